@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult
     from analysis.identify import RecordAnalysis, Selection, Setting
     from analysis.models import WelchSettings
-    from analysis.paper import WelchAnalysis
+    from analysis.paper.welch_analysis import WelchAnalysis
     from analysis.record import Record
     from analysis.record_part import PartOption
     from rigd.spectral import FrequencyResponse
@@ -89,9 +89,9 @@ def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyRespo
     >>> print(f"{response.frequency_hz[peak]:.2f} Hz")
     2.56 Hz
     """
+    from analysis.applicability import welch_settings
     from analysis.models import WelchSettings
     from analysis.paper import estimate
-    from analysis.suited import welch_settings
 
     return estimate(record, welch_settings(record, settings or WelchSettings()))[0]
 
@@ -176,19 +176,19 @@ def fit(
             f"{', '.join(STRUCTURES)}."
         )
     if method == "record":
+        from analysis.applicability import record_band_hz
         from analysis.identify import Measurement, fit_record
-        from analysis.suited import record_band_hz
 
         return fit_record(
-            Measurement.of_record(record),
+            Measurement.from_record(record),
             [STRUCTURES[type_name] for type_name in types or STRUCTURES],
             fixed=fixed,
             band_hz=record_band_hz(record, band_hz),
         )
     if method == "welch":
+        from analysis.applicability import welch_settings
         from analysis.models import PAPER_TYPES, PAPER_WEIGHTINGS, WelchSettings
-        from analysis.paper import analyse
-        from analysis.suited import welch_settings
+        from analysis.paper.welch_analysis import analyse
 
         settings = WelchSettings(
             types=tuple(types or PAPER_TYPES),

@@ -102,7 +102,7 @@ class OnlineEstimate:
         return None if None in value_flags else value_flags[0]
 
     @property
-    def predicting(self) -> RecordFit | None:
+    def predictive_fit(self) -> RecordFit | None:
         """Fit from which the next excitation is planned; None without a fit.
 
         It has internal and external damping. A damping that is insignificant, or whose order is not
@@ -135,10 +135,10 @@ class OnlineEstimate:
     def plant(self) -> Plant | None:
         """Model of beam and rig from which the next excitation is planned; None without a fit.
 
-        It is that of the fit `predicting`. If a uniform beam does not predict the modal constants,
-        each mode has its own measured stiffness.
+        It is that of the fit `predictive_fit`. If a uniform beam does not predict the modal
+        constants, each mode has its own measured stiffness.
         """
-        headline, fit = self.headline, self.predicting
+        headline, fit = self.headline, self.predictive_fit
         if headline is None or fit is None:
             return None
         beam_test = headline.uniform_beam
@@ -163,7 +163,7 @@ class OnlineEstimate:
             "with_air_drag": any(finding.kind == "air drag" for finding in self.findings),
             "modes": [],
         }
-        headline, fit, plant = self.headline, self.predicting, self.plant
+        headline, fit, plant = self.headline, self.predictive_fit, self.plant
         if headline and fit and plant and self.analysis:
             json_content |= headline_json(None, headline, self.orders, self.findings, self.validity)
             json_content |= {
@@ -305,6 +305,7 @@ class OnlineEstimator:
         OnlineEstimate
             Estimate, or the reason why no fit is possible.
         """
+        from analysis.applicability import record_band_hz
         from analysis.identify import (
             ORDER_ONE_STRUCTURE,
             Measurement,
@@ -313,7 +314,6 @@ class OnlineEstimator:
             select,
         )
         from analysis.record import RecordError
-        from analysis.suited import record_band_hz
         from analysis.validity import record_validity
 
         started_s = time.monotonic()
@@ -322,7 +322,7 @@ class OnlineEstimator:
             record = self.record(up_to_tick)
             end_tick = round((record.time_s[-1]) * record.rate_hz) + 1
             duration_s = record.time_s.size / record.rate_hz
-            measurement, band_hz = Measurement.of_record(record), record_band_hz(record)
+            measurement, band_hz = Measurement.from_record(record), record_band_hz(record)
             order_verdicts: tuple[OrderVerdict, ...] = ()
             fit_in_air = None
             if whole:

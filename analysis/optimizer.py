@@ -128,7 +128,7 @@ class Region(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class ConstantBounds:
     """Constant bounds, at which each unknown of a step is clipped.
 
     The other unknowns of a clipped step are not optimised again, as they are in `_compute_step`
@@ -192,7 +192,7 @@ def descend(
     start : ndarray, shape (k,)
         Starting point, in unknowns scaled so that a change of 1 is large.
     region : Region
-        Bounds and rule for steps; a `Box` for constant bounds.
+        Bounds and rule for steps; a `ConstantBounds` for constant bounds.
     relative_tolerance : float
         The descent ends when the predicted cost reduction of a step is less than this fraction of
         the cost, or when the step is as small as rounding errors.

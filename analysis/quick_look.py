@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.estimates import change_between, modes_from_json, unseen_modes
-from rigd.runtime import raise_on_signals, use_one_thread
+from rigd.runtime import raise_on_signals
+from rigd.runtime.background import use_one_thread
 from rigd.session import SessionError, Validity
 from rigd.session.quick_look import (
     QUICK_LOOK_VERSION,
@@ -142,9 +143,9 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
 
     The estimates are None if the record is not fitted.
     """
+    from analysis.applicability import record_band_hz
     from analysis.identify import Measurement, MeasurementError, fit_freest_alone
     from analysis.results import whole_record
-    from analysis.suited import record_band_hz
     from analysis.validity import record_validity, stated_validity
 
     sentences = []
@@ -161,7 +162,7 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
             )
         else:
             headline, findings, _ = fit_freest_alone(
-                Measurement.of_record(record), record_band_hz(record)
+                Measurement.from_record(record), record_band_hz(record)
             )
             validity = record_validity(
                 record.metadata, record.angle_rad, record.rate_hz, headline.fit.plant
@@ -198,7 +199,7 @@ def _model_document(
 
     if not headline.explained or headline.drag_speed_m_s is not None or len(shown_hz) == 0:
         return None
-    shown_model = ShownModel.of(headline, record)
+    shown_model = ShownModel.from_headline(headline, record)
     peaks_hz = [mode.frequency_hz for mode in shown_model.modes]
     response_band = shown_model.band(dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
     magnitude, magnitude_limits = np.abs(response_band.response), response_band.magnitude_limits()
@@ -220,8 +221,8 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
     """
     import numpy as np
 
+    from analysis.applicability import welch_exclusion_reason
     from analysis.models import LARGEST_FRACTION_OF_RATE
-    from analysis.suited import welch_exclusion_reason
     from rigd.spectral import SpectralError, segmentation_of
     from rigd.sweep_response import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_decimation
 
@@ -443,7 +444,7 @@ def _text_lines(document: Mapping[str, Any]) -> Iterator[str]:
     for mode in shown_modes:
         yield f"  {mode.line()}"
     if shown_modes:
-        validity = Validity.of_document(document.get("validity"))
+        validity = Validity.from_document(document.get("validity"))
         yield f"  {validity.sentence}"
         if validity.uniform_beam is not None:
             yield f"  {validity.uniform_beam.sentence}"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from analysis.identify.headline import Headline
     from analysis.identify.verdict import OrderVerdict, Verdict
     from analysis.models import WelchSettings
-    from analysis.paper import WelchAnalysis
+    from analysis.paper.welch_analysis import WelchAnalysis
     from analysis.record import Record
     from analysis.record_part import PartOption
     from analysis.structures import AddedStructure
@@ -40,7 +40,7 @@ DEFAULT_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg")
 
 
 @dataclass(frozen=True, slots=True)
-class Routes:
+class AnalysisOptions:
     """Selected analyses of a record, with their settings.
 
     Attributes
@@ -169,12 +169,12 @@ class WholeRecord:
         return self.headline.visible_modes
 
     @property
-    def withheld(self) -> frozenset[str]:
+    def withheld_orders(self) -> frozenset[str]:
         """Orders of the reported fit that are not to be reported: their estimate has a flag."""
         return frozenset(_ORDER_NAMES & self.headline.flags.keys())
 
     @property
-    def combined(self) -> dict[str, Estimate]:
+    def parameters_with_scales(self) -> dict[str, Estimate]:
         """Reported parameters that depend on a scale whose uncertainty the file states.
 
         Their standard uncertainties and intervals include the uncertainty of the scale.
@@ -206,7 +206,7 @@ class WholeRecord:
             },
             "combined": {
                 parameter_name: reported_value.as_json()
-                for parameter_name, reported_value in self.combined.items()
+                for parameter_name, reported_value in self.parameters_with_scales.items()
             },
         }
 
@@ -226,7 +226,7 @@ class WholeRecord:
         }
 
     @property
-    def unsupported(self) -> frozenset[str]:
+    def unsupported_orders(self) -> frozenset[str]:
         """Orders that the record does not support.
 
         These have a flag for an exactly uniform beam, or belong to absent damping.
@@ -285,9 +285,9 @@ class RecordResult:
         return f"{self.record.path.name}{'' if part_text is None else f', {part_text}'}"
 
     @property
-    def unsupported(self) -> frozenset[str]:
+    def unsupported_orders(self) -> frozenset[str]:
         """Orders that the whole record does not support; empty without whole-record fits."""
-        return frozenset() if self.whole is None else self.whole.unsupported
+        return frozenset() if self.whole is None else self.whole.unsupported_orders
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -321,17 +321,17 @@ def whole_record(
     MeasurementError
         The record cannot be used.
     """
+    from analysis.applicability import record_band_hz
     from analysis.identify import Measurement, select
-    from analysis.suited import record_band_hz
 
     band_hz = record_band_hz(record, band_hz)
-    selection = select(Measurement.of_record(record), fixed=fixed, band_hz=band_hz)
+    selection = select(Measurement.from_record(record), fixed=fixed, band_hz=band_hz)
     return WholeRecord(record, selection, band_hz, fixed)
 
 
 def record_result(
     path: Path,
-    routes: Routes,
+    routes: AnalysisOptions,
     *,
     on_step: Callable[[str], None] = lambda _done: None,
     warn: Callable[[str], None] = lambda _text: None,
@@ -342,7 +342,7 @@ def record_result(
     ----------
     path : Path
         Session file.
-    routes : Routes
+    routes : AnalysisOptions
         Selected analyses and their settings.
     on_step : callable, optional
         Called with the name of each step after it.
@@ -356,9 +356,14 @@ def record_result(
     FrequencyResponseError, MeasurementError
         No analysis is applicable to the record, or the settings are not.
     """
+    from analysis.applicability import (
+        check_record_band,
+        highest_frequency_hz,
+        remarks,
+        welch_analysis,
+    )
     from analysis.identify import MeasurementError
     from analysis.record import load_record
-    from analysis.suited import check_record_band, highest_frequency_hz, remarks, welch_analysis
 
     record = load_record(path, routes.part_s, highest_hz=highest_frequency_hz(routes.band_hz))
     record = with_uniformity(record, routes.uniformity)

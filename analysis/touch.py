@@ -39,7 +39,7 @@ from rigd.touch import (
     TouchEstimator,
     TouchModel,
     TouchRecord,
-    watched_beam,
+    detector_model,
 )
 from rigd.touch.samples import (
     CONTACT_S,
@@ -61,23 +61,23 @@ if TYPE_CHECKING:
 
     Real = NDArray[np.float64]
 
-_LEAST_BEFORE_S: Final = 0.3
+_MIN_BEFORE_S: Final = 0.3
 """Least duration of the record before a detection that an estimate needs."""
-_LEAST_AFTER_S: Final = 0.02
+_MIN_AFTER_S: Final = 0.02
 """Least duration of the record after a detection that an estimate needs."""
-_LEAST_REST_S: Final = 0.5
+_MIN_REST_S: Final = 0.5
 """Least duration at the start from which the test estimates the noise."""
-_LEAST_PAUSE_S: Final = 0.5
+_MIN_PAUSE_S: Final = 0.5
 """Time without a detection after which the next one is another touch, as the beam bounces."""
 _LONGEST_FILTER_TICKS: Final = 0.99
 """Limit of the averaging filter's span in ticks, which is that of a hundred records per tick."""
-_MOST_TOUCHES: Final = 20
+_MAX_TOUCHES: Final = 20
 """Largest number of touches found in a record; with more, the model does not fit the record."""
 _LARGEST_CHI2_PER_DEGREE: Final = 5.0
 """Sum of squared residuals per degree of freedom above which the model is doubtful."""
-_LEAST_NOISE_STD: Final = 1e-9
+_MIN_NOISE_STD: Final = 1e-9
 """Least standard deviation of a channel's noise."""
-_LEAST_FIT_SAMPLES: Final = 100
+_MIN_FIT_SAMPLES: Final = 100
 """Least number of samples for the fit of the vibration before a touch."""
 _ANTENNA_POINTS: Final = 41
 """Number of points along the antenna at which its deflection is computed."""
@@ -138,7 +138,7 @@ class Touch:
 
 
 @dataclass(frozen=True, slots=True)
-class TouchedSession:
+class SessionTouches:
     """Touches found in one session.
 
     Attributes
@@ -187,7 +187,7 @@ class TouchAnalysis:
 
     def session(
         self, path: Path, on_step: Callable[[str], None] = lambda _: None
-    ) -> TouchedSession:
+    ) -> SessionTouches:
         """Return the touches of a session.
 
         Parameters
@@ -228,12 +228,12 @@ class TouchAnalysis:
                 "record",
                 _detect_touches(session, touch_model, rate_hz, shear_coefficients),
             )
-            if len(detected_ticks) > _MOST_TOUCHES:
+            if len(detected_ticks) > _MAX_TOUCHES:
                 warnings.append(
-                    f"More than {_MOST_TOUCHES} touches were found, of which the first are shown: "
+                    f"More than {_MAX_TOUCHES} touches were found, of which the first are shown: "
                     "the model does not fit the record. Take an identified one (--model)."
                 )
-                detected_ticks = detected_ticks[:_MOST_TOUCHES]
+                detected_ticks = detected_ticks[:_MAX_TOUCHES]
         touches = []
         for touch_number, (detection_tick, free_ticks) in enumerate(detected_ticks, start=1):
             on_step(f"touch {touch_number} of {len(detected_ticks)}")
@@ -253,7 +253,7 @@ class TouchAnalysis:
             readable_texts(session.metadata, "keys of the metadata")[0],
             samples["angle_rad"], rate_hz, touch_model.plant,
         )  # fmt: skip
-        return TouchedSession(
+        return SessionTouches(
             path, tuple(touches), detection_source, touch_model, rate_hz,
             shear_coefficients is not None, tuple(warnings), validity,
         )  # fmt: skip
@@ -273,7 +273,7 @@ class TouchAnalysis:
         time_s = samples_record.detected / rate_hz
         after_s = (samples_record.angle_rad.size - 1 - samples_record.detected) / rate_hz
         angles_rad = samples_record.angle_rad
-        if time_s < _LEAST_BEFORE_S or after_s < _LEAST_AFTER_S:
+        if time_s < _MIN_BEFORE_S or after_s < _MIN_AFTER_S:
             return Touch(
                 touch_number,
                 detection_tick,
@@ -398,7 +398,7 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
         )
     record_count = round(1 / (1 - delay_fraction))
     spacing_s = delay_fraction / rate_hz / max(record_count - 1, 1)
-    return SensorFilter.of_records(corner_hz, filter_order, filter_kind, record_count, spacing_s)
+    return SensorFilter.for_records(corner_hz, filter_order, filter_kind, record_count, spacing_s)
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:
@@ -445,18 +445,18 @@ def _detect_touches(
         else base_shear_n(samples, shear_coefficients)
     )
     rest_end_tick = session.segments.get("rest", (0, 0))[1]
-    noise_end_tick = max(rest_end_tick, int(ticks[0]) + round(_LEAST_REST_S * rate_hz))
+    noise_end_tick = max(rest_end_tick, int(ticks[0]) + round(_MIN_REST_S * rate_hz))
     is_at_rest = ticks < noise_end_tick
     channel_noise = ChannelNoise(
         _white_noise_std(torque_nm[is_at_rest]),
         None if shear_coefficients is None else _white_noise_std(shear_n[is_at_rest]),
         _angle_noise_std(samples["angle_rad"], is_at_rest),
     )
-    beam_watch = watched_beam(touch_model, rate_hz, channel_noise)
+    beam_watch = detector_model(touch_model, rate_hz, channel_noise)
     detector = TouchDetector(beam_watch, rate_hz, DetectorSettings())
     is_armed = False
     detections: list[tuple[int, int]] = []
-    pause_ticks = round(_LEAST_PAUSE_S * rate_hz)
+    pause_ticks = round(_MIN_PAUSE_S * rate_hz)
     last_detection = int(ticks[0]) - pause_ticks - 1
     previous_tick = int(ticks[0]) - 1
     sample_columns = (
@@ -486,16 +486,16 @@ def _white_noise_std(signal_values: Real) -> float:
     """Return the standard deviation of the white noise in a slowly changing signal."""
     value_steps = np.diff(signal_values)
     return (
-        max(float(np.std(value_steps)) / sqrt(2), _LEAST_NOISE_STD)
+        max(float(np.std(value_steps)) / sqrt(2), _MIN_NOISE_STD)
         if value_steps.size
-        else _LEAST_NOISE_STD
+        else _MIN_NOISE_STD
     )
 
 
 def _angle_noise_std(angle_rad: Real, is_at_rest: NDArray[np.bool_]) -> float:
     """Return the standard deviation of the angle's noise, from rest or from its resolution."""
     angle_steps_rad = np.abs(np.diff(angle_rad))
-    angle_steps_rad = angle_steps_rad[angle_steps_rad > _LEAST_NOISE_STD]
+    angle_steps_rad = angle_steps_rad[angle_steps_rad > _MIN_NOISE_STD]
     resolution_rad = float(angle_steps_rad.min()) if angle_steps_rad.size else 0.0
     return max(_white_noise_std(angle_rad[is_at_rest]), resolution_rad / sqrt(12))
 
@@ -506,9 +506,9 @@ def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
     without_estimate = [touch.number for touch in touches if touch.estimate is None]
     if without_estimate:
         sentences.append(
-            f"Touch {_number_list(without_estimate)}: not estimated; it takes {_LEAST_BEFORE_S:g} "
+            f"Touch {_number_list(without_estimate)}: not estimated; it takes {_MIN_BEFORE_S:g} "
             "s of record "
-            f"before a touch and {1e3 * _LEAST_AFTER_S:g} ms after it."
+            f"before a touch and {1e3 * _MIN_AFTER_S:g} ms after it."
         )
     not_explained = [
         touch.number
@@ -540,7 +540,7 @@ def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, time_s: float) 
     `free_beam` has the free motion at points along the beam, the first at the motor's axis. The
     vibration is fitted to the samples of `record` before `time_s`, which counts from its start.
     """
-    fit_samples = min(max(int(time_s * record.rate_hz) - 1, _LEAST_FIT_SAMPLES), record.detected)
+    fit_samples = min(max(int(time_s * record.rate_hz) - 1, _MIN_FIT_SAMPLES), record.detected)
     free_motion = free_beam.motion(record, fit_samples, fit_samples - 4)
     step_index = round((time_s - free_motion.first_s) / free_motion.step_s)
     displacement_m: Real = free_motion.displacement_m[

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from gate import Gate, Row
 
-from rigd.runtime import use_one_thread
+from rigd.runtime.background import use_one_thread
 
 RUNS = 3
 REST_S = 16
@@ -52,9 +52,9 @@ from analysis.identify import BAND_HZ, Measurement
 mark("imports of the analysis")
 record = analysis.record.load_record(Path(sys.argv[1]))
 mark("reading")
-welch = analysis.paper.analyse(record, WelchSettings())
+welch = analysis.paper.welch_analysis.analyse(record, WelchSettings())
 mark("the paper's route")
-selection = analysis.identify.select(Measurement.of_record(record))
+selection = analysis.identify.select(Measurement.from_record(record))
 mark("whole record")
 from analysis.results import RecordResult, WholeRecord
 from analysis.report.record_report import write_report

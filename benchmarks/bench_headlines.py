@@ -223,7 +223,7 @@ def judged(name: str, seed: int) -> Scored:
     with tempfile.TemporaryDirectory() as folder:
         record = cell.record(crc32(f"{name} {seed}".encode()), Path(folder))
     start = time.process_time()
-    selection = select(Measurement.of_record(record))
+    selection = select(Measurement.from_record(record))
     spent_s = time.process_time() - start
     result = RecordResult(record, WholeRecord(record, selection, BAND_HZ))
     results = document([result])
@@ -311,7 +311,7 @@ def scored(
 
 def _own(record: Record, truth: Truth, name: str, loss_hz: NDArray[np.float64]) -> list[Told]:
     """Fit the true structure, and nothing else."""
-    (fit,) = fit_record(Measurement.of_record(record), [STRUCTURES[name]]).fits
+    (fit,) = fit_record(Measurement.from_record(record), [STRUCTURES[name]]).fits
     entries = [
         Told(key, truth.parameters[key], fit.parameters[key], ends)
         for key, ends in fit.interval.items()

@@ -24,8 +24,9 @@ from rigd.engine.shared_state import Phase
 from rigd.engine.workers import LIVE
 from rigd.excitation import make_excitation
 from rigd.profile import load_profile
-from rigd.runner.request import Order
-from rigd.runtime import StopRequest, use_one_thread
+from rigd.runner.request import SessionOrder
+from rigd.runtime import StopRequest
+from rigd.runtime.background import use_one_thread
 from rigd.session import read_session
 
 RATE_HZ = 1000.0
@@ -95,7 +96,7 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
         loops.connected_rig(profile, live=live) as (rig, group),
     ):
-        order = Order(profile, excitation, Path(folder) / "bench.mcap")
+        order = SessionOrder(profile, excitation, Path(folder) / "bench.mcap")
         meters, stop = [], StopRequest()
         if live:
             rig.show(order, stop)

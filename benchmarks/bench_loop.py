@@ -22,7 +22,7 @@ from rigd.bench import _loops as loops
 from rigd.bench.measure import HELD_FRACTION, percentiles
 from rigd.checks.machine import settings_granted
 from rigd.profile import load_profile
-from rigd.runtime import use_one_thread
+from rigd.runtime.background import use_one_thread
 
 RATE_HZ = 1000.0
 TRIES = 3

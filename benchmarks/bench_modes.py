@@ -107,7 +107,7 @@ def recorded(kind: list[str], profile: Path, count: int, folder: Path) -> list[M
         command += ["--seed", str(seed + 1), "--output", str(folder), "--json"]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         path = Path(json.loads(done.stdout)["sessions"][0]["path"])
-        measurements.append(Measurement.of_record(load_record(path)))
+        measurements.append(Measurement.from_record(load_record(path)))
         path.unlink()
     return measurements
 

@@ -32,7 +32,7 @@ from rigd.bench import cores_without_loop
 from rigd.bench.measure import LoopMeasurement
 from rigd.checks.machine import settings_granted
 from rigd.profile import Profile, load_profile
-from rigd.runtime import use_one_thread
+from rigd.runtime.background import use_one_thread
 
 RATE_HZ = 1000.0
 ALONE, STREAMING, READ, SIMULATED = "no box", "box not read", "box read", "box simulated"

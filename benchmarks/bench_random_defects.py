@@ -53,8 +53,8 @@ from uniform_shift import headline_shift
 from analysis.exchange import write_session
 from analysis.models import WelchSettings
 from analysis.report import document, document_text
-from analysis.results import Routes, record_result
-from rigd.runtime import use_one_thread
+from analysis.results import AnalysisOptions, record_result
+from rigd.runtime.background import use_one_thread
 
 _STATED = {
     "id": "defect",
@@ -130,7 +130,7 @@ def judged_text(path: Path, *, command_line: bool) -> tuple[str, float]:
             check=True, capture_output=True, text=True,
         )  # fmt: skip
         return done.stdout, time.monotonic() - start
-    routes = Routes(WelchSettings(), paper=False, whole_record=True, fixed=())
+    routes = AnalysisOptions(WelchSettings(), paper=False, whole_record=True, fixed=())
     start = time.process_time()
     result = record_result(path, routes)
     spent_s = time.process_time() - start

@@ -35,7 +35,7 @@ from analysis.identify import (
     RecordFit,
     fit_record,
 )
-from analysis.identify.parametrization import Steps, Unknowns
+from analysis.identify.parametrization import StepRule, Unknowns
 from analysis.models import STRUCTURES
 from analysis.optimizer import descend
 from rigd.beam import Beam, Damping, Plant, transfer
@@ -110,8 +110,8 @@ class Peer:
     """The same sum of squares, assembled again, for a search that knows nothing of it."""
 
     def __init__(self, measurement: Measurement, name: str, analysis: RecordAnalysis) -> None:
-        self.comparison = Comparison.of(measurement, (0.0, 50.0))
-        self.unknowns = Unknowns.of(STRUCTURES[name], Plant(LINK, Damping()), SETTINGS)
+        self.comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
+        self.unknowns = Unknowns.for_structure(STRUCTURES[name], Plant(LINK, Damping()), SETTINGS)
         self.weight = analysis.noise.weight
 
     def cost(self, x: NDArray[np.float64]) -> float:
@@ -192,11 +192,11 @@ def tool_inertia_of_either_sign(
     measurement: Measurement, analysis: RecordAnalysis, true: Damping
 ) -> float:
     """Estimate a tool inertia that may come out negative, everything else free as well."""
-    comparison = Comparison.of(measurement, (0.0, 50.0))
-    unknowns = Unknowns.of(analysis.fits[0].structure, Plant(LINK, Damping()), SETTINGS)
+    comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
+    unknowns = Unknowns.for_structure(analysis.fits[0].structure, Plant(LINK, Damping()), SETTINGS)
     weight = analysis.noise.weight
     objective = Objective(comparison, unknowns)
-    steps = Steps.of(unknowns)
+    steps = StepRule.for_unknowns(unknowns)
     place = unknowns.names.index("tool_inertia_kg_m2")
     steps.lower[place] = -steps.upper[place]
     first, second = unknowns.omega_rad_s

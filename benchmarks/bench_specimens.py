@@ -31,7 +31,7 @@ from independent_records import (
 )
 
 from analysis.campaigns import CampaignResult, campaign
-from rigd.runtime import use_one_thread
+from rigd.runtime.background import use_one_thread
 from rigd.testing import Signals, write_session
 
 ROWS = (
@@ -88,7 +88,7 @@ def line(case: Case, found: CampaignResult) -> str:
         stds = f"{leading.between_std_in_own_stds:.0f} std"
         mixed = f"yes, {sizes or 'no groups'}, by {leading.quantity} ({stds})"
     worst = "" if alike.mixed else f"{worst_error(case, found):.1f}"
-    lost = len(found.failures) + len(found.lost_trials)
+    lost = len(found.failures) + len(found.failed_predictions)
     return (
         f"| {case.name} | {alone} | {mixed} | {least:.2g} of {len(alike.quantities)} "
         f"| {worst} | {lost} |"

@@ -23,7 +23,7 @@ from rigd.identified_beam import TOUCH
 from rigd.profile import Profile, load_profile
 from rigd.runner.planning import RigPreview
 from rigd.sim import SimulatedRig
-from rigd.touch import ChannelNoise, DetectorSettings, TouchDetector, TouchModel, watched_beam
+from rigd.touch import ChannelNoise, DetectorSettings, TouchDetector, TouchModel, detector_model
 
 Real = NDArray[np.float64]
 
@@ -87,7 +87,7 @@ def detector_of(profile: Profile) -> TouchDetector:
     rig, simulation = profile.rig, profile.rig.simulation
     assert simulation is not None
     noise = ChannelNoise(simulation.torque_noise_nm, simulation.force_noise_n, 2e-5)
-    beam = watched_beam(TouchModel(profile.plant), rig.rate_hz, noise)
+    beam = detector_model(TouchModel(profile.plant), rig.rate_hz, noise)
     return TouchDetector(beam, rig.rate_hz, DetectorSettings())
 
 

@@ -29,9 +29,10 @@ from rigd.excitation import Excitation, touch
 from rigd.profile import Profile, load_profile
 from rigd.runner._touch_search import touch_search
 from rigd.runner.planning import RigPreview
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 from rigd.runner.session import SessionProgress
-from rigd.runtime import StopRequest, use_one_thread
+from rigd.runtime import StopRequest
+from rigd.runtime.background import use_one_thread
 from rigd.session import read_session
 from rigd.session.layout import Status
 
@@ -79,7 +80,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurem
         def watch(progress: SessionProgress, _: object) -> None:
             meter.sample(progress.phase)
 
-        order = Order(
+        order = SessionOrder(
             profile,
             excitation,
             Path(folder) / "bench.mcap",

@@ -30,7 +30,7 @@ from rigd.devices.canbus.adapters import SocketPort
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError, Wrench, WrenchSensor
 from rigd.devices.running_simulator import SimulatorAddress, find_simulator
-from rigd.engine.realtime import apply_realtime, collect_no_garbage
+from rigd.engine.realtime import apply_realtime, disable_garbage_collection
 from rigd.profile import load_profile
 
 BLOCKS, TICKS, SETTLING = 20, 250, 20
@@ -248,7 +248,7 @@ def main() -> None:
     gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     with tempfile.TemporaryDirectory(prefix="rigd-") as folder:
         os.environ["XDG_RUNTIME_DIR"] = folder
-        collect_no_garbage()
+        disable_garbage_collection()
         apply_realtime(priority=80, cpu=-1)
         for name in ("antenna_can", "antenna_serial"):
             for _ in range(TRIES):

@@ -106,7 +106,7 @@ def main() -> None:
             for seed in range(given.first, given.first + share):
                 one = Judged.of(make(RIGS[name], seed))
                 judged.append(one)
-                if given.say:
+                if given.write_message:
                     _say(f"{defect}, {name}, {seed}", one)
         if judged:
             every[defect] = judged

@@ -179,7 +179,7 @@ def fit_record(
         known,
         rest_angle_rad=0.0,
     )
-    comparison = Comparison.of(measurement, band_hz)
+    comparison = Comparison.from_measurement(measurement, band_hz)
     torque = comparison.spectrum(comparison.torque_nm[comparison.retained])
     power = np.full(torque.size, np.mean(np.abs(torque) ** 2))
     white = NoiseSpectrum(power, np.ones(torque.size, dtype=bool), ())

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rigd.daemon.client import Client, DaemonGoneError, RefusedByDaemonError
+from rigd.daemon.client import Client, DaemonUnreachableError, RefusedByDaemonError
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.runtime.processes import read_process, read_processes
 from rigd.testing import write_profile
@@ -189,7 +189,7 @@ def begin(socket: Path) -> None:
     parameters = {"duration_s": 100.0, "rest_s": 0.2, "ring_down_s": 0.0}
 
     def recording() -> bool:
-        with suppress(DaemonGoneError, RefusedByDaemonError), Client(socket) as client:
+        with suppress(DaemonUnreachableError, RefusedByDaemonError), Client(socket) as client:
             status = client.ask("status")
             if status["state"] == "fault":
                 client.ask("reset")

@@ -13,7 +13,7 @@ import numpy as np
 
 from analysis import frf, load
 from analysis.models import WelchSettings
-from analysis.paper import resonant_peaks
+from analysis.paper.welch_analysis import resonant_peaks
 from rigd.beam import undamped_frequencies_rad_s
 
 ETFE = WelchSettings(estimator="fft")

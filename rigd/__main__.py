@@ -22,7 +22,8 @@ def main() -> None:
             f"Error: rigd {command} needs Linux. This system has analyze, and of rigd the commands "
             f"{', '.join(_PORTABLE_COMMANDS)}."
         )
-    from rigd.runtime import ignore_handled_signals, use_one_thread
+    from rigd.runtime import ignore_handled_signals
+    from rigd.runtime.background import use_one_thread
 
     use_one_thread()
     if sys.argv[1:] == ["stop"]:

@@ -32,14 +32,14 @@ class DocumentError(ValueError):
     """A document cannot be read; the message is a clause that follows the file's name."""
 
 
-def read_text(path: Path, most_bytes: int = MAX_TOML_BYTES) -> str:
+def read_text(path: Path, max_bytes: int = MAX_TOML_BYTES) -> str:
     """Return the text of a user's file of limited size.
 
     Parameters
     ----------
     path
         Path of the file.
-    most_bytes
+    max_bytes
         Largest accepted size of the file in bytes.
 
     Raises
@@ -48,7 +48,7 @@ def read_text(path: Path, most_bytes: int = MAX_TOML_BYTES) -> str:
         If the file cannot be read, is not a regular file, is too large, or is not text.
     """
     try:
-        with open_plain_file(path, most_bytes) as text_file:
+        with open_plain_file(path, max_bytes) as text_file:
             return decode_text(text_file.buffer.read())
     except OSError as error:
         raise DocumentError(f"cannot be read ({error.strerror})") from error
@@ -88,14 +88,14 @@ def parse_toml(text: str) -> dict[str, Any]:
     return document
 
 
-def read_json(path: Path, most_bytes: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN401 - any JSON value
+def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN401 - any JSON value
     """Read a JSON file of limited size, and return its value.
 
     Parameters
     ----------
     path
         Path of the file.
-    most_bytes
+    max_bytes
         Largest accepted size of the file in bytes.
 
     Raises
@@ -103,7 +103,7 @@ def read_json(path: Path, most_bytes: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN
     DocumentError
         If the file cannot be read, is not a regular file, is too large, or is not JSON.
     """
-    json_text = read_text(path, most_bytes)
+    json_text = read_text(path, max_bytes)
     try:
         return json.loads(json_text)
     except RecursionError as error:

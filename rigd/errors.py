@@ -33,7 +33,7 @@
      |    +-- RigBusyError          another program runs the rig
      |    +-- UnsafeFolderError     others can write to the runtime folder
      |    +-- AddressError          no daemon is running, or its socket cannot be made
-     |    +-- DaemonGoneError       the daemon was killed during a request
+     |    +-- DaemonUnreachableError  the daemon was killed during a request
      |    +-- SessionError          a session file is damaged, or the disk is full
      |    +-- MissingExtraError     --live without the packages of rigd[live]
      |    +-- RrdFileError          a recording for Rerun exists already

@@ -49,7 +49,7 @@ class Estimate:
     flag: str | None = None
     """Reason why the value is not a property of the antenna or the rig; None if it is one."""
 
-    def flagged(self, flag: str | None) -> "Estimate":
+    def with_flag(self, flag: str | None) -> "Estimate":
         """Return the estimate with a flag, unless it already has one.
 
         Parameters

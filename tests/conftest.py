@@ -24,7 +24,7 @@ from hypothesis import settings
 from PIL import Image
 
 from rigd import testing
-from rigd.runtime import use_one_thread
+from rigd.runtime.background import use_one_thread
 
 pytest_plugins = [
     "browsers", "library_folders", "paper_sweeps", "patient_drives",

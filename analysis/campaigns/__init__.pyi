@@ -10,7 +10,7 @@ from ._experiment import SessionFailure as SessionFailure
 from ._experiment import SingleSessionError as SingleSessionError
 from ._experiment import differing_fact_keys as differing_fact_keys
 from ._experiment import fact_text as fact_text
-from ._headlines import campaign_numbers as campaign_numbers
+from ._headlines import campaign_estimates as campaign_estimates
 from ._headlines import headlines as headlines
 from ._homogeneity import Heterogeneity as Heterogeneity
 from ._homogeneity import Homogeneity as Homogeneity

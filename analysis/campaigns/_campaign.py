@@ -17,7 +17,7 @@ from analysis.campaigns._experiment import (
     stated_specimens,
 )
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
-from analysis.campaigns._modal import PooledModal, pooled_modal
+from analysis.campaigns._modal import PooledModalModel, pooled_modal
 from analysis.campaigns._session import (
     SessionAnalysis,
     SessionTask,
@@ -31,11 +31,16 @@ from analysis.campaigns._statistics import (
     parameter_statistics,
     ranked_structures,
 )
-from analysis.campaigns._validation import FEWEST_SESSIONS, LeftOutError, LostTrial, validate
+from analysis.campaigns._validation import (
+    MIN_SESSIONS,
+    FailedPrediction,
+    LeaveOneOutResult,
+    validate,
+)
 from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns._welch_bias import WelchBias, welch_biases
 from analysis.campaigns.pooling import PooledEstimate, PooledMode, freest_estimate, pooled_estimates
-from analysis.campaigns.workers import LostTask, available_cores, dask_cluster, process_pool
+from analysis.campaigns.workers import FailedTask, available_cores, dask_cluster, process_pool
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.validity import combined_validity
 
@@ -77,16 +82,16 @@ class CampaignResult:
     pooled : tuple of PooledEstimate
         Pooled estimates of the structures that two sessions or more determine, the lowest BIC
         first; empty without whole-record fits.
-    modal : PooledModal or None
+    modal : PooledModalModel or None
         Modal model of all sessions, and the nearly uniform beam estimated from it; None unless two
         sessions show a common mode.
     verdict : CampaignVerdict or None
         Structure that the data support, and further findings; None without pooled estimates.
-    validation : tuple of LeftOutError
+    validation : tuple of LeaveOneOutResult
         Errors of each session predicted from the others; empty with fewer than three sessions.
-    lost_trials : tuple of LostTrial
+    failed_predictions : tuple of FailedPrediction
         Sessions that could not be predicted from the others. With three sessions or more, each
-        session is in `validation` or in `lost_trials`.
+        session is in `validation` or in `failed_predictions`.
     """
 
     settings: WelchSettings
@@ -99,10 +104,10 @@ class CampaignResult:
     homogeneity: Homogeneity
     structures: tuple[RankedStructure, ...]
     pooled: tuple[PooledEstimate, ...]
-    modal: PooledModal | None
+    modal: PooledModalModel | None
     verdict: CampaignVerdict | None
-    validation: tuple[LeftOutError, ...]
-    lost_trials: tuple[LostTrial, ...]
+    validation: tuple[LeaveOneOutResult, ...]
+    failed_predictions: tuple[FailedPrediction, ...]
 
     @property
     def headline(self) -> PooledEstimate | None:
@@ -124,7 +129,7 @@ class CampaignResult:
     @property
     def trials(self) -> int:
         """Number of sessions whose torque was to be predicted by models of the other sessions."""
-        return len(self.sessions) if len(self.sessions) >= FEWEST_SESSIONS else 0
+        return len(self.sessions) if len(self.sessions) >= MIN_SESSIONS else 0
 
 
 def campaign(
@@ -213,7 +218,7 @@ def campaign(
         sessions, failures = _separate_experiments(
             [
                 SessionFailure(path, f"{path}: {session_result.reason}; analyse it by itself.")
-                if isinstance(session_result, LostTask)
+                if isinstance(session_result, FailedTask)
                 else session_result
                 for path, session_result in zip(paths, session_results, strict=True)
             ]
@@ -222,9 +227,9 @@ def campaign(
             raise CampaignError(
                 "No session could be analysed:\n" + "\n".join(f.message for f in failures)
             )
-        validation: tuple[LeftOutError, ...] = ()
-        lost_sessions: tuple[LostTrial, ...] = ()
-        if len(sessions) >= FEWEST_SESSIONS:
+        validation: tuple[LeaveOneOutResult, ...] = ()
+        lost_sessions: tuple[FailedPrediction, ...] = ()
+        if len(sessions) >= MIN_SESSIONS:
             total_steps = len(paths) + len(sessions)
             session_names = [session.path.name for session in sessions]
             validation, lost_sessions = validate(
@@ -236,8 +241,8 @@ def campaign(
 def campaign_result(
     sessions: Sequence[SessionAnalysis],
     failures: Sequence[SessionFailure] = (),
-    validation: Sequence[LeftOutError] = (),
-    lost: Sequence[LostTrial] = (),
+    validation: Sequence[LeaveOneOutResult] = (),
+    lost: Sequence[FailedPrediction] = (),
 ) -> CampaignResult:
     """Return the combined result of sessions of one experiment.
 
@@ -247,9 +252,9 @@ def campaign_result(
         Results of the sessions, at least one.
     failures : sequence of SessionFailure, optional
         Sessions that are not used.
-    validation : sequence of LeftOutError, optional
+    validation : sequence of LeaveOneOutResult, optional
         Errors of the sessions that were predicted from the others.
-    lost : sequence of LostTrial, optional
+    lost : sequence of FailedPrediction, optional
         Sessions that could not be predicted from the others.
     """
     session_names = distinct_names(
@@ -286,7 +291,7 @@ def campaign_result(
             sessions, pooled_fits, homogeneity_test, validation, lost, all_biases, modal_model
         ),
         validation=tuple(validation),
-        lost_trials=tuple(lost),
+        failed_predictions=tuple(lost),
     )
 
 
@@ -353,7 +358,7 @@ def _equalize_welch_fits(
     without_fits = [session for session in sessions if not session.frequency_hz.size]
     if not without_fits:
         return sessions, failures
-    has_searching = any(session.experiment.planned_itself for session in without_fits)
+    has_searching = any(session.experiment.is_planned_during_session for session in without_fits)
     if has_searching or 2 * len(without_fits) >= len(sessions):
         return [session.without_welch() for session in sessions], failures
     new_failures = [

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import Candidate, ModeEstimate
-    from analysis.paper import FittedModel, Indices
+    from analysis.paper.welch_analysis import FitIndices, FittedModel
     from rigd.beam import Damping, Plant
 
 
@@ -34,7 +34,7 @@ class WelchFit:
         Free parameters at a bound of the range searched.
     std : dict or None
         Standard deviations of the free parameters, as in `analysis.paper.FrfFit`.
-    indices : Indices or None
+    indices : FitIndices or None
         Fit indices relative to the session's response.
     """
 
@@ -45,7 +45,7 @@ class WelchFit:
     cost: float
     at_bounds: tuple[str, ...]
     std: Mapping[str, float] | None = None
-    indices: Indices | None = None
+    indices: FitIndices | None = None
 
     @classmethod
     def from_model(cls, model: FittedModel) -> WelchFit:
@@ -95,7 +95,7 @@ class RecordEstimate:
         Bayesian information criterion of this session alone.
     values : int
         Number of real values compared.
-    indices : Indices
+    indices : FitIndices
         Fit indices relative to the session's response by Welch's method, on the same bins as for
         the Welch fits. They contain the bias of that method.
     """
@@ -113,7 +113,7 @@ class RecordEstimate:
     deviance: float
     bic: float
     values: int
-    indices: Indices
+    indices: FitIndices
 
     @property
     def name(self) -> str:
@@ -126,14 +126,14 @@ class RecordEstimate:
         return frozenset((*self.determined, *self.at_bounds))
 
     @classmethod
-    def from_candidate(cls, candidate: Candidate, indices: Indices) -> RecordEstimate:
+    def from_candidate(cls, candidate: Candidate, indices: FitIndices) -> RecordEstimate:
         """Return the results of a whole-record fit that a campaign retains: all but the residual.
 
         Parameters
         ----------
         candidate : Candidate
             Fit of one session.
-        indices : Indices
+        indices : FitIndices
             Fit indices relative to the measured response.
         """
         fit = candidate.fit

@@ -141,7 +141,7 @@ class Experiment:
         return str(self.facts.get(LABEL_KEY, ""))
 
     @property
-    def planned_itself(self) -> bool:
+    def is_planned_during_session(self) -> bool:
         """Whether the excitation was planned during the session.
 
         Such an excitation agrees with any other.
@@ -164,7 +164,9 @@ class Experiment:
 
     def difference(self, other_experiment: Experiment) -> str | None:
         """Describe the first difference from another experiment; None if there is no difference."""
-        excitation_free = self.planned_itself or other_experiment.planned_itself
+        excitation_free = (
+            self.is_planned_during_session or other_experiment.is_planned_during_session
+        )
         other_facts = dict(other_experiment.facts)
         if {self.rising, other_experiment.rising} == {True, False}:
             start_key, stop_key = _SWEEP_END_KEYS
@@ -192,7 +194,7 @@ class Experiment:
             return None
         return start_hz < stop_hz
 
-    def same_specimen(self, other_experiment: Experiment) -> bool:
+    def has_same_specimen(self, other_experiment: Experiment) -> bool:
         """Return whether another experiment states the same beam and the same tool inertia."""
         return not any(
             key in self.facts
@@ -269,7 +271,7 @@ def stated_specimens(
         if experiment is None:
             continue
         for specimen, file_names in files_by_specimen:
-            if specimen.same_specimen(experiment):
+            if specimen.has_same_specimen(experiment):
                 file_names.append(file_name)
                 break
         else:
@@ -315,7 +317,7 @@ def most_common_index(experiments: Sequence[Experiment]) -> int:
     A session that planned its own excitation agrees with any other, so it is no candidate.
     """
     candidate_indices = [
-        i for i, experiment in enumerate(experiments) if not experiment.planned_itself
+        i for i, experiment in enumerate(experiments) if not experiment.is_planned_during_session
     ]
     return max(
         candidate_indices or range(len(experiments)),

@@ -14,7 +14,7 @@ from rigd.units import to_uncertainty
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.campaigns._modal import ModeInSweeps, OppositeSweeps, PooledModal
+    from analysis.campaigns._modal import ModeInSweeps, OppositeSweeps, PooledModalModel
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
@@ -35,7 +35,7 @@ def p_value_text(p_value: float) -> str:
     )
 
 
-def describe_tolerance(modal_model: PooledModal, estimate: TolerantEstimate) -> str:
+def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate) -> str:
     """Describe the basis of the parameters and the tolerated deviation from a uniform beam."""
     largest_stated = modal_model.stated[-1]
     tolerance_text = f"{100 * largest_stated:g} % as the files state it"
@@ -63,14 +63,14 @@ def describe_tolerance(modal_model: PooledModal, estimate: TolerantEstimate) -> 
     )
 
 
-def describe_slope(pooled_order: PooledOrder, modal_model: PooledModal) -> str:
+def describe_slope(pooled_order: PooledOrder, modal_model: PooledModalModel) -> str:
     """Describe an order of the damping as the slope of a loss over the visible modes.
 
     Parameters
     ----------
     pooled_order : PooledOrder
         Order estimated with a tolerance of the geometry.
-    modal_model : PooledModal
+    modal_model : PooledModalModel
         Modal model of all sessions, with the estimate `tolerant`.
     """
     estimate = modal_model.tolerant
@@ -99,7 +99,7 @@ def describe_slope(pooled_order: PooledOrder, modal_model: PooledModal) -> str:
 
 
 def describe_orders_if_exact(
-    freest_fit: PooledEstimate, orders: Sequence[PooledOrder], modal_model: PooledModal | None
+    freest_fit: PooledEstimate, orders: Sequence[PooledOrder], modal_model: PooledModalModel | None
 ) -> list[str]:
     """Describe the orders of the damping on condition that the beam is exactly uniform.
 
@@ -185,7 +185,7 @@ def _describe_mode_change(mode_change: ModeInSweeps) -> str:
 
 def recommend_sweeps(
     sweeps: OppositeSweeps | None,
-    modal_model: PooledModal | None,
+    modal_model: PooledModalModel | None,
     sessions: Sequence[SessionAnalysis],
 ) -> list[str]:
     """Recommend further sweeps that show whether the specimen changes during the records."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from analysis.identify import headline_json, replace_by_modal_model
+from analysis.identify import headline_json
 from analysis.identify.headline import ConditionalEstimate, Estimates, ReportedLossFactor
+from analysis.identify.modal_headline import replace_by_modal_model
 from analysis.models import STRUCTURES
 from analysis.statistics import BIC_DECISIVE, student_t_quantile
 from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
@@ -48,7 +49,7 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
         together. Without whole-record fits the list is empty.
     """
     documents = [dict(session.headline) for session in campaign.sessions if session.headline]
-    common_estimates, verdict = campaign_numbers(campaign), campaign.verdict
+    common_estimates, verdict = campaign_estimates(campaign), campaign.verdict
     if common_estimates is not None and verdict is not None:
         pooled_orders = (verdict.alpha, verdict.lambda_)
         named_findings = (
@@ -61,7 +62,7 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
     return documents
 
 
-def campaign_numbers(campaign: CampaignResult) -> Estimates | None:
+def campaign_estimates(campaign: CampaignResult) -> Estimates | None:
     """Collect the estimates from all sessions together, with flags on doubtful ones.
 
     Parameters
@@ -120,7 +121,7 @@ def _add_flags(
     return replace(
         estimates,
         parameters={
-            parameter_name: parameter.flagged(
+            parameter_name: parameter.with_flag(
                 mixture_flag(parameter_name) or order_flags.get(parameter_name)
             )
             for parameter_name, parameter in estimates.parameters.items()
@@ -128,10 +129,10 @@ def _add_flags(
         modes=tuple(
             replace(
                 mode,
-                frequency_hz=mode.frequency_hz.flagged(
+                frequency_hz=mode.frequency_hz.with_flag(
                     mixture_flag(f"frequency_hz_{mode.number}") if mode.shown else _NOT_SHOWN_FLAG
                 ),
-                damping_ratio=mode.damping_ratio.flagged(
+                damping_ratio=mode.damping_ratio.with_flag(
                     mixture_flag(f"damping_ratio_{mode.number}") if mode.shown else _NOT_SHOWN_FLAG
                 ),
             )
@@ -211,7 +212,7 @@ def _reported_loss_factors(
     """Return the loss factors with their flags."""
     order_flags = _order_flags(orders)
     return tuple(
-        loss_factor.flagged(common_flag or order_flags.get(loss_factor.order))
+        loss_factor.with_flag(common_flag or order_flags.get(loss_factor.order))
         for loss_factor in pooled_estimate.sizes
     )
 

@@ -45,7 +45,7 @@ deviation."""
 _CLEAR_GAP_STDS: Final = 5.0
 """Gap from which groups are distinguished, in standard deviations within groups."""
 
-_FEWEST_SESSIONS: Final = 2
+_MIN_SESSIONS: Final = 2
 """Smallest number of sessions that can be compared."""
 _MODE_QUANTITIES: Final = {"frequency_hz": "frequency_std_hz", "damping_ratio": "damping_ratio_std"}
 """Quantities of a mode that are tested, with the names of their standard deviations."""
@@ -102,7 +102,7 @@ class Heterogeneity:
         return self.between_std_in_own_stds**2 / (1 + self.between_std_in_own_stds**2)
 
     @property
-    def of_rig(self) -> bool:
+    def is_of_rig(self) -> bool:
         """Whether the quantity is a property of the rig and not of the specimen."""
         return self.quantity in _RIG_PARAMETERS
 
@@ -133,7 +133,7 @@ class Homogeneity:
         Modes take precedence over parameters.
         """
         mixed_scatters = [
-            scatter for scatter in self.quantities if scatter.mixed and not scatter.of_rig
+            scatter for scatter in self.quantities if scatter.mixed and not scatter.is_of_rig
         ]
         mode_scatters = [
             scatter
@@ -152,9 +152,9 @@ class Homogeneity:
         return self.leading is not None
 
     @property
-    def one_specimen(self) -> bool:
+    def is_one_specimen(self) -> bool:
         """Whether neither the files nor the estimates contradict a single specimen."""
-        return len(self.specimens) < _FEWEST_SESSIONS and not self.mixed
+        return len(self.specimens) < _MIN_SESSIONS and not self.mixed
 
     def scatter_of(self, quantity: str) -> Heterogeneity | None:
         """Return the between-session scatter of a quantity, or None if it is not known."""
@@ -196,7 +196,7 @@ def homogeneity(
     values_by_quantity = {
         quantity: quantity_values
         for quantity, quantity_values in values_by_quantity.items()
-        if len(quantity_values) >= _FEWEST_SESSIONS
+        if len(quantity_values) >= _MIN_SESSIONS
     }
     significance_level = SIGNIFICANCE_LEVEL / max(len(values_by_quantity), 1)
     return Homogeneity(

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import RandomEffects
 
-_FEWEST_SESSIONS: Final = 2
+_MIN_SESSIONS: Final = 2
 """Smallest number of sessions that can be pooled."""
 _COMMON_MODE_FRACTION: Final = 0.9
 """Fraction of the sessions that must show a mode for it to be pooled."""
@@ -46,7 +46,7 @@ _RESIDUE_PHASE_INDEX: Final = MODE_CONSTANT_NAMES.index("residue_phase_rad")
 
 
 @dataclass(frozen=True, slots=True)
-class PooledModal(ModalEstimate):
+class PooledModalModel(ModalEstimate):
     """Modal model (frequencies, damping ratios, residues) pooled over all sessions.
 
     Attributes
@@ -106,7 +106,7 @@ class PooledModal(ModalEstimate):
         return tuple(pooled_modes)
 
 
-def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
+def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None:
     """Pool the modal constants of the sessions; None unless two sessions show a common mode.
 
     Parameters
@@ -125,7 +125,7 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
         for session in modal_sessions
         if session.modal and set(common_modes) <= set(session.modal.visible)
     ]
-    if not common_modes or len(used_sessions) < _FEWEST_SESSIONS:
+    if not common_modes or len(used_sessions) < _MIN_SESSIONS:
         return None
     pooled_constants = _pooled_constants(
         [session.modal for session in used_sessions if session.modal is not None], common_modes
@@ -150,7 +150,7 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
             stated_uniformities[-1],
             is_uniform=beam_test.status != "refused",
         )
-    return PooledModal(
+    return PooledModalModel(
         model=modal_estimate.model,
         numbers=common_modes,
         constants=modal_estimate.constants,
@@ -168,7 +168,7 @@ def _modal_estimate(
 ) -> ModalEstimate:
     """Return the modal estimate of some modes from the vector of constants and background."""
     constants, background = np.split(joint_values, [len(modes) * len(MODE_CONSTANT_NAMES)])
-    modal_model = ModalModel.of_constants(constants, background.tolist())
+    modal_model = ModalModel.from_constants(constants, background.tolist())
     return ModalEstimate(modal_model, modes, constants, joint_covariance)
 
 
@@ -178,12 +178,12 @@ def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
     Such a mode is visible in at least 90 % of the sessions, and in at least two.
     """
     mode_counts = Counter(mode_number for estimate in estimates for mode_number in estimate.visible)
-    fewest_sessions = max(_COMMON_MODE_FRACTION * len(estimates), _FEWEST_SESSIONS)
+    min_sessions = max(_COMMON_MODE_FRACTION * len(estimates), _MIN_SESSIONS)
     return tuple(
         sorted(
             mode_number
             for mode_number, session_count in mode_counts.items()
-            if session_count >= fewest_sessions
+            if session_count >= min_sessions
         )
     )
 
@@ -336,7 +336,7 @@ def _pool_groups(
 ) -> Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Yield pooled constants and background of each group of estimates, with their covariance."""
     for group_estimates in groups:
-        if len(group_estimates) < _FEWEST_SESSIONS:
+        if len(group_estimates) < _MIN_SESSIONS:
             yield _constants_and_background(group_estimates[0], modes)
         else:
             pooled_effects = _pooled_constants(group_estimates, modes)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns.pooling import freest_estimate
-from analysis.identify import effective_reason, order_status_with_geometry_tolerance
+from analysis.identify.modal_headline import effective_reason, order_status_with_geometry_tolerance
 from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION
 from analysis.identify.verdict import too_few_modes
 from analysis.models import ORDER_RANGE, STRUCTURES
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._homogeneity import Homogeneity
     from analysis.campaigns.pooling import PooledEstimate, PooledParameter
-    from analysis.identify.profile_likelihood import Order
+    from analysis.identify.profile_likelihood import OrderName
     from analysis.identify.tolerant_estimate import TolerantEstimate
     from analysis.identify.verdict import Verdict
 
@@ -66,7 +66,7 @@ class PooledOrder:
         of different specimens and do not all determine it.
     """
 
-    order: Order
+    order: OrderName
     status: PooledStatus
     value: float | None
     interval: tuple[float, float] | None
@@ -76,7 +76,7 @@ class PooledOrder:
     std: float | None = None
     exact: PooledOrder | None = None
 
-    def doubted(self, reason: str) -> PooledOrder:
+    def with_doubt(self, reason: str) -> PooledOrder:
         """Return this order with a reason against its interpretation.
 
         Its status becomes "open" if it has an interval. An order that already has a reason is
@@ -88,7 +88,7 @@ class PooledOrder:
 
 
 def pooled_order(
-    order: Order,
+    order: OrderName,
     ranked_estimates: Sequence[PooledEstimate],
     verdicts: Sequence[Verdict],
     homogeneity: Homogeneity,
@@ -176,11 +176,11 @@ def tolerant_pooled_order(
         exact=exact_order,
     )
     if exact_order.mixture and exact_order.reason is not None:
-        return replace(tolerant_order.doubted(exact_order.reason), mixture=True)
+        return replace(tolerant_order.with_doubt(exact_order.reason), mixture=True)
     if not _nearly_all_adequate(verdicts):
-        return tolerant_order.doubted(_UNEXPLAINED_REASON)
+        return tolerant_order.with_doubt(_UNEXPLAINED_REASON)
     final_reason = effective_reason(order, refused=refused)
-    return tolerant_order if final_reason is None else tolerant_order.doubted(final_reason)
+    return tolerant_order if final_reason is None else tolerant_order.with_doubt(final_reason)
 
 
 def _nearly_all_adequate(verdicts: Sequence[Verdict]) -> bool:
@@ -203,7 +203,7 @@ def rival_estimates(
 
 
 def _status_and_reason(
-    order: Order,
+    order: OrderName,
     ranked_estimates: Sequence[PooledEstimate],
     freest_fit: PooledEstimate,
     verdicts: Sequence[Verdict],
@@ -245,7 +245,7 @@ def _status_and_reason(
     return ("fractional" if is_one_excluded else "open"), None
 
 
-def _has_order_one(estimate: PooledEstimate, order: Order) -> bool:
+def _has_order_one(estimate: PooledEstimate, order: OrderName) -> bool:
     """Return whether a damping structure has this kind of damping with a fixed order of 1."""
     return STRUCTURES[estimate.structure].fixed.get(order) == 1.0
 

@@ -11,7 +11,7 @@ import numpy as np
 from analysis.campaigns._estimates import RecordEstimate, WelchFit
 from analysis.campaigns._experiment import Experiment, SessionFailure, session_error_types
 from analysis.models import RECORD_BAND_HZ, WelchSettings
-from analysis.paper import Indices, fit_indices
+from analysis.paper.welch_analysis import FitIndices, fit_indices
 from analysis.results import RecordResult, whole_record, with_uniformity
 from rigd.session import Validity, sample_digests
 from rigd.spectral import FrequencyResponse
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from analysis.identify import Candidate, ModalEstimate, Setting
     from analysis.identify.verdict import Verdict
-    from analysis.paper import Peak
+    from analysis.paper.welch_analysis import Peak
     from analysis.results import WholeRecord
     from rigd.beam import Beam, Plant
 
@@ -38,7 +38,7 @@ _NO_RESPONSE: Final = FrequencyResponse(
 """Empty frequency response, for a session without Welch's method."""
 _PAPER_SETTINGS: Final = WelchSettings()
 """Welch settings of the paper."""
-_NO_INDICES: Final = Indices(math.nan, math.nan, math.nan)
+_NO_INDICES: Final = FitIndices(math.nan, math.nan, math.nan)
 """Fit indices of a model without a measured response."""
 
 
@@ -175,8 +175,8 @@ def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | 
     session_task : SessionTask
         Settings of the analysis.
     """
+    from analysis.applicability import highest_frequency_hz, remarks, welch_analysis
     from analysis.record import load_record
-    from analysis.suited import highest_frequency_hz, remarks, welch_analysis
 
     session_errors = session_error_types()
     experiment = None
@@ -233,7 +233,7 @@ def _session_result(
     warnings: tuple[str, ...],
 ) -> SessionAnalysis:
     """Return the results of a session that a campaign retains."""
-    from analysis.suited import record_band_hz, welch_settings
+    from analysis.applicability import record_band_hz, welch_settings
 
     record, whole_fits, welch_results = (
         record_result.record,

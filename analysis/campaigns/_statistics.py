@@ -16,7 +16,7 @@ import numpy as np
 
 from analysis.campaigns.pooling import determines_damping, estimates_by_structure, pooled_bic
 from analysis.models import STRUCTURES, FrequencyResponseModel
-from analysis.paper import fit_indices, peak_deviation, resonant_peaks
+from analysis.paper.welch_analysis import fit_indices, peak_deviation, resonant_peaks
 from rigd.beam import DAMPING_PARAMETERS, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._estimates import WelchFit
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
-    from analysis.paper import Indices, Peak
+    from analysis.paper.welch_analysis import FitIndices, Peak
     from rigd.beam import Beam, Damping
 
 
@@ -134,7 +134,7 @@ class NominalModel:
         Response of the model, with the tool inertia, in N·m/rad.
     peaks : tuple of Peak or None
         Peaks of that response, one for each mode.
-    indices : tuple of Indices
+    indices : tuple of FitIndices
         Distance of the model from the response of each session.
     deviations : tuple of MeanPeakDeviation
         Mean deviation of each mode's resonant peak.
@@ -146,7 +146,7 @@ class NominalModel:
     parameters: Mapping[str, float]
     response: NDArray[np.complex128]
     peaks: tuple[Peak | None, ...]
-    indices: tuple[Indices, ...]
+    indices: tuple[FitIndices, ...]
     deviations: tuple[MeanPeakDeviation, ...]
 
     @property

@@ -10,7 +10,7 @@ import numpy as np
 from analysis.campaigns._experiment import CampaignError, session_error_types
 from analysis.campaigns._statistics import mean_damping
 from analysis.campaigns.pooling import pooled_estimates
-from analysis.campaigns.workers import LostTask
+from analysis.campaigns.workers import FailedTask
 from analysis.identify import Measurement
 from rigd.beam import Plant
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.workers import Workers
 
-FEWEST_SESSIONS: Final = 3
+MIN_SESSIONS: Final = 3
 """Smallest number of sessions for which each can be predicted from the others, as pooling needs
 two."""
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOutError:
+class LeaveOneOutResult:
     """Prediction error of a model for a session that was not used to estimate the model.
 
     Attributes
@@ -58,7 +58,7 @@ class LeftOutError:
 
 
 @dataclass(frozen=True, slots=True)
-class LostTrial:
+class FailedPrediction:
     """A session that could not be predicted from the other sessions, and the reason."""
 
     path: Path
@@ -105,7 +105,7 @@ def validate(
     sessions: Sequence[SessionAnalysis],
     band_hz: tuple[float, float] | None,
     on_done: Callable[[int], None],
-) -> tuple[tuple[LeftOutError, ...], tuple[LostTrial, ...]]:
+) -> tuple[tuple[LeaveOneOutResult, ...], tuple[FailedPrediction, ...]]:
     """Predict every session from the others; return prediction errors and sessions not predicted.
 
     If all workers are lost, all sessions count as not predicted.
@@ -115,40 +115,40 @@ def validate(
         for i, session in enumerate(sessions)
     ]
     try:
-        task_results = workers.run(left_out_errors, prediction_tasks, on_done)
+        task_results = workers.run(leave_one_out_results, prediction_tasks, on_done)
     except CampaignError as error:
-        return (), tuple(LostTrial(session.path, str(error)) for session in sessions)
-    prediction_errors: list[LeftOutError] = []
-    lost_sessions: list[LostTrial] = []
+        return (), tuple(FailedPrediction(session.path, str(error)) for session in sessions)
+    prediction_errors: list[LeaveOneOutResult] = []
+    lost_sessions: list[FailedPrediction] = []
     for session, task_result in zip(sessions, task_results, strict=True):
-        if isinstance(task_result, LostTask):
-            lost_sessions.append(LostTrial(session.path, task_result.reason))
-        elif isinstance(task_result, LostTrial):
+        if isinstance(task_result, FailedTask):
+            lost_sessions.append(FailedPrediction(session.path, task_result.reason))
+        elif isinstance(task_result, FailedPrediction):
             lost_sessions.append(task_result)
         else:
             prediction_errors.extend(task_result)
     return tuple(prediction_errors), tuple(lost_sessions)
 
 
-def left_out_errors(
+def leave_one_out_results(
     path: Path, predictions: Sequence[PlantPrediction], band_hz: tuple[float, float] | None
-) -> tuple[LeftOutError, ...] | LostTrial:
+) -> tuple[LeaveOneOutResult, ...] | FailedPrediction:
     """Return the error of each model in predicting a session's torque from its angle.
 
     An error of one session is returned, not raised, because the others are still usable.
     """
+    from analysis.applicability import highest_frequency_hz, record_band_hz
     from analysis.identify import Comparison
     from analysis.record import load_record
-    from analysis.suited import highest_frequency_hz, record_band_hz
 
     try:
         record = load_record(path, highest_hz=highest_frequency_hz(band_hz))
         band_hz = record_band_hz(record, band_hz)
-        comparison = Comparison.of(Measurement.of_record(record), band_hz)
+        comparison = Comparison.from_measurement(Measurement.from_record(record), band_hz)
     except session_error_types() as why:
-        return LostTrial(path, str(why))
+        return FailedPrediction(path, str(why))
     except MemoryError:
-        return LostTrial(path, "not enough memory to predict it; use fewer --jobs")
+        return FailedPrediction(path, "not enough memory to predict it; use fewer --jobs")
     measured_torque_nm = comparison.torque_nm[comparison.retained]
     torque_norm = np.linalg.norm(comparison.spectrum(measured_torque_nm))
 
@@ -161,7 +161,7 @@ def left_out_errors(
         )
 
     return tuple(
-        LeftOutError(
+        LeaveOneOutResult(
             path=path,
             method=prediction.method,
             name=prediction.name,
@@ -174,13 +174,13 @@ def left_out_errors(
 
 
 def group_errors_by_model(
-    errors: Sequence[LeftOutError],
-) -> list[tuple[str, str, str | None, tuple[LeftOutError, ...]]]:
+    errors: Sequence[LeaveOneOutResult],
+) -> list[tuple[str, str, str | None, tuple[LeaveOneOutResult, ...]]]:
     """Group prediction errors by method, damping structure and weighting.
 
     The group of the smallest mean error comes first.
     """
-    errors_by_model: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
+    errors_by_model: dict[tuple[str, str, str | None], list[LeaveOneOutResult]] = {}
     for left_out_error in errors:
         errors_by_model.setdefault(
             (left_out_error.method, left_out_error.name, left_out_error.weighting), []

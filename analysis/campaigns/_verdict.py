@@ -19,7 +19,10 @@ from analysis.campaigns._orders import (
     tolerant_pooled_order,
 )
 from analysis.campaigns.pooling import freest_estimate
-from analysis.identify import loss_factors_with_geometry_tolerance, uniform_beam_refusal_reason
+from analysis.identify.modal_headline import (
+    loss_factors_with_geometry_tolerance,
+    uniform_beam_refusal_reason,
+)
 from analysis.identify.sentences import uniformity
 from analysis.statistics import BIC_DECISIVE, BIC_TIE
 from rigd.units import interval_text
@@ -28,9 +31,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from analysis.campaigns._homogeneity import Homogeneity
-    from analysis.campaigns._modal import PooledModal
+    from analysis.campaigns._modal import PooledModalModel
     from analysis.campaigns._session import SessionAnalysis
-    from analysis.campaigns._validation import LeftOutError, LostTrial
+    from analysis.campaigns._validation import FailedPrediction, LeaveOneOutResult
     from analysis.campaigns._welch_bias import WelchBias
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify import Finding
@@ -122,7 +125,7 @@ def _common_finding(
 
 
 @dataclass(frozen=True, slots=True)
-class Dissent:
+class DissentingSession:
     """A session that alone excludes the damping structure selected by all sessions together.
 
     Attributes
@@ -163,7 +166,7 @@ class CampaignVerdict:
         Orders of internal and external damping.
     findings : tuple of CommonFinding
         Other effects found in the records.
-    dissent : tuple of Dissent
+    dissent : tuple of DissentingSession
         Sessions that exclude `structure` by themselves.
     sweeps : OppositeSweeps or None
         Comparison of the modes of rising and falling sweeps; None without both directions.
@@ -182,13 +185,13 @@ class CampaignVerdict:
     alpha: PooledOrder
     lambda_: PooledOrder
     findings: tuple[CommonFinding, ...]
-    dissent: tuple[Dissent, ...]
+    dissent: tuple[DissentingSession, ...]
     sweeps: OppositeSweeps | None
     sentences: tuple[str, ...]
     experiments: tuple[str, ...]
 
     @property
-    def withheld(self) -> frozenset[str]:
+    def withheld_orders(self) -> frozenset[str]:
         """Orders that are not to be reported for an exactly uniform beam."""
         return _withheld_orders(self.alpha, self.lambda_)
 
@@ -197,10 +200,10 @@ def campaign_verdict(
     sessions: Sequence[SessionAnalysis],
     pooled: Sequence[PooledEstimate],
     homogeneity: Homogeneity,
-    validation: Sequence[LeftOutError],
-    lost_sessions: Sequence[LostTrial],
+    validation: Sequence[LeaveOneOutResult],
+    lost_sessions: Sequence[FailedPrediction],
     biases: Sequence[WelchBias] = (),
-    modal_model: PooledModal | None = None,
+    modal_model: PooledModalModel | None = None,
 ) -> CampaignVerdict | None:
     """Return the verdict on a campaign, or None if no damping structure could be pooled.
 
@@ -212,13 +215,13 @@ def campaign_verdict(
         Pooled estimates, the lowest BIC first.
     homogeneity : Homogeneity
         Whether the sessions are of one specimen.
-    validation : sequence of LeftOutError
+    validation : sequence of LeaveOneOutResult
         Errors of sessions predicted from the others.
-    lost_sessions : sequence of LostTrial
+    lost_sessions : sequence of FailedPrediction
         Sessions that could not be predicted from the others.
     biases : sequence of WelchBias, optional
         Differences of the Welch fits from the pooled estimates.
-    modal_model : PooledModal, optional
+    modal_model : PooledModalModel, optional
         Modal model of all sessions.
     """
     verdicts = [session.verdict for session in sessions if session.verdict is not None]
@@ -286,7 +289,7 @@ def campaign_verdict(
             ),
             *([] if homogeneity.mixed else [sentences.describe_scatter(freest_fit)]),
             *sentences.describe_prediction_errors(freest_fit, validation, len(sessions)),
-            *sentences.lost_trials(lost_sessions, len(sessions)),
+            *sentences.failed_predictions(lost_sessions, len(sessions)),
         ),
         experiments=(
             *geometry.recommend_sweeps(sweep_comparison, modal_model, sessions),
@@ -296,7 +299,7 @@ def campaign_verdict(
 
 
 def _final_order(
-    exact_order: PooledOrder, verdicts: Sequence[Verdict], modal_model: PooledModal | None
+    exact_order: PooledOrder, verdicts: Sequence[Verdict], modal_model: PooledModalModel | None
 ) -> PooledOrder:
     """Return an order estimated from the modal constants, or from a uniform beam without them."""
     if modal_model is None:
@@ -307,13 +310,13 @@ def _final_order(
             exact_order, modal_model.tolerant, verdicts, refused=is_beam_refused
         )
     refusal_reason = uniform_beam_refusal_reason(modal_model.uniform_beam)
-    return exact_order if refusal_reason is None else exact_order.doubted(refusal_reason)
+    return exact_order if refusal_reason is None else exact_order.with_doubt(refusal_reason)
 
 
 def _describe_parameters(
     freest_fit: PooledEstimate,
     lowest_bic_estimate: PooledEstimate,
-    modal_model: PooledModal | None,
+    modal_model: PooledModalModel | None,
     adequate_count: int,
     session_count: int,
 ) -> tuple[str, ...]:
@@ -339,7 +342,7 @@ def _describe_parameters(
 
 
 def _describe_modes(
-    freest_fit: PooledEstimate, modal_model: PooledModal | None, *, mixed: bool
+    freest_fit: PooledEstimate, modal_model: PooledModalModel | None, *, mixed: bool
 ) -> list[str]:
     """Describe the modes of the modal model if these are reported, else of the uniform beam."""
     if modal_model is not None and modal_model.leads:
@@ -348,7 +351,7 @@ def _describe_modes(
 
 
 def _describe_slopes(
-    alpha: PooledOrder, lambda_: PooledOrder, modal: PooledModal | None
+    alpha: PooledOrder, lambda_: PooledOrder, modal: PooledModalModel | None
 ) -> tuple[str, str]:
     """Describe both orders of the damping, as slopes of the losses if a tolerance is used."""
     if modal is None or modal.tolerant is None:
@@ -363,7 +366,7 @@ def _withheld_orders(*orders: PooledOrder) -> frozenset[str]:
 
 def _dissenting_sessions(
     sessions: Sequence[SessionAnalysis], lowest_bic_estimate: PooledEstimate
-) -> tuple[Dissent, ...]:
+) -> tuple[DissentingSession, ...]:
     """Return the sessions that alone exclude the damping structure of the lowest common BIC."""
     dissents = []
     for session in sessions:
@@ -372,5 +375,5 @@ def _dissenting_sessions(
             own = min(estimates_by_name.values(), key=lambda estimate: estimate.bic)
             bic_margin = estimates_by_name[lowest_bic_estimate.name].bic - own.bic
             if bic_margin > BIC_DECISIVE:
-                dissents.append(Dissent(session.name, own.name, bic_margin))
+                dissents.append(DissentingSession(session.name, own.name, bic_margin))
     return tuple(sorted(dissents, key=lambda dissenter: -dissenter.margin))

@@ -28,7 +28,7 @@ records."""
 
 _CONFIDENCE_LEVEL: Final = 0.999
 """Confidence level at which a bias is significant."""
-_FEWEST_SESSIONS: Final = 2
+_MIN_SESSIONS: Final = 2
 """Smallest number of sessions with Welch fits."""
 
 
@@ -89,7 +89,7 @@ class WelchBias:
     record_wmse: float
 
     @property
-    def significant(self) -> tuple[ParameterBias, ...]:
+    def significant_parameters(self) -> tuple[ParameterBias, ...]:
         """Parameters whose bias is significant."""
         return tuple(parameter for parameter in self.parameters if parameter.significant)
 
@@ -120,7 +120,7 @@ def welch_biases(
     }
     for (structure, weighting), welch_fits in fits_by_model(sessions).items():
         pooled_estimate = pooled_by_name.get(structure)
-        if pooled_estimate is None or len(welch_fits) < _FEWEST_SESSIONS:
+        if pooled_estimate is None or len(welch_fits) < _MIN_SESSIONS:
             continue
         significance_limit = student_t_quantile(_CONFIDENCE_LEVEL, len(welch_fits) - 1)
         parameters = []

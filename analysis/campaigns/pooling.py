@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify import SETTINGS, damping_size
+from analysis.identify import SETTINGS, pivot_loss_factor
 from analysis.identify.headline import ReportedLossFactor
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_p_value, student_t_quantile
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._session import SessionAnalysis
     from analysis.identify.headline import Damping
-    from analysis.identify.profile_likelihood import Order
+    from analysis.identify.profile_likelihood import OrderName
 
 
 # Random effects
@@ -206,9 +206,9 @@ def _pool_quantity(estimates: Sequence[tuple[float, float]]) -> tuple[float, flo
 
 # Structures
 
-_FEWEST_SESSIONS: Final = 2
+_MIN_SESSIONS: Final = 2
 """Smallest number of sessions that can be pooled."""
-_DAMPING_PARAMETERS: Final[tuple[tuple[Damping, str, Order], ...]] = (
+_DAMPING_PARAMETERS: Final[tuple[tuple[Damping, str, OrderName], ...]] = (
     ("internal", "zeta", "alpha"),
     ("external", "gamma", "lambda"),
 )
@@ -298,7 +298,7 @@ class PooledEstimate:
         plant_values = self.plant.parameters
         first_rad_s = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
         for damping, coefficient, order in _DAMPING_PARAMETERS:
-            loss_factor = damping_size(
+            loss_factor = pivot_loss_factor(
                 coefficient, order, plant_values, parameter_names, self.covariance, first_rad_s
             )
             if loss_factor is not None:
@@ -359,7 +359,7 @@ def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None
     not in the common covariance. The pooled plant has the unweighted mean of such a parameter.
     """
     used_estimates = list(filter(determines_damping, estimates))
-    if len(used_estimates) < _FEWEST_SESSIONS:
+    if len(used_estimates) < _MIN_SESSIONS:
         return None
     determined_names = [
         parameter_name
@@ -416,7 +416,7 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
         if all(parameter_name in e.determined for e in estimates)
     ]
     common_deviance = sum(e.deviance for e in estimates)
-    if common_names and len(estimates) >= _FEWEST_SESSIONS:
+    if common_names and len(estimates) >= _MIN_SESSIONS:
         common_deviance += random_effects(*_stack_estimates(estimates, common_names)).deviance
     separate_cost = (len(damping_parameters) - len(common_names)) * sum(
         math.log(e.values) for e in estimates

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from analysis.campaigns._experiment import StatedSpecimen
     from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, SessionValues
     from analysis.campaigns._orders import PooledOrder
-    from analysis.campaigns._validation import LeftOutError, LostTrial
+    from analysis.campaigns._validation import FailedPrediction, LeaveOneOutResult
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
     from analysis.campaigns.pooling import PooledEstimate, PooledMode
     from analysis.identify.headline import ReportedLossFactor
-    from analysis.identify.profile_likelihood import Order
+    from analysis.identify.profile_likelihood import OrderName
 
 
 # Names and numbers
@@ -119,7 +119,7 @@ MIXTURE_NOTE: Final = (
     "mixture, which may be valid for none of them."
 )
 """Footnote that explains `MIXTURE_MARK`."""
-_MOST_FILES_LISTED: Final = 5
+_MAX_FILES_LISTED: Final = 5
 """Largest number of file names that a sentence lists."""
 _SLIGHT_FREQUENCY_SCATTER: Final = 2e-3
 """Relative scatter of a frequency that one beam may show: ten kelvin change the stiffness of steel
@@ -183,7 +183,7 @@ def _describe_different_specimens(
     other_labels = [
         label(scatter.quantity)[0]
         for scatter in homogeneity.quantities
-        if scatter.mixed and not scatter.of_rig and scatter is not leading_scatter
+        if scatter.mixed and not scatter.is_of_rig and scatter is not leading_scatter
     ]
     others_sentence = f" The same holds of {', '.join(other_labels)}." if other_labels else ""
     return [
@@ -271,9 +271,9 @@ def _mean_text(session_values: Sequence[float], scatter: Heterogeneity) -> str:
 
 def _list_files(file_names: Sequence[str]) -> str:
     """Return the number of files and the names of the first few."""
-    listed_names = ", ".join(file_names[:_MOST_FILES_LISTED]) + (
-        f" and {len(file_names) - _MOST_FILES_LISTED} more"
-        if len(file_names) > _MOST_FILES_LISTED
+    listed_names = ", ".join(file_names[:_MAX_FILES_LISTED]) + (
+        f" and {len(file_names) - _MAX_FILES_LISTED} more"
+        if len(file_names) > _MAX_FILES_LISTED
         else ""
     )
     return f"{len(file_names)} file{'' if len(file_names) == 1 else 's'} ({listed_names})"
@@ -283,7 +283,7 @@ def _list_files(file_names: Sequence[str]) -> str:
 
 _DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
 """Name of the damping whose order each parameter is."""
-_ORDER_NAMES: Final[tuple[Order, ...]] = ("alpha", "lambda")
+_ORDER_NAMES: Final[tuple[OrderName, ...]] = ("alpha", "lambda")
 """Names of the orders of internal and of external damping."""
 _CLASSICAL_STRUCTURE: Final = "III"
 """Structure with internal and external damping, both of order 1."""
@@ -301,7 +301,7 @@ def describe_orders(
     freest_fit: PooledEstimate,
     alpha: PooledOrder,
     lambda_: PooledOrder,
-    validation: Sequence[LeftOutError],
+    validation: Sequence[LeaveOneOutResult],
 ) -> str:
     """Describe the order of each damping, and the prediction errors of two structures.
 
@@ -313,7 +313,7 @@ def describe_orders(
         Pooled estimate of the freest structure.
     alpha, lambda_ : PooledOrder
         Orders of internal and external damping.
-    validation : sequence of LeftOutError
+    validation : sequence of LeaveOneOutResult
         Errors of sessions predicted from the others.
     """
     conjunction = " and " if alpha.exact is None else "; "
@@ -581,7 +581,7 @@ def describe_order(pooled_order: PooledOrder) -> str:
 def describe_welch_bias(
     freest: PooledEstimate,
     biases: Sequence[WelchBias],
-    withheld: Collection[str],
+    withheld_orders: Collection[str],
     *,
     comparable: bool,
 ) -> list[str]:
@@ -593,7 +593,7 @@ def describe_welch_bias(
         Estimate of the reported structure.
     biases : sequence of WelchBias
         Biases of the Welch fits of all structures and weightings.
-    withheld : collection of str
+    withheld_orders : collection of str
         Orders that are not reported; their coefficients are not reported either.
     comparable : bool
         Whether the sessions are of one specimen and a uniform beam predicts its modes. If not,
@@ -605,11 +605,11 @@ def describe_welch_bias(
     best_model_biases = [
         bias for bias in type_biases if (bias.structure, bias.weighting) in PAPER_BEST_MODELS
     ]
-    omitted_parameters = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
+    omitted_parameters = {*withheld_orders, *(COEFFICIENT_OF[order] for order in withheld_orders)}
     sentences = []
     for bias in best_model_biases or type_biases[:1]:
         significant_parameters = [
-            one for one in bias.significant if one.parameter not in omitted_parameters
+            one for one in bias.significant_parameters if one.parameter not in omitted_parameters
         ]
         if not significant_parameters:
             continue
@@ -670,11 +670,11 @@ def describe_dissent(
     if not sessions:
         return []
     session_texts = ", ".join(
-        f"{file_name} (type {structure})" for file_name, structure in sessions[:_MOST_FILES_LISTED]
+        f"{file_name} (type {structure})" for file_name, structure in sessions[:_MAX_FILES_LISTED]
     )
     more_text = (
-        f" and {len(sessions) - _MOST_FILES_LISTED} more"
-        if len(sessions) > _MOST_FILES_LISTED
+        f" and {len(sessions) - _MAX_FILES_LISTED} more"
+        if len(sessions) > _MAX_FILES_LISTED
         else ""
     )
     return [
@@ -718,7 +718,7 @@ def describe_scatter(pooled_estimate: PooledEstimate) -> str:
 
 
 def describe_prediction_errors(
-    pooled_estimate: PooledEstimate, validation: Sequence[LeftOutError], sessions: int
+    pooled_estimate: PooledEstimate, validation: Sequence[LeaveOneOutResult], sessions: int
 ) -> list[str]:
     """Describe how well a damping structure predicts a session from the other sessions.
 
@@ -726,7 +726,7 @@ def describe_prediction_errors(
     ----------
     pooled_estimate : PooledEstimate
         Estimate of the structure.
-    validation : sequence of LeftOutError
+    validation : sequence of LeaveOneOutResult
         Errors of sessions predicted from the others.
     sessions : int
         Number of sessions.
@@ -759,12 +759,12 @@ def describe_prediction_errors(
     ]
 
 
-def lost_trials(lost_sessions: Sequence[LostTrial], requested: int) -> list[str]:
+def failed_predictions(lost_sessions: Sequence[FailedPrediction], requested: int) -> list[str]:
     """List the sessions that could not be predicted from the others, with the reasons.
 
     Parameters
     ----------
-    lost_sessions : sequence of LostTrial
+    lost_sessions : sequence of FailedPrediction
         Sessions that were not predicted.
     requested : int
         Number of sessions that were to be predicted.
@@ -773,11 +773,11 @@ def lost_trials(lost_sessions: Sequence[LostTrial], requested: int) -> list[str]
         return []
     reasons_text = "; ".join(
         f"{lost_trial.path.name}: {lost_trial.reason}"
-        for lost_trial in lost_sessions[:_MOST_FILES_LISTED]
+        for lost_trial in lost_sessions[:_MAX_FILES_LISTED]
     )
     more_text = (
-        f"; and {len(lost_sessions) - _MOST_FILES_LISTED} more"
-        if len(lost_sessions) > _MOST_FILES_LISTED
+        f"; and {len(lost_sessions) - _MAX_FILES_LISTED} more"
+        if len(lost_sessions) > _MAX_FILES_LISTED
         else ""
     )
     return [

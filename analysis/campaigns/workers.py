@@ -27,7 +27,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from analysis.campaigns._experiment import CampaignError
-from rigd.runtime import SINGLE_THREADED, use_one_thread
+from rigd.runtime.background import SINGLE_THREADED, use_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,13 +38,13 @@ Result = TypeVar("Result")
 _PRESENCE_CHECK_INTERVAL_S: Final = 2.0
 """Interval in seconds at which the presence of worker processes is checked."""
 
-_FEWEST_LOST_TASKS: Final = 2
+_MIN_LOST_TASKS: Final = 2
 """Number of lost tasks, with none finished, from which the workers and not the tasks are at
 fault."""
 
 
 @dataclass(frozen=True, slots=True)
-class LostTask:
+class FailedTask:
     """Result of a task whose worker process ended each time it ran the task.
 
     Attributes
@@ -83,10 +83,10 @@ class Workers:
 
     _process_end_error: type[Exception] = BrokenExecutor
     """Exception by which the executor reports that the process of a task ended."""
-    _most_in_progress: int | None = None
+    _max_in_progress: int | None = None
     """Most tasks in progress at once; the fewer, the fewer have to run again after a process
     ended."""
-    _lost_task_reason: str
+    _failed_task_reason: str
     """Reason reported for a task whose process ended twice."""
     _no_workers_message: str | None = None
     """Message of the error raised if no task survives; None: each lost task is reported by
@@ -100,7 +100,7 @@ class Workers:
         function: Callable[..., Result],
         arguments: Sequence[tuple[Any, ...]],
         on_done: Callable[[int], None] = _ignore_progress,
-    ) -> list[Result | LostTask]:
+    ) -> list[Result | FailedTask]:
         """Call a function with every tuple of arguments, in parallel.
 
         Parameters
@@ -115,20 +115,20 @@ class Workers:
         Returns
         -------
         list
-            Results in the order of the arguments; `LostTask` if a task's process ended each time.
+            Results in the order of the arguments; `FailedTask` if a task's process ended each time.
 
         Raises
         ------
         CampaignError
             There are no workers any more.
         """
-        task_results: dict[int, Result | LostTask] = {}
+        task_results: dict[int, Result | FailedTask] = {}
 
         def submit(task_index: int) -> Future[Result]:
             """Start a task by its index."""
             return self._executor.submit(function, *arguments[task_index])
 
-        def store_result(task_index: int, task_result: Result | LostTask) -> None:
+        def store_result(task_index: int, task_result: Result | FailedTask) -> None:
             """Store the result of a task and report its completion."""
             task_results[task_index] = task_result
             on_done(task_index)
@@ -140,15 +140,15 @@ class Workers:
                 for task_index in interrupted_tasks:
                     self._replace_executor(alone=True)
                     if self._run_until_process_ends(deque([task_index]), submit, store_result):
-                        store_result(task_index, LostTask(self._lost_task_reason))
+                        store_result(task_index, FailedTask(self._failed_task_reason))
             if interrupted_tasks:
                 any_finished = any(
-                    not isinstance(task_result, LostTask) for task_result in task_results.values()
+                    not isinstance(task_result, FailedTask) for task_result in task_results.values()
                 )
                 if (
                     self._no_workers_message
                     and not any_finished
-                    and (len(task_results) >= _FEWEST_LOST_TASKS or not task_queue)
+                    and (len(task_results) >= _MIN_LOST_TASKS or not task_queue)
                 ):
                     raise CampaignError(self._no_workers_message)
                 self._replace_executor()
@@ -170,7 +170,7 @@ class Workers:
         last_seen_s = time.monotonic()
         while in_progress or (task_queue and not interrupted_tasks):
             while (
-                task_queue and not interrupted_tasks and len(in_progress) != self._most_in_progress
+                task_queue and not interrupted_tasks and len(in_progress) != self._max_in_progress
             ):
                 try:
                     in_progress[submit_task(task_queue[0])] = task_queue[0]
@@ -242,7 +242,7 @@ def process_pool(jobs: int) -> Iterator[Workers]:
 class _LocalWorkers(Workers):
     """Worker processes of a pool on this machine."""
 
-    _lost_task_reason = "its worker process ended by itself twice, most often for lack of memory"
+    _failed_task_reason = "its worker process ended by itself twice, most often for lack of memory"
     _no_workers_message = (
         "The worker processes ended by themselves, most often for lack of memory: use fewer "
         "--jobs. A script that calls campaign() must do so under if __name__ == '__main__':"
@@ -250,12 +250,12 @@ class _LocalWorkers(Workers):
 
     def __init__(self, jobs: int) -> None:
         super().__init__(_spawn_pool(jobs))
-        self._most_in_progress = jobs
+        self._max_in_progress = jobs
 
     def _replace_executor(self, *, alone: bool = False) -> None:
         """Start a new pool after a worker process ended, with a single process if `alone`."""
         self.close()
-        self._executor = _spawn_pool(1 if alone else self._most_in_progress)
+        self._executor = _spawn_pool(1 if alone else self._max_in_progress)
 
     def close(self, *, wait: bool = True) -> None:
         """Start no more tasks, and end the processes after their present tasks."""
@@ -368,7 +368,7 @@ class _DaskWorkers(Workers):
     The scheduler repeats a task at another worker if its worker ended, and drops it after several.
     """
 
-    _lost_task_reason = (
+    _failed_task_reason = (
         "every Dask worker that ran it ended by itself, most often for lack of memory; see the "
         "workers' logs"
     )

@@ -36,9 +36,10 @@ from analysis.cli.welch_options import (
     parse_option_choice,
     welch_settings,
 )
-from analysis.results import FIGURE_FORMATS, Routes
+from analysis.results import FIGURE_FORMATS, AnalysisOptions
 from rigd.printable import readable_errors
-from rigd.runtime import raise_on_signals, use_one_thread
+from rigd.runtime import raise_on_signals
+from rigd.runtime.background import use_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -386,7 +387,7 @@ def analyze(
         )
     _check_part(from_s, to_s, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
-    run_routes = Routes(
+    run_routes = AnalysisOptions(
         settings,
         paper=method != "record",
         whole_record=method != "welch",
@@ -504,7 +505,7 @@ def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
 
 
 def _report_single_session(
-    single_session_error: SingleSessionError, routes: Routes, outputs: Outputs
+    single_session_error: SingleSessionError, routes: AnalysisOptions, outputs: Outputs
 ) -> int:
     """Print the errors of a campaign's unusable files, and report its only usable session."""
     for failure in single_session_error.failures:

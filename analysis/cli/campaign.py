@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _DEFAULT_NAME: Final = "campaign"
 """Default name of a campaign, for its report folder."""
-_MOST_FIGURES: Final = 8
+_MAX_FIGURES: Final = 8
 """Largest number of figures, for the progress bar; each takes about half as long as a session."""
 
 
@@ -107,7 +107,7 @@ def campaign_command(
     if outputs.json_to_stdout:
         json_content = campaign_document(campaign_result, with_paper=with_paper)
         print(document_text(json_content, ascii_only=True), end="")  # noqa: T201 - the requested output
-    return 1 if campaign_result.failures or campaign_result.lost_trials else 0
+    return 1 if campaign_result.failures or campaign_result.failed_predictions else 0
 
 
 def _analyse_and_write(
@@ -126,11 +126,11 @@ def _analyse_and_write(
     from rigd.printable import progress_bar
 
     with progress_bar("{task.completed:.0f}/{task.total:.0f}") as progress:
-        bar = progress.add_task("starting", total=2 * file_count + _MOST_FIGURES)
+        bar = progress.add_task("starting", total=2 * file_count + _MAX_FIGURES)
 
         def on_progress(done_steps: int, total_steps: int, file_name: str) -> None:
             progress.update(
-                bar, completed=done_steps, total=total_steps + _MOST_FIGURES, description=file_name
+                bar, completed=done_steps, total=total_steps + _MAX_FIGURES, description=file_name
             )
 
         with new_folder(report_folder, overwrite=outputs.overwrite) as partial_folder:
@@ -144,7 +144,7 @@ def _analyse_and_write(
     report_error = partial(print_readable, progress.console)
     for session_failure in campaign_result.failures:
         report_error(f"Error: {session_failure.message}")
-    for lost_trial in campaign_result.lost_trials:
+    for lost_trial in campaign_result.failed_predictions:
         report_error(
             f"Error: {lost_trial.path} is not predicted from the others: {lost_trial.reason}"
         )

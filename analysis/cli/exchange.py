@@ -352,7 +352,7 @@ def export_model_command(
 def _model_lines(model: LinearModel, source: Path, target: Path) -> list[str]:
     """Return the printed summary of an exported model, one statement per line."""
     state_space, accuracy = model.system, model.accuracy
-    test_status, p_value = model.identified.gate
+    test_status, p_value = model.identified.uniform_beam_test
     uniformity_text = test_status if p_value is None else f"{test_status}, p = {p_value:.2g}"
     model_name = "exact beam" if model.kind == "beam" else "modal model"
     relaxation_count = sum(
@@ -396,10 +396,10 @@ def _parse_order(option_text: str) -> int | None:
     if not (
         option_text.isascii()
         and option_text.isdecimal()
-        and 1 <= int(option_text[:6]) <= _MOST_STATES
+        and 1 <= int(option_text[:6]) <= _MAX_STATES
     ):
         raise typer.BadParameter(
-            f"'{option_text}' is neither auto nor a number of states from 1 to {_MOST_STATES}.",
+            f"'{option_text}' is neither auto nor a number of states from 1 to {_MAX_STATES}.",
             param_hint="--order",
         )
     return int(option_text)
@@ -422,7 +422,7 @@ def _parse_rate(option_text: str) -> float | None:
     return rate_hz
 
 
-_MOST_STATES: Final = 200
+_MAX_STATES: Final = 200
 """Largest number of states that --order accepts."""
 _RATE_RANGE_HZ: Final = (1.0, 1e6)
 """Range of sampling rates in Hz that --rate accepts."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from analysis.results import RecordResult, Routes
+    from analysis.results import AnalysisOptions, RecordResult
 
 _TEXT_WIDTH_CHARACTERS: Final = 120
 """Width in characters of texts that are printed to a file or a pipe."""
@@ -136,7 +136,7 @@ def latest_session(folder: Path = Path("sessions")) -> Path:
 
 def session_command(
     files: Sequence[Path],
-    routes: Routes,
+    routes: AnalysisOptions,
     outputs: Outputs,
     rerun: Path | None = None,
     others: Mapping[str, str] | None = None,
@@ -147,7 +147,7 @@ def session_command(
     ----------
     files : sequence of Path
         Session files.
-    routes : Routes
+    routes : AnalysisOptions
         Analyses to be run, and their settings.
     outputs : Outputs
         Files to be written. The report folder contains the report of a single file, or one folder
@@ -235,7 +235,7 @@ def _print_tables(
 def _analyse_all(
     files: Sequence[Path],
     folders: Sequence[Path],
-    routes: Routes,
+    routes: AnalysisOptions,
     rerun_file: Path | None,
     outputs: Outputs,
 ) -> tuple[list[RecordResult], dict[str, str], int]:
@@ -316,7 +316,7 @@ def _error_message(session_file: Path, error: Exception) -> str:
     return str(error)
 
 
-def _count_steps(routes: Routes, rerun_file: Path | None) -> int:
+def _count_steps(routes: AnalysisOptions, rerun_file: Path | None) -> int:
     """Return the number of progress steps of the analysis of one file."""
     from analysis.report import FIGURES as RECORD_FIGURES
     from analysis.report.record_report import welch_figure_names
@@ -334,7 +334,7 @@ def _count_steps(routes: Routes, rerun_file: Path | None) -> int:
 def _analyse_file(
     session_file: Path,
     report_folder: Path,
-    routes: Routes,
+    routes: AnalysisOptions,
     rerun_file: Path | None,
     on_step: Callable[[str], None],
     warn: Callable[[str], None],

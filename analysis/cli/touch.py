@@ -14,7 +14,7 @@ from analysis.cli.standard_streams import print_error, print_readable
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.touch import TouchedSession
+    from analysis.touch import SessionTouches
 
 TOUCH_EPILOG = """\
 Example: analyze touch sessions/*.mcap --model beam.json --report touches
@@ -92,38 +92,38 @@ def _run_analysis(files: Sequence[Path], model_file: Path | None, outputs: Outpu
         write_touch_report,
     )
 
-    touched_sessions, error_messages = _analyse_sessions(files, model_file)
-    json_document = touches_document(touched_sessions, error_messages)
+    session_touches, error_messages = _analyse_sessions(files, model_file)
+    json_document = touches_document(session_touches, error_messages)
     if outputs.json is not None and not outputs.json_to_stdout:
         write_new(outputs.json, document_text(json_document))
-    if outputs.report is not None and touched_sessions:
+    if outputs.report is not None and session_touches:
         with new_folder(outputs.report) as partial_folder:
-            write_touch_report(touched_sessions, error_messages, partial_folder)
+            write_touch_report(session_touches, error_messages, partial_folder)
     console = outputs.console()
     print_plain = partial(console.print, markup=False, highlight=False, soft_wrap=True)
-    for touched_session in touched_sessions:
+    for touched_session in session_touches:
         for table_line in session_lines(touched_session):
             print_plain(table_line)
-    if any(touched_session.touches for touched_session in touched_sessions):
+    if any(touched_session.touches for touched_session in session_touches):
         print_plain("")
-        console.print(terminal_table(touches_table(touched_sessions)))
+        console.print(terminal_table(touches_table(session_touches)))
     if outputs.json_to_stdout:
         typer.echo(document_text(json_document, ascii_only=True), nl=False)
-    if outputs.report is not None and touched_sessions:
+    if outputs.report is not None and session_touches:
         print_plain(f"Report: {outputs.report / 'report.html'}")
     return 1 if error_messages else 0
 
 
 def _analyse_sessions(
     files: Sequence[Path], model_file: Path | None
-) -> tuple[list[TouchedSession], dict[str, str]]:
+) -> tuple[list[SessionTouches], dict[str, str]]:
     """Analyse the touches in each file; return the results, and error messages by file."""
     from analysis.record import RecordError
     from analysis.touch import TouchAnalysis
     from rigd.printable import progress_bar
     from rigd.session import SessionError
 
-    touched_sessions: list[TouchedSession] = []
+    session_touches: list[SessionTouches] = []
     error_messages: dict[str, str] = {}
     touch_analysis = TouchAnalysis(model_file)
     with progress_bar() as file_progress:
@@ -134,7 +134,7 @@ def _analyse_sessions(
                 file_progress.update(progress_task, description=f"{name}: {step}")
 
             try:
-                touched_sessions.append(touch_analysis.session(session_file, on_step))
+                session_touches.append(touch_analysis.session(session_file, on_step))
             except (SessionError, RecordError, MemoryError) as error:
                 error_text = (
                     str(error) or f"{session_file}: not enough memory; close other programs."
@@ -142,4 +142,4 @@ def _analyse_sessions(
                 error_messages[str(session_file)] = error_text
                 print_readable(file_progress.console, f"Error: {error_text}")
             file_progress.update(progress_task, completed=file_number + 1)
-    return touched_sessions, error_messages
+    return session_touches, error_messages

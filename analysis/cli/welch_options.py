@@ -70,7 +70,7 @@ def welch_settings(
 ) -> WelchSettings:
     """Return the Welch settings from the options' texts; raise a usage error for invalid ones.
 
-    The band is the default one, because `analysis.suited` chooses a band for each record.
+    The band is the default one, because `analysis.applicability` chooses a band for each record.
     """
     from analysis.models import WelchSettings
     from rigd.spectral import Estimator as FrfEstimator

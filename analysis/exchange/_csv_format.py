@@ -34,7 +34,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """
     try:
         with path.open("rb") as stream:
-            table = read_table(stream, names, most_rows=MAX_SAMPLES)
+            table = read_table(stream, names, max_rows=MAX_SAMPLES)
     except TableError as error:
         raise ExchangeError(f"{path}: {error}") from error
     file_times = None

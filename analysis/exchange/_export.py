@@ -132,14 +132,14 @@ def export_model(
     rigd.session.SessionError, analysis.record.RecordError, analysis.identify.MeasurementError
         If the session cannot be read or analysed.
     """
-    from analysis.linear_model import identified_in_document, identified_in_session, linear_model
+    from analysis.linear_model import identify_session, linear_model, read_identified_model
 
     _check_suffix(target, MODEL_FORMATS)
     check_new_file(target, "The file")
     is_session_file = source.suffix.lower() == ".mcap"
     on_step("analysis" if is_session_file else "document")
     identified_models = (
-        identified_in_session(source) if is_session_file else identified_in_document(source)
+        identify_session(source) if is_session_file else read_identified_model(source)
     )
     model = linear_model(identified_models, options, on_step)
     on_step("file")

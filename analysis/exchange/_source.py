@@ -335,9 +335,9 @@ def check_samples(path: Path, channel_text: str, samples: int) -> None:
 
 # Common functions of the readers
 
-_MOST_NAMES_LISTED: Final = 12
+_MAX_NAMES_LISTED: Final = 12
 """Largest number of channel names that a message lists."""
-_MOST_NAME_CHARACTERS: Final = 60
+_MAX_NAME_CHARACTERS: Final = 60
 """Largest number of characters of each channel name in a message."""
 
 
@@ -347,12 +347,12 @@ def no_such_channel_error(
     """Return the error for a channel that is missing, with the names of the available channels."""
     available_names = list(available)
     listed_text = ", ".join(
-        repr(printable(channel_name, _MOST_NAME_CHARACTERS))
-        for channel_name in available_names[:_MOST_NAMES_LISTED]
+        repr(printable(channel_name, _MAX_NAME_CHARACTERS))
+        for channel_name in available_names[:_MAX_NAMES_LISTED]
     )
     more_text = (
-        f" and {len(available_names) - _MOST_NAMES_LISTED} more"
-        if len(available_names) > _MOST_NAMES_LISTED
+        f" and {len(available_names) - _MAX_NAMES_LISTED} more"
+        if len(available_names) > _MAX_NAMES_LISTED
         else ""
     )
     return ExchangeError(

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 import rigd
+from analysis.applicability import highest_frequency_hz, welch_settings
 from analysis.exchange._source import ExchangeError
 from analysis.paper import estimate
 from analysis.record import load_record
-from analysis.suited import highest_frequency_hz, welch_settings
 from rigd.session import read_session
 from rigd.session.layout import SAMPLE_FIELDS
 from rigd.units import unit_of

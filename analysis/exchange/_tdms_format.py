@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import BinaryIO
 
-_MOST_LISTED_CHANNELS: Final = 5_000_000
+_MAX_LISTED_CHANNELS: Final = 5_000_000
 """Largest number of channels, counted in each segment, because npTDMS processes all of them before
 it reads a value."""
 
@@ -98,7 +98,7 @@ def _check_entries(path: Path, stream: BinaryIO) -> None:
     """Raise if the table of contents would take minutes or gigabytes to read."""
     file_bytes = path.stat().st_size
     segment_offset = total_channels = entry_count = 0
-    while segment_offset + _LEAD_IN_BYTES <= file_bytes and entry_count <= _MOST_LISTED_CHANNELS:
+    while segment_offset + _LEAD_IN_BYTES <= file_bytes and entry_count <= _MAX_LISTED_CHANNELS:
         stream.seek(segment_offset)
         lead_in = stream.read(_LEAD_IN_BYTES + 4)
         contents_mask = int.from_bytes(lead_in[4:8], "little")
@@ -113,9 +113,9 @@ def _check_entries(path: Path, stream: BinaryIO) -> None:
         entry_count += 1
         segment_offset += _LEAD_IN_BYTES + segment_bytes
     stream.seek(0)
-    if entry_count > _MOST_LISTED_CHANNELS:
+    if entry_count > _MAX_LISTED_CHANNELS:
         raise ExchangeError(
-            f"{path}: its segments list more than {_MOST_LISTED_CHANNELS} channels in all, so it "
+            f"{path}: its segments list more than {_MAX_LISTED_CHANNELS} channels in all, so it "
             "is "
             "damaged or no record of a few channels; export the session's channels alone."
         )

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 ABSCISSA: Final = "abscissa"
 """Name of the channel of times that is common to the requested data sets."""
 
-_MOST_DATA_SETS: Final = 10_000
+_MAX_DATA_SETS: Final = 10_000
 """Largest number of data sets in a file that is read."""
 _SET_DELIMITER: Final = b"    -1"
 """Line that begins and ends each data set."""
@@ -115,9 +115,9 @@ def _read_channels(
 
 def _check_set_count(path: Path) -> None:
     """Raise if a file has too many data sets; pyuff would store the position of each."""
-    if path.read_bytes().count(_SET_DELIMITER) > 2 * _MOST_DATA_SETS:
+    if path.read_bytes().count(_SET_DELIMITER) > 2 * _MAX_DATA_SETS:
         raise ExchangeError(
-            f"{path}: has more than {_MOST_DATA_SETS} data sets; export the session's channels "
+            f"{path}: has more than {_MAX_DATA_SETS} data sets; export the session's channels "
             "alone."
         )
 

@@ -111,7 +111,7 @@ class CandidateSet:
     misread: tuple[Finding, ...] = ()
 
     @classmethod
-    def of(
+    def from_measurement(
         cls,
         measurement: Measurement,
         fixed: tuple[Setting, ...],
@@ -126,10 +126,12 @@ class CandidateSet:
         MeasurementError
             The record cannot be used.
         """
-        if misread := tuple(sign_and_unit_findings(Comparison.of(measurement, band_hz))):
+        if misread := tuple(
+            sign_and_unit_findings(Comparison.from_measurement(measurement, band_hz))
+        ):
             # No beam explains such a record, so all structures leave much the same residual.
             return replace(cls.fit_freest_structure(measurement, fixed, band_hz), misread=misread)
-        candidate_set = cls._of_uniform_beam(
+        candidate_set = cls._from_uniform_beam(
             fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed
         )
         return candidate_set._exclude_leakage()
@@ -164,7 +166,9 @@ class CandidateSet:
             The record cannot be used.
         """
         first_candidate, *other_candidates = earlier
-        unknowns = Unknowns.of(first_candidate.structure, measurement.nominal, free_settings(fixed))
+        unknowns = Unknowns.for_structure(
+            first_candidate.structure, measurement.nominal, free_settings(fixed)
+        )
         analysis = refit_record(measurement, unknowns, first_candidate.fit.plant, band_hz=band_hz)
         if analysis is None:
             return None
@@ -200,12 +204,12 @@ class CandidateSet:
             The record cannot be used.
         """
         structures = (_FREEST_STRUCTURE, *additional)
-        return cls._of_uniform_beam(
+        return cls._from_uniform_beam(
             fit_record(measurement, structures, fixed=fixed, band_hz=band_hz), fixed
         )
 
     @classmethod
-    def _of_uniform_beam(
+    def _from_uniform_beam(
         cls, uniform_analysis: RecordAnalysis, fixed: tuple[Setting, ...]
     ) -> CandidateSet:
         """Return the candidate set of an analysis that fitted structures on a uniform beam."""
@@ -282,7 +286,7 @@ class CandidateSet:
 
     def unknowns(self, structure: Structure) -> Unknowns:
         """Return the unknown parameters that a fit of a damping structure to this record varies."""
-        return Unknowns.of(structure, self.comparison.measurement.nominal, self.free)
+        return Unknowns.for_structure(structure, self.comparison.measurement.nominal, self.free)
 
     def refit(self, candidate: Candidate, max_evaluations: int = DESCENT_EVALUATIONS) -> Refit:
         """Return the minimum of the cost that a descent reaches from a candidate's estimate."""
@@ -319,7 +323,9 @@ class CandidateSet:
         candidate_set = self
         for _ in range(MAX_ANGLE_REESTIMATES):
             best = candidate_set.best
-            comparison = candidate_set.comparison.renewed(best.fit.plant, candidate_set.noise)
+            comparison = candidate_set.comparison.with_reestimated_angle(
+                best.fit.plant, candidate_set.noise
+            )
             if comparison is candidate_set.comparison:
                 break
             set_of_best = replace(candidate_set, comparison=comparison, candidates=(best,))

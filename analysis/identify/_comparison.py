@@ -124,7 +124,7 @@ class Comparison:
     shared_values: RecentValues[Any] = field(default_factory=lambda: RecentValues(1))
 
     @classmethod
-    def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
+    def from_measurement(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
         """Return a measurement filtered to a frequency band, ready for comparison.
 
         The mean of the residual is never compared, since it contains the zero offset of the torque
@@ -206,24 +206,24 @@ class Comparison:
             if 0 < decay_start_s < (samples - 1) / decimation.rate_hz
         )
         comparison = replace(comparison, later_decays=later_decays)
-        return comparison._remove_impacts() if measurement.knocks else comparison
+        return comparison._remove_impacts() if measurement.impacts else comparison
 
     def _remove_impacts(self) -> Comparison:
         """Return the comparison without the estimated torque of the known impacts on the beam.
 
         Errors of this estimate are projected out with `impact_spectra`.
         """
-        rate_hz, knocks = self.decimation.rate_hz, self.measurement.knocks
+        rate_hz, impacts = self.decimation.rate_hz, self.measurement.impacts
         sample_times_s = self.times_s()
         unknown_indices = self._decimated_indices(~self.measurement.torque_known)
         reach_s = self.decimation.reach / rate_hz
         unknown_times_s = unknown_indices / self.measurement.rate_hz - reach_s
         impact_nm, impact_at_unknown_nm = (
-            np.sum([impact.torque(time_s, sample_times_s, rate_hz) for impact in knocks], axis=0)
+            np.sum([impact.torque(time_s, sample_times_s, rate_hz) for impact in impacts], axis=0)
             for time_s in (sample_times_s, unknown_times_s)
         )
         impact_torques = np.concatenate(
-            [impact.columns(sample_times_s, rate_hz) for impact in knocks]
+            [impact.columns(sample_times_s, rate_hz) for impact in impacts]
         )
         return replace(self, impact_spectra=self.spectrum(impact_torques))._remove_torque(
             impact_nm, impact_at_unknown_nm
@@ -414,7 +414,7 @@ class Comparison:
             incoherent_nm - self.incoherent_nm, unknown_tick_nm - self.incoherent_in_gaps_nm
         )
 
-    def renewed(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
+    def with_reestimated_angle(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
         """Return the comparison with the reference-coherent angle estimated with a better plant.
 
         Parameters

@@ -179,7 +179,7 @@ class Measurement:
     reference_rad : ndarray, shape (n,), or None
         Reference of the motor's controller; None without a controller. The part of the angle that
         does not follow the reference is attributed to the noise.
-    knocks : tuple of RecordedImpact
+    impacts : tuple of RecordedImpact
         Known impacts on the beam. Their amplitudes are estimated in each fit.
     uniformity : float
         Relative standard deviation of each mode's frequency from that of a uniform beam.
@@ -208,7 +208,7 @@ class Measurement:
     reference_rad: NDArray[np.float64] | None = None
     filter_time_constant_s: float = 0.0
     second_order_filter_time_constant_s: float = 0.0
-    knocks: tuple[RecordedImpact, ...] = ()
+    impacts: tuple[RecordedImpact, ...] = ()
     uniformity: float = 1e-3
     tip_mass_kg: float | None = None
     axis_tilt_deg: float | None = None
@@ -216,7 +216,7 @@ class Measurement:
     torque_extremes: tuple[TorqueExtreme, ...] = ()
 
     @classmethod
-    def of_record(cls, record: Record) -> Measurement:
+    def from_record(cls, record: Record) -> Measurement:
         """Return the measurement in a record that was read from a session file.
 
         Raises

@@ -296,7 +296,7 @@ _HARMONIC_PHASE_TOLERANCE_TURNS: Final = 0.5
 excitation."""
 
 
-def mains(frequency_hz: float) -> str:
+def mains_harmonic_text(frequency_hz: float) -> str:
     """Return the words for the mains harmonic that a frequency is near, or an empty string.
 
     The text describes the possible source of a disturbance with this frequency.
@@ -308,7 +308,7 @@ def mains(frequency_hz: float) -> str:
     return ""
 
 
-def unexplained(
+def unexplained_residual_finding(
     whiteness: Whiteness,
     input_dependence: InputRelation,
     modes: tuple[ModeEstimate, ...],
@@ -325,7 +325,7 @@ def unexplained(
     ]
     if stiffness_step is not None:
         description = (
-            f"The modes do not fit together. The likeliest cause is {stiffness_step.words}, but "
+            f"The modes do not fit together. The likeliest cause is {stiffness_step.text}, but "
             "one sweep does not tell a change in time from one with the frequency."
         )
         remedy = (
@@ -360,7 +360,7 @@ def unexplained(
         )
         remedy = ""
     else:
-        mains_words = mains((peak_low_hz + peak_high_hz) / 2)
+        mains_words = mains_harmonic_text((peak_low_hz + peak_high_hz) / 2)
         description = (
             f"The residual is {whiteness.loudest_ratio:.1f} times the noise from {peak_low_hz:.2f} "
             f"to {peak_high_hz:.2f} Hz and does not follow the motor: a disturbance"
@@ -426,7 +426,7 @@ def _hum_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
     for noise_line in candidate_set.noise.lines:
         if noise_line.frequency_hz * duration_s < _MIN_HUM_PERIODS:
             continue
-        mains_words = mains(noise_line.frequency_hz)
+        mains_words = mains_harmonic_text(noise_line.frequency_hz)
         source_words = f", {mains_words}" if mains_words else ""
         phase_turns = noise_line.frequency_hz * period_s
         is_harmonic = (

@@ -12,7 +12,7 @@ _RINGING_P_VALUE: Final = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
-class DampingSize:
+class PivotLossFactor:
     """Loss factor of one damping at its pivot frequency, where it depends least on the order.
 
     Attributes
@@ -65,7 +65,7 @@ class Ringing:
     degrees_of_freedom: int
 
     @property
-    def significant(self) -> bool:
+    def is_significant(self) -> bool:
         """Return whether chance gives such amplitudes in less than one of 10 000 records."""
         degrees_of_freedom = self.degrees_of_freedom
         return bool(

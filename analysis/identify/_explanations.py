@@ -86,7 +86,7 @@ class CauseFit:
     ----------
     name : str
         Name of the cause.
-    words : str
+    phrase : str
         Cause and size as a phrase for sentences.
     size : float
         Size of the cause in `unit`.
@@ -102,7 +102,7 @@ class CauseFit:
     """
 
     name: str
-    words: str
+    phrase: str
     size: float
     unit: str
     chi_square: float
@@ -210,7 +210,7 @@ def _fit_cause(
     cause_size, size_unit, phrase = cause.describe(cause_unknowns.tolist(), plant.beam)
     return CauseFit(
         name=cause.name,
-        words=phrase,
+        phrase=phrase,
         size=cause_size,
         unit=size_unit,
         chi_square=chi_square,
@@ -441,9 +441,9 @@ def finding(
     stiffness_step : Step, optional
         Step of the stiffness during the record, from `best_stiffness_step`.
     """
-    cause_phrases = [cause_fit.words for cause_fit in causes]
-    if stiffness_step is not None and stiffness_step.named:
-        cause_phrases.append(stiffness_step.words)
+    cause_phrases = [cause_fit.phrase for cause_fit in causes]
+    if stiffness_step is not None and stiffness_step.is_significant:
+        cause_phrases.append(stiffness_step.text)
     refusal_sentence = f"A plain uniform beam does not predict the modes ({test.summary.chance})."
     if not cause_phrases:
         return Finding(

@@ -87,7 +87,7 @@ _INTERVAL_PATTERN: Final = re.compile(r" \((?:[^()]*; 95 %|± [^()]*)\)")
 """Interval in parentheses in a sentence."""
 
 
-def doubted(finding: Finding, reason: str) -> Finding:
+def with_doubt(finding: Finding, reason: str) -> Finding:
     """Return a finding whose sentence says that it is not established, for a given reason.
 
     Parameters
@@ -106,7 +106,7 @@ def doubted(finding: Finding, reason: str) -> Finding:
     --------
     >>> delay = Finding("delay", "The torque comes 1 ms later (0.9 to 1.1 ms; 95 %).",
     ...                 1e-3, (9e-4, 1.1e-3), "s", "")
-    >>> doubted(delay, "part of the record is unexplained").sentence
+    >>> with_doubt(delay, "part of the record is unexplained").sentence
     'Not established, because part of the record is unexplained: the torque comes 1 ms later.'
     """
     if finding.kind in MODEL_INDEPENDENT_KINDS:

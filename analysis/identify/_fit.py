@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._data import Measurement
-    from analysis.identify._problem import Projected
+    from analysis.identify._problem import ProjectedResidual
     from analysis.identify._settings import Setting
     from analysis.identify.noise import NoiseSpectrum
     from analysis.models import Structure
@@ -102,12 +102,14 @@ def fit_record(
     if invalid_names:
         raise ValueError(f"{invalid_names} cannot be fixed: choose from {SETTINGS}.")
     free_names = free_settings(fixed)
-    comparison = Comparison.of(measurement, band_hz)
+    comparison = Comparison.from_measurement(measurement, band_hz)
     nominal = measurement.nominal
     coarse_response = CoarseResponse(comparison)
     searches = [
-        StructureSearch.of(Objective(comparison, unknowns), coarse_response)
-        for unknowns in (Unknowns.of(structure, nominal, free_names) for structure in structures)
+        StructureSearch.start(Objective(comparison, unknowns), coarse_response)
+        for unknowns in (
+            Unknowns.for_structure(structure, nominal, free_names) for structure in structures
+        )
     ]
     closest_index = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
     reference_descent = searches[closest_index].lowest_coarse_minimum()
@@ -124,12 +126,14 @@ def fit_record(
         comparison = reference_descent.objective.comparison
         coarse_response = CoarseResponse(comparison)
         searches = [
-            StructureSearch.of(Objective(comparison, search.unknowns), coarse_response)
+            StructureSearch.start(Objective(comparison, search.unknowns), coarse_response)
             for search in searches
         ]
     # The incoherent part of the angle may contain the beam's motion, and not noise alone. It is
     # re-estimated with the closest structure, before and after all others are fitted.
-    updated_descent = reference_descent.renewed(reference_descent.noise(), _ROUGH_COST_TOLERANCE)
+    updated_descent = reference_descent.with_reestimated_angle(
+        reference_descent.noise(), _ROUGH_COST_TOLERANCE
+    )
     descents: list[Descent] = []
     for _ in range(_MAX_REFERENCE_ESTIMATES):
         if updated_descent is not reference_descent:
@@ -141,11 +145,11 @@ def fit_record(
         reference_descent = descents[closest_index]
         if not _residual_is_noise(reference_descent, noise):
             break  # none of these explains it, so a further pass does not distinguish them better
-        updated_descent = reference_descent.renewed(noise, _ROUGH_COST_TOLERANCE)
+        updated_descent = reference_descent.with_reestimated_angle(noise, _ROUGH_COST_TOLERANCE)
         if updated_descent is reference_descent:
             break
     fits = (summary(descent.objective, descent.x, noise) for descent in descents)
-    return RecordAnalysis.of(fits, noise, comparison)
+    return RecordAnalysis.from_fits(fits, noise, comparison)
 
 
 def refit_record(
@@ -175,10 +179,12 @@ def refit_record(
     MeasurementError
         The record cannot be used.
     """
-    comparison = Comparison.of(measurement, band_hz).use_reference_coherent_angle(plant)
+    comparison = Comparison.from_measurement(measurement, band_hz).use_reference_coherent_angle(
+        plant
+    )
     descent = Descent(Objective(comparison, unknowns), unknowns.vector(plant))
     descent = descent.descend_to_minimum(descent.noise(), _ROUGH_COST_TOLERANCE)
-    descent = descent.renewed(descent.noise(), _ROUGH_COST_TOLERANCE)
+    descent = descent.with_reestimated_angle(descent.noise(), _ROUGH_COST_TOLERANCE)
     if descent.hum():
         return None
     noise = descent.noise(with_lines=True)
@@ -186,7 +192,9 @@ def refit_record(
     if not _residual_is_noise(descent, noise):
         return None
     comparison = descent.objective.comparison
-    return RecordAnalysis.of([summary(descent.objective, descent.x, noise)], noise, comparison)
+    return RecordAnalysis.from_fits(
+        [summary(descent.objective, descent.x, noise)], noise, comparison
+    )
 
 
 def _descend_with_noise(
@@ -345,7 +353,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
 def _compared_jacobian(
     objective: Objective,
     x: NDArray[np.float64],
-    projected: Projected,
+    projected: ProjectedResidual,
     noise: NoiseSpectrum,
 ) -> NDArray[np.complex128]:
     """Return the whitened derivatives of the measured torque's spectrum by the unknowns, (k, K).

@@ -13,7 +13,7 @@ unbiased for any beam. But a beam that rings for long moves the motor in bands n
 smoothing of the response, and then the remaining angle is not noise: in a record of narrow sweeps
 with 0.2 g at the tip the first beam would bias the result by up to 45 standard deviations. So if a
 better beam predicts another torque, the part of the angle that follows the reference is
-re-estimated, with the torque on the motor as a second input (`Comparison.renewed`).
+re-estimated, with the torque on the motor as a second input (`Comparison.with_reestimated_angle`).
 
 References
 ----------

@@ -33,7 +33,7 @@ from analysis.identify._modal_model import (
 )
 from analysis.identify.noise import noise_power_with_peaks, smooth_power
 from analysis.identify.residual_tests import input_relation, whiteness
-from analysis.optimizer import Box, NormalEquations, RecentValues, descend
+from analysis.optimizer import ConstantBounds, NormalEquations, RecentValues, descend
 from rigd.beam import Pole
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ _MODE_REACH_HALF_WIDTHS: Final = 3.0
 """Distance from a mode, in half-widths of its resonance, within which the noise has no narrow peak.
 """
 
-_LEAST_RELATIVE_MODE_REACH: Final = 0.02
+_MIN_RELATIVE_MODE_REACH: Final = 0.02
 """Minimum distance from a mode, relative to its frequency, within which the noise has no narrow
 peak."""
 
@@ -215,7 +215,7 @@ class ModalFit(ModalEstimate):
     @property
     def explained(self) -> bool:
         """Return whether only noise remains in the residual of the modal model."""
-        return self.whiteness.white and not self.input_relation.related
+        return self.whiteness.is_white and not self.input_relation.related
 
     @property
     def visible(self) -> tuple[int, ...]:
@@ -363,7 +363,7 @@ class _ModalSearch:
         minimum = descend(
             problem.normal_equations,
             self.x,
-            Box(lower_bounds.ravel(), upper_bounds.ravel()),
+            ConstantBounds(lower_bounds.ravel(), upper_bounds.ravel()),
             relative_tolerance=_RELATIVE_TOLERANCE,
             max_evaluations=60,
         )
@@ -381,7 +381,7 @@ class _ModalSearch:
             comparison = search.comparison
             # A torque that the modal model lacks would change which part of the angle follows it.
             if not (len(search.effect_spectra) or comparison.drag):
-                comparison = comparison.renewed(modal_model, search.noise)
+                comparison = comparison.with_reestimated_angle(modal_model, search.noise)
             comparison = comparison.fill_unknown_torque(modal_model)
             noise_power = smooth_power(residual_spectrum, finely=True)
             noise_power = noise_power_with_peaks(
@@ -416,7 +416,7 @@ class _ModalSearch:
         mode_hz, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
         margin_hz = _MODE_REACH_MARGIN_BINS * float(hz[1, 0] - hz[0, 0])
         reach_hz = (
-            np.maximum(_MODE_REACH_HALF_WIDTHS * eta / 2, _LEAST_RELATIVE_MODE_REACH) * mode_hz
+            np.maximum(_MODE_REACH_HALF_WIDTHS * eta / 2, _MIN_RELATIVE_MODE_REACH) * mode_hz
             + margin_hz
         )
         if within_resonance:

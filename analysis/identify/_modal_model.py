@@ -105,7 +105,7 @@ class ModalModel:
         }
 
     @classmethod
-    def of_constants(
+    def from_constants(
         cls, constants: NDArray[np.float64], background: Sequence[float]
     ) -> ModalModel:
         """Return the modal model with given mode constants and background coefficients.

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._diagnostics import findings, setting_findings, unexplained
-from analysis.identify._finding import doubted
-from analysis.identify._knock import impact_findings
+from analysis.identify._diagnostics import findings, setting_findings, unexplained_residual_finding
+from analysis.identify._finding import with_doubt
+from analysis.identify._impacts import impact_findings
 from analysis.identify._record_model import test_residual
-from analysis.identify._time_varying import established
+from analysis.identify._time_varying import is_single_change_established
 from analysis.identify._visible_modes import visible_modes
 from analysis.identify.headline import CONTRADICTED_FILE_REASON, UNEXPLAINED_REASON
 
@@ -63,7 +63,7 @@ class ModelCheck:
     temporal_changes: tuple[TemporalChange, ...] = ()
 
     @classmethod
-    def of(
+    def run(
         cls,
         candidate_set: CandidateSet,
         modal_fit: ModalFit | None,
@@ -111,7 +111,7 @@ class ModelCheck:
 
         With a fitted change along the record, the modes are those at the middle of the record.
         """
-        if self.temporal_changes and self.temporal_changes[0].certain:
+        if self.temporal_changes and self.temporal_changes[0].is_certain:
             return self.doubt_reason
         return self.model_reason or self.clipped_reason
 
@@ -123,7 +123,7 @@ class ModelCheck:
         sweep passed it.
         """
         is_single_sweep = self.candidate_set.comparison.measurement.is_single_sweep
-        if not self.temporal_changes or established(
+        if not self.temporal_changes or is_single_change_established(
             self.temporal_changes, is_single_sweep=is_single_sweep
         ):
             return None
@@ -160,12 +160,12 @@ class ModelCheck:
             only_harmonics_remain=self.residual_tests.is_noise,
         )
         impacts = impact_findings(
-            self.candidate_set.comparison.measurement.knocks,
+            self.candidate_set.comparison.measurement.impacts,
             explained=self.residual_tests.is_noise,
         )
         if self.residual_tests.is_noise:
             return (*impacts, *marked)
-        residual_finding = unexplained(
+        residual_finding = unexplained_residual_finding(
             self.residual_tests.whiteness,
             self.residual_tests.input_relation,
             self.candidate_set.best.fit.modes,
@@ -225,9 +225,9 @@ def mark_doubtful_findings(
         finding_reason = doubt_reason or parameter_flag
         if finding_reason is None or (finding.kind == "harmonics" and only_harmonics_remain):
             return finding
-        return doubted(finding, finding_reason)
+        return with_doubt(finding, finding_reason)
 
     fitted_findings = tuple(map(qualified, fitted_findings))
     if model_reason is not None:
-        change_findings = tuple(doubted(finding, model_reason) for finding in change_findings)
+        change_findings = tuple(with_doubt(finding, model_reason) for finding in change_findings)
     return (*fitted_findings, *change_findings)

@@ -39,7 +39,7 @@ class Linearisation:
 
 
 @dataclass(frozen=True, slots=True)
-class Projected:
+class ProjectedResidual:
     """Whitened residual and derivatives with the torques of unknown amplitude projected out.
 
     Attributes
@@ -158,7 +158,7 @@ class Objective:
 
     def project(
         self, linearisation: Linearisation, weight: NDArray[np.float64] | float
-    ) -> Projected:
+    ) -> ProjectedResidual:
         """Return whitened residual and derivatives without the torques of unknown amplitude.
 
         These torques are projected out.
@@ -186,7 +186,7 @@ class Objective:
         )
         real_jacobian = _as_real_rows(jacobian)
         real_jacobian -= ((real_jacobian @ unit_columns.T) @ inverse_gram) @ unit_columns
-        return Projected(
+        return ProjectedResidual(
             residual=residual + (amplitudes @ unit_columns).view(np.complex128),
             jacobian=jacobian,
             amplitudes=amplitudes / column_lengths,

@@ -66,7 +66,7 @@ class ResidualTests:
     @property
     def is_noise(self) -> bool:
         """Whether the residual is white and does not follow the angle."""
-        return self.whiteness.white and not self.input_relation.related
+        return self.whiteness.is_white and not self.input_relation.related
 
 
 def test_residual(
@@ -159,7 +159,7 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
     )
     modes_with_drag, changed_by_drag = None, tuple[int, ...]()
     # In a single sweep another effect, or large drag, has a model of its own.
-    if effect is None or not is_single_sweep or (effect.kind == "air drag" and not effect.large):
+    if effect is None or not is_single_sweep or (effect.kind == "air drag" and not effect.is_large):
         modes_with_drag, changed_by_drag = _accepted_drag(
             linear_fit,
             fit_modes_with_drag(linear_candidates, linear_fit, drag_spectrum),
@@ -192,7 +192,7 @@ def add_further_effects(model: RecordModel, band_hz: tuple[float, float]) -> Rec
     band_hz : tuple of float
         First and last frequency of the comparison.
     """
-    is_large = model.small_effect is not None and model.small_effect.large
+    is_large = model.small_effect is not None and model.small_effect.is_large
     if model.explains_record and not is_large:
         return _with_fitted_candidates(model)
     is_single_sweep = model.linear_candidates.comparison.measurement.is_single_sweep
@@ -365,7 +365,7 @@ def _with_fitted_candidates(model: RecordModel) -> RecordModel:
             candidate_set=with_drag.refit_with_additional_effect(modes_with_drag.drag_spectra),
         )
     effect = model.small_effect
-    if effect is None or effect.saved <= LARGE_DEVIANCE_REDUCTION:
+    if effect is None or effect.deviance_reduction <= LARGE_DEVIANCE_REDUCTION:
         return model
     candidate_set = linear_candidates.refit_with_additional_effect(effect.column[None])
     return replace(model, candidate_set=candidate_set, modal_fit=fit_modal_model(candidate_set))
@@ -420,6 +420,8 @@ def _likely_stiffness_step(model: RecordModel, linear_fit: ModalFit) -> Stiffnes
     Return None if the small nonlinear effect explains more.
     """
     stiffness_step = best_stiffness_step(model.linear_candidates.comparison, linear_fit)
-    rival_deviance_reduction = 0.0 if model.small_effect is None else model.small_effect.saved
+    rival_deviance_reduction = (
+        0.0 if model.small_effect is None else model.small_effect.deviance_reduction
+    )
     is_likeliest = stiffness_step.score > max(rival_deviance_reduction, LARGE_DEVIANCE_REDUCTION)
     return stiffness_step if is_likeliest else None

@@ -16,7 +16,7 @@ from analysis.identify._candidate import Candidate
 from analysis.identify._fit import summary
 from analysis.identify._problem import Objective
 from analysis.identify.noise import NoiseSpectrum, smooth_power
-from analysis.identify.parametrization import VANISHING_LOSS, Steps
+from analysis.identify.parametrization import VANISHING_LOSS, StepRule
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -88,7 +88,7 @@ class Refit:
         `relative_tolerance` and `hopeless` are those of `analysis.optimizer.descend`. With
         `max_evaluations` of 1 the start is only evaluated.
         """
-        descent_steps = Steps.of(unknowns, VANISHING_LOSS)
+        descent_steps = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
         x = np.clip(start, descent_steps.lower, descent_steps.upper)
         for fixed_name in hold:
             fixed_index = unknowns.names.index(fixed_name)
@@ -111,7 +111,7 @@ class Refit:
         objective, minimum = self.objective.minimum(
             self.x,
             self.noise.weight,
-            Steps.of(self.objective.unknowns, VANISHING_LOSS),
+            StepRule.for_unknowns(self.objective.unknowns, VANISHING_LOSS),
             relative_tolerance=_COST_TOLERANCE,
             max_evaluations=max_evaluations,
         )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._estimates import DampingSize, ModeEstimate, Ringing
+    from analysis.identify._estimates import ModeEstimate, PivotLossFactor, Ringing
     from analysis.identify.noise import NoiseLine
     from analysis.models import Structure
     from rigd.beam import Plant
@@ -60,7 +60,7 @@ class RecordFit:
         stiffness as logarithms.
     at_bounds : tuple of str
         Free parameters that rest on a bound of their range.
-    internal, external : DampingSize or None
+    internal, external : PivotLossFactor or None
         Loss factors of internal and external damping. None if absent or not determined.
     modes : tuple of ModeEstimate
         Modes within the band.
@@ -83,8 +83,8 @@ class RecordFit:
     determined: tuple[str, ...]
     covariance: NDArray[np.float64]
     at_bounds: tuple[str, ...]
-    internal: DampingSize | None
-    external: DampingSize | None
+    internal: PivotLossFactor | None
+    external: PivotLossFactor | None
     modes: tuple[ModeEstimate, ...]
     ringing: Ringing
     cost: float
@@ -132,7 +132,7 @@ class RecordAnalysis:
     comparison: Comparison
 
     @classmethod
-    def of(
+    def from_fits(
         cls, fits: Iterable[RecordFit], noise: NoiseSpectrum, comparison: Comparison
     ) -> RecordAnalysis:
         """Return the analysis that contains fits to the same data under the same noise.

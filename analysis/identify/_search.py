@@ -19,9 +19,9 @@ from analysis.identify._hum import find_hum_near_modes, resonance_half_width_hz
 from analysis.identify._problem import Objective
 from analysis.identify.free_decay import count_decay_spectra
 from analysis.identify.noise import Hum, NoiseSpectrum, estimate_noise
-from analysis.identify.parametrization import Steps
+from analysis.identify.parametrization import StepRule
 from analysis.optimizer import NormalEquations, descend
-from analysis.paper import thinned
+from analysis.paper import representative_points
 from rigd.beam import ResponseGrid
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ class CoarseResponse:
             torque_spectrum[is_excited] / angle_spectrum[is_excited],
             angle_power[is_excited],
         )
-        selected_bins, self._weights = thinned(
+        selected_bins, self._weights = representative_points(
             measured_response, response_weights / response_weights.sum(), _COARSE_POINTS
         )
         self._measured = measured_response[selected_bins]
@@ -221,7 +221,7 @@ def coarse_minima(
     start_vectors: Iterable[NDArray[np.float64]],
 ) -> list[Minimum]:
     """Return the distinct minima of the coarse cost from some start vectors, the lowest first."""
-    descent_steps = Steps.of(unknowns)
+    descent_steps = StepRule.for_unknowns(unknowns)
     minima = [
         descend(
             lambda x: coarse_response.normal_equations(unknowns, x),
@@ -295,7 +295,7 @@ class Descent:
         hopeless : tuple of int and float, optional
             Number of evaluations and cost above which `descend` gives up.
         """
-        descent_steps = Steps.of(self.objective.unknowns)
+        descent_steps = StepRule.for_unknowns(self.objective.unknowns)
         objective, minimum = self.objective.minimum(
             self.x, noise.weight, descent_steps, relative_tolerance=tolerance, hopeless=hopeless
         )
@@ -305,14 +305,14 @@ class Descent:
         """Return the sum of squares at the current point under a noise spectrum."""
         return self.objective.normal_equations(self.x, noise.weight).cost
 
-    def renewed(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
+    def with_reestimated_angle(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
         """Re-estimate the motor angle from the reference angle, and descend until it converges.
 
         Return `self` if it has converged already.
         """
         descent = self
         for _ in range(MAX_ANGLE_REESTIMATES):
-            comparison = descent.objective.comparison.renewed(descent.plant, noise)
+            comparison = descent.objective.comparison.with_reestimated_angle(descent.plant, noise)
             if comparison is descent.objective.comparison:
                 break
             descent = Descent(Objective(comparison, descent.objective.unknowns), descent.x)
@@ -388,7 +388,7 @@ class StructureSearch:
     minima: list[Minimum]
 
     @classmethod
-    def of(cls, objective: Objective, coarse_response: CoarseResponse) -> StructureSearch:
+    def start(cls, objective: Objective, coarse_response: CoarseResponse) -> StructureSearch:
         """Search the whole range of the unknowns for minima of the coarse response."""
         start_vectors = initial_guesses(coarse_response, objective.unknowns)
         return cls(

@@ -18,13 +18,7 @@ from analysis.identify._drag import (
 from analysis.identify._explanations import explanations
 from analysis.identify._explanations import finding as explanation_finding
 from analysis.identify._fit import BAND_HZ
-from analysis.identify._knock import MAX_IMPACTS, add_known_impact, find_impacts
-from analysis.identify._modal_headline import (
-    flag_contradicted_damping,
-    flag_modes_changed_by_drag,
-    order_verdict_with_geometry_tolerance,
-    replace_by_modal_model,
-)
+from analysis.identify._impacts import MAX_IMPACTS, add_known_impact, find_impacts
 from analysis.identify._model_check import (
     MODES_WITHOUT_REDUNDANCY,
     ModelCheck,
@@ -46,6 +40,12 @@ from analysis.identify.headline import (
     Headline,
     headline,
     headline_of_fit,
+)
+from analysis.identify.modal_headline import (
+    flag_contradicted_damping,
+    flag_modes_changed_by_drag,
+    order_verdict_with_geometry_tolerance,
+    replace_by_modal_model,
 )
 from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION, profile_both_orders
 from analysis.identify.sentences import experiments, headline_sentences
@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     from analysis.identify._result import RecordFit
     from analysis.identify._settings import Setting
     from analysis.identify.beam_uniformity import UniformBeamTest
-    from analysis.identify.profile_likelihood import Order
+    from analysis.identify.profile_likelihood import OrderName
 
 
 _ONLINE_DRAG_COMPUTATIONS: Final = 4
@@ -124,7 +124,7 @@ class Selection:
         return self.headline.fit
 
     @property
-    def determined(self) -> frozenset[Order]:
+    def determined(self) -> frozenset[OrderName]:
         """Return the damping orders, "alpha" or "lambda", that the record determines precisely."""
         order_verdicts = (self.verdict.alpha, self.verdict.lambda_)
         return frozenset(
@@ -231,7 +231,7 @@ def _assess_with_impacts(
             impact_assessment = assess_measurement(
                 add_known_impact(candidate_set.comparison.measurement, impact)
             )
-            if impact_assessment.explained or impact.evident:
+            if impact_assessment.explained or impact.is_evident:
                 better_assessment = impact_assessment
             if impact_assessment.explained:
                 break
@@ -254,9 +254,11 @@ def _select_with_known_impacts(
         if earlier_candidates
         else None
     )
-    linear_candidates = refitted_candidates or CandidateSet.of(measurement, fixed, band_hz)
+    linear_candidates = refitted_candidates or CandidateSet.from_measurement(
+        measurement, fixed, band_hz
+    )
     model = fit_linear_model(linear_candidates, band_hz)
-    if not (model.explains_record or measurement.knocks):
+    if not (model.explains_record or measurement.impacts):
         for impact in find_impacts(linear_candidates, obvious=True):
             impact_assessment = _select_with_known_impacts(
                 add_known_impact(measurement, impact), fixed, band_hz, None
@@ -278,7 +280,7 @@ def _select_with_known_impacts(
         candidate_set, determined_orders, compute=should_compute_profiles
     )
     leading_candidates = candidate_set.with_leading_candidate(candidate_set.freest)
-    check = ModelCheck.of(
+    check = ModelCheck.run(
         leading_candidates, modal_fit, band_hz, model.nonlinear_forces, model.temporal_changes
     )
     alpha_verdict, lambda_verdict = (
@@ -287,10 +289,10 @@ def _select_with_known_impacts(
     )
     order_verdicts = alpha_verdict, lambda_verdict
     reported_headline = headline(
-        candidate_set, order_verdicts, visible_numbers, unexplained=check.model_reason
+        candidate_set, order_verdicts, visible_numbers, unexplained_reason=check.model_reason
     )
     if check.doubt_reason is not None:
-        reported_headline = reported_headline.doubted(check.doubt_reason)
+        reported_headline = reported_headline.with_flag_on_all(check.doubt_reason)
     reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)
     reported_headline = flag_modes_changed_by_drag(reported_headline, model.modes_changed_by_drag)
     effect_findings = model.findings
@@ -341,7 +343,7 @@ def _select_with_known_impacts(
         candidates=candidate_set.candidates,
         linear_candidates=linear_candidates.candidates,
         headline=reported_headline,
-        analysis=RecordAnalysis.of(
+        analysis=RecordAnalysis.from_fits(
             (c.fit for c in candidate_set.candidates), candidate_set.noise, candidate_set.comparison
         ),
         verdict=Verdict(
@@ -412,7 +414,7 @@ def _add_modal_model(
         return exact_headline
     estimate_with_tolerance = None
     if measurement.axis_tilt_deg:
-        exact_headline = exact_headline.doubted(_TILTED_AXIS_REASON)
+        exact_headline = exact_headline.with_flag_on_all(_TILTED_AXIS_REASON)
     if measurement.uniformity or beam_test.status == "refused" or measurement.axis_tilt_deg:
         estimate_with_tolerance = tolerant_estimate(
             check.modal_fit,
@@ -471,7 +473,9 @@ def _fit_freest_with_known_impacts(
     measurement: Measurement, band_hz: tuple[float, float]
 ) -> _Assessment[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
     """Fit the structure with most free parameters, with the impacts that the measurement states."""
-    misread_findings = tuple(sign_and_unit_findings(Comparison.of(measurement, band_hz)))
+    misread_findings = tuple(
+        sign_and_unit_findings(Comparison.from_measurement(measurement, band_hz))
+    )
     additional_structures = () if misread_findings else (ORDER_ONE_STRUCTURE,)
     candidate_set = replace(
         CandidateSet.fit_freest_structure(measurement, (), band_hz, additional_structures),
@@ -488,13 +492,13 @@ def _fit_freest_with_known_impacts(
     if modes_with_drag is not None:
         modal_fit = modes_with_drag.modal_fit
     visible_numbers = visible_mode_numbers(candidate_set, modal_fit)
-    check = ModelCheck.of(candidate_set, modal_fit, band_hz)
+    check = ModelCheck.run(candidate_set, modal_fit, band_hz)
     reported_headline = headline_of_fit(
         candidate_set.best.name,
         candidate_set.best.fit,
         visible_numbers,
         {} if misread_findings else _unidentifiable_orders(candidate_set, visible_numbers),
-        unexplained=check.model_reason,
+        unexplained_reason=check.model_reason,
         both=None if misread_findings else candidate_set.fit_with_both_dampings(candidate_set.best),
     )
     beam_test = _uniform_beam_test(measurement, modal_fit)
@@ -504,13 +508,13 @@ def _fit_freest_with_known_impacts(
         reported_headline, () if modes_with_drag is None else (modes_with_drag.finding(),)
     )
     if check.clipped_reason is not None:
-        reported_headline = reported_headline.doubted(check.clipped_reason)
+        reported_headline = reported_headline.with_flag_on_all(check.clipped_reason)
     other_fits = (
         candidate.fit
         for candidate in candidate_set.candidates
         if candidate.structure is ORDER_ONE_STRUCTURE
     )
-    record_analysis = RecordAnalysis.of(
+    record_analysis = RecordAnalysis.from_fits(
         (reported_headline.fit, *other_fits), candidate_set.noise, candidate_set.comparison
     )
     return _Assessment((reported_headline, all_findings, record_analysis), check)

@@ -16,7 +16,7 @@ import numpy as np
 
 from analysis.identify._finding import Finding
 from analysis.identify._nonlinear import NonlinearForceSpectra, NonlinearTerm
-from analysis.identify._time_varying import UNIT_PLAY_RAD, play_spectrum
+from analysis.identify._time_varying import UNIT_BACKLASH_RAD, backlash_spectrum
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -55,28 +55,28 @@ class SmallEffect:
     ----------
     kind : str
         Kind of the `Finding` on the effect.
-    words : str
+    phrase : str
         Description of the effect, as the beginning of a sentence.
     column : ndarray of complex, shape (K,)
         Spectrum of the torque by the effect, in N·m per unit of its size.
-    saved : float
+    deviance_reduction : float
         Reduction of deviance by the effect.
     """
 
     kind: Kind
-    words: str
+    phrase: str
     column: NDArray[np.complex128]
-    saved: float
+    deviance_reduction: float
 
     @property
-    def linear(self) -> bool:
+    def is_linear(self) -> bool:
         """Return whether the torque by this effect is proportional to the size of the effect."""
         return self.kind in _EXACT_KINDS
 
     @property
-    def large(self) -> bool:
+    def is_large(self) -> bool:
         """Return whether the nonlinear effect is so large that it needs a model of its own."""
-        return self.saved > LARGE_DEVIANCE_REDUCTION and not self.linear
+        return self.deviance_reduction > LARGE_DEVIANCE_REDUCTION and not self.is_linear
 
     def significant_with(self, modal_fit: ModalFit) -> bool:
         """Return whether the effect would improve a modal model that contains other effects."""
@@ -88,9 +88,9 @@ class SmallEffect:
         return Finding(
             kind=self.kind,
             sentence=(
-                f"{self.words} would explain part of the record (chi-square {self.saved:.0f} with "
-                "1 degree of freedom). It was fitted to first order with the modes, and is not "
-                "established."
+                f"{self.phrase} would explain part of the record (chi-square "
+                f"{self.deviance_reduction:.0f} with 1 degree of freedom). It was fitted to first "
+                "order with the modes, and is not established."
             ),
             remedy="Repeat the session at twice and at half the amplitude.",
         )
@@ -142,7 +142,7 @@ def _possible_effects(
     yield (
         "play",
         "Backlash between encoder and beam",
-        play_spectrum(comparison, plant) / UNIT_PLAY_RAD,
+        backlash_spectrum(comparison, plant) / UNIT_BACKLASH_RAD,
     )
     yield "friction", "Dry friction between sensor and beam", _friction_spectrum(comparison)
     model_torque_nm = comparison.prediction.torque(modal.model)[0]

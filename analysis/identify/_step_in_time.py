@@ -52,12 +52,12 @@ class StiffnessStep:
     relative_change: float
 
     @property
-    def named(self) -> bool:
+    def is_significant(self) -> bool:
         """Return whether the step is significant: its score is above `MIN_REPORTED_SCORE`."""
         return self.score > MIN_REPORTED_SCORE
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """Return size and time of the stiffness step in words, as part of a sentence."""
         percent = float(f"{100 * self.relative_change:.1g}")
         return (

@@ -19,7 +19,7 @@ from analysis.identify._structure_plant import StructureUnknowns
 from analysis.identify._uncertainty import covariance_of_unknowns
 from analysis.identify.parametrization import Unknowns
 from analysis.models import UNDAMPED
-from analysis.optimizer import Box
+from analysis.optimizer import ConstantBounds
 from analysis.statistics import BIC_DECISIVE
 from rigd.beam import LOGARITHMIC_PARAMETERS
 from rigd.plugins import plugin_errors
@@ -134,7 +134,9 @@ def fit_structure(
         return None
     noise = selection.analysis.noise
     comparison = selection.analysis.comparison
-    settings = Unknowns.of(UNDAMPED, comparison.measurement.nominal, free_settings(fixed))
+    settings = Unknowns.for_structure(
+        UNDAMPED, comparison.measurement.nominal, free_settings(fixed)
+    )
     unknowns = StructureUnknowns(
         structure,
         settings.nominal,
@@ -142,7 +144,7 @@ def fit_structure(
         settings.omega_rad_s,
         comparison.poles(best.fit.plant),
     )
-    region = Box(*unknowns.bounds)
+    region = ConstantBounds(*unknowns.bounds)
     with plugin_errors(plugin):
         try:
             objective = Objective(comparison, unknowns)

@@ -67,13 +67,13 @@ _RIVAL_BIC_FRACTION: Final = 0.75
 """Fraction of the BIC advantage of another explanation that an effect must be predicted to reach.
 The first order predicts this advantage to a tenth."""
 
-UNIT_PLAY_RAD: Final = 1e-4
+UNIT_BACKLASH_RAD: Final = 1e-4
 """Backlash that corresponds to 1 of the fitted size, in rad."""
 
 _CLOCK_UNIT: Final = 1e-5
 """Relative difference of the clock rates that corresponds to 1 of the fitted size."""
 
-_SIZE_UNITS: Final[Mapping[Effect, float]] = {"play": UNIT_PLAY_RAD, "clock": _CLOCK_UNIT}
+_SIZE_UNITS: Final[Mapping[Effect, float]] = {"play": UNIT_BACKLASH_RAD, "clock": _CLOCK_UNIT}
 """Value that corresponds to 1 of the fitted size, by effect. It is 1 for the other effects."""
 
 _TAYLOR_TERMS: Final = 16
@@ -112,7 +112,7 @@ class TemporalChange:
         return _EFFECT_NAMES[self.what]
 
     @property
-    def certain(self) -> bool:
+    def is_certain(self) -> bool:
         """Return whether no model without this change explains the record as well."""
         return self.bic_difference < -BIC_DECISIVE
 
@@ -128,18 +128,18 @@ def find_temporal_changes(
     """
     if candidate_set.misread:
         return candidate_set, ()
-    play_angle = _play_angle(candidate_set.comparison)
+    backlash_angle = _backlash_angle(candidate_set.comparison)
     highest_bic = candidate_set.best.bic + min(
         BIC_DECISIVE, _RIVAL_BIC_FRACTION * (rival_bic - candidate_set.bic)
     )
     fitted_changes: dict[Effect, tuple[float, Refit]] = {}
     for candidate in _candidates_to_test(candidate_set):
         for changing_property, predicted_bic in _promising_changes(
-            candidate_set, candidate, play_angle, highest_bic
+            candidate_set, candidate, backlash_angle, highest_bic
         ):
             if predicted_bic < fitted_changes.get(changing_property, (math.inf,))[0]:
                 best_refit, bic = _fit_with_change(
-                    candidate_set, candidate, changing_property, play_angle
+                    candidate_set, candidate, changing_property, backlash_angle
                 )
                 if bic < fitted_changes.get(changing_property, (math.inf,))[0]:
                     fitted_changes[changing_property] = (bic, best_refit)
@@ -164,7 +164,7 @@ def find_temporal_changes(
         for c, _ in possible_changes
         if c.bic_difference < best_change.bic_difference + BIC_DECISIVE
     )
-    if not best_change.certain or len(equivalent_changes) > 1:
+    if not best_change.is_certain or len(equivalent_changes) > 1:
         return candidate_set, equivalent_changes
     return candidate_set.refit_with_effect_spectra(
         best_refit.columns, best_refit.residual_noise()
@@ -197,7 +197,7 @@ def _candidates_to_test(candidate_set: CandidateSet) -> Iterator[Candidate]:
 def _promising_changes(
     candidate_set: CandidateSet,
     candidate: Candidate,
-    play_angle: NDArray[np.float64],
+    backlash_angle: NDArray[np.float64],
     highest_bic: float,
 ) -> Iterator[tuple[Effect, float]]:
     """Yield the changes that would make a candidate the best one, with their predicted BIC.
@@ -205,7 +205,7 @@ def _promising_changes(
     A change must reduce the deviance significantly, and its BIC must be below `highest_bic`.
     """
     candidate_refit = candidate_set.refit(candidate, 1)
-    effect_spectra = _torque_spectra(candidate_set.comparison, candidate.fit.plant, play_angle)
+    effect_spectra = _torque_spectra(candidate_set.comparison, candidate.fit.plant, backlash_angle)
     cost_reductions = candidate_refit.cost_reduction_by_spectrum(
         np.array(list(effect_spectra.values()))
     )
@@ -223,7 +223,7 @@ def _fit_with_change(
     candidate_set: CandidateSet,
     candidate: Candidate,
     changing_property: Effect,
-    play_angle: NDArray[np.float64],
+    backlash_angle: NDArray[np.float64],
 ) -> tuple[Refit, float]:
     """Fit a candidate with one change along the record. Return the fit and its BIC."""
     change_refit = candidate_set.refit(candidate, 1)
@@ -231,7 +231,11 @@ def _fit_with_change(
     change_size = 0.0
     for _ in range(_MAX_SIZE_FITS):
         change_spectrum = _torque_spectrum(
-            candidate_set.comparison, change_refit.plant, play_angle, changing_property, change_size
+            candidate_set.comparison,
+            change_refit.plant,
+            backlash_angle,
+            changing_property,
+            change_size,
         )
         added_spectra = np.concatenate([candidate_set.columns, change_spectrum[None]])
         cost_before = change_refit.cost
@@ -252,13 +256,13 @@ def _fit_with_change(
 
 
 def _torque_spectra(
-    comparison: Comparison, plant: Plant, play_angle: NDArray[np.float64]
+    comparison: Comparison, plant: Plant, backlash_angle: NDArray[np.float64]
 ) -> dict[Effect, NDArray[np.complex128]]:
     """Return the torque spectrum of each possible change per unit of its size, each (K,)."""
     torque_slopes = _torque_slopes(comparison, plant)
     return {
         changing_property: _torque_spectrum(
-            comparison, plant, play_angle, changing_property, 0.0, torque_slopes
+            comparison, plant, backlash_angle, changing_property, 0.0, torque_slopes
         )
         for changing_property in _EFFECT_NAMES
     }
@@ -282,7 +286,7 @@ def _torque_slopes(comparison: Comparison, plant: Plant) -> dict[Effect, NDArray
 def _torque_spectrum(
     comparison: Comparison,
     plant: Plant,
-    play_angle: NDArray[np.float64],
+    backlash_angle: NDArray[np.float64],
     changing_property: Effect,
     change_size: float,
     torque_slopes: Mapping[Effect, NDArray[np.float64]] | None = None,
@@ -292,7 +296,9 @@ def _torque_spectrum(
     `torque_slopes` is the result of `_torque_slopes`, if it is known already.
     """
     if changing_property == "play":
-        return comparison.spectrum(comparison.prediction.with_angle(play_angle).torque(plant)[0])
+        return comparison.spectrum(
+            comparison.prediction.with_angle(backlash_angle).torque(plant)[0]
+        )
     if changing_property == "clock":
         return comparison.spectrum(_clock_torque(comparison, plant, change_size))
     unit_ramp = np.linspace(-0.5, 0.5, comparison.samples)
@@ -324,15 +330,15 @@ def _clock_torque(comparison: Comparison, plant: Plant, change_size: float) -> N
     return torque_change
 
 
-def play_spectrum(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Return the spectrum of the torque change in N·m by a backlash of `UNIT_PLAY_RAD`, (K,)."""
-    return _torque_spectrum(comparison, plant, _play_angle(comparison), "play", 0.0)
+def backlash_spectrum(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
+    """Return the torque spectrum in N·m of a backlash of `UNIT_BACKLASH_RAD`, shape (K,)."""
+    return _torque_spectrum(comparison, plant, _backlash_angle(comparison), "play", 0.0)
 
 
-def _play_angle(comparison: Comparison) -> NDArray[np.float64]:
+def _backlash_angle(comparison: Comparison) -> NDArray[np.float64]:
     """Return the hub angle minus the shaft angle under backlash, in rad, at the decimated rate."""
     highest_hz = float(comparison.frequency_hz[-1])
-    half_play_rad, hub_angle_rad, hub_angles_rad = UNIT_PLAY_RAD / 2, 0.0, []
+    half_play_rad, hub_angle_rad, hub_angles_rad = UNIT_BACKLASH_RAD / 2, 0.0, []
     shaft_angle_rad = comparison.measurement.angle_from_rest(highest_hz)
     for sample_angle_rad in shaft_angle_rad.tolist():
         # A comparison each: min and max take three times as long, at every tick of the record.
@@ -459,7 +465,9 @@ _FINDING_KINDS: Final[dict[Effect, Kind]] = {
 """Kind of the finding on each effect."""
 
 
-def established(equivalent_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -> bool:
+def is_single_change_established(
+    equivalent_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool
+) -> bool:
     """Return whether the record establishes exactly one change as its explanation.
 
     A change with time is never established by one sweep: it may depend on frequency instead.
@@ -472,7 +480,7 @@ def established(equivalent_changes: tuple[TemporalChange, ...], *, is_single_swe
     is_single_sweep : bool
         Whether the excitation is a single sweep.
     """
-    if len(equivalent_changes) != 1 or not equivalent_changes[0].certain:
+    if len(equivalent_changes) != 1 or not equivalent_changes[0].is_certain:
         return False
     return equivalent_changes[0].what == "play" or not is_single_sweep
 
@@ -491,7 +499,7 @@ def temporal_change_findings(
     """
     for change in equivalent_changes:
         finding = _established_finding(change)
-        if established(equivalent_changes, is_single_sweep=is_single_sweep):
+        if is_single_change_established(equivalent_changes, is_single_sweep=is_single_sweep):
             yield finding
         else:
             rival_names = "the others named" if len(equivalent_changes) > 1 else "any other model"

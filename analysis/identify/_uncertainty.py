@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._estimates import DampingSize, ModeEstimate, Ringing
+from analysis.identify._estimates import ModeEstimate, PivotLossFactor, Ringing
 from analysis.identify.free_decay import count_decay_spectra
 from analysis.statistics import NORMAL_95
 from rigd.beam import LOGARITHMIC_PARAMETERS
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify._problem import Projected
+    from analysis.identify._problem import ProjectedResidual
     from analysis.identify.parametrization import Unknowns
     from rigd.beam import Pole
 
@@ -88,8 +88,8 @@ class ParameterUncertainty:
     determined: tuple[str, ...]
     covariance: NDArray[np.float64]
     at_bounds: tuple[str, ...]
-    internal: DampingSize | None
-    external: DampingSize | None
+    internal: PivotLossFactor | None
+    external: PivotLossFactor | None
 
 
 def parameter_uncertainty(
@@ -157,7 +157,7 @@ def parameter_uncertainty(
             for parameter_name, is_held in zip(parameter_names, at_bound, strict=True)
             if is_held
         ),
-        internal=damping_size(
+        internal=pivot_loss_factor(
             "zeta",
             "alpha",
             parameter_values,
@@ -165,7 +165,7 @@ def parameter_uncertainty(
             determined_covariance,
             first_omega_rad_s,
         ),
-        external=damping_size(
+        external=pivot_loss_factor(
             "gamma",
             "lambda",
             parameter_values,
@@ -211,14 +211,14 @@ def interval_from_zero(estimated_value: float, std: float) -> tuple[float, float
 # Loss factor at its pivot frequency
 
 
-def damping_size(
+def pivot_loss_factor(
     coefficient_name: str,
     order_name: str,
     parameter_values: dict[str, float],
     determined_names: Sequence[str],
     covariance: NDArray[np.float64],
-    least_omega_rad_s: float,
-) -> DampingSize | None:
+    min_omega_rad_s: float,
+) -> PivotLossFactor | None:
     """Return the loss factor of a damping at its pivot frequency, or None if undetermined.
 
     At the pivot frequency the loss factor depends least on the order. A record determines the loss
@@ -235,14 +235,14 @@ def damping_size(
         Names of the determined parameters.
     covariance : ndarray, shape (k, k)
         Covariance of the determined parameters, with coefficients as logarithms.
-    least_omega_rad_s : float
+    min_omega_rad_s : float
         Smallest pivot frequency: that of the first mode, below which no mode vibrates.
     """
     if coefficient_name not in determined_names:
         return None
     i = list(determined_names).index(coefficient_name)
     if order_name not in determined_names:
-        return DampingSize(
+        return PivotLossFactor(
             None,
             parameter_values[coefficient_name],
             parameter_values[coefficient_name] * covariance[i, i] ** 0.5,
@@ -258,7 +258,7 @@ def damping_size(
     # At this derivative of ln loss by the order, ln loss and order are uncorrelated:
     pivot_slope = -float(ln_loss_gradient @ covariance[:, j]) / covariance[j, j]
     phase_term = math.pi / 2 / math.tan(order_phase_rad)
-    ln_omega = max(pivot_slope - phase_term, math.log(least_omega_rad_s))
+    ln_omega = max(pivot_slope - phase_term, math.log(min_omega_rad_s))
     if abs(ln_omega) > _MAX_LN_PIVOT_FREQUENCY:
         return None  # an almost undetermined order has no pivot frequency
     ln_loss_gradient[j] = ln_omega + phase_term
@@ -266,7 +266,9 @@ def damping_size(
     loss_factor = parameter_values[coefficient_name] / inertia_scale * math.sin(order_phase_rad)
     loss_factor *= math.exp((parameter_values[order_name] - inertia_power) * ln_omega)
     relative_variance = max(float(ln_loss_gradient @ covariance @ ln_loss_gradient), 0.0)
-    return DampingSize(math.exp(ln_omega), loss_factor, loss_factor * math.sqrt(relative_variance))
+    return PivotLossFactor(
+        math.exp(ln_omega), loss_factor, loss_factor * math.sqrt(relative_variance)
+    )
 
 
 # Modes
@@ -324,7 +326,7 @@ def _propagated_std(derivatives: NDArray[np.float64], covariance: NDArray[np.flo
 
 def ringing(
     poles: Sequence[Pole],
-    projected: Projected,
+    projected: ProjectedResidual,
     residual_variance: float,
     projected_spectra: NDArray[np.complex128],
     hum_spectra: NDArray[np.complex128],

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
-    from analysis.identify._estimates import DampingSize, ModeEstimate
+    from analysis.identify._estimates import ModeEstimate, PivotLossFactor
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._result import RecordFit
@@ -96,7 +96,7 @@ class ReportedLossFactor:
     omega_rad_s : float or None
         Pivot frequency in rad/s. None if the order is fixed: `size` is the coefficient then.
     size : Estimate
-        Value of the loss factor, as in `DampingSize`.
+        Value of the loss factor, as in `PivotLossFactor`.
     """
 
     damping: Damping
@@ -108,7 +108,7 @@ class ReportedLossFactor:
         """Return the name of the order of this damping: "alpha" or "lambda"."""
         return DAMPING_PARAMETER_NAMES[self.damping][1]
 
-    def flagged(self, flag: str | None) -> ReportedLossFactor:
+    def with_flag(self, flag: str | None) -> ReportedLossFactor:
         """Return the loss factor with a flag, unless it already has one.
 
         Parameters
@@ -116,7 +116,7 @@ class ReportedLossFactor:
         flag : str or None
             Reason why the loss factor is not valid. None changes nothing.
         """
-        return replace(self, size=self.size.flagged(flag))
+        return replace(self, size=self.size.with_flag(flag))
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +183,7 @@ class Estimates:
     tolerant: TolerantEstimate | None = None
     modal: ModalEstimate | None = None
 
-    def doubted(self, flag: str) -> Self:
+    def with_flag_on_all(self, flag: str) -> Self:
         """Return the estimates with a given flag on every number that has no flag yet.
 
         Parameters
@@ -194,15 +194,15 @@ class Estimates:
         return replace(
             self,
             parameters={
-                parameter_name: each.flagged(flag)
+                parameter_name: each.with_flag(flag)
                 for parameter_name, each in self.parameters.items()
             },
-            sizes=tuple(each.flagged(flag) for each in self.sizes),
+            sizes=tuple(each.with_flag(flag) for each in self.sizes),
             modes=tuple(
                 replace(
                     each,
-                    frequency_hz=each.frequency_hz.flagged(flag),
-                    damping_ratio=each.damping_ratio.flagged(flag),
+                    frequency_hz=each.frequency_hz.with_flag(flag),
+                    damping_ratio=each.damping_ratio.with_flag(flag),
                 )
                 for each in self.modes
             ),
@@ -245,13 +245,13 @@ class Headline(Estimates):
         return replace(
             self,
             parameters={
-                name: each.flagged(_STIFFNESS_LAW_FLAG)
+                name: each.with_flag(_STIFFNESS_LAW_FLAG)
                 if name == "density_over_stiffness"
                 else each
                 for name, each in self.parameters.items()
             },
             modes=tuple(
-                replace(each, frequency_hz=each.frequency_hz.flagged(_STIFFNESS_LAW_FLAG))
+                replace(each, frequency_hz=each.frequency_hz.with_flag(_STIFFNESS_LAW_FLAG))
                 for each in self.modes
             ),
         )
@@ -272,7 +272,7 @@ def headline(
     order_verdicts: tuple[OrderVerdict, OrderVerdict],
     visible_numbers: tuple[int, ...],
     *,
-    unexplained: str | None,
+    unexplained_reason: str | None,
 ) -> Headline:
     """Return the headline from the freest structure of a candidate set.
 
@@ -284,7 +284,7 @@ def headline(
         Verdicts on alpha and lambda.
     visible_numbers : tuple of int
         Numbers of the visible modes.
-    unexplained : str or None
+    unexplained_reason : str or None
         Reason against every number. None if the residual is noise only.
     """
     freest = candidate_set.freest
@@ -300,16 +300,19 @@ def headline(
         if each.profile.is_computed and each.order in freest.structure.free
     }
     reported_headline = headline_of_fit(
-        freest.name, freest.fit, visible_numbers, order_reasons, order_intervals, unexplained,
-        candidate_set.fit_with_both_dampings(freest),
+        freest.name, freest.fit, visible_numbers, order_reasons, order_intervals,
+        unexplained_reason, candidate_set.fit_with_both_dampings(freest),
     )  # fmt: skip
     if candidate_set.drag is not None:
         drag_estimate = candidate_set.drag
         reported_drag = Estimate(
-            drag_estimate.value_m, drag_estimate.std_m, drag_estimate.interval_95_m, unexplained
+            drag_estimate.value_m,
+            drag_estimate.std_m,
+            drag_estimate.interval_95_m,
+            unexplained_reason,
         )
         loss_factors = (
-            each.flagged(WITH_DRAG_REASON) if each.damping == "external" else each
+            each.with_flag(WITH_DRAG_REASON) if each.damping == "external" else each
             for each in reported_headline.sizes
         )
         reported_headline = replace(
@@ -319,7 +322,9 @@ def headline(
             drag_speed_m_s=drag_estimate.speed_m_s,
         )
     conditional_estimate = (
-        _conditional_estimate(candidate_set, fractional_orders) if unexplained is None else None
+        _conditional_estimate(candidate_set, fractional_orders)
+        if unexplained_reason is None
+        else None
     )
     return replace(
         reported_headline,
@@ -334,7 +339,7 @@ def headline_of_fit(
     visible_numbers: Collection[int],
     order_reasons: Mapping[str, str] = _EMPTY_MAPPING,
     order_intervals: Mapping[str, tuple[float, float]] = _EMPTY_MAPPING,
-    unexplained: str | None = None,
+    unexplained_reason: str | None = None,
     both: tuple[RecordFit, bool] | None = None,
 ) -> Headline:
     """Return the headline of one fit, with flags on the numbers that are not valid.
@@ -351,7 +356,7 @@ def headline_of_fit(
         Reasons against "alpha" or "lambda", which also apply to the coefficients.
     order_intervals : mapping of str to (float, float)
         95 % intervals of orders, used instead of those of the fit.
-    unexplained : str, optional
+    unexplained_reason : str, optional
         Reason against all numbers.
     both : tuple of (RecordFit, bool), optional
         Result of `CandidateSet.fit_with_both_dampings`: the fit with both dampings, for the modes.
@@ -372,7 +377,10 @@ def headline_of_fit(
         fit=fit,
         parameters={
             each: _reported_parameter(
-                fit, each, unexplained or parameter_flags.get(each), order_intervals.get(each)
+                fit,
+                each,
+                unexplained_reason or parameter_flags.get(each),
+                order_intervals.get(each),
             )
             for each in fit.parameters
             if fit.structure.has(each)
@@ -382,7 +390,7 @@ def headline_of_fit(
             reported_loss_factor(
                 each,
                 loss_factor,
-                unexplained
+                unexplained_reason
                 or (
                     order_reasons.get(DAMPING_PARAMETER_NAMES[each][1])
                     if loss_factor.omega_rad_s is None
@@ -394,7 +402,7 @@ def headline_of_fit(
             if loss_factor is not None
         ),
         modes=tuple(
-            _reported_mode(mode_estimate, visible_numbers, unexplained)
+            _reported_mode(mode_estimate, visible_numbers, unexplained_reason)
             for mode_estimate in (
                 _modes_with_wider_uncertainty(fit, with_both) if uses_both else with_both.modes
             )
@@ -403,7 +411,7 @@ def headline_of_fit(
         structures=((name, "selected"),),
         simpler=None,
         drag_speed_m_s=None,
-        explained=unexplained is None,
+        explained=unexplained_reason is None,
     )
 
 
@@ -516,7 +524,7 @@ def _reported_parameter(
 
 
 def reported_loss_factor(
-    damping: Damping, damping_size: DampingSize, invalid_reason: str | None
+    damping: Damping, pivot_loss_factor: PivotLossFactor, invalid_reason: str | None
 ) -> ReportedLossFactor:
     """Return the loss factor of a damping as reported, with 95 % interval and flag.
 
@@ -524,21 +532,21 @@ def reported_loss_factor(
     ----------
     damping : str
         "internal" or "external".
-    damping_size : DampingSize
+    pivot_loss_factor : PivotLossFactor
         Estimated loss factor.
     invalid_reason : str or None
         Flag of the reported value. None if it is valid.
     """
     # A loss factor is positive and uncertain by a factor, so its interval is logarithmic.
-    relative_half_width = NORMAL_95 * damping_size.std / damping_size.value
+    relative_half_width = NORMAL_95 * pivot_loss_factor.std / pivot_loss_factor.value
     interval_95 = (
-        damping_size.value * math.exp(-relative_half_width),
-        damping_size.value * math.exp(min(relative_half_width, 300.0)),
+        pivot_loss_factor.value * math.exp(-relative_half_width),
+        pivot_loss_factor.value * math.exp(min(relative_half_width, 300.0)),
     )
     return ReportedLossFactor(
         damping,
-        damping_size.omega_rad_s,
-        Estimate(damping_size.value, damping_size.std, interval_95, invalid_reason),
+        pivot_loss_factor.omega_rad_s,
+        Estimate(pivot_loss_factor.value, pivot_loss_factor.std, interval_95, invalid_reason),
     )
 
 

@@ -18,8 +18,8 @@ Where damping is larger than the stiffness or inertia it adds to, loss and order
 other: the record determines only the phase theta of ``1 ± size exp(j order pi/2)``, and at constant
 theta loss and order vary over many powers of ten. A straight step leaves this curve at once, and a
 descent with straight steps takes a hundred of them. So a step is taken along ``ln tan(theta/2)``
-and the order instead of ``ln loss`` and the order (`Steps`). Where the damping is small the two are
-the same.
+and the order instead of ``ln loss`` and the order (`StepRule`). Where the damping is small the two
+are the same.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Unknowns:
     omega_rad_s: tuple[float, float]
 
     @classmethod
-    def of(
+    def for_structure(
         cls, structure: Structure, nominal: Plant, free_settings: tuple[Setting, ...]
     ) -> Unknowns:
         """Return the unknowns of a structure with some settings of the rig free.
@@ -187,36 +187,36 @@ class Unknowns:
         }
         unknown_values |= self._linear_unknowns(plant)
         if damping.zeta > 0:
-            damping_size, damping_phase_rad = (
+            pivot_loss_factor, damping_phase_rad = (
                 damping.zeta * second_omega_rad_s**damping.alpha,
                 _QUARTER_TURN_RAD * damping.alpha,
             )
             unknown_values["zeta"], unknown_values["alpha"] = (
-                math.log(damping_size * math.sin(damping_phase_rad)),
+                math.log(pivot_loss_factor * math.sin(damping_phase_rad)),
                 damping.alpha,
             )
             ln_stiffening = math.log(
                 abs(
                     1
-                    + damping_size
+                    + pivot_loss_factor
                     * complex(math.cos(damping_phase_rad), math.sin(damping_phase_rad))
                 )
             )
             ln_ratio -= ln_stiffening
             ln_stiffness += ln_stiffening
         if damping.gamma > 0:
-            damping_size = (
+            pivot_loss_factor = (
                 damping.gamma / density_over_stiffness * first_omega_rad_s ** (damping.lambda_ - 2)
             )
             damping_phase_rad = _QUARTER_TURN_RAD * damping.lambda_
             unknown_values["gamma"], unknown_values["lambda"] = (
-                math.log(damping_size * math.sin(damping_phase_rad)),
+                math.log(pivot_loss_factor * math.sin(damping_phase_rad)),
                 damping.lambda_,
             )
             ln_ratio += math.log(
                 abs(
                     1
-                    - damping_size
+                    - pivot_loss_factor
                     * complex(math.cos(damping_phase_rad), math.sin(damping_phase_rad))
                 )
             )
@@ -409,7 +409,7 @@ _MAX_GROWTH_EXPONENT: Final = 50.0
 
 
 @dataclass(frozen=True, slots=True)
-class Steps:
+class StepRule:
     """Rule of the steps of a descent: their curve in the space of the unknowns, and limits.
 
     Attributes
@@ -434,7 +434,7 @@ class Steps:
     linear_below: float = 0.0
 
     @classmethod
-    def of(cls, unknowns: Unknowns, linear_below: float = 0.0) -> Steps:
+    def for_unknowns(cls, unknowns: Unknowns, linear_below: float = 0.0) -> StepRule:
         """Return the rule of the steps for the unknowns of a structure.
 
         Parameters
@@ -532,11 +532,11 @@ def _loss_and_phase_after_step(
     The phase changes from `phase_before` to `phase_after`. If no loss up to `largest_loss` gives
     the required phase, the largest loss is combined with the phase that it gives.
     """
-    damping_size = loss_factor / math.sin(phase_before)
-    real_part = 1 + damping_size * math.cos(phase_before)
+    pivot_loss_factor = loss_factor / math.sin(phase_before)
+    real_part = 1 + pivot_loss_factor * math.cos(phase_before)
     # d ln tan(theta/2) = (d ln loss + size / sin(turn) d turn) / |1 + size exp(j turn)|
     ln_tan_step = (
-        ln_loss_step + damping_size / math.sin(phase_before) * (phase_after - phase_before)
+        ln_loss_step + pivot_loss_factor / math.sin(phase_before) * (phase_after - phase_before)
     ) / math.hypot(real_part, loss_factor)
     if ln_tan_step <= -1 and loss_factor < VANISHING_LOSS:
         return (

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 # Profile
 
-Order = Literal["alpha", "lambda"]
+OrderName = Literal["alpha", "lambda"]
 """Name of a damping order: alpha of internal, lambda of external damping."""
 
 MAX_IDENTIFIABLE_FRACTION: Final = 0.25
@@ -69,7 +69,7 @@ class LikelihoodProfile:
         Reduction of deviance by freeing the order. 0 if the order was free in the candidate.
     """
 
-    order: Order
+    order: OrderName
     structure: str
     values: tuple[float, ...]
     deviance: tuple[float, ...]
@@ -81,7 +81,7 @@ class LikelihoodProfile:
     gain: float
 
     @classmethod
-    def undetermined(cls, candidate: Candidate, order: Order) -> LikelihoodProfile:
+    def undetermined(cls, candidate: Candidate, order: OrderName) -> LikelihoodProfile:
         """Return the profile of an order that was not profiled: one value, the whole range 0 to 2.
 
         Parameters
@@ -143,7 +143,7 @@ class ProfileWithPlants:
 def profile(
     candidate_set: CandidateSet,
     candidate: Candidate,
-    order: Order,
+    order: OrderName,
     *,
     search_other_minima: bool = True,
 ) -> ProfileWithPlants:
@@ -196,7 +196,7 @@ def profile(
     )
 
 
-_BOTH_ORDERS: Final[tuple[Order, Order]] = ("alpha", "lambda")
+_BOTH_ORDERS: Final[tuple[OrderName, OrderName]] = ("alpha", "lambda")
 """Orders of internal and external damping, as they are returned."""
 
 _MAX_ROUNDS: Final = 3
@@ -204,7 +204,7 @@ _MAX_ROUNDS: Final = 3
 
 
 def profile_both_orders(
-    candidate_set: CandidateSet, determined: Collection[Order] = (), *, compute: bool = True
+    candidate_set: CandidateSet, determined: Collection[OrderName] = (), *, compute: bool = True
 ) -> tuple[CandidateSet, LikelihoodProfile, LikelihoodProfile]:
     """Compute the profiles of alpha and lambda in the freest structure.
 
@@ -313,7 +313,7 @@ _TRIAL_EVALUATIONS: Final = 8
 """Evaluations of the sum of squares at each order of this search."""
 
 
-def with_free_order(structure: Structure, order: Order) -> Structure:
+def with_free_order(structure: Structure, order: OrderName) -> Structure:
     """Return a structure with one order of its damping free.
 
     A missing damping is added, with a free coefficient.
@@ -347,7 +347,7 @@ class OrderProfiler:
         Order that is fixed at each value.
     """
 
-    def __init__(self, candidate_set: CandidateSet, candidate: Candidate, order: Order) -> None:
+    def __init__(self, candidate_set: CandidateSet, candidate: Candidate, order: OrderName) -> None:
         self.order = order
         self.structure = with_free_order(candidate.structure, order)
         self._candidate_set, self._value_count = candidate_set, candidate.values

@@ -98,7 +98,7 @@ class Whiteness:
     loud: bool
 
     @property
-    def white(self) -> bool:
+    def is_white(self) -> bool:
         """Return whether the power of the residual is distributed over frequency as noise is."""
         return self.probability > _NOT_WHITE_PROBABILITY and not self.loud
 

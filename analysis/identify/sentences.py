@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from analysis.identify._finding import Finding
     from analysis.identify.beam_uniformity import UniformBeamTest
     from analysis.identify.headline import ConditionalEstimate, Headline
-    from analysis.identify.profile_likelihood import Order
+    from analysis.identify.profile_likelihood import OrderName
     from analysis.identify.tolerant_estimate import TolerantEstimate
     from analysis.identify.verdict import OrderVerdict, Status
     from rigd.estimates import Estimate
@@ -34,7 +34,7 @@ _MIN_MODES_TO_SEPARATE_DAMPINGS: Final = 2
 _DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
 """Damping to which each order belongs, in words."""
 
-LOSS_NAMES: Final[Mapping[Order, str]] = {
+LOSS_NAMES: Final[Mapping[OrderName, str]] = {
     "alpha": "internal loss",
     "lambda": "external damping torque",
 }
@@ -155,7 +155,7 @@ def order_slope_sentence(headline: Headline, verdict: OrderVerdict) -> str:
 
 
 def loss_slope_sentence(
-    order: Order,
+    order: OrderName,
     order_value: float,
     order_interval: tuple[float, float],
     shown_hz: Sequence[float],

@@ -169,7 +169,7 @@ def tolerant_estimate(
         ("geometry", wider_tolerance, _PLAUSIBLE_P_VALUE_WIDER),
         ("losses", _LOOSE_TOLERANCE, MIN_P_VALUE_OF_UNIFORM_BEAM),
     )
-    for estimate_basis, frequency_tolerance, least_p_value in tolerance_attempts:
+    for estimate_basis, frequency_tolerance, min_p_value in tolerance_attempts:
         loss_tolerance = (
             0.0
             if is_uniform
@@ -192,7 +192,7 @@ def tolerant_estimate(
             if degrees_of_freedom > 0
             else None
         )
-        if p_value is None or p_value >= least_p_value:
+        if p_value is None or p_value >= min_p_value:
             break
     else:
         estimate_basis = "none"

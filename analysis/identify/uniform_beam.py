@@ -15,7 +15,7 @@ import numpy as np
 
 from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
 from analysis.identify._modal_model import MODE_CONSTANT_NAMES
-from analysis.optimizer import Box, NormalEquations, descend
+from analysis.optimizer import ConstantBounds, NormalEquations, descend
 from rigd.beam import (
     BEAM_PARAMETERS,
     DAMPING_PARAMETERS,
@@ -487,7 +487,7 @@ def _minimize_within_bounds(
     return descend(
         equations,
         x,
-        Box(lower_bounds, upper_bounds),
+        ConstantBounds(lower_bounds, upper_bounds),
         relative_tolerance=_COST_TOLERANCE,
         max_evaluations=_MAX_EVALUATIONS,
     )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._drag import DampingAtAmplitude
     from analysis.identify._finding import Finding
-    from analysis.identify.profile_likelihood import LikelihoodProfile, Order
+    from analysis.identify.profile_likelihood import LikelihoodProfile, OrderName
     from analysis.identify.residual_tests import Harmonic, InputRelation, Whiteness
     from analysis.models import Structure
 
@@ -74,7 +74,7 @@ class OrderVerdict:
         Deviance over the values of the order.
     """
 
-    order: Order
+    order: OrderName
     status: Status
     value: float | None
     interval: tuple[float, float] | None

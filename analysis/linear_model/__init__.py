@@ -1,6 +1,6 @@
 """Linear models of an identified antenna, for the design of controllers and for simulations.
 
-`identified_in_session` and `identified_in_document` return the result of an analysis;
+`identify_session` and `read_identified_model` return the result of an analysis;
 `linear_model` converts it to a state space with its error, its uncertainty and samples of the
 posterior.
 """

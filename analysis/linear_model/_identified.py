@@ -85,7 +85,7 @@ class IdentifiedModel:
     band_hz: tuple[float, float]
 
     @property
-    def gate(self) -> tuple[str, float | None]:
+    def uniform_beam_test(self) -> tuple[str, float | None]:
         """Return status and p-value of the test whether a uniform beam predicts the modes.
 
         The p-value is None if it was not tested.
@@ -334,7 +334,7 @@ class IdentifiedModel:
         )
 
 
-def identified_in_document(path: Path) -> IdentifiedModel:
+def read_identified_model(path: Path) -> IdentifiedModel:
     """Read the identified model from a document of ``analyze --json``.
 
     Parameters
@@ -387,7 +387,7 @@ def identified_in_document(path: Path) -> IdentifiedModel:
     )
 
 
-def identified_in_session(path: Path) -> IdentifiedModel:
+def identify_session(path: Path) -> IdentifiedModel:
     """Analyse the record of a session, and return the identified model.
 
     Parameters

@@ -53,45 +53,45 @@ def realise_response(
     """
     dynamics = fit.dynamics
     if order is not None:
-        least_states = len(dynamics.real_poles) + sum(each for _, each in dynamics.filters)
-        most_states = least_states + 2 * len(dynamics.pairs) + _MAX_REAL_POLES
+        min_states = len(dynamics.real_poles) + sum(each for _, each in dynamics.filters)
+        max_states = min_states + 2 * len(dynamics.pairs) + _MAX_REAL_POLES
         zero_real_poles = dict.fromkeys(range(len(dynamics.pairs) + 1), 0)
         realisation = _best_realisation(
-            fit, order - least_states, input_kind, zero_real_poles, np.inf
+            fit, order - min_states, input_kind, zero_real_poles, np.inf
         )
         if realisation is not None:
             return realisation
         raise LinearModelError(
             f"A stable model with {order} states was not found: the model may have "
-            f"{least_states} to {most_states} states, 2 for each of the {dynamics.in_band} modes "
+            f"{min_states} to {max_states} states, 2 for each of the {dynamics.in_band} modes "
             "in its band; state another number, or --order auto."
         )
-    least_real_poles = {
+    min_real_poles = {
         pair_count: bisect_left(
             range(_MAX_REAL_POLES + 1), True, key=partial(_real_poles_suffice, fit, pair_count)
         )
         for pair_count in range(dynamics.in_band, len(dynamics.pairs) + 1)
     }
-    least_real_poles = {
+    min_real_poles = {
         pair_count: real_pole_count
-        for pair_count, real_pole_count in least_real_poles.items()
+        for pair_count, real_pole_count in min_real_poles.items()
         if real_pole_count <= _MAX_REAL_POLES
     }
     smallest_state_count = min(
         (
             2 * pair_count + real_pole_count
-            for pair_count, real_pole_count in least_real_poles.items()
+            for pair_count, real_pole_count in min_real_poles.items()
         ),
         default=0,
     )
     largest_state_count = (
-        max((2 * pair_count for pair_count in least_real_poles), default=-1)
+        max((2 * pair_count for pair_count in min_real_poles), default=-1)
         + _MAX_REAL_POLES
         + _MAX_INTEGRATORS
     )
     for state_count in range(smallest_state_count, largest_state_count + 1):
         realisation = _best_realisation(
-            fit, state_count, input_kind, least_real_poles, MAX_RELATIVE_ERROR
+            fit, state_count, input_kind, min_real_poles, MAX_RELATIVE_ERROR
         )
         if realisation is not None:
             return realisation
@@ -153,20 +153,20 @@ def _best_realisation(
     fit: PoleFit,
     state_count: int,
     input_kind: InputKind,
-    least_real_poles: Mapping[int, int],
+    min_real_poles: Mapping[int, int],
     error_tolerance: float,
 ) -> tuple[PoleStructure, StateSpace] | None:
     """Return the most accurate stable state space within a tolerance, or None if there is none.
 
-    `least_real_poles` gives the admissible numbers of pairs and, for each, the smallest number of
+    `min_real_poles` gives the admissible numbers of pairs and, for each, the smallest number of
     real poles.
     """
     accurate_fits: list[tuple[float, int, PoleStructure, NDArray[np.float64]]] = []
     for pole_structure in (
         accurate_fit
-        for pair_count, least_real_pole_count in least_real_poles.items()
+        for pair_count, min_real_pole_count in min_real_poles.items()
         for accurate_fit in _structures_with_states(pair_count, state_count, input_kind)
-        if len(accurate_fit.added_real_poles_rad_s) >= least_real_pole_count
+        if len(accurate_fit.added_real_poles_rad_s) >= min_real_pole_count
     ):
         fit_coefficients, fit_error = fit.solve(pole_structure)
         if fit_error <= error_tolerance:

@@ -1,7 +1,8 @@
 """Welch method of the reference paper: Welch's estimate, fits of Eq. (26), and indices.
 
-`analyse` runs the whole method on a record. `estimate` only estimates the response, `fit_frf` and
-`fit_many` only fit models to a response. `fit_indices` and `peak_deviation` are Eqs. (28) to (32).
+Module `welch_analysis` runs the whole method on a record (`analyse`), and has the fit indices and
+peak deviations of Eqs. (28) to (32). `estimate` only estimates the response, `fit_frf` and
+`fit_many` only fit models to a response.
 The package follows the paper without corrections, for comparison, and is independent of
 `analysis.identify`.
 """

@@ -44,7 +44,7 @@ from analysis.models import (
     weighting_name,
     weights,
 )
-from analysis.optimizer import Box, Minimum, NormalEquations, RecentValues, descend
+from analysis.optimizer import ConstantBounds, Minimum, NormalEquations, RecentValues, descend
 from rigd.beam import DAMPING_PARAMETERS, Beam, Damping
 
 # Fits
@@ -189,7 +189,7 @@ def fit_many(
     grids_by_weighting: list[tuple[_FrequencyGrid, _FrequencyGrid]] = []
     for weighting in weightings:
         all_weights = weights(omega_rad_s, weighting)
-        point_index, point_weights = thinned(response, all_weights, _FEW_POINTS)
+        point_index, point_weights = representative_points(response, all_weights, _FEW_POINTS)
         thinned_model = FrequencyResponseModel(frequency_hz[point_index], beam, tool_inertia_kg_m2)
         grids_by_weighting.append(
             (
@@ -261,7 +261,7 @@ def _fit(
 ) -> FrfFit:
     """Fit a damping structure: descents on few points, then refinement on all points."""
     unknowns = DampingUnknowns.for_beam(structure, whole_grid.model.beam)
-    bounds = Box(*unknowns.bounds)
+    bounds = ConstantBounds(*unknowns.bounds)
     thinned_problem, whole_problem = (
         _FrfProblem(unknowns, few_points_grid),
         _FrfProblem(unknowns, whole_grid),
@@ -301,7 +301,7 @@ def _fit(
     )
 
 
-def _refine(frf_problem: _FrfProblem, rough_minimum: Minimum, bounds: Box) -> Minimum:
+def _refine(frf_problem: _FrfProblem, rough_minimum: Minimum, bounds: ConstantBounds) -> Minimum:
     """Continue a less accurate descent to the minimum."""
     return descend(
         frf_problem.normal_equations,
@@ -363,7 +363,7 @@ def _check_response(
 # Representative points
 
 
-def thinned(
+def representative_points(
     measured_response: NDArray[np.complex128], weights: NDArray[np.float64], point_count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Choose representative points of a response, densest near peaks and at large weights.
@@ -416,7 +416,7 @@ _START_GRID: Final[dict[str, tuple[float, ...]]] = {
 }
 """Values of the unknowns in the coarse grid. A coefficient is the logarithm of the damping relative
 to stiffness or inertia at a mode, about twice a damping ratio."""
-_MOST_STARTS: Final = 8
+_MAX_STARTS: Final = 8
 """Largest number of descents for each structure."""
 
 
@@ -443,7 +443,7 @@ def starting_points(
         is_minimum &= np.pad(cost_differences, pad_start) <= 0
     minimum_indices = np.flatnonzero(is_minimum)
     sorted_minima = minimum_indices[np.argsort(grid_costs.ravel()[minimum_indices])]
-    return [grid_points[i] for i in sorted_minima[:_MOST_STARTS]]
+    return [grid_points[i] for i in sorted_minima[:_MAX_STARTS]]
 
 
 # Covariance

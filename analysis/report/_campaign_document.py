@@ -35,7 +35,7 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
         ``headlines`` of each session and, with ``file`` null, of all sessions together;
         ``validity`` of the linear model for the least valid session; ``verdict`` on all sessions
         (null without whole-record estimates); ``files`` with the verdict on each; ``errors`` (files
-        that are left out, and why); ``one_specimen``, and the ``groups`` of sessions if they are
+        that are left out, and why); ``is_one_specimen``, and the ``groups`` of sessions if they are
         not of one specimen; ``trials`` of the validation: how many were requested, completed and
         lost; ``fits`` and ``modes`` of single sessions; and the tables by the names of their CSV
         files. All numbers are finite.
@@ -60,15 +60,15 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
                 }
                 for session_analysis in campaign.sessions
             ],
-            "one_specimen": campaign.homogeneity.one_specimen,
+            "one_specimen": campaign.homogeneity.is_one_specimen,
             "groups": leading_quantity
             and {"quantity": leading_quantity.quantity, "files": leading_quantity.groups},
             "trials": {
                 "asked": campaign.trials,
-                "done": campaign.trials - len(campaign.lost_trials),
+                "done": campaign.trials - len(campaign.failed_predictions),
                 "lost": [
                     {"file": str(trial.path), "reason": trial.reason}
-                    for trial in campaign.lost_trials
+                    for trial in campaign.failed_predictions
                 ],
             },
             "errors": [

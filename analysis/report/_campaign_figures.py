@@ -120,7 +120,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
 
     estimate = campaign.headline
     assert estimate is not None
-    unsupported_orders = campaign.verdict.withheld if campaign.verdict else ()
+    unsupported_orders = campaign.verdict.withheld_orders if campaign.verdict else ()
     not_reported = unreported_parameters(STRUCTURES[estimate.structure], unsupported_orders)
     subtitle_note = (
         f"  ·  {NOT_REPORTED_MARK} not reported: not supported by the data" if not_reported else ""
@@ -225,7 +225,7 @@ _PANEL_COLUMNS: Final = 500
 """Number of columns into which a response is decimated in a small panel."""
 _WIDE_COLUMNS: Final = 1500
 """Number of columns into which a response is decimated in a wide panel."""
-_MOST_DRAWN_SESSIONS: Final = 40
+_MAX_DRAWN_SESSIONS: Final = 40
 """Largest number of sessions whose responses are drawn: more would not be distinguishable."""
 SESSION_COLOR: Final = "#A8A8A8"
 """Colour of a single session's response."""
@@ -302,7 +302,7 @@ def _new_response_figure(
     """Return an empty figure whose title states the sessions and the response estimator."""
     session_count = len(campaign.sessions)
     drawn_sessions_text = (
-        "" if session_count <= _MOST_DRAWN_SESSIONS else f", {_MOST_DRAWN_SESSIONS} of them drawn"
+        "" if session_count <= _MAX_DRAWN_SESSIONS else f", {_MAX_DRAWN_SESSIONS} of them drawn"
     )
     return style.new_figure(
         width_in, height_in, f"{session_count} sessions — {figure_heading}",
@@ -349,9 +349,7 @@ def _draw_responses(
 def shown_sessions(campaign: CampaignResult) -> list[SessionAnalysis]:
     """Return the sessions to draw together, evenly spread over the campaign."""
     last_index = len(campaign.sessions) - 1
-    session_indices = np.unique(
-        np.linspace(0, last_index, _MOST_DRAWN_SESSIONS).round().astype(int)
-    )
+    session_indices = np.unique(np.linspace(0, last_index, _MAX_DRAWN_SESSIONS).round().astype(int))
     return [campaign.sessions[session_index] for session_index in session_indices]
 
 
@@ -361,7 +359,7 @@ def draw_session(
     frequency_hz: NDArray[np.float64],
     response: NDArray[np.complex128],
     decimation_columns: int,
-    most_dots: int,
+    max_dots: int,
     opacity: float = 1.0,
 ) -> Line2D:
     """Draw one session's response in the background and return the line of its magnitude."""
@@ -370,7 +368,7 @@ def draw_session(
         color=SESSION_COLOR,
         linewidth=0.5, alpha=opacity, rasterized=True,
     )  # fmt: skip
-    point_indices = style.log_spaced_indices(frequency_hz, most_dots)
+    point_indices = style.log_spaced_indices(frequency_hz, max_dots)
     # Dots, because a line would jump wherever noise wraps the phase.
     phase_axes.plot(
         frequency_hz[point_indices], phase_deg(response[point_indices]), ".", markersize=0.8,
@@ -474,10 +472,10 @@ def validation_figure(campaign: CampaignResult) -> Figure:
 
 def _predicted_sessions_text(campaign: CampaignResult) -> str:
     """Return how many of the sessions were predicted, as text."""
-    completed_trials = campaign.trials - len(campaign.lost_trials)
+    completed_trials = campaign.trials - len(campaign.failed_predictions)
     return (
         f"{completed_trials} of {campaign.trials}"
-        if campaign.lost_trials
+        if campaign.failed_predictions
         else str(completed_trials)
     )
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.campaigns import group_errors_by_model
-from analysis.campaigns.sentences import label, lost_trials
+from analysis.campaigns.sentences import failed_predictions, label
 from analysis.report._paper_tables import FIT_NAME_COLUMNS, paper_tables
 from analysis.report._pooled_tables import (
     homogeneity_table,
@@ -100,7 +100,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
         if experiment
         for metadata_name in experiment.added
     )
-    return Table.of(
+    return Table.from_rows(
         "session_list",
         "Sessions, as their files state them",
         (
@@ -227,7 +227,7 @@ def validation_table(campaign: CampaignResult) -> Table:
     ]
     table_rows += [
         {"file": str(failed_trial.path), "lost": failed_trial.reason}
-        for failed_trial in campaign.lost_trials
+        for failed_trial in campaign.failed_predictions
     ]
     return _file_only_table("validation", table_rows)
 
@@ -273,7 +273,7 @@ def validation_summary(campaign: CampaignResult) -> Table:
         (
             "Fit: 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖), each session by its own whole-record fit: "
             "100 % less the in-sample error. Both errors include the noise of the torque.",
-            *lost_trials(campaign.lost_trials, campaign.trials),
+            *failed_predictions(campaign.failed_predictions, campaign.trials),
         ),
     )  # fmt: skip
 
@@ -311,7 +311,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         (failure.name, "left out", None, None, ABSENT_TEXT, failure.message)
         for failure in campaign.failures
     ]
-    return Table.of(
+    return Table.from_rows(
         "sessions",
         "Sessions, each by itself",
         (

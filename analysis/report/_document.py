@@ -18,7 +18,7 @@ import numpy as np
 
 import rigd
 from analysis.models import FrequencyResponseModel
-from analysis.paper import fit_indices
+from analysis.paper.welch_analysis import fit_indices
 from analysis.report._shown_model import ShownModel
 from analysis.report.bands import loss_estimate, loss_factors, supported_band_hz
 from analysis.report.table import unreported_parameters
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import DampingSize, RecordFit, StructureFit
-    from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.identify import PivotLossFactor, RecordFit, StructureFit
+    from analysis.paper.welch_analysis import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report.bands import LossFactor
     from analysis.results import RecordResult, WholeRecord
@@ -169,7 +169,9 @@ def record_entries(
                 **fit_key,
                 "free": [*fit.interval],
                 "parameters": dict(fit.parameters),
-                "withheld": sorted(unreported_parameters(fit.structure, whole_record.unsupported)),
+                "withheld": sorted(
+                    unreported_parameters(fit.structure, whole_record.unsupported_orders)
+                ),
                 "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
                 "interval_95": {
                     key: None if order_interval is None else list(order_interval)
@@ -181,9 +183,9 @@ def record_entries(
                 "nrmse_percent": whole_record.analysis.fit_percent(fit),
                 "determined": list(fit.determined),
                 "covariance": fit.covariance.tolist(),
-                "internal_size": _damping_size_json(fit.internal),
-                "external_size": _damping_size_json(fit.external),
-                "ringing": {**asdict(fit.ringing), "significant": fit.ringing.significant},
+                "internal_size": _pivot_loss_factor_json(fit.internal),
+                "external_size": _pivot_loss_factor_json(fit.external),
+                "ringing": {**asdict(fit.ringing), "significant": fit.ringing.is_significant},
                 "indices": welch_indices,
                 "indices_whole_record": record_indices,
             }
@@ -213,7 +215,7 @@ def record_entries(
                 "selected": whole_record.headline.name,
                 "verdict": list(whole_record.verdict.sentences),
                 "experiments": list(whole_record.verdict.experiments),
-                "withheld": sorted(whole_record.withheld),
+                "withheld": sorted(whole_record.withheld_orders),
                 "orders": {
                     order_estimate.order: {
                         "status": order_estimate.status,
@@ -260,9 +262,9 @@ def _added_structure_json(structure_fit: StructureFit, whole_record: WholeRecord
     }
 
 
-def _damping_size_json(damping_size: DampingSize | None) -> dict[str, Any] | None:
+def _pivot_loss_factor_json(pivot_loss_factor: PivotLossFactor | None) -> dict[str, Any] | None:
     """Return the size of a damping (loss factor or coefficient) for JSON; None if unknown."""
-    return None if damping_size is None else asdict(damping_size)
+    return None if pivot_loss_factor is None else asdict(pivot_loss_factor)
 
 
 def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
@@ -270,7 +272,7 @@ def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
     first_hz, last_hz = whole_record.band_hz
     frequency_hz = np.geomspace(max(first_hz, last_hz / 200), last_hz, _CURVE_POINTS)
     model, loss_model = (
-        ShownModel.of(whole_record.headline, whole_record.record),
+        ShownModel.from_headline(whole_record.headline, whole_record.record),
         loss_estimate(whole_record),
     )
     model_band = model.band(frequency_hz)
@@ -334,7 +336,7 @@ def document(
         record_entries(result.whole, result.welch) for result in record_results if result.whole
     ]
     welch_analyses = [
-        (result.welch, result.unsupported) for result in record_results if result.welch
+        (result.welch, result.unsupported_orders) for result in record_results if result.welch
     ]
     document_content: dict[str, Any] = finite(
         {

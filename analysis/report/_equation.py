@@ -323,7 +323,7 @@ def types_table(whole_record: WholeRecord) -> Table:
                     )
             yield structure.name, damping_terms[0], damping_terms[1], ", ".join(term_descriptions)
 
-    return Table.of(
+    return Table.from_rows(
         "types",
         "Types of damping",
         (

@@ -8,7 +8,7 @@ from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Final
 
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
-from analysis.paper import LARGEST_FREQUENCY_SHIFT
+from analysis.paper.welch_analysis import LARGEST_FREQUENCY_SHIFT
 from analysis.report._document import response_fit_percent
 from analysis.report.table import (
     ABSENT_TEXT,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from analysis.models import Structure
-    from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.paper.welch_analysis import FittedModel, WelchAnalysis
     from analysis.results import WholeRecord
 
 _AT_LIMIT_NOTE: Final = "* at the limit of the search range: not determined by the data."
@@ -43,7 +43,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
     Fractional orders that the data do not determine are marked.
     """
     lowest_cost = min(fit.cost for fit in whole_record.fits.values())
-    unsupported_orders = whole_record.unsupported
+    unsupported_orders = whole_record.unsupported_orders
     delta_bic = whole_record.delta_bic
     status_by_name = dict(whole_record.headline.structures)
     table_rows: list[tuple[Entry, ...]] = []
@@ -71,7 +71,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
                 " ".join(sorted(unreported_parameters(fit.structure, unsupported_orders))),
             )
         )
-    return Table.of(
+    return Table.from_rows(
         "structures",
         "All structures on the whole record",
         (
@@ -122,7 +122,7 @@ def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
         for fit in whole_record.added
         for parameter in fit.structure.parameters
     ]
-    table = Table.of(
+    table = Table.from_rows(
         "added_structures",
         "Structures of installed packages on the whole record",
         (
@@ -244,7 +244,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
         Orders that the whole record does not support. They are marked.
     """
     fits = [model.fit for model in analysis.models]
-    return Table.of(
+    return Table.from_rows(
         "welch_fits",
         "Fits to Welch's estimate, as in the paper",
         (
@@ -312,7 +312,7 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
                 ),
             )
         )
-    return Table.of(
+    return Table.from_rows(
         "welch_summary",
         f"Mean ± standard deviation over {len(analyses)} files",
         (
@@ -350,7 +350,7 @@ def peaks_table(analysis: WelchAnalysis) -> Table:
         *(2 * math.pi * p.frequency_hz if p else None for p in analysis.peaks),
         *(p.magnitude_db if p else None for p in analysis.peaks),
     )
-    return Table.of(
+    return Table.from_rows(
         "welch_peaks",
         "Resonant peaks of Welch's estimate, and deviations of the models' peaks from them",
         (
@@ -385,8 +385,8 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     A mode far from that of the undamped beam is marked. An overdamped mode is a dash.
     """
     fitted_models = analysis.models
-    most_modes = max((len(fitted_model.modes) for fitted_model in fitted_models), default=0)
-    if not most_modes:
+    max_modes = max((len(fitted_model.modes) for fitted_model in fitted_models), default=0)
+    if not max_modes:
         return None
 
     def cells(
@@ -402,7 +402,7 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
             if cell.value is not None and not is_followed:
                 cell = grey_cell(replace(cell, text=cell.text + _FAR_MODE_MARK))
             mode_cells.append(cell)
-        return mode_cells or [number_cell(None)] * most_modes
+        return mode_cells or [number_cell(None)] * max_modes
 
     mode_pairs = [
         mode_pair
@@ -419,13 +419,13 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
         )
     if not all(is_underdamped) or not all(fitted_model.modes for fitted_model in fitted_models):
         table_notes.append(f"{ABSENT_TEXT} overdamped in this fit.")
-    return Table.of(
+    return Table.from_rows(
         "welch_modes",
         "Modes of the fits to Welch's estimate",
         (
             *_NAME_COLUMNS,
-            *(Column(f"f{n} (Hz)", f"frequency_{n}_hz") for n in range(1, most_modes + 1)),
-            *(Column(f"ξ{n} (%)", f"damping_ratio_{n}") for n in range(1, most_modes + 1)),
+            *(Column(f"f{n} (Hz)", f"frequency_{n}_hz") for n in range(1, max_modes + 1)),
+            *(Column(f"ξ{n} (%)", f"damping_ratio_{n}") for n in range(1, max_modes + 1)),
         ),
         (
             (

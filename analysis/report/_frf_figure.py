@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.paper.welch_analysis import FittedModel, WelchAnalysis
 
 _CURVE_COLUMNS: Final = 500
 """Number of columns into which the curves of a panel are decimated."""

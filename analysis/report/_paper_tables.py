@@ -62,11 +62,9 @@ def welch_method_text(campaign: CampaignResult) -> str:
     """Return how the sessions' frequency responses were estimated, as text."""
     settings = campaign.settings
     segment_counts = [session.segments for session in campaign.sessions]
-    least_segments, most_segments = min(segment_counts), max(segment_counts)
+    min_segments, max_segments = min(segment_counts), max(segment_counts)
     segments_text = (
-        f"{least_segments}"
-        if least_segments == most_segments
-        else f"{least_segments} to {most_segments}"
+        f"{min_segments}" if min_segments == max_segments else f"{min_segments} to {max_segments}"
     )
     # The settings state all lengths, so that the rate has no effect.
     return estimate_text(settings.estimator, settings.segmentation(PAPER_RATE_HZ), segments_text)
@@ -311,7 +309,7 @@ def indices_table(campaign: CampaignResult) -> Table:
 
 def bias_table(campaign: CampaignResult) -> Table:
     """Return the table of the Welch fits' bias relative to pooled whole-record estimates."""
-    unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
+    unsupported_orders = campaign.verdict.withheld_orders if campaign.verdict else frozenset[str]()
     table_rows: list[Row] = []
     for fit_bias in campaign.welch_biases:
         not_reported = unreported_parameters(STRUCTURES[fit_bias.structure], unsupported_orders)

@@ -56,12 +56,12 @@ class _PooledFit:
     covariance: NDArray[np.float64]
 
     @classmethod
-    def of_campaign(cls, campaign: CampaignResult) -> _PooledFit | None:
+    def from_campaign(cls, campaign: CampaignResult) -> _PooledFit | None:
         """Return the pooled estimate whose parameters a campaign reports; None without one."""
         modal_result, pooled_estimate = campaign.modal, campaign.headline
         tolerant_estimate = modal_result.tolerant if modal_result else None
         if tolerant_estimate is None:
-            return None if pooled_estimate is None else cls.of(pooled_estimate)
+            return None if pooled_estimate is None else cls.from_estimate(pooled_estimate)
         if tolerant_estimate.basis == "none":
             return None
         return cls(
@@ -73,7 +73,7 @@ class _PooledFit:
         )
 
     @classmethod
-    def of(cls, pooled_estimate: PooledEstimate) -> _PooledFit:
+    def from_estimate(cls, pooled_estimate: PooledEstimate) -> _PooledFit:
         """Return a pooled estimate with an enlarged covariance.
 
         With it, intervals of 1.96 standard deviations are as wide as those of Student's t for the
@@ -124,7 +124,7 @@ def damping_figure(campaign: CampaignResult) -> Figure:
         height_ratios=(1.25, 1.0), hspace=0.32, wspace=0.28,
     )  # fmt: skip
     upper_axes = figure.add_subplot(grid[0, :])
-    _draw_loss_factor(upper_axes, pooled_modes, _PooledFit.of_campaign(campaign))
+    _draw_loss_factor(upper_axes, pooled_modes, _PooledFit.from_campaign(campaign))
     for panel_number, pooled_mode in enumerate(pooled_modes):
         session_modes = _session_estimates_of_mode(campaign, pooled_estimate, pooled_mode)
         upper_axes.plot(
@@ -270,7 +270,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
     peaks_hz = [pooled_mode.frequency_hz for pooled_mode in campaign.modes]
     first_hz, last_hz = _response_band_hz(campaign, peaks_hz)
     pooled_band = response_band(
-        _PooledFit.of(pooled_estimate), dense_grid(first_hz, last_hz, peaks_hz)
+        _PooledFit.from_estimate(pooled_estimate), dense_grid(first_hz, last_hz, peaks_hz)
     )
     is_measured = bool(campaign.sessions[0].frequency_hz.size)
     width_in, height_in = 11.0, 6.6

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns import campaign_numbers, differing_fact_keys, fact_text
+from analysis.campaigns import campaign_estimates, differing_fact_keys, fact_text
 from analysis.campaigns.sentences import (
     MIXTURE_MARK,
     MIXTURE_NOTE,
@@ -138,7 +138,7 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
         Estimate to show. Without it, as in the files, all estimates are in the table, followed by
         the structures that are not pooled, without values.
     """
-    unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
+    unsupported_orders = campaign.verdict.withheld_orders if campaign.verdict else frozenset[str]()
     homogeneity, headline = campaign.homogeneity, campaign.headline
     table_columns = (
         Column("parameter", "parameter", TEXT_FORMAT),
@@ -238,7 +238,7 @@ def _pooled_row(
         "high_95": high_cell,
         "within_std": number_cell(parameter.within_std, ".2g", display_factor),
         "between_std": number_cell(parameter.between_std, ".2g", display_factor),
-        "p_value": chance_cell(parameter.chance),
+        "p_value": p_value_cell(parameter.chance),
         "next_low_95": parameter.next_interval[0],
         "next_high_95": parameter.next_interval[1],
         "reported": is_reported,
@@ -252,7 +252,7 @@ def tolerance_table(campaign: CampaignResult) -> Table:
     It also contains the parameters that an exactly uniform beam would have. It has no rows if no
     tolerance of the beam's geometry is stated.
     """
-    modal_result, reported_numbers = campaign.modal, campaign_numbers(campaign)
+    modal_result, reported_numbers = campaign.modal, campaign_estimates(campaign)
     tolerant_estimate = modal_result.tolerant if modal_result else None
     table_columns = (
         Column("parameter", "parameter", TEXT_FORMAT), Column("value", "value"),
@@ -460,7 +460,7 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
             "between_in_own_std": scatter.between_std_in_own_stds,
             "cochran_q": scatter.cochran_q,
             "i_squared": replace(number_cell(scatter.i_squared), text=percent(scatter.i_squared)),
-            "p_value": chance_cell(scatter.chance),
+            "p_value": p_value_cell(scatter.chance),
             "mixture": scatter.mixed,
         }
 
@@ -496,7 +496,7 @@ def _decimals_of_scatter(scatter: Heterogeneity) -> int:
     return min(decimals(shown_std), 9)
 
 
-def chance_cell(p_value: float) -> Cell:
+def p_value_cell(p_value: float) -> Cell:
     """Return a cell with a p-value; a very small one is displayed as a bound, such as "< 1e-99"."""
     return replace(number_cell(p_value), text=probability(p_value))
 

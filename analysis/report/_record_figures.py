@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 _LABEL_HEIGHT_IN: Final = 0.15
 """Height of a tick label with the space around it, in inches."""
-_LEAST_LABELS_PER_DECADE: Final = 1 / math.log10(2.0)
+_MIN_LABELS_PER_DECADE: Final = 1 / math.log10(2.0)
 """Number of labels per decade for which there must be room, so that 1, 2 and 5 are labelled."""
 
 
@@ -58,7 +58,7 @@ def plain_logarithmic(axes: Axes, lower_limit: float, upper_limit: float) -> Non
         labels_per_decade = height_in / (_LABEL_HEIGHT_IN * math.log10(upper_limit / lower_limit))
         leading_digits = (
             (1.0, 2.0, 5.0)
-            if upper_limit < 1000 * lower_limit and labels_per_decade > _LEAST_LABELS_PER_DECADE
+            if upper_limit < 1000 * lower_limit and labels_per_decade > _MIN_LABELS_PER_DECADE
             else (1.0,)
         )
         axes.yaxis.set_major_locator(LogLocator(subs=leading_digits, numticks=12))
@@ -77,7 +77,7 @@ _DETAIL_POINTS: Final = 161
 _DETAIL_TO_HALF_WIDTH: Final = 6.0
 """Frequency range of a mode's enlarged panel to either side, in half-widths of the resonance."""
 
-_LEAST_RELATIVE_DETAIL: Final = 0.006
+_MIN_RELATIVE_DETAIL: Final = 0.006
 """Least frequency range of a mode's enlarged panel to either side, relative to the frequency."""
 
 
@@ -211,7 +211,7 @@ def _draw_magnitude(
 def _detail_range_hz(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
     """Return the frequency range of a mode's enlarged panel, with at least one bin."""
     bin_spacing_hz = float(np.diff(frequency_hz).max())
-    relative_width = max(_DETAIL_TO_HALF_WIDTH * mode.damping_ratio, _LEAST_RELATIVE_DETAIL)
+    relative_width = max(_DETAIL_TO_HALF_WIDTH * mode.damping_ratio, _MIN_RELATIVE_DETAIL)
     half_width_hz = max(relative_width * mode.frequency_hz, bin_spacing_hz)
     lowest_hz = float(frequency_hz[0]) / 2
     return max(mode.frequency_hz - half_width_hz, lowest_hz), mode.frequency_hz + half_width_hz
@@ -225,7 +225,7 @@ _CURVE_STYLES: Final = {
     "total": (style.BLUE, "-"),
 }
 """Colour and dash of each loss factor's curve by its label."""
-_MOST_LOSS_AXIS_RATIO: Final = 300.0
+_MAX_LOSS_AXIS_RATIO: Final = 300.0
 """Largest ratio of the ends of the loss factor's axis.
 
 Smaller loss factors do not matter for the total."""
@@ -296,7 +296,7 @@ def loss_figure(
         default=highest_loss,
     )
     plain_logarithmic(
-        axes, max(lowest_loss / 2, 3 * highest_loss / _MOST_LOSS_AXIS_RATIO), 3 * highest_loss
+        axes, max(lowest_loss / 2, 3 * highest_loss / _MAX_LOSS_AXIS_RATIO), 3 * highest_loss
     )
     axes.set_ylabel("Loss factor (1)")
     axes.set_xlabel("Frequency (Hz)", labelpad=1)
@@ -386,7 +386,7 @@ _BINS_PER_POINT: Final = 24
 """Number of bins whose mean is one point of the residual's spectrum."""
 _NOISE_MODEL_POINTS: Final = 600
 """Number of points of the noise model's curve."""
-_MOST_INTERVALS: Final = 120
+_MAX_INTERVALS: Final = 120
 """Largest number of intervals in which the residual's power over time is shown.
 
 A short record has fewer independent values."""
@@ -514,7 +514,7 @@ def residual_power(
     bin_count = residual.size
     envelope_power = np.abs(np.fft.ifft(residual)) ** 2 * bin_count / 2
     envelope_power *= bin_count / np.count_nonzero(analysis.compared)
-    interval_count = min(_MOST_INTERVALS, bin_count)
+    interval_count = min(_MAX_INTERVALS, bin_count)
     interval_power: NDArray[np.float64] = np.array(
         [
             interval_envelope.mean()
@@ -547,7 +547,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     from analysis.report._signal_figures import signals_figure
 
     highest_hz, headline = whole_record.band_hz[1], whole_record.headline
-    model = ShownModel.of(headline, whole_record.record)
+    model = ShownModel.from_headline(headline, whole_record.record)
     analysis = model.compared(whole_record.analysis)
     modes_text = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
     frf, _, loss_name, residual_name, signals_name = FIGURES
@@ -576,7 +576,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
             loss_model,
             (float(measured_frf.frequency_hz[0]), highest_hz),
             supported_band_hz(whole_record),
-            unsupported_orders=whole_record.withheld,
+            unsupported_orders=whole_record.withheld_orders,
             flagged_modes=flagged_modes,
         ),
         _loss_description(whole_record, has_curves=loss_model is not None),
@@ -614,7 +614,7 @@ def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
         f"Loss factor over frequency with 95 % bands, {_describe_curve_model(whole_record)}; "
         f"points: {points_text}. "
     )
-    if whole_record.withheld:
+    if whole_record.withheld_orders:
         return curves_text + (
             "It is of all damping, not split into internal and external, and drawn between the "
             "modes that show only: elsewhere (grey), and for either part, an order that the data "

@@ -61,7 +61,7 @@ def modes_table(whole_record: WholeRecord) -> Table:
             table_rows.append(
                 (mark_cell(count_cell(mode.number)), *map(grey_cell, mode_cells), mode.source)
             )
-    return Table.of(
+    return Table.from_rows(
         "modes",
         f"Modes with locked hub (clamped–free): {_modes_source(headline)}",
         (
@@ -91,7 +91,7 @@ def exact_modes_table(whole_record: WholeRecord) -> Table | None:
     ]
     if not shown_mode_values:
         return None
-    return Table.of(
+    return Table.from_rows(
         "exact_geometry_modes",
         f"Modes {EXACTLY_UNIFORM_CONDITION}: type {exact_estimates.name}",
         _MODE_COLUMNS,
@@ -147,9 +147,9 @@ def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
         "Inertia: effective inertia about the motor axis that takes part in the mode; it is "
         "proportional to the torque scale."
     )
-    nrmse_percent = ShownModel.of(whole_record.headline, whole_record.record).fit_percent(
-        whole_record.analysis
-    )
+    nrmse_percent = ShownModel.from_headline(
+        whole_record.headline, whole_record.record
+    ).fit_percent(whole_record.analysis)
     yield f"Fit of the modal model {nrmse_percent:.2f} % (NRMSE)."
     other_resonances_hz = [
         f"{frequency_hz:.4g}"
@@ -173,7 +173,7 @@ def parameters_table(whole_record: WholeRecord) -> Table:
     states why.
     """
     headline = whole_record.headline
-    parameters_with_scales = whole_record.combined
+    parameters_with_scales = whole_record.parameters_with_scales
     scale_columns = (
         Column("", "combined_std"),
         Column("with scales: from", "combined_low_95"),
@@ -182,7 +182,7 @@ def parameters_table(whole_record: WholeRecord) -> Table:
     fit_note = ""
     if headline.tolerant is None:
         fit_note = f" Fit {whole_record.analysis.fit_percent(headline.fit):.2f} % (NRMSE)."
-    return Table.of(
+    return Table.from_rows(
         "parameters",
         f"Parameters{_condition_text(headline)}",
         (*_PARAMETER_COLUMNS, *(scale_columns if parameters_with_scales else ()), _REMARK_COLUMN),
@@ -331,7 +331,7 @@ def exact_geometry_table(whole_record: WholeRecord) -> Table | None:
     flag_texts = [
         parameter.flag for parameter in exact_estimates.parameters.values() if parameter.flag
     ]
-    return Table.of(
+    return Table.from_rows(
         "exact_geometry",
         f"Parameters {EXACTLY_UNIFORM_CONDITION}: type {exact_estimates.name}",
         (*_PARAMETER_COLUMNS, _REMARK_COLUMN),
@@ -365,7 +365,7 @@ def loss_factors_table(whole_record: WholeRecord) -> Table:
     There, the loss factor is not correlated with the order of the damping.
     """
     headline = whole_record.headline
-    return Table.of(
+    return Table.from_rows(
         "damping_sizes",
         "Loss factor of either damping at its pivot frequency",
         (
@@ -425,7 +425,7 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
                 ),
             )
         )
-    return Table.of(
+    return Table.from_rows(
         "on_condition",
         f"If {assumption_text or 'the rest'} is assumed: type {simpler_estimates.name} "
         "(sufficient)",
@@ -453,7 +453,7 @@ def correlations_table(whole_record: WholeRecord) -> Table:
     parameter_symbols = [
         parameter_named(parameter_name).symbol for parameter_name in fit.determined
     ]
-    return Table.of(
+    return Table.from_rows(
         "correlations",
         "Correlations of the parameters on an exactly uniform beam, "
         f"type {whole_record.headline.name}",
@@ -591,7 +591,7 @@ def amplitude_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
         )
         table_rows.append((at.mode, at.tip_amplitude_m, *ratio_cells))
     return (
-        Table.of(
+        Table.from_rows(
             "damping_with_amplitude",
             "Damping of free vibration against the amplitude, air drag included",
             (

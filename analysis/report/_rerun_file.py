@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rerun import RecordingStream
 
-    from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.paper.welch_analysis import FittedModel, WelchAnalysis
     from analysis.report._signal_figures import TorqueInBand
     from analysis.results import RecordResult, WholeRecord
     from rigd.view.chart import Axis
@@ -91,7 +91,7 @@ _LINES_BY_WEIGHTING: Final[dict[str, tuple[Color, float]]] = {
 The narrower line lies over the wider one, because the two models are often alike."""
 _FURTHER_LINES: Final = ((PURPLE, 1.5), (GREEN, 1.5), (ORANGE, 1.5))
 """Colours and widths of the lines for further weightings."""
-_MOST_MODELS_WITH_LONG_LABEL: Final = 2
+_MAX_MODELS_WITH_LONG_LABEL: Final = 2
 """Largest number of models for which the legend of a narrow chart contains the word "weights"."""
 _SCALARS_COMPONENT: Final = "Scalars:scalars"
 """Rerun's name for the values of a plot over time."""
@@ -306,7 +306,7 @@ def _type_page(
     models = [model for model in analysis.models if model.fit.structure.name == type_name]
     legend_entries = [entry_by_weighting[model.fit.weighting] for model in models]
     # Short labels on the narrow charts, because long ones would overlap the axis title.
-    label_format = "weights {}" if len(models) <= _MOST_MODELS_WITH_LONG_LABEL else "{}"
+    label_format = "weights {}" if len(models) <= _MAX_MODELS_WITH_LONG_LABEL else "{}"
     short_entries = [
         replace(key, label=label_format.format(model.fit.weighting))
         for key, model in zip(legend_entries, models, strict=True)
@@ -409,7 +409,7 @@ def _entity_name(weighting: str) -> str:
 
 # Whole record
 
-_MOST_LABELS_PER_SIDE: Final = 5
+_MAX_LABELS_PER_SIDE: Final = 5
 """Largest number of labels on either side of 0, in half the height of a window."""
 
 
@@ -467,7 +467,7 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
 
     measured_with_delay, shown_model = (
         measured_response(whole_record),
-        ShownModel.of(whole_record.headline, whole_record.record),
+        ShownModel.from_headline(whole_record.headline, whole_record.record),
     )
     grid_hz = measured_with_delay.frequency_hz
     delay_phasor = np.exp(2j * np.pi * shown_model.delay_s * grid_hz)
@@ -619,7 +619,7 @@ def _labelled_axis_range(largest_value: float) -> tuple[float, float]:
     label_step = 10.0 ** np.floor(np.log10(max(largest_value, 1e-12)))
     axis_end = (
         1.1 * largest_value
-        if largest_value < _MOST_LABELS_PER_SIDE * label_step
+        if largest_value < _MAX_LABELS_PER_SIDE * label_step
         else 11.0 * label_step
     )
     return -axis_end, axis_end
@@ -661,7 +661,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
 
         torque = torque_in_band(
             whole_record.record,
-            ShownModel.of(whole_record.headline, whole_record.record).transfer,
+            ShownModel.from_headline(whole_record.headline, whole_record.record).transfer,
             whole_record.band_hz[1],
         )
         result_tabs.append(record_tab(whole_record, torque))

@@ -47,7 +47,7 @@ class ShownModel:
     stated_delay_s: float
 
     @classmethod
-    def of(cls, headline: Headline, record: Record) -> ShownModel:
+    def from_headline(cls, headline: Headline, record: Record) -> ShownModel:
         """Return the model that a record's report shows, from the reported results (headline).
 
         Parameters
@@ -107,7 +107,7 @@ class ShownModel:
         """
         if self.modal is None:
             return analysis
-        return RecordAnalysis.of(analysis.fits, self.modal.noise, analysis.comparison)
+        return RecordAnalysis.from_fits(analysis.fits, self.modal.noise, analysis.comparison)
 
     def fit_percent(self, analysis: RecordAnalysis) -> float:
         """Return how well the model reproduces the measured torque in the band, in percent.

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from analysis.identify import Measurement, TorquePredictor
-from analysis.paper import band_limited, largest_oscillation_time_s, modelled_torque
+from analysis.paper.welch_analysis import band_limited, largest_oscillation_time_s, modelled_torque
 from analysis.report import _style as style
 from rigd.beam import undamped_frequencies_rad_s
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import ModalModel
-    from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.paper.welch_analysis import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report._shown_model import ShownModel
     from rigd.beam import Plant
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 _PERIODS_SHOWN: Final = 12
 """Number of a mode's periods that its enlarged panel shows."""
-_LEAST_DETAIL_S: Final = 0.3
+_MIN_DETAIL_S: Final = 0.3
 """Least duration that an enlarged panel shows, in seconds."""
-_MOST_DETAIL_FRACTION: Final = 1 / 8
+_MAX_DETAIL_FRACTION: Final = 1 / 8
 """Largest duration that an enlarged panel shows, as a fraction of the record."""
 
 
@@ -71,8 +71,8 @@ def resonance_intervals(record: Record, mode_count: int) -> tuple[RecordInterval
         interval_centre_s = largest_oscillation_time_s(
             record.torque_nm, record.rate_hz, frequency_hz
         )
-        interval_length_s = min(_PERIODS_SHOWN / frequency_hz, _MOST_DETAIL_FRACTION * duration_s)
-        interval_length_s = max(interval_length_s, _LEAST_DETAIL_S)
+        interval_length_s = min(_PERIODS_SHOWN / frequency_hz, _MAX_DETAIL_FRACTION * duration_s)
+        interval_length_s = max(interval_length_s, _MIN_DETAIL_S)
         sample_count = min(round(interval_length_s * record.rate_hz), len(record.time_s))
         first_sample = round((interval_centre_s - interval_length_s / 2) * record.rate_hz)
         first_sample = min(max(first_sample, 0), len(record.time_s) - sample_count)
@@ -128,7 +128,7 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
     The model's torque is computed from the measured angle. Above the limit the measured torque is
     noise, and the model's torque is the encoder's quantisation.
     """
-    angle = Measurement.of_record(record).angle_from_rest(highest_hz)
+    angle = Measurement.from_record(record).angle_from_rest(highest_hz)
     band_hz = (0.0, highest_hz)
     # Followed by its mirror image, the angle has no step at its end, to which the model would
     # respond before it in so narrow a band.

@@ -332,12 +332,12 @@ def envelope(
     return np.repeat(x[interval_starts], 2), extreme_pairs.ravel()
 
 
-def log_spaced_indices(x: NDArray[np.float64], most_indices: int) -> NDArray[np.intp]:
-    """Return the indices of at most `most_indices` values of x that are evenly spaced in log x.
+def log_spaced_indices(x: NDArray[np.float64], max_indices: int) -> NDArray[np.intp]:
+    """Return the indices of at most `max_indices` values of x that are evenly spaced in log x.
 
     x is positive and increasing.
     """
-    spaced_values = np.geomspace(x[0], x[-1], most_indices)
+    spaced_values = np.geomspace(x[0], x[-1], max_indices)
     return np.unique(np.clip(np.searchsorted(x, spaced_values), 0, len(x) - 1))
 
 

@@ -10,11 +10,11 @@ from rich.console import Console, Group
 from rich.padding import Padding
 from rich.text import Text
 
+from analysis.applicability import WELCH_OMITTED_TEXT
 from analysis.identify.headline import CONTRADICTED_FILE_REASON, EXACTLY_UNIFORM_CONDITION
 from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
 from analysis.report.table import NOT_REPORTED_MARK, estimate_cells, terminal_table
-from analysis.suited import WELCH_OMITTED_TEXT
 from rigd.printable import listed
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def analysis_tables(result: RecordResult) -> RenderableType:
         "",
         *with_empty_lines(
             (
-                fit_tables.welch_fits_table(welch_analysis, result.unsupported),
+                fit_tables.welch_fits_table(welch_analysis, result.unsupported_orders),
                 fit_tables.peaks_table(welch_analysis),
                 *(() if mode_table is None else (mode_table,)),
             )
@@ -229,7 +229,7 @@ def with_empty_lines(tables_to_show: Iterable[Table]) -> Iterator[RenderableType
 
 # Damping in sentences
 
-_LEAST_PLAIN_VALUE: Final = 1e-3
+_MIN_PLAIN_VALUE: Final = 1e-3
 """Value below which a damping is written with the power of ten that zeta has in the paper."""
 
 _DAMPING_SYMBOLS: Final = {
@@ -302,13 +302,13 @@ def _percent_text(damping_ratio: Estimate) -> str:
 def _size_text(loss_factor: ReportedLossFactor) -> str:
     """Return the loss factor, or else the coefficient, of a damping as part of a sentence."""
     coefficient_symbol, unit_text, *_names = _DAMPING_SYMBOLS[loss_factor.damping]
-    damping_size = loss_factor.size
+    pivot_loss_factor = loss_factor.size
     display_factor, power_of_ten = (
-        (1e5, " · 10⁻⁵") if damping_size.value < _LEAST_PLAIN_VALUE else (1.0, "")
+        (1e5, " · 10⁻⁵") if pivot_loss_factor.value < _MIN_PLAIN_VALUE else (1.0, "")
     )
     value_cell, lower_cell, upper_cell = estimate_cells(
-        (damping_size.value, *(damping_size.interval_95 or (None, None))),
-        damping_size.std,
+        (pivot_loss_factor.value, *(pivot_loss_factor.interval_95 or (None, None))),
+        pivot_loss_factor.std,
         display_factor,
     )
     interval_text = f"{value_cell.text} ({lower_cell.text} to {upper_cell.text}){power_of_ten}"

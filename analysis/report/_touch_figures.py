@@ -16,24 +16,24 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from analysis.touch import Touch, TouchedSession
+    from analysis.touch import SessionTouches, Touch
     from rigd.touch import TouchEstimate
 
 _SHOWN_BEFORE_MS: Final = 25.0
 """Time that is shown before a touch, in milliseconds."""
 _SHOWN_AFTER_MS: Final = 100.0
 """Time that is shown after a touch, in milliseconds."""
-_LEAST_LOG_LIKELIHOOD_RANGE: Final = 40.0
+_MIN_LOG_LIKELIHOOD_RANGE: Final = 40.0
 """Least range of the log-likelihood's axis."""
 _LINEAR_RANGE_STD: Final = 5.0
 """Number of standard deviations up to which the axis of innovations is linear."""
-_MOST_DETAIL_FRACTION: Final = 0.25
+_MAX_DETAIL_FRACTION: Final = 0.25
 """Largest extent of the contact points, relative to the antenna, for an enlarged map of them."""
 _SESSION_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE)
 """Colours of the sessions in the map."""
 
 
-def touch_illustrations(sessions: Sequence[TouchedSession]) -> Iterator[Illustration]:
+def touch_illustrations(sessions: Sequence[SessionTouches]) -> Iterator[Illustration]:
     """Yield a map of all contacts and a figure of each touch; call it within `figure_style`."""
     if any(touch.point_m is not None for session in sessions for touch in session.touches):
         yield Illustration(
@@ -95,7 +95,7 @@ def _draw_likelihood(axes: Axes, estimate: TouchEstimate) -> None:
         axes.axvline(estimate.x_m.value, color=style.VERMILION, linewidth=0.9)
     axes.set_xlim(0.0, float(estimate.positions_m[-1]))
     axes.set_ylim(
-        -max(_LEAST_LOG_LIKELIHOOD_RANGE, float(np.quantile(-relative_log_likelihood, 0.75))), 2.0
+        -max(_MIN_LOG_LIKELIHOOD_RANGE, float(np.quantile(-relative_log_likelihood, 0.75))), 2.0
     )
     axes.set_title("Point of contact")
     axes.set_ylabel("Relative log-likelihood")
@@ -144,41 +144,36 @@ def _draw_innovations(
 # Map
 
 
-def map_figure(touched_sessions: Sequence[TouchedSession]) -> Figure:
+def map_figure(session_touches: Sequence[SessionTouches]) -> Figure:
     """Draw the points of contact of all sessions as seen from above.
 
     Parameters
     ----------
-    touched_sessions : sequence of TouchedSession
+    session_touches : sequence of SessionTouches
         Sessions with at least one contact point.
     """
     contact_points_m = np.array(
-        [
-            t.point_m
-            for session in touched_sessions
-            for t in session.touches
-            if t.point_m is not None
-        ]
+        [t.point_m for session in session_touches for t in session.touches if t.point_m is not None]
     )
-    length_m = max(session.model.plant.beam.length_m for session in touched_sessions)
+    length_m = max(session.model.plant.beam.length_m for session in session_touches)
     spread_m = float(np.ptp(contact_points_m, axis=0).max())
-    has_detail = spread_m < _MOST_DETAIL_FRACTION * length_m
+    has_detail = spread_m < _MAX_DETAIL_FRACTION * length_m
     figure = style.new_figure(9.0, 4.6)
     grid = figure.add_gridspec(
         1, 1 + has_detail, left=0.075, right=0.97, top=0.93, bottom=0.1, wspace=0.22
     )
     overview_axes = figure.add_subplot(grid[0])
-    _draw_map(overview_axes, touched_sessions, with_numbers=not has_detail)
+    _draw_map(overview_axes, session_touches, with_numbers=not has_detail)
     overview_axes.plot(0.0, 0.0, "o", color=style.INK, markersize=7)
     overview_axes.set_aspect("equal", adjustable="datalim")
     overview_axes.set_title("Seen from above")
     if has_detail:
         detail_axes = figure.add_subplot(grid[1])
-        _draw_map(detail_axes, touched_sessions, with_numbers=True)
+        _draw_map(detail_axes, session_touches, with_numbers=True)
         interval_ends_m = np.concatenate(
             [
                 t.ends_m
-                for session in touched_sessions
+                for session in session_touches
                 for t in session.touches
                 if t.ends_m is not None
             ]
@@ -193,12 +188,12 @@ def map_figure(touched_sessions: Sequence[TouchedSession]) -> Figure:
     for axes in figure.axes:
         axes.set_xlabel("x (m)", labelpad=1)
     overview_axes.set_ylabel("y (m)")
-    if len(touched_sessions) > 1:
+    if len(session_touches) > 1:
         overview_axes.legend(loc="upper left", fontsize=7.5)
     return figure
 
 
-def _draw_map(axes: Axes, sessions: Sequence[TouchedSession], *, with_numbers: bool) -> None:
+def _draw_map(axes: Axes, sessions: Sequence[SessionTouches], *, with_numbers: bool) -> None:
     """Draw the contact points of sessions with their intervals, and the bent antenna."""
     for session_number, session in enumerate(sessions):
         session_color = _SESSION_COLORS[session_number % len(_SESSION_COLORS)]

@@ -76,7 +76,7 @@ def uniformity_figure(uniformity_test: UniformBeamTest) -> Figure:
             uniformity_test.modes, deviation_values, "o", color=style.BLUE, markersize=5.0
         )
         _set_axes(
-            std_axes, uniformity_test.modes, float(np.abs(deviation_values).max()), least_limit=3.0
+            std_axes, uniformity_test.modes, float(np.abs(deviation_values).max()), min_limit=3.0
         )
         half_width_percent = NORMAL_95 * _PERCENT * std[:, panel_number]
         percent_values = _PERCENT * constant_deviations[:, panel_number]
@@ -114,11 +114,11 @@ def uniformity_figure(uniformity_test: UniformBeamTest) -> Figure:
 
 
 def _set_axes(
-    axes: Axes, mode_numbers: tuple[int, ...], largest_value: float, *, least_limit: float = 0.0
+    axes: Axes, mode_numbers: tuple[int, ...], largest_value: float, *, min_limit: float = 0.0
 ) -> None:
     """Set symmetric limits about zero, and a tick at each mode."""
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7, zorder=1)
-    axis_limit = max(1.2 * largest_value, least_limit)
+    axis_limit = max(1.2 * largest_value, min_limit)
     axes.set_ylim(-axis_limit, axis_limit)
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.set_xlim(mode_numbers[0] - 0.5, mode_numbers[-1] + 0.5)
@@ -157,7 +157,7 @@ def uniformity_table(uniformity_test: UniformBeamTest) -> Table:
                 number_cell(deviation / std, "+.1f"), number_cell(deviation, "+#.2g", _PERCENT),
             )
         )  # fmt: skip
-    return Table.of(
+    return Table.from_rows(
         "modal_constants",
         "Modal constants measured and of a uniform beam",
         (

@@ -50,7 +50,7 @@ def supported_band_hz(whole_record: WholeRecord) -> Band | None:
     tuple of float or None
         First and last frequency in Hz; None if there is no such band.
     """
-    if not whole_record.withheld:
+    if not whole_record.withheld_orders:
         return excited_band_hz(whole_record.record, whole_record.analysis)
     mode_frequencies_hz = [
         mode.frequency_hz.value for mode in whole_record.headline.modes if mode.shown
@@ -151,7 +151,7 @@ class NearlyUniformBeam:
     covariance: Real
 
     @classmethod
-    def of(cls, tolerant_estimate: TolerantEstimate) -> NearlyUniformBeam:
+    def from_estimate(cls, tolerant_estimate: TolerantEstimate) -> NearlyUniformBeam:
         """Return the beam of an estimate with a tolerance of the geometry and both orders free."""
         return cls(
             STRUCTURES["VI"],
@@ -167,7 +167,9 @@ def loss_estimate(whole_record: WholeRecord) -> FittedPlant | None:
     headline = whole_record.headline
     if headline.tolerant is not None:
         return (
-            None if headline.tolerant.basis == "none" else NearlyUniformBeam.of(headline.tolerant)
+            None
+            if headline.tolerant.basis == "none"
+            else NearlyUniformBeam.from_estimate(headline.tolerant)
         )
     is_refused = headline.uniform_beam is not None and headline.uniform_beam.status == "refused"
     return None if is_refused else whole_record.fit

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from rich.console import Group
 from rich.text import Text
 
-from analysis.campaigns.sentences import lost_trials, specimens
+from analysis.campaigns.sentences import failed_predictions, specimens
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
@@ -60,7 +60,7 @@ def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
     return (
         *specimens(campaign.homogeneity),
         *([_NO_VERDICT_SENTENCE] if has_estimates else []),
-        *lost_trials(campaign.lost_trials, campaign.trials),
+        *failed_predictions(campaign.failed_predictions, campaign.trials),
     )
 
 
@@ -176,7 +176,7 @@ def _warning_texts(campaign: CampaignResult) -> list[str]:
         *(f"Left out: {failure.message}" for failure in campaign.failures),
         *(
             f"Not predicted from the others: {lost_trial.path}: {lost_trial.reason}"
-            for lost_trial in campaign.lost_trials
+            for lost_trial in campaign.failed_predictions
         ),
         *_session_warnings(campaign),
     ]
@@ -362,7 +362,7 @@ def _figures_with_data(campaign: CampaignResult) -> dict[str, tuple[Callable[[],
 
 def _draw_example_signals(campaign: CampaignResult) -> Figure:
     """Draw the first session's signals as an example, as the paper does."""
-    from analysis.paper import analyse
+    from analysis.paper.welch_analysis import analyse
     from analysis.record import load_record
     from analysis.report._signal_figures import paper_signals_figure as signals_figure
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from analysis.paper import WelchAnalysis
+    from analysis.paper.welch_analysis import WelchAnalysis
     from analysis.record import Record
     from analysis.report._page import Facts
     from analysis.report._style import Picture
@@ -342,7 +342,7 @@ def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple
         ()
         if welch_analysis is None
         else (
-            fit_tables.welch_fits_table(welch_analysis, whole_record.unsupported),
+            fit_tables.welch_fits_table(welch_analysis, whole_record.unsupported_orders),
             fit_tables.peaks_table(welch_analysis),
         )
     )

@@ -144,7 +144,7 @@ class Table:
     grouped: bool = False
 
     @classmethod
-    def of(
+    def from_rows(
         cls,
         name: str,
         caption: str,

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from analysis.report._page import Facts
-    from analysis.touch import Touch, TouchedSession
-    from rigd.touch import Estimated
+    from analysis.touch import SessionTouches, Touch
+    from rigd.touch import TouchQuantity
 
-_MOST_INTERVAL_ASYMMETRY = 0.25
+_MAX_INTERVAL_ASYMMETRY = 0.25
 """Asymmetry of an interval above which its ends are shown instead of value and half-width.
 
 It is the distance of the value from the middle, relative to the interval's length."""
@@ -33,15 +33,15 @@ _KIND_DESCRIPTIONS = {
 """Descriptions of the kinds of contact, by key."""
 
 
-def touches_table(touched_sessions: Sequence[TouchedSession]) -> Table:
+def touches_table(session_touches: Sequence[SessionTouches]) -> Table:
     """Return the table of the touches of all sessions.
 
     Parameters
     ----------
-    touched_sessions : sequence of TouchedSession
+    session_touches : sequence of SessionTouches
         Sessions with their touches.
     """
-    has_several_sessions = len(touched_sessions) > 1
+    has_several_sessions = len(session_touches) > 1
     table_columns = (
         Column("Session" if has_several_sessions else "", "session", TEXT_FORMAT),
         Column("Touch", "number"),
@@ -53,7 +53,7 @@ def touches_table(touched_sessions: Sequence[TouchedSession]) -> Table:
         Column("Kind", "kind", TEXT_FORMAT),
     )
     table_rows = [
-        _touch_row(session, touch) for session in touched_sessions for touch in session.touches
+        _touch_row(session, touch) for session in session_touches for touch in session.touches
     ]
     return Table(
         "touches",
@@ -67,7 +67,7 @@ def touches_table(touched_sessions: Sequence[TouchedSession]) -> Table:
     )
 
 
-def _touch_row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
+def _touch_row(session: SessionTouches, touch: Touch) -> dict[str, Entry]:
     """Return the table row of a touch: time, position, angle, peak force, stiffness and kind."""
     estimate = touch.estimate
     row: dict[str, Entry] = {
@@ -78,7 +78,7 @@ def _touch_row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
         if estimate is None
         else _KIND_DESCRIPTIONS.get(estimate.kind, estimate.kind),
     }
-    estimate_offsets: dict[str, tuple[Estimated | None, float]] = {}
+    estimate_offsets: dict[str, tuple[TouchQuantity | None, float]] = {}
     if estimate is not None:
         estimate_offsets = {
             "time_s": (estimate.time_s, touch.start_s),
@@ -93,7 +93,7 @@ def _touch_row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
     return row
 
 
-def _estimate_cell(estimated_quantity: Estimated | None, display_offset: float) -> Cell:
+def _estimate_cell(estimated_quantity: TouchQuantity | None, display_offset: float) -> Cell:
     """Return the cell of an estimate with its 95 % interval; a dash without an estimate."""
     if estimated_quantity is None:
         return number_cell(None)
@@ -101,7 +101,7 @@ def _estimate_cell(estimated_quantity: Estimated | None, display_offset: float) 
     lower_limit, upper_limit = (
         interval_limit + display_offset for interval_limit in estimated_quantity.interval_95
     )
-    if abs(shown_value - (lower_limit + upper_limit) / 2) > _MOST_INTERVAL_ASYMMETRY * (
+    if abs(shown_value - (lower_limit + upper_limit) / 2) > _MAX_INTERVAL_ASYMMETRY * (
         upper_limit - lower_limit
     ):
         decimal_digits = decimals((upper_limit - lower_limit) / 2)
@@ -116,12 +116,12 @@ def _estimate_cell(estimated_quantity: Estimated | None, display_offset: float) 
     )
 
 
-def session_lines(session: TouchedSession) -> list[str]:
+def session_lines(session: SessionTouches) -> list[str]:
     """Return text lines on a session: number of touches, source of the model, and warnings.
 
     Parameters
     ----------
-    session : TouchedSession
+    session : SessionTouches
         Session with its touches.
     """
     touch_count = len(session.touches)
@@ -142,20 +142,20 @@ def session_lines(session: TouchedSession) -> list[str]:
     ]
 
 
-def model_words(session: TouchedSession) -> str:
+def model_words(session: SessionTouches) -> str:
     """Return as text from where the parameters of a session's beam model are."""
     model_source = session.model.source
     return "the nominal beam of the attached profile" if model_source == "profile" else model_source
 
 
 def touches_document(
-    touched_sessions: Sequence[TouchedSession], error_messages: Mapping[str, str]
+    session_touches: Sequence[SessionTouches], error_messages: Mapping[str, str]
 ) -> dict[str, Any]:
     """Return the touches of all sessions as one JSON document.
 
     Parameters
     ----------
-    touched_sessions : sequence of TouchedSession
+    session_touches : sequence of SessionTouches
         Sessions with their touches.
     error_messages : mapping of str to str
         Message for each file that could not be analysed.
@@ -175,7 +175,7 @@ def touches_document(
                     "validity": session.validity.as_json(),
                     **touch.as_dict(),
                 }
-                for session in touched_sessions
+                for session in session_touches
                 for touch in session.touches
             ],
             "errors": [
@@ -191,7 +191,7 @@ def touches_document(
 
 
 def write_touch_report(
-    touched_sessions: Sequence[TouchedSession],
+    session_touches: Sequence[SessionTouches],
     error_messages: Mapping[str, str],
     folder: Path,
 ) -> None:
@@ -201,7 +201,7 @@ def write_touch_report(
 
     Parameters
     ----------
-    touched_sessions : sequence of TouchedSession
+    session_touches : sequence of SessionTouches
         At least one session.
     error_messages : mapping of str to str
         Message for each file that could not be analysed.
@@ -219,30 +219,30 @@ def write_touch_report(
 
     pictures = []
     with style.figure_style():
-        for illustration in touch_illustrations(touched_sessions):
+        for illustration in touch_illustrations(session_touches):
             figure_stem = folder / "figures" / illustration.name
             picture = style.save_picture(
                 illustration.figure, figure_stem, illustration.description, DEFAULT_FORMATS
             )
             pictures.append(picture)
-    touch_table = touches_table(touched_sessions)
+    touch_table = touches_table(session_touches)
     write_new(folder / "tables" / "touches.csv", csv_text(touch_table))
     write_new(
-        folder / "touches.json", document_text(touches_document(touched_sessions, error_messages))
+        folder / "touches.json", document_text(touches_document(session_touches, error_messages))
     )
     page_html = pages.page(
         "touch.html",
-        title=touched_sessions[0].path.stem
-        if len(touched_sessions) == 1
-        else f"{len(touched_sessions)} sessions",
-        files=", ".join(session.path.name for session in touched_sessions),
+        title=session_touches[0].path.stem
+        if len(session_touches) == 1
+        else f"{len(session_touches)} sessions",
+        files=", ".join(session.path.name for session in session_touches),
         first=(),
-        sentences=[line for session in touched_sessions for line in session_lines(session)[:1]],
+        sentences=[line for session in session_touches for line in session_lines(session)[:1]],
         experiments=(),
         warnings=[
             *(
                 f"{session.path.name}: {sentence}"
-                for session in touched_sessions
+                for session in session_touches
                 for sentence in session.warnings
             ),
             *(f"Left out: {message}" for message in error_messages.values()),
@@ -251,12 +251,12 @@ def write_touch_report(
         tables=(touch_table,) if touch_table.rows else (),
         paper_pictures=(),
         paper_tables=(),
-        how=[*_collect_facts(touched_sessions), pages.versions(datetime.now().astimezone())],
+        how=[*_collect_facts(session_touches), pages.versions(datetime.now().astimezone())],
     )
     write_new(folder / "report.html", page_html)
 
 
-def _collect_facts(touched_sessions: Sequence[TouchedSession]) -> list[Facts]:
+def _collect_facts(session_touches: Sequence[SessionTouches]) -> list[Facts]:
     """Return tables of (name, text) on sessions, model and estimator, for the HTML page."""
     return [
         (
@@ -267,12 +267,12 @@ def _collect_facts(touched_sessions: Sequence[TouchedSession]) -> list[Facts]:
                     f"{session.rate_hz:g} Hz, "
                     + ("torque and base shear" if session.has_shear else "torque alone"),
                 )
-                for session in touched_sessions
+                for session in session_touches
             ],
         ),
         (
             "Model",
-            sorted({(model_words(session), _beam_text(session)) for session in touched_sessions}),
+            sorted({(model_words(session), _beam_text(session)) for session in session_touches}),
         ),
         (
             "Estimate",
@@ -294,7 +294,7 @@ def _collect_facts(touched_sessions: Sequence[TouchedSession]) -> list[Facts]:
     ]
 
 
-def _beam_text(session: TouchedSession) -> str:
+def _beam_text(session: SessionTouches) -> str:
     """Return length, density and bending stiffness of a session's beam model as text."""
     model_beam = session.model.plant.beam
     return (

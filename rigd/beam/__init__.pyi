@@ -32,7 +32,6 @@ from ._parameters import FILTER_PARAMETERS as FILTER_PARAMETERS
 from ._parameters import LOGARITHMIC_PARAMETERS as LOGARITHMIC_PARAMETERS
 from ._parameters import OFFSET_PREFIX as OFFSET_PREFIX
 from ._parameters import PARAMETERS as PARAMETERS
-from ._parameters import DampingParameter as DampingParameter
 from ._parameters import Parameter as Parameter
 from ._parameters import gradient_name as gradient_name
 from ._parameters import parameter_named as parameter_named

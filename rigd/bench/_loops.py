@@ -15,14 +15,14 @@ import numpy as np
 from rigd.bench.measure import LoopMeasurement, UsageMeter, record_measurement
 from rigd.devices import unknown_values
 from rigd.devices.parameters import DeviceSelection
-from rigd.engine.messages import Finished, SessionJob
+from rigd.engine.messages import SessionFinished, SessionJob
 from rigd.engine.reference import write_reference
-from rigd.engine.shared_state import Phase, StateField, Stop
+from rigd.engine.shared_state import Phase, StateField, StopReason
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
 from rigd.runner import ProcessGroup, Rig
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 from rigd.runner.session import SessionProgress
 from rigd.runtime import StopRequest
 from rigd.session import read_session
@@ -117,13 +117,13 @@ def run_alone(
     with connected_rig(profile) as (_, process_group):
         channels, shared_state = process_group.channels, process_group.channels.shared_state
         usage_meter = UsageMeter(process_group.control.pid)
-        shared_state[StateField.STOP] = Stop.NO
+        shared_state[StateField.STOP] = StopReason.NONE
         shared_state[StateField.GO] = 1
         reference_record = write_reference(channels.reference_fd, excitation.reference_rad)
         process_group.control.send(SessionJob(profile, reference_record))
         sample_blocks = []
         finished_message = None
-        while not isinstance(finished_message, Finished):
+        while not isinstance(finished_message, SessionFinished):
             finished_message = process_group.control.poll(_POLL_TIMEOUT_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
             usage_meter.sample(Phase(shared_state[StateField.PHASE]))
@@ -155,7 +155,7 @@ def run_session(
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as temporary_folder,
         connected_rig(profile, live=live) as (rig, process_group),
     ):
-        session_order = Order(profile, excitation, Path(temporary_folder) / "bench.mcap")
+        session_order = SessionOrder(profile, excitation, Path(temporary_folder) / "bench.mcap")
         usage_meter = UsageMeter(process_group.control.pid)
         stop_request = StopRequest()
         if live:

@@ -1,7 +1,7 @@
 """``rigd check``: all checks of a rig that need no torque, in rows.
 
-Offers the whole check (`check_rig`) and the part that every session runs (`check_on_paper`). In
-this order: what profile and EDS file show (module `on_paper`, its functions listed in `_gate`),
+Offers the whole check (`check_rig`) and the part that every session runs (`run_offline_checks`). In
+this order: what profile and EDS file show (module `offline`, listed in `_offline_checks`),
 this computer (`machine`), the devices (`devices`). Each is a list of `rows.CheckRow`, with their
 verdict. No torque is ever commanded.
 """

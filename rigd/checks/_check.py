@@ -1,16 +1,16 @@
-"""Complete check of a rig: on paper, this computer, then the devices.
+"""Complete check of a rig: offline, this computer, then the devices.
 
-The order matters: a failure on paper can rule out that devices are connected.
+The order matters: a failed offline check can rule out that devices are connected.
 """
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rigd.check_rows import CheckResult, CheckRow, grade
-from rigd.checks._gate import paper_rows
+from rigd.checks._offline_checks import offline_rows
 from rigd.checks.devices import calibration_rows, inspect_devices
 from rigd.checks.machine import machine_rows, rights_rows
-from rigd.checks.on_paper import wiring_rows
+from rigd.checks.offline import wiring_rows
 from rigd.devices import unknown_values
 from rigd.errors import UserError
 from rigd.profile import Profile
@@ -56,7 +56,7 @@ def check_without_devices(
     Returns
     -------
     list of CheckRow
-        Rows of the checks on paper, of this computer, and of the calibration.
+        Rows of the offline checks, of this computer, and of the calibration.
     """
     check_rows = _rows_without_devices(profile)
     if calibration is None:
@@ -73,7 +73,7 @@ def check_without_devices(
 def _rows_without_devices(profile: Profile) -> list[CheckRow]:
     """Return the rows of all checks of a profile and this computer that need no devices."""
     return [
-        *paper_rows(profile),
+        *offline_rows(profile),
         *default_session_rows(profile),
         *rights_rows(profile.realtime),
         *machine_rows(profile.realtime),

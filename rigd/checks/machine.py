@@ -17,7 +17,7 @@ from pathlib import Path
 from rigd.check_rows import CheckResult, CheckRow, grade
 from rigd.engine.realtime import MEMORY_LOCKED, REFUSED, isolated_cores
 from rigd.profile import RealtimeSettings
-from rigd.runtime import OWN_PYTHON
+from rigd.runtime.background import OWN_PYTHON
 
 # Rights
 
@@ -25,11 +25,11 @@ _GRANT_TIMEOUT_S = 20.0
 """Longest time in seconds for the process that tries the real-time settings."""
 _GRANT_PROGRAM = """
 import json, sys
-from rigd.engine.realtime import Precedence, apply_realtime
+from rigd.engine.realtime import RaisedPriority, apply_realtime
 priority, below, cpu = map(int, sys.argv[1:])
-other = Precedence(below, cpu)
-supervision = other.take()
-other.release()
+other = RaisedPriority(below, cpu)
+supervision = other.request()
+other.restore()
 print(json.dumps([apply_realtime(priority=priority, cpu=cpu), supervision]))
 """
 """Program that requests the real-time settings and prints those granted as JSON."""

@@ -42,17 +42,17 @@ def check(
     """
     _interrupt_on_end_signals()
     if eds is not None:
-        _print_result(_eds_file_rows(eds, profile), as_json=as_json, on_paper=True)
+        _print_result(_eds_file_rows(eds, profile), as_json=as_json, eds_only=True)
         return
     rig_profile = _openable_profile("sim" if profile is None else profile)
     from rigd.checks import check_rig
 
-    _print_result(check_rig(rig_profile), as_json=as_json, on_paper=False)
+    _print_result(check_rig(rig_profile), as_json=as_json, eds_only=False)
 
 
 def _eds_file_rows(eds: Path, profile: str | None) -> "list[CheckRow]":
     """Return the rows of an EDS file's check, by itself or against a profile."""
-    from rigd.checks.on_paper import eds_rows
+    from rigd.checks.offline import eds_rows
 
     if profile is None:
         return list(eds_rows(eds, None))
@@ -66,10 +66,10 @@ def _eds_file_rows(eds: Path, profile: str | None) -> "list[CheckRow]":
     return list(eds_rows(eds, rig_profile.rig))
 
 
-def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
+def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, eds_only: bool) -> None:
     """Print the rows of a check as a table or JSON, and end with exit code 1 if it failed.
 
-    `on_paper` states that the rows are those of an EDS file only.
+    `eds_only` states that the rows are those of an EDS file only.
     """
     from rigd.check_rows import overall
 
@@ -82,9 +82,9 @@ def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, on_paper: bool
         from rigd.checks import ACCEPTABLE
         from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, print_table
 
-        print_table(check_rows, EDS_CONSEQUENCES if on_paper else RIG_CONSEQUENCES)
+        print_table(check_rows, EDS_CONSEQUENCES if eds_only else RIG_CONSEQUENCES)
         has_failed = {row.name for row in check_rows if row.verdict is CheckResult.FAIL}
-        if has_failed and has_failed.issubset(ACCEPTABLE) and not on_paper:
+        if has_failed and has_failed.issubset(ACCEPTABLE) and not eds_only:
             accepted_rows = " ".join(
                 f"--accept {row_name}" for row_name in ACCEPTABLE if row_name in has_failed
             )
@@ -178,7 +178,7 @@ def _run_bench(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: f
 
     from rigd.bench import Bench
     from rigd.devices import ActuationTarget, actuation_target
-    from rigd.runtime import RigLock
+    from rigd.runtime.locks import RigLock
 
     moves_hardware = actuation_target(profile.rig) is ActuationTarget.HARDWARE
     console = Console(stderr=True)

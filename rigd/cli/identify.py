@@ -172,7 +172,7 @@ def _run_sessions(
         ):
             raise typer.Exit(EXIT_INTERRUPTED)
         file_path = session_results[0].path if session_results else None
-        if file_path is None or not session_results[0].went_well:
+        if file_path is None or not session_results[0].is_successful:
             raise typer.Exit(EXIT_FAILED)
         return file_path
 

@@ -216,14 +216,14 @@ def _validity_text(row: "SessionRow") -> str:
     """Return in short whether a session's linear model is valid; "" if it has no modes."""
     from rigd.session import Validity
 
-    return Validity.of_document(row.validity).short if row.modes else ""
+    return Validity.from_document(row.validity).short if row.modes else ""
 
 
 def _uniform_beam_text(row: "SessionRow") -> str:
     """Return in short whether a uniform beam predicts a session's modes; "" if it is unknown."""
     from rigd.session import Validity
 
-    check_result = Validity.of_document(row.validity).uniform_beam
+    check_result = Validity.from_document(row.validity).uniform_beam
     return "" if check_result is None or not row.modes else check_result.short
 
 

@@ -284,12 +284,12 @@ def _save_recording(path: Path, out: Path, *, web: bool) -> None:
 
 def _check_displayable(path: Path) -> None:
     """Raise an error if the beginning of a file shows that it cannot be displayed."""
-    from rigd.session import check_beginning
+    from rigd.session import check_magic_bytes
 
     if path.suffix == SUFFIX:
         check_rrd_file(path)
     else:
-        check_beginning(path)
+        check_magic_bytes(path)
 
 
 def _convert(path: Path, out: Path) -> None:

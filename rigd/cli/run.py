@@ -46,7 +46,7 @@ from rigd.units import unit_of
 
 if TYPE_CHECKING:
     from rigd.excitation import Value
-    from rigd.runner.session import RunResult
+    from rigd.runner.session import SessionResult
 
 
 class _AddedExcitations(TyperGroup):
@@ -270,7 +270,7 @@ def run_sessions(
         raise typer.Exit(EXIT_FAILED)
     if stop_request.requested:
         raise typer.Exit(EXIT_INTERRUPTED)
-    if not all(session_result.went_well for session_result in session_results):
+    if not all(session_result.is_successful for session_result in session_results):
         raise typer.Exit(EXIT_FAILED)
 
 
@@ -547,7 +547,7 @@ def until(
     }
 
 
-def _write_json(results: "list[RunResult]") -> None:
+def _write_json(results: "list[SessionResult]") -> None:
     """Write the results of sessions as a JSON document to standard output."""
     from rigd.runner.session import results_document
 

@@ -146,7 +146,7 @@ def start_sessions(
         if not detach:
             client.ask("watch")
         with _Interrupts.caught() as interrupts:
-            reply = client.ask_unless(lambda: interrupts.count > 0, "start", **request)
+            reply = client.request_unless_stopped(lambda: interrupts.count > 0, "start", **request)
             if reply["reply"] == "stop":
                 typer.echo("Stopped before the session began.", err=True)
                 raise typer.Exit(EXIT_INTERRUPTED)
@@ -227,7 +227,7 @@ def _follow_series(
             if interrupts.count and not stop_sent:
                 stop_sent = True
                 client.send("stop")
-                progress_line.say(
+                progress_line.write_message(
                     "Stopping; press Ctrl-C again to leave while the daemon finishes."
                 )
             if final_event is None and interrupts.count > 1:
@@ -249,15 +249,15 @@ def _follow_series(
                 case "message" if "session" in daemon_event:
                     pass  # the end of a session is reported by the event of that name
                 case "message" if daemon_event["level"] != "info":
-                    progress_line.say(
+                    progress_line.write_message(
                         f"{daemon_event['level'].capitalize()}: {daemon_event['text']}"
                     )
                 case "message" if daemon_event.get("notable") or daemon_event["text"].startswith(
                     "Live view"
                 ):
-                    progress_line.say(daemon_event["text"])
+                    progress_line.write_message(daemon_event["text"])
                 case "session":
-                    progress_line.say(result_line(daemon_event))
+                    progress_line.write_message(result_line(daemon_event))
                     progress_line.close()  # standard output may be the same terminal
                     if daemon_event["path"] is not None:
                         if not as_json:
@@ -269,16 +269,16 @@ def _follow_series(
                     progress_line, ended_sessions = ProgressLine(), daemon_event["number"]
                 case "quick_look" if daemon_event["path"] in awaited_quick_looks:
                     awaited_quick_looks.discard(daemon_event["path"])
-                    quick_look = QuickLook.of_event(daemon_event)
+                    quick_look = QuickLook.from_event(daemon_event)
                     if quick_look.path is not None:
                         quick_look_paths[daemon_event["path"]] = str(quick_look.path)
                     for log_text in quick_look.lines:
-                        progress_line.say(log_text)
+                        progress_line.write_message(log_text)
                 case "series" if daemon_event["series"] == series_number:
                     final_event, interrupts_at_end = daemon_event, interrupts.count
                     deadline_s = time.monotonic() + _QUICK_LOOK_PATIENCE_S
                     if awaited_quick_looks:
-                        progress_line.say("Quick look at the session; Ctrl-C skips it.")
+                        progress_line.write_message("Quick look at the session; Ctrl-C skips it.")
     finally:
         progress_line.close()
     session_results = [

@@ -1,5 +1,4 @@
 from ._closed_loop import ClosedLoop as ClosedLoop
-from ._closed_loop import LoopResponse as LoopResponse
 from ._closed_loop import check_stability as check_stability
 from ._closed_loop import close_loop as close_loop
 from ._closed_loop import stable_loop as stable_loop

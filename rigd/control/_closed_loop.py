@@ -70,7 +70,7 @@ class LoopResponse:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CutSignal:
+class LoopOpening:
     """Signal at which the closed loop can be opened, to compute the gain of the open loop.
 
     The signal depends on the present state and acts on the next state. ``outer(action, reading)``
@@ -104,7 +104,7 @@ class ClosedLoop:
     """Direct effect of the reference on the outputs, shape (5,)."""
     model: LoopModel
     """Model from which the loop was computed."""
-    cuts: tuple[CutSignal, ...]
+    openings: tuple[LoopOpening, ...]
     """Signals at which the loop can be opened: torque command, angle reading, torque reading."""
     poles_rad_s: Complex
     """Poles of the loop in continuous time, the fastest growing (or slowest decaying) first."""
@@ -123,7 +123,7 @@ class ClosedLoop:
         """Growth rate of the loop's fastest growing mode in 1/s; negative if all modes decay."""
         return float(self.poles_rad_s[0].real)
 
-    def least_damped(self) -> complex:
+    def least_damped_pole(self) -> complex:
         """Return the pole of the closed loop with the lowest damping ratio, in rad/s."""
         return complex(min(self.poles_rad_s, key=_damping_ratio))
 
@@ -298,9 +298,9 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     torque_action = law.d[0, 2] * command_column
     torque_action[n:] = law.b[:, 2]
     cut_signals = (
-        CutSignal("torque command", command_column, torque_row),
-        CutSignal("angle reading", angle_action, measured_angle_row),
-        CutSignal("torque reading", torque_action, measured_torque_row),
+        LoopOpening("torque command", command_column, torque_row),
+        LoopOpening("angle reading", angle_action, measured_angle_row),
+        LoopOpening("torque reading", torque_action, measured_torque_row),
     )
 
     a[:n, :n] = discrete_plant.a
@@ -374,7 +374,7 @@ def check_stability(closed_loop: ClosedLoop) -> str | None:
         raise ControlDesignError(f"{instability_text}; {remedy_text}.")
     if (plant := closed_loop.model.plant) is not None:
         lightly_damped_loop = close_loop(lightly_damped_model(closed_loop.model, plant))
-        least_damped_pole = lightly_damped_loop.least_damped()
+        least_damped_pole = lightly_damped_loop.least_damped_pole()
         if _damping_ratio(least_damped_pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_REDUCTION:
             raise ControlDesignError(
                 "The closed loop is stable only by the beam's own damping: without it (spectral "

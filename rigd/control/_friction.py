@@ -69,15 +69,15 @@ def simulate_disturbed(
     """
     realisation, settings = closed_loop.realisation, closed_loop.model.settings
     assert realisation is not None
-    command_cut, angle_cut, torque_cut = closed_loop.cuts
+    command_opening, angle_opening, torque_opening = closed_loop.openings
     n, step_rad = reference_rad.size, disturbances.encoder_step_rad
     random_numbers = np.random.default_rng(seed)
     offset_rad = step_rad * random_numbers.uniform(-0.5, 0.5, draws)
     torque_noise_nm = random_numbers.normal(0.0, disturbances.torque_noise_nm, (n, draws))
     input_columns = np.stack(
-        [closed_loop.b, command_cut.action, torque_cut.action, angle_cut.action], axis=1
+        [closed_loop.b, command_opening.action, torque_opening.action, angle_opening.action], axis=1
     )
-    output_rows = np.stack([closed_loop.c[0], angle_cut.reading, closed_loop.c[3]])
+    output_rows = np.stack([closed_loop.c[0], angle_opening.reading, closed_loop.c[3]])
     velocity_row, shaft_effect = closed_loop.c[1], closed_loop.shaft_torque[:, None]
     speed_per_torque = float(velocity_row @ closed_loop.shaft_torque)
 

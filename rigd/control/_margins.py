@@ -1,4 +1,4 @@
-"""Gain, phase, delay and modulus margin of the discrete closed loop at each of its cuts.
+"""Gain, phase, delay and modulus margin of the discrete closed loop at each of its openings.
 
 A margin states how wrong one signal may be before the loop becomes unstable. There are three such
 signals, each with a meaning of its own:
@@ -27,7 +27,7 @@ from math import inf, nan, pi
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.control._closed_loop import ClosedLoop, CutSignal
+from rigd.control._closed_loop import ClosedLoop, LoopOpening
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -60,7 +60,7 @@ class Margins:
     A frequency is NaN if the margin is unlimited.
     """
 
-    cut: str
+    opening: str
     """Name of the signal."""
     gain_up: float
     """Smallest factor above 1 on the signal with which the loop becomes unstable; infinite if
@@ -107,23 +107,23 @@ def loop_margins(closed_loop: ClosedLoop) -> tuple[Margins, ...]:
     >>> from rigd.control import close_loop, loop_margins
     >>> from rigd.profile import load_profile
     >>> for each in loop_margins(close_loop(load_profile("sim").loop_model())):
-    ...     print(f"{each.cut}: modulus margin {each.modulus:.2f}")
+    ...     print(f"{each.opening}: modulus margin {each.modulus:.2f}")
     torque command: modulus margin 0.23
     angle reading: modulus margin 0.47
     torque reading: modulus margin 0.25
     """
-    return tuple(_margins_at_cut(closed_loop, cut) for cut in closed_loop.cuts)
+    return tuple(_margins_at_opening(closed_loop, opening) for opening in closed_loop.openings)
 
 
-def open_loop_gain(closed_loop: ClosedLoop, cut_signal: CutSignal, phase_rad: Real) -> Complex:
+def open_loop_gain(closed_loop: ClosedLoop, opening: LoopOpening, phase_rad: Real) -> Complex:
     """Return the complex gain L of the loop opened at one signal, at some frequencies.
 
     The sensitivity of the closed loop is ``1/(1 + L)``.
 
     Parameters
     ----------
-    closed_loop, cut_signal
-        Closed loop, and one of its cuts.
+    closed_loop, opening
+        Closed loop, and one of its openings.
     phase_rad
         Angular frequencies times the period, shape (m,); π is half the sampling rate.
 
@@ -132,29 +132,29 @@ def open_loop_gain(closed_loop: ClosedLoop, cut_signal: CutSignal, phase_rad: Re
     ndarray
         Complex gain, shape (m,).
     """
-    n = cut_signal.action.size
-    open_loop_matrix = closed_loop.a - np.outer(cut_signal.action, cut_signal.reading)
+    n = opening.action.size
+    open_loop_matrix = closed_loop.a - np.outer(opening.action, opening.reading)
     complex_gain = np.empty(phase_rad.shape, complex)
     for first_index in range(0, phase_rad.size, _FREQUENCIES_AT_ONCE):
         z = np.exp(1j * phase_rad[first_index : first_index + _FREQUENCIES_AT_ONCE])[
             :, np.newaxis, np.newaxis
         ]
-        action_column = np.broadcast_to(cut_signal.action[:, np.newaxis], (z.size, n, 1))
+        action_column = np.broadcast_to(opening.action[:, np.newaxis], (z.size, n, 1))
         state_responses = np.linalg.solve(z * np.eye(n) - open_loop_matrix, action_column)
         complex_gain[first_index : first_index + _FREQUENCIES_AT_ONCE] = -(
-            state_responses[:, :, 0] @ cut_signal.reading
+            state_responses[:, :, 0] @ opening.reading
         )
     return complex_gain
 
 
-def _margins_at_cut(closed_loop: ClosedLoop, cut_signal: CutSignal) -> Margins:
+def _margins_at_opening(closed_loop: ClosedLoop, opening: LoopOpening) -> Margins:
     """Return the stability margins of a closed loop opened at one signal."""
 
     def curve(phase_rad: Real) -> Complex:
-        return open_loop_gain(closed_loop, cut_signal, phase_rad)
+        return open_loop_gain(closed_loop, opening, phase_rad)
 
     rate_hz = closed_loop.model.rate_hz
-    angular_frequencies = _examined_frequencies(closed_loop, cut_signal)
+    angular_frequencies = _examined_frequencies(closed_loop, opening)
     complex_gain = curve(angular_frequencies)
 
     crossing_phase_rad, real_gain = _negative_real_crossings(
@@ -184,7 +184,7 @@ def _margins_at_cut(closed_loop: ClosedLoop, cut_signal: CutSignal) -> Margins:
     )
     phase_rad_to_hz = rate_hz / (2.0 * pi)
     return Margins(
-        cut=cut_signal.name,
+        opening=opening.name,
         gain_up=gain_up,
         gain_up_hz=gain_up_phase_rad * phase_rad_to_hz,
         gain_down=0.0 if gain_down == inf else -gain_down,
@@ -202,12 +202,12 @@ Curve = Callable[[Real], Complex]
 """Function that returns the open loop's gain at angular frequencies times the period."""
 
 
-def _examined_frequencies(closed_loop: ClosedLoop, cut_signal: CutSignal) -> Real:
+def _examined_frequencies(closed_loop: ClosedLoop, opening: LoopOpening) -> Real:
     """Return the frequencies at which margins are searched, in rad per tick, increasing.
 
     They are dense around the resonances of the open and the closed loop.
     """
-    open_loop_matrix = closed_loop.a - np.outer(cut_signal.action, cut_signal.reading)
+    open_loop_matrix = closed_loop.a - np.outer(opening.action, opening.reading)
     resonance_poles = np.concatenate(
         [np.linalg.eigvals(state_matrix) for state_matrix in (open_loop_matrix, closed_loop.a)]
     )

@@ -27,7 +27,7 @@ _MAX_HALVINGS = 5
 """Largest number of times that the strength of the damping is halved to make the loop stable."""
 _STIFFNESS_RATIOS = (0.8, 1.0, 1.25)
 """Ratios of the beam's stiffness to the profile's for which the loop must be stable."""
-_SLOW_CORNER_OVER_MODE = 0.25
+_HIGH_PASS_CORNER_OVER_MODE = 0.25
 """Frequency below which torques are filtered out, over the frequency of the first mode."""
 
 
@@ -35,13 +35,13 @@ _SLOW_CORNER_OVER_MODE = 0.25
 class DamperSettings:
     """Settings of the active damping of one rig's beam: gain, lead and corners of the filters."""
 
-    yield_rad_per_nm_s: float
+    gain_rad_per_nm_s: float
     """Speed of the reference per torque of the beam."""
     lead_s: float
     """Lead time that compensates the lag of the loop."""
-    slow_rad_s: float
+    high_pass_rad_s: float
     """Corner frequency below which torques are filtered out."""
-    fast_rad_s: float
+    low_pass_rad_s: float
     """Corner frequency above which torques are filtered out."""
 
 
@@ -89,10 +89,10 @@ class _DampingLaw:
     """
 
     def __init__(self, settings: DamperSettings, rate_hz: float) -> None:
-        self._gain = settings.yield_rad_per_nm_s / rate_hz
-        self._lead = settings.yield_rad_per_nm_s * settings.lead_s
-        self._fast_coefficient = 1.0 - exp(-settings.fast_rad_s / rate_hz)
-        self._slow_coefficient = 1.0 - exp(-settings.slow_rad_s / rate_hz)
+        self._gain = settings.gain_rad_per_nm_s / rate_hz
+        self._lead = settings.gain_rad_per_nm_s * settings.lead_s
+        self._low_pass_coefficient = 1.0 - exp(-settings.low_pass_rad_s / rate_hz)
+        self._high_pass_coefficient = 1.0 - exp(-settings.high_pass_rad_s / rate_hz)
 
     def advance(
         self, law_state: tuple[_Signal, _Signal, _Signal], torque_value: _Signal
@@ -102,11 +102,13 @@ class _DampingLaw:
         The state consists of both filters and the leaky integral.
         """
         fast_filter, slow_filter, leaky_integral = law_state
-        fast_filter = fast_filter + self._fast_coefficient * (torque_value - fast_filter)
-        slow_filter = slow_filter + self._slow_coefficient * (fast_filter - slow_filter)
+        fast_filter = fast_filter + self._low_pass_coefficient * (torque_value - fast_filter)
+        slow_filter = slow_filter + self._high_pass_coefficient * (fast_filter - slow_filter)
         filtered_torque = fast_filter - slow_filter
         leaky_integral = (
-            leaky_integral - self._slow_coefficient * leaky_integral + self._gain * filtered_torque
+            leaky_integral
+            - self._high_pass_coefficient * leaky_integral
+            + self._gain * filtered_torque
         )
         return (
             fast_filter,
@@ -143,10 +145,10 @@ def design_damper(closed_loop: "ClosedLoop") -> DamperSettings | None:
         return None
     first_rad_s = float(undamped_frequencies_rad_s(plant.beam, 1)[0])
     settings = DamperSettings(
-        yield_rad_per_nm_s=_DAMPING_STRENGTH / (plant.beam.inertia_kg_m2 * first_rad_s),
+        gain_rad_per_nm_s=_DAMPING_STRENGTH / (plant.beam.inertia_kg_m2 * first_rad_s),
         lead_s=2.0 / loop_model.settings.pole_rad_s,
-        slow_rad_s=_SLOW_CORNER_OVER_MODE * first_rad_s,
-        fast_rad_s=4.0 * loop_model.settings.pole_rad_s,
+        high_pass_rad_s=_HIGH_PASS_CORNER_OVER_MODE * first_rad_s,
+        low_pass_rad_s=4.0 * loop_model.settings.pole_rad_s,
     )
     bending_stiffness_n_m2 = plant.beam.bending_stiffness_n_m2
     beams = [
@@ -163,7 +165,7 @@ def design_damper(closed_loop: "ClosedLoop") -> DamperSettings | None:
         # The same growth as without it is allowed, on beams with almost no damping of their own.
         if max(growth_rates_per_s) <= MAX_GROWTH_PER_S:
             return settings
-        settings = replace(settings, yield_rad_per_nm_s=0.5 * settings.yield_rad_per_nm_s)
+        settings = replace(settings, gain_rad_per_nm_s=0.5 * settings.gain_rad_per_nm_s)
     return None
 
 
@@ -180,7 +182,9 @@ def damped_poles(closed_loop: "ClosedLoop", settings: DamperSettings) -> Complex
     from rigd.control._closed_loop import continuous_poles
 
     n, rate_hz = closed_loop.b.size, closed_loop.model.rate_hz
-    torque_reading = next(cut.reading for cut in closed_loop.cuts if cut.name == "torque reading")
+    torque_reading = next(
+        opening.reading for opening in closed_loop.openings if opening.name == "torque reading"
+    )
     fast_row, slow_row, leaky_integral = np.eye(3, n + 3, n)
     next_states, displacement = _DampingLaw(settings, rate_hz).advance(
         (fast_row, slow_row, leaky_integral), np.append(torque_reading, np.zeros(3))

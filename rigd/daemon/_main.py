@@ -22,7 +22,8 @@ from rigd.devices import (
 )
 from rigd.profile import Profile
 from rigd.runner import Rig
-from rigd.runtime import STOP_SIGNAL, RigLock
+from rigd.runtime import STOP_SIGNAL
+from rigd.runtime.locks import RigLock
 
 _END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 

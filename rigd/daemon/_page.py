@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.daemon._log import LOGGER_NAME
-from rigd.engine.messages import Failed, PageAddress
-from rigd.engine.processes import Child, ChildError
+from rigd.engine.messages import PageAddress, ProcessFailed
+from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.workers import PAGE
 from rigd.runtime.addresses import announce, file_name, read_address, runtime_folder, started_at
 
@@ -71,7 +71,7 @@ class PageProcess:
         self._address_path = _address_path(profile.name)
         self._on_address = on_address
         self._is_closing = threading.Event()
-        self._child: Child | None = None
+        self._child: ChildProcess | None = None
         self._thread = threading.Thread(target=self._restart_repeatedly, name="page", daemon=True)
         self._thread.start()
 
@@ -80,9 +80,9 @@ class PageProcess:
         self._is_closing.set()
         if self._child is not None:
             self._child.close_input()
-            self._thread.join(PAGE.end_s)
+            self._thread.join(PAGE.end_timeout_s)
             self._child.kill()
-        self._thread.join(PAGE.end_s)
+        self._thread.join(PAGE.end_timeout_s)
         self._address_path.unlink(missing_ok=True)
 
     def _restart_repeatedly(self) -> None:
@@ -104,7 +104,7 @@ class PageProcess:
 
     def _run_process(self) -> None:
         """Start the process of the page, announce its address, and wait for its end."""
-        self._child = page_process = Child(PAGE)
+        self._child = page_process = ChildProcess(PAGE)
         if self._is_closing.is_set():
             page_process.kill()
         failure_text = ""
@@ -114,7 +114,7 @@ class PageProcess:
                 match page_process.poll(None):
                     case PageAddress(port):
                         self._announce(port)
-                    case Failed(failure_text):
+                    case ProcessFailed(failure_text):
                         pass
         except (ChildError, ValueError):  # it has ended, or its input was closed
             page_process.stop()

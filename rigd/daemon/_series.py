@@ -11,7 +11,7 @@ from rigd.daemon._log import LOGGER_NAME
 from rigd.daemon._states import DaemonState, Document, fit_document
 from rigd.engine.shared_state import LogEvent
 from rigd.runner import RigError, Series, result_line
-from rigd.runner.session import RunResult, SessionProgress
+from rigd.runner.session import SessionProgress, SessionResult
 from rigd.runtime import StopRequest
 
 _LOGGING_LEVELS = {
@@ -46,7 +46,7 @@ class ServedSeries:
     """Path of the present session's file."""
     fit: Document | None = None
     """Last fit of the present session's record."""
-    results: list[RunResult] = field(default_factory=list)
+    results: list[SessionResult] = field(default_factory=list)
     """Results of the sessions so far, including a failed session."""
     reason: str = ""
     """Sentence that states why the series ended early; empty if it did not."""
@@ -142,7 +142,7 @@ class SeriesReporter:
         for fit in progress.fits:
             self._report_fit(fit)
 
-    def on_result(self, result: RunResult, *, look_follows: bool) -> None:
+    def on_result(self, result: SessionResult, *, look_follows: bool) -> None:
         series = self._series
         series.results.append(result)
         fit_entry = {}
@@ -152,7 +152,7 @@ class SeriesReporter:
             fit_entry = {"fit": series.fit}
         outcome_line = result_line(result.as_dict())
         _log.log(
-            logging.INFO if result.went_well else logging.WARNING,
+            logging.INFO if result.is_successful else logging.WARNING,
             "series %d: session %d of %d, %s: %s",
             series.number,
             series.session,

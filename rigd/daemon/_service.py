@@ -16,7 +16,7 @@ from math import inf
 from pathlib import Path
 from typing import TypeVar
 
-from rigd.checks import check_on_paper
+from rigd.checks import run_offline_checks
 from rigd.daemon import _protocol as protocol
 from rigd.daemon import background
 from rigd.daemon._log import LOGGER_NAME
@@ -40,7 +40,7 @@ from rigd.devices import ActuationTarget, describe_actuation_target
 from rigd.errors import UserError
 from rigd.profile import Profile
 from rigd.runner import ProbeFailedError, Rig, RigError, Series
-from rigd.runner.quick_looks import QuickLook, QuickLooks
+from rigd.runner.quick_looks import QuickLook, QuickLookQueue
 from rigd.runner.request import remaining_file_text
 from rigd.runner.session import SessionFailedError
 from rigd.runner.status import RigStatus
@@ -112,7 +112,7 @@ class Service:
         self._find_target = find_target
         self._announced_target = find_target()
         self._failed_checks = [
-            asdict(failed_check) for failed_check in check_on_paper(profile).failed
+            asdict(failed_check) for failed_check in run_offline_checks(profile).failed
         ]
         self._fast = fast
         self._live = live
@@ -127,7 +127,7 @@ class Service:
         """Number of stops that were requested so far."""
         self._is_closing = False
         self._series: ServedSeries | None = None
-        self._quick_looks = QuickLooks(self._report_quick_look) if quick_looks else None
+        self._quick_looks = QuickLookQueue(self._report_quick_look) if quick_looks else None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._series_count = 0
@@ -553,7 +553,7 @@ class Service:
             await self._disconnect_safely()
         else:
             last_result = series.results[-1] if series.results else None
-            if last_result is not None and not last_result.went_well:
+            if last_result is not None and not last_result.is_successful:
                 series.reason = last_result.reason
                 if last_result.fault:
                     fault_reason = last_result.reason
@@ -646,7 +646,7 @@ class Service:
     def _report_quick_look(self, quick_look: QuickLook) -> None:
         """Log and publish a quick look; either thread may call this."""
         if self._series is not None:
-            quick_look.note(self._series.results)
+            quick_look.add_path_to_results(self._series.results)
         for report_line in quick_look.lines:
             _log.info("%s", report_line)
         if self._loop is not None:

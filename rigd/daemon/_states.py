@@ -286,7 +286,7 @@ def _process_state(process: ProcessStatus, phase: Phase) -> str:
 
     A process that runs for one session only has the state ``done``, not ``ended``, after it.
     """
-    is_for_one_session = any(p.for_one_session and p.name == process.name for p in PROCESSES)
+    is_for_one_session = any(p.is_per_session and p.name == process.name for p in PROCESSES)
     return (
         "done"
         if process.state == "ended" and is_for_one_session and phase is Phase.OFF
@@ -308,7 +308,7 @@ the modal constants of the test of a uniform beam."""
 def fit_document(fit: Mapping[str, Any]) -> Document:
     """Return a fit of the record as a dictionary for JSON that has a limited size.
 
-    `fit` has the format of `RunResult.fit`.
+    `fit` has the format of `SessionResult.fit`.
     """
     return {
         fit_key: _shortened_value(fit[fit_key]) for fit_key in _PUBLISHED_FIT_KEYS if fit_key in fit

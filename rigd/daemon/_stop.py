@@ -23,8 +23,9 @@ from rigd.daemon.address import GROUP_FOLDER, SOCKET_SUFFIX, own_sockets, peer_a
 from rigd.daemon.client import UNKNOWN_STATE, await_end, stop_session
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.errors import RigdError
-from rigd.runtime import STOP_SIGNAL, held_rig, holds_rig
+from rigd.runtime import STOP_SIGNAL
 from rigd.runtime.addresses import file_name, folder_fault, known_folders
+from rigd.runtime.locks import holds_rig_lock, locked_rig
 from rigd.runtime.processes import RunningProcess, read_processes, send_signal
 
 _END_TIMEOUT_S: Final = 10.0
@@ -324,7 +325,7 @@ class _DaemonStop:
         if folder_fault(folder, shared=is_group_folder):
             return "Other users can write to its folder."
         try:
-            holds_lock = holds_rig(pid, rig, folder)
+            holds_lock = holds_rig_lock(pid, rig, folder)
         except OSError as error:
             return f"The table of locks cannot be read ({error.strerror})."
         # The folder with the lock of a simulated rig is readable only by the daemon's user. But
@@ -402,7 +403,7 @@ class _SupervisorStop:
         self.controls = control_processes
         self._rigd_command = _rigd_arguments(process.command)
         self._start_time = process.start_ticks or 0
-        self._rig = held_rig(process.pid) or self._rig_of_command_line
+        self._rig = locked_rig(process.pid) or self._rig_of_command_line
         self._had_session = self.has_session
         self.suspended = False
         """Whether the process was sent the signal but is suspended, and cannot receive it."""

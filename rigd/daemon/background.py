@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol, TypeVar
 
-from rigd.checks import check_on_paper
+from rigd.checks import run_offline_checks
 from rigd.daemon._protocol import CommandError, StartRequest
-from rigd.engine.messages import Performed
-from rigd.engine.processes import Child, ChildError, Parent
+from rigd.engine.messages import JobPerformed
+from rigd.engine.processes import ChildError, ChildProcess, SupervisorConnection
 from rigd.engine.workers import PLAN, PREDICTION, Worker
 from rigd.errors import RigdError
 from rigd.excitation import Value
@@ -145,7 +145,7 @@ class PlanJob:
         notes = request.notes.as_metadata()
         try:
             profile = with_specimen(self.profile, notes.get("specimen", ""))
-            check_on_paper(profile, request.accept).require()
+            run_offline_checks(profile, request.accept).require()
             profile = with_tip_slope(profile, request.tip_slope_rad)
             return Series(
                 profile,
@@ -181,7 +181,7 @@ async def perform(job: BackgroundJob[Result]) -> Result:
         If the job is refused, fails, or takes longer than 50 s.
     """
     try:
-        child = Child(job.worker)
+        child = ChildProcess(job.worker)
     except ChildError as error:
         raise CommandError(f"No process can be started for it ({error.system_reason}).") from None
     try:
@@ -194,7 +194,7 @@ async def perform(job: BackgroundJob[Result]) -> Result:
         raise CommandError(f"Its process ended with exit code {child.exit_code}.") from None
     finally:
         await asyncio.to_thread(child.stop)
-    assert isinstance(performed, Performed)
+    assert isinstance(performed, JobPerformed)
     if isinstance(performed.result, CommandError):
         raise performed.result
     job_result: Result = performed.result
@@ -204,7 +204,7 @@ async def perform(job: BackgroundJob[Result]) -> Result:
 def main() -> None:
     """Perform a job of the daemon, and send its result, or an error in place of the result."""
     ignore_signals()
-    daemon = Parent()
+    daemon = SupervisorConnection()
     job: BackgroundJob[object] = daemon.receive_job()
     result_or_error: object
     try:
@@ -219,7 +219,7 @@ def main() -> None:
         )
     if isinstance(result_or_error, dict):
         json.dumps(result_or_error, allow_nan=False)  # raises if the reply is not JSON
-    daemon.send(Performed(result_or_error))
+    daemon.send(JobPerformed(result_or_error))
 
 
 if __name__ == "__main__":

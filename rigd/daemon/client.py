@@ -51,7 +51,7 @@ UNKNOWN_STATE = (
 # Connection
 
 
-class DaemonGoneError(FailureError):
+class DaemonUnreachableError(FailureError):
     """Raised if the daemon cannot be reached, or the connection to it was lost.
 
     Parameters
@@ -72,7 +72,11 @@ class DaemonGoneError(FailureError):
 
         If the connection was lost, it states which processes still run, after up to 3 s.
         """
-        return str(self) if self._lost_process is None else describe_remains(*self._lost_process)
+        return (
+            str(self)
+            if self._lost_process is None
+            else describe_remaining_processes(*self._lost_process)
+        )
 
 
 class RefusedByDaemonError(RigdError):
@@ -110,7 +114,7 @@ class Client:
 
     Raises
     ------
-    DaemonGoneError
+    DaemonUnreachableError
         If no process listens on the socket, or the connection is not accepted in time.
     """
 
@@ -127,7 +131,7 @@ class Client:
         self._connect()
 
     def _connect(self) -> None:
-        """Connect to the daemon; raise DaemonGoneError if that fails or takes too long."""
+        """Connect to the daemon; raise DaemonUnreachableError if that fails or takes too long."""
         self._received = b""
         self._socket = new_socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
@@ -140,14 +144,14 @@ class Client:
             self.pid, self.uid = peer_of(new_socket)
         except BlockingIOError:
             new_socket.close()
-            raise DaemonGoneError(
+            raise DaemonUnreachableError(
                 f"The daemon on {self._path} takes no connection within "
                 f"{self._connect_timeout_s:g} s: it is suspended, or overloaded by other clients. "
                 f"{UNKNOWN_STATE}"
             ) from None
         except OSError as error:
             new_socket.close()
-            raise DaemonGoneError(
+            raise DaemonUnreachableError(
                 f"The daemon on {self._path} cannot be reached ({error.strerror or error})."
             ) from None
 
@@ -188,12 +192,14 @@ class Client:
         ------
         RefusedByDaemonError
             If the daemon refuses the request.
-        DaemonGoneError
+        DaemonUnreachableError
             If the daemon does not reply.
         """
-        return self.ask_unless(lambda: False, command, **fields)
+        return self.request_unless_stopped(lambda: False, command, **fields)
 
-    def ask_unless(self, stopped: Callable[[], bool], command: str, **fields: object) -> Document:
+    def request_unless_stopped(
+        self, stopped: Callable[[], bool], command: str, **fields: object
+    ) -> Document:
         """Send a request like :meth:`ask`, but cancel it if a stop is requested meanwhile.
 
         Parameters
@@ -214,13 +220,13 @@ class Client:
         ------
         RefusedByDaemonError
             If the daemon refuses the request.
-        DaemonGoneError
+        DaemonUnreachableError
             If the daemon does not reply.
         """
         deadline_s = time.monotonic() + min(_TOO_MANY_CLIENTS_TIMEOUT_S, self._reply_timeout_s)
         while True:
             try:
-                return self._ask_once(command, fields, stopped)
+                return self._request_once(command, fields, stopped)
             except _TooManyClientsError:
                 if time.monotonic() > deadline_s:
                     raise
@@ -228,7 +234,7 @@ class Client:
                 self.close()
                 self._connect()
 
-    def _ask_once(
+    def _request_once(
         self, command: str, fields: dict[str, object], stopped: Callable[[], bool]
     ) -> Document:
         """Send a request once, and return its reply, or that to a stop sent after it."""
@@ -251,7 +257,7 @@ class Client:
                 raise _refusal_error(reply_message)
             else:
                 return reply_message
-        raise DaemonGoneError(
+        raise DaemonUnreachableError(
             f"The daemon (process {self.pid}) does not answer within {self._reply_timeout_s:g} s. "
             f"{UNKNOWN_STATE}"
         )
@@ -268,7 +274,7 @@ class Client:
 
         Raises
         ------
-        DaemonGoneError
+        DaemonUnreachableError
             If the request cannot be sent.
         """
         request_line = json.dumps({"command": command, **fields}).encode() + b"\n"
@@ -285,7 +291,7 @@ class Client:
 
         Raises
         ------
-        DaemonGoneError
+        DaemonUnreachableError
             If the connection was lost.
         """
         return self._events.popleft() if self._events else self._next_message(timeout_s)
@@ -310,7 +316,9 @@ class Client:
         except ValueError:
             message = None
         if not isinstance(message, dict):
-            raise DaemonGoneError("The process on the socket is not a daemon of this version.")
+            raise DaemonUnreachableError(
+                "The process on the socket is not a daemon of this version."
+            )
         return message
 
     def _raise_refusal(self) -> None:
@@ -319,12 +327,12 @@ class Client:
             while (last_message := self._next_message(0.1)) is not None:
                 if "error" in last_message:
                     raise _refusal_error(last_message)
-        except DaemonGoneError:
+        except DaemonUnreachableError:
             return
 
-    def _connection_lost_error(self) -> DaemonGoneError:
+    def _connection_lost_error(self) -> DaemonUnreachableError:
         """Return the error for a lost connection."""
-        return DaemonGoneError(
+        return DaemonUnreachableError(
             f"The connection to the daemon (process {self.pid}) is lost.", (self.pid, self.uid)
         )
 
@@ -364,7 +372,7 @@ def stop_session(path: Path) -> Document:
     ------
     RefusedByDaemonError
         If the daemon refuses the request.
-    DaemonGoneError
+    DaemonUnreachableError
         If the daemon does not confirm the stop within 10 s. The message states what was done.
     """
     began_s = time.monotonic()
@@ -376,7 +384,7 @@ def stop_session(path: Path) -> Document:
             with Client(path, reply_timeout_s, reply_timeout_s) as client:
                 peer = client.pid, client.uid
                 return client.ask("stop") | {"signalled": signalled, "peer": peer}
-        except (DaemonGoneError, _TooManyClientsError) as error:
+        except (DaemonUnreachableError, _TooManyClientsError) as error:
             last_failure = str(error)
         elapsed_s = time.monotonic() - began_s
         if peer is not None and not signalled and elapsed_s > _STOP_SIGNAL_DELAY_S:
@@ -387,10 +395,10 @@ def stop_session(path: Path) -> Document:
         reply_timeout_s = min(2.0 * reply_timeout_s, _STOP_TIMEOUT_S)
         time.sleep(_RETRY_PAUSE_S)
     if peer is None:
-        raise DaemonGoneError(last_failure)
+        raise DaemonUnreachableError(last_failure)
     if not signalled:
-        raise DaemonGoneError(last_failure, peer)
-    raise DaemonGoneError(
+        raise DaemonUnreachableError(last_failure, peer)
+    raise DaemonUnreachableError(
         f"The daemon (process {peer[0]}) was sent {STOP_SIGNAL.name}, which asks it to stop, and "
         f"has not replied for {elapsed_s:.0f} s. {UNKNOWN_STATE}"
     )
@@ -418,13 +426,13 @@ def await_end(
 
     Raises
     ------
-    RefusedByDaemonError, DaemonGoneError
+    RefusedByDaemonError, DaemonUnreachableError
         If the daemon no longer replies.
     """
     deadline_s = time.monotonic() + patience_s
     with Client(path, answer_s=patience_s) as client:
         if peer not in (None, (client.pid, client.uid)):
-            raise DaemonGoneError(f"Another process listens on {path} now. {UNKNOWN_STATE}")
+            raise DaemonUnreachableError(f"Another process listens on {path} now. {UNKNOWN_STATE}")
         while True:
             try:
                 daemon_status = client.ask("status")
@@ -443,7 +451,7 @@ def await_end(
             time.sleep(_RETRY_PAUSE_S)
 
 
-def describe_remains(pid: int, uid: int) -> str:
+def describe_remaining_processes(pid: int, uid: int) -> str:
     """Return text that states which processes of a lost daemon still run, with the remedy.
 
     The processes have some seconds to end before the text is made.

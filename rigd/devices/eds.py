@@ -22,7 +22,7 @@ MAX_BYTES: Final = 4_000_000
 MAX_ENTRIES: Final = 20_000
 """Largest number of objects and sub-indices in a file: five times that of the largest drives."""
 
-_MOST_SHOWN_CHARACTERS: Final = 80
+_MAX_SHOWN_CHARACTERS: Final = 80
 """Largest number of characters of a text from a file that messages show."""
 
 _BIT_RATES_KBIT_S: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
@@ -462,4 +462,4 @@ def _parse_integer(text: str) -> int | None:
 
 def _printable_line(text: str) -> str:
     """Return a text of the file as messages may show it: one line, printable, not too long."""
-    return printable(" ".join(text.split()), _MOST_SHOWN_CHARACTERS)
+    return printable(" ".join(text.split()), _MAX_SHOWN_CHARACTERS)

@@ -11,8 +11,8 @@ from rigd.engine._publish import ReadingPublisher
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine.channels import Channels
 from rigd.engine.cycle import Cycle, StandstillMonitor
-from rigd.engine.messages import Ending
-from rigd.engine.processes import Parent
+from rigd.engine.messages import PostRecordPlan
+from rigd.engine.processes import SupervisorConnection
 from rigd.engine.shared_state import Phase, StateField
 from rigd.engine.timing import Clock, TickScheduler
 from rigd.profile import Profile
@@ -36,12 +36,12 @@ class ProbeSequence(SessionSequence):
         standstill: StandstillMonitor,
         channels: Channels,
         reading_publisher: ReadingPublisher,
-        parent: Parent,
+        parent: SupervisorConnection,
         stop_request: StopRequest,
     ) -> None:
         super().__init__(
             profile, (0.0,), cycle, clock, scheduler, standstill, channels,
-            reading_publisher, parent, stop_request, Ending(),
+            reading_publisher, parent, stop_request, PostRecordPlan(),
         )  # fmt: skip
         self._rig = probed_rig(profile)
         self._move: ProbingMove | None = None
@@ -66,7 +66,7 @@ class ProbeSequence(SessionSequence):
         cycle = self._cycle
         start_rad = cycle.angle_rad
         probing_move = ProbingMove(self._rig, plan_probe(self._rig), self._rest_spread_nm)
-        cycle.encoder_watch = None  # the move itself compares angle and torques
+        cycle.encoder_monitor = None  # the move itself compares angle and torques
         cycle.controller = probing_move
         cycle.start(self._rest_spread_nm)
         self._run_tick(start_rad, excused=True)  # enabling takes its time

@@ -111,7 +111,7 @@ _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
 _STALE_FLAGS = _ANGLE_STALE | _WRENCH_STALE
 
-_TERMS_PERIOD_TICKS = CONTROL.every
+_TERMS_PERIOD_TICKS = CONTROL.tick_interval
 """Number of ticks from one record of the controller's terms to the next."""
 _FREE_SLOT_TIMEOUT_S = 2.0
 """Longest time in s to wait for free space in the ring while the recorder reads nothing."""
@@ -120,7 +120,7 @@ _FREE_SLOT_POLL_S = 0.0002
 
 
 @dataclass(slots=True)
-class Counts:
+class TickCounts:
     """Numbers of a record's ticks, where scheduled = recorded + missed + lost.
 
     Among the recorded ticks, `late` counts those with a late wake-up. `stale_angles` and
@@ -174,7 +174,7 @@ class SampleLog:
         self._timing_ring = None if clock.virtual else channels.timings
         self._shared_state = channels.shared_state
         self._late_ns = late_ns
-        self.counts = Counts()
+        self.counts = TickCounts()
 
     def write(
         self, tick: int, reference_rad: float, missed_ticks: int, *, wait_for_slot: bool
@@ -289,7 +289,10 @@ class SampleLog:
         """
         ring, recorder_heartbeat = self._ring, Heartbeat()
         while (slot_offset := ring.next_slot()) < 0:
-            if recorder_heartbeat.stalled_for(ring.read, time.monotonic()) > _FREE_SLOT_TIMEOUT_S:
+            if (
+                recorder_heartbeat.stalled_for(ring.read_count, time.monotonic())
+                > _FREE_SLOT_TIMEOUT_S
+            ):
                 break
             time.sleep(_FREE_SLOT_POLL_S)
         return slot_offset

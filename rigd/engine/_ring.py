@@ -72,22 +72,22 @@ class Ring:
         return cls(RingSpec(fd, record_size, capacity))
 
     @property
-    def written(self) -> int:
+    def written_count(self) -> int:
         """Number of records written to the ring since it was created."""
         return self._counters[_WRITTEN_COUNTER]
 
     @property
-    def read(self) -> int:
+    def read_count(self) -> int:
         """Number of records that the consumer has read since the ring was created."""
         return self._counters[_READ_COUNTER]
 
     @property
-    def waiting(self) -> int:
+    def waiting_count(self) -> int:
         """Number of records in the ring that the consumer has not read yet."""
         return self._counters[_WRITTEN_COUNTER] - self._counters[_READ_COUNTER]
 
     @property
-    def oldest(self) -> int:
+    def oldest_index(self) -> int:
         """Index of the oldest record in the ring that an observer may read.
 
         Records are counted from the ring's creation, and the index is negative in a new ring. Half
@@ -161,11 +161,11 @@ class Observer:
 
     def __init__(self, ring: Ring, first: int | None = None) -> None:
         self._ring = ring
-        self._next_index = ring.written if first is None else first
+        self._next_index = ring.written_count if first is None else first
         self.dropped = 0
 
     @property
-    def next(self) -> int:
+    def next_index(self) -> int:
         """Index of the record that the observer reads next, counted since the ring's creation."""
         return self._next_index
 
@@ -175,18 +175,20 @@ class Observer:
         The oldest record comes first.
         """
         ring = self._ring
-        oldest_record = ring.oldest
+        oldest_record = ring.oldest_index
         if self._next_index < oldest_record:
             self.dropped += oldest_record - self._next_index
             self._next_index = oldest_record
         ring_slot = self._next_index % ring.capacity
-        record_count = min(max_records, ring.written - self._next_index, ring.capacity - ring_slot)
+        record_count = min(
+            max_records, ring.written_count - self._next_index, ring.capacity - ring_slot
+        )
         start_offset = HEADER_SIZE + ring_slot * ring.record_size
         record_bytes = bytes(
             ring.buffer[start_offset : start_offset + record_count * ring.record_size]
         )
         self._next_index += record_count
-        if ring.written - (self._next_index - record_count) >= ring.capacity:
+        if ring.written_count - (self._next_index - record_count) >= ring.capacity:
             # The producer overtook the copy: none of it is reliable.
             self.dropped += record_count
             return b""

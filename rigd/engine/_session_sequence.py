@@ -19,12 +19,18 @@ from rigd.devices.kinds import failure_of_device
 from rigd.engine._publish import ReadingPublisher, SampleLog
 from rigd.engine.channels import Channels
 from rigd.engine.cycle import Cycle, RestReadings, StandstillMonitor, observe_rest
-from rigd.engine.messages import Ending
-from rigd.engine.processes import Parent
+from rigd.engine.messages import PostRecordPlan
+from rigd.engine.processes import SupervisorConnection
 from rigd.engine.realtime import page_faults
 from rigd.engine.reference import ReferenceReader
-from rigd.engine.shared_state import Level, LogEvent, Phase, StateField, Stop, write_event
-from rigd.engine.timing import SIGN_OF_LIFE_S, SUSPENDED_S, Clock, SuspendWatch, TickScheduler
+from rigd.engine.shared_state import Level, LogEvent, Phase, StateField, StopReason, write_event
+from rigd.engine.timing import (
+    MAX_VIRTUAL_PAUSE_S,
+    SUSPENDED_S,
+    Clock,
+    SuspendMonitor,
+    TickScheduler,
+)
 from rigd.excitation.moves import quintic, vibration_free_path
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
@@ -32,7 +38,7 @@ from rigd.safety import SLOW_CHECK_TICKS
 from rigd.safety.limits import INTERLOCKS_BY_NAME, OVERLOADED_ADVICE
 
 if TYPE_CHECKING:
-    from rigd.engine._touch_watch import TouchWatch
+    from rigd.engine._touch_monitor import TouchMonitor
 
 _SETTLING_S = 0.5
 """Time in s for which the motor is held before tick 0, and the beam rests before the last tare."""
@@ -140,10 +146,10 @@ class SessionSequence:
         standstill: StandstillMonitor,
         channels: Channels,
         reading_publisher: ReadingPublisher,
-        parent: Parent,
+        parent: SupervisorConnection,
         stop_request: StopRequest,
-        ending: Ending,
-        touch: "TouchWatch | None" = None,
+        ending: PostRecordPlan,
+        touch: "TouchMonitor | None" = None,
         reference_reader: ReferenceReader | None = None,
     ) -> None:
         self._touch = touch
@@ -159,7 +165,7 @@ class SessionSequence:
         self._rate_hz = profile.rig.rate_hz
         self._scheduler = scheduler
         self._standstill = standstill
-        self._suspend_watch = SuspendWatch()
+        self._suspend_monitor = SuspendMonitor()
         self._page_faults = 0
         self._doubts_reported: set[str] = set()
         self._polls_without_heartbeat = 0
@@ -195,7 +201,7 @@ class SessionSequence:
             If the rig does not come to rest in time, or the record would leave the angle limits
             from its present angle.
         """
-        self._cycle.watch.reset(0.0)  # the counts of the last session no longer apply
+        self._cycle.limit_monitor.reset(0.0)  # the counts of the last session no longer apply
         rest_readings = self._wait_for_rest()
         self._start_angle_rad = float(np.mean(rest_readings.angles_rad))
         limit_rad = self._profile.limits.angle_rad
@@ -217,7 +223,7 @@ class SessionSequence:
                 "back first (rigd run move 0; rigd start move 0 with a daemon), or lower the "
                 "amplitude.",
             )
-        sensor_violation = self._cycle.sensor_watch.finish_learning()
+        sensor_violation = self._cycle.sensor_monitor.finish_learning()
         self._report_warnings()
         if sensor_violation is not None:
             raise SessionEnd("fault", str(sensor_violation))
@@ -228,15 +234,15 @@ class SessionSequence:
 
     def _compare_with_tare_before(self, zero_nm: float) -> None:
         """Raise `SessionEnd` if the torque at rest, in N·m, differs too much from the last tare."""
-        watch = self._cycle.watch
-        if watch.tared_nm is not None:
-            violation = watch.check_tare(zero_nm - watch.tared_nm)
+        limit_monitor = self._cycle.limit_monitor
+        if limit_monitor.tared_nm is not None:
+            violation = limit_monitor.check_tare(zero_nm - limit_monitor.tared_nm)
             self._report_warnings()
             if violation is not None:
                 raise SessionEnd(
                     "fault", f"{violation} If nothing is wrong, run rigd tare to set a new zero."
                 )
-        watch.tared_nm = zero_nm
+        limit_monitor.tared_nm = zero_nm
 
     def _wait_for_rest(self) -> RestReadings:
         """Return the readings of the first interval in which neither the motor nor the beam moves.
@@ -247,7 +253,7 @@ class SessionSequence:
         self._shared_state[StateField.PHASE] = Phase.TARING
         remaining_s = session_settings.rest_timeout_s
         while True:
-            self._cycle.sensor_watch.learn()
+            self._cycle.sensor_monitor.learn()
             rest_readings = self._read_rest(session_settings.tare_s)
             motion_text = self._describe_motion(rest_readings)
             if not motion_text:
@@ -337,7 +343,7 @@ class SessionSequence:
             self._shared_state,
         )
         counts, is_virtual, stop_request = self.counts, self._clock.virtual, self._stop
-        touch_watch, reader = self._touch, self._reader
+        touch_monitor, reader = self._touch, self._reader
         stop_field, scheduled_field = (
             shared_state.view(StateField.STOP),
             shared_state.view(StateField.SCHEDULED),
@@ -390,8 +396,8 @@ class SessionSequence:
             )
             if end is None:
                 end = self._control_tick(reference_rad)
-                if touch_watch is not None and end is None:
-                    end = self._watch_touch(touch_watch, tick_number, missed_ticks)
+                if touch_monitor is not None and end is None:
+                    end = self._monitor_touch(touch_monitor, tick_number, missed_ticks)
             else:
                 self._switch_off_and_observe()
             wait_for_slot = is_virtual or end is not None
@@ -423,19 +429,19 @@ class SessionSequence:
         uses_line = self._cycle.devices.uses_line
         wait_start_s = time.monotonic()
         while reference_reader.must_wait(tick) and self._stop_reason() is None:
-            if uses_line and time.monotonic() - wait_start_s > SIGN_OF_LIFE_S:
+            if uses_line and time.monotonic() - wait_start_s > MAX_VIRTUAL_PAUSE_S:
                 return
             self._display.publish(self._cycle, self._scheduler.due_ns)
             time.sleep(_VIRTUAL_POLL_S)
 
-    def _watch_touch(
-        self, touch_watch: "TouchWatch", tick: int, missed_ticks: int
+    def _monitor_touch(
+        self, touch_monitor: "TouchMonitor", tick: int, missed_ticks: int
     ) -> SessionEnd | None:
         """Check the last tick for a touch of an obstacle, and let the touch watch react to it.
 
         Return an error that ends the session if the touch requires that, otherwise None.
         """
-        contact = touch_watch.step(tick, missed_ticks)
+        contact = touch_monitor.step(tick, missed_ticks)
         if contact is None:
             return None
         if contact.detected:
@@ -503,7 +509,7 @@ class SessionSequence:
         zero_nm = np.dot(self._cycle.tare, self._profile.rig.sensor.projection)
         drift_nm = float(rest_readings.torques_nm.mean() - zero_nm)
         self.results["tare_drift_nm"] = repr(drift_nm)
-        violation = self._cycle.watch.check_tare(drift_nm)
+        violation = self._cycle.limit_monitor.check_tare(drift_nm)
         self._report_warnings()
         if violation is not None:
             raise SessionEnd("fault", str(violation))
@@ -541,7 +547,7 @@ class SessionSequence:
             device_failure = failure_of_device(error, self._profile.rig.devices)
             self._cycle.mark_readings_stale()
             # A drive whose host stalled switches itself off by its own watchdog.
-            violation_text = f"{device_failure} {self._cycle.watch.after_missed}".strip()
+            violation_text = f"{device_failure} {self._cycle.limit_monitor.after_missed}".strip()
             return SessionEnd("fault", violation_text, device_failed=True)
         if violation is None:
             return None
@@ -594,7 +600,7 @@ class SessionSequence:
         if not new_missed_ticks:
             return None
         self._cycle.skip_encoder(new_missed_ticks)
-        violation_text = self._cycle.watch.check_missed(
+        violation_text = self._cycle.limit_monitor.check_missed(
             new_missed_ticks, self.counts.missed, tick + 1
         )
         return None if violation_text is None else SessionEnd("fault", str(violation_text))
@@ -606,7 +612,7 @@ class SessionSequence:
     def _check_stale_readings(self, scheduled_ticks: int) -> SessionEnd | None:
         """Return an error that ends the session if more readings were stale than allowed."""
         tick_counts = self.counts
-        violation_text = self._cycle.watch.check_stale_fraction(
+        violation_text = self._cycle.limit_monitor.check_stale_fraction(
             tick_counts.stale_angles, tick_counts.stale_wrenches, scheduled_ticks
         )
         return (
@@ -618,9 +624,9 @@ class SessionSequence:
     def _stop_reason(self) -> SessionEnd | None:
         """Return an error that ends the session if a stop is requested or a process died."""
         stop_reason = self._shared_state[StateField.STOP]
-        if self._stop.requested or stop_reason == Stop.OPERATOR:
+        if self._stop.requested or stop_reason == StopReason.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")
-        if stop_reason == Stop.NO_RECORDER:
+        if stop_reason == StopReason.NO_RECORDER:
             return SessionEnd("fault", "The recorder process ended during the session.")
         if self.counts.lost:
             # A record with a lost sample can never be complete.
@@ -639,14 +645,14 @@ class SessionSequence:
         violation = self._cycle.check_slow_limits(
             self._scheduler.due_ns,
             # With the virtual clock the loop waits for the recorder.
-            0.0 if self._clock.virtual else self._channels.samples.waiting / self._rate_hz,
+            0.0 if self._clock.virtual else self._channels.samples.waiting_count / self._rate_hz,
             self._shared_state[StateField.DISK_FREE_MB] or inf,
         )
         self._report_warnings()
         if violation is not None:
             return SessionEnd("fault", str(violation))
         if not self._clock.virtual:
-            suspended_s = self._suspend_watch.suspended_s()
+            suspended_s = self._suspend_monitor.suspended_s()
             if suspended_s > SUSPENDED_S:
                 return SessionEnd(
                     "fault",
@@ -708,9 +714,11 @@ class SessionSequence:
     def _report_warnings(self) -> None:
         """Log new warnings of the limit, sensor and encoder monitors."""
         cycle = self._cycle
-        for warning_text in cycle.watch.take_notices() + cycle.sensor_watch.take_notices():
+        for warning_text in (
+            cycle.limit_monitor.take_notices() + cycle.sensor_monitor.take_notices()
+        ):
             self._log_event("warning", warning_text)
-        encoder_tests = 0 if cycle.encoder_watch is None else cycle.encoder_watch.tests
+        encoder_tests = 0 if cycle.encoder_monitor is None else cycle.encoder_monitor.tests
         if encoder_tests > self._encoder_tests:
             self.results["encoder_tests"] = str(encoder_tests)
             if not self._encoder_tests:
@@ -724,7 +732,7 @@ class SessionSequence:
         write_event(self._channels.events, LogEvent(t_ns, level, message))
 
 
-def _return_path(profile: Profile, ending: Ending) -> list[float]:
+def _return_path(profile: Profile, ending: PostRecordPlan) -> list[float]:
     """Return the path of the motor's return as a fraction from 0 to 1 for each tick.
 
     It is computed before the drive is enabled, so that the loop does not pause for it.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from rigd.engine._ring import Ring, RingSpec
-from rigd.engine.shared_state import EVENT_SIZE, SharedState, StateField, Stop
+from rigd.engine.shared_state import EVENT_SIZE, SharedState, StateField, StopReason
 from rigd.safety.limits import RECORDER_BUFFER_S
 from rigd.session.layout import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
@@ -32,11 +32,11 @@ class Topic:
     """Name of the topic's channel in the session file."""
     record_size: int
     """Size of a record in bytes."""
-    every: int
+    tick_interval: int
     """Number of ticks from one record to the next; 0: irregular."""
-    logged: bool
+    is_recorded: bool
     """Whether the recorder writes each record to the file."""
-    live: bool
+    is_shown_live: bool
     """Whether the live publisher reads the records, and drops those it cannot show in time."""
 
     def capacity(self, rate_hz: float, buffered_s: float = RECORDER_BUFFER_S) -> int:
@@ -49,23 +49,25 @@ class Topic:
         buffered_s
             Time in s whose records the ring holds.
         """
-        return ceil(rate_hz * buffered_s / self.every) if self.every else _EVENTS
+        return ceil(rate_hz * buffered_s / self.tick_interval) if self.tick_interval else _EVENTS
 
     def expected_hz(self, rate_hz: float) -> float | None:
         """Return the topic's records per second while a session is recorded, or None if irregular.
 
         `rate_hz` is the number of ticks a second.
         """
-        return rate_hz / self.every if self.every else None
+        return rate_hz / self.tick_interval if self.tick_interval else None
 
 
-EVENT = Topic("/rig/event", EVENT_SIZE, every=0, logged=True, live=True)
+EVENT = Topic("/rig/event", EVENT_SIZE, tick_interval=0, is_recorded=True, is_shown_live=True)
 """Topic of the log events."""
-CONTROL = Topic("/rig/control", CONTROL_SIZE, every=10, logged=True, live=False)
+CONTROL = Topic(
+    "/rig/control", CONTROL_SIZE, tick_interval=10, is_recorded=True, is_shown_live=False
+)
 """Topic of the controller's terms."""
-TIMING = Topic("/rig/timing", TIMING_SIZE, every=1, logged=True, live=True)
+TIMING = Topic("/rig/timing", TIMING_SIZE, tick_interval=1, is_recorded=True, is_shown_live=True)
 """Topic of the ages of the readings."""
-SAMPLE = Topic("/rig/sample", SAMPLE_SIZE, every=1, logged=True, live=True)
+SAMPLE = Topic("/rig/sample", SAMPLE_SIZE, tick_interval=1, is_recorded=True, is_shown_live=True)
 """Topic of the samples."""
 
 TOPICS = (EVENT, CONTROL, TIMING, SAMPLE)
@@ -116,10 +118,10 @@ class Channels:
         """Descriptors and layout with which a child process attaches to the shared memory."""
         return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.shared_state.fd)
 
-    def ask_to_stop(self) -> None:
+    def request_stop(self) -> None:
         """Request a stop of the control process, unless a stop was requested before."""
-        if self.shared_state[StateField.STOP] == Stop.NO:
-            self.shared_state[StateField.STOP] = Stop.OPERATOR
+        if self.shared_state[StateField.STOP] == StopReason.NONE:
+            self.shared_state[StateField.STOP] = StopReason.OPERATOR
 
     def clear(self) -> None:
         """Discard the records of the last session in all rings, while no recorder runs."""

@@ -30,23 +30,23 @@ from rigd.engine.cycle import (
     stored_motor_heat_nm2,
 )
 from rigd.engine.messages import (
-    Connected,
+    ControlEnded,
     ControlJob,
-    Ended,
-    Finished,
-    Measured,
-    Probe,
-    Ready,
-    Refused,
+    DevicesConnected,
+    MeasurementRefused,
+    MeasurementResult,
+    ProbeOrder,
+    ReadyToRecord,
+    SessionFinished,
     SessionJob,
-    Tare,
-    Zero,
+    TareOrder,
+    ZeroOrder,
 )
-from rigd.engine.processes import Parent
-from rigd.engine.realtime import REFUSED, apply_realtime, collect_no_garbage
+from rigd.engine.processes import SupervisorConnection
+from rigd.engine.realtime import REFUSED, apply_realtime, disable_garbage_collection
 from rigd.engine.reference import ReferenceReader, map_reference
 from rigd.engine.shared_state import LogEvent, Phase, StateField, write_event
-from rigd.engine.timing import SIGN_OF_LIFE_S, Clock, RealClock, TickScheduler, VirtualClock
+from rigd.engine.timing import MAX_VIRTUAL_PAUSE_S, Clock, RealClock, TickScheduler, VirtualClock
 from rigd.errors import RigdError
 from rigd.plugins import PluginError
 from rigd.profile import Profile
@@ -69,12 +69,12 @@ def main() -> None:
     """Run the control process, started as ``python -m rigd.engine.control_process``."""
     stop_request = StopRequest()
     stop_request.catch()
-    parent = Parent()
+    parent = SupervisorConnection()
     job: ControlJob = parent.receive_job()
     channels = attach_channels(job.channels)
     realtime_settings = job.profile.realtime
     if job.fast:
-        realtime_results = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
+        realtime_results = {"clock": "virtual", "garbage_collector": disable_garbage_collection()}
     else:
         realtime_results = {"clock": "real"} | apply_realtime(
             priority=realtime_settings.priority, cpu=realtime_settings.cpu
@@ -84,7 +84,7 @@ def main() -> None:
         # Imports a package and designs its controller before a connected drive expects SYNCs.
         make_controller(job.profile.controlled_rig())
     except RigdError as error:  # of a device, a controller, or a beam that cannot be simulated
-        parent.send(Ended(str(error)))
+        parent.send(ControlEnded(str(error)))
         return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime_settings.spin_us * 1000))
     run_control(job.profile, devices, clock, channels, parent, stop_request, realtime_results)
@@ -95,7 +95,7 @@ def run_control(
     devices: Devices,
     clock: Clock,
     channels: Channels,
-    parent: Parent,
+    parent: SupervisorConnection,
     stop_request: StopRequest,
     realtime_results: dict[str, str],
 ) -> None:
@@ -126,7 +126,7 @@ def run_control(
         server.observe_standstill()
         name_this_process(IDLE_NAME)
         parent.send(
-            Connected(
+            DevicesConnected(
                 calibration=devices.sensor.calibration(),
                 drive=drive.statement() if isinstance(drive, StatedDrive) else {},
                 realtime=realtime_results,
@@ -143,7 +143,7 @@ def run_control(
         channels.shared_state[StateField.PHASE] = Phase.OFF
         devices.drive.close()
         devices.sensor.close()
-    parent.send(Ended(f"{end_text} {devices.drive.off_doubt}".strip()))
+    parent.send(ControlEnded(f"{end_text} {devices.drive.off_doubt}".strip()))
 
 
 class _ControlServer:
@@ -155,7 +155,7 @@ class _ControlServer:
         devices: Devices,
         clock: Clock,
         channels: Channels,
-        parent: Parent,
+        parent: SupervisorConnection,
         stop_request: StopRequest,
         realtime_results: dict[str, str],
     ) -> None:
@@ -173,7 +173,7 @@ class _ControlServer:
         self._on_lines = devices.uses_line
         # A simulated motor starts cold.
         real_motor = not devices.simulated
-        self._watch = make_limit_monitor(
+        self._limit_monitor = make_limit_monitor(
             profile, stored_motor_heat_nm2(profile) if real_motor else 0.0
         )
         self._standstill = StandstillMonitor(profile)
@@ -183,7 +183,7 @@ class _ControlServer:
     def store_heat(self) -> None:
         """Store the heat of a real motor in a file for the next connection to the rig."""
         if not self._devices.simulated:
-            store_motor_heat(self._profile, self._watch.heat_nm2)
+            store_motor_heat(self._profile, self._limit_monitor.heat_nm2)
 
     def observe_standstill(self) -> None:
         """Read the devices with the torque off until the motor's angle and speed are known.
@@ -218,11 +218,11 @@ class _ControlServer:
                         self.store_heat()
                     self.observe_standstill()
                     gc.collect()  # the torque is off: the only time for it
-                case Tare():
+                case TareOrder():
                     self._send_measurement(self._measure_tare)
-                case Zero():
+                case ZeroOrder():
                     self._send_measurement(self._set_zero)
-                case Probe():
+                case ProbeOrder():
                     self._run_probe(supervisor_order.profile)
                     self.observe_standstill()
 
@@ -245,7 +245,7 @@ class _ControlServer:
                 return supervisor_message
             if not self._clock.virtual:
                 self._read_idle_devices()
-            elif self._on_lines and time.monotonic() - last_tick_s > SIGN_OF_LIFE_S:
+            elif self._on_lines and time.monotonic() - last_tick_s > MAX_VIRTUAL_PAUSE_S:
                 last_tick_s = time.monotonic()
                 self._scheduler.wait()
                 self._read_at_rest()
@@ -270,12 +270,12 @@ class _ControlServer:
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
 
     def _run_session(self, session_job: SessionJob) -> None:
-        """Run one session, disable the drive in any case, and send `Finished` to the supervisor.
+        """Run one session, disable the drive in any case, and send `SessionFinished`.
 
         Raises
         ------
         DeviceError
-            If a device failed. `Finished` has been sent nevertheless.
+            If a device failed. `SessionFinished` has been sent nevertheless.
         """
         shared_state, devices = self._shared_state, self._devices
         for state_field in (
@@ -287,20 +287,20 @@ class _ControlServer:
             StateField.STALE_ANGLES,
             StateField.STALE_WRENCHES,
             StateField.TOUCHES,
-            StateField.HELD,
-            StateField.HELD_BEFORE,
-            StateField.BEGUN,
+            StateField.HELD_TICKS,
+            StateField.HELD_TICKS_BEFORE_SEGMENT,
+            StateField.BEGUN_REFERENCE_TICKS,
         ):
             shared_state[state_field] = 0
         self._warn_of_refusals(session_job)
         self._log_accepted(session_job)
         cycle = self._cycle = self._make_cycle(session_job.profile)
         reference_rad = map_reference(session_job.reference)
-        touch_watch = None
+        touch_monitor = None
         if session_job.touch is not None:
-            from rigd.engine._touch_watch import TouchWatch  # late: few sessions need it
+            from rigd.engine._touch_monitor import TouchMonitor  # late: few sessions need it
 
-            touch_watch = TouchWatch(
+            touch_monitor = TouchMonitor(
                 session_job.touch, cycle, reference_rad, session_job.profile.rig.rate_hz
             )
         reference_reader = None
@@ -320,7 +320,7 @@ class _ControlServer:
             self._parent,
             self._stop,
             session_job.ending,
-            touch_watch,
+            touch_monitor,
             reference_reader,
         )
         session_outcome, end_reason = "complete", ""
@@ -331,7 +331,7 @@ class _ControlServer:
             tare_metadata = session_sequence.tare()
             devices.drive.enable(session_sequence.stop_requested)
             session_sequence.hold()
-            self._parent.send(Ready(tare_metadata | seed_metadata))
+            self._parent.send(ReadyToRecord(tare_metadata | seed_metadata))
             session_sequence.wait_for_go()
             session_sequence.record()
             was_recorded = True
@@ -365,7 +365,7 @@ class _ControlServer:
             # Events after the last tick do not make the record incomplete.
             session_outcome, end_reason = "complete", f"After the record: {end_reason}"
         self._parent.send(
-            Finished(
+            SessionFinished(
                 outcome=session_outcome,
                 reason=end_reason,
                 fault=is_fault,
@@ -412,15 +412,15 @@ class _ControlServer:
             self._parent,
             self._stop,
         )
-        reply_message: Measured | Refused
+        reply_message: MeasurementResult | MeasurementRefused
         failure_text = ""
         name_this_process(SESSION_NAME)
         try:
             probe_sequence.tare()
             self._devices.drive.enable(probe_sequence.stop_requested)
-            reply_message = Measured(probe_sequence.move())
+            reply_message = MeasurementResult(probe_sequence.move())
         except SessionEnd as end:
-            reply_message = Refused(end.reason)
+            reply_message = MeasurementRefused(end.reason)
             failure_text = end.reason if end.device_failed else ""
         finally:
             self._devices.drive.disable()
@@ -434,24 +434,24 @@ class _ControlServer:
         self._parent.send(reply_message)
 
     def _send_measurement(self, measure_at_rest: Callable[[], dict[str, object]]) -> None:
-        """Run a measurement at rest; send its result, or `Refused` with the reason of a failure."""
+        """Run a measurement at rest; send its result, or `MeasurementRefused` with the reason."""
         try:
-            self._parent.send(Measured(measure_at_rest()))
+            self._parent.send(MeasurementResult(measure_at_rest()))
         except SessionEnd as end:
-            self._parent.send(Refused(end.reason))
+            self._parent.send(MeasurementRefused(end.reason))
 
     def _measure_tare(self) -> dict[str, object]:
         """Measure the sensor's zero at rest, and return mean and standard deviation by axis.
 
         The values are for display, because each session measures the zero itself.
         """
-        self._cycle.sensor_watch.learn()
+        self._cycle.sensor_monitor.learn()
         rest_readings = self._read_rest(self._profile.session.tare_s)
-        sensor_violation = self._cycle.sensor_watch.finish_learning()
+        sensor_violation = self._cycle.sensor_monitor.finish_learning()
         if sensor_violation is not None:
             raise SessionEnd("fault", str(sensor_violation))
         self._cycle.tare = rest_readings.mean
-        self._watch.tared_nm = float(rest_readings.torques_nm.mean())
+        self._limit_monitor.tared_nm = float(rest_readings.torques_nm.mean())
         return {
             "mean": dict(zip(WRENCH_FIELDS, rest_readings.mean, strict=True)),
             "std": dict(zip(WRENCH_FIELDS, rest_readings.spread, strict=True)),
@@ -517,7 +517,7 @@ class _ControlServer:
             self._devices,
             rig.sensor.projection,
             make_controller(profile.controlled_rig()),
-            self._watch,
+            self._limit_monitor,
             make_reading_monitors(profile, self._devices),
         )
         cycle.zero_rad = self._zero_rad

@@ -1,9 +1,9 @@
 """One tick: read the devices, check the limits, control, command; and the checks at rest.
 
 `Cycle` runs a tick. The tare is the mean of readings without torque (`observe_rest`). The zero of
-the angle, and with it the limits, depend on the encoder's count. `LimitWatch` checks every reading
-during a session, and `StandstillMonitor` before, between and after sessions. While the torque is
-off, a person may turn the motor by hand, but its angle cannot jump.
+the angle, and with it the limits, depend on the encoder's count. `LimitMonitor` checks every
+reading during a session, and `StandstillMonitor` before, between and after sessions. While the
+torque is off, a person may turn the motor by hand, but its angle cannot jump.
 """
 
 import json
@@ -23,7 +23,7 @@ from rigd.devices.contracts import DeviceError, Devices, GaugeSensor, Wrench
 from rigd.engine.timing import TickScheduler
 from rigd.profile import Profile
 from rigd.runtime.addresses import UnsafeFolderError, runtime_folder
-from rigd.safety import BeamPrediction, EncoderWatch, LimitWatch, ScaleWatch, SensorWatch
+from rigd.safety import BeamPrediction, EncoderMonitor, LimitMonitor, ScaleMonitor, SensorMonitor
 from rigd.safety.limits import INTERLOCKS_BY_NAME, Violation
 from rigd.session.layout import WRENCH_FIELDS, Status
 
@@ -160,7 +160,7 @@ class Cycle:
         Connected drive and sensor.
     projection
         Coupling torque about the motor's axis = projection · wrench.
-    controller, limit_watch
+    controller, limit_monitor
         Controller and limit monitor. The monitor checks every reading before the controller
         uses it.
     reading_monitors
@@ -179,7 +179,7 @@ class Cycle:
         The present torque command, after the limits.
     flags
         Status bits of the last tick.
-    encoder_watch
+    encoder_monitor
         Check of the encoder against the torques, or None in a probing move, which has its own.
     """
 
@@ -188,7 +188,7 @@ class Cycle:
         devices: Devices,
         projection: Wrench,
         controller: LoopController,
-        limit_watch: LimitWatch,
+        limit_monitor: LimitMonitor,
         reading_monitors: "ReadingMonitors",
     ) -> None:
         self.devices = devices
@@ -196,9 +196,9 @@ class Cycle:
         self._sensor = devices.sensor
         self._projection = projection
         self.controller: LoopController = controller
-        self.watch = limit_watch
-        self.encoder_watch: EncoderWatch | None = reading_monitors.encoder
-        self.sensor_watch = reading_monitors.sensor
+        self.limit_monitor = limit_monitor
+        self.encoder_monitor: EncoderMonitor | None = reading_monitors.encoder
+        self.sensor_monitor = reading_monitors.sensor
         self._gauges = devices.sensor if isinstance(devices.sensor, GaugeSensor) else None
         self.tare: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.zero_rad = 0.0
@@ -255,17 +255,17 @@ class Cycle:
         """
         self.observe(due_ns)
         status_flags = self.flags & ~_TORQUE_OFF
-        limit_watch = self.watch
-        violation = limit_watch.check(
+        limit_monitor = self.limit_monitor
+        violation = limit_monitor.check(
             reference_rad,
             self.angle_rad,
             self.raw_wrench,
             angle_stale=bool(status_flags & _ANGLE_STALE),
         )
         violation = violation or self.check_stale() or self.check_sensor()
-        encoder_watch = self.encoder_watch
-        if encoder_watch is not None and violation is None:
-            violation = encoder_watch.step(
+        encoder_monitor = self.encoder_monitor
+        if encoder_monitor is not None and violation is None:
+            violation = encoder_monitor.step(
                 self.angle_rad,
                 self.coupling_torque_nm,
                 self.torque_command_nm,
@@ -276,20 +276,20 @@ class Cycle:
             self.torque_off()
             self.flags |= _LIMIT_WARNING
             return violation
-        if limit_watch.warning:
+        if limit_monitor.warning:
             status_flags |= _LIMIT_WARNING
         controller = self.controller
         torque_nm = controller.step(reference_rad, self.angle_rad, self.coupling_torque_nm)
         if controller.saturated:  # a torque that is not a number counts as saturated
-            violation = limit_watch.check_torque(controller.unlimited_torque_nm)
+            violation = limit_monitor.check_torque(controller.unlimited_torque_nm)
             if violation is not None:
                 self.torque_off()
                 self.flags |= _LIMIT_WARNING | _TORQUE_SATURATED
                 return violation
             status_flags |= _TORQUE_SATURATED | _LIMIT_WARNING
-        if encoder_watch is not None and encoder_watch.test_nm:
+        if encoder_monitor is not None and encoder_monitor.test_nm:
             limit_nm = controller.torque_limit_nm
-            torque_nm = max(-limit_nm, min(limit_nm, torque_nm + encoder_watch.test_nm))
+            torque_nm = max(-limit_nm, min(limit_nm, torque_nm + encoder_monitor.test_nm))
         self._commanding = True
         sent_nm = self.torque_command_nm = self._drive.command(torque_nm)
         self._torque_squares_nm2 += sent_nm * sent_nm
@@ -306,21 +306,21 @@ class Cycle:
             Standard deviation of the coupling torque at rest.
         """
         self.controller.reset(self.angle_rad)
-        self.watch.reset(self.angle_rad)
-        if self.encoder_watch is not None:
-            self.encoder_watch.reset(self.angle_rad, noise_nm)
+        self.limit_monitor.reset(self.angle_rad)
+        if self.encoder_monitor is not None:
+            self.encoder_monitor.reset(self.angle_rad, noise_nm)
         self._recent_ticks.clear()
 
     def skip(self, missed_ticks: int) -> None:
         """Report ticks missed while the torque was held to the limit and encoder monitors."""
         if missed_ticks:
-            self.watch.skip(missed_ticks)
+            self.limit_monitor.skip(missed_ticks)
             self.skip_encoder(missed_ticks)
 
     def skip_encoder(self, missed_ticks: int) -> None:
         """Report missed ticks to the encoder monitor only."""
-        if self.encoder_watch is not None:
-            self.encoder_watch.skip(missed_ticks, self.angle_rad)
+        if self.encoder_monitor is not None:
+            self.encoder_monitor.skip(missed_ticks, self.angle_rad)
 
     def accelerates_against_torque(
         self, inertia_kg_m2: float, rate_hz: float, resolution_rad: float
@@ -402,7 +402,7 @@ class Cycle:
         if self.flags & _UNUSABLE_FLAGS & ~_ANGLE_STALE:
             return None
         gauge_sensor = self._gauges
-        return self.sensor_watch.step(
+        return self.sensor_monitor.step(
             self.raw_wrench if gauge_sensor is None else gauge_sensor.gauges
         )
 
@@ -412,7 +412,7 @@ class Cycle:
         if not (status_flags & _UNUSABLE_FLAGS or self._last_unusable):
             return None
         self._last_unusable = bool(status_flags & _UNUSABLE_FLAGS)
-        return self.watch.check_stale(
+        return self.limit_monitor.check_stale(
             bool(status_flags & _ANGLE_STALE),
             bool(status_flags & _WRENCH_STALE),
             bool(status_flags & _WRENCH_SATURATED),
@@ -456,7 +456,7 @@ class Cycle:
             The violated limit, if any; the torque is then off.
         """
         squares_nm2, self._torque_squares_nm2 = self._torque_squares_nm2, 0.0
-        violation = self.watch.check_slow(due_ns, squares_nm2, recorder_lag_s, disk_free_mb)
+        violation = self.limit_monitor.check_slow(due_ns, squares_nm2, recorder_lag_s, disk_free_mb)
         if violation is not None:
             self.torque_off()
         return violation
@@ -566,10 +566,10 @@ def observe_rest(
     )
 
 
-# The limits' watch, and the motor's heat
+# The limit monitor, and the motor's heat
 
 
-def make_limit_monitor(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
+def make_limit_monitor(profile: Profile, heat_nm2: float = 0.0) -> LimitMonitor:
     """Return the limit monitor of a rig, which is used as long as the rig is connected.
 
     Parameters
@@ -580,7 +580,7 @@ def make_limit_monitor(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
         Heat of the motor: mean square of its torque over its thermal time constant, (N·m)².
     """
     rig = profile.rig
-    limit_watch = LimitWatch(
+    limit_monitor = LimitMonitor(
         profile.limits,
         rig.sensor.range,
         rig.rate_hz,
@@ -590,17 +590,17 @@ def make_limit_monitor(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
         thermal_time_constant_s=rig.motor.thermal_time_constant_s,
         tare_warning_nm=profile.session.tare_drift_nm,
     )
-    limit_watch.heat_nm2 = heat_nm2
-    return limit_watch
+    limit_monitor.heat_nm2 = heat_nm2
+    return limit_monitor
 
 
 @dataclass(frozen=True, slots=True)
 class ReadingMonitors:
     """Monitors that check encoder and sensor readings for plausibility."""
 
-    encoder: EncoderWatch
+    encoder: EncoderMonitor
     """Check of the encoder against the torques on the shaft."""
-    sensor: SensorWatch
+    sensor: SensorMonitor
     """Check that the sensor does not repeat its last reading."""
 
 
@@ -616,14 +616,14 @@ def make_reading_monitors(profile: Profile, devices: Devices) -> ReadingMonitors
     """
     rig = profile.rig
     beam_prediction = BeamPrediction(rig.beam, rig.damping, rig.rate_hz)
-    encoder_watch = EncoderWatch(
+    encoder_monitor = EncoderMonitor(
         beam_prediction,
         rig.rate_hz,
         resolution_rad=rig.encoder.resolution_rad,
         inertia_kg_m2=rig.motor.inertia_kg_m2,
         breakaway_nm=profile.standstill_torque_nm,
         delay_ticks=max(1, round(rig.actuation.delay_s * rig.rate_hz)),
-        scale_watch=ScaleWatch(rig.motor.inertia_kg_m2, profile.limits.torque_ratio),
+        scale_monitor=ScaleMonitor(rig.motor.inertia_kg_m2, profile.limits.torque_ratio),
     )
     simulation = rig.simulation
     is_noisy = [True] * 6
@@ -636,7 +636,7 @@ def make_reading_monitors(profile: Profile, devices: Devices) -> ReadingMonitors
             [f"gauge {gauge_number}" for gauge_number in range(6)],
             [all(is_noisy)] * 6,
         )
-    return ReadingMonitors(encoder_watch, SensorWatch(channel_names, is_noisy, rig.rate_hz))
+    return ReadingMonitors(encoder_monitor, SensorMonitor(channel_names, is_noisy, rig.rate_hz))
 
 
 def store_motor_heat(profile: Profile, heat_nm2: float) -> None:

@@ -6,9 +6,9 @@ messages that each sends):
 ============  =============================================
 process       receives
 ============  =============================================
-control       ControlJob, then SessionJob, Tare, Zero, Probe
-recorder      RecorderJob, FileHeader, Close
-live          LiveJob, LiveSession, LiveEnd of `rigd.live`
+control       ControlJob, then SessionJob, TareOrder, ZeroOrder, ProbeOrder
+recorder      RecorderJob, FileHeader, CloseFile
+live          LiveJob, LiveSession, LiveSessionEnded of `rigd.live`
 touch         TouchJob
 fit           FitJob, FileHeader, RecordEnded
 page          the data that it shows, as a JSON document
@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # children start before the supervisor has imported any of th
     from rigd.engine.reference import ReferenceSpec
     from rigd.excitation import Approach, PrecisionSearch
     from rigd.profile import Profile, RealtimeSettings
-    from rigd.touch import DetectorSettings, TouchModel, WatchedBeam
+    from rigd.touch import DetectorModel, DetectorSettings, TouchModel
 
 _LENGTH_HEADER: Final = struct.Struct("=I")
 """Binary format of the length in bytes that precedes each message."""
@@ -64,7 +64,7 @@ class ControlJob:
 
 
 @dataclass(frozen=True, slots=True)
-class Ending:
+class PostRecordPlan:
     """Plan of the steps after a session's record: how to damp the beam and return the motor."""
 
     stays: bool = False
@@ -79,7 +79,7 @@ class Ending:
 class TouchOrder:
     """Settings of a session that moves the beam until it touches an obstacle."""
 
-    beam: "WatchedBeam"
+    beam: "DetectorModel"
     """Model of the beam for the touch detector."""
     settings: "DetectorSettings"
     """Sensitivity of the touch detector."""
@@ -99,7 +99,7 @@ class SessionJob:
     """Reference angles in shared memory, relative to the angle at the start."""
     refused: Mapping[str, str] = field(default_factory=dict)
     """Reasons why the system refused real-time settings to supervisor and recorder, by setting."""
-    ending: Ending = field(default_factory=Ending)
+    ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Steps after the record."""
     touch: TouchOrder | None = None
     """Search for an obstacle; None: no search."""
@@ -110,17 +110,17 @@ class SessionJob:
 
 
 @dataclass(frozen=True, slots=True)
-class Tare:
+class TareOrder:
     """Order to measure the sensor's zero by averaging at rest."""
 
 
 @dataclass(frozen=True, slots=True)
-class Zero:
+class ZeroOrder:
     """Order to set the rig's zero to the present angle."""
 
 
 @dataclass(frozen=True, slots=True)
-class Probe:
+class ProbeOrder:
     """Order to run the probing move, with the data of a profile."""
 
     profile: "Profile"
@@ -128,7 +128,7 @@ class Probe:
 
 
 @dataclass(frozen=True, slots=True)
-class Connected:
+class DevicesConnected:
     """Message that the devices are connected and the torque is off."""
 
     calibration: Mapping[str, Any]
@@ -142,7 +142,7 @@ class Connected:
 
 
 @dataclass(frozen=True, slots=True)
-class Ready:
+class ReadyToRecord:
     """Message that the motor is held at its angle and the record may begin."""
 
     tare: Mapping[str, str]
@@ -150,7 +150,7 @@ class Ready:
 
 
 @dataclass(frozen=True, slots=True)
-class Finished:
+class SessionFinished:
     """Message that a session has ended and the torque is off."""
 
     outcome: str
@@ -168,7 +168,7 @@ class Finished:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasurementResult:
     """Message with the result of a tare, a new zero or a probing move between sessions."""
 
     values: dict[str, Any]
@@ -176,7 +176,7 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
+class MeasurementRefused:
     """Message that a tare, a new zero or a probing move failed, with the reason."""
 
     reason: str
@@ -184,7 +184,7 @@ class Refused:
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class ControlEnded:
     """Last message of the control process: the devices are closed."""
 
     reason: str
@@ -219,7 +219,7 @@ class FileHeader:
 
 
 @dataclass(frozen=True, slots=True)
-class Close:
+class CloseFile:
     """Order to the recorder to write the outcome and close the session file."""
 
     outcome: Mapping[str, str]
@@ -231,7 +231,7 @@ class Close:
 
 
 @dataclass(frozen=True, slots=True)
-class Opened:
+class FileOpened:
     """Message of the recorder that it has created the session file."""
 
     realtime: Mapping[str, str]
@@ -239,12 +239,12 @@ class Opened:
 
 
 @dataclass(frozen=True, slots=True)
-class Armed:
+class RecorderReady:
     """Message that the recorder is ready, so the record may begin."""
 
 
 @dataclass(frozen=True, slots=True)
-class Closed:
+class FileClosed:
     """Message of the recorder that it has completed and closed the session file."""
 
     path: Path | None = None
@@ -258,7 +258,7 @@ class Closed:
 
 
 @dataclass(frozen=True, slots=True)
-class Failed:
+class ProcessFailed:
     """Message that a recorder, live publisher, fit process or page has failed and ends."""
 
     reason: str
@@ -389,7 +389,7 @@ class PageAddress:
 
 
 @dataclass(frozen=True, slots=True)
-class Performed:
+class JobPerformed:
     """Message with the result of a prediction, a check or a plan."""
 
     result: Any

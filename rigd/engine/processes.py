@@ -1,11 +1,11 @@
 """Both ends of a child process: its client, and its connection to the process that started it.
 
-`Child` starts the process that a row of `rigd.engine.workers` describes, and is the client of its
-messages; it suspends, resumes and ends it. A worker that sends messages is ``python -m MODULE PID``
-with the process id of its supervisor. It receives its job and then messages on standard input,
-whose end means that the supervisor is gone, and sends its answers on standard output (`messages`);
-its end of the pipes is a `Parent`. Any other worker is a program with arguments, which the system
-kills when its supervisor ends.
+`ChildProcess` starts the process that a row of `rigd.engine.workers` describes, and is the client
+of its messages; it suspends, resumes and ends it. A worker that sends messages is ``python -m
+MODULE PID`` with the process id of its supervisor. It receives its job and then messages on
+standard input, whose end means that the supervisor is gone, and sends its answers on standard
+output (`messages`); its end of the pipes is a `SupervisorConnection`. Any other worker is a program
+with arguments, which the system kills when its supervisor ends.
 """
 
 import contextlib
@@ -24,14 +24,13 @@ from rigd.engine._ring import shared_memory_fd
 from rigd.engine.messages import MessageReader, encode, is_ready
 from rigd.engine.workers import Worker
 from rigd.errors import FailureError
-from rigd.runtime import (
+from rigd.runtime import signal_when_orphaned, signals_blocked
+from rigd.runtime.background import (
     OWN_PYTHON,
     RUN_PROGRAM,
     SINGLE_THREADED,
     give_way,
     prefer_oom_kill,
-    signal_when_orphaned,
-    signals_blocked,
 )
 
 _WRITE_PATIENCE_S = 5.0
@@ -51,7 +50,7 @@ class ChildError(FailureError):
     """Reason of the system why the process cannot be started."""
 
 
-class Child:
+class ChildProcess:
     """Child process of a supervisor: its start, its messages, and its end.
 
     Parameters
@@ -87,7 +86,7 @@ class Child:
         own_pid = str(os.getpid())
         self._errors_fd: int | None = None
         try:
-            if worker.errors_hidden:
+            if worker.captures_stderr:
                 self._errors_fd = shared_memory_fd()  # a pipe would have to be read meanwhile
             # A program has its own group, which is suspended and killed with its workers.
             with contextlib.nullcontext() if is_program else signals_blocked():
@@ -129,7 +128,7 @@ class Child:
                 os.setpriority(os.PRIO_PROCESS, pid, raised_niceness)
         if worker.niceness is None:
             give_way(pid)
-        if worker.ended_for_memory:
+        if worker.prefers_oom_kill:
             prefer_oom_kill(pid)
 
     def start(self, job: object) -> None:
@@ -262,12 +261,12 @@ class Child:
         if self._process.stdout is None:
             self.kill()
             with contextlib.suppress(subprocess.TimeoutExpired):  # it ends late at low priority
-                self._process.wait(self._worker.end_s)
+                self._process.wait(self._worker.end_timeout_s)
         elif not self._process.stdout.closed:
             self.close_input()
             self.resume()
             for terminate_or_kill in (self._process.terminate, self._process.kill):
-                has_ended = self._wait_for_output_end(self._worker.end_s)
+                has_ended = self._wait_for_output_end(self._worker.end_timeout_s)
                 try:
                     self._process.wait(_EXIT_GRACE_S if has_ended else 0.0)
                     break
@@ -322,7 +321,7 @@ class Child:
                 return  # poll() reports how it ended
 
 
-class Parent:
+class SupervisorConnection:
     """A child process's connection to the supervisor, whose process id is its only argument.
 
     (The parent's id at the start of the child would be wrong if the supervisor has died already.)

@@ -2,7 +2,7 @@
 
 The control process gets all settings for a 1 kHz loop (:func:`apply_realtime`). Supervisor and
 recorder get a priority below the loop's and above that of every ordinary program
-(:class:`Precedence`), so that a session can be stopped even if a viewer occupies the processor.
+(:class:`RaisedPriority`), so that a session can be stopped even if a viewer occupies the processor.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ _IDLE_LATENCY_DEVICE = "dev/cpu_dma_latency"
 """Device file that limits the exit latency of idle states while it is open."""
 
 
-def collect_no_garbage() -> str:
+def disable_garbage_collection() -> str:
     """Turn off Python's cyclic garbage collector, whose run can take ten periods; return "off"."""
     gc.collect()
     gc.freeze()
@@ -69,7 +69,7 @@ def apply_realtime(*, priority: int, cpu: int, root_folder: Path = Path("/")) ->
     setting_functions: dict[str, Callable[[], str]] = {
         "memory": lambda: lock_memory(libc),
         "timer_slack": lambda: _set_timer_slack(libc),
-        "garbage_collector": collect_no_garbage,
+        "garbage_collector": disable_garbage_collection,
         "cpu": lambda: _pin_to_loop_core(cpu, root_folder),
         "idle_states": lambda: _limit_idle_states(root_folder),
     }
@@ -98,12 +98,12 @@ def pin_off_loop_core(loop_cpu: int) -> None:
         os.sched_setaffinity(0, other_cores)
 
 
-class Precedence:
+class RaisedPriority:
     """Raised priority of this process: above ordinary programs and below the control loop.
 
-    It lasts from :meth:`take` to :meth:`release`. If the real-time priority is granted, the process
-    also avoids the loop's core where it may use another core. Its children are ordinary processes,
-    but inherit the restriction to these cores: start them with :attr:`cores_before`.
+    It lasts from :meth:`request` to :meth:`restore`. If the real-time priority is granted, the
+    process also avoids the loop's core where it may use another core. Its children are ordinary
+    processes, but inherit the restriction to these cores: start them with :attr:`cores_before`.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class Precedence:
         self._other_cores = self.cores_before - {core}
         self._apply: Callable[[int], None] | None = None
 
-    def take(self) -> dict[str, str]:
+    def request(self) -> dict[str, str]:
         """Request the raised priority, and return the results by setting: scheduling and cores.
 
         Returns
@@ -151,7 +151,7 @@ class Precedence:
             return {"scheduling": f"{niceness_result} (SCHED_RR {scheduling_result})"}
         return {"scheduling": scheduling_result}
 
-    def cover(self) -> None:
+    def raise_new_threads(self) -> None:
         """Raise the priority of the threads started since, too; one interpreter lock serves all."""
         if self._apply is None:
             return
@@ -159,26 +159,26 @@ class Precedence:
             with contextlib.suppress(OSError):  # one that has just ended
                 self._apply(int(thread.name))
 
-    def release(self) -> None:
+    def restore(self) -> None:
         """Return to ordinary priority; calling this again has no effect."""
         if self._apply is None:
             return
         self._apply = self._restore
-        self.cover()
+        self.raise_new_threads()
         self._apply = None
 
     def _raise_to_realtime(self) -> str:
         """Set the real-time priority SCHED_RR for all threads, and return its description."""
         self._set_realtime(0)
         self._apply = self._set_realtime
-        self.cover()
+        self.raise_new_threads()
         return f"SCHED_RR {self._priority}"
 
     def _raise_by_niceness(self) -> str:
         """Set the niceness `SUPERVISION_NICENESS` for all threads, and return its description."""
         self._set_nice(0)
         self._apply = self._set_nice
-        self.cover()
+        self.raise_new_threads()
         return f"nice {SUPERVISION_NICENESS}"
 
     def _set_realtime(self, thread_id: int) -> None:

@@ -24,10 +24,18 @@ from rigd.engine.channels import (
     Topic,
     attach_channels,
 )
-from rigd.engine.messages import Armed, Close, Closed, Failed, FileHeader, Opened, RecorderJob
-from rigd.engine.processes import Parent
-from rigd.engine.realtime import Precedence
-from rigd.engine.reference import is_whole
+from rigd.engine.messages import (
+    CloseFile,
+    FileClosed,
+    FileHeader,
+    FileOpened,
+    ProcessFailed,
+    RecorderJob,
+    RecorderReady,
+)
+from rigd.engine.processes import SupervisorConnection
+from rigd.engine.realtime import RaisedPriority
+from rigd.engine.reference import covers_reference
 from rigd.engine.shared_state import Phase, SharedState, StateField, read_events
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import SessionError, SessionExistsError, SessionWriter, segments_until
@@ -46,24 +54,26 @@ _DISK_POLL_S = 1.0
 def main() -> None:
     """Run the recorder process, started as ``python -m rigd.engine.recorder``."""
     ignore_signals()
-    parent = Parent()
+    parent = SupervisorConnection()
     job: RecorderJob = parent.receive_job()
     channels = attach_channels(job.channels)
     realtime_results = {}
     if job.realtime is not None:
-        realtime_results = Precedence(job.realtime.supervision_priority, job.realtime.cpu).take()
+        realtime_results = RaisedPriority(
+            job.realtime.supervision_priority, job.realtime.cpu
+        ).request()
     try:
         writer = SessionWriter(job.path)
     except SessionError as error:
-        parent.send(Failed(str(error), taken=isinstance(error, SessionExistsError)))
+        parent.send(ProcessFailed(str(error), taken=isinstance(error, SessionExistsError)))
         raise SystemExit(1) from None
     _publish_free_space(channels.shared_state, job.path.parent)
-    parent.send(Opened(realtime_results))
+    parent.send(FileOpened(realtime_results))
     try:
         _record_until_closed(parent, channels, writer, job.path.parent)
     except SessionError as error:
         failure_text, saved_path = _abandon_recording(writer)
-        parent.send(Failed(f"{error}{failure_text}", saved_path=saved_path))
+        parent.send(ProcessFailed(f"{error}{failure_text}", saved_path=saved_path))
         raise SystemExit(1) from None
 
 
@@ -88,7 +98,7 @@ def _abandon_recording(writer: SessionWriter) -> tuple[str, Path | None]:
 
 
 def _record_until_closed(
-    parent: Parent, channels: Channels, writer: SessionWriter, disk_folder: Path
+    parent: SupervisorConnection, channels: Channels, writer: SessionWriter, disk_folder: Path
 ) -> None:
     """Write the records of the rings until the supervisor orders to close the file, or ends."""
     recorder = Recorder(channels, writer)
@@ -106,15 +116,15 @@ def _record_until_closed(
         match message:
             case FileHeader():
                 recorder.header = message
-                parent.send(Armed())
-            case Close(outcome, touches, segments):
+                parent.send(RecorderReady())
+            case CloseFile(outcome, touches, segments):
                 recorder.transfer()
                 if recorder.begun:
                     writer.write_touches(touches)
                     parent.send(recorder.close(outcome, segments))
                 else:
                     writer.discard()
-                    parent.send(Closed())
+                    parent.send(FileClosed())
                 return
 
 
@@ -154,7 +164,7 @@ class Recorder:
         self._ring_writers = [
             (ring, topic_writers[topic])
             for topic, ring in zip(TOPICS, channels.rings, strict=True)
-            if topic.logged
+            if topic.is_recorded
         ]
         self._recorded = 0
         self.header: FileHeader | None = None
@@ -200,7 +210,7 @@ class Recorder:
         self,
         outcome: Mapping[str, str],
         segments: Mapping[str, tuple[int, int]] = MappingProxyType({}),
-    ) -> Closed:
+    ) -> FileClosed:
         """Write the remaining records and the outcome, and close the file.
 
         Parameters
@@ -237,7 +247,7 @@ class Recorder:
             # Segments of a growing reference end with the record.
             segments = segments_until({**self.header.segments, **segments}, scheduled_ticks)
         closed_path = self._writer.close(outcome_with_counts, segments)
-        return Closed(closed_path, tick_counts, outcome["outcome"], outcome["reason"])
+        return FileClosed(closed_path, tick_counts, outcome["outcome"], outcome["reason"])
 
     def close_without_supervisor(self) -> None:
         """Wait until the loop has stopped, and close the file without the supervisor's order."""
@@ -252,7 +262,7 @@ class Recorder:
             self._writer.discard()
             return
         scheduled_ticks = shared_state[StateField.SCHEDULED]
-        is_complete = is_whole(
+        is_complete = covers_reference(
             shared_state, scheduled_ticks, max(end for _, end in self.header.segments.values())
         )
         self.close(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _DOUBLE_BYTES = 8  # bytes of a double
-_AT_REST_RAD = 1e-4
+_REST_TOLERANCE_RAD = 1e-4
 """Largest distance in rad of a segment's ends from the start angle: one or two encoder steps."""
 _MAX_ANGLE_RAD = 6.3
 """Angle in rad that no reference reaches; a larger number in the memory is an error."""
@@ -75,7 +75,7 @@ def map_reference(spec: ReferenceSpec) -> "memoryview[float]":
     return memoryview(shared_memory).cast("d")
 
 
-def is_whole(shared_state: SharedState, scheduled_ticks: int, reference_ticks: int) -> bool:
+def covers_reference(shared_state: SharedState, scheduled_ticks: int, reference_ticks: int) -> bool:
     """Return whether the ticks of a record extend to the end of its reference angles.
 
     Parameters
@@ -91,7 +91,9 @@ def is_whole(shared_state: SharedState, scheduled_ticks: int, reference_ticks: i
         return True
     return (
         bool(shared_state[StateField.LAST_SEGMENT])
-        and scheduled_ticks >= shared_state[StateField.PLANNED] + shared_state[StateField.HELD] > 0
+        and scheduled_ticks
+        >= shared_state[StateField.PLANNED] + shared_state[StateField.HELD_TICKS]
+        > 0
     )
 
 
@@ -132,7 +134,7 @@ class ReferenceWriter:
         segment_ticks = int(reference_rad.size)
         ends_rad = abs(reference_rad[0]), abs(reference_rad[-1])
         # Also refuse NaN: the loop follows every angle in this memory.
-        if not (max(ends_rad) <= _AT_REST_RAD and abs(reference_rad).max() < _MAX_ANGLE_RAD):
+        if not (max(ends_rad) <= _REST_TOLERANCE_RAD and abs(reference_rad).max() < _MAX_ANGLE_RAD):
             raise ValueError(f"a segment from {reference_rad[0]} rad to {reference_rad[-1]} rad")
         if segment_ticks > self.room:
             raise ValueError(f"a segment of {segment_ticks} ticks; there is room for {self.room}")
@@ -159,9 +161,9 @@ class ReferenceReader:
         Number of ticks that are planned at the start.
     shared_state
         `StateField.PLANNED` announces the planned ticks, and `StateField.LAST_SEGMENT` the last
-        segment. The reader writes the number of held ticks to `StateField.HELD`, the number before
-        the segment that began last to `StateField.HELD_BEFORE`, and the end of that segment to
-        `StateField.BEGUN`.
+        segment. The reader writes the number of held ticks to `StateField.HELD_TICKS`, the number
+        before the segment that began last to `StateField.HELD_TICKS_BEFORE_SEGMENT`, and the end of
+        that segment to `StateField.BEGUN_REFERENCE_TICKS`.
     """
 
     def __init__(
@@ -171,9 +173,9 @@ class ReferenceReader:
         self._planned = planned_ticks
         self._announced = shared_state.view(StateField.PLANNED)
         self._last_segment = shared_state.view(StateField.LAST_SEGMENT)
-        self._held_ticks = shared_state.view(StateField.HELD)
-        self._held_before = shared_state.view(StateField.HELD_BEFORE)
-        self._begun_ticks = shared_state.view(StateField.BEGUN)
+        self._held_ticks = shared_state.view(StateField.HELD_TICKS)
+        self._held_before = shared_state.view(StateField.HELD_TICKS_BEFORE_SEGMENT)
+        self._begun_ticks = shared_state.view(StateField.BEGUN_REFERENCE_TICKS)
         self._held = 0
 
     def reference_at(self, tick: int) -> float:

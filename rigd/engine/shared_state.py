@@ -77,10 +77,10 @@ class Activity(StrEnum):
     """A stop was requested."""
 
 
-class Stop(IntEnum):
+class StopReason(IntEnum):
     """Reason why the supervisor requests a stop: the values of :attr:`StateField.STOP`."""
 
-    NO = 0
+    NONE = 0
     """No stop is requested."""
     OPERATOR = 1
     """The operator requested the stop."""
@@ -93,7 +93,7 @@ class StateField(IntEnum):
 
     # Written by the supervisor
     STOP = 0
-    """Reason for a requested stop, a value of :class:`Stop`."""
+    """Reason for a requested stop, a value of :class:`StopReason`."""
     GO = 1
     """1 once the record may begin, because the recorder is ready."""
     SUPERVISOR_BEAT = 2
@@ -136,7 +136,7 @@ class StateField(IntEnum):
     """Number of samples that the live publisher did not show in time."""
     LIVE_BEAT = 16
     """Heartbeat count of the live publisher."""
-    LIVE_SEEN = 20
+    LIVE_SAMPLES_SEEN = 20
     """Number of samples of the ring that have been shown, or counted as dropped."""
     # Written by the control process
     STALE_ANGLES = 21
@@ -145,11 +145,11 @@ class StateField(IntEnum):
     """Number of recorded ticks with a stale wrench."""
     TOUCHES = 23
     """Number of touches detected in the record."""
-    HELD = 25
+    HELD_TICKS = 25
     """Number of recorded ticks in which the angle was held because no next segment was planned."""
-    HELD_BEFORE = 29
+    HELD_TICKS_BEFORE_SEGMENT = 29
     """Number of ticks in which the angle was held before the segment that began last."""
-    BEGUN = 30
+    BEGUN_REFERENCE_TICKS = 30
     """Number of ticks of the reference up to the end of the segment that began last; 0: none."""
     # Written by the touch process
     TOUCH_BEAT = 24
@@ -293,7 +293,7 @@ def activity(shared_state: SharedState) -> Activity:
     <Activity.PREPARING: 'preparing'>
     """
     phase = Phase(shared_state[StateField.PHASE])
-    if shared_state[StateField.STOP] != Stop.NO:
+    if shared_state[StateField.STOP] != StopReason.NONE:
         return Activity.STOPPING
     if phase is Phase.RUNNING:
         return Activity.RUNNING

@@ -2,7 +2,7 @@
 
 Both clocks count nanoseconds of monotonic time and have the same two methods, so the cycle uses
 the same code with either. `TickScheduler` computes when a tick is due and how many were missed.
-`SuspendWatch` detects that the computer was suspended.
+`SuspendMonitor` detects that the computer was suspended.
 """
 
 import time
@@ -11,9 +11,9 @@ from functools import partial
 from typing import Protocol
 
 SUSPENDED_S = 0.01
-"""Time in s from :meth:`SuspendWatch.suspended_s` above which the computer counts as suspended;
+"""Time in s from :meth:`SuspendMonitor.suspended_s` above which the computer counts as suspended;
 every real suspend is longer."""
-SIGN_OF_LIFE_S = 1.0
+MAX_VIRTUAL_PAUSE_S = 1.0
 """Longest pause in s between two ticks of virtual time with devices on a bus or serial line, which
 would otherwise treat the silent host as failed."""
 
@@ -85,7 +85,7 @@ class VirtualClock:
         return 0
 
 
-class SuspendWatch:
+class SuspendMonitor:
     """Detector of a suspended computer.
 
     The monotonic clock stops during a suspend, so no tick seems missed although the rig ran without

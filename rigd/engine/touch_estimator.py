@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rigd.engine._ring import Observer
 from rigd.engine.channels import attach_channels
 from rigd.engine.messages import TouchJob, TouchReady, TouchReport
-from rigd.engine.processes import Parent
+from rigd.engine.processes import SupervisorConnection
 from rigd.engine.realtime import pin_off_loop_core
 from rigd.engine.shared_state import StateField
 from rigd.runtime import ignore as ignore_signals
@@ -42,7 +42,7 @@ estimate."""
 def main() -> None:
     """Run the touch process, started as ``python -m rigd.engine.touch_estimator``."""
     ignore_signals()
-    parent = Parent()
+    parent = SupervisorConnection()
     job: TouchJob = parent.receive_job()
     if job.realtime is not None:
         pin_off_loop_core(job.realtime.cpu)
@@ -50,7 +50,7 @@ def main() -> None:
     sample_reader = Observer(channels.samples, job.first)
     estimator = TouchEstimator(job.model, job.rate_hz)
     parent.send(TouchReady())
-    touch_follower = TouchFollower(estimator, job)
+    touch_follower = RunningTouchEstimator(estimator, job)
     while True:
         channels.shared_state.beat(StateField.TOUCH_BEAT)
         sample_bytes = sample_reader.take(_MAX_BLOCK_SAMPLES)
@@ -85,7 +85,7 @@ class _PendingTouch:
     """Whether the first estimate has been sent."""
 
 
-class TouchFollower:
+class RunningTouchEstimator:
     """Estimator of all detected touches of a record, each as soon as it has enough samples.
 
     Parameters

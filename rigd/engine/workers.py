@@ -1,7 +1,8 @@
 """The table of workers: every child process of rigd, how it is started, and what follows its loss.
 
-Each row is a `Worker`; `rigd.engine.processes.Child` starts it, and is the client of its messages.
-The programs of the analyser are named here and nowhere else, since rigd does not import them.
+Each row is a `Worker`; `rigd.engine.processes.ChildProcess` starts it, and is the client of its
+messages. The programs of the analyser are named here and nowhere else, since rigd does not import
+them.
 """
 
 from dataclasses import dataclass
@@ -18,9 +19,9 @@ class MemoryLimit:
 
     fraction: float
     """Fraction of the available memory that the worker may use."""
-    least_bytes: int
+    min_bytes: int
     """Memory in bytes that the worker may use in any case."""
-    largest_bytes: int
+    max_bytes: int
     """Maximum memory in bytes, however much is available."""
 
     def bytes_now(self, meminfo: Path = Path("/proc/meminfo")) -> int:
@@ -33,7 +34,7 @@ class MemoryLimit:
         """
         available_text = meminfo.read_text().partition("MemAvailable:")[2].split()[0]
         allowed_bytes = int(self.fraction * int(available_text) * 1024)
-        return min(max(allowed_bytes, self.least_bytes), self.largest_bytes)
+        return min(max(allowed_bytes, self.min_bytes), self.max_bytes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +46,7 @@ class Worker:
     module: str
     """Module that is run as ``python -m module``; empty for the supervisor."""
     sends: tuple[str, ...] = ()
-    """Classes of its messages, by name; the first one that a `SessionWorker` sends means that it is
+    """Classes of its messages, by name; the first one that a `WorkerClient` sends means that it is
     ready. Empty for a program, whose results are files and an exit code."""
     loss: Literal["fault", "warning", "nothing"]
     """What the operator gets if the process dies or hangs: a fault, a warning, or no message."""
@@ -55,21 +56,21 @@ class Worker:
     """Number of times that the process is started again in a session, or in a row for the page."""
     beat: StateField | None = None
     """Field of its heartbeat in the shared state; None: the process has no access to it."""
-    start_s: float = 20.0
+    start_timeout_s: float = 20.0
     """Longest time in s for the process to become ready on a busy computer."""
-    hung_after_s: float | None = None
+    max_silence_s: float | None = None
     """Longest time in s without a heartbeat; None: the process's results are checked instead."""
-    end_s: float
+    end_timeout_s: float
     """Time in s in which the process must end on request, before it is terminated, then killed."""
-    for_one_session: bool = False
+    is_per_session: bool = False
     """Whether each session starts a new process of this kind."""
     niceness: int | None = 0
     """Increment of the niceness; None: it runs only while no other process needs the processor."""
     memory: MemoryLimit | None = None
     """Limit of its memory; None: no limit."""
-    ended_for_memory: bool = False
+    prefers_oom_kill: bool = False
     """Whether the system ends this process first if memory runs out."""
-    errors_hidden: bool = False
+    captures_stderr: bool = False
     """Whether its standard error is read by its client instead of being shown to the operator."""
 
 
@@ -79,36 +80,43 @@ CONTROL: Final = Worker(
     name="control",
     module=CONTROL_MODULE,
     # It takes its real-time priority itself, as the profile states.
-    sends=("Connected", "Ready", "Finished", "Measured", "Refused", "Ended"),
+    sends=(
+        "DevicesConnected",
+        "ReadyToRecord",
+        "SessionFinished",
+        "MeasurementResult",
+        "MeasurementRefused",
+        "ControlEnded",
+    ),
     loss="fault",
     consequence="The drive's watchdog switches it off; the session ends as a fault.",
     beat=StateField.CONTROL_BEAT,
-    hung_after_s=3.0,
-    end_s=5.0,
+    max_silence_s=3.0,
+    end_timeout_s=5.0,
 )
 RECORDER: Final = Worker(
     name="recorder",
     module="rigd.engine.recorder",
-    sends=("Opened", "Armed", "Closed", "Failed"),
+    sends=("FileOpened", "RecorderReady", "FileClosed", "ProcessFailed"),
     loss="fault",
     consequence="The session ends as a fault.",
     beat=StateField.RECORDER_BEAT,
     # A disk may stall for seconds; the number of waiting samples is checked instead.
-    hung_after_s=None,
-    end_s=5.0,
-    for_one_session=True,
+    max_silence_s=None,
+    end_timeout_s=5.0,
+    is_per_session=True,
 )
 LIVE: Final = Worker(
     name="live",
     module="rigd.live.publisher",
-    sends=("LiveAddress", "LiveShown", "Failed"),
+    sends=("LiveAddress", "LiveSessionShown", "ProcessFailed"),
     loss="warning",
     consequence="It is not restarted; the session continues.",
     restarts=3,
     beat=StateField.LIVE_BEAT,
-    start_s=60.0,
-    hung_after_s=5.0,
-    end_s=2.0,
+    start_timeout_s=60.0,
+    max_silence_s=5.0,
+    end_timeout_s=2.0,
 )
 TOUCH: Final = Worker(
     name="touch",
@@ -118,24 +126,24 @@ TOUCH: Final = Worker(
     consequence="Touches are detected but not estimated; the session continues.",
     beat=StateField.TOUCH_BEAT,
     # An estimate may take long; a missing estimate is reported as such.
-    hung_after_s=None,
-    end_s=1.0,
-    for_one_session=True,
+    max_silence_s=None,
+    end_timeout_s=1.0,
+    is_per_session=True,
 )
 FIT: Final = Worker(
     name="fit",
     module="rigd.runner.fit_process",
-    sends=("FitReady", "FitReport", "PlannedSegment", "SearchEnded", "Failed"),
+    sends=("FitReady", "FitReport", "PlannedSegment", "SearchEnded", "ProcessFailed"),
     loss="warning",
     # A session that plans itself ends with what is planned instead.
     consequence="The session continues without fits.",
     beat=StateField.FIT_BEAT,
     # A decision may take long on a busy computer; the loop holds the angle meanwhile.
-    hung_after_s=15.0,
-    end_s=1.0,
-    for_one_session=True,
+    max_silence_s=15.0,
+    end_timeout_s=1.0,
+    is_per_session=True,
     niceness=5,  # a third of a processor in competition with another program
-    ended_for_memory=True,
+    prefers_oom_kill=True,
 )
 SUPERVISOR: Final = Worker(
     name="supervisor",
@@ -143,8 +151,8 @@ SUPERVISOR: Final = Worker(
     loss="fault",
     consequence="The control process ends the session as a fault.",
     beat=StateField.SUPERVISOR_BEAT,
-    hung_after_s=2.0,
-    end_s=0.0,
+    max_silence_s=2.0,
+    end_timeout_s=0.0,
 )
 
 PROCESSES: Final = (CONTROL, RECORDER, LIVE, TOUCH, FIT, SUPERVISOR)
@@ -157,25 +165,25 @@ switches the torque off."""
 PAGE: Final = Worker(
     name="page",
     module="rigd.web",
-    sends=("PageAddress", "Failed"),
+    sends=("PageAddress", "ProcessFailed"),
     loss="warning",
     consequence="It is not started again; the rig does not need it.",
     restarts=4,
-    end_s=3.0,
+    end_timeout_s=3.0,
 )
 PREDICTION: Final = Worker(
     name="prediction",
     module="rigd.daemon.background",
-    sends=("Performed",),
+    sends=("JobPerformed",),
     loss="nothing",
     consequence="The client's request is refused.",
-    end_s=0.0,
+    end_timeout_s=0.0,
     niceness=19,  # it may run during a session
     # Apart from the control process of a session, the memory of no process is locked. A session of
     # two minutes needs 180 MiB, of which 120 MiB are the program.
-    memory=MemoryLimit(fraction=0.25, least_bytes=256 << 20, largest_bytes=4 << 30),
-    ended_for_memory=True,
-    errors_hidden=True,
+    memory=MemoryLimit(fraction=0.25, min_bytes=256 << 20, max_bytes=4 << 30),
+    prefers_oom_kill=True,
+    captures_stderr=True,
 )
 PLAN: Final = Worker(
     name="plan",
@@ -183,10 +191,10 @@ PLAN: Final = Worker(
     sends=PREDICTION.sends,
     loss="nothing",
     consequence="The session is not started.",
-    end_s=0.0,
+    end_timeout_s=0.0,
     memory=PREDICTION.memory,
-    ended_for_memory=True,
-    errors_hidden=True,
+    prefers_oom_kill=True,
+    captures_stderr=True,
 )
 
 
@@ -200,21 +208,21 @@ QUICK_LOOK: Final = Worker(
     module="analysis.quick_look",
     loss="warning",
     consequence="The session has no quick look.",
-    end_s=0.5,
+    end_timeout_s=0.5,
     # Not the lowest priority, because other programs may never pause.
     niceness=10,
-    ended_for_memory=True,
-    errors_hidden=True,
+    prefers_oom_kill=True,
+    captures_stderr=True,
 )
 REPORT: Final = Worker(
     name="report",
     module="analysis",
     loss="warning",
     consequence="The report, campaign or export is not made.",
-    end_s=5.0,
+    end_timeout_s=5.0,
     niceness=None,
-    ended_for_memory=True,
-    errors_hidden=True,
+    prefers_oom_kill=True,
+    captures_stderr=True,
 )
 
 WORKERS: Final = (*PROCESSES, PAGE, PREDICTION, PLAN, QUICK_LOOK, REPORT)

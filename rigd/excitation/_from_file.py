@@ -134,11 +134,11 @@ def _read_columns(
 def _read_table(table_stream: BinaryIO) -> TextTable:
     """Read a table with the columns of times and angles, or with a single column of angles."""
     try:
-        return read_table(table_stream, (TIME_COLUMN, ANGLE_COLUMN), most_rows=MAX_SAMPLES)
+        return read_table(table_stream, (TIME_COLUMN, ANGLE_COLUMN), max_rows=MAX_SAMPLES)
     except MissingColumnError:
         pass
     try:
-        text_table = read_table(table_stream, (ANGLE_COLUMN,), most_rows=MAX_SAMPLES)
+        text_table = read_table(table_stream, (ANGLE_COLUMN,), max_rows=MAX_SAMPLES)
     except MissingColumnError:
         pass
     else:
@@ -148,7 +148,7 @@ def _read_table(table_stream: BinaryIO) -> TextTable:
                 f"name the column of times in seconds so, or leave {ANGLE_COLUMN} alone."
             )
         return text_table
-    text_table = read_table(table_stream, ("#1",), most_rows=MAX_SAMPLES)
+    text_table = read_table(table_stream, ("#1",), max_rows=MAX_SAMPLES)
     if text_table.width > 1 or text_table.columns["#1"].title:
         raise TableError(
             f"must name the columns {TIME_COLUMN} (s) and {ANGLE_COLUMN} (rad) in one line above "

@@ -356,7 +356,7 @@ def _student_factor(degrees_of_freedom: Real) -> Real:
 
 # Estimate of a motor
 
-LEAST_REPEATS = 4
+MIN_REPEATS = 4
 """Smallest number of repeats of a motion; fewer do not determine the scatter."""
 
 _MIN_SPEED_FRACTION = 0.1
@@ -440,7 +440,7 @@ def estimate_motor(
     Parameters
     ----------
     windows
-        Windows of equal length; at least `LEAST_REPEATS` of each key, and both directions.
+        Windows of equal length; at least `MIN_REPEATS` of each key, and both directions.
     timing
         Timing of the readings. The windows show only the delay from command to angle, from which
         the angle's own delay is subtracted.
@@ -531,14 +531,12 @@ def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_
     for pass_readings in windows:
         window_groups.setdefault(pass_readings.key, []).append(pass_readings)
     complete_groups = [
-        repeat_group
-        for repeat_group in window_groups.values()
-        if len(repeat_group) >= LEAST_REPEATS
+        repeat_group for repeat_group in window_groups.values() if len(repeat_group) >= MIN_REPEATS
     ]
     if {np.sign(repeat_group[0].speed_rad_s) for repeat_group in complete_groups} != {1.0, -1.0}:
         raise MotorEstimateError(
             f"Too few passes: {len(windows)} of {window_count} have neither gaps nor a standstill, "
-            f"but an estimate takes at least {LEAST_REPEATS} of the same kind in each direction."
+            f"but an estimate takes at least {MIN_REPEATS} of the same kind in each direction."
         )
     session_indices = {
         session_number: session_index

@@ -31,7 +31,7 @@ _SQLITE_FIRST_BYTES: Final = b"SQLite format 3\0"
 """First bytes of every SQLite file."""
 _APPLICATION_ID_POSITION: Final = slice(68, 72)
 """Position of the application ID in an SQLite file."""
-_MOST_LOCK_WAIT_S: Final = 2.0
+_MAX_LOCK_WAIT_S: Final = 2.0
 """Longest wait in seconds for another program that is writing the index."""
 
 _DAMAGE_ERROR_CODES: Final = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
@@ -174,7 +174,7 @@ class Index:
         database = sqlite3.connect(
             f"{self._path.absolute().as_uri()}?mode={open_mode}",
             uri=True,
-            timeout=_MOST_LOCK_WAIT_S,
+            timeout=_MAX_LOCK_WAIT_S,
             isolation_level=None,
         )
         try:
@@ -209,7 +209,9 @@ class Index:
         column_values["modes"] = usable_modes(json.loads(str(column_values["modes"])))
         validity_document = json.loads(str(column_values["validity"]))
         column_values["validity"] = (
-            None if validity_document is None else Validity.of_document(validity_document).as_json()
+            None
+            if validity_document is None
+            else Validity.from_document(validity_document).as_json()
         )
         column_values["meta"] = dict(json.loads(str(column_values["meta"])))
         column_values["report"] = None if report_name is None else self._folder / str(report_name)

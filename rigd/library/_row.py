@@ -25,13 +25,13 @@ REPORT_PAGE: Final = "report.html"
 RESULTS_FILE: Final = "analysis.json"
 """Name of the file with the results in JSON in a report folder."""
 
-_MOST_JSON_BYTES: Final = 8 << 20
+_MAX_JSON_BYTES: Final = 8 << 20
 """Largest size of a JSON file that is read."""
-_MOST_TEXT_CHARACTERS: Final = 1000
+_MAX_TEXT_CHARACTERS: Final = 1000
 """Number of characters to which texts are cut."""
-_MOST_META_ENTRIES: Final = 100
+_MAX_META_ENTRIES: Final = 100
 """Largest number of metadata entries of users in a row."""
-_MOST_COUNT_DIGITS: Final = 18
+_MAX_COUNT_DIGITS: Final = 18
 """Number of digits that every count of up to 64 bits may have."""
 
 """Mode of a session as in JSON documents."""
@@ -171,7 +171,7 @@ def read_row(
     scheduled_ticks = _count_of_key(outcome_document, "scheduled")
     tick_count = file_summary.samples if scheduled_ticks is None else scheduled_ticks
     rate_hz = _number_of_key(file_metadata, "rate_hz") or 0.0
-    user_metadata = list(added_metadata(file_metadata).items())[:_MOST_META_ENTRIES]
+    user_metadata = list(added_metadata(file_metadata).items())[:_MAX_META_ENTRIES]
     row = SessionRow(
         id=session_id,
         path=path,
@@ -206,7 +206,7 @@ def read_row(
 
 def _cut_text(text: str) -> str:
     """Return a printable text of at most 1000 characters."""
-    return printable(text, _MOST_TEXT_CHARACTERS)
+    return printable(text, _MAX_TEXT_CHARACTERS)
 
 
 def _text_of_key(key_texts: Mapping[str, str], key: str) -> str:
@@ -219,7 +219,7 @@ def _count_of_key(key_texts: Mapping[str, str], key: str) -> int | None:
     count_text = key_texts.get(key, "")
     # More digits are not a count and exceed 64 bits.
     is_count = (
-        count_text.isascii() and count_text.isdigit() and len(count_text) <= _MOST_COUNT_DIGITS + 1
+        count_text.isascii() and count_text.isdigit() and len(count_text) <= _MAX_COUNT_DIGITS + 1
     )
     return int(count_text) if is_count and int(count_text) < 2**63 else None
 
@@ -260,13 +260,13 @@ def _with_validity(modes: tuple[EstimatedMode, ...], document: object) -> Docume
     if not modes:
         return {}
     validity_document = document.get("validity") if isinstance(document, dict) else None
-    return {"modes": modes, "validity": Validity.of_document(validity_document).as_json()}
+    return {"modes": modes, "validity": Validity.from_document(validity_document).as_json()}
 
 
 def _read_json(path: Path) -> object:
     """Return the content of a JSON file; None if it cannot be read."""
     try:
-        return json.loads(read_plain_file(path, _MOST_JSON_BYTES))
+        return json.loads(read_plain_file(path, _MAX_JSON_BYTES))
     except (OSError, ValueError, RecursionError):  # the session is listed without this result
         return None
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 from rigd.estimates import Change, Estimate, change_between
 from rigd.library._row import SessionRow
 
-_MOST_LOG_FREQUENCY_RATIO: Final = log(1.25)
+_MAX_LOG_FREQUENCY_RATIO: Final = log(1.25)
 """Largest logarithm of the frequency ratio of the same mode in two sessions.
 
 Modes of a beam are further apart."""
@@ -81,7 +81,7 @@ def mode_trends(session_rows: Iterable[SessionRow]) -> list[ModeTrend]:
                 if trend_index not in assigned
             }
             nearest_trend = min(distances, key=distances.__getitem__, default=None)
-            if nearest_trend is None or distances[nearest_trend] > _MOST_LOG_FREQUENCY_RATIO:
+            if nearest_trend is None or distances[nearest_trend] > _MAX_LOG_FREQUENCY_RATIO:
                 nearest_trend = len(trends)
                 trends.append([])
             assigned.add(nearest_trend)

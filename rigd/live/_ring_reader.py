@@ -81,7 +81,7 @@ class SessionRecordReader:
             for topic, ring_buffer, first_record in zip(
                 TOPICS, channels.rings, session.begins, strict=True
             )
-            if topic.live
+            if topic.is_shown_live
         }
 
     @property
@@ -90,9 +90,9 @@ class SessionRecordReader:
         return self._readers[SAMPLE].dropped
 
     @property
-    def next(self) -> int:
+    def next_index(self) -> int:
         """Number of the next sample to read, counted as `LiveSession.begins`."""
-        return self._readers[SAMPLE].next
+        return self._readers[SAMPLE].next_index
 
     @property
     def exhausted(self) -> bool:
@@ -119,7 +119,7 @@ class SessionRecordReader:
             signal_drawings += scene.samples(sample_records)
             self.t_ns = int(sample_records["t_ns"][-1])
             sample_count += len(sample_records)
-            first_shown += min(len(sample_records), max(0, self.next - self._seen_samples))
+            first_shown += min(len(sample_records), max(0, self.next_index - self._seen_samples))
         self.read_duration_s = sample_count / self._rate_hz
         return NewDrawings(note_drawings, signal_drawings, first_shown)
 
@@ -134,7 +134,7 @@ class _RingReader:
     def __init__(self, ring: Ring, first: int, seen: int) -> None:
         self._ring = ring
         # Overwritten records that an earlier publisher showed do not count as dropped.
-        self._observer = Observer(ring, max(first, min(seen, ring.oldest)))
+        self._observer = Observer(ring, max(first, min(seen, ring.oldest_index)))
         self._damaged_records = 0
         self.end: int | None = None
 
@@ -144,24 +144,24 @@ class _RingReader:
         return self._observer.dropped + self._damaged_records
 
     @property
-    def next(self) -> int:
+    def next_index(self) -> int:
         """Number of the next record to read."""
-        return self._observer.next
+        return self._observer.next_index
 
     @property
     def exhausted(self) -> bool:
         """Whether the session has ended and all its records were read."""
-        return self.end is not None and self._observer.next >= self.end
+        return self.end is not None and self._observer.next_index >= self.end
 
     def records(self, decode: Callable[[bytes], Records]) -> Iterator[Records]:
         """Yield the unread records in decoded blocks."""
-        observer, written_records = self._observer, self._ring.written
+        observer, written_records = self._observer, self._ring.written_count
         last_record = written_records if self.end is None else min(self.end, written_records)
         while True:
             observer.take(0)  # skip overwritten records
-            if observer.next >= last_record:
+            if observer.next_index >= last_record:
                 return
-            record_block = observer.take(last_record - observer.next)
+            record_block = observer.take(last_record - observer.next_index)
             if not record_block:
                 continue
             try:

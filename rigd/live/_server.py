@@ -154,7 +154,7 @@ class RerunServer:
     def _announce(self) -> None:
         """Store the address of the server, and write it to its file."""
         self._grpc_port = self._program.grpc_port
-        self.address = self._announced_address = LiveAddress.of_this_process(
+        self.address = self._announced_address = LiveAddress.for_this_process(
             self._rig, self._grpc_port, self._page.port, time.time_ns()
         )
         with suppress(OSError):  # the view works nevertheless

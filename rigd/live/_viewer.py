@@ -142,7 +142,7 @@ class PageOfFile(_RerunContext):
         except BaseException:
             self._program.kill()
             raise
-        self.address = LiveAddress.of_this_process(
+        self.address = LiveAddress.for_this_process(
             path.stem, self._program.grpc_port, self._page.port, time.time_ns()
         )
 

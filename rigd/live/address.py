@@ -54,7 +54,7 @@ class LiveAddress:
     server: int
 
     @classmethod
-    def of_this_process(cls, rig: str, grpc_port: int, page_port: int, server: int) -> Self:
+    def for_this_process(cls, rig: str, grpc_port: int, page_port: int, server: int) -> Self:
         """Return the address of a live view that this process publishes.
 
         Parameters

@@ -71,7 +71,7 @@ class LiveFit:
 
 
 @dataclass(frozen=True, slots=True)
-class LiveEnd:
+class LiveSessionEnded:
     """Message to the publisher: the session that it shows has ended.
 
     Attributes
@@ -89,7 +89,7 @@ class LiveEnd:
 
 
 @dataclass(frozen=True, slots=True)
-class LiveShown:
+class LiveSessionShown:
     """Message from the publisher: it has begun to show a session."""
 
     recording_id: str

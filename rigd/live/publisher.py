@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rigd.engine.channels import SAMPLE, TOPICS, Channels, attach_channels
-from rigd.engine.messages import Failed
-from rigd.engine.processes import Heartbeat, Parent
+from rigd.engine.messages import ProcessFailed
+from rigd.engine.processes import Heartbeat, SupervisorConnection
 from rigd.engine.shared_state import Activity, Phase, StateField, activity
 from rigd.live._feed import DrawingStream
 from rigd.live._program import RerunError
 from rigd.live._ring_reader import SessionRecordReader
 from rigd.live._server import RerunServer
-from rigd.live.messages import LiveEnd, LiveFit, LiveSession, LiveShown, LiveTouches
+from rigd.live.messages import LiveFit, LiveSession, LiveSessionEnded, LiveSessionShown, LiveTouches
 from rigd.runtime import ignore as ignore_signals
 from rigd.session.quick_look import last_quick_look, quick_look_path, read_quick_look
 from rigd.session.touches import touch_line
@@ -79,7 +79,7 @@ def main() -> None:
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGALRM,))
     prepare_sdk_environment()
-    parent = Parent()
+    parent = SupervisorConnection()
     job: LiveJob = parent.receive_job()
     channels = attach_channels(job.channels)
     try:
@@ -88,7 +88,7 @@ def main() -> None:
 
         server_program.wait()
     except (RerunError, ImportError) as error:
-        parent.send(Failed(str(error)))
+        parent.send(ProcessFailed(str(error)))
         raise SystemExit(1) from None
     publisher = _Publisher(parent, channels, server_program)
     publisher.serve()
@@ -101,7 +101,9 @@ def main() -> None:
 class _Publisher:
     """Main loop of the publisher: receives sessions from the supervisor and shows them."""
 
-    def __init__(self, parent: Parent, channels: Channels, server_program: RerunServer) -> None:
+    def __init__(
+        self, parent: SupervisorConnection, channels: Channels, server_program: RerunServer
+    ) -> None:
         self._parent = parent
         self._channels = channels
         self._server_program = server_program
@@ -128,7 +130,7 @@ class _Publisher:
                 case LiveFit(fit):
                     if self._shown_session is not None:
                         self._shown_session.show_fit(fit)
-                case LiveEnd():
+                case LiveSessionEnded():
                     self._finish_session(supervisor_message)
         self._show_orphaned()
 
@@ -157,7 +159,7 @@ class _Publisher:
 
     def _begin_session(self, session: LiveSession) -> None:
         """Show a new session, after the end of the previous one."""
-        self._finish_session(LiveEnd(session.begins))
+        self._finish_session(LiveSessionEnded(session.begins))
         if self._shown_session is not None:
             self._last_response = (
                 self._shown_session.reader.scene.last_response or self._last_response
@@ -168,9 +170,9 @@ class _Publisher:
         self._server_program.count_session()
         self._drawing_stream.begin(session.recording_id, self._shown_session.reader.scene.frame)
         self._show_new_records()
-        self._parent.send(LiveShown(session.recording_id))
+        self._parent.send(LiveSessionShown(session.recording_id))
 
-    def _finish_session(self, end: LiveEnd) -> None:
+    def _finish_session(self, end: LiveSessionEnded) -> None:
         """Show the end of the present session, unless it has been shown already."""
         if self._shown_session is not None and not self._shown_session.has_ended:
             self._shown_session.finish(end)
@@ -188,7 +190,9 @@ class _Publisher:
             self._show_new_records()
             time.sleep(_SEND_PERIOD_S)
         self._finish_session(
-            LiveEnd(tuple(ring_buffer.written for ring_buffer in self._channels.rings))
+            LiveSessionEnded(
+                tuple(ring_buffer.written_count for ring_buffer in self._channels.rings)
+            )
         )
 
     def _show_new_records(self) -> None:
@@ -221,7 +225,7 @@ class _ShownSession:
         shared_state = self._shared_state = channels.shared_state
         first_sample, seen_samples = (
             session.begins[TOPICS.index(SAMPLE)],
-            shared_state[StateField.LIVE_SEEN],
+            shared_state[StateField.LIVE_SAMPLES_SEEN],
         )
         # Continue the count of a previous publisher of the same session.
         self._dropped_before = (
@@ -232,7 +236,7 @@ class _ShownSession:
         self.has_ended = False
         self.supervisor_lost = False
         self._health_reader = HealthReader(channels)
-        self._state_watch = StateWatch(channels)
+        self._state_reader = SessionStateReader(channels)
         self._unsent_samples = 0
         session_folder, session_name = session.folder, session.subject.name
         self._quick_look_path = (
@@ -258,7 +262,7 @@ class _ShownSession:
         if self._health_reader.is_due(now_s):
             rig_health = self._health_reader.read(now_s, self.dropped)
             queued_drawings += self.reader.scene.health(self.reader.t_ns, rig_health)
-        banner_state = SUPERVISOR_LOST if self.supervisor_lost else self._state_watch.read(now_s)
+        banner_state = SUPERVISOR_LOST if self.supervisor_lost else self._state_reader.read(now_s)
         queued_drawings += self.reader.scene.state(self.reader.t_ns, banner_state)
         self.backlog.put_required(new_drawings.notes)
         self.backlog.put(queued_drawings, new_drawings.samples)
@@ -268,8 +272,10 @@ class _ShownSession:
         """Store the counts of shown and dropped samples for a publisher that replaces this one."""
         shared_state = self._shared_state
         shared_state[StateField.LIVE_DROPPED] = self.dropped
-        shown_samples = self.reader.next - self.backlog.samples
-        shared_state[StateField.LIVE_SEEN] = max(shared_state[StateField.LIVE_SEEN], shown_samples)
+        shown_samples = self.reader.next_index - self.backlog.samples
+        shared_state[StateField.LIVE_SAMPLES_SEEN] = max(
+            shared_state[StateField.LIVE_SAMPLES_SEEN], shown_samples
+        )
 
     def show_touches(self, touches: "Sequence[Mapping[str, Any]]") -> None:
         """Queue the drawings and log lines of estimated touches."""
@@ -283,7 +289,7 @@ class _ShownSession:
         log_notes = [Note(t_ns, "info", fit_line) for fit_line in fit["text"]]
         self.backlog.put_required([*view_scene.fit(fit), *view_scene.events(log_notes)])
 
-    def finish(self, end: LiveEnd) -> None:
+    def finish(self, end: LiveSessionEnded) -> None:
         """Queue the drawings of the session's remaining records and of its outcome."""
         self.reader.end(end.ends)
         self.queue_new_records()
@@ -477,7 +483,7 @@ _ACTIVITY_BANNERS: Final = {  # Banner for each activity of the rig
 }
 
 
-class StateWatch:
+class SessionStateReader:
     """Derives the session's state, shown in the view's banner, from the processes' shared state.
 
     Parameters
@@ -569,7 +575,7 @@ class HealthReader:
             missed_ticks=missed_ticks,
             late_ticks=late_ticks,
             lost_ticks=lost_samples,
-            recorder_lag_ticks=self._samples.waiting,
+            recorder_lag_ticks=self._samples.waiting_count,
             disk_free_mb=shared_state[StateField.DISK_FREE_MB] or None,
             view_dropped=view_dropped,
             bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,

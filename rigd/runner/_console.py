@@ -56,7 +56,7 @@ def result_line(session: Mapping[str, Any]) -> str:
     Parameters
     ----------
     session
-        Result of the session, from :meth:`rigd.runner.session.RunResult.as_dict`.
+        Result of the session, from :meth:`rigd.runner.session.SessionResult.as_dict`.
     """
     outcome = session["outcome"].capitalize()
     reason = f" {session['reason']}" if session["reason"] else ""
@@ -127,7 +127,7 @@ class ProgressLine:
             self._next_redraw_s = now_s + _MIN_REDRAW_INTERVAL_S
             self._has_changed.set()
 
-    def say(self, message: str) -> None:
+    def write_message(self, message: str) -> None:
         """Write a message for the operator above the progress line."""
         with self._lock:
             self._messages.append(message)

@@ -9,7 +9,7 @@ from typing import Final, Self
 
 import typer
 
-from rigd.checks import check_on_paper
+from rigd.checks import run_offline_checks
 from rigd.devices import ActuationTarget, describe_actuation_target, simulated_differently
 from rigd.engine.shared_state import LogEvent
 from rigd.errors import FailureError, RigdError
@@ -20,10 +20,11 @@ from rigd.runner._process_group import ProcessGroup
 from rigd.runner._rig import Rig
 from rigd.runner._series import Series
 from rigd.runner._tip_slope import with_tip_slope
-from rigd.runner.quick_looks import QuickLook, QuickLooks
+from rigd.runner.quick_looks import QuickLook, QuickLookQueue
 from rigd.runner.request import load_rig, remaining_file_text
-from rigd.runner.session import RunResult, SessionFailedError, SessionProgress
-from rigd.runtime import RigLock, StopRequest
+from rigd.runner.session import SessionFailedError, SessionProgress, SessionResult
+from rigd.runtime import StopRequest
+from rigd.runtime.locks import RigLock
 
 _QUICK_LOOK_MAX_RUN_TIME_S: Final = 10.0
 """Maximum run time in seconds of the last quick look after the sessions. Time in which it waits for
@@ -52,7 +53,7 @@ class SeriesFailedError(FailureError):
         List of these results.
     """
 
-    def __init__(self, message: str, results: Sequence[RunResult] = ()) -> None:
+    def __init__(self, message: str, results: Sequence[SessionResult] = ()) -> None:
         super().__init__(message)
         self.results = list(results)
 
@@ -80,7 +81,7 @@ def run_in_foreground(
     watch_fit: bool = False,
     identifies_motor: bool = False,
     tip_slope_rad: float | None = None,
-) -> list[RunResult]:
+) -> list[SessionResult]:
     """Run a series of sessions until a stop or the first incomplete session; return the results.
 
     Parameters
@@ -124,14 +125,14 @@ def run_in_foreground(
         If a session cannot be run, or failed.
     """
     print_line: _PrintLine = partial(_print, to_stderr=quiet_stdout)
-    results: list[RunResult] = []
+    results: list[SessionResult] = []
 
     def report(quick_look: QuickLook) -> None:
-        quick_look.note(results)
+        quick_look.add_path_to_results(results)
         for report_line in quick_look.lines:
             print_line(report_line)
 
-    quick_looks = QuickLooks(report) if quick_look else None
+    quick_looks = QuickLookQueue(report) if quick_look else None
     try:
         # The lock of the rig is released last, when no process uses the devices any more.
         with contextlib.ExitStack() as locks, group:
@@ -139,7 +140,7 @@ def run_in_foreground(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
             )
             specimen = notes.get("specimen", "")
-            check_on_paper(with_specimen(profile, specimen), accept).require()
+            run_offline_checks(with_specimen(profile, specimen), accept).require()
             if prepare is not None:
                 profile = prepare(profile)
             profile = with_tip_slope(profile, tip_slope_rad)
@@ -225,9 +226,9 @@ class _TerminalProgress:
         assert self._progress_line is not None
         for event in events:
             if event.level in ("warning", "error", "fatal"):
-                self._progress_line.say(f"{event.level.capitalize()}: {event.message}")
+                self._progress_line.write_message(f"{event.level.capitalize()}: {event.message}")
             elif event.notable:
-                self._progress_line.say(event.message)
+                self._progress_line.write_message(event.message)
         self._progress_line.update(
             progress.phase,
             progress.tick,
@@ -237,7 +238,7 @@ class _TerminalProgress:
             session_number_text=self._number,
         )
 
-    def on_result(self, result: RunResult, *, look_follows: bool) -> None:  # noqa: ARG002
+    def on_result(self, result: SessionResult, *, look_follows: bool) -> None:  # noqa: ARG002
         self._close()
         self._print(result_line(result.as_dict()))
         if result.path is not None:
@@ -257,7 +258,7 @@ def _print(text: str, *, to_stderr: bool) -> None:
         typer.echo(text, err=to_stderr)
 
 
-def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
+def _await_quick_looks(quick_looks: QuickLookQueue, stop: StopRequest) -> None:
     """Wait for the last quick looks to be completed, up to a time limit or another Ctrl-C."""
     stop.ignore_stop_signal()
     was_stopped, is_skipped = stop.requested, False
@@ -293,12 +294,12 @@ def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
     stop.requested = was_stopped  # this Ctrl-C skipped the quick look only
 
 
-def _print_stop(results: Sequence[RunResult], repeat: int) -> None:
+def _print_stop(results: Sequence[SessionResult], repeat: int) -> None:
     """Print that a stop was requested before the first session or between two sessions.
 
     Nothing is printed if a session itself was stopped, because its result states the stop.
     """
-    if len(results) == repeat or any(not result.went_well for result in results):
+    if len(results) == repeat or any(not result.is_successful for result in results):
         return
     count_text = f" after {len(results)} of {repeat} sessions" if results else ""
     _print(

@@ -10,11 +10,18 @@ import numpy as np
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.engine.workers import LIVE
 from rigd.live.address import LiveAddress
-from rigd.live.messages import LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
+from rigd.live.messages import (
+    LiveFit,
+    LiveJob,
+    LiveSession,
+    LiveSessionEnded,
+    LiveSessionShown,
+    LiveTouches,
+)
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._session_worker import SessionWorker
-from rigd.runner.request import Order
+from rigd.runner._worker_client import WorkerClient
+from rigd.runner.request import SessionOrder
 from rigd.runtime import StopRequest
 from rigd.sweep_response import sweep_ticks
 from rigd.view import Subject, linear_sweep_band_hz
@@ -30,7 +37,7 @@ _MAX_FIT_MODES = 4
 """Maximum number of modes whose fits are plotted; more plots would be too small to read."""
 
 
-class LiveView(SessionWorker):
+class LiveViewClient(WorkerClient):
     """Client of the publisher process."""
 
     worker = LIVE
@@ -44,7 +51,7 @@ class LiveView(SessionWorker):
         self._is_session_shown = False
         self._restart()
 
-    def show(self, order: Order, stop: StopRequest) -> str:
+    def show(self, order: SessionOrder, stop: StopRequest) -> str:
         """Prepare the view for the next session; return text with its address, or why none."""
 
         def is_not_stopped() -> bool:
@@ -54,7 +61,7 @@ class LiveView(SessionWorker):
         if self.failure:  # a new attempt for the new session
             self._restart()
         self._wait(lambda: self._is_ready, _ADDRESS_TIMEOUT_S, is_not_stopped)
-        start_positions = tuple(ring.written for ring in self._group.channels.rings)
+        start_positions = tuple(ring.written_count for ring in self._group.channels.rings)
         self._session = LiveSession(
             subject_of(order, fast=self._fast),
             str(uuid.uuid4()),
@@ -85,8 +92,8 @@ class LiveView(SessionWorker):
         """Show the end of the current session; an unknown outcome and reason are empty."""
         if self._session is not None:
             self._session = None
-            end_positions = tuple(ring.written for ring in self._group.channels.rings)
-            self._send(LiveEnd(end_positions, outcome, reason))
+            end_positions = tuple(ring.written_count for ring in self._group.channels.rings)
+            self._send(LiveSessionEnded(end_positions, outcome, reason))
 
     def _restart(self) -> None:
         """Start a publisher process, and send it the rig and the current session."""
@@ -95,7 +102,7 @@ class LiveView(SessionWorker):
     def _process_message(self, message: object) -> None:
         """Process a message of the publisher: its address, or that it shows the session."""
         match message:
-            case LiveShown():
+            case LiveSessionShown():
                 self._is_session_shown = True
             case LiveAddress():
                 previous_address, self.address = self.address, message
@@ -117,7 +124,7 @@ class LiveView(SessionWorker):
         self.address = None
 
 
-def subject_of(order: Order, *, fast: bool = False) -> Subject:
+def subject_of(order: SessionOrder, *, fast: bool = False) -> Subject:
     """Return the data of a session that the live view shows, such as beam, sweep and limits."""
     rig_parameters, excitation = order.profile.rig, order.excitation
     absent_plots: set[str] = set()
@@ -146,7 +153,7 @@ def subject_of(order: Order, *, fast: bool = False) -> Subject:
     )
 
 
-def _fit_modes(order: Order) -> int | None:
+def _fit_modes(order: SessionOrder) -> int | None:
     """Return the number of modes whose fits are plotted: those expected in the excited band.
 
     Returns None if the session makes no fits.

@@ -12,7 +12,7 @@ from rigd.engine.messages import (
     RecordEnded,
     SearchEnded,
 )
-from rigd.engine.shared_state import LogEvent, StateField, Stop
+from rigd.engine.shared_state import LogEvent, StateField, StopReason
 from rigd.engine.workers import FIT
 from rigd.runner._precision_search import (
     TargetEstimate,
@@ -20,7 +20,7 @@ from rigd.runner._precision_search import (
     target_estimates,
     targets_json,
 )
-from rigd.runner._session_worker import SessionWorker
+from rigd.runner._worker_client import WorkerClient
 
 if TYPE_CHECKING:
     from rigd.engine.reference import ReferenceSpec
@@ -39,7 +39,7 @@ _STORED_KEYS: Final = (
 """Keys of the last estimate that are stored in the session file."""
 
 
-class FitSupervisor(SessionWorker):
+class FitClient(WorkerClient):
     """Client of the fit process of one session, which collects the estimates.
 
     If the session lasts until a precision is reached, it ends with its last planned segment after
@@ -69,7 +69,7 @@ class FitSupervisor(SessionWorker):
         self._skip_reason = ""
         self.segments: Mapping[str, tuple[int, int]] = {}
         self.unmet_reason = ""
-        first_position = group.channels.samples.written
+        first_position = group.channels.samples.written_count
         self._start(
             FitJob(group.channels.specs, first_position, profile, reference, search, realtime)
         )
@@ -94,7 +94,10 @@ class FitSupervisor(SessionWorker):
 
         def is_worth_waiting() -> bool:
             call_while_waiting()
-            if self._shared_state[StateField.STOP] == Stop.NO or time.monotonic() <= stopped_by_s:
+            if (
+                self._shared_state[StateField.STOP] == StopReason.NONE
+                or time.monotonic() <= stopped_by_s
+            ):
                 return True
             self._skip_reason = "A stop skipped the fit of the whole record."
             return False

@@ -507,7 +507,7 @@ class ExcitationPlanner:
         The row is left out if `without_table_row` is True.
         """
         search_document = {"left_s": self._forecast.remaining_s, "targets": targets_json(estimates)}
-        validity = Validity.of_document(document.get("validity"))
+        validity = Validity.from_document(document.get("validity"))
         table_rows = [] if without_table_row else self._table_rows(estimates, time_s, validity)
         return FitReport({**document, "search": search_document, "text": table_rows})
 

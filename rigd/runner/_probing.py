@@ -20,8 +20,9 @@ from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._rig import Rig
 from rigd.runner.request import load_rig
-from rigd.runtime import RigLock, StopRequest
+from rigd.runtime import StopRequest
 from rigd.runtime.addresses import runtime_folder
+from rigd.runtime.locks import RigLock
 from rigd.safety.probe_estimate import ProbeEstimate, contradiction, doubts
 from rigd.safety.probing_move import PROBED_KEYS, ProbeEnd, plan_probe
 
@@ -140,7 +141,7 @@ def probing_announcement(profile: Profile) -> str:
     return (
         "Probing move, which verifies the scales of motor, encoder and sensor: strokes of up to "
         f"{probe_plan.travel_rad:.2g} rad to one side and back at {probe_plan.speed_rad_s:.2g} and "
-        f"{probe_plan.fast_rad_s:.2g} rad/s, at most {probe_plan.torque_limit_nm:.2g} N·m."
+        f"{probe_plan.fast_speed_rad_s:.2g} rad/s, at most {probe_plan.torque_limit_nm:.2g} N·m."
     )
 
 

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from rigd.engine import shared_memory_fd
-from rigd.engine.processes import Child, ChildError, Heartbeat
+from rigd.engine.processes import ChildError, ChildProcess, Heartbeat
 from rigd.engine.workers import CONTROL, LIVE, PROCESSES, RECORDER, Worker
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class ProcessGroup:
         self._fds: list[int] = []
         self._channels: Channels | None = None
         self._processes_with_job: set[Worker] = set()
-        self._children: dict[Worker, Child] = {}
+        self._children: dict[Worker, ChildProcess] = {}
         self._heartbeats: dict[Worker, Heartbeat] = {}
         try:
             while len(self._fds) < _SHARED_MEMORY_FILES:
@@ -68,23 +68,23 @@ class ProcessGroup:
             self.end()
             raise
 
-    def __getitem__(self, process: Worker) -> Child:
+    def __getitem__(self, process: Worker) -> ChildProcess:
         return self._children[process]
 
     def __contains__(self, process: Worker) -> bool:
         return process in self._children
 
     @property
-    def control(self) -> Child:
+    def control(self) -> ChildProcess:
         """Control process, which communicates with the devices."""
         return self._children[CONTROL]
 
     @property
-    def recorder(self) -> Child:
+    def recorder(self) -> ChildProcess:
         """Recorder process, which writes the session file."""
         return self._children[RECORDER]
 
-    def idle_process(self, process: Worker) -> Child:
+    def idle_process(self, process: Worker) -> ChildProcess:
         """Return a started process without a job; replace it if it already received one.
 
         Raises
@@ -150,7 +150,7 @@ class ProcessGroup:
 
     def _start(self, process: Worker) -> None:
         """Start a process, which waits for its job."""
-        self._children[process] = Child(process, descriptors=self._fds, cores=self.cores)
+        self._children[process] = ChildProcess(process, descriptors=self._fds, cores=self.cores)
         self._processes_with_job.discard(process)
 
     def __enter__(self) -> Self:
@@ -167,7 +167,7 @@ class ProcessGroup:
     def end(self) -> None:
         """End all processes and release the shared memory; may be called repeatedly."""
         if self._channels is not None:
-            self._channels.ask_to_stop()
+            self._channels.request_stop()
         with contextlib.ExitStack() as ending_children:  # continues after an error of one process
             for process in reversed(PROCESSES):
                 if process in self._children:

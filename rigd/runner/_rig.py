@@ -10,24 +10,33 @@ from typing import Any
 
 from rigd.devices import ActuationTarget, describe_unknown_values
 from rigd.devices.contracts import DeviceError
-from rigd.engine.messages import Connected, ControlJob, Ended, Measured, Probe, Refused, Tare, Zero
+from rigd.engine.messages import (
+    ControlEnded,
+    ControlJob,
+    DevicesConnected,
+    MeasurementRefused,
+    MeasurementResult,
+    ProbeOrder,
+    TareOrder,
+    ZeroOrder,
+)
 from rigd.engine.processes import ChildError
-from rigd.engine.realtime import Precedence
-from rigd.engine.shared_state import SharedState, StateField, Stop
+from rigd.engine.realtime import RaisedPriority
+from rigd.engine.shared_state import SharedState, StateField, StopReason
 from rigd.engine.workers import CONTROL, LIVE
 from rigd.errors import FailureError
 from rigd.profile import Profile
-from rigd.runner._live_view import LiveView
+from rigd.runner._live_view import LiveViewClient
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 from rigd.runner.session import (
     ProgressCallback,
-    RunResult,
     SessionFailedError,
-    SessionRun,
+    SessionResult,
+    SessionSupervisor,
     can_always_receive_stop,
 )
-from rigd.runner.signal_blocks import SignalBlock, SignalReader
+from rigd.runner.signal_blocks import SignalBlock, SignalBlockReader
 from rigd.runner.status import RigStatus, StatusReader
 from rigd.runtime import StopRequest
 
@@ -85,13 +94,13 @@ class Rig:
         self._fast = fast
         self._live = live
         self._group = group
-        self._connection: Connected | None = None
-        self._view: LiveView | None = None
+        self._connection: DevicesConnected | None = None
+        self._view: LiveViewClient | None = None
         self._is_zero_set = False
-        self._precedence: Precedence | None = None
+        self._raised_priority: RaisedPriority | None = None
         self._status_lock = threading.Lock()
         self._status_reader = StatusReader(profile.rig.rate_hz)
-        self._signal_reader = SignalReader(profile)
+        self._signal_reader = SignalBlockReader(profile)
         self.connected = False
         self.zero_lost = False
 
@@ -158,7 +167,7 @@ class Rig:
             job = ControlJob(self._profile, target, group.channels.specs, self._fast)
             group.idle_process(CONTROL).start(job)
             connection = self._await_message(_CONNECT_TIMEOUT_S)
-            assert isinstance(connection, Connected)
+            assert isinstance(connection, DevicesConnected)
             self._connection = replace(
                 connection, realtime={**connection.realtime, **granted_settings}
             )
@@ -166,18 +175,18 @@ class Rig:
             self.disconnect()
             raise RigError(str(error)) from None
         if LIVE in group:
-            self._view = LiveView(group, self._profile.name, fast=self._fast)
+            self._view = LiveViewClient(group, self._profile.name, fast=self._fast)
         self.connected = True
         self.zero_lost |= self._is_zero_set
         self._is_zero_set = False
 
     def run(
         self,
-        order: Order,
+        order: SessionOrder,
         stop: StopRequest,
         on_progress: ProgressCallback,
         can_receive_stop: Callable[[], bool] = can_always_receive_stop,
-    ) -> RunResult:
+    ) -> SessionResult:
         """Run one session to its end, and return its result.
 
         Parameters
@@ -187,7 +196,7 @@ class Rig:
         stop
             Stop request of the operator, which ends the session.
         on_progress, can_receive_stop
-            See :class:`rigd.runner.session.SessionRun`.
+            See :class:`rigd.runner.session.SessionSupervisor`.
 
         Raises
         ------
@@ -203,11 +212,11 @@ class Rig:
                 "The zero of the angle was lost with the connection, and the limits with it; move "
                 "the motor to mid-travel and run rigd zero."
             )
-        if self._precedence is not None:
-            self._precedence.cover()
+        if self._raised_priority is not None:
+            self._raised_priority.raise_new_threads()
         _reset_session_fields(group.channels.shared_state)
         group.channels.clear()
-        session_run = SessionRun(
+        session_run = SessionSupervisor(
             order, group, self._connection, self._view, on_progress, can_receive_stop
         )
         end_outcome = end_reason = ""
@@ -228,7 +237,7 @@ class Rig:
             # and a long series would take 4 kB more for each session.
             gc.collect()
 
-    def show(self, order: Order, stop: StopRequest) -> str:
+    def show(self, order: SessionOrder, stop: StopRequest) -> str:
         """Prepare the live view for the next session, and return its address.
 
         Parameters
@@ -260,7 +269,7 @@ class Rig:
         RigError
             If the tare fails.
         """
-        return self._measure(Tare(), self._profile.session.tare_s)
+        return self._measure(TareOrder(), self._profile.session.tare_s)
 
     def zero(self) -> dict[str, Any]:
         """Set the present motor angle as the rig's zero, to which the limits are relative.
@@ -275,7 +284,7 @@ class Rig:
         RigError
             If the motor moves.
         """
-        zero_reply = self._measure(Zero(), 0.0)
+        zero_reply = self._measure(ZeroOrder(), 0.0)
         self._is_zero_set, self.zero_lost = True, False
         return zero_reply
 
@@ -302,18 +311,18 @@ class Rig:
         """
         group = self._connected_group()
         shared_state = group.channels.shared_state
-        if self._precedence is not None:
-            self._precedence.cover()
+        if self._raised_priority is not None:
+            self._raised_priority.raise_new_threads()
         _reset_session_fields(shared_state)
 
         def request_stop() -> None:
-            shared_state[StateField.STOP] = Stop.OPERATOR
+            shared_state[StateField.STOP] = StopReason.OPERATOR
 
         stop.on_request = request_stop
         if stop.requested:
             request_stop()
         try:
-            group.control.send(Probe(profile))
+            group.control.send(ProbeOrder(profile))
             probe_reply = self._await_probe(group, profile)
         except (ChildError, RigError) as error:
             self.disconnect()
@@ -321,9 +330,9 @@ class Rig:
         finally:
             stop.on_request = _ignore_stop_request
             _reset_session_fields(shared_state)
-        if isinstance(probe_reply, Refused):
+        if isinstance(probe_reply, MeasurementRefused):
             raise RigError(probe_reply.reason)
-        assert isinstance(probe_reply, Measured)
+        assert isinstance(probe_reply, MeasurementResult)
         return probe_reply.values
 
     def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
@@ -332,22 +341,22 @@ class Rig:
         A hung control process is killed.
         """
         shared_state = group.channels.shared_state
-        assert CONTROL.hung_after_s is not None
-        hung_after_s = (
+        assert CONTROL.max_silence_s is not None
+        max_silence_s = (
             _VIRTUAL_CLOCK_HEARTBEAT_TIMEOUT_S
             if self._fast
-            else CONTROL.hung_after_s + _ENABLE_TIMEOUT_S
+            else CONTROL.max_silence_s + _ENABLE_TIMEOUT_S
         )
         deadline_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_TIMEOUT_S
         while True:
             probe_reply = group.control.poll(_POLL_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
-            if isinstance(probe_reply, Ended):
+            if isinstance(probe_reply, ControlEnded):
                 raise RigError(probe_reply.reason or "It was stopped.")
             if probe_reply is not None:
                 return probe_reply
             now_s = time.monotonic()
-            if group.stalled_s(CONTROL) > hung_after_s or now_s > deadline_s:
+            if group.stalled_s(CONTROL) > max_silence_s or now_s > deadline_s:
                 group.control.kill()
                 raise RigError(
                     "The control process did not end the probing move and was killed: without its "
@@ -369,19 +378,21 @@ class Rig:
         try:
             control_message = group.control.poll(0.0)
         except ChildError as error:
-            control_message = Ended(str(error))
+            control_message = ControlEnded(str(error))
         shared_state = group.channels.shared_state
         shared_state.beat(StateField.SUPERVISOR_BEAT)
-        assert CONTROL.hung_after_s is not None
+        assert CONTROL.max_silence_s is not None
         stalled_s = group.stalled_s(CONTROL)
-        if control_message is None and stalled_s > CONTROL.hung_after_s:
+        if control_message is None and stalled_s > CONTROL.max_silence_s:
             group.control.kill()
-            control_message = Ended(
+            control_message = ControlEnded(
                 f"The control process has not responded for {stalled_s:.1f} s. Check CPU load."
             )
         if control_message is not None:
             self.disconnect()
-            loss_reason = control_message.reason if isinstance(control_message, Ended) else ""
+            loss_reason = (
+                control_message.reason if isinstance(control_message, ControlEnded) else ""
+            )
             raise RigError(loss_reason or "The control process was asked to end.")
 
     def status(self) -> RigStatus | None:
@@ -413,20 +424,22 @@ class Rig:
             self.connected = False
         if group is not None:
             group.end()
-        if self._precedence is not None:
-            self._precedence.release()
-            self._precedence = None
+        if self._raised_priority is not None:
+            self._raised_priority.restore()
+            self._raised_priority = None
 
     def _raise_priority(self, group: ProcessGroup) -> dict[str, str]:
         """Raise the priority of this process, and return the granted settings as metadata."""
         if self._fast:
             return {}
         realtime_settings = self._profile.realtime
-        self._precedence = Precedence(realtime_settings.supervision_priority, realtime_settings.cpu)
-        group.cores = self._precedence.cores_before
+        self._raised_priority = RaisedPriority(
+            realtime_settings.supervision_priority, realtime_settings.cpu
+        )
+        group.cores = self._raised_priority.cores_before
         return {
             f"supervisor_{setting_name}": setting_text
-            for setting_name, setting_text in self._precedence.take().items()
+            for setting_name, setting_text in self._raised_priority.request().items()
         }
 
     def _reset_fault(self, target: ActuationTarget | None) -> None:
@@ -444,7 +457,9 @@ class Rig:
             raise RigError("The rig is not connected.")
         return self._group
 
-    def _measure(self, measurement_order: Tare | Zero, duration_s: float) -> dict[str, Any]:
+    def _measure(
+        self, measurement_order: TareOrder | ZeroOrder, duration_s: float
+    ) -> dict[str, Any]:
         """Make the control process tare the sensor or set the zero; return the result.
 
         `duration_s` is the measuring time.
@@ -456,9 +471,9 @@ class Rig:
         except (ChildError, RigError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
-        if isinstance(measurement_reply, Refused):
+        if isinstance(measurement_reply, MeasurementRefused):
             raise RigError(measurement_reply.reason)
-        assert isinstance(measurement_reply, Measured)
+        assert isinstance(measurement_reply, MeasurementResult)
         return measurement_reply.values
 
     def _await_message(self, timeout_s: float) -> object:
@@ -474,7 +489,7 @@ class Rig:
                 f"The control process does not answer within {timeout_s:g} s; check that the "
                 "devices are on, and check CPU load."
             )
-        if isinstance(control_message, Ended):
+        if isinstance(control_message, ControlEnded):
             raise RigError(control_message.reason or "It was stopped.")
         return control_message
 
@@ -492,7 +507,7 @@ def _ignore_stop_request() -> None:
 
 def _reset_session_fields(shared_state: SharedState) -> None:
     """Reset the fields of the shared state that belong to a single session."""
-    shared_state[StateField.STOP] = Stop.NO
+    shared_state[StateField.STOP] = StopReason.NONE
     shared_state[StateField.GO] = 0
     shared_state[StateField.LIVE_DROPPED] = 0
     shared_state[StateField.PLANNED] = 0

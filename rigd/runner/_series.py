@@ -1,6 +1,6 @@
 """Series of sessions of one request, which are planned once and run one after another.
 
-`rigd run` and the daemon use it, each with its own implementation of `SeriesWatcher`.
+`rigd run` and the daemon use it, each with its own implementation of `SeriesListener`.
 """
 
 import contextlib
@@ -16,9 +16,9 @@ from rigd.profile import Profile
 from rigd.runner._rig import Rig, RigError
 from rigd.runner._touch_search import touch_search
 from rigd.runner.planning import RefusedError, plan_document, plan_session, predicted_metadata
-from rigd.runner.quick_looks import QuickLooks
-from rigd.runner.request import Order, check_required, choose_path, require_disk_space
-from rigd.runner.session import RunResult, SessionProgress, can_always_receive_stop
+from rigd.runner.quick_looks import QuickLookQueue
+from rigd.runner.request import SessionOrder, check_required, choose_path, require_disk_space
+from rigd.runner.session import SessionProgress, SessionResult, can_always_receive_stop
 from rigd.runtime import StopRequest
 
 _QUICK_LOOK_MAX_PAUSE_S: Final = 8.0
@@ -27,7 +27,7 @@ takes two or three seconds. An unfinished quick look is then suspended."""
 _POLL_S: Final = 0.05
 
 
-class SeriesWatcher(Protocol):
+class SeriesListener(Protocol):
     """Receiver of the progress of a series of sessions."""
 
     def on_start(self, number: int, path: Path) -> None:
@@ -45,7 +45,7 @@ class SeriesWatcher(Protocol):
     def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         """Process progress and new events of a session, about fifty times a second."""
 
-    def on_result(self, result: RunResult, *, look_follows: bool) -> None:
+    def on_result(self, result: SessionResult, *, look_follows: bool) -> None:
         """Process the result of a session; `look_follows` states whether a quick look follows."""
 
 
@@ -123,7 +123,7 @@ class Series:
             )
         self.plan = plan_session(profile, excitation, force=force, accept=accept)
         self._touch = touch_search(profile, excitation)
-        self.results: list[RunResult] = []
+        self.results: list[SessionResult] = []
         self._require_disk_space()
 
     @property
@@ -143,11 +143,11 @@ class Series:
         self,
         rig: Rig,
         stop: StopRequest,
-        watcher: SeriesWatcher,
+        listener: SeriesListener,
         *,
         live: bool,
         can_receive_stop: Callable[[], bool] = can_always_receive_stop,
-        quick_looks: QuickLooks | None = None,
+        quick_looks: QuickLookQueue | None = None,
     ) -> None:
         """Run the sessions until a stop or the first incomplete session.
 
@@ -159,12 +159,12 @@ class Series:
             The connected rig.
         stop
             Stop request of the operator.
-        watcher
+        listener
             Receiver of the progress.
         live
             Show each session in a live view.
         can_receive_stop
-            See :class:`rigd.runner.session.SessionRun`.
+            See :class:`rigd.runner.session.SessionSupervisor`.
         quick_looks
             Program that makes a quick look at each session. The next session waits some seconds for
             it.
@@ -179,7 +179,7 @@ class Series:
             If a probing move before the first session shows that the rig contradicts its profile.
         """
         try:
-            probe_metadata = {} if stop.requested else self._probe_if_needed(rig, stop, watcher)
+            probe_metadata = {} if stop.requested else self._probe_if_needed(rig, stop, listener)
         except RigError:
             if stop.requested and rig.connected:
                 return  # the probing move was stopped, and nothing failed
@@ -197,8 +197,8 @@ class Series:
             session_notes = self._notes | (
                 {"series": f"{session_number} of {self._repeat}"} if is_numbered else {}
             )
-            watcher.on_start(session_number, session_path)
-            session_order = Order(
+            listener.on_start(session_number, session_path)
+            session_order = SessionOrder(
                 self._profile,
                 self._excitation,
                 session_path,
@@ -217,17 +217,17 @@ class Series:
             )
             with contextlib.nullcontext() if quick_looks is None else quick_looks.suspended():
                 if live:
-                    watcher.on_live_view(rig.show(session_order, stop))
-                run_result = rig.run(session_order, stop, watcher.on_progress, can_receive_stop)
+                    listener.on_live_view(rig.show(session_order, stop))
+                run_result = rig.run(session_order, stop, listener.on_progress, can_receive_stop)
             self.results.append(run_result)
             # The record of a vibration-free move contains no information on the modes.
             analysed_path = run_result.path if self._excitation.shows_modes else None
-            watcher.on_result(
+            listener.on_result(
                 run_result, look_follows=quick_looks is not None and analysed_path is not None
             )
             if quick_looks is not None and analysed_path is not None:
                 quick_looks.begin(analysed_path)
-            if not run_result.went_well:
+            if not run_result.is_successful:
                 return
 
     def _session_seed(self, number: int) -> int | None:
@@ -238,7 +238,7 @@ class Series:
         return session_seed(simulation.seed, number)
 
     def _probe_if_needed(
-        self, rig: Rig, stop: StopRequest, watcher: SeriesWatcher
+        self, rig: Rig, stop: StopRequest, listener: SeriesListener
     ) -> dict[str, str]:
         """Make a probing move if motor and encoder were not measured; return its metadata.
 
@@ -249,7 +249,7 @@ class Series:
         from rigd.runner import _probing  # late: a simulation in this process needs none
 
         probe_result = _probing.verify_by_probing(
-            self._profile, rig, stop, watcher.on_message, motor=not self._identifies_motor
+            self._profile, rig, stop, listener.on_message, motor=not self._identifies_motor
         )
         return {} if probe_result is None else probe_result.as_metadata()
 
@@ -258,7 +258,7 @@ class Series:
         require_disk_space(self._folder, self._excitation, self._profile.limits)
 
 
-def _await_quick_look(quick_looks: QuickLooks, rig: Rig, stop: StopRequest) -> None:
+def _await_quick_look(quick_looks: QuickLookQueue, rig: Rig, stop: StopRequest) -> None:
     """Wait some seconds for the quick look at the last session before the next session begins."""
     deadline_s = time.monotonic() + _QUICK_LOOK_MAX_PAUSE_S
     while quick_looks.busy and not stop.requested and time.monotonic() < deadline_s:

@@ -17,7 +17,7 @@ from rigd.engine.shared_state import LogEvent
 from rigd.engine.workers import TOUCH
 from rigd.excitation import Excitation, TouchExcitation
 from rigd.profile import Profile
-from rigd.runner._session_worker import SessionWorker
+from rigd.runner._worker_client import WorkerClient
 from rigd.session.touches import packed_touches, touch_line
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
     """Return the settings of the search for an obstacle, or None if there is no search."""
     if not isinstance(excitation, TouchExcitation):
         return None
-    from rigd.touch import DetectorSettings, TouchModel, watched_beam
+    from rigd.touch import DetectorSettings, TouchModel, detector_model
 
     rig = profile.rig
     sensor = rig.sensor
@@ -57,7 +57,7 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
         )
     else:
         touch_model = TouchModel.assumed(profile.plant, rig.encoder.delay_s, sensor_filter)
-    beam_prediction = watched_beam(touch_model, rig.rate_hz, _reading_noise(profile))
+    beam_prediction = detector_model(touch_model, rig.rate_hz, _reading_noise(profile))
     shear_projection = sensor.shear_projection if any(sensor.shear_projection) else None
     return TouchSearch(
         TouchOrder(beam_prediction, DetectorSettings(), excitation.approach, shear_projection),
@@ -74,7 +74,7 @@ def _sensor_filter(rig: RigParameters) -> "SensorFilter":
     if serial_settings is None:
         return SensorFilter(*low_pass_hz_and_order)
     records_per_tick = serial_settings.records_per_tick(rig.rate_hz)
-    return SensorFilter.of_records(
+    return SensorFilter.for_records(
         *low_pass_hz_and_order,
         serial_settings.filter,
         records_per_tick,
@@ -102,7 +102,7 @@ def _reading_noise(profile: Profile) -> "ChannelNoise":
     )
 
 
-class TouchEstimates(SessionWorker):
+class TouchClient(WorkerClient):
     """Client of the touch process of one session, which collects the estimates."""
 
     worker = TOUCH
@@ -121,7 +121,7 @@ class TouchEstimates(SessionWorker):
         self._start(
             TouchJob(
                 group.channels.specs,
-                group.channels.samples.written,
+                group.channels.samples.written_count,
                 rate_hz,
                 search.model,
                 search.order.shear_projection,

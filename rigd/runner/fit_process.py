@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from rigd.engine import Observer
 from rigd.engine.channels import Channels, attach_channels
-from rigd.engine.messages import Failed, FileHeader, FitJob, FitReady, FitReport, RecordEnded
-from rigd.engine.processes import Parent
+from rigd.engine.messages import FileHeader, FitJob, FitReady, FitReport, ProcessFailed, RecordEnded
+from rigd.engine.processes import SupervisorConnection
 from rigd.engine.realtime import pin_off_loop_core
 from rigd.engine.reference import ReferenceWriter
 from rigd.engine.shared_state import StateField
@@ -87,7 +87,7 @@ class _OnlineEstimator(Protocol):
 def main() -> None:
     """Run the fit process of one session; called by ``python -m rigd.runner.fit_process``."""
     ignore_signals()
-    parent = Parent()
+    parent = SupervisorConnection()
     job: FitJob = parent.receive_job()
     if job.realtime is not None:
         pin_off_loop_core(job.realtime.cpu)
@@ -95,7 +95,7 @@ def main() -> None:
     try:
         _SessionFit(job, parent, attach_channels(job.channels)).run()
     except EstimationError as error:
-        parent.send(Failed(str(error)))
+        parent.send(ProcessFailed(str(error)))
         exit_code = 1
     # Without the interpreter's clean-up, which would wait for a running fit.
     os._exit(exit_code)
@@ -201,7 +201,7 @@ def _estimate_document(estimator: _OnlineEstimator, request: EstimateRequest) ->
 class _SessionFit:
     """Passes the samples of one session to the estimator, and its estimates to the supervisor."""
 
-    def __init__(self, job: FitJob, parent: Parent, channels: Channels) -> None:
+    def __init__(self, job: FitJob, parent: SupervisorConnection, channels: Channels) -> None:
         self._parent = parent
         self._estimator = EstimatorThread()
         self._shared_state = channels.shared_state
@@ -235,8 +235,8 @@ class _SessionFit:
                     self._record_ticks = ticks
                     if self._search is not None and self._search.due_tick is not None:
                         held_ticks_before, begun_until_tick = (
-                            self._shared_state[StateField.HELD_BEFORE],
-                            self._shared_state[StateField.BEGUN],
+                            self._shared_state[StateField.HELD_TICKS_BEFORE_SEGMENT],
+                            self._shared_state[StateField.BEGUN_REFERENCE_TICKS],
                         )
                         self._parent.send(
                             self._search.end_of_record(ticks, held_ticks_before, begun_until_tick)
@@ -278,11 +278,13 @@ class _SessionFit:
         elif (
             excitation_planner is not None
             and excitation_planner.due_tick is not None
-            and excitation_planner.has_last_segment_begun(self._shared_state[StateField.BEGUN])
+            and excitation_planner.has_last_segment_begun(
+                self._shared_state[StateField.BEGUN_REFERENCE_TICKS]
+            )
         ):
             # The count of held ticks is read after the samples, because the loop increases it
             # before it publishes the sample.
-            request_tick = excitation_planner.due_tick + self._shared_state[StateField.HELD]
+            request_tick = excitation_planner.due_tick + self._shared_state[StateField.HELD_TICKS]
             if self._passed_ticks >= request_tick:
                 self._request_estimate(
                     request_tick, whole=excitation_planner.may_be_last, from_last=True
@@ -333,8 +335,8 @@ class _SessionFit:
     ) -> None:
         """Plan the next segment from an estimate, and send the plan to the supervisor."""
         held_ticks, held_ticks_before = (
-            self._shared_state[StateField.HELD],
-            self._shared_state[StateField.HELD_BEFORE],
+            self._shared_state[StateField.HELD_TICKS],
+            self._shared_state[StateField.HELD_TICKS_BEFORE_SEGMENT],
         )
         for planner_message in excitation_planner.plan_next(
             estimate, held_ticks, held_ticks_before

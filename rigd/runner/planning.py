@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from rigd.beam import Beam, Plant
 from rigd.beam.realisation import RealisationError
 from rigd.beam.tip import TipMotion, tip_motion
-from rigd.checks import PaperCheckResult, check_on_paper
+from rigd.checks import OfflineCheckResult, run_offline_checks
 from rigd.control import ClosedLoop, ControlDesignError, stable_loop
 from rigd.control.damper import design_damper
-from rigd.engine.messages import Ending
+from rigd.engine.messages import PostRecordPlan
 from rigd.errors import UserError
 from rigd.excitation import KINDS, BeamEstimate, Excitation, MovePlant, Value, make_excitation
 from rigd.identified_beam import Use, read_identified_beam
@@ -77,7 +77,7 @@ class SessionPrediction:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class SessionPlan:
     """Prediction of a session before any motion, and whether the limits allow the session."""
 
     prediction: SessionPrediction
@@ -88,9 +88,9 @@ class Plan:
     """Sentence on the predicted motion of the beam's free end and the linear model's validity."""
     refused: str = ""
     """Reasons to refuse the session, one line for each exceeded limit, or empty if allowed."""
-    ending: Ending = field(default_factory=Ending)
+    ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Motion that the control process makes after the record, such as the return to the start."""
-    clearance: PaperCheckResult = field(default_factory=PaperCheckResult)
+    clearance: OfflineCheckResult = field(default_factory=OfflineCheckResult)
     """Results of the checks on the profile that need no device."""
 
 
@@ -243,7 +243,7 @@ def excitation_for(
 
 def plan_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
-) -> Plan:
+) -> SessionPlan:
     """Return the plan of a session; raise if checks or limits of the profile forbid the session.
 
     Parameters
@@ -270,7 +270,7 @@ def plan_session(
 
 def predict_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
-) -> Plan:
+) -> SessionPlan:
     """Return the plan of a session; its field `refused` states why it is not allowed, if so.
 
     Parameters
@@ -294,7 +294,7 @@ def predict_session(
     RealisationError
         If the beam's damping cannot be realised by a model with poles.
     """
-    paper_check = check_on_paper(profile, accept)
+    offline_check = run_offline_checks(profile, accept)
     closed_loop, instability_warning = stable_loop(loop_model_with(profile, excitation.model))
     prediction = predict(closed_loop, excitation)
     violations, torque_violations = (
@@ -305,7 +305,7 @@ def predict_session(
         ]
         for limited_peaks in _limited_peaks(profile, prediction)
     )
-    refusals = list(paper_check.refusals)
+    refusals = list(offline_check.refusals)
     tip_slope = _limited_tip_slope(profile, prediction) if has_slope_limit(excitation) else None
     slope_violation = tip_slope is not None and tip_slope.violation_text()
     if violations or slope_violation or (torque_violations and not force):
@@ -318,7 +318,7 @@ def predict_session(
             f"{violation_text}; {amplitude_advice}, or allow clipping with --force."
             for violation_text in torque_violations
         ]
-    warnings = [*paper_check.warnings, *([instability_warning] if instability_warning else [])]
+    warnings = [*offline_check.warnings, *([instability_warning] if instability_warning else [])]
     if not profile.is_loop_modelled:
         warnings.append(
             f'The peaks are predicted with the PID of [control]: controller "'
@@ -331,7 +331,7 @@ def predict_session(
         ]
     if excitation.limits_force and not any(profile.rig.sensor.shear_projection):
         warnings.append(_UNKNOWN_FORCE_WARNING)
-    return Plan(
+    return SessionPlan(
         prediction,
         warnings=tuple(warnings),
         tip_in_words=tip_in_words(prediction.tip, profile.rig.beam, excitation),
@@ -339,7 +339,7 @@ def predict_session(
         ending=_motion_after_record(
             closed_loop, stays=excitation.stays, damped=profile.is_loop_modelled
         ),
-        clearance=paper_check,
+        clearance=offline_check,
     )
 
 
@@ -351,15 +351,15 @@ def _amplitude_advice(profile: Profile, excitation: Excitation, *, force: bool) 
     return "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
 
 
-def _motion_after_record(loop: ClosedLoop, *, stays: bool, damped: bool) -> Ending:
+def _motion_after_record(loop: ClosedLoop, *, stays: bool, damped: bool) -> PostRecordPlan:
     """Return the motion after the record: a vibration-free return to the start, with damping.
 
     Active damping is designed for the loop, and left out where its controller is not known.
     """
     if loop.model.plant is None:
-        return Ending(stays=stays)
+        return PostRecordPlan(stays=stays)
     damper = design_damper(loop) if damped else None
-    return Ending(stays, tuple(map(complex, mode_poles(loop)[1])), damper)
+    return PostRecordPlan(stays, tuple(map(complex, mode_poles(loop)[1])), damper)
 
 
 def largest_amplitude(
@@ -422,7 +422,7 @@ def largest_amplitude(
     return float(f"{digit_count * digit_step_rad:.3g}") if digit_count else None
 
 
-def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[str, Any]:
+def plan_document(profile: Profile, excitation: Excitation, plan: SessionPlan) -> dict[str, Any]:
     """Return the plan of a session as a dictionary for JSON.
 
     Parameters

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.engine.processes import Child, ChildError
+from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.workers import QUICK_LOOK
 from rigd.printable import printable
-from rigd.runner.session import RunResult
-from rigd.runtime import processor_use
+from rigd.runner.session import SessionResult
+from rigd.runtime.background import processor_use
 from rigd.session.quick_look import quick_look_path, read_quick_look
 
 _MAX_RUN_TIME_S: Final = 60.0
@@ -57,7 +57,7 @@ class QuickLook:
         return cls(session_path, None, None, error)
 
     @classmethod
-    def of_event(cls, event: Mapping[str, Any]) -> "QuickLook":
+    def from_event(cls, event: Mapping[str, Any]) -> "QuickLook":
         """Return the quick look that an event of the daemon reports."""
         session_path, report_content = Path(event["path"]), event["look"]
         return cls(
@@ -74,7 +74,7 @@ class QuickLook:
             return [f"No quick look at {self.session.name}: {self.error}"]
         return [printable(str(text_line)) for text_line in self.content["text"]]
 
-    def note(self, results: list[RunResult]) -> None:
+    def add_path_to_results(self, results: list[SessionResult]) -> None:
         """Add the path of the quick look to the result of its session in a list of results."""
         for result_index, run_result in enumerate(results):
             if run_result.path == self.session:
@@ -85,7 +85,7 @@ class QuickLook:
         return {"path": str(self.session), "look": self.content, "error": self.error}
 
 
-class QuickLooks:
+class QuickLookQueue:
     """Queue of sessions at which quick looks are made, one at a time, while no session runs.
 
     Parameters
@@ -98,7 +98,7 @@ class QuickLooks:
         self._on_result = on_result
         self._lock = threading.Lock()
         self._waiting_sessions: deque[Path] = deque()
-        self._process: Child | None = None
+        self._process: ChildProcess | None = None
         self._session = Path()
         self._is_suspended = False
         self._run_time_s = 0.0
@@ -203,7 +203,7 @@ class QuickLooks:
         self._session = self._waiting_sessions.popleft()
         self._run_time_s, self._processor_s, self._run_time_updated_s = 0.0, 0.0, time.monotonic()
         try:
-            self._process = Child(QUICK_LOOK, str(self._session))
+            self._process = ChildProcess(QUICK_LOOK, str(self._session))
         except ChildError as error:
             yield QuickLook.failed(
                 self._session, f"its program cannot be started ({error.system_reason})."

@@ -31,7 +31,7 @@ from rigd.devices.kinds import DEVICES
 from rigd.devices.obstacles import with_obstacles
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import unreachable_simulators
-from rigd.engine.messages import Connected, Ending, FileHeader
+from rigd.engine.messages import DevicesConnected, FileHeader, PostRecordPlan
 from rigd.excitation import Excitation, PrecisionExcitation, PrecisionSearch, find_excitation
 from rigd.plugins import plugin_errors
 from rigd.printable import printable
@@ -57,7 +57,7 @@ class NoRoomError(RefusedError):
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class SessionOrder:
     """Session to run, which was already checked against the limits of the profile."""
 
     profile: Profile
@@ -70,7 +70,7 @@ class Order:
     """Metadata of the user (key, text), such as operator, specimen, note and number in a series."""
     predicted: tuple[tuple[str, str], ...] = ()
     """Metadata (key, text) with the predicted peaks and their limits."""
-    ending: Ending = field(default_factory=Ending)
+    ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Motion after the record, such as the return to the start."""
     touch: TouchSearch | None = None
     """Settings of the search for an obstacle, or None for a session without a search."""
@@ -322,11 +322,11 @@ def part_path(path: Path) -> Path:
 def _unused_path(session_path: Path) -> Path:
     """Return a path at which no session file exists, with a number appended if necessary."""
     while session_path.exists() or part_path(session_path).exists():
-        session_path = another_path(session_path)
+        session_path = next_free_path(session_path)
     return session_path
 
 
-def another_path(session_path: Path) -> Path:
+def next_free_path(session_path: Path) -> Path:
     """Return the next path for a session file if its path is used: X.mcap → X_2.mcap → X_3.mcap."""
     base_stem, _, number_text = session_path.stem.rpartition("_")
     if base_stem and number_text.isdecimal():
@@ -344,7 +344,7 @@ def remaining_file_text(session_path: Path | None) -> str:
     session_path
         Path of the session file, or None if no file was begun.
     """
-    from rigd.session import holds_samples
+    from rigd.session import may_contain_samples
 
     if session_path is None:
         return "It has no file."
@@ -359,7 +359,7 @@ def remaining_file_text(session_path: Path | None) -> str:
             if file_exists
             else f"There is no {session_path.name} in {session_path.parent}."
         )
-    if not holds_samples(part_file_path):
+    if not may_contain_samples(part_file_path):
         return f"Nothing was recorded; {part_file_path} holds no sample and can be removed."
     old_path_text, new_path_text = (
         shlex.quote(str(part_path(file_path)))
@@ -377,7 +377,9 @@ def remaining_file_text(session_path: Path | None) -> str:
     )
 
 
-def file_header(order: Order, connection: Connected, tare: Mapping[str, str]) -> FileHeader:
+def file_header(
+    order: SessionOrder, connection: DevicesConnected, tare: Mapping[str, str]
+) -> FileHeader:
     """Return the metadata, segments and attachments with which a session file begins.
 
     Parameters
@@ -402,7 +404,7 @@ def file_header(order: Order, connection: Connected, tare: Mapping[str, str]) ->
 
 
 def _session_metadata(
-    order: Order, connection: Connected, tare: Mapping[str, str]
+    order: SessionOrder, connection: DevicesConnected, tare: Mapping[str, str]
 ) -> dict[str, str]:
     """Return the record ``session`` of a session file: key → text."""
     rig = order.profile.rig

@@ -15,29 +15,29 @@ from typing import Any, Final, TypeVar
 
 from rigd.engine import Observer
 from rigd.engine.messages import (
-    Armed,
-    Close,
-    Closed,
-    Connected,
-    Ended,
-    Failed,
-    Finished,
-    Opened,
-    Ready,
+    CloseFile,
+    ControlEnded,
+    DevicesConnected,
+    FileClosed,
+    FileOpened,
+    ProcessFailed,
+    ReadyToRecord,
     RecorderJob,
+    RecorderReady,
+    SessionFinished,
     SessionJob,
 )
 from rigd.engine.processes import ChildError
 from rigd.engine.realtime import REFUSED
-from rigd.engine.reference import is_whole, write_reference
-from rigd.engine.shared_state import LogEvent, Phase, StateField, Stop, read_events
+from rigd.engine.reference import covers_reference, write_reference
+from rigd.engine.shared_state import LogEvent, Phase, StateField, StopReason, read_events
 from rigd.engine.workers import CONTROL, RECORDER
 from rigd.errors import FailureError
-from rigd.runner._live_view import LiveView
-from rigd.runner._online_fit import FitSupervisor
+from rigd.runner._live_view import LiveViewClient
+from rigd.runner._online_fit import FitClient
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._touch_search import TouchEstimates
-from rigd.runner.request import Order, another_path, file_header, part_path
+from rigd.runner._touch_search import TouchClient
+from rigd.runner.request import SessionOrder, file_header, next_free_path, part_path
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.02
@@ -84,7 +84,7 @@ class SessionFailedError(FailureError):
     counts: Mapping[str, int] = _ZERO_COUNTS
     hardware: bool | None = None
 
-    def result(self) -> "RunResult":
+    def result(self) -> "SessionResult":
         """Return the failed session's result; call this after its processes have ended."""
         partial_path, complete_path = self.saved_path, None
         if partial_path is None and self.path is not None:
@@ -95,7 +95,7 @@ class SessionFailedError(FailureError):
                     complete_path = self.path  # the recorder was only slow, and completed the file
             except OSError:
                 partial_path = part_path(self.path)  # the folder cannot be read
-        return RunResult(
+        return SessionResult(
             path=complete_path,
             outcome="fault",
             reason=str(self),
@@ -116,7 +116,7 @@ class _FileExistsError(SessionFailedError):
 
 
 @dataclass(frozen=True, slots=True)
-class RunResult:
+class SessionResult:
     """Result of a session: how it ended, its file, and counts of ticks."""
 
     path: Path | None
@@ -155,7 +155,7 @@ class RunResult:
     """Result of the fit during the session, as in JSON documents; None if not requested."""
 
     @property
-    def went_well(self) -> bool:
+    def is_successful(self) -> bool:
         """Whether the session is complete and no reason for an early end is stated."""
         return self.outcome == "complete" and not self.reason
 
@@ -203,7 +203,7 @@ ProgressCallback = Callable[[SessionProgress, list[LogEvent]], None]
 MessageType = TypeVar("MessageType")
 
 
-class SessionRun:
+class SessionSupervisor:
     """Supervisor of one session; :meth:`run` may be called once.
 
     Parameters
@@ -216,7 +216,7 @@ class SessionRun:
         Message that the control process sent after it had connected to the devices.
     live
         Live view that shows the session, or None.
-    watcher
+    on_progress
         Called about fifty times a second with the progress and the events since the last call.
     can_receive_stop
         Returns whether this process can receive a stop request. If not, this process stops its
@@ -230,11 +230,11 @@ class SessionRun:
 
     def __init__(
         self,
-        order: Order,
+        order: SessionOrder,
         group: ProcessGroup,
-        connection: Connected,
-        live: LiveView | None,
-        watcher: ProgressCallback,
+        connection: DevicesConnected,
+        live: LiveViewClient | None,
+        on_progress: ProgressCallback,
         can_receive_stop: Callable[[], bool],
     ) -> None:
         self._order = order
@@ -243,7 +243,7 @@ class SessionRun:
         self._live = live
         self._shared_state = group.channels.shared_state
         self._events = Observer(group.channels.events)
-        self._watcher = watcher
+        self._on_progress = on_progress
         self._can_receive_stop = can_receive_stop
         self._is_virtual_clock = connection.realtime["clock"] == "virtual"
         self._recorder_failure: str | None = None
@@ -252,11 +252,11 @@ class SessionRun:
         self._final_drive_state = "The drive is disabled."
         self._opened_path: Path | None = None
         self._saved_path: Path | None = None
-        self._touches: TouchEstimates | None = None
-        self._fit: FitSupervisor | None = None
+        self._touches: TouchClient | None = None
+        self._fit: FitClient | None = None
         self.device_failed = False
 
-    def run(self, stop: StopRequest) -> RunResult:
+    def run(self, stop: StopRequest) -> SessionResult:
         """Run the session to its end, or until a stop is requested, and return its result.
 
         Raises
@@ -272,7 +272,7 @@ class SessionRun:
         except (ChildError, SessionFailedError) as error:
             self._recorder_failure = self._recorder_failure or str(error)
             if self._is_control_busy:
-                self._shared_state[StateField.STOP] = Stop.NO_RECORDER
+                self._shared_state[StateField.STOP] = StopReason.NO_RECORDER
                 self._await_control()
             failure_error = SessionFailedError(
                 f"{self._recorder_failure} {self._final_drive_state}"
@@ -285,9 +285,9 @@ class SessionRun:
 
     def _request_stop(self) -> None:
         """Request the control process to stop the session."""
-        self._shared_state[StateField.STOP] = Stop.OPERATOR
+        self._shared_state[StateField.STOP] = StopReason.OPERATOR
 
-    def _run(self) -> RunResult:
+    def _run(self) -> SessionResult:
         """Start the processes of the session, supervise them to the end, and close the file."""
         process_group, excitation = self._group, self._order.excitation
         try:
@@ -305,12 +305,12 @@ class SessionRun:
         profile = session_order.profile
         realtime_settings = None if self._is_virtual_clock else profile.realtime
         if session_order.touch is not None:
-            self._touches = TouchEstimates(
+            self._touches = TouchClient(
                 process_group, session_order.touch, profile.rig.rate_hz, realtime_settings
             )
             self._touches.await_ready(self._report_and_check_stop)
         if session_order.makes_fits:
-            self._fit = FitSupervisor(
+            self._fit = FitClient(
                 process_group, profile, reference_spec, session_order.search, realtime_settings
             )
             failure_reason = self._fit.await_ready(self._report_and_check_stop)
@@ -334,23 +334,23 @@ class SessionRun:
         )
         process_group.control.send(job)
         control_message = self._await_control()
-        if isinstance(control_message, Ready):
+        if isinstance(control_message, ReadyToRecord):
             file_header_data = file_header(session_order, self._connection, control_message.tare)
             process_group.recorder.send(file_header_data)
             if self._fit is not None:
                 self._fit.begin(file_header_data)
-            self._await_recorder(Armed)
+            self._await_recorder(RecorderReady)
             self._shared_state[StateField.GO] = 1
             control_message = self._await_control()
         if self._recorder_failure is not None:
             raise SessionFailedError(self._recorder_failure)
-        assert isinstance(control_message, Finished)
+        assert isinstance(control_message, SessionFinished)
         return self._close(control_message)
 
     def _report_and_check_stop(self) -> bool:
         """Report progress before any motion; return whether no stop is requested so far."""
         self._report()
-        return self._shared_state[StateField.STOP] == Stop.NO
+        return self._shared_state[StateField.STOP] == StopReason.NONE
 
     def _open_file(self) -> None:
         """Start the recorder, which creates the session file; use another name if one exists."""
@@ -360,10 +360,10 @@ class SessionRun:
             job = RecorderJob(self._order.path, process_group.channels.specs, realtime_settings)
             process_group.idle_process(RECORDER).start(job)
             try:
-                opened_reply = self._await_recorder(Opened, _RECORDER_START_TIMEOUT_S)
+                opened_reply = self._await_recorder(FileOpened, _RECORDER_START_TIMEOUT_S)
             except _FileExistsError as error:
                 name_error = error
-                self._order = replace(self._order, path=another_path(self._order.path))
+                self._order = replace(self._order, path=next_free_path(self._order.path))
             else:
                 self._opened_path = self._order.path
                 recorder_settings = {
@@ -389,7 +389,7 @@ class SessionRun:
             and setting_text.startswith(REFUSED)
         }
 
-    def _await_control(self) -> Ready | Finished:
+    def _await_control(self) -> ReadyToRecord | SessionFinished:
         """Supervise all processes until the control process sends a message, and return that.
 
         A hung control process is killed.
@@ -410,7 +410,7 @@ class SessionRun:
                 and not self._is_virtual_clock
             )
             if (
-                self._shared_state[StateField.STOP] == Stop.NO
+                self._shared_state[StateField.STOP] == StopReason.NONE
                 or self._shared_state[StateField.PHASE] != last_phase
             ):
                 last_phase = self._shared_state[StateField.PHASE]
@@ -418,22 +418,22 @@ class SessionRun:
                 deadline_s = now_s + timeout_s
             elif control_message is None and now_s > deadline_s:
                 return self._kill_control(f"did not stop within {timeout_s:g} s")
-            assert CONTROL.hung_after_s is not None
-            hung_after_s = CONTROL.hung_after_s if is_torque_on else _DRIVE_TIMEOUT_S
+            assert CONTROL.max_silence_s is not None
+            max_silence_s = CONTROL.max_silence_s if is_torque_on else _DRIVE_TIMEOUT_S
             stalled_s = self._group.stalled_s(CONTROL)
-            if control_message is None and stalled_s > hung_after_s:
-                return self._kill_control(f"hung for {hung_after_s:g} s (check CPU load)")
+            if control_message is None and stalled_s > max_silence_s:
+                return self._kill_control(f"hung for {max_silence_s:g} s (check CPU load)")
             if control_message is not None:
                 return self._checked_control_message(control_message)
             if self._recorder_failure is None:
                 self._recorder_failure = self._recorder_failure_reason()
                 if self._recorder_failure is not None:
-                    self._shared_state[StateField.STOP] = Stop.NO_RECORDER
+                    self._shared_state[StateField.STOP] = StopReason.NO_RECORDER
 
-    def _checked_control_message(self, control_message: object) -> Ready | Finished:
-        """Return the message of the control process as ``Ready`` or ``Finished``."""
+    def _checked_control_message(self, control_message: object) -> ReadyToRecord | SessionFinished:
+        """Return the message of the control process as ``ReadyToRecord`` or ``SessionFinished``."""
         match control_message:
-            case Ended(reason):  # before the session began
+            case ControlEnded(reason):  # before the session began
                 session_end = self._control_died(reason)
                 if reason:
                     return session_end
@@ -441,17 +441,17 @@ class SessionRun:
                 return replace(
                     session_end, outcome="stopped", reason="Stopped by the operator.", fault=False
                 )
-            case Finished():
+            case SessionFinished():
                 self._is_control_busy = False
                 if control_message.device_failed:
                     self.device_failed = True
                     self._final_drive_state = control_message.reason
                 return control_message
-            case Ready():
+            case ReadyToRecord():
                 return control_message
         raise SessionFailedError(f"The control process answers {control_message}.")
 
-    def _kill_control(self, failure_predicate: str) -> Finished:
+    def _kill_control(self, failure_predicate: str) -> SessionFinished:
         """Kill a hung control process, and return the session's end.
 
         The drive's watchdog then switches the torque off.
@@ -462,20 +462,20 @@ class SessionRun:
             "drive switches itself off. Check that it is off."
         )
 
-    def _control_died(self, reason: str) -> Finished:
+    def _control_died(self, reason: str) -> SessionFinished:
         """Mark the control process as ended, and return the session's end with the reason."""
         self._is_control_busy = False
         self.device_failed = True
         self._final_drive_state = reason
         return self._finished_from_shared_state(reason)
 
-    def _finished_from_shared_state(self, reason: str) -> Finished:
+    def _finished_from_shared_state(self, reason: str) -> SessionFinished:
         """Return the session's end for a dead control process, from counts in shared memory."""
         tick_counts = self._counts()
-        is_complete = is_whole(
+        is_complete = covers_reference(
             self._shared_state, tick_counts["scheduled"], self._order.excitation.reference_rad.size
         )
-        return Finished(
+        return SessionFinished(
             outcome="complete" if is_complete else "fault",
             reason=f"After the record: {reason}" if is_complete else reason,
             fault=True,
@@ -497,7 +497,7 @@ class SessionRun:
             recorder_message = self._group.recorder.poll(0.0)
         except ChildError as error:
             return str(error)
-        if isinstance(recorder_message, Failed):
+        if isinstance(recorder_message, ProcessFailed):
             self._saved_path = recorder_message.saved_path
             return recorder_message.reason
         return None if recorder_message is None else str(recorder_message)
@@ -520,7 +520,7 @@ class SessionRun:
                 f"The recorder process does not answer within {timeout_s:g} s. Check CPU load and "
                 "disk."
             )
-        if isinstance(recorder_message, Failed):
+        if isinstance(recorder_message, ProcessFailed):
             self._saved_path = recorder_message.saved_path
             raise (_FileExistsError if recorder_message.taken else SessionFailedError)(
                 recorder_message.reason
@@ -530,7 +530,7 @@ class SessionRun:
         return recorder_message
 
     def _report(self) -> None:
-        """Signal this process's heartbeat, and pass progress, events and fits to the watcher."""
+        """Signal this process's heartbeat, and report progress, events and fits."""
         shared_state = self._shared_state
         if self._can_receive_stop():
             shared_state.beat(StateField.SUPERVISOR_BEAT)
@@ -547,7 +547,7 @@ class SessionRun:
             new_fits = self._fit.take_new_estimates()
             if self._live is not None:
                 self._live.show_fits(new_fits)
-        self._watcher(
+        self._on_progress(
             SessionProgress(
                 Phase(shared_state[StateField.PHASE]),
                 shared_state[StateField.SCHEDULED],
@@ -558,7 +558,7 @@ class SessionRun:
             new_events,
         )
 
-    def _close(self, finished: Finished) -> RunResult:
+    def _close(self, finished: SessionFinished) -> SessionResult:
         """Complete touches and fit, make the recorder close the file, and return the result."""
         self._report()
         touch_documents = None
@@ -588,16 +588,16 @@ class SessionRun:
                 outcome_record["reason"] = f"{self._fit.search_failure} {finished.reason}"
         self._group.recorder.resume()
         packed_touches = b"" if self._touches is None else self._touches.encoded_touches()
-        self._group.recorder.send(Close(outcome_record, packed_touches, segment_ticks))
+        self._group.recorder.send(CloseFile(outcome_record, packed_touches, segment_ticks))
         # A disk may stall for as long at the end of a record as during the record.
         stall_s = self._order.profile.limits.recorder_lag_s
-        closed_reply = self._await_recorder(Closed, stall_s + 2 * _REPLY_TIMEOUT_S)
+        closed_reply = self._await_recorder(FileClosed, stall_s + 2 * _REPLY_TIMEOUT_S)
         # The recorder's counts take precedence over those of the control process.
         tick_counts = {**_ZERO_COUNTS, **finished.counts, **closed_reply.counts}
         outcome_text, end_reason = finished.outcome, outcome_record["reason"]
         if closed_reply.path is not None:
             outcome_text, end_reason = closed_reply.outcome, closed_reply.reason
-        return RunResult(
+        return SessionResult(
             path=closed_reply.path,
             outcome=outcome_text,
             reason=end_reason,
@@ -617,7 +617,7 @@ class SessionRun:
         )
 
 
-def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
+def results_document(results: Sequence[SessionResult]) -> dict[str, Any]:
     """Return the results of a series of sessions as a dictionary for JSON.
 
     Parameters

@@ -50,7 +50,7 @@ class SignalBlock:
         return self.first_tick + self.count - 1
 
 
-class SignalReader:
+class SignalBlockReader:
     """Reader of the samples in shared memory, for viewers.
 
     It may miss samples, and never delays the control loop.
@@ -98,11 +98,13 @@ class SignalReader:
             self._samples_since_gauges = []
             self._gauges.forget_angle()
         self._last_call_s = now_s
-        signal_blocks = list(self._read_blocks(self._ring_and_observer[1], sample_ring.written))
+        signal_blocks = list(
+            self._read_blocks(self._ring_and_observer[1], sample_ring.written_count)
+        )
         if now_s - self._last_gauges_s < _MIN_GAUGES_INTERVAL_S:
             return signal_blocks
         self._last_gauges_s = now_s
-        latest_gauges = self._take_gauges()
+        latest_gauges = self._updated_gauges()
         if not signal_blocks:
             is_session_active = shared_state[StateField.PHASE] != Phase.PREPARING
             present_magnitudes = {
@@ -118,7 +120,7 @@ class SignalReader:
         signal_blocks[-1] = replace(signal_blocks[-1], gauges=latest_gauges)
         return signal_blocks
 
-    def _take_gauges(self) -> dict[str, Gauge] | None:
+    def _updated_gauges(self) -> dict[str, Gauge] | None:
         """Return the gauges for the samples since their last update, or None without samples."""
         if not self._samples_since_gauges:
             return None
@@ -129,8 +131,8 @@ class SignalReader:
 
     def _read_blocks(self, observer: Observer, end: int) -> Iterator[SignalBlock]:
         """Yield the unread samples before position `end` of the ring buffer in blocks."""
-        while observer.next < end:
-            ring_bytes = observer.take(min(_MAX_BLOCK_TICKS, end - observer.next))
+        while observer.next_index < end:
+            ring_bytes = observer.take(min(_MAX_BLOCK_TICKS, end - observer.next_index))
             try:
                 sample_array = decode_samples(ring_bytes)
             except ValueError:
@@ -145,7 +147,7 @@ class SignalReader:
         first_tick, newest_tick = int(ticks[0]), int(ticks[-1])
         previous_tick, self._last_tick = self._last_tick, newest_tick
         if previous_tick is None or previous_tick >= first_tick:
-            self._take_gauges()  # includes the end of the previous record in the thermal model
+            self._updated_gauges()  # includes the end of the previous record in the thermal model
             self._gauges.forget_angle()
         # Ticks missed between two blocks belong to the second block.
         elif first_tick - previous_tick <= _MAX_BLOCK_TICKS:

@@ -70,7 +70,9 @@ class SignalStatisticsReader:
         which is less often than this call.
         """
         if self._ring_and_observer is None or self._ring_and_observer[0] is not ring:
-            window_position = max(0, ring.written - round(_STATISTICS_WINDOW_S * self._rate_hz))
+            window_position = max(
+                0, ring.written_count - round(_STATISTICS_WINDOW_S * self._rate_hz)
+            )
             self._ring_and_observer = ring, Observer(ring, window_position)
         while ring_bytes := self._ring_and_observer[1].take(ring.capacity // 4):
             try:
@@ -236,7 +238,7 @@ class StatusReader:
     def _topic_statuses(self, group: ProcessGroup) -> Iterator[TopicStatus]:
         """Yield the status of each topic, with its message rate since the last call."""
         topic_rings, now_s = group.channels.rings, time.monotonic()
-        written_counts = tuple(topic_ring.written for topic_ring in topic_rings)
+        written_counts = tuple(topic_ring.written_count for topic_ring in topic_rings)
         previous_s, previous_counts = self._last_time_and_counts or (now_s, written_counts)
         self._last_time_and_counts = now_s, written_counts
         elapsed_s = now_s - previous_s
@@ -250,7 +252,7 @@ class StatusReader:
                 else None
             )
             expected_hz = topic.expected_hz(self._rate_hz)
-            yield TopicStatus(topic.name, now, rate_hz, expected_hz, topic_ring.waiting)
+            yield TopicStatus(topic.name, now, rate_hz, expected_hz, topic_ring.waiting_count)
 
     def _process_statuses(self, group: ProcessGroup) -> Iterator[ProcessStatus]:
         """Yield the status of each started process, with the time since its last heartbeat."""
@@ -268,7 +270,7 @@ class StatusReader:
                 process_state = "ended"
             elif not group.has_job(process):
                 process_state = "waiting"
-            elif process.hung_after_s is not None and silent_s > process.hung_after_s:
+            elif process.max_silence_s is not None and silent_s > process.max_silence_s:
                 process_state = "hung"
             else:
                 process_state = "running"

@@ -1,12 +1,12 @@
 """Resources of the operating system: runtime folder, addresses, locks, signals, process table.
 
 The package offers the user's folder for sockets and addresses, and the detection of dead processes
-(module `addresses`), the kernel's tables of processes and sockets (module `processes`), a lock file
-that states its holder (`LockFile`), the lock of a rig (`RigLock`, `holds_rig`), background work at
-low priority (`run_program`, `give_way`), the opening of files that users name
-(`open_plain_file`), and the signals that request a program's end. Commands use `raise_on_signals`
-for these signals, and the processes of a rig use `StopRequest`, `ignore` and `signals_blocked`. The
-package depends on no other package, and knows rigs by name only.
+(module `addresses`), the kernel's tables of processes and sockets (module `processes`), the lock of
+a rig and other lock files that state their holder (module `locks`), work at low priority (module
+`background`), the opening of files that users name (`open_plain_file`), and the signals that
+request a program's end. Commands use `raise_on_signals` for these signals, and the processes of a
+rig use `StopRequest`, `ignore` and `signals_blocked`. The package depends on no other package, and
+knows rigs by name only.
 """
 
 import lazy_loader as lazy

@@ -170,14 +170,14 @@ class ProbePlan:
     """Rate at which the torque rises until the shaft moves."""
 
     @property
-    def fast_rad_s(self) -> float:
+    def fast_speed_rad_s(self) -> float:
         """Speed of the second pair of strokes, in rad/s."""
         return 2.0 * self.speed_rad_s
 
     @property
     def travel_rad(self) -> float:
         """Travel of a stroke of the second, faster pair, in rad."""
-        return self.fast_rad_s * self.cruise_s
+        return self.fast_speed_rad_s * self.cruise_s
 
     @property
     def bound_rad(self) -> float:
@@ -187,7 +187,7 @@ class ProbePlan:
     @property
     def velocity_bound_rad_s(self) -> float:
         """Speed in rad/s above which the probing move ends."""
-        return 2.5 * self.fast_rad_s
+        return 2.5 * self.fast_speed_rad_s
 
 
 def plan_probe(rig: ProbedRig) -> ProbePlan:
@@ -312,7 +312,7 @@ class ProbingMove:
         first_side = -1.0 if angle_rad > 0.0 else 1.0
         self._strokes = [
             (stroke_side * first_side, speed_rad_s)
-            for speed_rad_s in (self._plan.speed_rad_s, self._plan.fast_rad_s)
+            for speed_rad_s in (self._plan.speed_rad_s, self._plan.fast_speed_rad_s)
             for stroke_side in (1.0, -1.0)
         ]
         self._stroke_index = 0

@@ -4,8 +4,8 @@ from . import online_fit as online_fit
 from . import quick_look as quick_look
 from . import touches as touches
 from . import user_metadata as user_metadata
-from ._contents import check_beginning as check_beginning
-from ._contents import holds_samples as holds_samples
+from ._contents import check_magic_bytes as check_magic_bytes
+from ._contents import may_contain_samples as may_contain_samples
 from ._errors import SessionAccessError as SessionAccessError
 from ._errors import SessionError as SessionError
 from ._errors import SessionExistsError as SessionExistsError
@@ -25,4 +25,4 @@ from ._validity import BeamUniformity as BeamUniformity
 from ._validity import Validity as Validity
 from ._writer import PART_SUFFIX as PART_SUFFIX
 from ._writer import SessionWriter as SessionWriter
-from ._writer import rename_new as rename_new
+from ._writer import rename_without_replacing as rename_without_replacing

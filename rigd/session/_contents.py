@@ -46,7 +46,7 @@ def load_contents(
         )
 
 
-def check_beginning(path: Path) -> None:
+def check_magic_bytes(path: Path) -> None:
     """Raise if a file does not begin with the magic bytes of an MCAP file.
 
     Raises
@@ -107,7 +107,7 @@ def recovered_path(path: Path) -> Path:
     return path.with_name(path.name.removesuffix(_SESSION_SUFFIX) + _RECOVERED_SUFFIX)
 
 
-def holds_samples(path: Path) -> bool:
+def may_contain_samples(path: Path) -> bool:
     """Return whether `recover` may find a sample in a file.
 
     Only the first mebibyte is searched. The result is True for a longer MCAP file, and for a file

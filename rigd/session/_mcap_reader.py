@@ -107,7 +107,7 @@ class McapContents:
     stated_counts: dict[int, int] = field(default_factory=dict)
     """Channel number → number of messages that the file's statistics state, for a damaged file read
     in salvage mode. It is empty for a sound file and if the statistics are damaged."""
-    sound_bytes: int = 0
+    intact_bytes: int = 0
     """Number of bytes at the start of the file that were read without error."""
     verified: bool = False
     """Whether the file has a correct checksum over its whole data section."""
@@ -256,7 +256,7 @@ class _ContainerReader:
         *,
         salvage: bool,
     ) -> None:
-        self.contents = McapContents(sound_bytes=len(MAGIC))
+        self.contents = McapContents(intact_bytes=len(MAGIC))
         self._salvage = salvage
         self._data = data
         self._topics = topics
@@ -289,9 +289,9 @@ class _ContainerReader:
                     on_progress(end / len(data))
             elif opcode == Opcode.DATA_END:
                 self._check_data_end(data[content:end], start)
-                contents.sound_bytes = end
+                contents.intact_bytes = end
                 self._check_summary(end)
-                contents.sound_bytes = len(data)
+                contents.intact_bytes = len(data)
                 return
             elif opcode == Opcode.FOOTER:
                 break
@@ -302,7 +302,7 @@ class _ContainerReader:
                     if not self._salvage:
                         raise
                     self._add_skipped(str(error))
-            contents.sound_bytes = end
+            contents.intact_bytes = end
             if end - self._released_end > _RELEASE_INTERVAL_BYTES:
                 self._release_up_to(end)
         raise McapDamageError("has no end of its data section")

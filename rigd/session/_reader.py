@@ -174,7 +174,7 @@ def read_session(
         sample_buffer.decoder.add_block(mcap_contents, block)
         undecoded_log.add_block(mcap_contents, block)
 
-    mcap_contents = _load_sound_contents(path, (SAMPLE_TOPIC, EVENT_TOPIC), add_block)
+    mcap_contents = _load_intact_contents(path, (SAMPLE_TOPIC, EVENT_TOPIC), add_block)
     metadata = merged_metadata(mcap_contents, "session") or {}
     format_version = metadata.get("format_version", FORMAT_VERSION)
     if format_version != FORMAT_VERSION:
@@ -249,7 +249,7 @@ def _read_topic(path: Path, layout: MessageLayout) -> npt.NDArray[np.void]:
     """Return all messages of one topic of a session file as an array (n,)."""
     topic_buffer = TopicBuffer(path, layout, None, limits.MAX_SAMPLES)
     return topic_buffer.finish(
-        _load_sound_contents(path, (layout.topic,), topic_buffer.decoder.add_block)
+        _load_intact_contents(path, (layout.topic,), topic_buffer.decoder.add_block)
     )
 
 
@@ -403,7 +403,7 @@ class _UndecodedLog:
         return logged_events
 
 
-def _load_sound_contents(path: Path, topics: Sequence[str], on_block: OnBlock) -> McapContents:
+def _load_intact_contents(path: Path, topics: Sequence[str], on_block: OnBlock) -> McapContents:
     """Return the contents of a session file; raise if it is incomplete or damaged."""
     contents = load_contents(path, topics, on_block=on_block)
     if contents.damage is not None:

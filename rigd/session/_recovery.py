@@ -44,7 +44,7 @@ from rigd.session._writer import (
     copy_new,
     fsync_directory,
     is_being_written,
-    rename_new,
+    rename_without_replacing,
 )
 from rigd.session.layout import SAMPLE_DTYPE, SAMPLE_FIELDS, Status
 
@@ -162,7 +162,7 @@ def recover(
         and not mcap_contents.skipped
         and sample_selection.order_error is None
     ):
-        return _copy_sound_file(path, recovered_file)
+        return _copy_intact_file(path, recovered_file)
     damage_texts = [mcap_contents.damage, *mcap_contents.skipped, sample_selection.order_error]
     first_damage, *further_damages = [
         damage_text for damage_text in damage_texts if damage_text is not None
@@ -305,7 +305,7 @@ def _scaled_progress(
     return lambda fraction: on_progress(start_fraction + (end_fraction - start_fraction) * fraction)
 
 
-def _copy_sound_file(path: Path, final_path: Path) -> Recovery:
+def _copy_intact_file(path: Path, final_path: Path) -> Recovery:
     """Copy a complete ``.part`` file to its final name; leave any other complete file alone."""
     session = read_session(
         path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
@@ -347,7 +347,7 @@ def _temporary_target(path: Path, target: Path, copied_file: Path | None = None)
             with copied_file.open("rb") as source:
                 copy_new(source.fileno(), temporary_path)
         yield temporary_path
-        rename_new(temporary_path, target)
+        rename_without_replacing(temporary_path, target)
         fsync_directory(target.parent)
     except FileExistsError:
         _require_target_absent(path, target)  # the target may have been created meanwhile
@@ -371,7 +371,7 @@ def _planned_recovery(
 ) -> Recovery:
     """Return the result of a recovery whose new file is still to be written."""
     copied_samples = selection.samples
-    bytes_lost = path.stat().st_size - contents.sound_bytes
+    bytes_lost = path.stat().st_size - contents.intact_bytes
     # The recorded outcome describes all samples: it is used only if none is missing.
     is_outcome_valid = contents.verified and selection.order_error is None
     planned_recovery = Recovery(

@@ -45,7 +45,7 @@ class BeamUniformity:
     p_value: float | None = None
 
     @classmethod
-    def of_document(cls, document: object) -> "BeamUniformity | None":
+    def from_document(cls, document: object) -> "BeamUniformity | None":
         """Return the test result in a document, or None if the document contains no valid one.
 
         Parameters
@@ -119,7 +119,7 @@ class Validity:
     uniform_beam: BeamUniformity | None = None
 
     @classmethod
-    def of_document(cls, document: object) -> "Validity":
+    def from_document(cls, document: object) -> "Validity":
         """Return the validity that a document states; its values are None if not stated.
 
         Parameters
@@ -129,7 +129,7 @@ class Validity:
         """
         if not isinstance(document, Mapping):
             return cls()
-        beam_uniformity = BeamUniformity.of_document(document.get("uniform_beam"))
+        beam_uniformity = BeamUniformity.from_document(document.get("uniform_beam"))
         slope_rad = finite_number(document.get("predicted_peak_tip_slope_rad"))
         model_error = finite_number(document.get("linear_model_error"))
         if slope_rad is None or model_error is None or slope_rad < 0.0 or model_error < 0.0:

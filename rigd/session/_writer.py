@@ -152,7 +152,7 @@ class SessionWriter:
                 ) from None
             self._counted_file = _CountedFile(file_descriptor, "wb")
             self._stream = io.BufferedWriter(self._counted_file)
-            mark_as_written(file_descriptor)
+            mark_as_being_written(file_descriptor)
             # Checked only now, to detect a writer that finishes in between.
             if os.path.lexists(path):
                 self._stream.close()
@@ -315,7 +315,7 @@ class SessionWriter:
             self._check_part_file()
             self._stream.close()
             try:
-                rename_new(self.part, self.path)
+                rename_without_replacing(self.part, self.path)
             except FileExistsError:
                 raise SessionExistsError(
                     f"{self.path} was created during the session and is not overwritten; the "
@@ -604,7 +604,7 @@ def copy_new(descriptor: int, target: Path) -> None:
             raise
 
 
-def rename_new(source: Path, target: Path) -> None:
+def rename_without_replacing(source: Path, target: Path) -> None:
     """Rename a file without ever replacing another file.
 
     Parameters
@@ -637,7 +637,7 @@ def rename_new(source: Path, target: Path) -> None:
         source.unlink()
 
 
-def mark_as_written(descriptor: int) -> None:
+def mark_as_being_written(descriptor: int) -> None:
     """Mark an open file as being written until it is closed or this process ends.
 
     The mark is an advisory lock. On a file system without locks the file is not marked.

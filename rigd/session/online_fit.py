@@ -23,7 +23,7 @@ def estimate_lines(
     findings = [f"  {finding_sentence}" for finding_sentence in fit_document["findings"]]
     if fit_document["problem"]:
         return [f"After {fit_document['duration_s']:.1f} s: {fit_document['problem']}", *findings]
-    validity = Validity.of_document(fit_document.get("validity")).short
+    validity = Validity.from_document(fit_document.get("validity")).short
     heading = f"± 95 %, statistical only; tip slope {validity}"
     report_lines = [f"After {fit_document['duration_s']:.1f} s ({heading}):"]
     modes = modes_from_json(fit_document["modes"])
@@ -40,7 +40,7 @@ def estimate_lines(
             report_lines.append(f"  {mode.line()}{change_text}{doubt_text}")
     if unseen_text := unseen_modes(modes):
         report_lines.append(f"  not visible so far: {unseen_text}")
-    if uniform_beam := Validity.of_document(fit_document.get("validity")).uniform_beam:
+    if uniform_beam := Validity.from_document(fit_document.get("validity")).uniform_beam:
         report_lines.append(f"  {uniform_beam.sentence}")
     return [*report_lines, *findings]
 

@@ -79,7 +79,7 @@ def read_quick_look(path: Path) -> Document | None:
             **{key_name: _checked_text(document.get(key_name) or "") for key_name in _TEXT_KEYS},
             **{key_name: int(document.get(key_name) or 0) for key_name in _TIME_KEYS},
             "modes": [mode.as_json() for mode in modes_from_json(document.get("modes"))],
-            "validity": Validity.of_document(document.get("validity")).as_json(),
+            "validity": Validity.from_document(document.get("validity")).as_json(),
             "response": _valid_response(document.get("response")),
             "model": _valid_curves(document.get("model"), (*_CURVE_KEYS, *_CONFIDENCE_BAND_KEYS)),
             **{
@@ -194,7 +194,7 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
         return {
             "duration_s": max(duration_s or 0.0, 0.0),
             "problem": _checked_text(fit_document.get("problem") or ""),
-            "validity": Validity.of_document(fit_document.get("validity")).as_json(),
+            "validity": Validity.from_document(fit_document.get("validity")).as_json(),
             "modes": [mode.as_json() for mode in modes_from_json(fit_document.get("modes"))],
             "parameters": {
                 parameter_name: estimate.as_json()

@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 _DRIVE_NAME = "Simulated drive"
 """Name of the simulated drive in messages."""
-_MOST_ADDED_DISTURBANCES = 4
+_MAX_ADDED_DISTURBANCES = 4
 """Largest number of disturbances that can be added while the rig runs."""
 _NOISE_BLOCK_READINGS = 128
 """Number of readings whose noise is drawn at a time, which takes 50 µs in one tick.
@@ -164,9 +164,9 @@ class SimulatedRig:
         """
         with_obstacles(self._parameters, [describe_obstacle(disturbance)])
         check_force_damping_order(self._parameters.damping)
-        if len(self._added_disturbances) == _MOST_ADDED_DISTURBANCES:
+        if len(self._added_disturbances) == _MAX_ADDED_DISTURBANCES:
             raise ObstacleError(
-                f"{_MOST_ADDED_DISTURBANCES} obstacles and knocks were added while the simulated "
+                f"{_MAX_ADDED_DISTURBANCES} obstacles and knocks were added while the simulated "
                 "rig ran, and one more would take too long a tick; start it again."
             )
 

@@ -43,9 +43,9 @@ _STIFFEST_N_PER_M = 1e5
 """Stiffness in N/m of the stiffest obstacle whose contact the substeps resolve."""
 _SUBSTEPS_PER_CONTACT_TIME = 6
 """Number of substeps in the time in which a beam that is hit recedes from an obstacle."""
-_FEWEST_SUBSTEPS_PER_S = 16e3
+_MIN_SUBSTEPS_PER_S = 16e3
 """Smallest number of substeps per second."""
-_FEWEST_SUBSTEPS = 8
+_MIN_SUBSTEPS = 8
 """Smallest number of substeps per period."""
 _TIP_COMPLIANCE_RATIO = 4.0
 """Compliance of a beam at its tip, relative to that of a beam without ends."""
@@ -618,7 +618,7 @@ def _substeps_per_period(beam: Beam, bodies: tuple[Disturbance, ...], period_s: 
     """Return the number of substeps per period, which resolves the contacts of all obstacles."""
     # A force that grows like k t moves a beam without ends by k t^(3/2) / unit.
     rate_factor = 2 * sqrt(2) * beam.density_kg_per_m**0.75 * beam.bending_stiffness_n_m2**0.25
-    required_rates_per_s = [_FEWEST_SUBSTEPS_PER_S]
+    required_rates_per_s = [_MIN_SUBSTEPS_PER_S]
     for attached_body in bodies:
         if isinstance(attached_body, Obstacle):
             rate_per_s = (
@@ -630,7 +630,7 @@ def _substeps_per_period(beam: Beam, bodies: tuple[Disturbance, ...], period_s: 
             required_rates_per_s.append(
                 _SUBSTEPS_PER_CONTACT_TIME * rate_per_s * compliance_ratio ** (2 / 3)
             )
-    return max(_FEWEST_SUBSTEPS, ceil(max(required_rates_per_s) * period_s))
+    return max(_MIN_SUBSTEPS, ceil(max(required_rates_per_s) * period_s))
 
 
 def _displacement_per_angle(beam: Beam, damping: Damping, x_m: float, s: Complex) -> Complex:

@@ -19,4 +19,3 @@ from ._running import RunningEstimate as RunningEstimate
 from ._running import RunningResponse as RunningResponse
 from ._spectrogram import RunningSpectrogram as RunningSpectrogram
 from ._window import WINDOW as WINDOW
-from ._window import WelchWindow as WelchWindow

@@ -54,7 +54,7 @@ class CurveDecimation:
 
     @classmethod
     def logarithmic(
-        cls, grid: Real, first_hz: float, last_hz: float, most_groups: int
+        cls, grid: Real, first_hz: float, last_hz: float, max_groups: int
     ) -> "CurveDecimation":
         """Return the decimation of a curve over frequency, in groups of equal frequency ratio.
 
@@ -66,10 +66,10 @@ class CurveDecimation:
             Frequencies of the points, increasing, shape (n,).
         first_hz, last_hz
             Lowest and highest frequency. Points outside are dropped.
-        most_groups
+        max_groups
             Largest number of groups.
         """
-        group_edges = np.geomspace(first_hz, last_hz, most_groups + 1)
+        group_edges = np.geomspace(first_hz, last_hz, max_groups + 1)
         # A point at the very end belongs to the last group.
         group_edges[-1] = np.nextafter(last_hz, np.inf)
         group_bounds = np.unique(np.searchsorted(grid, group_edges))
@@ -134,9 +134,9 @@ class CurveDecimation:
         is_unknown = np.isnan(grouped_values)
         group_indices = np.flatnonzero(~is_unknown.all(axis=1))
         grouped_values, is_unknown = grouped_values[group_indices], is_unknown[group_indices]
-        least_columns = np.where(is_unknown, np.inf, grouped_values).argmin(axis=1)
+        min_columns = np.where(is_unknown, np.inf, grouped_values).argmin(axis=1)
         greatest_columns = np.where(is_unknown, -np.inf, grouped_values).argmax(axis=1)
-        extreme_columns = np.stack([least_columns, greatest_columns], axis=1)
+        extreme_columns = np.stack([min_columns, greatest_columns], axis=1)
         return group_indices, np.take_along_axis(
             self.groups[group_indices], extreme_columns, axis=1
         )

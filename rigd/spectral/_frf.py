@@ -339,7 +339,7 @@ class CrossSpectra:
     segments: int = 0
 
     @classmethod
-    def of_zero_segments(cls, bin_count: int) -> "CrossSpectra":
+    def empty(cls, bin_count: int) -> "CrossSpectra":
         """Return sums of spectra without any segment: zero in each frequency bin."""
         return cls(
             np.zeros(bin_count), np.zeros(bin_count), np.zeros(bin_count, dtype=np.complex128)
@@ -470,7 +470,7 @@ def welch_response(
             "record for longer or ask for shorter segments."
         )
     bin_count = nfft // 2 + 1
-    summed_spectra = CrossSpectra.of_zero_segments(bin_count)
+    summed_spectra = CrossSpectra.empty(bin_count)
     # Allocated once, because allocating this much memory again is slow.
     fx, fy = np.empty((2, bin_count), dtype=np.complex128)
     # One segment at a time stays in the cache, unlike a whole batch.

@@ -32,7 +32,7 @@ from rigd.spectral._window import WINDOW
 Real = NDArray[np.float64]
 """Array of real numbers."""
 
-LEAST_SEGMENT_FRACTION: Final = 0.25
+MIN_SEGMENT_FRACTION: Final = 0.25
 """Least fraction of a segment from which a response is estimated.
 
 Shorter segments have too little resolution."""
@@ -97,7 +97,7 @@ class RunningResponse:
         check_segmentation(self._length, used_segmentation.overlap, self._nfft)
         bin_count = bins_up_to(last_hz, self._nfft, rate_hz)
         self._frequency_hz = np.arange(bin_count) * rate_hz / self._nfft
-        self._transform = LowBins(self._length, self._nfft, bin_count)
+        self._transform = LowBinTransform(self._length, self._nfft, bin_count)
         self._segments = Segments(
             3,
             self._length,
@@ -105,7 +105,7 @@ class RunningResponse:
             longest_gap_ticks=round(LONGEST_GAP_S * rate_hz),
             end_tick=record_length,
         )
-        self._sums = CrossSpectra.of_zero_segments(bin_count)
+        self._sums = CrossSpectra.empty(bin_count)
         self._reference_power = np.zeros(bin_count)
         self._summed_up_to = 0
 
@@ -158,7 +158,7 @@ class RunningResponse:
         """Return whether the newest samples count as a segment in addition to the whole ones."""
         if self._segments.end == self._summed_up_to or (is_final and self._sums.segments):
             return False
-        return newest_count >= LEAST_SEGMENT_FRACTION * self._length
+        return newest_count >= MIN_SEGMENT_FRACTION * self._length
 
     def _add(
         self,
@@ -257,12 +257,12 @@ class Segments:
                     block_start, sample_block[:, block_start - first_tick : end_tick - first_tick]
                 )
 
-    def newest(self, most_samples: int) -> Real:
-        """Return the newest samples without a gap, shape (channels, n), at most `most_samples`.
+    def newest(self, max_samples: int) -> Real:
+        """Return the newest samples without a gap, shape (channels, n), at most `max_samples`.
 
         The array is a view of the internal array.
         """
-        return self._buffer[:, self._used - min(most_samples, self._available) : self._used]
+        return self._buffer[:, self._used - min(max_samples, self._available) : self._used]
 
     def _add_block(self, first_tick: int, sample_block: Real) -> Iterator[tuple[int, Real]]:
         """Add samples without gaps; yield the first tick and the data of each complete segment."""
@@ -367,7 +367,7 @@ def excited_bins(reference_power: NDArray[np.float64], resolution_bins: int) -> 
     if not largest_power > 0.0:
         return np.zeros(reference_power.shape, dtype=np.bool_)
     without_dips = _is_near_marked(
-        reference_power > WINDOW.least_relative_power * largest_power, resolution_bins
+        reference_power > WINDOW.min_relative_power * largest_power, resolution_bins
     )
     return ~_is_near_marked(~without_dips, 2 * resolution_bins)
 
@@ -393,7 +393,7 @@ def bins_up_to(last_hz: float, transform_length: int, rate_hz: float) -> int:
     return 1 + min(transform_length // 2, int(last_hz * transform_length / rate_hz * (1 + 1e-9)))
 
 
-class LowBins:
+class LowBinTransform:
     """Fourier transform in the lowest bins: ``np.fft.rfft(x, nfft)[:bins]`` except for rounding.
 
     With ``2 n k = n² + k² − (k − n)²`` the sum over n becomes a convolution with a chirp, which two
@@ -446,15 +446,15 @@ class LowBins:
         return low
 
 
-def _fast_length(least_length: int) -> int:
-    """Return the smallest length from `least_length` on without a prime factor above 5."""
-    best_length = 1 << (least_length - 1).bit_length()
+def _fast_length(min_length: int) -> int:
+    """Return the smallest length from `min_length` on without a prime factor above 5."""
+    best_length = 1 << (min_length - 1).bit_length()
     power_of_five = 1
     while power_of_five < best_length:
         odd_factor = power_of_five
         while odd_factor < best_length:
             best_length = min(
-                best_length, odd_factor << (-(-least_length // odd_factor) - 1).bit_length()
+                best_length, odd_factor << (-(-min_length // odd_factor) - 1).bit_length()
             )
             odd_factor *= 3
         power_of_five *= 5

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigd.spectral._running import LONGEST_GAP_S, Segments, bins_up_to
 
-LEAST_LEVEL_DB: Final = -200.0
+MIN_LEVEL_DB: Final = -200.0
 """Level of silence, in dB: lower levels are raised to it."""
 
 _TRANSFORM_TO_WINDOW_LENGTH: Final = 4
@@ -77,7 +77,7 @@ class RunningSpectrogram:
         -------
         list of (time_s, level_db)
             Time of the middle of the column's window since tick 0, and levels (m,) of at least
-            `LEAST_LEVEL_DB`.
+            `MIN_LEVEL_DB`.
         """
         return [
             ((first_tick + (segment.shape[1] - 1) / 2) / self._rate_hz, self._levels_db(segment[0]))
@@ -92,6 +92,6 @@ class RunningSpectrogram:
             np.fft.rfft(segment * self._window, self._nfft)[: self.frequency_hz.size]
         )
         bin_amplitudes[0] /= 2.0  # a constant has no negative frequency
-        least_amplitude = 10.0 ** (LEAST_LEVEL_DB / 20.0)
+        least_amplitude = 10.0 ** (MIN_LEVEL_DB / 20.0)
         level_db: NDArray[np.float64] = 20.0 * np.log10(np.maximum(bin_amplitudes, least_amplitude))
         return level_db

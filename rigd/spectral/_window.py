@@ -18,12 +18,12 @@ class WelchWindow:
     """Function that returns the weights of a segment of n samples, shape (n,)."""
     half_power_bins: float
     """Width of the main lobe at half power, in bins of a segment's transform."""
-    least_relative_power: float
+    min_relative_power: float
     """Least power of the reference in an excited bin, relative to the largest power; what leaks
     into other bins is below it."""
 
 
 # The side lobes have -43 dB, and where the record ends in mid-chirp the pedestal is 0.08. The power
 # of a chirp where two of the reference paper's segments join is -15 dB.
-WINDOW: Final = WelchWindow("Hamming", np.hamming, half_power_bins=1.30, least_relative_power=2e-3)
+WINDOW: Final = WelchWindow("Hamming", np.hamming, half_power_bins=1.30, min_relative_power=2e-3)
 """Window of all estimates: the symmetric Hamming window, as in MATLAB and the reference paper."""

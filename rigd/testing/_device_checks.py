@@ -10,7 +10,7 @@ _PERIOD_NS = 1_000_000
 """Time between two ticks in nanoseconds."""
 _TORQUE_NM = 0.3
 """Torque that the checks command, in newton metres."""
-_MOST_ROUNDING_FRACTION = 0.1
+_MAX_ROUNDING_FRACTION = 0.1
 """Largest relative deviation of a sent torque, by which a drive may round the command."""
 
 
@@ -95,7 +95,7 @@ def _check_sent_torque_is_reported(devices: Devices) -> None:
     sent_nm = reported_nm(10)
     devices.drive.disable()
     _require(
-        abs(sent_nm - _TORQUE_NM) <= _MOST_ROUNDING_FRACTION * _TORQUE_NM,
+        abs(sent_nm - _TORQUE_NM) <= _MAX_ROUNDING_FRACTION * _TORQUE_NM,
         f"the torque sent is reported as {sent_nm:g} N·m instead of {_TORQUE_NM:g} N·m",
     )
     _require(reported_nm(20) == 0.0, "a torque is reported as sent after it was disabled")

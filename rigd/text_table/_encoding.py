@@ -11,7 +11,7 @@ _BYTE_ORDER_MARKS: Final = (
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 """Byte order marks and the encodings that they state."""
-_MOST_MARK_BYTES: Final = 4
+_MAX_MARK_BYTES: Final = 4
 """Number of bytes in the longest byte order mark."""
 
 
@@ -52,7 +52,7 @@ def decode_text(text_bytes: bytes) -> str:
     >>> decode_text(b"\xef\xbb\xbfname = 1")
     'name = 1'
     """
-    return text_bytes.decode(_encoding_of_mark(text_bytes[:_MOST_MARK_BYTES]) or "utf-8")
+    return text_bytes.decode(_encoding_of_mark(text_bytes[:_MAX_MARK_BYTES]) or "utf-8")
 
 
 def _encoding_of_mark(first_bytes: bytes) -> str | None:

@@ -5,9 +5,9 @@ from typing import Final
 
 from rigd.printable import printable
 
-_MOST_TITLES_SHOWN: Final = 12
+_MAX_TITLES_SHOWN: Final = 12
 """Largest number of titles in a message."""
-_MOST_CELL_CHARACTERS_SHOWN: Final = 40
+_MAX_CELL_CHARACTERS_SHOWN: Final = 40
 """Largest number of characters of a cell in a message."""
 
 
@@ -29,7 +29,7 @@ class TableError(Exception):
 
     def __str__(self) -> str:
         """Return the message with the invalid text from the file."""
-        cell_text = f" ('{printable(self.cell, _MOST_CELL_CHARACTERS_SHOWN)}')" if self.cell else ""
+        cell_text = f" ('{printable(self.cell, _MAX_CELL_CHARACTERS_SHOWN)}')" if self.cell else ""
         return self.message.replace("{cell}", cell_text)
 
     def unquoted(self) -> str:
@@ -52,11 +52,11 @@ class MissingColumnError(TableError):
 
     def __init__(self, name: str, titles: Sequence[str], line: int) -> None:
         listed_titles = ", ".join(
-            repr(printable(title, 60)) for title in titles[:_MOST_TITLES_SHOWN]
+            repr(printable(title, 60)) for title in titles[:_MAX_TITLES_SHOWN]
         )
         more_titles = (
-            f" and {len(titles) - _MOST_TITLES_SHOWN} more"
-            if len(titles) > _MOST_TITLES_SHOWN
+            f" and {len(titles) - _MAX_TITLES_SHOWN} more"
+            if len(titles) > _MAX_TITLES_SHOWN
             else ""
         )
         line_text = f" (line {line})" if line else ""

@@ -20,7 +20,7 @@ from rigd.text_table._head_rates import stated_rate_hz
 from rigd.text_table._stamps import is_stamp
 from rigd.text_table.titles import bare_unit, is_unit
 
-MOST_HEAD_LINES: Final = 500
+MAX_HEAD_LINES: Final = 500
 """Number of lines at the beginning of a file in which the first line of numbers must be."""
 
 BLANK_SEPARATOR: Final = " "
@@ -37,7 +37,7 @@ _SEPARATOR_NAMES: Final = {
 """Names of the separators in messages."""
 _EXCEL_SEPARATOR_LINE: Final = "sep="
 """Beginning of the line with which Excel states the separator."""
-_MOST_LINES_BELOW_TITLES: Final = 6
+_MAX_LINES_BELOW_TITLES: Final = 6
 """Largest number of lines between the titles and the first line of numbers."""
 _NUMBERING_LINES: Final = 5
 """Number of rows below a row 1, 2, 3, … that are examined to find out if it numbers the columns."""
@@ -178,7 +178,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
     Parameters
     ----------
     lines : sequence of str
-        First lines with their line ends, at most `MOST_HEAD_LINES`.
+        First lines with their line ends, at most `MAX_HEAD_LINES`.
     requested_names : sequence of str
         Titles of the requested columns, or numbers such as ``#3`` for the third column.
 
@@ -259,7 +259,7 @@ class _NotThisTableError(Exception):
     `rank` states how much of the table was found, and `error` is the error for the user.
     """
 
-    def __init__(self, rank: int, error: TableError, row_index: int = MOST_HEAD_LINES) -> None:
+    def __init__(self, rank: int, error: TableError, row_index: int = MAX_HEAD_LINES) -> None:
         super().__init__()
         self.rank = rank
         self.error = error
@@ -301,7 +301,7 @@ def _layout_with_separator(
             if found_layout is not None:
                 return found_layout
         except _NotThisTableError as unlikely:
-            if unlikely.index == MOST_HEAD_LINES:
+            if unlikely.index == MAX_HEAD_LINES:
                 unlikely.index = row.index
             if not requested_titles:
                 raise
@@ -409,7 +409,7 @@ def _layout_below_titles(
         is_unit(cell) for cell in cells_above if cell
     ):
         units = cells_above
-    for row in rows[titles_index + 1 : titles_index + 2 + _MOST_LINES_BELOW_TITLES]:
+    for row in rows[titles_index + 1 : titles_index + 2 + _MAX_LINES_BELOW_TITLES]:
         row_cells = without_trailing_empty_cells(row.cells, column_count)
         has_table_width = column_count - optional_columns <= len(row_cells) <= column_count
         if has_table_width and _is_data(row_cells, column_indices, _next_row(rows, row)):
@@ -698,10 +698,10 @@ def _missing_title_error(
 
 def _no_numbers_error(rows: Sequence[TextRow], requested_names: Sequence[str]) -> TableError:
     """Return the error for a table that has no row with numbers in the requested columns."""
-    most_cells = max(len(row.cells) for row in rows)
+    max_cells = max(len(row.cells) for row in rows)
     for column_name in requested_names:
-        if (_column_number(column_name) or 0) > most_cells:
-            return MissingColumnError(column_name, [f"#{n}" for n in range(1, most_cells + 1)], 0)
+        if (_column_number(column_name) or 0) > max_cells:
+            return MissingColumnError(column_name, [f"#{n}" for n in range(1, max_cells + 1)], 0)
     return TableError(
         f"has 0 samples: none of its first {len(rows)} lines has numbers in all of the columns "
         f"{', '.join(requested_names)}."

@@ -25,7 +25,7 @@ from rigd.text_table._cells import (
 from rigd.text_table._encoding import encodings
 from rigd.text_table._errors import TableError
 from rigd.text_table._layout import (
-    MOST_HEAD_LINES,
+    MAX_HEAD_LINES,
     TableLayout,
     comma_in_single_message,
     find_layout,
@@ -38,14 +38,14 @@ from rigd.text_table._layout import (
 from rigd.text_table._stamps import StampReader, is_stamp
 from rigd.text_table.titles import is_title_of_times, stated_unit_of, time_unit_s
 
-MOST_LINE_CHARACTERS: Final = 65_536
+MAX_LINE_CHARACTERS: Final = 65_536
 """Largest number of characters in a line; a longer line is an error.
 
 It is enough for hundreds of columns."""
 
 _ENCODING_BYTES: Final = 4
 """Number of bytes from which the encoding is detected."""
-_MOST_HEAD_CHARACTERS: Final = 1_000_000
+_MAX_HEAD_CHARACTERS: Final = 1_000_000
 """Number of characters after which no further lines are read to detect the layout."""
 _TIME_DIMENSIONS: Final = ("", "time", "zeit")
 """Values of the key X_Dimension for samples over time, in LabVIEW's files."""
@@ -120,7 +120,7 @@ class TextTable:
     remark: str = ""
 
 
-def read_table(stream: BinaryIO, requested_names: Sequence[str], *, most_rows: int) -> TextTable:
+def read_table(stream: BinaryIO, requested_names: Sequence[str], *, max_rows: int) -> TextTable:
     r"""Read some columns of a table of numbers in a text file.
 
     The separator is a tab, a semicolon, a comma, a bar or blanks. The decimal sign is a point or a
@@ -134,7 +134,7 @@ def read_table(stream: BinaryIO, requested_names: Sequence[str], *, most_rows: i
         The file must be seekable; it is not closed.
     requested_names : sequence of str
         Titles of the requested columns, or numbers such as ``#3`` for the third column.
-    most_rows : int
+    max_rows : int
         Number of rows after which reading ends. If the file has more rows, one more is returned.
 
     Returns
@@ -150,7 +150,7 @@ def read_table(stream: BinaryIO, requested_names: Sequence[str], *, most_rows: i
     --------
     >>> from io import BytesIO
     >>> from rigd.text_table import read_table
-    >>> table = read_table(BytesIO(b"t;angle\ns;rad\n0;0,5\n1;0,7\n"), ["angle"], most_rows=10)
+    >>> table = read_table(BytesIO(b"t;angle\ns;rad\n0;0,5\n1;0,7\n"), ["angle"], max_rows=10)
     >>> table.columns["angle"].values.tolist(), table.columns["angle"].unit
     ([0.5, 0.7], 'rad')
     """
@@ -159,7 +159,7 @@ def read_table(stream: BinaryIO, requested_names: Sequence[str], *, most_rows: i
     last_decoding_error: UnicodeError | None = None
     for possible_encoding in encodings(first_bytes):
         try:
-            return _read(stream, possible_encoding, requested_names, most_rows)
+            return _read(stream, possible_encoding, requested_names, max_rows)
         except UnicodeError as found:
             last_decoding_error = last_decoding_error or found
         except csv.Error as found:
@@ -170,7 +170,7 @@ def read_table(stream: BinaryIO, requested_names: Sequence[str], *, most_rows: i
 
 
 def _read(
-    stream: BinaryIO, encoding: str, requested_names: Sequence[str], most_rows: int
+    stream: BinaryIO, encoding: str, requested_names: Sequence[str], max_rows: int
 ) -> TextTable:
     """Read columns of a text with a given encoding."""
     with _open_lines(stream, encoding) as text_lines:
@@ -181,21 +181,21 @@ def _read(
     )
     try:
         return _read_columns(
-            stream, encoding, table_layout, requested_names, most_rows, decimal_sign
+            stream, encoding, table_layout, requested_names, max_rows, decimal_sign
         )
     except _DecimalCommaError:
         # Read again from the start: a point in earlier lines may not be a decimal point.
-        return _read_columns(stream, encoding, table_layout, requested_names, most_rows, COMMA)
+        return _read_columns(stream, encoding, table_layout, requested_names, max_rows, COMMA)
 
 
 def _first_lines(lines: Iterator[str]) -> list[str]:
     """Return the first lines of a file, from which the layout is detected."""
     first_lines: list[str] = []
     character_count = 0
-    for text_line in islice(lines, MOST_HEAD_LINES):
+    for text_line in islice(lines, MAX_HEAD_LINES):
         first_lines.append(text_line)
         character_count += len(text_line)
-        if character_count > _MOST_HEAD_CHARACTERS:
+        if character_count > _MAX_HEAD_CHARACTERS:
             break
     return first_lines
 
@@ -218,11 +218,11 @@ def _open_lines(stream: BinaryIO, encoding: str) -> Iterator[Iterator[str]]:
 def _lines_of_bounded_length(text_stream: TextIOWrapper) -> Iterator[str]:
     """Yield the lines of a text, and raise TableError for a line that is too long."""
     line_number = 0
-    while text_line := text_stream.readline(MOST_LINE_CHARACTERS + 1):
+    while text_line := text_stream.readline(MAX_LINE_CHARACTERS + 1):
         line_number += 1
-        if len(text_line) > MOST_LINE_CHARACTERS:
+        if len(text_line) > MAX_LINE_CHARACTERS:
             raise TableError(
-                f"line {line_number}: a line of more than {MOST_LINE_CHARACTERS} characters; a "
+                f"line {line_number}: a line of more than {MAX_LINE_CHARACTERS} characters; a "
                 "table has one line per sample and few channels. Export the session's channels "
                 "alone."
             )
@@ -368,7 +368,7 @@ def _read_columns(
     encoding: str,
     layout: TableLayout,
     requested_names: Sequence[str],
-    most_rows: int,
+    max_rows: int,
     decimal_sign: str,
 ) -> TextTable:
     """Read the requested columns and the column of times, with a given decimal sign."""
@@ -437,7 +437,7 @@ def _read_columns(
             for append_value, column_index in stamp_appends:
                 append_value(number_rows.stamp(row, column_index, line_number))
             line_numbers.append(line_number)
-            if len(line_numbers) > most_rows:
+            if len(line_numbers) > max_rows:
                 break
     number_rows.check_thousands()
     return _text_table(

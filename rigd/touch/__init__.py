@@ -1,7 +1,7 @@
 """Detection and estimation of touches of the beam, from its torque and base shear.
 
 Offers the innovations of the free beam (`observed_beam`, `InnovationFilter`), which the control
-loop computes tick by tick, and the sequential test on them (`watched_beam`, `TouchDetector`).
+loop computes tick by tick, and the sequential test on them (`detector_model`, `TouchDetector`).
 
 `TouchEstimator` estimates one touch after another with one model of the beam (`TouchModel`, from an
 analysis or from the profile). It estimates point, instant, force and stiffness with intervals, and

@@ -9,9 +9,9 @@ from ._innovations import ChannelNoise as ChannelNoise
 from ._innovations import InnovationFilter as InnovationFilter
 from ._innovations import observed_beam as observed_beam
 from ._model import TouchModel as TouchModel
-from ._results import Estimated as Estimated
 from ._results import TouchEstimate as TouchEstimate
+from ._results import TouchQuantity as TouchQuantity
 from ._sensor_filter import SensorFilter as SensorFilter
-from ._signatures import WatchedBeam as WatchedBeam
+from ._signatures import DetectorModel as DetectorModel
+from ._signatures import detector_model as detector_model
 from ._signatures import signatures as signatures
-from ._signatures import watched_beam as watched_beam

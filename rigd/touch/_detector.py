@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.touch._innovations import InnovationFilter
-from rigd.touch._signatures import WatchedBeam
+from rigd.touch._signatures import DetectorModel
 
 Real = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class TouchDetector:
     Parameters
     ----------
     beam
-        Model and signatures of the beam, from `rigd.touch.watched_beam`.
+        Model and signatures of the beam, from `rigd.touch.detector_model`.
     rate_hz
         Ticks a second.
     settings
@@ -108,7 +108,7 @@ class TouchDetector:
         "noise",
     )
 
-    def __init__(self, beam: WatchedBeam, rate_hz: float, settings: DetectorSettings) -> None:
+    def __init__(self, beam: DetectorModel, rate_hz: float, settings: DetectorSettings) -> None:
         signatures = beam.signatures
         self._filter = InnovationFilter(beam.observed)
         self._threshold = settings.threshold(rate_hz, len(signatures))

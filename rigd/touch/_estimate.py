@@ -6,7 +6,7 @@ samples before the touch determine the motion of the free beam.
 
 import numpy as np
 
-from rigd.touch._answer import estimate_from_explanations
+from rigd.touch._combined_estimate import estimate_from_explanations
 from rigd.touch._explanations import ExplanationSearch
 from rigd.touch._free_motion import TouchRecord
 from rigd.touch._model import TouchModel

@@ -2,7 +2,7 @@
 
 A springy obstacle at rest, integrated in time through its bounces, explains the innovations of
 torque and base shear. Alternatives are two obstacles, an obstacle that moves or yields, a knock
-(one pulse of force), and any force at all. `_answer` decides which of them are reported.
+(one pulse of force), and any force at all. `_combined_estimate` decides which of them are reported.
 """
 
 from dataclasses import dataclass, replace
@@ -11,12 +11,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.touch._blind import AnyForceLikelihood
+from rigd.touch._any_force import AnyForceLikelihood
 from rigd.touch._free_motion import TouchRecord
+from rigd.touch._impact import ImpactResponse
 from rigd.touch._kernels import ContactKernels
-from rigd.touch._knock import KnockResponse
-from rigd.touch._pair import TwoObstacleContact
-from rigd.touch._physical import (
+from rigd.touch._obstacle_contact import (
     MAX_LN_STIFFNESS,
     MIN_LN_STIFFNESS,
     Minima,
@@ -27,9 +26,10 @@ from rigd.touch._physical import (
     chi2_of,
     find_minima,
 )
+from rigd.touch._pair import TwoObstacleContact
 from rigd.touch._posterior import Posterior, sample_posterior
 from rigd.touch._tables import GRID_COMPARISON_S, TouchTables
-from rigd.touch._uncertain import uncertainty_effects
+from rigd.touch._uncertainty_effects import uncertainty_effects
 from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 
 Real = NDArray[np.float64]
@@ -618,15 +618,15 @@ class ExplanationSearch:
                 )
             )
         obstacle_contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
-        knock_response = KnockResponse(obstacle_contact, self.tables.middle, 2)
-        start_candidates = knock_response.starts(self.window(FIRST_S), self.detected, 10)
+        impact_response = ImpactResponse(obstacle_contact, self.tables.middle, 2)
+        start_candidates = impact_response.starts(self.window(FIRST_S), self.detected, 10)
         obstacle_ranges = self.space(3)
-        parameter_ranges = knock_response.space(
+        parameter_ranges = impact_response.space(
             self.edges, (obstacle_ranges.low[1], obstacle_ranges.high[1])
         )
         explanations.append(
             self.explain_by_kind(
-                "knock", knock_response.predict, sample_window, start_candidates, parameter_ranges
+                "knock", impact_response.predict, sample_window, start_candidates, parameter_ranges
             )
         )
         return explanations

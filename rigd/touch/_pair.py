@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from rigd.touch._contact import integrate_two_contacts
 from rigd.touch._kernels import ContactKernels, CrossKernels
-from rigd.touch._physical import MIN_LN_STIFFNESS, ObstacleContact, ParameterRanges, WhitenedWindow
+from rigd.touch._obstacle_contact import (
+    MIN_LN_STIFFNESS,
+    ObstacleContact,
+    ParameterRanges,
+    WhitenedWindow,
+)
 
 Real = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ Real = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Estimated:
+class TouchQuantity:
     """Estimated number, with its standard deviation and its 95 % interval."""
 
     value: float
@@ -32,13 +32,13 @@ class TouchEstimate:
     A quantity is None if the record does not determine it.
     """
 
-    x_m: Estimated | None
+    x_m: TouchQuantity | None
     """Distance of the touched point from the motor's axis."""
-    time_s: Estimated | None
+    time_s: TouchQuantity | None
     """Instant of the first contact, from the record's first sample."""
-    force_n: Estimated | None
+    force_n: TouchQuantity | None
     """Peak of the contact force's magnitude."""
-    stiffness_n_per_m: Estimated | None
+    stiffness_n_per_m: TouchQuantity | None
     """Stiffness of the obstacle."""
     kind: str
     """Kind of obstacle: rigid (at rest, springy or not) | yielding | moving | knock | unknown."""

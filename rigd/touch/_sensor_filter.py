@@ -34,7 +34,7 @@ class SensorFilter:
     """Time between two of the sensor's records."""
 
     @classmethod
-    def of_records(
+    def for_records(
         cls, corner_hz: float, order: int, kind: str, record_count: int, spacing_s: float
     ) -> "SensorFilter":
         """Return the filter of a sensor that sends several readings per tick, which are averaged.

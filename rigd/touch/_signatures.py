@@ -42,7 +42,7 @@ remain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WatchedBeam:
+class DetectorModel:
     """Beam model and effects of touches on it, with which a `TouchDetector` compares readings."""
 
     observed: ObservedBeam
@@ -51,7 +51,7 @@ class WatchedBeam:
     """Signatures of touches from the function `signatures`, shape (signatures, 2 · ticks)."""
 
 
-def watched_beam(model: "TouchModel", rate_hz: float, noise_stds: ChannelNoise) -> WatchedBeam:
+def detector_model(model: "TouchModel", rate_hz: float, noise_stds: ChannelNoise) -> DetectorModel:
     """Return the model and the signatures of a beam, with which touches are detected.
 
     Parameters
@@ -75,7 +75,7 @@ def watched_beam(model: "TouchModel", rate_hz: float, noise_stds: ChannelNoise) 
     unit_signatures = signatures(
         model.plant.beam, model.plant.damping, rate_hz, observed_model, model.sensor_filter
     )
-    return WatchedBeam(observed_model, unit_signatures)
+    return DetectorModel(observed_model, unit_signatures)
 
 
 def signatures(

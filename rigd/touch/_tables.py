@@ -4,11 +4,11 @@ from typing import Final
 
 import numpy as np
 
-from rigd.touch._blind import AnyForceEstimator
+from rigd.touch._any_force import AnyForceEstimator
 from rigd.touch._free_motion import FreeBeam
 from rigd.touch._kernels import contact_kernels, cross_kernels, positions
 from rigd.touch._model import TouchModel
-from rigd.touch._physical import CandidateGrid
+from rigd.touch._obstacle_contact import CandidateGrid
 from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 
 DETECTION_DELAYS_S: Final = (0.013, 0.04, 0.12)

@@ -67,7 +67,7 @@ _SHAPE_HZ: Final = 100.0
 _LABEL_HZ: Final = 4.0
 """Rate at which two drawings are sent: the label with the tip's deflection, and the trail of past
 lines."""
-_MOST_INTERPOLATED_GAP_S: Final = 10.0
+_MAX_INTERPOLATED_GAP_S: Final = 10.0
 """Longest gap between samples over which the motor angle is interpolated."""
 _ASSUMED_DAMPING_RATIO: Final = 2e-3
 """Damping ratio of the first mode that is assumed if the profile states no damping.
@@ -78,7 +78,7 @@ _STORED_LINES_S: Final = 30.0
 """Time for which drawn beam lines are stored, so that a later estimate of a touch can be drawn."""
 _ARROW_LENGTH_PER_N: Final = 0.2
 """Length of the arrow of a contact force per newton, in beam lengths."""
-_MOST_ARROW_LENGTH: Final = 0.4
+_MAX_ARROW_LENGTH: Final = 0.4
 """Upper limit of the length of a contact force's arrow, in beam lengths."""
 
 _HOUSING_COLOR: Color = (105, 110, 120)
@@ -198,7 +198,7 @@ class Antenna:
         arrow_length = (
             0.0
             if touch_force is None
-            else min(_ARROW_LENGTH_PER_N * abs(touch_force["value"]), _MOST_ARROW_LENGTH)
+            else min(_ARROW_LENGTH_PER_N * abs(touch_force["value"]), _MAX_ARROW_LENGTH)
         )
         # An obstacle pushes against the motion.
         displacement_norm = float(np.linalg.norm(displacements[0]))
@@ -229,7 +229,7 @@ class Antenna:
         last_tick, last_values = self._newest or (int(ticks[0]) - 1, times_and_angles[0])
         self._newest = int(ticks[-1]), times_and_angles[-1]
         tick_steps = np.minimum(
-            np.diff(ticks, prepend=last_tick), round(_MOST_INTERPOLATED_GAP_S * self._rate_hz)
+            np.diff(ticks, prepend=last_tick), round(_MAX_INTERPOLATED_GAP_S * self._rate_hz)
         )
         if np.all(tick_steps == 1):
             return times_and_angles

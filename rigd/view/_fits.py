@@ -28,7 +28,7 @@ TABLE: Final = "/fit_table"
 """Entity path in Rerun of the table with the last fit."""
 _PLOTS_ENTITY: Final = "/fits"
 """Entity path in Rerun of the plots of fitted modes over time."""
-_MOST_FINDINGS: Final = 8
+_MAX_FINDINGS: Final = 8
 """Largest number of findings that the table of a fit lists."""
 
 
@@ -215,7 +215,7 @@ def fit_table(fit: Fit | None) -> str:
     if modes_not_visible := unseen_modes(modes):
         paragraphs.append(f"Not visible so far: {modes_not_visible}.")
     if mode_rows:
-        validity = Validity.of_document(fit.get("validity"))
+        validity = Validity.from_document(fit.get("validity"))
         paragraphs.append(validity.sentence)
         if validity.uniform_beam is not None:
             paragraphs.append(validity.uniform_beam.sentence)
@@ -226,7 +226,7 @@ def fit_table(fit: Fit | None) -> str:
     ]
     if table_rows:
         paragraphs.append(_markdown_table("parameter", "value", table_rows=table_rows))
-    paragraphs += [plain(sentence) for sentence in fit.get("findings", ())[:_MOST_FINDINGS]]
+    paragraphs += [plain(sentence) for sentence in fit.get("findings", ())[:_MAX_FINDINGS]]
     return "\n\n".join(paragraphs)
 
 

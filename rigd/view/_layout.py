@@ -115,7 +115,7 @@ HEALTH: Final = (
     ),
 )
 """Plots of the tab Health."""
-_LEAST_PLOTS_FOR_TWO_COLUMNS: Final = 4
+_MIN_PLOTS_FOR_TWO_COLUMNS: Final = 4
 """Least number of plots in the tab Health for which they are arranged in two columns."""
 TIME_VIEWS: Final = (*OVERVIEW_PLOTS, *SIGNALS, *HEALTH)
 """All plots over time of the window, without those of the tab Fit."""
@@ -244,7 +244,7 @@ def _health(absent_components: Collection[str]) -> "rrb.Container":
     return rrb.Horizontal(
         rrb.Grid(
             *map(_plot, shown_views),
-            grid_columns=1 if len(shown_views) < _LEAST_PLOTS_FOR_TWO_COLUMNS else 2,
+            grid_columns=1 if len(shown_views) < _MIN_PLOTS_FOR_TWO_COLUMNS else 2,
         ),
         _summary(),
         column_shares=[7, 2],
@@ -404,7 +404,7 @@ def _log() -> "rrb.TextLogView":
 
 # Axis labels
 
-LEAST_LABEL_SPACING_PT: Final = 24.0
+MIN_LABEL_SPACING_PT: Final = 24.0
 """Least distance between axis labels, in points.
 
 Rerun omits labels nearer than 20 points, and fades those at 21."""
@@ -414,9 +414,9 @@ AXIS_TO_RANGE_RATIO: Final = 1.1
 
 _EXTREMES_INTERVAL_NS: Final = 100_000_000
 """Length of the intervals, in nanoseconds, over which the extremes of the values are computed."""
-_MOST_VALUE_TO_AXIS_RATIO: Final = 1e9
+_MAX_VALUE_TO_AXIS_RATIO: Final = 1e9
 """Ratio of the largest value to the least axis length above which Rerun alone chooses the axis."""
-_LEAST_LABEL_SPACING, _MOST_LABEL_SPACING = 1e-300, 1e300
+_MIN_LABEL_SPACING, _MAX_LABEL_SPACING = 1e-300, 1e300
 """Smallest and largest distance between axis labels, in the unit of the values, for which points
 are added.
 
@@ -522,7 +522,7 @@ class _AxisExtremes:
         high_ns, greatest_value = self._greatest.take(t_ns, greatest_value)
         low_ns, minus_low = self._least.take(t_ns, -least_value)
         value_below, value_above = missing_ticks(
-            -minus_low, greatest_value, self.view.height, self.view.plot.least_span
+            -minus_low, greatest_value, self.view.height, self.view.plot.min_span
         )
         # When either extreme leaves the window, the missing points are computed again.
         first_extreme_ns = min(low_ns, high_ns)
@@ -563,7 +563,7 @@ class _RunningMaximum:
 
 
 def missing_ticks(
-    lowest_value: float, highest_value: float, height_pt: float, least_span: float = 0.0
+    lowest_value: float, highest_value: float, height_pt: float, min_span: float = 0.0
 ) -> tuple[float | None, float | None]:
     """Return the values to add to a plot so that its axis has two labels and its least length.
 
@@ -573,7 +573,7 @@ def missing_ticks(
         Least and greatest plotted value.
     height_pt
         Height of the plot, in points.
-    least_span
+    min_span
         Least length of the axis, in the unit of the values.
 
     Returns
@@ -582,11 +582,11 @@ def missing_ticks(
         Values to add below and above the plotted values; None if none is needed on that side.
     """
     if (
-        0.0 <= highest_value - lowest_value < least_span
-        and max(-lowest_value, highest_value) < _MOST_VALUE_TO_AXIS_RATIO * least_span
+        0.0 <= highest_value - lowest_value < min_span
+        and max(-lowest_value, highest_value) < _MAX_VALUE_TO_AXIS_RATIO * min_span
     ):
         # The ends are multiples of a step, so that noise does not move the axis.
-        tick_step = least_span / 2
+        tick_step = min_span / 2
         first_multiple, last_multiple = (
             math.floor(lowest_value / tick_step),
             math.ceil(highest_value / tick_step),
@@ -613,10 +613,10 @@ def missing_ticks(
             value_above if value_above > highest_value else None,
         )
     label_spacing = (
-        AXIS_TO_RANGE_RATIO * (highest_value - lowest_value) / height_pt * LEAST_LABEL_SPACING_PT
+        AXIS_TO_RANGE_RATIO * (highest_value - lowest_value) / height_pt * MIN_LABEL_SPACING_PT
     )
     # Rerun shows a single value with one unit on either side.
-    if not _LEAST_LABEL_SPACING < label_spacing < _MOST_LABEL_SPACING:
+    if not _MIN_LABEL_SPACING < label_spacing < _MAX_LABEL_SPACING:
         return None, None
     tick_step = 10.0 ** math.ceil(math.log10(label_spacing))
     first_multiple, last_multiple = (

@@ -39,7 +39,7 @@ Records = npt.NDArray[Any]
 
 _BLOCK_S: Final = 1.0
 """Duration of the blocks of samples that are drawn together: the period of the charts."""
-_MOST_TICKS_PER_SAMPLE: Final = 10
+_MAX_TICKS_PER_SAMPLE: Final = 10
 """Largest ratio of a record's length in ticks to its number of samples.
 
 Filling longer gaps would invent data and fill the disk."""
@@ -82,7 +82,7 @@ def subject_of_session(
             f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, "
             "which Rerun cannot show. The writing program must correct it."
         )
-    if end_tick - first_tick > _MOST_TICKS_PER_SAMPLE * len(sample_ticks):
+    if end_tick - first_tick > _MAX_TICKS_PER_SAMPLE * len(sample_ticks):
         raise SessionError(
             f"{session.path}: only {len(sample_ticks)} of the {end_tick - first_tick} ticks from "
             f"{first_tick} to {end_tick - 1} have a sample, too few to be shown as a session."

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 Records = npt.NDArray[Any]
 """Structured array of samples, timings or other records of a session, shape (n,)."""
 
-_LEAST_BLOCK_S: Final = 0.1
+_MIN_BLOCK_S: Final = 0.1
 """Least duration of a block of records that is drawn at once.
 
 The computation time for a block hardly depends on its size, so few large blocks are cheaper."""
@@ -48,7 +48,7 @@ _CHART_UPDATE_PERIOD_S: Final = 1.0
 """Session time between two updates of the charts; each update computes a frequency response."""
 _SPECTROGRAM_STEP_S: Final = 0.5
 """Time between adjacent columns of the spectrogram."""
-_MOST_STORED_NOTES: Final = 200
+_MAX_STORED_NOTES: Final = 200
 """Largest number of log lines that are stored and sent again to a new connection."""
 
 
@@ -93,7 +93,7 @@ class Scene:
             subject, self._spectrogram.frequency_hz, _SPECTROGRAM_STEP_S
         )
         self._columns: list[tuple[float, npt.NDArray[Any]]] = []
-        self._notes: collections.deque[Note] = collections.deque(maxlen=_MOST_STORED_NOTES)
+        self._notes: collections.deque[Note] = collections.deque(maxlen=_MAX_STORED_NOTES)
         self._touches: dict[int, list[Drawing]] = {}
         self._charts_due = _PeriodicTimer(_CHART_UPDATE_PERIOD_S)
         self._samples = _BlockBuffer(subject.rate_hz)
@@ -334,7 +334,7 @@ class _BlockBuffer:
     """Buffer that combines small blocks of records with a field ``tick`` into larger blocks."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._ticks = max(1, round(_LEAST_BLOCK_S * rate_hz))
+        self._ticks = max(1, round(_MIN_BLOCK_S * rate_hz))
         self._parts: list[Records] = []
 
     def add(self, new_records: Records) -> Records | None:

@@ -25,7 +25,7 @@ SUMMARY_ENTITY: Final = "/summary"
 
 _LOG_WIDTH_CHARACTERS: Final = 150
 """Width of the log in characters. Longer lines are wrapped, because the viewer would cut them."""
-_MOST_RECENT_EVENTS: Final = 20
+_MAX_RECENT_EVENTS: Final = 20
 """Largest number of events in the document with the newest events."""
 _LEVEL_PREFIXES: Final = {"warning": "⚠ ", "error": "⚠ **ERROR** ", "fatal": "⚠ **FATAL** "}
 """Markdown prefixes of events in the document with the newest events, by level."""
@@ -256,7 +256,7 @@ def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     document_lines = []
-    for log_note in reversed(notes[-_MOST_RECENT_EVENTS:]):
+    for log_note in reversed(notes[-_MAX_RECENT_EVENTS:]):
         time_s = max(0.0, 1e-9 * log_note.t_ns)  # the first event may come a tick early
         level_prefix = _LEVEL_PREFIXES.get(log_note.level, "")
         document_lines.append(f"**{time_s:.1f} s** {level_prefix}{plain(log_note.message)}")

@@ -484,14 +484,14 @@ def decades(first_value: float, last_value: float) -> tuple[tuple[float, ...], t
     )
 
 
-def steps(first_value: float, last_value: float, most_steps: int) -> tuple[float, ...]:
-    """Return at most `most_steps` evenly spaced round values within a range, for axis ticks.
+def steps(first_value: float, last_value: float, max_steps: int) -> tuple[float, ...]:
+    """Return at most `max_steps` evenly spaced round values within a range, for axis ticks.
 
     Parameters
     ----------
     first_value, last_value
         Values at both ends of the axis.
-    most_steps
+    max_steps
         Largest number of values.
 
     Examples
@@ -500,7 +500,7 @@ def steps(first_value: float, last_value: float, most_steps: int) -> tuple[float
     >>> steps(1.0, 47.0, 6)
     (10.0, 20.0, 30.0, 40.0)
     """
-    least_step = (last_value - first_value) / most_steps
+    least_step = (last_value - first_value) / max_steps
     power_of_ten = 10.0 ** np.floor(np.log10(least_step))
     step_size = next(
         leading_digit * power_of_ten

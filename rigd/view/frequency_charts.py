@@ -68,7 +68,7 @@ NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
 NO_COHERENCE: Final = "Of a single segment there is no coherence"
 """Text in the coherence chart of a finished response from a single segment."""
 
-_MOST_WIDTH_FOR_FOUR_ENTRIES: Final = 700.0
+_MAX_WIDTH_FOR_FOUR_ENTRIES: Final = 700.0
 """Width in points above which a chart's legend has room for a fifth entry."""
 _SHADE_NAMES: Final = ("not_estimated_below", "not_estimated_above")
 """Names of the shaded areas over the bands that are not estimated."""
@@ -85,7 +85,7 @@ _MAGNITUDE_TICK_STEP_DB: Final = 20.0
 """Distance between ticks of a magnitude axis, in dB."""
 _ASSUMED_DAMPING: Final = Damping(zeta=3e-4)
 """Damping from which the magnitude axis is computed if the beam's damping is unknown."""
-_MOST_MAGNITUDE_RANGE_DB: Final = 140.0
+_MAX_MAGNITUDE_RANGE_DB: Final = 140.0
 """Largest range of a magnitude axis, in dB."""
 
 
@@ -352,7 +352,7 @@ def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
     axis_end_db = _MAGNITUDE_TICK_STEP_DB * np.ceil(highest_db / _MAGNITUDE_TICK_STEP_DB)
     axis_start_db = max(
         _MAGNITUDE_TICK_STEP_DB * np.floor(lowest_db / _MAGNITUDE_TICK_STEP_DB),
-        axis_end_db - _MOST_MAGNITUDE_RANGE_DB,
+        axis_end_db - _MAX_MAGNITUDE_RANGE_DB,
     )
     tick_levels_db = steps(
         axis_start_db,
@@ -395,7 +395,7 @@ def _chart(entity_path: str, vertical_axis: Axis, *legend_entries: LegendEntry) 
     """Return a chart of the frequency response, with a legend entry for bands without estimate."""
     chart_size = SIZES[entity_path]
     if (
-        LAST_SESSION_ENTRY not in legend_entries or chart_size[0] > _MOST_WIDTH_FOR_FOUR_ENTRIES
+        LAST_SESSION_ENTRY not in legend_entries or chart_size[0] > _MAX_WIDTH_FOR_FOUR_ENTRIES
     ):  # there is room for another entry
         legend_entries = (*legend_entries, NOT_ESTIMATED_ENTRY)
     return response_chart(
@@ -412,7 +412,7 @@ SIZE: Final = (1280.0, 677.0)
 
 LOWEST_DB, HIGHEST_DB = -80.0, 0.0
 """Levels at the lower and upper end of the colour scale, in dB re 1 N·m."""
-MOST_COLUMNS: Final = 300
+MAX_COLUMNS: Final = 300
 """Largest number of columns of the spectrogram.
 
 In longer sessions, a column shows the highest level of several time windows."""
@@ -443,7 +443,7 @@ class SpectrogramChart:
 
     def __init__(self, subject: "Subject", frequency_hz: Real, step_s: float) -> None:
         duration_s = max(subject.ticks / subject.rate_hz, step_s)
-        self._column_s = max(step_s, duration_s / MOST_COLUMNS)
+        self._column_s = max(step_s, duration_s / MAX_COLUMNS)
         column_count = int(np.ceil(duration_s / self._column_s))
         end_s = column_count * self._column_s
         half_bin_hz = float(frequency_hz[1] - frequency_hz[0]) / 2

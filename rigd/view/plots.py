@@ -87,7 +87,7 @@ class Plot:
         Curves from the lowest to the topmost.
     span
         Ends of a fixed axis; None if the axis follows the values.
-    least_span
+    min_span
         Least length of the axis in the unit of the curves, so that noise is not drawn as large as a
         signal.
     """
@@ -96,7 +96,7 @@ class Plot:
     title: str
     curves: tuple[PlotCurve, ...]
     span: tuple[float, float] | None = None
-    least_span: float = 0.0
+    min_span: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +199,7 @@ ANGLE = Plot(
         PlotCurve("reference (mrad)", ORANGE, lambda r: 1e3 * r["angle_reference_rad"], 2.5),
         PlotCurve("measured (mrad)", SKY_BLUE, lambda r: 1e3 * r["angle_rad"]),
     ),
-    least_span=4.0,
+    min_span=4.0,
 )
 """Plot of the motor's measured angle and its reference."""
 TRACKING_ERROR = Plot(
@@ -212,27 +212,27 @@ TRACKING_ERROR = Plot(
             lambda r: 1e3 * (r["angle_reference_rad"] - r["angle_rad"]),
         ),
     ),
-    least_span=2.0,
+    min_span=2.0,
 )
 """Plot of the difference of reference and measured angle."""
 COUPLING_TORQUE = Plot(
     "coupling_torque_nm",
     "Coupling torque, tared (N·m)",
     (PlotCurve("coupling torque (N·m)", GREEN, lambda r: r["coupling_torque_nm"]),),
-    least_span=0.1,
+    min_span=0.1,
 )
 """Plot of the torque between motor and beam."""
 TORQUE_COMMAND = Plot(
     "torque_command_nm",
     "Torque command, after limits (N·m)",
     (PlotCurve("torque command (N·m)", PURPLE, lambda r: r["torque_command_nm"]),),
-    least_span=0.1,
+    min_span=0.1,
 )
 """Plot of the torque that the motor is commanded to apply."""
-FORCES = Plot("forces_n", "Forces at the sensor (N)", _axes("f{}_n", "F", "N"), least_span=1.0)
+FORCES = Plot("forces_n", "Forces at the sensor (N)", _axes("f{}_n", "F", "N"), min_span=1.0)
 """Plot of the three forces at the sensor."""
 TORQUES = Plot(
-    "torques_nm", "Torques at the sensor (N·m)", _axes("t{}_nm", "T", "N·m"), least_span=0.1
+    "torques_nm", "Torques at the sensor (N·m)", _axes("t{}_nm", "T", "N·m"), min_span=0.1
 )
 """Plot of the three torques at the sensor."""
 LOOP = Plot(
@@ -242,7 +242,7 @@ LOOP = Plot(
         PlotCurve("wake-up latency (µs)", GREY, lambda r: 1e-3 * r["lateness_ns"]),
         PlotCurve("execution time (µs)", ORANGE, lambda r: 1e-3 * r["work_ns"]),
     ),
-    least_span=100.0,
+    min_span=100.0,
 )
 """Plot of the control loop's wake-up latency and execution time."""
 SIGNALS = Source(
@@ -258,7 +258,7 @@ AGES = Plot(
         PlotCurve("angle (ms)", SKY_BLUE, lambda r: 1e3 * r["angle_age_s"], 2.5),
         PlotCurve("wrench (ms)", GREEN, lambda r: 1e3 * r["wrench_age_s"]),
     ),
-    least_span=1.0,
+    min_span=1.0,
 )
 """Plot of the age of angle and wrench readings."""
 READINGS = Source("/readings", (AGES,))
@@ -272,7 +272,7 @@ FAULTY_TICKS = Plot(
         PlotCurve("late (ticks)", ORANGE, lambda r: r["late_ticks"]),
         PlotCurve("lost (ticks)", PURPLE, lambda r: r["lost_ticks"]),
     ),
-    least_span=10.0,
+    min_span=10.0,
 )
 """Plot of the number of missed, late and lost ticks."""
 BACKLOG = Plot(
@@ -282,7 +282,7 @@ BACKLOG = Plot(
         PlotCurve("recorder backlog (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
         PlotCurve("dropped by the viewer (samples)", GREY, lambda r: r["view_dropped"]),
     ),
-    least_span=100.0,
+    min_span=100.0,
 )
 """Plot of samples that the recorder has not written yet and that the viewer dropped."""
 BUS_LOAD = Plot(
@@ -296,7 +296,7 @@ BUS_ERRORS = Plot(
     "bus_errors",
     "Bus errors since the devices were connected (count)",
     (PlotCurve("bus errors (count)", VERMILION, lambda r: r["bus_errors"]),),
-    least_span=10.0,
+    min_span=10.0,
 )
 """Plot of the number of bus errors."""
 SENSOR_STATUS = Plot(
@@ -309,7 +309,7 @@ DISK = Plot(
     "disk_free_gb",
     "Free on the disk (GB)",
     (PlotCurve("free on the disk (GB)", GREEN, lambda r: 1e-3 * r["disk_free_mb"]),),
-    least_span=1.0,
+    min_span=1.0,
 )
 """Plot of the free disk space."""
 BUS_PLOT_COMPONENTS: Final = frozenset(

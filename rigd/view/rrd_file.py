@@ -66,7 +66,7 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
     prepare_sdk_environment()
     import rerun as rr
 
-    from rigd.session import rename_new
+    from rigd.session import rename_without_replacing
     from rigd.view.plots import APPLICATION_ID
 
     check_new(path)
@@ -80,7 +80,7 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
         with _translate_write_errors(path, temporary_path):
             stream.flush()
             stream.disconnect()
-            rename_new(temporary_path, path)
+            rename_without_replacing(temporary_path, path)
     finally:
         stream.disconnect()
         temporary_path.unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.engine.processes import Child, ChildError
+from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.workers import REPORT
 
 Document = dict[str, Any]
@@ -162,7 +162,7 @@ class Jobs:
 
     async def _run_process(self, job: AnalysisJob) -> None:
         """Run a job's process to its end, or raise JobError if it is dropped or fails."""
-        child = Child(REPORT, *job.arguments, folder=self._folder)
+        child = ChildProcess(REPORT, *job.arguments, folder=self._folder)
         is_suspended = False
         try:
             while child.running:

@@ -90,7 +90,7 @@ class Library:
         """Return the names of the specimens of all sessions, the most recent first."""
         return list(dict.fromkeys(row.specimen for row in await self.rows() if row.specimen))
 
-    async def last_response(self, specimen: str, but: str) -> Document | None:
+    async def last_response(self, specimen: str, excluded_session: str) -> Document | None:
         """Return the frequency response of a specimen's last session, as a message to the pages.
 
         It is None if there is none.
@@ -99,7 +99,7 @@ class Library:
         ----------
         specimen
             Name of the specimen, or "" for the last session without a specimen's name.
-        but
+        excluded_session
             Name of a session to exclude, because it is running.
         """
         newest_pair = await asyncio.to_thread(
@@ -107,7 +107,7 @@ class Library:
                 last_quick_look,
                 self._folder,
                 specimen,
-                excluded_session=but,
+                excluded_session=excluded_session,
                 is_usable=itemgetter("response"),
             )
         )

@@ -14,9 +14,9 @@ from typing import Any, Final
 from aiohttp import web
 
 from rigd.beam import Beam, Damping
-from rigd.daemon.client import DaemonGoneError, RefusedByDaemonError, stop_session
-from rigd.engine.messages import Failed, PageAddress
-from rigd.engine.processes import Parent
+from rigd.daemon.client import DaemonUnreachableError, RefusedByDaemonError, stop_session
+from rigd.engine.messages import PageAddress, ProcessFailed
+from rigd.engine.processes import SupervisorConnection
 from rigd.excitation import KINDS, excitation_options
 from rigd.profile import specimen_files
 from rigd.runner.quick_looks import QuickLook
@@ -173,7 +173,7 @@ class OperatorPageServer:
                 daemon_reply = await self._stop()
             else:
                 daemon_reply = await self._link.send_request(request_object)
-        except (DaemonError, DaemonGoneError) as error:
+        except (DaemonError, DaemonUnreachableError) as error:
             return refusal_response(503, str(error))
         except (BusyError, RefusedByDaemonError) as error:
             return refusal_response(409, str(error))
@@ -194,7 +194,7 @@ class OperatorPageServer:
         """Stop the daemon's session, and return the reply or the reason of a failure."""
         try:
             return await self._stop()
-        except (DaemonGoneError, RefusedByDaemonError) as error:
+        except (DaemonUnreachableError, RefusedByDaemonError) as error:
             return {"ok": False, "error": str(error)}
         finally:
             self._link.request_status()
@@ -224,7 +224,7 @@ class OperatorPageServer:
             if event_name == "session":
                 self._start_search(self._find_specimens())
             elif event_name == "quick_look":
-                self.pages.log("info", "\n".join(QuickLook.of_event(message).lines))
+                self.pages.log("info", "\n".join(QuickLook.from_event(message).lines))
 
     def _process_status(self, status: Document) -> None:
         """Send the daemon's status to the open pages, and prepare for a new session."""
@@ -266,7 +266,7 @@ class OperatorPageServer:
     def _process_signals(self, event: Document) -> None:
         """Send a block of signals and the gauges to the open pages."""
         if event["count"]:
-            signal_block = PageSignalBlock.of_event(event)
+            signal_block = PageSignalBlock.from_event(event)
             self.pages.send(self._envelopes.feed(signal_block))
             if self._response is not None:
                 self._response.feed(signal_block)
@@ -307,10 +307,10 @@ class OperatorPageServer:
             recorded_specimens = await self._library.specimens()
             self._specimens = list(dict.fromkeys([*recorded_specimens, *specimen_files()]))
 
-    async def _find_last(self, specimen: str, but: str) -> None:
-        """Send the response of the specimen's last session, except `but`, to the open pages."""
+    async def _find_last(self, specimen: str, excluded_session: str) -> None:
+        """Send the response of the last session of a specimen, except one, to the open pages."""
         with suppress(OSError, ValueError):
-            self._last_response = await self._library.last_response(specimen, but)
+            self._last_response = await self._library.last_response(specimen, excluded_session)
             self.pages.send(self._last_response)
 
 
@@ -341,16 +341,16 @@ def run_page() -> None:
     # No log: a stopped terminal (Ctrl-S) would block all pages, and invalid requests would fill the
     # journal.
     logging.disable()
-    daemon = Parent()
+    daemon = SupervisorConnection()
     asyncio.run(_serve_until_end(daemon, daemon.receive_job()))
 
 
-async def _serve_until_end(daemon: Parent, job: Document) -> None:
+async def _serve_until_end(daemon: SupervisorConnection, job: Document) -> None:
     """Serve the page of a job until the daemon ends or the server fails."""
     try:
         page_server, _, listening_server = await open_page(job)
     except OSError as error:
-        daemon.send(Failed(f"port {job['port']} cannot be had: {error.strerror}"))
+        daemon.send(ProcessFailed(f"port {job['port']} cannot be had: {error.strerror}"))
         return
     daemon.send(PageAddress(port_of(listening_server)))
     server_task = asyncio.create_task(page_server.run())
@@ -358,7 +358,7 @@ async def _serve_until_end(daemon: Parent, job: Document) -> None:
     await asyncio.wait((server_task, daemon_ended), return_when=asyncio.FIRST_COMPLETED)
     has_failed = server_task.done()
     if has_failed:
-        daemon.send(Failed(f"unexpected error ({server_task.exception()!r})"))
+        daemon.send(ProcessFailed(f"unexpected error ({server_task.exception()!r})"))
     # The successor of this process or of the daemon may need the port.
     listening_server.close()
     page_server.end(

@@ -56,7 +56,7 @@ class PageSignalBlock:
     """Angle (rad), its reference (rad) and coupling torque (N·m), shape (3, n); NaN if unknown."""
 
     @classmethod
-    def of_event(cls, event: Mapping[str, Any]) -> "PageSignalBlock":
+    def from_event(cls, event: Mapping[str, Any]) -> "PageSignalBlock":
         """Decode the block of signals in the daemon's event ``signals``."""
         signal_bytes = b"".join(
             base64.b64decode(event[signal_name]) for signal_name in _SIGNAL_NAMES

@@ -8,7 +8,7 @@ import pytest
 from packages import CONTROLLERS, install, rigd_with
 
 from rigd.check_rows import CheckResult
-from rigd.checks import check_on_paper, check_rig
+from rigd.checks import check_rig, run_offline_checks
 from rigd.control import LinearController, close_loop
 from rigd.control.kinds import make_controller
 from rigd.excitation import hold
@@ -51,7 +51,7 @@ def packages(tmp_path, monkeypatch):
 def test_a_profile_takes_it_and_it_behaves_as_the_loop_relies_on(packages, tmp_path, name):
     profile = load_profile(write_rig(tmp_path, name))
     assert profile.control.controller == name
-    assert check_on_paper(profile).failed == ()
+    assert run_offline_checks(profile).failed == ()
     for check in CONTROLLER_CHECKS:
         check(profile)
 
@@ -112,11 +112,11 @@ def test_an_unstable_loop_and_a_failed_row_of_theirs_refuse_a_session(packages, 
         tmp_path, "statespace",
         SECTIONS["statespace"] + '\ngain = { value = 30.0, source = "assumed" }',
     )  # fmt: skip
-    (failed,) = check_on_paper(load_profile(unstable)).failed
+    (failed,) = run_offline_checks(load_profile(unstable)).failed
     assert failed.name == "loop_stability"
     assert "change the settings of [statespace]" in failed.text
     stiff = write_rig(tmp_path, "own", SECTIONS["own"].replace("9.0", "30.0"))
-    (failed,) = check_on_paper(load_profile(stiff)).failed
+    (failed,) = run_offline_checks(load_profile(stiff)).failed
     assert (failed.name, failed.acceptable) == ("controller", False)
     assert "30 N·m/rad" in failed.text
 
@@ -227,7 +227,7 @@ def test_code_that_fails_refuses_a_session_with_the_name_of_the_package(
     install(tmp_path / "b", "u-bad", "1", renamed("bad", old, new), f"[{GROUP}]\nbad = u_bad:OWN\n")
     monkeypatch.syspath_prepend(tmp_path / "b")
     profile = load_profile(write_rig(tmp_path, "bad", SECTIONS["own"]))
-    failed = check_on_paper(profile).failed
+    failed = run_offline_checks(profile).failed
     assert {each.acceptable for each in failed} == {False}
     assert any(reason in each.text for each in failed)
     sys.modules.pop("u_bad", None)

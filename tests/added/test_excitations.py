@@ -10,8 +10,8 @@ import pytest
 from operated_daemons import RequestError, parse_request
 from packages import EXCITATION, install, rigd_with
 
+from analysis.applicability import welch_exclusion_reason
 from analysis.record import load_record
-from analysis.suited import welch_exclusion_reason
 from rigd.excitation import KINDS, ExcitationError, excitation_options, make_excitation
 from rigd.plugins import PluginError, check_plugin, find_plugin, installed_plugins
 from rigd.session import read_session

@@ -35,7 +35,7 @@ def session(tmp_path_factory, make_signals, write_session):
 
 @pytest.fixture(scope="module")
 def selection(session):
-    return select(Measurement.of_record(load_record(session)))
+    return select(Measurement.from_record(load_record(session)))
 
 
 def test_it_is_found_by_name(packages):

@@ -89,7 +89,7 @@ def test_a_short_gap_is_interpolated_and_a_long_one_reaches_as_far_as_the_filter
 
     unknown = samples_near(70_000, 70_030) | samples_near(90_000, 90_050)
     np.testing.assert_array_equal(~record.torque_known, unknown)
-    (gap,) = Measurement.of_record(record).long_gaps(50.0)
+    (gap,) = Measurement.from_record(record).long_gaps(50.0)
     assert gap[0] * FACTOR == pytest.approx(90_000 - FACTOR * REACH, abs=FACTOR)
     short = samples_near(40_000, 40_004)
     assert record.torque_known[short].all()
@@ -114,7 +114,7 @@ def test_clipping_is_found_in_all_samples(
     assert (largest.limit_nm, largest.values) == (torque_nm.max(), 1)
     assert decimated.torque_extremes[1].values == 1
     assert load_record(paper_file).torque_extremes == ()
-    measurement = Measurement.of_record(load_record(path, longest_samples=LONGEST))
+    measurement = Measurement.from_record(load_record(path, longest_samples=LONGEST))
     assert measurement.torque_extremes == (largest, smallest)
 
 

@@ -8,11 +8,11 @@ import pytest
 from cases import further
 from processes import eventually
 
+from analysis.applicability import record_band_hz
 from analysis.identify import Measurement, fit_freest_alone, select
 from analysis.online import OnlineEstimate, OnlineEstimator
 from analysis.record import load_record
 from analysis.results import whole_record
-from analysis.suited import record_band_hz
 from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, modes
 from rigd.runner.fit_process import EstimateRequest, EstimationError, EstimatorThread
 from rigd.session import read_session
@@ -76,7 +76,7 @@ def test_the_last_estimate_is_that_of_the_file(session):
 def test_the_quick_estimate_is_that_of_the_file(session):
     live = fed(session).estimate()
     record = load_record(session.path)
-    told, found, _ = fit_freest_alone(Measurement.of_record(record), record_band_hz(record))
+    told, found, _ = fit_freest_alone(Measurement.from_record(record), record_band_hz(record))
     assert live.headline.parameters == told.parameters
     assert live.headline.modes == told.modes
     assert live.findings == found
@@ -204,9 +204,9 @@ def test_what_the_last_judgement_does_not_explain_is_searched_for(session):
     time_s = np.arange(signals.torque_nm.size) / 1000
     hum_nm = 2e-2 * np.sin(2 * np.pi * 16.4 * time_s)
     humming = replace(signals, torque_nm=signals.torque_nm + hum_nm)
-    before = select(Measurement.of_record(fed_with(signals, session).record(6_000)))
+    before = select(Measurement.from_record(fed_with(signals, session).record(6_000)))
     assert before.verdict.adequate
-    record = Measurement.of_record(fed_with(humming, session).record())
+    record = Measurement.from_record(fed_with(humming, session).record())
     again, alone = (select(record, earlier=each) for each in (before, None))
     assert again.headline.parameters == alone.headline.parameters
     assert again.headline.modes == alone.headline.modes
@@ -276,7 +276,7 @@ def test_damping_that_does_not_show_counts_as_uncertainty(session):
     estimate = fed_with(signals, session).estimate()
     told = estimate.headline
     assert told.name == "IV"
-    assert "gamma" in estimate.predicting.determined
+    assert "gamma" in estimate.predictive_fit.determined
     mode, alone = told.modes[0].damping_ratio, told.fit.modes[0]
     assert mode.std > 3 * alone.damping_ratio_std
     true = 0.5 * (2e-4 * 16.1 + 5e-4 / (0.05206 * 16.1))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy  # whose parts come on first use
 
-from analysis.optimizer import Box, NormalEquations, descend
+from analysis.optimizer import ConstantBounds, NormalEquations, descend
 
 T = np.linspace(0.0, 4.0, 200)
 
@@ -28,7 +28,7 @@ def decay_problem(measured):
     return problem
 
 
-FREE = Box(np.array([-50.0, -50.0]), np.array([50.0, 50.0]))
+FREE = ConstantBounds(np.array([-50.0, -50.0]), np.array([50.0, 50.0]))
 
 
 def test_finds_what_made_the_data():
@@ -70,7 +70,7 @@ def test_rests_on_a_bound_and_moves_along_it(low, high, rest):
     found = descend(
         rosenbrock,
         np.array([1.0, -3.0]),
-        Box(np.array([low, -4.0]), np.array([high, 4.0])),
+        ConstantBounds(np.array([low, -4.0]), np.array([high, 4.0])),
         relative_tolerance=1e-14,
     )
     np.testing.assert_allclose(found.x, [rest, rest**2], atol=1e-8)
@@ -80,7 +80,7 @@ def test_rests_on_a_bound_and_moves_along_it(low, high, rest):
 
 
 def test_start_outside_is_brought_inside():
-    box = Box(np.array([0.0, 0.0]), np.array([3.0, 3.0]))
+    box = ConstantBounds(np.array([0.0, 0.0]), np.array([3.0, 3.0]))
     found = descend(rosenbrock, np.array([9.0, -9.0]), box, relative_tolerance=1e-14)
     np.testing.assert_allclose(found.x, 1.0, atol=1e-7)
 
@@ -158,7 +158,7 @@ def test_what_was_learnt_wrongly_does_no_harm():
 
 
 def free(k):
-    return Box(np.full(k, -10.0), np.full(k, 10.0))
+    return ConstantBounds(np.full(k, -10.0), np.full(k, 10.0))
 
 
 class Counted:
@@ -215,7 +215,7 @@ def test_on_a_bound_the_others_make_the_best_of_it():
     matrix = np.array([[2.0, 1.9], [1.9, 2.0], [0.3, 0.1]])
     target = np.array([1.0, -2.0, 0.5])
     problem = Counted(lambda x: matrix @ x - target, lambda x: matrix)
-    bounded = Box(np.array([-10.0, -0.5]), np.array([1.2, 10.0]))
+    bounded = ConstantBounds(np.array([-10.0, -0.5]), np.array([1.2, 10.0]))
     found = descend(problem, np.array([0.0, 0.0]), bounded, relative_tolerance=1e-13)
     other = scipy.optimize.least_squares(
         lambda x: matrix @ x - target, [0.0, 0.0], bounds=(bounded.lower, bounded.upper), xtol=1e-14

@@ -214,7 +214,7 @@ def test_a_long_record_is_fitted_by_the_freest_structure_alone(chirps, selection
 
 @pytest.mark.process
 def test_the_freest_structure_alone_flags_what_it_does_not_explain(short_chirps):
-    measurement = Measurement.of_record(load_record(short_chirps[0]))
+    measurement = Measurement.from_record(load_record(short_chirps[0]))
     cubic = measurement.torque_nm + 4e3 * measurement.angle_rad**3
     told, found, _ = fit_freest_alone(replace(measurement, torque_nm=cubic))
     assert {mode.frequency_hz.flag for mode in told.modes if mode.shown} == {
@@ -313,9 +313,9 @@ def test_it_runs_at_a_low_priority_and_ends_with_its_parent(short_chirps, tmp_pa
     path = Path(shutil.copy(short_chirps[0], tmp_path))
     code = (
         "import os, pathlib, sys, time\n"
-        "from rigd.engine.processes import Child\n"
+        "from rigd.engine.processes import ChildProcess\n"
         "from rigd.engine.workers import QUICK_LOOK\n"
-        "look = Child(QUICK_LOOK, sys.argv[1])\n"
+        "look = ChildProcess(QUICK_LOOK, sys.argv[1])\n"
         "own = os.getpriority(os.PRIO_PROCESS, 0)\n"
         "assert os.getpriority(os.PRIO_PROCESS, look.pid) == min(19, own + 10)\n"
         "command = pathlib.Path(f'/proc/{look.pid}/cmdline')\n"

@@ -180,7 +180,10 @@ def test_the_uniformity_is_that_of_the_file(
 ):
     path = write_session(tmp_path / "a.mcap", short_signals, metadata=metadata)
     record = load_record(path)
-    assert (record.uniformity, Measurement.of_record(record).uniformity) == (uniformity, uniformity)
+    assert (record.uniformity, Measurement.from_record(record).uniformity) == (
+        uniformity,
+        uniformity,
+    )
 
 
 def test_a_tip_mass_and_a_tilt_that_nobody_states_are_unknown(
@@ -189,7 +192,7 @@ def test_a_tip_mass_and_a_tilt_that_nobody_states_are_unknown(
     def of(**stated):
         path = write_session(tmp_path / f"{len(stated)}.mcap", short_signals, metadata=stated)
         record = load_record(path)
-        measurement = Measurement.of_record(record)
+        measurement = Measurement.from_record(record)
         values = record.tip_mass_kg, record.axis_tilt_deg
         assert (measurement.tip_mass_kg, measurement.axis_tilt_deg) == values
         return (*values, record.uncertainty)

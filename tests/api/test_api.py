@@ -60,7 +60,7 @@ def test_load_and_frf_are_the_command_s(record, workspace):
 def test_fit_by_either_method(record):
     settings = {"fixed": ("delay_s",), "band_hz": (0.0, 30.0)}
     (found,) = api.fit(record, ["III"], **settings).fits
-    (own,) = fit_record(Measurement.of_record(record), [STRUCTURES["III"]], **settings).fits
+    (own,) = fit_record(Measurement.from_record(record), [STRUCTURES["III"]], **settings).fits
     assert found.parameters == own.parameters
     assert "delay_s" not in found.interval
     paper = api.fit(record, ["I", "III"], method="welch", weightings=["omega"], band_hz=(1.0, 40.0))

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from rigd.bench import Results
 from rigd.cli.app import app
 from rigd.errors import FailureError
-from rigd.runtime import RigLock
+from rigd.runtime.locks import RigLock
 
 
 @pytest.fixture

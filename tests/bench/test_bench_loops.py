@@ -26,7 +26,7 @@ def assert_accounted(found):
     assert (found.work_us > 0.0).all()
 
 
-def precedence():
+def raised_priority():
     policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK  # which nobody can take back
     return policy, os.getpriority(os.PRIO_PROCESS, 0), os.sched_getaffinity(0)
 
@@ -34,10 +34,10 @@ def precedence():
 @pytest.mark.further  # as one with a file
 def test_the_loop_alone_is_measured_without_a_file(profile):
     looks = []
-    before = precedence()
+    before = raised_priority()
     assert_accounted(loops.run_alone("alone", profile, SECONDS, lambda: looks.append(1)))
     assert looks
-    assert precedence() == before
+    assert raised_priority() == before
 
 
 def test_a_session_is_measured_and_its_file_goes(profile, tmp_path, monkeypatch):

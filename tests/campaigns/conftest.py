@@ -19,7 +19,7 @@ from analysis.campaigns import (
 from analysis.campaigns._experiment import Experiment
 from analysis.identify import ModeEstimate
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper import Indices, Peak
+from analysis.paper.welch_analysis import FitIndices, Peak
 from rigd.beam import Beam, Damping, Plant
 from rigd.testing import PAPER_BEAM, chirp_signals, write_session
 
@@ -171,7 +171,7 @@ def record_estimate(structure, values, covariance, determined, at_bounds=(), cos
         std=dict.fromkeys(every, 0.0), determined=tuple(determined),
         covariance=np.asarray(covariance), at_bounds=at_bounds,
         modes=(ModeEstimate(1, 2.5, 1e-4, 0.01, 1e-5),), cost=cost, degrees_of_freedom=100,
-        deviance=cost, bic=bic, values=100, indices=Indices(1.0, 1.0, 1.0),
+        deviance=cost, bic=bic, values=100, indices=FitIndices(1.0, 1.0, 1.0),
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from analysis.campaigns import CampaignError, SessionTask, analyse_session, campaign
-from analysis.campaigns._validation import left_out_errors, models_without_session
+from analysis.campaigns._validation import leave_one_out_results, models_without_session
 from analysis.identify import BAND_HZ
 from analysis.models import FrequencyResponseModel
 from analysis.record import load_record
@@ -98,7 +98,7 @@ def test_error_of_a_forecast_is_that_of_the_torque(done, short_sessions, truth):
     true = replace(forecast, plant=Plant(link, damping), own=None)
     light = replace(link, density_kg_per_m=1e-12, bending_stiffness_n_m2=1e-12)
     none = replace(true, plant=Plant(light, damping))
-    exact, nothing = left_out_errors(short_sessions[0], [true, none], BAND_HZ)
+    exact, nothing = leave_one_out_results(short_sessions[0], [true, none], BAND_HZ)
     best = min(e.own_error for e in found.validation if e.own_error is not None)
     assert exact.error == pytest.approx(best, rel=0.1)
     assert nothing.error == pytest.approx(1.0, abs=1e-6)
@@ -161,9 +161,9 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     assert found.validity.sentence in text
     assert found.validity.sentence in page
     of_beam = content["headlines"][-1]["validity"].pop("uniform_beam")
-    of_campaign = found.validity.as_json()
-    assert content["validity"].pop("uniform_beam") is of_campaign.pop("uniform_beam") is None
-    assert content["validity"] == content["headlines"][-1]["validity"] == of_campaign
+    from_campaign = found.validity.as_json()
+    assert content["validity"].pop("uniform_beam") is from_campaign.pop("uniform_beam") is None
+    assert content["validity"] == content["headlines"][-1]["validity"] == from_campaign
     assert of_beam["status"] == found.modal.uniform_beam.status == "passed"
     assert len(content["uniform_beam"]) == len(of_beam["constants"]) == 12
     alpha = next(row for row in content["parameters"] if row["parameter"] == "alpha")

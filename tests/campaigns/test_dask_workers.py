@@ -10,7 +10,7 @@ import pytest
 
 from analysis.campaigns import CampaignError, campaign
 from analysis.campaigns import workers as dask_workers
-from analysis.campaigns.workers import LostTask, dask_cluster, versions
+from analysis.campaigns.workers import FailedTask, dask_cluster, versions
 
 ONE_DEATH_IS_ENOUGH = {"distributed.scheduler.allowed-failures": 0}
 
@@ -118,7 +118,7 @@ def test_a_worker_that_is_lost_takes_one_task_with_it_and_no_more():
         dask_cluster(processes.scheduler_address) as workers,
     ):
         one, lost, two = workers.run(eval, [("1",), ("__import__('os')._exit(1)",), ("2",)])
-    assert isinstance(lost, LostTask)
+    assert isinstance(lost, FailedTask)
     assert (one, two) == (1, 2)
 
 

@@ -40,7 +40,7 @@ def sessions_of(make_session, make_experiment):
         for number in range(first, first + count):
             own = constants + std * np.random.default_rng(number).normal(size=std.size)
             modal = ModalEstimate(
-                ModalModel.of_constants(own, (0.0,) * 5),
+                ModalModel.from_constants(own, (0.0,) * 5),
                 MODES,
                 own,
                 np.diag(np.concatenate([std**2, np.ones(5)])),
@@ -220,7 +220,7 @@ def test_an_order_is_the_slope_of_a_loss_and_an_exact_value_a_condition(sessions
     assert "lambda 0.59" in condition
     assert "which would exclude 1" in condition
     assert "; 1 is excluded" not in text
-    assert found.withheld == frozenset()
+    assert found.withheld_orders == frozenset()
 
 
 def test_exact_values_are_withheld_where_a_uniform_beam_is_refused(sessions_of, verdict_of):

@@ -10,7 +10,7 @@ import pytest
 from analysis.campaigns import best_models
 from analysis.campaigns._statistics import mean_deviations
 from analysis.models import STRUCTURES, FrequencyResponseModel
-from analysis.paper import Peak, resonant_peaks
+from analysis.paper.welch_analysis import Peak, resonant_peaks
 from analysis.report._paper_tables import published_table3, published_table4, published_wmse
 from rigd.beam import transfer
 

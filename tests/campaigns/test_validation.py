@@ -55,7 +55,7 @@ def shaken(short_sessions, settings, done):
 @pytest.mark.process
 def test_a_trial_whose_worker_is_killed_is_lost_and_the_others_are_done(shaken):
     assert shaken.failures == ()
-    (lost,) = shaken.lost_trials
+    (lost,) = shaken.failed_predictions
     assert (lost.path.name, shaken.trials) == ("1.mcap", 4)
     assert "worker process ended by itself twice" in lost.reason
     assert {each.path.name for each in shaken.validation} == {"0.mcap", "2.mcap", "3.mcap"}
@@ -77,7 +77,7 @@ def test_terminal_page_and_files_account_for_it(shaken):
     assert "3 of 4" in row
     page = campaign_page(shaken, (), datetime.now(UTC), with_paper=False)
     assert "3 of 4" in page
-    assert f"Not predicted from the others: {shaken.lost_trials[0].path}: its worker" in page
+    assert f"Not predicted from the others: {shaken.failed_predictions[0].path}: its worker" in page
     content = campaign_document(shaken)
     trials = content["trials"]
     assert trials["asked"] == trials["done"] + len(trials["lost"]) == 4
@@ -110,7 +110,7 @@ def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tm
 def test_sessions_that_cannot_be_read_any_more_are_lost_with_the_reason(make_session, campaign_of):
     found = campaign_of([make_session(f"gone{number}.mcap") for number in range(3)])
     assert found.validation == ()
-    for number, lost in enumerate(found.lost_trials):
+    for number, lost in enumerate(found.failed_predictions):
         assert f"gone{number}.mcap" in lost.reason
 
 
@@ -125,11 +125,11 @@ def test_what_was_found_is_kept_though_all_workers_go(make_session):
 
     found = campaign([each.path for each in sessions], workers=Going())
     assert found.validation == ()
-    assert [each.path.name for each in found.lost_trials] == ["0.mcap", "1.mcap", "2.mcap"]
-    assert {each.reason for each in found.lost_trials} == {"The Dask scheduler went away."}
+    assert [each.path.name for each in found.failed_predictions] == ["0.mcap", "1.mcap", "2.mcap"]
+    assert {each.reason for each in found.failed_predictions} == {"The Dask scheduler went away."}
 
 
 def test_nothing_is_said_where_nothing_was_asked(short_sessions, settings):
     found = campaign(short_sessions[:2], settings, structures=(), jobs=1)
-    assert (found.trials, found.validation, found.lost_trials) == (0, (), ())
+    assert (found.trials, found.validation, found.failed_predictions) == (0, (), ())
     assert "predicted" not in campaign_text(found)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.campaigns import sentences
-from analysis.paper import Indices
+from analysis.paper.welch_analysis import FitIndices
 
 pytestmark = pytest.mark.fit
 
@@ -29,7 +29,7 @@ def make_sessions(make_fit, make_estimate, make_session):
             sessions.append(
                 make_session(
                     f"{number}.mcap",
-                    fits=[replace(fit, indices=Indices(0.5, 0.5, 0.5))],
+                    fits=[replace(fit, indices=FitIndices(0.5, 0.5, 0.5))],
                     estimates=[make_estimate("VI", values, covariance, names, cost=cost)],
                 )
             )
@@ -55,7 +55,7 @@ def test_a_bias_is_the_difference_of_the_means_and_not_the_scatter(make_sessions
     assert bias.bias == pytest.approx(0.068)
     assert bias.welch_std == pytest.approx(0.001 * np.std([-1, -0.5, 0, 0.5, 1], ddof=1))
     assert bias.bias_std == pytest.approx(np.hypot(bias.welch_std, RECORD_STD) / 5**0.5)
-    assert [each.parameter for each in found.significant] == ["lambda"]
+    assert [each.parameter for each in found.significant_parameters] == ["lambda"]
     first, second = sentences.describe_welch_bias(freest, (found,), (), comparable=True)
     assert "Welch's lambda (1.06800 ± 0.00079 between sessions) is 0.06800 above" in first
     assert "1.00000 (type VI, weights omega, as in Table 3): bias, not scatter" in first
@@ -67,7 +67,7 @@ def test_a_bias_is_the_difference_of_the_means_and_not_the_scatter(make_sessions
 
 def test_a_difference_within_the_scatter_is_no_bias(make_sessions, biases_of):
     freest, (found,) = biases_of(make_sessions(0.02, 0.1))
-    assert found.significant == ()
+    assert found.significant_parameters == ()
     assert sentences.describe_welch_bias(freest, (found,), (), comparable=True) == []
 
 

@@ -6,7 +6,7 @@ import pytest
 from cases import further
 
 from analysis.campaigns import CampaignError
-from analysis.campaigns.workers import LostTask, process_pool
+from analysis.campaigns.workers import FailedTask, process_pool
 
 pytestmark = pytest.mark.process
 
@@ -42,7 +42,7 @@ def ends_at_zero(number):
 def test_one_task_whose_worker_dies_is_told_and_the_others_are_done():
     with process_pool(2) as pool:
         found = pool.run(ends_at_zero, [(n,) for n in (5, 4, 3, 0, 2, 1)])
-    (lost,) = (each for each in found if isinstance(each, LostTask))
+    (lost,) = (each for each in found if isinstance(each, FailedTask))
     assert found == [5, 4, 3, lost, 2, 1]
     assert "memory" in lost.reason
 
@@ -51,7 +51,7 @@ def test_one_task_whose_worker_dies_is_told_and_the_others_are_done():
 def test_the_first_task_of_all_may_be_the_one(jobs):
     with process_pool(jobs) as pool:
         lost, *others = pool.run(ends_at_zero, [(n,) for n in (0, 1, 2)])
-    assert isinstance(lost, LostTask)
+    assert isinstance(lost, FailedTask)
     assert others == [1, 2]
 
 

@@ -14,7 +14,7 @@ from rigd.engine.recorder import Recorder
 from rigd.engine.shared_state import Phase, StateField
 from rigd.excitation import hold
 from rigd.runner import Rig
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 from rigd.runtime import StopRequest
 from rigd.session import SessionWriter, read_session
 from rigd.session.layout import pack_sample_into
@@ -67,18 +67,20 @@ def test_a_control_process_that_dies_on_the_way_back_leaves_a_whole_record(tmp_p
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=0.3, rest_s=0.1, ring_down_s=0.0)
     rig = Rig(profile)
 
-    def watcher(progress, events):
+    def listener(progress, events):
         control = next(p for p in rig.status().processes if p.name == "control")
         if progress.phase is Phase.RETURNING and control.state != "ended":
             os.kill(control.pid, signal.SIGKILL)
 
     try:
         rig.connect()
-        result = rig.run(Order(profile, excitation, tmp_path / "a.mcap"), StopRequest(), watcher)
+        result = rig.run(
+            SessionOrder(profile, excitation, tmp_path / "a.mcap"), StopRequest(), listener
+        )
     finally:
         rig.disconnect()
     assert result.outcome == "complete"
     assert result.reason == "After the record: The control process was killed by signal 9."
-    assert not result.went_well
+    assert not result.is_successful
     assert result.scheduled == 400 == result.recorded + result.missed
     assert read_session(result.path).outcome["outcome"] == "complete"

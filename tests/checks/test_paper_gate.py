@@ -9,7 +9,7 @@ from cases import further
 from eds_files import eds_path
 
 from rigd.check_rows import CheckResult, overall
-from rigd.checks import check_on_paper, check_without_devices
+from rigd.checks import check_without_devices, run_offline_checks
 from rigd.control import ControlDesignError
 from rigd.devices import MAY_BE_UNKNOWN, open_devices, unknown_values
 from rigd.devices.contracts import DeviceError
@@ -84,7 +84,9 @@ def test_check_and_run_agree_on_a_profile_with_one_lie(lie, tmp_path, key, facto
         return  # neither command begins
     rows = check_without_devices(profile, None)
     failed = [row for row in rows if row.verdict is CheckResult.FAIL]
-    assert {row.name for row in failed} == {each.name for each in check_on_paper(profile).failed}
+    assert {row.name for row in failed} == {
+        each.name for each in run_offline_checks(profile).failed
+    }
     refused = refusal(profile, tmp_path / "out", "hold", duration_s=0.5)
     assert bool(failed) == bool(refused)
     for row in failed:
@@ -97,7 +99,7 @@ def test_check_and_run_agree_on_a_profile_with_one_lie(lie, tmp_path, key, facto
 
 def test_the_shipped_profiles_pass(can_profile, serial_profile):
     for profile in (can_profile, serial_profile, load_profile("sim")):
-        assert check_on_paper(profile).failed == ()
+        assert run_offline_checks(profile).failed == ()
 
 
 def test_every_row_that_fails_has_a_name_of_its_check(lie):
@@ -105,7 +107,7 @@ def test_every_row_that_fails_has_a_name_of_its_check(lie):
     travel = {
         "travel_loop_fails", "travel_no_angle", "travel_encoder_fails", "travel_missed_ticks",
     }  # fmt: skip
-    assert {each.name for each in check_on_paper(profile).failed} == travel
+    assert {each.name for each in run_offline_checks(profile).failed} == travel
     assert {
         row.name for row in check_without_devices(profile, None) if row.verdict is CheckResult.FAIL
     } == travel
@@ -128,10 +130,10 @@ def test_only_what_is_accepted_passes(lie, tmp_path):
 
 def test_a_name_that_is_none_is_refused_with_those_there_are(can_profile):
     with pytest.raises(UserError, match="travel_loop_fails, travel_no_angle") as refused:
-        check_on_paper(can_profile, ["worst travel"])
+        run_offline_checks(can_profile, ["worst travel"])
     assert refused.value.wrong_use
     with pytest.raises(UserError, match="nothing can be computed without it"):
-        check_on_paper(can_profile, ["unknown_values"])
+        run_offline_checks(can_profile, ["unknown_values"])
 
 
 def test_a_drive_s_file_is_asked_for_too(can_profile, tmp_path):

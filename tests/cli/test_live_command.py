@@ -26,7 +26,7 @@ def nobody_else(runtime_folder, monkeypatch):
 @pytest.fixture
 def view(nobody_else):
     """A live view of the rig sim, as far as can be told from outside."""
-    address = LiveAddress.of_this_process("sim", grpc_port=9876, page_port=9090, server=1)
+    address = LiveAddress.for_this_process("sim", grpc_port=9876, page_port=9090, server=1)
     announce(address)
     return address
 
@@ -88,7 +88,7 @@ def test_of_several_views_one_has_to_be_named(rigd_here, view, write_profile):
 
 
 def test_it_waits_if_it_is_to(rigd_here, nobody_else, monkeypatch):
-    address = LiveAddress.of_this_process("sim", grpc_port=9876, page_port=9090, server=1)
+    address = LiveAddress.for_this_process("sim", grpc_port=9876, page_port=9090, server=1)
     monkeypatch.setattr("time.sleep", lambda _: announce(address))  # while it waits
     done = rigd_here("live", "--web", "--wait")
     assert (done.returncode, done.stdout) == (0, "http://127.0.0.1:9090\n")

@@ -20,10 +20,10 @@ from processes import child_running, eventually, has_ended, ignored, ignores
 from resting_beams import pressing_force_n
 
 from analysis import load, select
+from analysis.applicability import remarks, welch_exclusion_reason, welch_settings
 from analysis.models import WelchSettings
 from analysis.paper import estimate
 from analysis.record import record_of
-from analysis.suited import remarks, welch_exclusion_reason, welch_settings
 from rigd.beam import modes
 from rigd.profile import load_profile
 from rigd.session import read_controls, read_session

@@ -7,7 +7,7 @@ import sys
 import pytest
 from cases import further
 
-from rigd.runtime import SINGLE_THREADED
+from rigd.runtime.background import SINGLE_THREADED
 
 pytestmark = pytest.mark.process
 

@@ -40,7 +40,7 @@ def test_it_damps_a_beam_that_is_not_the_profile_s(model, stiffness):
 def test_where_the_torque_is_old_it_is_weaker_or_none(model):
     prompt = design_damper(close_loop(model))
     old = design_damper(close_loop(replace(model, torque_delay_s=0.02)))
-    assert old is None or old.yield_rad_per_nm_s < prompt.yield_rad_per_nm_s
+    assert old is None or old.gain_rad_per_nm_s < prompt.gain_rad_per_nm_s
 
 
 def test_without_a_beam_there_is_nothing_to_damp(model):
@@ -51,7 +51,7 @@ def test_the_recursion_gives_the_designed_poles(model):
     """The closed loop is marched through with the damper: the first mode decays as computed."""
     settings = design_damper(close_loop(model))
     loop = close_loop(model)
-    reading = next(cut.reading for cut in loop.cuts if cut.name == "torque reading")
+    reading = next(opening.reading for opening in loop.openings if opening.name == "torque reading")
     damper = VibrationDamper(settings, model.rate_hz)
     state, torques = np.zeros(loop.b.size), []
     for tick in range(2500):

@@ -26,9 +26,9 @@ def slower(model):
     return replace(model, actuation_delay_s=1.3e-3, angle_delay_s=0.6e-3, torque_delay_s=1.7e-3)
 
 
-def radius_with_gain(loop, cut, factor):
-    opened = loop.a - np.outer(cut.action, cut.reading)
-    changed = opened + factor * np.outer(cut.action, cut.reading)
+def radius_with_gain(loop, opening, factor):
+    opened = loop.a - np.outer(opening.action, opening.reading)
+    changed = opened + factor * np.outer(opening.action, opening.reading)
     return np.max(np.abs(np.linalg.eigvals(changed)))
 
 
@@ -62,19 +62,19 @@ def test_the_motor_alone_has_the_margins_of_the_designed_loop(motor_alone):
     assert math.isnan(torque.delay_hz)
 
 
-def open_loop_gain(loop, cut, phase_rad):
+def open_loop_gain(loop, opening, phase_rad):
     """Gain of the loop opened at a cut, for each angle on the unit circle."""
-    opened = loop.a - np.outer(cut.action, cut.reading)
+    opened = loop.a - np.outer(opening.action, opening.reading)
     z = np.exp(1j * np.asarray(phase_rad))[:, np.newaxis, np.newaxis]
     return (
-        -np.linalg.solve(z * np.eye(len(opened)) - opened, cut.action[:, np.newaxis])[..., 0]
-        @ cut.reading
+        -np.linalg.solve(z * np.eye(len(opened)) - opened, opening.action[:, np.newaxis])[..., 0]
+        @ opening.reading
     )
 
 
 def test_cutting_the_torque_reading_leaves_a_loop_without_feed_forward(loop_model):
     loop = close_loop(slower(loop_model))
-    torque = loop.cuts[2]
+    torque = loop.openings[2]
     unfed = replace(loop.model, settings=replace(loop.model.settings, feedforward_gain=0.0))
     opened = loop.a - np.outer(torque.action, torque.reading)
     np.testing.assert_allclose(opened, close_loop(unfed).a, atol=1e-12)
@@ -83,7 +83,9 @@ def test_cutting_the_torque_reading_leaves_a_loop_without_feed_forward(loop_mode
 def test_the_command_carries_what_both_readings_carry(loop_model):
     """Cut at the command, or at both readings: the same poles are left, those of the plant."""
     loop = close_loop(slower(loop_model))
-    command, angle, torque = (np.outer(cut.action, cut.reading) for cut in loop.cuts)
+    command, angle, torque = (
+        np.outer(opening.action, opening.reading) for opening in loop.openings
+    )
     one, both = (
         np.sort(np.abs(np.linalg.eigvals(opened)))[-20:]
         for opened in (loop.a - command, loop.a - angle - torque)
@@ -98,17 +100,17 @@ def test_a_gain_or_delay_beyond_its_margin_is_unstable(loop_model, change, pole_
     model = replace(model, settings=replace(model.settings, pole_rad_s=pole_rad_s))
     loop = close_loop(model)
     compared = set()
-    for cut, margins in zip(loop.cuts, loop_margins(loop), strict=True):
-        assert margins.cut == cut.name
-        assert radius_with_gain(loop, cut, 0.98 * margins.gain_up) < 1
-        assert radius_with_gain(loop, cut, 1.02 * margins.gain_up) > 1
+    for opening, margins in zip(loop.openings, loop_margins(loop), strict=True):
+        assert margins.opening == opening.name
+        assert radius_with_gain(loop, opening, 0.98 * margins.gain_up) < 1
+        assert radius_with_gain(loop, opening, 1.02 * margins.gain_up) > 1
         if margins.gain_down > 0:
-            assert radius_with_gain(loop, cut, 1.02 * margins.gain_down) < 1
-            assert radius_with_gain(loop, cut, 0.98 * margins.gain_down) > 1
-        key = DELAY_OF[cut.name]
+            assert radius_with_gain(loop, opening, 1.02 * margins.gain_down) < 1
+            assert radius_with_gain(loop, opening, 0.98 * margins.gain_down) > 1
+        key = DELAY_OF[opening.name]
         stated = getattr(model, key)
         if (stated + 1.02 * margins.delay_s) * model.rate_hz < MAX_DELAY_PERIODS:
-            compared.add(cut.name)
+            compared.add(opening.name)
             for part, stable in ((0.98, True), (1.02, False)):
                 late = close_loop(replace(model, **{key: stated + part * margins.delay_s}))
                 assert (late.spectral_radius < 1) is stable
@@ -118,9 +120,9 @@ def test_a_gain_or_delay_beyond_its_margin_is_unstable(loop_model, change, pole_
 def test_phase_margin_is_taken_either_way(loop_model):
     """At the limit the gain, turned by the margin one way or the other, is -1."""
     loop = close_loop(loop_model)
-    for cut, margins in zip(loop.cuts, loop_margins(loop), strict=True):
+    for opening, margins in zip(loop.openings, loop_margins(loop), strict=True):
         at = np.array([2 * np.pi * margins.phase_hz / loop.model.rate_hz])
-        gain = open_loop_gain(loop, cut, at)[0]
+        gain = open_loop_gain(loop, opening, at)[0]
         turned = gain * np.exp(1j * np.array([-1, 1]) * margins.phase_rad)
         assert np.min(np.abs(turned + 1)) < 1e-6
 
@@ -131,8 +133,8 @@ def test_no_frequency_of_a_fine_grid_is_nearer_to_minus_one(loop_model):
     grid = 2 * np.pi * np.concatenate([np.linspace(2.5, 2.6, 801), np.linspace(15.8, 16.2, 801)])
     for model in (loop_model, light):
         loop = close_loop(model)
-        for cut, margins in zip(loop.cuts, loop_margins(loop), strict=True):
-            distance = np.abs(1 + open_loop_gain(loop, cut, grid / model.rate_hz))
+        for opening, margins in zip(loop.openings, loop_margins(loop), strict=True):
+            distance = np.abs(1 + open_loop_gain(loop, opening, grid / model.rate_hz))
             assert margins.modulus <= 1.001 * np.min(distance)
 
 
@@ -156,10 +158,10 @@ def test_between_its_gain_margins_every_loop_is_stable(
     )
     loop = close_loop(model)
     assume(loop.spectral_radius < 1)
-    for cut, margins in zip(loop.cuts, loop_margins(loop), strict=True):
+    for opening, margins in zip(loop.openings, loop_margins(loop), strict=True):
         assert margins.gain_down < 1 < margins.gain_up
         low, high = max(margins.gain_down, 1e-2), min(margins.gain_up, 50.0)
-        assert radius_with_gain(loop, cut, low * (high / low) ** part) < 1 + 1e-9
+        assert radius_with_gain(loop, opening, low * (high / low) ** part) < 1 + 1e-9
 
 
 def test_what_the_shipped_simulation_has(loop_model):

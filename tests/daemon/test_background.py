@@ -10,7 +10,7 @@ import pytest
 from operated_daemons import CommandError
 
 from rigd.daemon import background
-from rigd.engine.processes import Child
+from rigd.engine.processes import ChildProcess
 from rigd.engine.workers import PREDICTION
 from rigd.runner.planning import excitation_for, plan_session
 
@@ -91,7 +91,7 @@ def test_of_the_free_memory_a_job_may_have_a_part(tmp_path):
 
 @pytest.mark.process
 def test_a_job_is_the_first_that_is_killed_for_lack_of_memory():
-    job = Child(PREDICTION)
+    job = ChildProcess(PREDICTION)
     assert Path(f"/proc/{job.pid}/oom_score_adj").read_text() == "1000\n"
     assert resource.prlimit(job.pid, resource.RLIMIT_AS)[1] <= 4 << 30
     assert os.getpriority(os.PRIO_PROCESS, job.pid) == 19

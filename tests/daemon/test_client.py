@@ -15,7 +15,7 @@ import pytest
 from rigd.daemon import client as client_module
 from rigd.daemon.client import (
     Client,
-    DaemonGoneError,
+    DaemonUnreachableError,
     RefusedByDaemonError,
     await_end,
     stop_session,
@@ -93,7 +93,7 @@ def test_a_full_queue_is_not_waited_for_for_ever(path):
         listener.bind(str(path))
         listener.listen(0)
         first.connect(str(path))
-        with pytest.raises(DaemonGoneError, match=r"suspended.*may still be running.*STO"):
+        with pytest.raises(DaemonUnreachableError, match=r"suspended.*may still be running.*STO"):
             Client(path, connect_s=0.05)
 
 
@@ -135,7 +135,7 @@ def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(
 ):
     monkeypatch.setattr(client_module, "_STOP_TIMEOUT_S", 1.0)
     process = deaf()
-    with pytest.raises(DaemonGoneError) as raised:
+    with pytest.raises(DaemonUnreachableError) as raised:
         stop_session(path)
     assert process.stdout.readline() == "asked to stop\n"
     said = raised.value.full_message()
@@ -150,7 +150,7 @@ def test_a_process_that_does_not_know_the_signal_is_not_ended_by_it(path, deaf, 
     monkeypatch.setattr(client_module, "_STOP_TIMEOUT_S", 1.0)
     monkeypatch.setattr(client_module, "_PROCESS_END_TIMEOUT_S", 0.1)
     process = deaf(handles=False)
-    with pytest.raises(DaemonGoneError) as raised:
+    with pytest.raises(DaemonUnreachableError) as raised:
         stop_session(path)
     assert process.poll() is None
     assert "though it runs" in raised.value.full_message()
@@ -168,7 +168,7 @@ def ended():
 def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
     assert (
         "Its control process, which alone moves the motor, has ended"
-        in client_module.describe_remains(ended, os.getuid())
+        in client_module.describe_remaining_processes(ended, os.getuid())
     )
     monkeypatch.setattr(client_module, "_PROCESS_END_TIMEOUT_S", 0.3)
     control = subprocess.Popen(
@@ -179,20 +179,24 @@ def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
     try:
         while not Path(f"/proc/{control.pid}/cmdline").read_bytes():
             time.sleep(0.001)  # its program is being loaded, and has no arguments yet
-        said = client_module.describe_remains(ended, os.getuid())
+        said = client_module.describe_remaining_processes(ended, os.getuid())
         assert f"control process {control.pid} still runs" in said
         assert "STO" in said
     finally:
         control.kill()
         control.communicate()
-    assert "may still be running" in client_module.describe_remains(os.getpid(), os.getuid())
+    assert "may still be running" in client_module.describe_remaining_processes(
+        os.getpid(), os.getuid()
+    )
 
 
 @pytest.mark.process
 def test_a_process_that_is_dead_but_not_buried_is_gone():
     process = subprocess.Popen([sys.executable, "-c", ""])
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-    assert "The daemon is gone." in client_module.describe_remains(process.pid, os.getuid())
+    assert "The daemon is gone." in client_module.describe_remaining_processes(
+        process.pid, os.getuid()
+    )
     process.wait()
 
 
@@ -255,7 +259,7 @@ def test_an_end_that_a_crowd_or_a_silent_daemon_hides_is_not_told(path, monkeypa
     began_s = time.monotonic()
     assert await_end(path, 0.3) is None
     crowded.clear()
-    with pytest.raises(DaemonGoneError, match="may still be running"):
+    with pytest.raises(DaemonUnreachableError, match="may still be running"):
         await_end(path, 0.3)
     assert time.monotonic() - began_s < 30.0  # and not the minute of other answers
     listener.close()

@@ -103,8 +103,8 @@ def descriptors():
 
 def test_commands_and_events(served):
     async def scenario(served):
-        watcher, operator = await served.connect(), await served.connect()
-        assert await watcher.ask({"command": "watch", "id": 3}) == {
+        listener, operator = await served.connect(), await served.connect()
+        assert await listener.ask({"command": "watch", "id": 3}) == {
             "reply": "watch", "ok": True, "id": 3,
         }  # fmt: skip
         status = await operator.ask({"command": "status"})
@@ -113,17 +113,17 @@ def test_commands_and_events(served):
         assert (await operator.ask(short))["plan"]["record_s"] == 0.3
         events = []
         while not events or events[-1]["event"] != "series":
-            events.append(await watcher.next())
+            events.append(await listener.next())
         assert [e["to"] for e in events if e["event"] == "state"] == ["running", "ready"]
         assert sum(e["event"] == "session" for e in events) == 2
         assert len(events[-1]["sessions"]) == 2
-        refused = await watcher.ask({"command": "tare"})
+        refused = await listener.ask({"command": "tare"})
         assert not refused["ok"]
         assert f"process {os.getpid()}" in refused["error"]
         await operator.close()
-        while (await watcher.ask({"command": "status"}))["controller"] is not None:
+        while (await listener.ask({"command": "status"}))["controller"] is not None:
             pass
-        assert (await watcher.ask({"command": "tare"}))["ok"]
+        assert (await listener.ask({"command": "tare"}))["ok"]
 
     served.run(scenario)
 
@@ -233,8 +233,8 @@ def test_a_stop_is_obeyed_where_there_is_no_room_left(served, monkeypatch):
         assert (await (await served.connect()).ask(LONG))["ok"]
         watchers = [await served.connect() for _ in range(4)]
         assert (await watchers[0].ask({"command": "watch"}))["ok"]
-        for watcher in watchers[1:]:
-            assert (await watcher.ask({"command": "watch"}))["ok"]
+        for listener in watchers[1:]:
+            assert (await listener.ask({"command": "watch"}))["ok"]
         refused = await (await served.connect()).ask({"command": "status"})
         assert (refused["ok"], refused["crowded"]) == (False, True)
         told = await (await served.connect()).ask({"command": "stop", "id": 7})
@@ -279,7 +279,7 @@ def test_the_crowd_of_one_process_pushes_out_nobody_else(served, monkeypatch):
 def test_there_is_room_for_those_who_ask_beside_those_who_watch(served):
     async def scenario(served):
         watchers = [await served.connect() for _ in range(server.MAX_CLIENTS)]
-        replies = [await watcher.ask({"command": "watch"}) for watcher in watchers]
+        replies = [await listener.ask({"command": "watch"}) for listener in watchers]
         assert sum(reply["ok"] for reply in replies) == server.MAX_SUBSCRIBERS
         assert (await (await served.connect()).ask({"command": "status"}))["ok"]
 
@@ -394,16 +394,16 @@ def test_signals_go_to_those_who_asked_for_them(served, monkeypatch):
 
     async def scenario(served):
         telling = asyncio.create_task(served.operated.service.stream_signals())
-        plain, watcher = await served.connect(), await served.connect()
+        plain, listener = await served.connect(), await served.connect()
         await plain.ask({"command": "watch"})
-        await watcher.ask({"command": "watch", "signals": True})
+        await listener.ask({"command": "watch", "signals": True})
         await served.connect()
-        event = await watcher.next()
+        event = await listener.next()
         assert (event["event"], event["count"]) == ("signals", 0)
         await plain.ask(LONG | {"repeat": 1, "parameters": LONG["parameters"]})
         events = []
         while not events or events[-1]["event"] != "series":
-            events.append(await watcher.next())
+            events.append(await listener.next())
         blocks = [event for event in events if event["event"] == "signals" and event["count"]]
         decoded = {
             name: np.concatenate(
@@ -421,7 +421,7 @@ def test_signals_go_to_those_who_asked_for_them(served, monkeypatch):
         while not seen or seen[-1]["event"] != "series":
             seen.append(await plain.next())
         assert all(event["event"] != "signals" for event in seen)
-        await watcher.close()
+        await listener.close()
         await plain.ask({"command": "status"})
         assert served.operated.service._signal_watchers == set()
         telling.cancel()

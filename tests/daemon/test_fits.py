@@ -9,7 +9,7 @@ from operated_daemons import parse_request
 
 from rigd.daemon._series import SeriesReporter, ServedSeries
 from rigd.engine.shared_state import LogEvent, Phase
-from rigd.runner.session import RunResult, SessionProgress
+from rigd.runner.session import SessionProgress, SessionResult
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def result(**members):
         "path": Path("1.mcap"), "outcome": "complete", "reason": "", "scheduled": 9,
         "recorded": 9, "missed": 0, "late": 0, "lost": 0, "fault": False,
     }  # fmt: skip
-    return RunResult(**told | members)
+    return SessionResult(**told | members)
 
 
 def shown(told, fit):

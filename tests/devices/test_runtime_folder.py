@@ -6,8 +6,8 @@ import tempfile
 
 import pytest
 
-from rigd.runtime import LockFile
 from rigd.runtime.addresses import UnsafeFolderError, folder_fault, known_folders, runtime_folder
+from rigd.runtime.locks import LockFile
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from shipped_profile import load_shipped
 from rigd.engine.workers import CONTROL
 from rigd.excitation import hold
 from rigd.runner import ProcessGroup, Rig
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 from rigd.runtime import StopRequest
 
 pytestmark = pytest.mark.fit
@@ -46,7 +46,7 @@ def test_sessions_on_one_connection_leave_nothing_behind(campaign, tmp_path):
         rig.connect()
         for number in range(6):
             path = tmp_path / f"{number}.mcap"
-            rig.run(Order(profile, excitation, path), StopRequest(), lambda *_: None)
+            rig.run(SessionOrder(profile, excitation, path), StopRequest(), lambda *_: None)
             assert campaign.check(path) == (1200, "")
             looks.append([campaign.Look.at(pid) for pid in (os.getpid(), control)])
     finally:

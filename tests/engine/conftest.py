@@ -11,7 +11,7 @@ from rigd.devices.contracts import Devices
 from rigd.engine import shared_memory_fd
 from rigd.engine.channels import DESCRIPTORS, create_channels
 from rigd.engine.control_process import run_control
-from rigd.engine.messages import Finished, SessionJob
+from rigd.engine.messages import SessionFinished, SessionJob
 from rigd.engine.reference import write_reference
 from rigd.engine.shared_state import Phase, StateField, read_events
 from rigd.engine.timing import VirtualClock
@@ -182,7 +182,7 @@ class Session:
 
     @property
     def finished(self):
-        return self.parent.said(Finished)[-1]
+        return self.parent.said(SessionFinished)[-1]
 
     @property
     def samples(self):

@@ -8,7 +8,7 @@ import pytest
 from packages import install
 from shipped_profile import load_shipped
 
-from rigd.engine.messages import Finished, Measured, Probe
+from rigd.engine.messages import MeasurementResult, ProbeOrder, SessionFinished
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import hold
 from rigd.session.layout import Status
@@ -109,7 +109,7 @@ def test_a_failing_one_ends_the_session_as_a_fault_without_torque(
     monkeypatch.setattr(law, "ACTION", action)
     session = run_hold(make_session, name)
     session.obey(session.order(), session.order())  # the rig stays connected
-    assert [each.outcome for each in session.parent.said(Finished)] == ["fault", "fault"]
+    assert [each.outcome for each in session.parent.said(SessionFinished)] == ["fault", "fault"]
     assert words in session.finished.reason
     assert "bad-laws 0.9" in session.finished.reason
     samples = session.samples
@@ -177,8 +177,8 @@ def test_a_slow_one_counts_as_missed_ticks(make_session, law, monkeypatch):
 def test_a_probing_move_is_its_own_controller(make_session, law, monkeypatch):
     monkeypatch.setattr(law.Law, "step", lambda *_: float("nan"))
     session = run_hold(make_session)
-    session.obey(Probe(session.profile), session.order())
-    (measured,) = session.parent.said(Measured)
+    session.obey(ProbeOrder(session.profile), session.order())
+    (measured,) = session.parent.said(MeasurementResult)
     assert measured.values["end"] == "COMPLETE"
     assert session.finished.outcome == "fault"  # the session after it has the profile's controller
     session.assert_safe()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.control.damper import DamperSettings
-from rigd.engine.messages import Ending, Finished, Ready
+from rigd.engine.messages import PostRecordPlan, ReadyToRecord, SessionFinished
 from rigd.excitation import chirp, step
 from rigd.runner.planning import plan_session
 
@@ -36,7 +36,7 @@ def two_sessions(make_session, struck):
         session = make_session(excitation=excitation)
         job = replace(session.order(), ending=ending)
         session.obey(job, replace(session.order(), ending=ending))
-        outcomes = [finished.outcome for finished in session.parent.said(Finished)]
+        outcomes = [finished.outcome for finished in session.parent.said(SessionFinished)]
         assert outcomes == ["complete", "complete"]
         session.assert_safe()
         return session, session.clock.now_ns() * 1e-9
@@ -53,7 +53,7 @@ def test_the_next_session_need_not_wait_for_the_beam(two_sessions, struck):
     assert any("Waiting" in event.message for event in left.events)
     # The zero of the torque can be checked right after the record, which needs a beam at rest.
     for session, checked in ((damped, True), (left, False)):
-        for finished in session.parent.said(Finished):
+        for finished in session.parent.said(SessionFinished):
             assert ("tare_drift_nm" in finished.results) == checked
 
 
@@ -64,7 +64,7 @@ def plan_session_of(excitation):
 
 
 def starts_rad(session):
-    return [float(ready.tare["start_angle_rad"]) for ready in session.parent.said(Ready)]
+    return [float(ready.tare["start_angle_rad"]) for ready in session.parent.said(ReadyToRecord)]
 
 
 def test_the_motor_returns_to_where_it_started(two_sessions, stepped):
@@ -94,7 +94,7 @@ def test_active_damping_stays_within_the_limit_of_the_angle(make_session):
 
 def test_a_damper_that_excites_the_beam_ends(two_sessions):
     """With the sign turned round it feeds the vibration: it ends after its time, and safely."""
-    wrong = Ending(damper=DamperSettings(-2.0, 0.025, 4.0, 320.0))
+    wrong = PostRecordPlan(damper=DamperSettings(-2.0, 0.025, 4.0, 320.0))
     hold = step(rate_hz=RATE_HZ, amplitude_rad=0.005, duration_s=0.2, rest_s=0.2, ring_down_s=0.0)
     session, _ = two_sessions(wrong, hold)
     assert np.abs(session.samples["coupling_torque_nm"]).max() < 1.0

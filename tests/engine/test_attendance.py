@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 from rigd.devices.contracts import DeviceError, LineHealth
-from rigd.engine.messages import Ended, Finished, Measured, Ready, Refused, Tare, Zero
+from rigd.engine.messages import (
+    ControlEnded,
+    MeasurementRefused,
+    MeasurementResult,
+    ReadyToRecord,
+    SessionFinished,
+    TareOrder,
+    ZeroOrder,
+)
 from rigd.engine.shared_state import Phase, StateField
-from rigd.engine.timing import SuspendWatch, VirtualClock
+from rigd.engine.timing import SuspendMonitor, VirtualClock
 from rigd.excitation import hold, step
 from rigd.session.layout import Status
 
@@ -31,7 +39,7 @@ def test_sessions_follow_each_other_on_one_connection(make_session):
     connect = session.drive.connect
     session.drive.connect = lambda: (connects.append(1), connect())
     session.obey(short(session), short(session))
-    first, second = session.parent.said(Finished)
+    first, second = session.parent.said(SessionFinished)
     assert (first.outcome, second.outcome) == ("complete", "complete")
     assert first.counts == second.counts == {
         "scheduled": 1200, "missed": 0, "late": 0, "lost": 0,
@@ -39,7 +47,7 @@ def test_sessions_follow_each_other_on_one_connection(make_session):
     }  # fmt: skip
     assert connects == [1]
     assert session.samples["tick"].tolist() == [*range(1200), *range(1200)]
-    assert session.parent.said(Ended) == [Ended("")]
+    assert session.parent.said(ControlEnded) == [ControlEnded("")]
     session.assert_safe()
 
 
@@ -47,10 +55,10 @@ def test_sessions_follow_each_other_on_one_connection(make_session):
 def test_the_zero_is_where_the_operator_says_and_stays_there(make_session, clock):
     session = make_session(clock=clock())
     session.drive.fault_at, session.drive.fault = 1, lambda angle: angle + 0.3
-    session.obey(short(session), Zero(), short(session), short(session))
-    (zeroed,) = session.parent.said(Measured)
+    session.obey(short(session), ZeroOrder(), short(session), short(session))
+    (zeroed,) = session.parent.said(MeasurementResult)
     assert zeroed.values["moved_rad"] == pytest.approx(0.3, abs=3 * 7e-5)
-    starts = [float(m.tare["start_angle_rad"]) for m in session.parent.said(Ready)]
+    starts = [float(m.tare["start_angle_rad"]) for m in session.parent.said(ReadyToRecord)]
     assert starts == pytest.approx([0.3, 0.0, 0.0], abs=3 * 7e-5)
     samples = session.samples
     assert np.abs(samples["angle_rad"][-2400:]).max() < 1e-2
@@ -60,8 +68,8 @@ def test_limits_are_relative_to_the_zero(make_session):
     session = make_session()
     limit_rad = session.profile.limits.angle_rad
     session.drive.fault_at, session.drive.fault = 1, lambda angle: angle + 1.1 * limit_rad
-    session.obey(short(session), Zero(), short(session))
-    refused, fine = session.parent.said(Finished)
+    session.obey(short(session), ZeroOrder(), short(session))
+    refused, fine = session.parent.said(SessionFinished)
     assert refused.outcome == "fault"
     assert "outside limits.angle_rad" in refused.reason
     assert refused.device_failed is False
@@ -72,16 +80,16 @@ def test_no_zero_while_the_motor_moves(make_session):
     session = make_session()
     session.drive.fault_at = 1
     session.drive.fault = lambda angle: angle + 1e-5 * session.drive.reads
-    session.obey(Zero())
-    (refused,) = session.parent.said(Refused)
+    session.obey(ZeroOrder())
+    (refused,) = session.parent.said(MeasurementRefused)
     assert "rest_velocity_rad_s" in refused.reason
     session.assert_safe()
 
 
 def test_a_tare_between_sessions_tells_what_the_sensor_reads(make_session):
     session = make_session()
-    session.obey(Tare())
-    (tared,) = session.parent.said(Measured)
+    session.obey(TareOrder())
+    (tared,) = session.parent.said(MeasurementResult)
     offset = session.profile.rig.simulation.offset
     assert tared.values["mean"]["fz_n"] == pytest.approx(offset[2], abs=0.01)
     assert tared.values["torque_std_nm"] < session.profile.session.rest_torque_nm
@@ -93,12 +101,12 @@ def test_a_session_waits_until_the_beam_has_come_to_rest(make_session):
     rate_hz = session.profile.rig.rate_hz
     kick = step(rate_hz=rate_hz, amplitude_rad=0.1, duration_s=0.5, ring_down_s=0.0)
     session.obey(short(session, excitation=kick), short(session))
-    first, second = session.parent.said(Finished)
+    first, second = session.parent.said(SessionFinished)
     assert (first.outcome, second.outcome) == ("complete", "complete")
     waits = [event.message for event in session.events if "Waiting until" in event.message]
     assert len(waits) == 1
     assert "The beam is not at rest" in waits[0]
-    tares = [float(m.tare["tare_std_tz_nm"]) for m in session.parent.said(Ready)]
+    tares = [float(m.tare["tare_std_tz_nm"]) for m in session.parent.said(ReadyToRecord)]
     assert max(tares) <= session.profile.session.rest_torque_nm
 
 
@@ -109,7 +117,7 @@ def test_it_does_not_wait_for_rest_for_ever(make_session):
     rate_hz = session.profile.rig.rate_hz
     kick = step(rate_hz=rate_hz, amplitude_rad=0.1, duration_s=0.5, ring_down_s=0.0)
     session.obey(short(session, excitation=kick), short(session))
-    refused = session.parent.said(Finished)[1]
+    refused = session.parent.said(SessionFinished)[1]
     assert refused.outcome == "fault"
     assert "rest_timeout_s = 3 s" in refused.reason
     assert refused.counts["scheduled"] == 0
@@ -125,7 +133,7 @@ def test_a_device_that_fails_between_sessions_ends_the_attendance(make_session):
     polls = []
     session.parent.poll = polls.append  # nobody orders anything
     session.obey()
-    assert session.parent.said(Ended) == [Ended("The drive is gone.")]
+    assert session.parent.said(ControlEnded) == [ControlEnded("The drive is gone.")]
     session.assert_safe()
 
 
@@ -134,7 +142,7 @@ def test_a_sensor_that_is_silent_between_sessions_is_told(make_session):
     session.drive.stale_at = 50
     session.parent.poll = lambda timeout_s: None
     session.obey()
-    (ended,) = session.parent.said(Ended)
+    (ended,) = session.parent.said(ControlEnded)
     assert "A new angle has not come for 1 s" in ended.reason
     session.assert_safe()
 
@@ -146,7 +154,7 @@ def test_stale_readings_of_a_session_do_not_count_in_the_next(make_session, monk
 
     def stale(drive):
         """In the middle of the first record for long enough to end it; once in the next tare."""
-        ended = len(session.parent.said(Finished))
+        ended = len(session.parent.said(SessionFinished))
         if ended and not ends:
             ends.append(drive.reads)
         return (not ended and drive.reads > tare + 900) or (
@@ -155,7 +163,7 @@ def test_stale_readings_of_a_session_do_not_count_in_the_next(make_session, monk
 
     monkeypatch.setattr(type(session.drive), "angle_stale", property(stale))
     session.obey(short(session), short(session))
-    first, second = session.parent.said(Finished)
+    first, second = session.parent.said(SessionFinished)
     assert first.outcome == "fault"
     assert "angle" in first.reason
     assert (second.outcome, second.reason) == ("complete", "")
@@ -168,10 +176,10 @@ def test_a_device_that_fails_in_a_session_ends_the_attendance_after_it(make_sess
     session = make_session()
     session.drive.fault_at, session.drive.fault = 2000, fail
     session.obey(short(session), short(session))
-    (finished,) = session.parent.said(Finished)
+    (finished,) = session.parent.said(SessionFinished)
     assert finished.outcome == "fault"
     assert finished.device_failed is True
-    assert session.parent.said(Ended) == [Ended("The drive is gone.")]
+    assert session.parent.said(ControlEnded) == [ControlEnded("The drive is gone.")]
     session.assert_safe()
 
 
@@ -203,8 +211,8 @@ def test_a_supervisor_that_hangs_ends_the_session(make_session):
 
 def test_a_suspend_of_the_computer_ends_the_session(make_session, monkeypatch):
     boot_ns = [0]
-    watch = SuspendWatch(monotonic_ns=lambda: 0, boot_ns=lambda: boot_ns[0])
-    monkeypatch.setattr("rigd.engine._session_sequence.SuspendWatch", lambda: watch)
+    watch = SuspendMonitor(monotonic_ns=lambda: 0, boot_ns=lambda: boot_ns[0])
+    monkeypatch.setattr("rigd.engine._session_sequence.SuspendMonitor", lambda: watch)
     session = make_session(clock=FakeRealClock())
 
     read_angle = session.drive.read_angle
@@ -272,21 +280,25 @@ def test_an_encoder_that_slips_between_two_orders_is_noticed(
     session = make_session(clock=clock())
 
     def order(name):
-        return short(session) if name == "session" else {"zero": Zero(), "tare": Tare()}[name]
+        return (
+            short(session)
+            if name == "session"
+            else {"zero": ZeroOrder(), "tare": TareOrder()}[name]
+        )
 
     orders = [order(name) for name in (first, then) if name is not None]
     jump_between(session, len(orders) - 1, counts)
     session.obey(*orders)
-    (ended,) = session.parent.said(Ended)
+    (ended,) = session.parent.said(ControlEnded)
     assert "The encoder jumped by " in ended.reason
     assert f"{counts * 7e-5:.2g}"[:-1] in ended.reason
     assert "set the zero again" in ended.reason
-    told = session.parent.said(Finished)
+    told = session.parent.said(SessionFinished)
     if then == "session" and clock is VirtualClock:
         assert told[-1].outcome == "fault"
         assert told[-1].device_failed is True
         assert told[-1].counts["scheduled"] == 0
-    assert session.parent.said(Refused) == []
+    assert session.parent.said(MeasurementRefused) == []
     session.assert_safe()
 
 
@@ -295,7 +307,7 @@ def test_an_encoder_that_slips_in_the_pause_before_the_tare_is_noticed(make_sess
     session = make_session()
     session.drive.fault_at, session.drive.fault = 500, lambda angle_rad: angle_rad + 0.56
     session.obey(short(session))
-    (finished,) = session.parent.said(Finished)
+    (finished,) = session.parent.said(SessionFinished)
     assert finished.device_failed is True
     assert "The encoder jumped by 0.56 rad within one tick" in finished.reason
 
@@ -303,11 +315,11 @@ def test_an_encoder_that_slips_in_the_pause_before_the_tare_is_noticed(make_sess
 def test_an_encoder_that_slips_in_a_session_loses_the_connection_and_so_the_zero(make_session):
     session = make_session()
     session.drive.fault_at, session.drive.fault = 2000, lambda angle_rad: angle_rad + 0.05
-    session.obey(Zero(), short(session), short(session))
-    (finished,) = session.parent.said(Finished)
+    session.obey(ZeroOrder(), short(session), short(session))
+    (finished,) = session.parent.said(SessionFinished)
     assert "ncoder jump " in finished.reason
     assert finished.device_failed is True
-    assert len(session.parent.said(Ended)) == 1
+    assert len(session.parent.said(ControlEnded)) == 1
     session.assert_safe()
 
 
@@ -324,18 +336,18 @@ def test_a_hand_may_turn_the_motor_between_sessions(make_session, speed_rad_s):
 
     session.drive.fault_at, session.drive.fault = 1, hand
     looks = [None] * 20
-    session.parent.poll = lambda timeout_s: looks.pop() if looks else Zero()
+    session.parent.poll = lambda timeout_s: looks.pop() if looks else ZeroOrder()
     done = session.parent.send
 
     def send(message):
         done(message)
-        if isinstance(message, Measured):
+        if isinstance(message, MeasurementResult):
             session.stop.request()
 
     session.parent.send = send
     session.obey()
-    assert session.parent.said(Ended) == [Ended("")]
-    (zeroed,) = session.parent.said(Measured)
+    assert session.parent.said(ControlEnded) == [ControlEnded("")]
+    (zeroed,) = session.parent.said(MeasurementResult)
     assert zeroed.values["moved_rad"] == pytest.approx(turned[-1], abs=1e-3)
 
 
@@ -344,7 +356,7 @@ def test_virtual_time_goes_on_slowly_where_a_device_waits_for_signs_of_life(
     make_session, monkeypatch, bits
 ):
     """On a line, that is: it stands still for a rig that is simulated in this process."""
-    monkeypatch.setattr("rigd.engine.control_process.SIGN_OF_LIFE_S", 0.0)
+    monkeypatch.setattr("rigd.engine.control_process.MAX_VIRTUAL_PAUSE_S", 0.0)
     session = make_session()
     session.drive.health = lambda: LineHealth(bits)
     reads = []

@@ -10,7 +10,7 @@ import pytest
 from rigd.control import close_loop
 from rigd.devices.contracts import Devices
 from rigd.engine.cycle import make_limit_monitor
-from rigd.engine.messages import Finished, Tare
+from rigd.engine.messages import SessionFinished, TareOrder
 from rigd.engine.shared_state import StateField
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp, hold
@@ -315,9 +315,9 @@ def test_a_zero_that_moves_between_two_sessions_is_refused_unless_it_is_tared(
     session = make_session()
     sensor(session, wrong_from=7301, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.05])
     job = session.order()
-    session.obey(*[job, *([Tare()] if operator_tares else []), job])
+    session.obey(*[job, *([TareOrder()] if operator_tares else []), job])
     session.assert_safe()
-    first, second = session.parent.said(Finished)
+    first, second = session.parent.said(SessionFinished)
     assert (first.outcome, first.reason) == ("complete", "")
     if operator_tares:
         assert (second.outcome, second.reason) == ("complete", "")
@@ -359,7 +359,7 @@ def test_the_motor_stays_warm_through_the_sessions_of_a_connection(make_session)
     motor(session, continuous_torque_nm=(1.5 * heat_nm2) ** 0.5, thermal_time_constant_s=1e4)
     job = session.order()
     session.obey(job, job)
-    first, second = session.parent.said(Finished)
+    first, second = session.parent.said(SessionFinished)
     assert (first.outcome, first.reason) == ("complete", "")
     assert second.outcome == "fault"
     assert "i²t" in second.reason

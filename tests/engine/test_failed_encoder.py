@@ -13,7 +13,7 @@ from rigd.control import close_loop
 from rigd.control.damper import design_damper
 from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
-from rigd.engine.messages import Ending
+from rigd.engine.messages import PostRecordPlan
 from rigd.excitation import Excitation, chirp, hold, multisine, step
 from rigd.excitation.moves import quintic
 from rigd.profile import load_profile
@@ -93,7 +93,7 @@ def run_with_failing_encoder(make_session, reference_rad, at, friction_nm, stuck
     session.devices = Devices(drive, devices.sensor, simulated=True)
     excitation = Excitation("file", {}, RATE_HZ, reference_rad, {})
     damper = design_damper(close_loop(session.profile.loop_model()))
-    session.obey(replace(session.order(excitation), ending=Ending(damper=damper)))
+    session.obey(replace(session.order(excitation), ending=PostRecordPlan(damper=damper)))
     assert not drive.inner._plant.enabled
     return session.finished, drive
 
@@ -246,7 +246,7 @@ def test_fifty_sound_sessions_end_well(make_session, seed):
         session.devices = Devices(drive, devices.sensor, simulated=True)
         excitation = Excitation("file", {}, RATE_HZ, reference_rad, {})
         order = session.order(excitation, seed=1000 * seed + number)
-        session.obey(replace(order, ending=Ending(damper=damper)))
+        session.obey(replace(order, ending=PostRecordPlan(damper=damper)))
         finished = session.finished
         if finished.reason:
             # An obstacle may hold the motor back: that is no false fault.

@@ -5,7 +5,7 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.engine.timing import SUSPENDED_S, RealClock, SuspendWatch, TickScheduler, VirtualClock
+from rigd.engine.timing import SUSPENDED_S, RealClock, SuspendMonitor, TickScheduler, VirtualClock
 
 
 class LateClock:
@@ -105,7 +105,7 @@ class SuspendableComputer:
         return self.monotonic_ns() + self.suspended_ns + 7 * 10**9
 
     def watch(self):
-        return SuspendWatch(self.monotonic_ns, self.boot_ns)
+        return SuspendMonitor(self.monotonic_ns, self.boot_ns)
 
 
 @given(
@@ -123,6 +123,6 @@ def test_a_suspend_shows_and_a_delay_between_two_readings_does_not(steps_ns, sus
 
 
 def test_this_computer_was_not_suspended_meanwhile():
-    watch = SuspendWatch()
+    watch = SuspendMonitor()
     time.sleep(0.01)
     assert watch.suspended_s() < SUSPENDED_S

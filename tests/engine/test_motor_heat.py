@@ -8,7 +8,7 @@ import pytest
 
 from rigd.engine import cycle
 from rigd.engine.cycle import make_limit_monitor, store_motor_heat, stored_motor_heat_nm2
-from rigd.engine.messages import Finished
+from rigd.engine.messages import SessionFinished
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 
@@ -87,7 +87,7 @@ def test_connections_in_a_row_add_up_on_hardware_alone(make_session, heat_file, 
             ring_down_s=0.0,
         )
         session.obey(session.order(sweep))
-        assert session.parent.said(Finished)[0].outcome == "complete"
+        assert session.parent.said(SessionFinished)[0].outcome == "complete"
         if not simulated:
             heat.append(json.loads(heat_file().read_text())["heat_nm2"])
     if simulated:

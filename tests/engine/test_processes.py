@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from rigd.engine import shared_memory_fd
-from rigd.engine.messages import Ended, MessageReader, Ready, SessionJob, encode
-from rigd.engine.processes import Child, ChildError
+from rigd.engine.messages import ControlEnded, MessageReader, ReadyToRecord, SessionJob, encode
+from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.reference import map_reference, write_reference
 from rigd.engine.workers import RECORDER
 from rigd.profile import load_profile
@@ -53,13 +53,13 @@ def pipe():
 
 def test_nobody_waits_for_the_rest_of_a_message(pipe):
     read, write = pipe
-    reader, message = MessageReader(read), Ready({"start_angle_rad": "0.1"})
+    reader, message = MessageReader(read), ReadyToRecord({"start_angle_rad": "0.1"})
     for byte in (data := encode(message))[:-1]:
         os.write(write, bytes([byte]))
         assert reader.next(0.0) is None
-    os.write(write, data[-1:] + encode(Ended("")) + data[:7])
+    os.write(write, data[-1:] + encode(ControlEnded("")) + data[:7])
     assert reader.next(0.0) == message
-    assert reader.next(None) == Ended("")
+    assert reader.next(None) == ControlEnded("")
     assert reader.next(0.01) is None
     os.close(write)
     with pytest.raises(EOFError):
@@ -75,7 +75,7 @@ def test_what_is_no_message_is_not_waited_for(pipe):
 
 @pytest.mark.process
 def test_what_is_no_message_is_told_with_the_name_of_the_process():
-    child = Child(replace(RECORDER, module="this"))  # prints the Zen of Python
+    child = ChildProcess(replace(RECORDER, module="this"))  # prints the Zen of Python
     try:
         with pytest.raises(ChildError, match="recorder process sent no message, but b'The Zen of"):
             child.poll(60.0)
@@ -86,22 +86,23 @@ def test_what_is_no_message_is_told_with_the_name_of_the_process():
 @pytest.mark.process
 def test_what_a_library_prints_does_not_stand_among_the_messages():
     says = (
-        "import os; from rigd.engine.messages import Ended; "
-        "from rigd.engine.processes import Parent; parent = Parent(); "
-        "print('of a library', flush=True); os.write(1, b'and so on'); parent.send(Ended(''))"
+        "import os; from rigd.engine.messages import ControlEnded; "
+        "from rigd.engine.processes import SupervisorConnection; "
+        "parent = SupervisorConnection(); print('of a library', flush=True); "
+        "os.write(1, b'and so on'); parent.send(ControlEnded(''))"
     )
     child = subprocess.Popen(
         [sys.executable, "-c", says, str(os.getpid())],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     output, errors = child.communicate(timeout=60)
-    assert output == encode(Ended(""))
+    assert output == encode(ControlEnded(""))
     assert errors == b"of a library\nand so on"
 
 
 @pytest.mark.process
 def test_a_process_may_be_stopped_twice():
-    child = Child(RECORDER)
+    child = ChildProcess(RECORDER)
     child.stop()
     child.stop()
     assert not child.running
@@ -114,4 +115,4 @@ def test_a_process_that_the_system_does_not_start_is_told(monkeypatch):
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
     with pytest.raises(ChildError, match=r"recorder process cannot be started .*ulimit"):
-        Child(RECORDER)
+        ChildProcess(RECORDER)

@@ -161,8 +161,8 @@ def test_touching_new_memory_is_counted():
 PRECEDENCE = """
 import json, os, resource, sys, threading
 from pathlib import Path
-from rigd.engine.processes import Child
-from rigd.engine.realtime import Precedence
+from rigd.engine.processes import ChildProcess
+from rigd.engine.realtime import RaisedPriority
 from rigd.engine.workers import RECORDER
 {before}
 
@@ -181,19 +181,19 @@ def as_child():
     return json.loads(os.read(there, 1000))
 
 told = dict(before=state())
-precedence = Precedence({priority}, {cpu}, root_folder=Path("{root}"))
-told["obtained"], told["with"] = precedence.take(), state()
+raised_priority = RaisedPriority({priority}, {cpu}, root_folder=Path("{root}"))
+told["obtained"], told["with"] = raised_priority.request(), state()
 wait = threading.Event()
 thread = threading.Thread(target=wait.wait, daemon=True)
 thread.start()
-precedence.cover()
+raised_priority.raise_new_threads()
 told["thread"] = state(thread.native_id)
 told["child"] = as_child()
 if os.access(sys.executable, os.X_OK):
-    rig_child = Child(RECORDER, cores=precedence.cores_before)
+    rig_child = ChildProcess(RECORDER, cores=raised_priority.cores_before)
     told["cores of a process of the rig"] = sorted(os.sched_getaffinity(rig_child.pid))
     rig_child.stop()
-precedence.release()
+raised_priority.restore()
 told["after"], told["thread after"] = state(), state(thread.native_id)
 wait.set()
 print(json.dumps(told))

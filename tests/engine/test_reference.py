@@ -17,11 +17,11 @@ from rigd.engine.reference import (
     ReferenceReader,
     ReferenceSpec,
     ReferenceWriter,
-    is_whole,
+    covers_reference,
     map_reference,
     write_reference,
 )
-from rigd.engine.shared_state import SharedState, StateField, Stop
+from rigd.engine.shared_state import SharedState, StateField, StopReason
 from rigd.excitation import chirp
 
 UNIT_RAD = 1e-7
@@ -69,7 +69,7 @@ def test_pieces_follow_each_other_without_a_gap():
     writer.append(np.array([10.0, 11.0]))
     writer.append(np.array([20.0]))
     assert [reader.at(tick) for tick in range(6)] == [1, 2, 3, 10, 11, 20]
-    assert shared_state[StateField.HELD] == 0
+    assert shared_state[StateField.HELD_TICKS] == 0
 
 
 def test_a_record_is_whole_with_the_last_piece_and_all_ticks_held():
@@ -77,26 +77,30 @@ def test_a_record_is_whole_with_the_last_piece_and_all_ticks_held():
     assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
     writer.append(np.array([10.0, 11.0]))
     assert [reader.at(tick) for tick in range(5, 7)] == [10, 11]
-    assert not is_whole(shared_state, 7, 43)  # there may come more
+    assert not covers_reference(shared_state, 7, 43)  # there may come more
     shared_state[StateField.LAST_SEGMENT] = 1
     assert reader.over(7)
-    assert is_whole(shared_state, 7, 43)
-    assert not is_whole(shared_state, 6, 43)
-    assert not is_whole(shared_state, 0, 43)
+    assert covers_reference(shared_state, 7, 43)
+    assert not covers_reference(shared_state, 6, 43)
+    assert not covers_reference(shared_state, 0, 43)
 
 
 def test_a_record_of_what_was_given_is_whole_at_its_end():
     shared_state = SharedState.create(shared_memory_fd())
-    assert [is_whole(shared_state, scheduled, 9) for scheduled in (0, 8, 9)] == [False, False, True]
+    assert [covers_reference(shared_state, scheduled, 9) for scheduled in (0, 8, 9)] == [
+        False,
+        False,
+        True,
+    ]
 
 
 def test_the_last_angle_is_held_until_the_next_piece():
     writer, reader, shared_state = growing()
     assert [reader.at(tick) for tick in range(6)] == [1, 2, 3, 3, 3, 3]
-    assert shared_state[StateField.HELD] == 3
+    assert shared_state[StateField.HELD_TICKS] == 3
     writer.append(np.array([10.0, 11.0, 12.0]))
     assert [reader.at(tick) for tick in range(6, 10)] == [10, 11, 12, 12]
-    assert shared_state[StateField.HELD] == 4
+    assert shared_state[StateField.HELD_TICKS] == 4
 
 
 def test_it_is_told_before_which_piece_the_angle_was_held():
@@ -106,10 +110,10 @@ def test_it_is_told_before_which_piece_the_angle_was_held():
         if tick in (2, 6):
             writer.append(np.array([10.0, 11.0]))
         reader.at(tick)
-        before.append(shared_state[StateField.HELD_BEFORE])
+        before.append(shared_state[StateField.HELD_TICKS_BEFORE_SEGMENT])
     assert before == [0] * 6 + [1] * 6  # the first piece at tick 3, the second at tick 6
-    assert shared_state[StateField.BEGUN] == 7
-    assert shared_state[StateField.HELD] == 5
+    assert shared_state[StateField.BEGUN_REFERENCE_TICKS] == 7
+    assert shared_state[StateField.HELD_TICKS] == 5
 
 
 @pytest.mark.parametrize(("room", "played"), [(4, [10, 11]), (3, [3])])
@@ -120,7 +124,7 @@ def test_a_piece_that_would_not_end_with_the_record_is_not_begun(room, played):
     writer.append(np.array([10.0, 11.0]))
     assert not reader.waits(5)
     assert [reader.at(tick) for tick in range(5, 3 + room)] == played
-    assert shared_state[StateField.BEGUN] == (5 if len(played) > 1 else 0)
+    assert shared_state[StateField.BEGUN_REFERENCE_TICKS] == (5 if len(played) > 1 else 0)
 
 
 def test_missed_ticks_are_played_by_as_in_a_given_reference():
@@ -130,7 +134,7 @@ def test_missed_ticks_are_played_by_as_in_a_given_reference():
     assert reader.at(8) == 12  # three ticks after the end
     writer.append(np.array([20.0, 21.0]))
     assert [reader.at(tick) for tick in (9, 10)] == [20, 21]
-    assert shared_state[StateField.HELD] == 3
+    assert shared_state[StateField.HELD_TICKS] == 3
 
 
 def test_the_end_comes_after_all_that_is_planned():
@@ -185,7 +189,7 @@ def test_every_angle_of_a_piece_comes_in_its_order(pieces, missed):
             writer.append(np.arange(told + 1, told + length + 1))
             told += length
         followed.append((tick, reader.at(tick)))
-        held = shared_state[StateField.HELD]
+        held = shared_state[StateField.HELD_TICKS]
         assert followed[-1][1] == min(tick - held + 1, told)
     values = [value for _, value in followed]
     assert values == sorted(values)
@@ -218,7 +222,7 @@ def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
     assert session.finished.counts["scheduled"] == len(samples) == expected.size
     reference_rad = samples["angle_reference_rad"]
     assert reference_rad - reference_rad[0] == pytest.approx(expected, abs=1e-12)
-    assert session.shared_state[StateField.HELD] == 0
+    assert session.shared_state[StateField.HELD_TICKS] == 0
     session.assert_safe()
 
 
@@ -227,7 +231,7 @@ def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_sign
     make_session, monkeypatch, bits, held
 ):
     """A drive on a line takes a host that is silent for 5 s for dead, the torque being on."""
-    monkeypatch.setattr("rigd.engine._session_sequence.SIGN_OF_LIFE_S", 0.1)
+    monkeypatch.setattr("rigd.engine._session_sequence.MAX_VIRTUAL_PAUSE_S", 0.1)
     session = make_session()
     session.drive.health = lambda: LineHealth(bits)
     spec = write_reference(shared_memory_fd(), np.zeros(2000), 300)
@@ -241,7 +245,7 @@ def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_sign
     planner.start()
     session.obey(SessionJob(session.profile, spec))
     planner.join()
-    ticks_held = session.shared_state[StateField.HELD]
+    ticks_held = session.shared_state[StateField.HELD_TICKS]
     assert (ticks_held > 0) == held
     assert ticks_held < 12
     assert session.finished.outcome == "complete"
@@ -253,7 +257,7 @@ def test_a_stop_ends_the_wait_for_a_piece(make_session):
     session = make_session()
     spec = ReferenceSpec(write_reference(shared_memory_fd(), np.zeros(900)).fd, 900, 300)
     stopping = threading.Timer(
-        0.5, lambda: session.shared_state.__setitem__(StateField.STOP, Stop.OPERATOR)
+        0.5, lambda: session.shared_state.__setitem__(StateField.STOP, StopReason.OPERATOR)
     )
     stopping.start()
     session.obey(SessionJob(session.profile, spec))

@@ -10,8 +10,8 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
-from rigd.engine.messages import Connected, Finished, Ready
-from rigd.engine.shared_state import Phase, StateField, Stop
+from rigd.engine.messages import DevicesConnected, ReadyToRecord, SessionFinished
+from rigd.engine.shared_state import Phase, StateField, StopReason
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import hold
 from rigd.session.layout import Status, decode_samples
@@ -53,7 +53,7 @@ def test_the_reference_starts_where_the_motor_stands_and_follows_the_excitation(
 
 def test_the_tare_takes_the_offset_away(make_session):
     session = make_session().run()
-    ready = session.parent.said(Ready)[0].tare
+    ready = session.parent.said(ReadyToRecord)[0].tare
     offset = session.profile.rig.simulation.offset
     axes = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
     for axis, expected in zip(axes, offset, strict=True):
@@ -89,7 +89,9 @@ def test_the_same_seed_gives_the_same_samples_and_another_one_does_not(make_sess
 def test_without_a_seed_each_session_has_a_fresh_one_and_states_it(make_session):
     session = make_session()
     session.obey(session.order(seed=None), session.order(seed=None))
-    first, second = (int(ready.tare["simulation_seed"]) for ready in session.parent.said(Ready))
+    first, second = (
+        int(ready.tare["simulation_seed"]) for ready in session.parent.said(ReadyToRecord)
+    )
     assert first != second
     samples = session.samples
     here, there = np.split(samples["coupling_torque_nm"], 2)
@@ -117,12 +119,12 @@ class StopAt(VirtualClock):
     ("action", "outcome", "words"),
     [
         (
-            lambda s: s.shared_state.__setitem__(StateField.STOP, Stop.OPERATOR),
+            lambda s: s.shared_state.__setitem__(StateField.STOP, StopReason.OPERATOR),
             "stopped",
             "operator",
         ),
         (
-            lambda s: s.shared_state.__setitem__(StateField.STOP, Stop.NO_RECORDER),
+            lambda s: s.shared_state.__setitem__(StateField.STOP, StopReason.NO_RECORDER),
             "fault",
             "recorder",
         ),
@@ -531,7 +533,7 @@ def test_settings_that_were_not_granted_are_told_and_logged(make_session):
     session.run()
     [warning] = [event for event in session.events if event.level == "warning"]
     assert "memory (refused: no), scheduling (refused: never)" in warning.message
-    assert session.parent.said(Connected)[0].realtime == session.obtained
+    assert session.parent.said(DevicesConnected)[0].realtime == session.obtained
 
 
 def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session):
@@ -603,7 +605,9 @@ def test_a_doubt_about_the_age_of_readings_is_told_once_in_each_session(make_ses
     health = session.devices.sensor.health
 
     def doubtful():
-        late = session.shared_state[StateField.SCHEDULED] > 1000 or session.parent.said(Finished)
+        late = session.shared_state[StateField.SCHEDULED] > 1000 or session.parent.said(
+            SessionFinished
+        )
         count = f"Late so far: {session.shared_state[StateField.SCHEDULED]}." if late else ""
         return replace(health(), doubt="Records are late." if late else "", doubt_count=count)
 
@@ -617,7 +621,7 @@ def test_a_doubt_about_the_age_of_readings_is_told_once_in_each_session(make_ses
     assert told[1].t_ns == 0, "in its tare"
     counts = [event.message for event in events if event.message.startswith("Late so far")]
     assert counts == ["Late so far: 2200."] * 2
-    assert [m.outcome for m in session.parent.said(Finished)] == ["complete"] * 2
+    assert [m.outcome for m in session.parent.said(SessionFinished)] == ["complete"] * 2
 
 
 def test_what_the_sensor_knows_of_the_cause_is_the_remedy(make_session):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.engine.messages import TouchJob
-from rigd.engine.touch_estimator import TouchFollower
+from rigd.engine.touch_estimator import RunningTouchEstimator
 from rigd.session.layout import SAMPLE_DTYPE, Status
 
 TOUCH = 2000
@@ -47,7 +47,7 @@ def followed():
     def follow(ends, *touches, realtime=True, off=False):
         asked, told = [], []
         job = TouchJob(None, 0, RATE_HZ, None, None, SimpleNamespace() if realtime else None)
-        follower = TouchFollower(SimpleNamespace(follow=lambda: Growing(asked)), job)
+        follower = RunningTouchEstimator(SimpleNamespace(follow=lambda: Growing(asked)), job)
         for first, last in zip([0, *ends], ends, strict=False):
             follower.take(samples(first, last, *touches, off=off and last == ends[-1]))
             while some := follower.reports():

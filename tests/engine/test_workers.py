@@ -10,7 +10,7 @@ import pytest
 from rigd.engine import messages
 from rigd.engine.workers import ONLINE_ESTIMATOR, PROCESSES, SUPERVISOR, WORKERS
 from rigd.live.address import LiveAddress
-from rigd.live.messages import LiveShown
+from rigd.live.messages import LiveSessionShown
 
 ARCHITECTURE = Path(__file__).parents[2] / "docs" / "architecture.md"
 
@@ -20,7 +20,7 @@ ARCHITECTURE = Path(__file__).parents[2] / "docs" / "architecture.md"
 )
 def test_module_and_messages_of_a_row_are_there(worker):
     assert find_spec(worker.module)
-    elsewhere = {each.__name__ for each in (LiveAddress, LiveShown)}
+    elsewhere = {each.__name__ for each in (LiveAddress, LiveSessionShown)}
     assert all(hasattr(messages, name) or name in elsewhere for name in worker.sends)
 
 

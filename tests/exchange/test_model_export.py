@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from analysis.cli.app import app
 from analysis.identify import ModalModel
-from analysis.linear_model import ModelOptions, identified_in_session, linear_model
+from analysis.linear_model import ModelOptions, identify_session, linear_model
 from rigd.beam import Beam, Damping, Plant
 
 BAND_HZ = (0.05, 100.0)
@@ -442,8 +442,8 @@ def test_a_session_is_analysed_on_the_spot(simulated, analyze, tmp_path):
 
 @pytest.mark.process
 def test_beam_and_modal_model_of_a_session_agree_within_what_the_record_knows(simulated):
-    found = identified_in_session(simulated)
-    assert found.gate[0] == "passed"
+    found = identify_session(simulated)
+    assert found.uniform_beam_test[0] == "passed"
     beam = linear_model(found, ModelOptions(order=20, samples=0))
     refused = found.headline | {"validity": {"uniform_beam": {"status": "refused"}}}
     modal = linear_model(

@@ -19,7 +19,8 @@ from analysis.exchange import (
     read_specimen,
 )
 from analysis.models import WelchSettings
-from analysis.paper import analyse, estimate
+from analysis.paper import estimate
+from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from rigd.session import read_session
 

@@ -279,7 +279,7 @@ def brake():
 @pytest.fixture(scope="session")
 def candidates_of():
     """Fit all structures to a measurement, in the usual band: its candidate set."""
-    return lambda measurement: CandidateSet.of(measurement, (), BAND_HZ)
+    return lambda measurement: CandidateSet.from_measurement(measurement, (), BAND_HZ)
 
 
 @pytest.fixture(scope="session")
@@ -302,4 +302,4 @@ def candidates():
 @pytest.fixture(scope="session")
 def decimation():
     """Decimation of a record at 1 kHz to the usual band."""
-    return Comparison.of(session("VI").measured(), BAND_HZ).decimation
+    return Comparison.from_measurement(session("VI").measured(), BAND_HZ).decimation

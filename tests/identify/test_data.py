@@ -31,7 +31,7 @@ RECORD = SimpleNamespace(
 
 
 def test_a_record_is_taken_over():
-    measurement = Measurement.of_record(RECORD)
+    measurement = Measurement.from_record(RECORD)
     assert measurement.name == "session.mcap"
     assert measurement.delay_s == pytest.approx(3e-4)  # by how much the torque is older
     assert measurement.tool_inertia_kg_m2 == 1e-5
@@ -78,13 +78,13 @@ def test_an_encoder_that_shows_motion_is_read_as_it_is(pattern, reference_rad):
 def test_a_motor_that_was_held_excites_nothing():
     held = SimpleNamespace(**vars(RECORD) | {"metadata": {"excitation": "hold"}})
     with pytest.raises(MeasurementError, match="the motor was held"):
-        Measurement.of_record(held)
+        Measurement.from_record(held)
 
 
 def test_its_masks_and_its_first_angle():
     known = np.arange(300) % 10 != 3
     masks = {"angle_known": known, "torque_known": known}
-    measurement = Measurement.of_record(
+    measurement = Measurement.from_record(
         SimpleNamespace(**vars(RECORD) | masks | {"rest_angle_rad": None})
     )
     assert measurement.known_torque_fraction == pytest.approx(0.9)

@@ -35,7 +35,7 @@ def swept(duration_s, stop_hz, amplitude_rad=0.025, rest_s=1.0, after_s=3.0):
 def compared(angle_rad):
     known = np.ones(angle_rad.size, dtype=bool)
     zero = np.zeros(angle_rad.size)
-    return Comparison.of(
+    return Comparison.from_measurement(
         Measurement("m", angle_rad, zero, RATE_HZ, LINK, known, known, 0.0), (0.0, 50.0)
     )
 

@@ -153,7 +153,7 @@ def test_finite_elements_of_the_uniform_beam_are_its_exact_modes(plain):
 def assert_stated(cause):
     """With a unit, and with a size in words."""
     assert cause.unit
-    assert any(character.isdigit() for character in cause.words)
+    assert any(character.isdigit() for character in cause.phrase)
 
 
 FURTHER = pytest.mark.further

@@ -110,7 +110,9 @@ def test_a_reference_may_end_anywhere():
 def test_a_drift_does_not_keep_the_reference_from_being_followed(controlled):
     measured = controlled("III", 2)
     drift = np.linspace(0.0, 0.2, measured.angle_rad.size)
-    comparison = Comparison.of(replace(measured, angle_rad=measured.angle_rad + drift), (0.0, 50.0))
+    comparison = Comparison.from_measurement(
+        replace(measured, angle_rad=measured.angle_rad + drift), (0.0, 50.0)
+    )
     assert comparison.coherent_rad() is not comparison.angle_rad
 
 
@@ -128,11 +130,11 @@ def test_unknown_torques_do_not_count_under_a_controller_either(controlled):
 def test_a_reference_that_does_not_explain_the_angle_is_not_believed(sessions, references):
     measured = sessions("III").measured()
     other = np.random.default_rng(0).normal(size=measured.angle_rad.size)
-    comparison = Comparison.of(replace(measured, reference_rad=other), (0.0, 50.0))
+    comparison = Comparison.from_measurement(replace(measured, reference_rad=other), (0.0, 50.0))
     plant = fit(measured, "III").plant
     assert comparison.use_reference_coherent_angle(plant) is comparison
     explained = replace(measured, reference_rad=references(measured.angle_rad.size))
-    comparison = Comparison.of(explained, (0.0, 50.0))
+    comparison = Comparison.from_measurement(explained, (0.0, 50.0))
     assert comparison.use_reference_coherent_angle(plant) is not comparison
 
 
@@ -206,14 +208,14 @@ def test_a_first_wrong_beam_does_not_decide_what_followed_no_reference(in_narrow
 def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
     unknown = np.arange(30_000, 30_050)
     measured = controlled("III", 1, unknown_torque=unknown)
-    comparison = Comparison.of(measured, (0.0, 50.0))
+    comparison = Comparison.from_measurement(measured, (0.0, 50.0))
     found = fit_record(measured, [STRUCTURES["III"]])
     plant = found.fits[0].plant
     first = comparison.use_reference_coherent_angle(plant)
-    assert first.renewed(plant, found.noise) is first
-    other = first.renewed(
+    assert first.with_reestimated_angle(plant, found.noise) is first
+    other = first.with_reestimated_angle(
         replace(plant, beam=replace(LINK, density_kg_per_m=5.2e-3)), found.noise
-    ).renewed(plant, found.noise)
+    ).with_reestimated_angle(plant, found.noise)
     assert other.angle_rad + other.incoherent_rad == pytest.approx(
         first.angle_rad + first.incoherent_rad
     )
@@ -221,17 +223,19 @@ def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
         retained = each.torque_nm[each.retained] + each.incoherent_nm
         assert retained == pytest.approx(comparison.torque_nm[comparison.retained])
     # Nothing was taken out there.
-    assert comparison.renewed(plant, found.noise) is comparison
+    assert comparison.with_reestimated_angle(plant, found.noise) is comparison
 
 
 @pytest.mark.fit
 def test_what_rings_in_narrow_bands_is_followed_with_the_torque_it_makes(in_narrow_bands):
     loaded = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4)
     plant = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4)
-    first = Comparison.of(in_narrow_bands, (0.0, 50.0)).use_reference_coherent_angle(plant)
+    first = Comparison.from_measurement(in_narrow_bands, (0.0, 50.0)).use_reference_coherent_angle(
+        plant
+    )
     noise = fit_record(in_narrow_bands, [STRUCTURES["III"]]).noise
-    wrong = first.renewed(Plant(LINK, DAMPED), noise)
-    told = wrong.renewed(plant, noise)
+    wrong = first.with_reestimated_angle(Plant(LINK, DAMPED), noise)
+    told = wrong.with_reestimated_angle(plant, noise)
     assert loaded.tip_mass_kg == plant.tip_mass_kg
     rest, told_rest = (np.std(each.incoherent_rad[each.retained]) for each in (first, told))
     assert told_rest < 0.2 * rest

@@ -2,7 +2,7 @@
 
 import pytest
 
-from analysis.identify._finding import MODEL_INDEPENDENT_KINDS, Finding, doubted
+from analysis.identify._finding import MODEL_INDEPENDENT_KINDS, Finding, with_doubt
 from analysis.identify._model_check import mark_doubtful_findings
 
 
@@ -24,7 +24,7 @@ from analysis.identify._model_check import mark_doubtful_findings
     ],
 )
 def test_a_doubted_finding_is_no_fact_and_has_no_interval(sentence, bare):
-    found = doubted(Finding("delay", sentence, 1.0, (0.9, 1.1), "s", "Look."), "it rains")
+    found = with_doubt(Finding("delay", sentence, 1.0, (0.9, 1.1), "s", "Look."), "it rains")
     assert found.sentence == f"Not established, because it rains: {bare}"
     assert (found.value, found.interval, found.remedy) == (1.0, None, "Look.")
 
@@ -32,7 +32,7 @@ def test_a_doubted_finding_is_no_fact_and_has_no_interval(sentence, bare):
 @pytest.mark.parametrize("kind", sorted(MODEL_INDEPENDENT_KINDS))
 def test_what_is_seen_in_the_record_stays_a_fact(kind):
     found = Finding(kind, "It is there (1 to 2; 95 %).", 1.0, (1.0, 2.0), "1", "")
-    assert doubted(found, "it rains") is found
+    assert with_doubt(found, "it rains") is found
 
 
 def test_a_finding_on_a_flagged_parameter_is_no_fact():

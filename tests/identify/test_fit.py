@@ -5,7 +5,7 @@ import pytest
 from cases import further
 
 from analysis.identify import SETTINGS, Comparison, MeasurementError, Objective, fit_record
-from analysis.identify.parametrization import Steps, Unknowns
+from analysis.identify.parametrization import StepRule, Unknowns
 from analysis.identify.residual_tests import whiteness
 from analysis.models import STRUCTURES
 from analysis.optimizer import descend
@@ -60,7 +60,7 @@ def test_with_noise_within_its_own_error(sessions, true_parameters, name):
     assert found.std["alpha"] == (0.0 if name == "III" else pytest.approx(3e-3, abs=3e-3))
     assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.05)
     assert not found.at_bounds
-    assert not found.ringing.significant
+    assert not found.ringing.is_significant
 
 
 def test_a_far_wrong_beam_is_found(sessions, true_parameters):
@@ -103,7 +103,7 @@ def test_a_beam_that_rings_from_the_start(sessions, true_parameters, name):
     assert_exact(fit(shaken.measured(), name), true_parameters(name), relative=2e-5)
     found = fit(shaken.measured(noise_nm=1e-2, seed=12), name)
     assert_within(found, true_parameters(name))
-    assert found.ringing.significant
+    assert found.ringing.is_significant
     assert found.ringing.amplitude_nm[0] > 0.05
 
 
@@ -182,7 +182,7 @@ def test_a_hum_is_no_ringing(sessions, name, hz, amplitude_nm):
         analysis = fit_record(noisy.measured(noise_nm=1e-2, seed=4), [STRUCTURES[name]])
         ringing = analysis.fits[0].ringing
         assert len(analysis.lines) == 1
-        assert ringing.significant == shaken
+        assert ringing.is_significant == shaken
         assert ringing.degrees_of_freedom == 6
         if shaken:
             assert ringing.amplitude_nm[0] == pytest.approx(quiet.amplitude_nm[0], rel=0.02)
@@ -252,8 +252,8 @@ def test_the_wrong_structures_are_far_off(all_seven):
 def test_no_descent_from_elsewhere_ends_lower(sessions, name):
     measurement = sessions("VI").measured(noise_nm=1e-2, seed=9)
     analysis = fit_record(measurement, [STRUCTURES[name]])
-    comparison = Comparison.of(measurement, (0.0, 50.0))
-    unknowns = Unknowns.of(STRUCTURES[name], Plant(LINK, Damping()), SETTINGS)
+    comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
+    unknowns = Unknowns.for_structure(STRUCTURES[name], Plant(LINK, Damping()), SETTINGS)
     objective = Objective(comparison, unknowns)
     weight = analysis.noise.weight
     rng = np.random.default_rng(6)
@@ -264,7 +264,7 @@ def test_no_descent_from_elsewhere_ends_lower(sessions, name):
         found = descend(
             lambda x: objective.normal_equations(x, weight),
             unknowns.start(np.array(sizes)),
-            Steps.of(unknowns),
+            StepRule.for_unknowns(unknowns),
             relative_tolerance=1e-10,
             max_evaluations=40,
         )
@@ -381,7 +381,7 @@ def test_what_moved_in_a_gap_of_the_angle_biases_nothing(sessions, moved_unseen,
     (found,) = analysis.fits
     assert_within(found, true_parameters("VI"))
     counts = analysis.noise.counts
-    assert whiteness(found.residual[counts], analysis.comparison.frequency_hz[counts]).white
+    assert whiteness(found.residual[counts], analysis.comparison.frequency_hz[counts]).is_white
     # Nothing of what moved counts as noise.
     at_rest = fit(sessions("VI").measured(noise_nm=5e-4, **unseen), "VI")
     for name in found.determined:

@@ -33,8 +33,10 @@ class Fitted:
 
 def test_the_first_flag_stays():
     number = Estimate(0.98, 0.01, (0.96, 1.0))
-    assert number.flagged(None) is number
-    told = number.flagged(ORDER_NOT_DETERMINED_REASON).flagged("part of the record is unexplained")
+    assert number.with_flag(None) is number
+    told = number.with_flag(ORDER_NOT_DETERMINED_REASON).with_flag(
+        "part of the record is unexplained"
+    )
     assert told.flag == ORDER_NOT_DETERMINED_REASON
     assert (told.value, told.std, told.interval_95) == (0.98, 0.01, (0.96, 1.0))
 

@@ -51,7 +51,7 @@ def test_a_hum_on_a_mode_is_found_and_moves_nothing(sessions, quiet, offset_hz, 
     assert line.amplitude_nm == pytest.approx(amplitude_nm, abs=3e-4)
     assert analysis.compared.all()  # nothing of the resonance is left out
     assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.1)
-    assert not found.ringing.significant
+    assert not found.ringing.is_significant
     for name in quiet.determined:
         assert abs(found.parameters[name] - quiet.parameters[name]) < quiet.std[name], name
 
@@ -76,12 +76,14 @@ def test_a_hum_while_the_beam_rings(sessions):
     analysis = analysed(session, "IV")
     (line,), (found,) = analysis.lines, analysis.fits
     assert line.amplitude_nm == pytest.approx(0.01, abs=4e-4)
-    assert found.ringing.significant
+    assert found.ringing.is_significant
     assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_mode_that_a_fit_has_beyond_the_band(sessions):
-    comparison = Comparison.of(sessions("VI").measured(noise_nm=NOISE_NM, seed=21), (0.0, 50.0))
+    comparison = Comparison.from_measurement(
+        sessions("VI").measured(noise_nm=NOISE_NM, seed=21), (0.0, 50.0)
+    )
     pole = Pole(3, complex(-2.0, 2 * np.pi * 80), np.zeros(0))
     plant, nothing = Plant(comparison.measurement.beam, Damping()), np.zeros(comparison.samples)
     noise = estimate_noise(

@@ -14,7 +14,7 @@ MODE_1 = NonlinearTerm("cubic stiffness", 1)
 
 @pytest.fixture(scope="module")
 def forces(sessions, plants, link):
-    comparison = Comparison.of(sessions("III").measured(), (0.0, 50.0))
+    comparison = Comparison.from_measurement(sessions("III").measured(), (0.0, 50.0))
     return comparison, NonlinearForceSpectra(comparison, Plant(link, plants["III"]))
 
 
@@ -53,7 +53,7 @@ def test_which_harmonics_a_force_makes(link, plants, kind, multiples):
     angle = 0.05 * np.sin(4 * np.pi * t) * rise
     known = np.ones(t.size, dtype=bool)
     measurement = Measurement("m", angle, np.zeros(t.size), 1000.0, link, known, known, 0.0)
-    comparison = Comparison.of(measurement, (0.0, 50.0))
+    comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
     column = NonlinearForceSpectra(comparison, Plant(link, plants["III"])).column(
         NonlinearTerm(kind, 1)
     )

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper import FrequencyResponseError, analyse
+from analysis.paper import FrequencyResponseError
+from analysis.paper.welch_analysis import analyse
 
 pytestmark = pytest.mark.fit
 

@@ -19,7 +19,7 @@ def start(unknowns):
 @pytest.mark.parametrize("free", [SETTINGS, (), SETTINGS[:1], SETTINGS[1:3], SETTINGS[3:]])
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_derivatives(name, free):
-    unknowns = Unknowns.of(STRUCTURES[name], NOMINAL, free)
+    unknowns = Unknowns.for_structure(STRUCTURES[name], NOMINAL, free)
     x = start(unknowns) + np.random.default_rng(8).normal(scale=0.1, size=len(unknowns.names))
 
     def estimates(at, logarithmic):
@@ -43,7 +43,7 @@ def test_derivatives(name, free):
 
 def test_damping_that_a_plant_lacks_comes_in_small_and_of_order_one():
     plant = Plant(NOMINAL.beam, Damping(zeta=7e-5, alpha=0.9), 2e-4, 2e-5)
-    unknowns = Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS)
+    unknowns = Unknowns.for_structure(STRUCTURES["VI"], NOMINAL, SETTINGS)
     found = unknowns.plant(unknowns.vector(plant))
     first, _ = undamped_frequencies_rad_s(NOMINAL.beam, 2)
     ratio = plant.beam.density_over_stiffness
@@ -55,7 +55,7 @@ def test_damping_that_a_plant_lacks_comes_in_small_and_of_order_one():
 
 
 def test_what_is_not_free_stays_as_it_is():
-    unknowns = Unknowns.of(STRUCTURES["III"], NOMINAL, ())
+    unknowns = Unknowns.for_structure(STRUCTURES["III"], NOMINAL, ())
     plant = unknowns.plant(start(unknowns))
     assert plant.beam.density_kg_per_m == pytest.approx(NOMINAL.beam.density_kg_per_m)
     assert plant.beam.bending_stiffness_n_m2 == NOMINAL.beam.bending_stiffness_n_m2
@@ -64,7 +64,7 @@ def test_what_is_not_free_stays_as_it_is():
 
 
 def test_an_order_alone_leaves_loss_and_stiffness_at_the_mode():
-    unknowns = Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS)
+    unknowns = Unknowns.for_structure(STRUCTURES["VI"], NOMINAL, SETTINGS)
     x = start(unknowns)
     first, second = undamped_frequencies_rad_s(NOMINAL.beam, 2)
 
@@ -91,7 +91,7 @@ def test_an_order_alone_leaves_loss_and_stiffness_at_the_mode():
 
 def test_starts_lie_within_the_bounds():
     for structure in STRUCTURES.values():
-        unknowns = Unknowns.of(structure, NOMINAL, SETTINGS)
+        unknowns = Unknowns.for_structure(structure, NOMINAL, SETTINGS)
         lower, upper = unknowns.bounds
         x = start(unknowns)
         assert ((lower <= x) & (x <= upper)).all()

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.identify import SETTINGS
-from analysis.identify.parametrization import VANISHING_LOSS, Steps, Unknowns
+from analysis.identify.parametrization import VANISHING_LOSS, StepRule, Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, Plant
 
 NOMINAL = Plant(Beam(0.98, 4.7e-3, 0.090275), Damping())
-UNKNOWNS = Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS)
-STEPS = Steps.of(UNKNOWNS)
+UNKNOWNS = Unknowns.for_structure(STRUCTURES["VI"], NOMINAL, SETTINGS)
+STEPS = StepRule.for_unknowns(UNKNOWNS)
 REST = [0.01, -0.02, 0.1, 0.001]
 
 losses = st.floats(-15.0, 6.0)
@@ -102,7 +102,7 @@ def test_what_all_but_vanishes_may_vanish_and_keeps_its_order():
 
 
 def test_without_a_free_order_steps_are_straight():
-    steps = Steps.of(Unknowns.of(STRUCTURES["III"], NOMINAL, SETTINGS))
+    steps = StepRule.for_unknowns(Unknowns.for_structure(STRUCTURES["III"], NOMINAL, SETTINGS))
     x, step = np.array([1.0, 1.0, *REST]), np.array([2.0, -3.0, 0.1, 0.1, 0.1, 0.1])
     assert steps.dampings == ()
     assert steps.losses == (0, 1)
@@ -111,13 +111,15 @@ def test_without_a_free_order_steps_are_straight():
 
 @pytest.mark.parametrize("structure", ["VI", "III"])
 def test_from_next_to_nothing_a_loss_grows_by_what_is_asked_of_it(structure):
-    unknowns = Unknowns.of(STRUCTURES[structure], NOMINAL, SETTINGS)
-    steps = Steps.of(unknowns, VANISHING_LOSS)
+    unknowns = Unknowns.for_structure(STRUCTURES[structure], NOMINAL, SETTINGS)
+    steps = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
     place = unknowns.names.index("zeta")
     x, step = unknowns.vector(NOMINAL), np.zeros(len(unknowns.names))
     # A loss of 1e-8 is to become 1e-5: a step of its logarithm by 999 would end at the upper bound.
     x[place], step[place] = math.log(1e-8), 999.0
     assert math.exp(steps.end(x, step)[place]) == pytest.approx(1e-5, rel=1e-3)
-    assert Steps.of(unknowns).end(x, step)[place] == steps.upper[place]
+    assert StepRule.for_unknowns(unknowns).end(x, step)[place] == steps.upper[place]
     x[place], step[place] = math.log(1e-2), 0.5
-    assert steps.end(x, step) == pytest.approx(Steps.of(unknowns).end(x, step), abs=1e-12)
+    assert steps.end(x, step) == pytest.approx(
+        StepRule.for_unknowns(unknowns).end(x, step), abs=1e-12
+    )

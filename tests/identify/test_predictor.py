@@ -25,7 +25,7 @@ def link():
     "more", [{}, {"delay_s": 3e-4, "tool_inertia_kg_m2": 1e-5}, {"offsets": OFFSETS}]
 )
 def test_the_torque_of_an_independent_synthesis(sessions, link, plant, more):
-    compared = Comparison.of(sessions("VI", **more).measured(), (0.0, 50.0))
+    compared = Comparison.from_measurement(sessions("VI", **more).measured(), (0.0, 50.0))
     renamed = {name.replace("offsets", "stiffness_offsets"): value for name, value in more.items()}
     torque, _ = compared.prediction.torque(Plant(link, plant.damping, **renamed))
     measured = compared.torque_nm[compared.retained]

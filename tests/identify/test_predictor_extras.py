@@ -77,5 +77,5 @@ def test_between_the_samples_it_is_the_same():
 def test_a_filter_that_the_file_states_is_part_of_the_model(sessions):
     measurement = replace(sessions("III").measured(), filter_time_constant_s=1e-3)
     assert measurement.nominal.filter_time_constant_s == 1e-3
-    unknowns = Unknowns.of(STRUCTURES["III"], measurement.nominal, SETTINGS)
+    unknowns = Unknowns.for_structure(STRUCTURES["III"], measurement.nominal, SETTINGS)
     assert unknowns.plant(unknowns.start(np.log([1e-3, 1e-2]))).filter_time_constant_s == 1e-3

@@ -4,7 +4,7 @@ import pytest
 from analysis.identify import SETTINGS, Comparison, Objective
 from analysis.identify._refit import Refit
 from analysis.identify.noise import NoiseSpectrum
-from analysis.identify.parametrization import VANISHING_LOSS, Steps, Unknowns
+from analysis.identify.parametrization import VANISHING_LOSS, StepRule, Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, Plant
 
@@ -16,8 +16,8 @@ NOMINAL = Plant(Beam(0.98, 4.7e-3, 0.090275), Damping())
 @pytest.fixture(scope="module")
 def objective(sessions):
     measurement = sessions("VI", shaken=True).cut(5000).measured(noise_nm=1e-2)
-    comparison = Comparison.of(measurement, (0.0, 50.0))
-    return Objective(comparison, Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS))
+    comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
+    return Objective(comparison, Unknowns.for_structure(STRUCTURES["VI"], NOMINAL, SETTINGS))
 
 
 def test_the_gradient_is_that_of_the_cost(objective):
@@ -59,8 +59,8 @@ def test_torques_are_put_anew_where_a_descent_has_ended(
 ):
     lost = np.arange(2000, 2100, 7)
     measurement = sessions("VI", shaken=True).cut(5000).measured(noise_nm=1e-2, unknown_torque=lost)
-    comparison = Comparison.of(measurement, (0.0, 50.0))
-    unknowns = Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS)
+    comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
+    unknowns = Unknowns.for_structure(STRUCTURES["VI"], NOMINAL, SETTINGS)
     evaluated = []
     evaluate = Objective.normal_equations
     monkeypatch.setattr(
@@ -71,7 +71,7 @@ def test_torques_are_put_anew_where_a_descent_has_ended(
     _, found = Objective(comparison, unknowns).minimum(
         unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8])),
         np.ones(comparison.frequency_hz.size),
-        Steps.of(unknowns, VANISHING_LOSS),
+        StepRule.for_unknowns(unknowns, VANISHING_LOSS),
         relative_tolerance=1e-8,
         max_evaluations=most,
         hopeless=hopeless,

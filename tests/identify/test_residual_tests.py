@@ -24,7 +24,7 @@ def test_noise_is_white_and_the_band_means_what_it_says():
     found = [whiteness(noise(seed), HZ) for seed in range(300)]
     outside = np.mean([test.distance > test.band for test in found])
     assert 0.01 < outside < 0.10
-    assert np.mean([test.white for test in found]) > 0.98
+    assert np.mean([test.is_white for test in found]) > 0.98
     assert not any(test.loud for test in found)
 
 
@@ -38,7 +38,7 @@ def test_the_cumulative_periodogram_is_the_share_of_the_power():
 
 def test_a_tilted_spectrum_is_not_white():
     found = whiteness(noise(2) * np.linspace(1.3, 0.7, BINS), HZ)
-    assert not found.white
+    assert not found.is_white
     assert found.distance > 2 * found.band
 
 
@@ -47,7 +47,7 @@ def test_what_is_loud_is_found_where_it_is():
     residual[1600:1616] *= 4
     found = whiteness(residual, HZ)
     assert found.loud
-    assert not found.white
+    assert not found.is_white
     low, high = found.loudest_hz
     assert low < HZ[1616]
     assert high > HZ[1600]

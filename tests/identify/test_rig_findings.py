@@ -143,7 +143,7 @@ def test_clocks_that_differ_much_are_named_and_leave_no_number_without_a_flag():
     ],
 )
 def test_a_sign_and_a_unit_are_seen_at_once(factor, kinds):
-    comparison = Comparison.of(record(factor), (0.0, 50.0))
+    comparison = Comparison.from_measurement(record(factor), (0.0, 50.0))
     assert [finding.kind for finding in sign_and_unit_findings(comparison)] == kinds
 
 
@@ -315,6 +315,6 @@ def test_a_drive_that_repeats_has_a_period():
     made = record()
     t = np.arange(TICKS) / RATE_HZ
     lines = sum(np.cos(2 * np.pi * k * t / 7.2 + k * k) for k in range(1, 200, 3))
-    repeating = Comparison.of(replace(made, angle_rad=1e-3 * lines), (0.0, 50.0))
+    repeating = Comparison.from_measurement(replace(made, angle_rad=1e-3 * lines), (0.0, 50.0))
     assert repetition_period_s(repeating) == pytest.approx(7.2, abs=0.01)
-    assert repetition_period_s(Comparison.of(made, (0.0, 50.0))) == 0.0
+    assert repetition_period_s(Comparison.from_measurement(made, (0.0, 50.0))) == 0.0

@@ -59,12 +59,12 @@ def test_step_of_the_stiffness_is_found(score_of, sessions, plants, link):
     still = sessions("III")
     more = slipped_torque(still.angle_rad, link, plants["III"])
     step = score_of(replace(still, torque_nm=still.torque_nm + more))
-    assert step.named
+    assert step.is_significant
     assert step.instant_s == pytest.approx(AT_S, abs=2)
     assert step.relative_change == pytest.approx(CHANGE, rel=0.5)
 
 
 def test_none_is_named_where_nothing_changes(score_of, sessions):
     step = score_of(sessions("III"))
-    assert not step.named
+    assert not step.is_significant
     assert step.score < 13

@@ -60,7 +60,7 @@ def test_whether_a_sweep_reached_the_second_mode(sessions, highest_hz, covered):
     phase = 2 * np.pi * (0.05 * t + (highest_hz - 0.05) * t**2 / 120)
     angle = np.where((t >= 0) & (t < 60), 0.025 * np.sin(phase), 0.0)
     measured = type(made)(angle, made.torque_nm).measured()
-    assert is_excited(Comparison.of(measured, (0.0, 50.0)), 16.0, 2.55) is covered
+    assert is_excited(Comparison.from_measurement(measured, (0.0, 50.0)), 16.0, 2.55) is covered
 
 
 def test_a_step_is_no_sweep_over_the_second_mode(sessions):
@@ -68,7 +68,7 @@ def test_a_step_is_no_sweep_over_the_second_mode(sessions):
     t = np.arange(made.angle_rad.size) / 1000
     angle = 0.02 * (1 - np.exp(-80 * np.maximum(t - 1, 0)))
     measured = type(made)(angle, made.torque_nm).measured()
-    assert not is_excited(Comparison.of(measured, (0.0, 50.0)), 16.0, 2.55)
+    assert not is_excited(Comparison.from_measurement(measured, (0.0, 50.0)), 16.0, 2.55)
 
 
 def test_a_sweep_that_covered_the_mode_is_to_be_louder_not_wider(sessions):

@@ -146,7 +146,7 @@ def test_a_folder_without_room_for_an_index_is_listed(record_briefly, tmp_path):
 
 
 def test_an_index_that_is_locked_is_done_without(record_briefly, tmp_path, monkeypatch):
-    monkeypatch.setattr("rigd.library._index._MOST_LOCK_WAIT_S", 0.05)
+    monkeypatch.setattr("rigd.library._index._MAX_LOCK_WAIT_S", 0.05)
     record_briefly("a")
     list_sessions(tmp_path)
     holder = sqlite3.connect(tmp_path / INDEX_NAME, isolation_level=None)

@@ -16,10 +16,10 @@ from processes import children, eventually, state_of
 from rigd.beam import Beam, Damping
 from rigd.engine import Ring, shared_memory_fd
 from rigd.engine.channels import TOPICS, Channels, create_channels
-from rigd.engine.messages import Failed, MessageReader, encode
+from rigd.engine.messages import MessageReader, ProcessFailed, encode
 from rigd.engine.shared_state import LogEvent, SharedState, StateField, write_event
 from rigd.live.address import LiveAddress
-from rigd.live.messages import LiveEnd, LiveJob, LiveSession, LiveShown
+from rigd.live.messages import LiveJob, LiveSession, LiveSessionEnded, LiveSessionShown
 from rigd.session.layout import pack_sample_into, pack_timing_into
 from rigd.view import Subject
 
@@ -53,7 +53,7 @@ class Producer(threading.Thread):
         self.fds = descriptors()
         *for_rings, for_board, _ = self.fds
         rings = [
-            Ring.create(topic.record_size, capacity if topic.every else 256, fd)
+            Ring.create(topic.record_size, capacity if topic.tick_interval else 256, fd)
             for topic, fd in zip(TOPICS, for_rings, strict=True)
         ]
         self.channels = Channels(*rings, SharedState.create(for_board))
@@ -165,12 +165,12 @@ class Publisher:
         ticks = 120_000
         subject = Subject(name, RATE_HZ, ticks, (0, ticks), BEAM, Damping(zeta=1e-3), **members)
         self.send(LiveSession(subject, f"recording of {name}", begins, folder))
-        self._hear(LiveShown)
+        self._hear(LiveSessionShown)
 
     def finish(self, outcome: str = "stopped", reason: str = "The test is over.") -> None:
         """Tell it that the session is over."""
-        ends = tuple(ring.written for ring in self.producer.channels.rings)
-        self.send(LiveEnd(ends, outcome, reason))
+        ends = tuple(ring.written_count for ring in self.producer.channels.rings)
+        self.send(LiveSessionEnded(ends, outcome, reason))
 
     def send(self, message: object) -> None:
         send_message(self.process.stdin, message)
@@ -224,7 +224,7 @@ class Publisher:
         while True:
             message = self._messages.next(300.0)
             assert message is not None, "the publisher does not answer"
-            if isinstance(message, kind | Failed):
+            if isinstance(message, kind | ProcessFailed):
                 return message
 
 

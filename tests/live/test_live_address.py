@@ -21,7 +21,7 @@ pytestmark = pytest.mark.process
 
 @pytest.fixture
 def address(runtime_folder):
-    return LiveAddress.of_this_process("antenna can", grpc_port=9876, page_port=9090, server=1)
+    return LiveAddress.for_this_process("antenna can", grpc_port=9876, page_port=9090, server=1)
 
 
 def files():

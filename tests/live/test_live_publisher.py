@@ -15,7 +15,7 @@ import pytest
 from online_fits import online_fit
 from processes import eventually, has_ended, listeners, sockets
 
-from rigd.engine.messages import Failed
+from rigd.engine.messages import ProcessFailed
 from rigd.engine.shared_state import StateField
 from rigd.live.address import LiveAddress, find
 from rigd.live.messages import LiveFit, LiveJob
@@ -290,13 +290,13 @@ def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, star
     shared_state = producer.channels.shared_state
     assert eventually(lambda: producer.tick > 5000)
     producer.stop()
-    assert eventually(lambda: shared_state[StateField.LIVE_SEEN] == producer.tick)
+    assert eventually(lambda: shared_state[StateField.LIVE_SAMPLES_SEEN] == producer.tick)
     before = producer.dropped
     first.process.kill()
     first.process.wait()
     producer.go_on(3000)
     second = start_publisher(producer)
-    assert eventually(lambda: shared_state[StateField.LIVE_SEEN] == producer.tick)
+    assert eventually(lambda: shared_state[StateField.LIVE_SAMPLES_SEEN] == producer.tick)
     # An observer reads half of what a ring has; the half before it is gone.
     assert second.dropped == before + 3000 - 4000 // 2
 
@@ -319,7 +319,7 @@ def test_a_server_that_does_not_start_is_told_in_a_sentence(
     (package / "rerun").write_text(script)
     (package / "rerun").chmod(mode)
     publisher = start_publisher(PYTHONPATH=str(tmp_path))
-    assert isinstance(publisher.answer, Failed)
+    assert isinstance(publisher.answer, ProcessFailed)
     assert publisher.answer.reason.endswith(sentence)
     assert publisher.end() == (1, "", "")
 

@@ -17,7 +17,7 @@ from rigd.live.address import find
 from rigd.profile import load_profile
 from rigd.runner import Rig
 from rigd.runner import _live_view as live_view
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 from rigd.runner.session import SessionFailedError
 from rigd.runtime import StopRequest
 from rigd.session import read_session
@@ -40,12 +40,12 @@ def rig(write_profile, runtime_folder, monkeypatch):
 def order(rig, tmp_path):
     """Return the order for a session."""
 
-    def order(name: str, duration_s: float = 5.0) -> Order:
+    def order(name: str, duration_s: float = 5.0) -> SessionOrder:
         profile = rig._profile
         excitation = make_excitation(
             "hold", {"duration_s": duration_s, "rest_s": 0.0}, profile.rig.rate_hz
         )
-        return Order(profile, excitation, tmp_path / f"{name}.mcap")
+        return SessionOrder(profile, excitation, tmp_path / f"{name}.mcap")
 
     return order
 
@@ -223,7 +223,7 @@ class StillGroup:
 @pytest.mark.parametrize(("heard", "patience_s"), [(False, 60.0), (True, 5.0)])
 def test_one_that_is_only_starting_has_time_on_a_busy_computer(heard, patience_s):
     group = StillGroup()
-    view = live_view.LiveView(group, "rig")
+    view = live_view.LiveViewClient(group, "rig")
     view._is_ready = heard
     while group.started == 1:
         group.silent_s += 0.1

@@ -17,12 +17,12 @@ def run_session(publisher, name: str) -> tuple[int, int]:
     Returns with which sample it began, and how many there were when it was over.
     """
     producer = publisher.producer
-    begins = tuple(ring.written for ring in producer.channels.rings)
+    begins = tuple(ring.written_count for ring in producer.channels.rings)
     publisher.show(name, begins)
     until = producer.tick + 250
     assert eventually(lambda: producer.tick > until)
     publisher.finish()
-    return begins[-1], producer.channels.samples.written
+    return begins[-1], producer.channels.samples.written_count
 
 
 def resident_mb(pid: int) -> float:
@@ -87,7 +87,7 @@ def test_a_session_that_begins_while_the_server_is_frozen_is_shown_when_it_goes_
     server = publisher.server_pid
     os.kill(server, signal.SIGSTOP)
     assert eventually(lambda: publisher.dropped > 1000)
-    publisher.show("next", tuple(ring.written for ring in producer.channels.rings))
+    publisher.show("next", tuple(ring.written_count for ring in producer.channels.rings))
     assert eventually(lambda: publisher.dropped < 1000), "they are counted for each session"
     os.kill(server, signal.SIGCONT)
     dropped = -1

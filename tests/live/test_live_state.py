@@ -10,9 +10,9 @@ from cases import further
 from processes import eventually
 
 from rigd.beam import Beam
-from rigd.engine.shared_state import Phase, StateField, Stop
+from rigd.engine.shared_state import Phase, StateField, StopReason
 from rigd.live.messages import LiveSession
-from rigd.live.publisher import StateWatch, last_response
+from rigd.live.publisher import SessionStateReader, last_response
 from rigd.view import Subject
 from rigd.view.banner import (
     FINISHING,
@@ -32,7 +32,7 @@ PERIOD_S = 1 / 15
 
 
 def test_the_board_tells_every_state_of_a_session(channels):
-    shared_state, states = channels.shared_state, StateWatch(channels)
+    shared_state, states = channels.shared_state, SessionStateReader(channels)
 
     def state(**words):
         for name, value in words.items():
@@ -45,13 +45,13 @@ def test_the_board_tells_every_state_of_a_session(channels):
     assert state(PHASE=Phase.WAITING) == preparing("Waiting for the beam to rest.")
     assert state(PHASE=Phase.READY, GO=1) == preparing("Ready.")
     assert state(PHASE=Phase.RUNNING) == RUNNING
-    assert state(STOP=Stop.OPERATOR) == STOPPING
-    assert state(STOP=Stop.NO, PHASE=Phase.RETURNING) == RETURNING
+    assert state(STOP=StopReason.OPERATOR) == STOPPING
+    assert state(STOP=StopReason.NONE, PHASE=Phase.RETURNING) == RETURNING
     assert state(PHASE=Phase.OFF) == FINISHING
 
 
 def test_a_supervisor_that_hangs_is_told_within_a_second(channels):
-    shared_state, states, now_s = channels.shared_state, StateWatch(channels), 100.0
+    shared_state, states, now_s = channels.shared_state, SessionStateReader(channels), 100.0
     shared_state[StateField.GO], shared_state[StateField.PHASE] = 1, Phase.RUNNING
     for _ in range(100):
         now_s += PERIOD_S
@@ -88,7 +88,7 @@ def test_running_and_fault_are_shown_within_a_second(publisher, producer, receiv
     shared_state, told_s = producer.channels.shared_state, {"RUNNING": [], "FAULT": []}
     received = receive(publisher)
     for number in range(3):  # what else happens on this computer only makes it slower
-        begins = tuple(ring.written for ring in producer.channels.rings)
+        begins = tuple(ring.written_count for ring in producer.channels.rings)
         publisher.show(f"session {number}", begins)
         told_s["RUNNING"].append(time.time())
         shared_state[StateField.PHASE] = Phase.RUNNING

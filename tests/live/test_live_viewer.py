@@ -59,7 +59,7 @@ def test_it_keeps_up_through_everything(publisher, viewer, shown_s):
 
     # Sessions follow each other in it.
     publisher.finish()
-    begins = tuple(ring.written for ring in publisher.producer.channels.rings)
+    begins = tuple(ring.written_count for ring in publisher.producer.channels.rings)
     publisher.show("second", begins)
     assert eventually(lambda: shown_s() > begins[-1] * 1e-3 + 0.2)
 
@@ -81,7 +81,7 @@ def test_it_keeps_up_through_everything(publisher, viewer, shown_s):
 def test_a_computer_without_vulkan_is_told_which_package_it_lacks(tmp_path, monkeypatch, absent):
     for variable in absent:
         monkeypatch.setenv(variable, "/nonexistent")
-    nobody = LiveAddress.of_this_process("sim", grpc_port=9, page_port=9, server=1)
+    nobody = LiveAddress.for_this_process("sim", grpc_port=9, page_port=9, server=1)
     window = Viewer(nobody, tmp_path, ("--headless", "--window-size", "320x200"))
     try:
         assert eventually(lambda: window.exit_code is not None)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.models import FrequencyResponseModel
-from analysis.paper import Peak, fit_indices, peak_deviation, resonant_peaks
+from analysis.paper.welch_analysis import Peak, fit_indices, peak_deviation, resonant_peaks
 from rigd.beam import Damping
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper import FrequencyResponseError, SettingsError, analyse
+from analysis.paper import FrequencyResponseError, SettingsError
+from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from rigd.beam import transfer
 from rigd.spectral import Segmentation

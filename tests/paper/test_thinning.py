@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.models import FrequencyResponseModel, weights
-from analysis.paper import thinned
+from analysis.paper import representative_points
 
 
 @given(n=st.integers(3, 900), count=st.integers(2, 900), seed=st.integers(0, 2**32 - 1))
@@ -15,7 +15,7 @@ def test_weights_are_shared_out(n, count, seed):
     measured = rng.normal(size=n) + 1j * rng.normal(size=n)
     every = rng.random(n)
     every /= every.sum()
-    index, share = thinned(measured, every, count)
+    index, share = representative_points(measured, every, count)
     assert index.size == share.size <= max(count, 1)
     assert (np.diff(index) > 0).all()
     # Every point counts for the chosen one that is nearest, of two the later.
@@ -29,7 +29,7 @@ def test_weights_are_shared_out(n, count, seed):
 
 
 def test_flat_zero_response_is_thinned_evenly():
-    index, _ = thinned(np.zeros(1000, dtype=complex), np.full(1000, 1e-3), 100)
+    index, _ = representative_points(np.zeros(1000, dtype=complex), np.full(1000, 1e-3), 100)
     assert np.diff(index).max() <= 11
 
 
@@ -37,7 +37,7 @@ def test_flat_zero_response_is_thinned_evenly():
 def test_costs_of_models_are_kept(noisy_frf, link, paper_dampings, weighting):
     """Within 5 % of the whole cost, for all models that the paper fitted."""
     every = weights(2 * np.pi * noisy_frf.frequency_hz, weighting)
-    index, share = thinned(noisy_frf.response, every, 800)
+    index, share = representative_points(noisy_frf.response, every, 800)
     model = FrequencyResponseModel(noisy_frf.frequency_hz, link)
     for damping in paper_dampings.values():
         square = np.abs(model.evaluate(damping) - noisy_frf.response) ** 2

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.paper import band_limited, largest_oscillation_time_s, modelled_torque
+from analysis.paper.welch_analysis import band_limited, largest_oscillation_time_s, modelled_torque
 from rigd.beam import Beam, Damping, transfer
 
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)

@@ -11,7 +11,7 @@ _WITHOUT_GRAPHICS = re.compile(
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no Vulkan driver for the viewer (package mesa-vulkan-drivers)"
 
 
-class Ended(Protocol):
+class ControlEnded(Protocol):
     """A viewer that has ended."""
 
     @property
@@ -21,7 +21,7 @@ class Ended(Protocol):
     def last_log_lines(self) -> str: ...
 
 
-def viewer_ended(viewer: Ended) -> NoReturn:
+def viewer_ended(viewer: ControlEnded) -> NoReturn:
     """End a test whose viewer has: skipped if the computer lacks graphics, failed otherwise."""
     if viewer.without_graphics:
         pytest.skip(NO_GRAPHICS)

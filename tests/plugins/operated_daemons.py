@@ -346,10 +346,10 @@ def shown_status(status):
 def run_processes_as_threads(monkeypatch):
     """Have the processes of every rig be threads of this one, with a drive that is watched."""
     for module in (control, recorder):
-        monkeypatch.setattr(module, "Parent", lambda: _current.parent)
+        monkeypatch.setattr(module, "SupervisorConnection", lambda: _current.parent)
     monkeypatch.setattr(recorder, "ignore_signals", lambda: None)
     monkeypatch.setattr(recorder, "SessionWriter", open_writer)
     monkeypatch.setattr(control, "StopRequest", QuietStop)
-    monkeypatch.setattr(control, "collect_no_garbage", lambda: "off")
+    monkeypatch.setattr(control, "disable_garbage_collection", lambda: "off")
     monkeypatch.setattr(control, "open_devices", open_watched)
     monkeypatch.setattr(rig_module, "ProcessGroup", ThreadGroup)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper import analyse
+from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from rigd.testing import Signals, chirp_signals, write_session
 

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from rigd.engine.messages import Connected
+from rigd.engine.messages import DevicesConnected
 from rigd.profile import load_profile
-from rigd.runner.request import Order, file_header
+from rigd.runner.request import SessionOrder, file_header
 
 SHIPPED = ("sim", "antenna_can", "antenna_serial")
 
@@ -44,8 +44,8 @@ def header_of(loaded):
 
     def header_of(text, **parameters):
         excitation = SimpleNamespace(kind="chirp", parameters=parameters, segments={})
-        connected = Connected(simulated=True, calibration={}, realtime={}, drive={})
-        order = Order(loaded(text), excitation, Path("a.mcap"))
+        connected = DevicesConnected(simulated=True, calibration={}, realtime={}, drive={})
+        order = SessionOrder(loaded(text), excitation, Path("a.mcap"))
         return file_header(order, connected, {})
 
     return header_of

@@ -25,7 +25,7 @@ import lz4.frame
 import numpy as np
 import zstandard
 
-from rigd.runtime import use_one_thread
+from rigd.runtime.background import use_one_thread
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "plugins"))  # as pytest has it
 

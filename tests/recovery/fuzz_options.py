@@ -30,7 +30,7 @@ import typer
 from fuzz_hostile import MOST_MEGABYTES, MOST_PRINTED, Outcome, run_forked
 from typer.utils import get_params_from_function
 
-from rigd.runtime import use_one_thread
+from rigd.runtime.background import use_one_thread
 
 LONG = 1_000_000
 STEP = 11

@@ -9,7 +9,7 @@ from analysis.identify import Candidate, Measurement, Selection, fit_record
 from analysis.identify.headline import headline_of_fit
 from analysis.identify.verdict import OrderVerdict, Verdict
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper import analyse
+from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from analysis.report.record_report import write_report
 from analysis.results import RecordResult, WholeRecord
@@ -46,7 +46,7 @@ def record_result(make_signals, write_session, tmp_path_factory):
         metadata={"note": HOSTILE, "operator": "<i>Rossi</i>", "specimen": "</td>"},
     )
     record = load_record(path)
-    analysis = fit_record(Measurement.of_record(record), [STRUCTURES[name] for name in TYPES])
+    analysis = fit_record(Measurement.from_record(record), [STRUCTURES[name] for name in TYPES])
     candidates = [Candidate(fit.structure, fit) for fit in analysis.fits]
     selection = Selection(
         verdict(

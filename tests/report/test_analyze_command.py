@@ -67,8 +67,8 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert (best["type"], best["weighting"]) == ("VI", "omega")
     lines = result.stdout.splitlines()
     assert len(lines) <= 30
-    (of_record,) = content["records"]
-    assert lines[0] in of_record["verdict"][0]
+    (from_record,) = content["records"]
+    assert lines[0] in from_record["verdict"][0]
     modes = [line.split() for line in lines if line[:4].strip().isdigit()]
     assert [float(cells[1]) for cells in modes] == pytest.approx(
         [mode["frequency_hz"] for mode in content["modes"] if mode["estimator"] == "record"],
@@ -80,7 +80,7 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert "Resonant peaks" not in result.stdout
     # Welch's windows bias the damping by a third; the whole record tells the plant's.
     (selected,) = (
-        fit for fit in content["fits"] if fit.get("candidate") == of_record["selected"]
+        fit for fit in content["fits"] if fit.get("candidate") == from_record["selected"]
     )  # fmt: skip
     for name, true in (("gamma", 5.5e-2), ("lambda", 0.594)):
         assert abs(selected["parameters"][name] - true) < 5 * selected["std"][name]
@@ -97,10 +97,14 @@ def test_the_numbers_of_a_part_state_it(session, tmp_path, analyze_here, without
     assert result.returncode == 0, result.stderr
     part = {"from_s": 0.0, "to_s": 60.0}
     content = json.loads((tmp_path / "fits.json").read_text())
-    (headline,), (file,), (of_record,) = content["headlines"], content["files"], content["records"]
+    (headline,), (file,), (from_record,) = (
+        content["headlines"],
+        content["files"],
+        content["records"],
+    )
     assert (headline["part"], file["part"]) == (part, part)
-    assert of_record["verdict"][0] == "All results are of 0 to 60 s of the session."
-    assert result.stdout.startswith(of_record["verdict"][0])
+    assert from_record["verdict"][0] == "All results are of 0 to 60 s of the session."
+    assert result.stdout.startswith(from_record["verdict"][0])
     assert "0 to 60 s of the session" in (tmp_path / "out" / "report.html").read_text()
     # The sweep is at 24.6 Hz then, and no fit uses what lies beyond.
     assert any("24.6" in warning for warning in file["warnings"])

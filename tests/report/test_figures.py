@@ -10,7 +10,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 from analysis.models import WelchSettings
-from analysis.paper import analyse
+from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from analysis.report import _style as style
 from analysis.report import frf_figure

@@ -55,14 +55,14 @@ def test_tables_of_a_report_hold_what_the_page_shows(record_result):
 
 def test_a_column_without_an_entry_is_left_out():
     columns = (Column("A", "a"), Column("Remark", "remark", ""))
-    table = Table.of("some_name", "Caption 5 %", columns, [(1.0, ""), (2.0, "")], ("Note.",))
+    table = Table.from_rows("some_name", "Caption 5 %", columns, [(1.0, ""), (2.0, "")], ("Note.",))
     source = latex_table(table)
     assert "Remark" not in source
     assert r"\caption{Caption 5 \%}" in source
     assert r"\label{tab:some_name}" in source
     assert r"\par\footnotesize Note." in source
     assert body(source) == [r"1 \\", r"2 \\"]
-    filled = Table.of("b", "c", columns, [(1.0, Cell("x", "x"))])
+    filled = Table.from_rows("b", "c", columns, [(1.0, Cell("x", "x"))])
     assert "A & Remark" in latex_table(filled)
 
 

@@ -170,8 +170,8 @@ def test_the_verdict_comes_first_with_its_intervals(read_page, record_result):
 
 def test_numbers_are_those_of_the_json_document(report, read_page):
     entries = json.loads((report / "analysis.json").read_text())
-    of_record = [fit for fit in entries["fits"] if fit["estimator"] == "record"]
-    (fit,) = [fit for fit in of_record if fit["type"] == "VI"]
+    from_record = [fit for fit in entries["fits"] if fit["estimator"] == "record"]
+    (fit,) = [fit for fit in from_record if fit["type"] == "VI"]
     rows = read_page.rows["parameters"][1:]
     assert len(rows) == len(fit["parameters"]) == 8
     for row, (name, value) in zip(rows, fit["parameters"].items(), strict=True):
@@ -194,7 +194,7 @@ def test_numbers_are_those_of_the_json_document(report, read_page):
         read_page.rows["correlations"][1:], covariance / np.outer(std, std), rtol=1e-12
     )
     by_type = {row["type"]: row for row in csv.DictReader(open_table(report, "structures"))}
-    for each in of_record:
+    for each in from_record:
         assert float(by_type[each["type"]]["cost"]) == each["cost"]
 
 
@@ -286,7 +286,7 @@ def test_a_size_for_an_order_that_was_only_assumed_is_not_told(record_result, pa
 
 def test_what_is_unexplained_makes_every_number_a_condition(record_result, retold, page_of):
     spoilt = headline_of_fit(
-        "VI", record_result.whole.fit, (1, 2, 3), unexplained="part is unexplained"
+        "VI", record_result.whole.fit, (1, 2, 3), unexplained_reason="part is unexplained"
     )
     told = page_of(spoilt).partition("the antenna's damping ratio would be ")[2]
     assert told

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.paper import fit_indices
+from analysis.paper.welch_analysis import fit_indices
 from analysis.report import document
 from rigd.beam import transfer
 

@@ -80,8 +80,8 @@ def test_of_absent_damping_no_fit_tells_the_order(record_result, retold):
     known = SimpleNamespace(order="alpha", status="fractional", value=0.8, interval=(0.7, 0.9))
     verdict = replace(record_result.whole.verdict, alpha=known, lambda_=absent)
     result = retold(record_result, verdict=verdict)
-    assert not result.whole.withheld
-    assert result.unsupported == {"lambda"}
+    assert not result.whole.withheld_orders
+    assert result.unsupported_orders == {"lambda"}
     _modes, (*_others, structures), (welch, _peaks) = report_tables(result)
     for table in (structures, welch):
         assert any(NOT_REPORTED_MARK in note and "λ" in note for note in table.notes)
@@ -156,7 +156,7 @@ def test_of_modes_that_do_not_show_no_damping_is_told(careful, retold, as_text):
     none = headline_of_fit("VI", careful.whole.fit, ())
     assert "damping ratio is" in told
     assert "damping ratio" not in verdict(retold(careful, headline=none))
-    misread = careful.whole.headline.doubted(CONTRADICTED_FILE_REASON)
+    misread = careful.whole.headline.with_flag_on_all(CONTRADICTED_FILE_REASON)
     assert "damping ratio" not in verdict(retold(careful, headline=misread))
 
 

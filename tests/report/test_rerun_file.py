@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from analysis.cli.app import app
 from analysis.decimation import fast_length
 from analysis.models import WelchSettings
-from analysis.paper import analyse
+from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from analysis.report import write_rerun_file
 from analysis.report.folder import OutputError
@@ -169,16 +169,16 @@ def test_it_has_the_session_the_numbers_and_a_tab_for_each(paper_analysis, paper
 
 
 @pytest.fixture(scope="module")
-def of_record(record_result, tmp_path_factory):
+def from_record(record_result, tmp_path_factory):
     path = tmp_path_factory.mktemp("rerun") / "record.rrd"
     write_rerun_file(replace(record_result, welch=None), path)
     return batches(path), path
 
 
 def test_the_whole_record_s_model_and_residual_lie_over_the_measured_response(
-    record_result, of_record
+    record_result, from_record
 ):
-    chunks, _ = of_record
+    chunks, _ = from_record
     whole = record_result.whole
     angle = whole.record.angle_rad - (whole.record.rest_angle_rad or 0.0)
     size = fast_length(len(angle))
@@ -199,8 +199,8 @@ def test_the_whole_record_s_model_and_residual_lie_over_the_measured_response(
 
 
 @pytest.mark.further  # as the response's
-def test_torque_model_and_residual_run_over_the_session(record_result, of_record):
-    chunks, _ = of_record
+def test_torque_model_and_residual_run_over_the_session(record_result, from_record):
+    chunks, _ = from_record
     record = record_result.record
     torque, residual = (
         np.concatenate(
@@ -218,8 +218,8 @@ def test_torque_model_and_residual_run_over_the_session(record_result, of_record
     np.testing.assert_allclose(times.astype(np.int64), 1e9 * record.time_s, atol=1)
 
 
-def test_the_verdict_is_read_first(record_result, of_record):
-    chunks, path = of_record
+def test_the_verdict_is_read_first(record_result, from_record):
+    chunks, path = from_record
     text = value(chunks["/whole_record/verdict"], "TextDocument:text")[0]
     for sentence in record_result.whole.verdict.sentences:
         assert sentence in text

@@ -93,7 +93,7 @@ def test_what_is_held_leaves_no_combined_interval(stated):
         selection=replace(whole.selection, headline=headline),
         fixed=("bending_stiffness_n_m2",),
     )
-    assert held.combined == {}
+    assert held.parameters_with_scales == {}
     assert "the file's values of EI, which were held" in notes_of(held)
 
 

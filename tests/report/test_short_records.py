@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper import analyse
+from analysis.paper.welch_analysis import analyse
 from analysis.record import RecordError, load_record
 from analysis.report import document_text
 from analysis.report.folder import write_new

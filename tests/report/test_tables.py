@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper import analyse
+from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from analysis.report import result_text, summary_table
 from analysis.report.table import (
@@ -36,7 +36,7 @@ from rigd.beam import modes
 )
 def test_a_value_shows_the_digits_its_spread_leaves(value, std, text, as_text):
     columns = (Column("value", "value"), Column("std", "std", std_of_previous=True))
-    table = Table.of("name", "", columns, [estimate_cells((value, std), std)])
+    table = Table.from_rows("name", "", columns, [estimate_cells((value, std), std)])
     assert as_text(terminal_table(table)).split("\n")[2].strip() == text
 
 
@@ -180,6 +180,6 @@ def test_one_table_is_shown_in_its_units_and_written_in_full(as_text):
 
 def test_rows_that_belong_together_are_ruled_off(as_text):
     columns = (Column("type", "type", TEXT_FORMAT), Column("n", "n"))
-    table = Table.of("name", "", columns, [("I", 1), ("I", 2), ("II", 3)], grouped=True)
+    table = Table.from_rows("name", "", columns, [("I", 1), ("I", 2), ("II", 3)], grouped=True)
     lines = [line.strip() for line in as_text(terminal_table(table)).splitlines()]
     assert [line.split() for line in lines[2:]] == [["I", "1"], ["I", "2"], [], ["II", "3"]]

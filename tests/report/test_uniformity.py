@@ -26,7 +26,7 @@ TOLERANT = "if each mode lies where that of a uniform beam does, to 0.1 %"
 def modal_result(record_result):
     """Result of a record whose modes are those of the modal model."""
     record = record_result.record
-    selection = select(Measurement.of_record(record))
+    selection = select(Measurement.from_record(record))
     return RecordResult(record, WholeRecord(record, selection, (0.0, 50.0)))
 
 
@@ -36,7 +36,7 @@ def unexplained_losses(modal_result, retold):
     told = modal_result.whole.headline
     reason = "no beam explains the losses"
     test = replace(told.uniform_beam, status="refused", p_value=2e-18)
-    parameters = {name: each.flagged(reason) for name, each in told.parameters.items()}
+    parameters = {name: each.with_flag(reason) for name, each in told.parameters.items()}
     tolerant = replace(told.tolerant, basis="none")
     return retold(
         modal_result,
@@ -81,7 +81,7 @@ def test_the_band_of_the_modal_model_is_what_draws_scatter(modal_result):
 
 def test_what_is_shown_first_is_the_modal_model(modal_result):
     whole = modal_result.whole
-    model = ShownModel.of(whole.headline, whole.record)
+    model = ShownModel.from_headline(whole.headline, whole.record)
     assert model.transfer is whole.headline.modal.model
     assert model.fit_percent(whole.analysis) == pytest.approx(
         whole.analysis.fit_percent(whole.fit), abs=0.2

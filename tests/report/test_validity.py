@@ -65,19 +65,19 @@ def test_every_output_with_a_damping_has_its_validity(record_result, report, as_
 
 
 def test_the_slope_is_computed_from_a_record_that_states_none(record_result):
-    of_record = record_result.validity.predicted_peak_tip_slope_rad
-    assert of_record == pytest.approx(0.41, rel=0.1)
+    from_record = record_result.validity.predicted_peak_tip_slope_rad
+    assert from_record == pytest.approx(0.41, rel=0.1)
     error = record_result.validity.linear_model_error
-    assert error == linear_model_error(of_record)
+    assert error == linear_model_error(from_record)
     by_welch = replace(record_result, whole=None).validity.predicted_peak_tip_slope_rad
-    assert by_welch == pytest.approx(of_record, rel=0.25)
+    assert by_welch == pytest.approx(from_record, rel=0.25)
     assert replace(record_result, whole=None, welch=None).validity == Validity()
 
 
 @pytest.mark.parametrize("slope", ["", "none", "nan", "-1", "inf", "1e300"])
 def test_a_statement_that_is_no_slope_does_not_count(record_result, slope):
-    of_record = record_result.validity
-    assert with_stated(record_result, slope).validity == of_record
+    from_record = record_result.validity
+    assert with_stated(record_result, slope).validity == from_record
     unknown = with_stated(RecordResult(record_result.record), slope)
     assert "unknown" in unknown.validity.sentence
 

@@ -7,7 +7,7 @@ from shipped_profile import load_shipped
 
 from rigd.excitation import make_excitation
 from rigd.runner._live_view import subject_of
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 
 
 @pytest.mark.parametrize(
@@ -25,5 +25,5 @@ from rigd.runner.request import Order
 def test_plots_are_of_the_modes_that_are_expected_in_the_band(kind, parameters, watch_fit, modes):
     profile = load_shipped("sim")
     excitation = make_excitation(kind, parameters, profile.rig.rate_hz)
-    order = Order(profile, excitation, Path("a.mcap"), watch_fit=watch_fit)
+    order = SessionOrder(profile, excitation, Path("a.mcap"), watch_fit=watch_fit)
     assert subject_of(order).fit_modes == modes

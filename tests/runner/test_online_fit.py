@@ -7,9 +7,9 @@ import pytest
 
 from rigd.engine.messages import FitReport, SearchEnded
 from rigd.engine.processes import ChildError
-from rigd.engine.shared_state import StateField, Stop
+from rigd.engine.shared_state import StateField, StopReason
 from rigd.excitation.targets import parse_target
-from rigd.runner._online_fit import FitSupervisor
+from rigd.runner._online_fit import FitClient
 
 REACHED = SearchEnded(True, "Reached: damping of mode 1 0.009, standard deviation 8e-05.", {})
 NOT_REACHED = SearchEnded(False, "Not reached within 20 s (--at-most).", {})
@@ -41,7 +41,7 @@ def test_reason_and_result_agree(ended, std, reached, reason):
     told = [each for each in (ended, of_whole_record(std)) if each is not None]
     group.__getitem__().messages.return_value = told
     search = SimpleNamespace(targets=(parse_target("damping", "1%"),))
-    fit = FitSupervisor(group, MagicMock(), MagicMock(), search)
+    fit = FitClient(group, MagicMock(), MagicMock(), search)
     fit.begin(MagicMock())
     found = fit.finish(9000, lambda: None)["search"]
     assert found["reached"] is reached
@@ -49,7 +49,7 @@ def test_reason_and_result_agree(ended, std, reached, reason):
     assert (fit.unmet_reason == "") == reached
 
 
-STOPPED = {StateField.STOP: Stop.OPERATOR}
+STOPPED = {StateField.STOP: StopReason.OPERATOR}
 ON_THE_WAY = of_whole_record(0.9e-4, final=False)
 FAILED = FitReport({"problem": "The sensor stands still.", "modes": [], "text": []}, final=True)
 NOT_A_NUMBER = of_whole_record(float("nan"))
@@ -83,7 +83,7 @@ def test_no_answer_of_the_whole_record_is_not_a_no(told, board, reached, words, 
 
     group.__getitem__().messages.side_effect = messages
     search = SimpleNamespace(targets=(parse_target("damping", "1%"),))
-    fit = FitSupervisor(group, MagicMock(), MagicMock(), search)
+    fit = FitClient(group, MagicMock(), MagicMock(), search)
     fit.begin(MagicMock())
     found = fit.finish(9000, lambda: None)["search"]
     assert found["reached"] is reached

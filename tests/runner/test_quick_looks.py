@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 from processes import children, eventually, state_of
 
-from rigd.engine.processes import Child
+from rigd.engine.processes import ChildProcess
 from rigd.engine.workers import QUICK_LOOK
 from rigd.runner import quick_looks
-from rigd.runner.quick_looks import QuickLook, QuickLooks
-from rigd.runner.session import RunResult
-from rigd.runtime import processor_use
+from rigd.runner.quick_looks import QuickLook, QuickLookQueue
+from rigd.runner.session import SessionResult
+from rigd.runtime.background import processor_use
 from rigd.session.quick_look import quick_look_path
 
 pytestmark = pytest.mark.process
@@ -56,7 +56,7 @@ def looks(tmp_path, monkeypatch, started):
     program = replace(QUICK_LOOK, module="look_program", niceness=0)
     monkeypatch.setattr(quick_looks, "QUICK_LOOK", program)
     told = []
-    looks = QuickLooks(told.append)
+    looks = QuickLookQueue(told.append)
     looks.told = told
     yield looks
     looks.close()
@@ -162,7 +162,7 @@ def test_what_a_process_does_with_the_processors():
 def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeypatch):
     monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.05)
     # As on a busy computer, it has no time to end in; at last it is killed, lest a failure hang.
-    monkeypatch.setattr(Child, "kill", lambda _: None)
+    monkeypatch.setattr(ChildProcess, "kill", lambda _: None)
     for end in (looks.poll, looks.close):
         looks.begin(tmp_path / "hangs.mcap")
         process = looks._process
@@ -207,15 +207,15 @@ def test_closing_ends_one_that_is_suspended(looks, tmp_path, started):
 def test_a_look_is_noted_and_told_as_an_event():
     path = Path("out/a.mcap")
     look = QuickLook(path, quick_look_path(path), {"text": ["Look\x1b[2J"]}, "")
-    result = RunResult(path, "complete", "", 1, 1, 0, 0, 0, fault=False)
+    result = SessionResult(path, "complete", "", 1, 1, 0, 0, 0, fault=False)
     other = replace(result, path=Path("out/b.mcap"))
     results = [other, result]
-    look.note(results)
+    look.add_path_to_results(results)
     assert results == [other, replace(result, quick_look=look.path)]
     assert results[1].as_dict()["look"] == "out/a.look.json"
     assert other.as_dict()["look"] is None
     event = json.loads(json.dumps({"event": "quick_look", **look.as_dict()}))
-    assert QuickLook.of_event(event) == look
+    assert QuickLook.from_event(event) == look
     assert look.lines == ["Look?[2J"]
     none = QuickLook(path, None, None, "why.")
-    assert QuickLook.of_event(none.as_dict()) == none
+    assert QuickLook.from_event(none.as_dict()) == none

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from rigd.engine.messages import Connected
+from rigd.engine.messages import DevicesConnected
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner.request import Order, file_header, software_commit
+from rigd.runner.request import SessionOrder, file_header, software_commit
 
 
 @pytest.fixture
@@ -17,8 +17,8 @@ def metadata_of():
 
     def make(calibration):
         profile = load_profile("sim")
-        order = Order(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
-        return file_header(order, Connected(calibration, {}, {}, True), {}).metadata
+        order = SessionOrder(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
+        return file_header(order, DevicesConnected(calibration, {}, {}, True), {}).metadata
 
     return make
 

@@ -13,7 +13,7 @@ from shipped_profile import load_shipped
 from rigd.engine.shared_state import Phase
 from rigd.excitation import hold
 from rigd.runner import Rig, RigError
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 from rigd.runtime import StopRequest
 from rigd.session import read_session
 
@@ -38,12 +38,12 @@ def run(profile, tmp_path):
     """Run a short session."""
     number = iter(range(100))
 
-    def run(rig, *, stop=None, watcher=lambda *_: None, duration_s=1.0):
+    def run(rig, *, stop=None, listener=lambda *_: None, duration_s=1.0):
         excitation = hold(
             rate_hz=profile.rig.rate_hz, duration_s=duration_s, rest_s=0.2, ring_down_s=0.0
         )
-        order = Order(profile, excitation, tmp_path / f"{next(number)}.mcap")
-        return rig.run(order, stop or StopRequest(), watcher)
+        order = SessionOrder(profile, excitation, tmp_path / f"{next(number)}.mcap")
+        return rig.run(order, stop or StopRequest(), listener)
 
     return run
 
@@ -58,8 +58,8 @@ def test_nothing_is_left_of_a_rig(profile, run):
     rig = Rig(profile, fast=True)
     assert rig.status() is None
     rig.connect()
-    assert run(rig).went_well
-    assert run(rig).went_well
+    assert run(rig).is_successful
+    assert run(rig).is_successful
     rig.disconnect()
     rig.disconnect()
     assert rig.status() is None
@@ -94,7 +94,7 @@ def test_tare_and_zero_between_sessions(rig, run):
     assert set(tare) == {"mean", "std", "torque_std_nm"}
     assert abs(rig.zero()["moved_rad"]) < 1e-2
     assert rig.status().angle_rad == 0.0
-    assert run(rig).went_well
+    assert run(rig).is_successful
 
 
 @pytest.mark.further  # as in the service
@@ -107,7 +107,7 @@ def test_a_zero_is_lost_with_its_connection_and_has_to_be_set_again(rig, run):
     with pytest.raises(RigError, match="rigd zero"):
         run(rig)
     rig.zero()
-    assert run(rig).went_well
+    assert run(rig).is_successful
 
 
 def test_a_control_process_that_dies_between_sessions_is_noticed(rig):
@@ -126,20 +126,20 @@ def test_a_control_process_that_dies_between_sessions_is_noticed(rig):
 def test_a_stop_ends_one_session_and_not_the_next(rig, run, tmp_path):
     stop = StopRequest()
 
-    def watcher(progress, events):
+    def listener(progress, events):
         if progress.phase is Phase.RUNNING:
             stop.request()
 
-    stopped = run(rig, stop=stop, watcher=watcher, duration_s=100.0)
+    stopped = run(rig, stop=stop, listener=listener, duration_s=100.0)
     assert stopped.outcome == "stopped"
     assert stopped.scheduled == stopped.recorded + stopped.missed + stopped.lost < 100_200
     after = run(rig)
-    assert after.went_well
+    assert after.is_successful
     assert read_session(after.path).samples["tick"].tolist() == list(range(1200))
 
 
 def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_path):
-    def watcher(progress, events):
+    def listener(progress, events):
         if progress.phase is Phase.RUNNING:
             (recorder,) = (p for p in rig.status().processes if p.name == "recorder")
             if recorder.state != "ended":
@@ -148,7 +148,7 @@ def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_pa
     from rigd.runner.session import SessionFailedError
 
     with pytest.raises(SessionFailedError, match="killed by signal 9") as caught:
-        run(rig, watcher=watcher, duration_s=100.0)
+        run(rig, listener=listener, duration_s=100.0)
     told = caught.value.result()
     assert (told.outcome, told.fault, told.path) == ("fault", True, None)
     assert told.part == tmp_path / "0.mcap.part"
@@ -159,4 +159,4 @@ def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_pa
     told.part.unlink()
     assert caught.value.result().path == tmp_path / "0.mcap"
     assert rig.status().phase is Phase.OFF
-    assert run(rig).went_well
+    assert run(rig).is_successful

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from rigd.runtime import RigBusyError, RigLock
+from rigd.runtime.locks import RigBusyError, RigLock
 
 
 def test_whoever_comes_second_is_told_who_is_there(runtime_folder):
@@ -34,7 +34,7 @@ def test_simulated_rigs_of_their_own_share_but_not_with_a_daemon(runtime_folder)
 
 
 def test_hardware_is_locked_for_all_users_of_the_computer(runtime_folder, monkeypatch, tmp_path):
-    monkeypatch.setattr("rigd.runtime._locks._COMMON_LOCK_FOLDER", tmp_path)
+    monkeypatch.setattr("rigd.runtime.locks._COMMON_LOCK_FOLDER", tmp_path)
     with RigLock("antenna 1", "rigd serve", hardware=True):
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "another user's"))
         (path,) = tmp_path.iterdir()

@@ -14,11 +14,11 @@ from rigd.profile import load_profile
 from rigd.runner import ProgressLine, Series, plan_lines, result_line
 from rigd.runner.planning import RefusedError
 from rigd.runner.request import NoRoomError
-from rigd.runner.session import RunResult
+from rigd.runner.session import SessionResult
 from rigd.runtime import StopRequest
 from rigd.testing import write_profile
 
-WELL = RunResult(None, "complete", "", 1200, 1200, 0, 0, 0, fault=False)
+WELL = SessionResult(None, "complete", "", 1200, 1200, 0, 0, 0, fault=False)
 UNSEEN = ("look_follows", False)
 
 
@@ -32,7 +32,7 @@ class Rig:
     def show(self, order, stop):
         return "Live view: there"
 
-    def run(self, order, stop, watcher, listens):
+    def run(self, order, stop, listener, listens):
         self.orders.append(order)
         return self.results.pop(0)
 
@@ -60,8 +60,8 @@ def make_series(tmp_path):
 def test_a_series_ends_with_the_first_session_that_does_not_go_well(make_series):
     series = make_series(repeat=4, notes={"operator": "Ada", "note": ""})
     bad = replace(WELL, outcome="fault")
-    rig, watcher = Rig(WELL, bad), Watcher()
-    series.run(rig, StopRequest(), watcher, live=True)
+    rig, listener = Rig(WELL, bad), Watcher()
+    series.run(rig, StopRequest(), listener, live=True)
     assert series.results == [WELL, bad]
     assert [dict(order.notes) for order in rig.orders] == [
         {"operator": "Ada", "series": "1 of 4"},
@@ -69,7 +69,7 @@ def test_a_series_ends_with_the_first_session_that_does_not_go_well(make_series)
     ]
     first, second = (order.path for order in rig.orders)
     assert first.stem.endswith("-hold-01")
-    assert watcher.told == [
+    assert listener.told == [
         ("on_start", 1, first), ("on_live_view", "Live view: there"), ("on_result", WELL, UNSEEN),
         ("on_start", 2, second), ("on_live_view", "Live view: there"), ("on_result", bad, UNSEEN),
     ]  # fmt: skip
@@ -106,10 +106,10 @@ def test_no_shipped_profile_states_a_seed():
 
 @pytest.mark.process
 def test_after_a_stop_no_session_begins(make_series):
-    stop, watcher = StopRequest(), Watcher()
+    stop, listener = StopRequest(), Watcher()
     stop.request()
-    make_series(repeat=2).run(Rig(), stop, watcher, live=False)
-    assert watcher.told == []
+    make_series(repeat=2).run(Rig(), stop, listener, live=False)
+    assert listener.told == []
 
 
 @pytest.mark.process
@@ -153,53 +153,53 @@ class Looks:
 
 @pytest.mark.process
 def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_series):
-    watcher = Watcher()
+    listener = Watcher()
 
     class Watched(Rig):
         def watch(self):
-            watcher.told.append("watch")
+            listener.told.append("watch")
 
         def run(self, *order):
-            watcher.told.append("run")
+            listener.told.append("run")
             return super().run(*order)
 
     stopped = replace(WELL, path=None)
     results = (replace(WELL, path=Path(f"a-0{number}.mcap")) for number in (1, 2))
-    looks = Looks(watcher.told)
+    looks = Looks(listener.told)
     series = make_series(repeat=3)
-    series.run(Watched(*results, stopped), StopRequest(), watcher, live=False, quick_looks=looks)
+    series.run(Watched(*results, stopped), StopRequest(), listener, live=False, quick_looks=looks)
     session = ["held", "run", "let go", "on_result"]
     pause = ["look", "watch", "watch", "watch"]
-    told = [each if isinstance(each, str) else each[0] for each in watcher.told]
+    told = [each if isinstance(each, str) else each[0] for each in listener.told]
     assert told == ["on_start", *session, *pause] * 2 + ["on_start", *session]
-    ends = [each[-1] for each in watcher.told if each[0] == "on_result"]
+    ends = [each[-1] for each in listener.told if each[0] == "on_result"]
     assert ends == [("look_follows", True), ("look_follows", True), UNSEEN]
 
 
 @pytest.mark.process
 def test_a_stop_ends_the_wait_for_a_quick_look(make_series):
-    watcher, stop = Watcher(), StopRequest()
+    listener, stop = Watcher(), StopRequest()
 
     class Stopped(Rig):
         def watch(self):
-            watcher.told.append("watch")
+            listener.told.append("watch")
             stop.request()
 
-    looks = Looks(watcher.told)
+    looks = Looks(listener.told)
     result = replace(WELL, path=Path("a-01.mcap"))
-    make_series(repeat=3).run(Stopped(result), stop, watcher, live=False, quick_looks=looks)
-    told = [each if isinstance(each, str) else each[0] for each in watcher.told]
+    make_series(repeat=3).run(Stopped(result), stop, listener, live=False, quick_looks=looks)
+    told = [each if isinstance(each, str) else each[0] for each in listener.told]
     assert told == ["on_start", "held", "let go", "on_result", "look", "watch"]
 
 
 @pytest.mark.process
 def test_no_quick_look_at_a_move_is_begun_and_none_announced(tmp_path):
-    profile, watcher = load_shipped("sim"), Watcher()
+    profile, listener = load_shipped("sim"), Watcher()
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
-    recorded, looks = replace(WELL, path=Path("a.mcap")), Looks(watcher.told)
+    recorded, looks = replace(WELL, path=Path("a.mcap")), Looks(listener.told)
     series = Series(profile, replace(excitation, stays=True), tmp_path / "out")
-    series.run(Rig(recorded), StopRequest(), watcher, live=False, quick_looks=looks)
-    assert watcher.told[-2:] == ["let go", ("on_result", recorded, UNSEEN)]
+    series.run(Rig(recorded), StopRequest(), listener, live=False, quick_looks=looks)
+    assert listener.told[-2:] == ["let go", ("on_result", recorded, UNSEEN)]
 
 
 def test_a_plan_is_told_with_its_limits_from_a_document_as_well(make_series):
@@ -233,8 +233,8 @@ def test_a_result_is_told_in_a_line(changes, said):
 def test_what_was_said_last_is_written(capsys):
     for number in range(20):
         line = ProgressLine()
-        line.say("[first]")
-        line.say(f"last {number}")
+        line.write_message("[first]")
+        line.write_message(f"last {number}")
         line.close()
         assert capsys.readouterr().err == f"[first]\nlast {number}\n"
 
@@ -249,7 +249,7 @@ def test_progress_alone_has_the_line_drawn_anew_some_times_a_second(monkeypatch)
             now_s = tick / 1000
             line.update(Phase.RUNNING, tick, 1000, missed=0, late=0)
         assert 15 <= len(drawn) <= 21
-        line.say("at once")
+        line.write_message("at once")
         assert drawn[-1] == now_s
     line.close()
 

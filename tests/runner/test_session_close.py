@@ -7,10 +7,10 @@ from unittest.mock import MagicMock
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.engine.messages import Closed, Connected, Finished
+from rigd.engine.messages import DevicesConnected, FileClosed, SessionFinished
 from rigd.excitation import hold
-from rigd.runner.request import Order
-from rigd.runner.session import SessionFailedError, SessionRun, can_always_receive_stop
+from rigd.runner.request import SessionOrder
+from rigd.runner.session import SessionFailedError, SessionSupervisor, can_always_receive_stop
 
 KILLED = "The fit process was killed by signal 9."
 STOPPED = "Stopped by the operator."
@@ -23,14 +23,14 @@ def close():
 
     def closed(finished, failure, unmet_reason="", *, recorded=True, slow=lambda poll: poll):
         profile = load_shipped("sim")
-        order = Order(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
+        order = SessionOrder(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
         group = MagicMock()
         group.channels.shared_state.__getitem__.return_value = 0
         group.channels.events = MagicMock(
-            oldest=0, written=0, capacity=16, record_size=1, buffer=bytes(1000)
+            oldest_index=0, written_count=0, capacity=16, record_size=1, buffer=bytes(1000)
         )
-        connected = Connected({}, {}, {"clock": "virtual"}, simulated=True)
-        session = SessionRun(
+        connected = DevicesConnected({}, {}, {"clock": "virtual"}, simulated=True)
+        session = SessionSupervisor(
             order, group, connected, None, lambda *_: None, can_always_receive_stop
         )
         session._fit = MagicMock(search_failure=failure, unmet_reason=unmet_reason, segments={})
@@ -41,8 +41,8 @@ def close():
             (message,) = group.recorder.send.call_args.args
             outcome = message.outcome
             if not recorded:
-                return Closed()
-            return Closed(order.path, COUNTS, outcome["outcome"], outcome["reason"])
+                return FileClosed()
+            return FileClosed(order.path, COUNTS, outcome["outcome"], outcome["reason"])
 
         group.recorder.poll.side_effect = slow(poll)
         return session._close(finished)
@@ -52,7 +52,7 @@ def close():
 
 @pytest.mark.parametrize("recorded", [True, False])
 def test_a_stop_does_not_hide_why_the_session_was_ending(close, recorded):
-    stopped = Finished("stopped", STOPPED, fault=False, counts=COUNTS)
+    stopped = SessionFinished("stopped", STOPPED, fault=False, counts=COUNTS)
     result = close(stopped, KILLED, recorded=recorded)
     assert (result.outcome, result.fault) == ("stopped", True)
     assert result.reason == f"{KILLED} {STOPPED}"
@@ -61,7 +61,7 @@ def test_a_stop_does_not_hide_why_the_session_was_ending(close, recorded):
 
 
 def test_a_complete_record_says_what_it_lacks_once(close):
-    complete = Finished("complete", "", fault=False, counts=COUNTS)
+    complete = SessionFinished("complete", "", fault=False, counts=COUNTS)
     result = close(complete, KILLED, f"Not known whether the whole record has it: {KILLED}")
     assert result.reason.count(KILLED) == 1
     later = replace(complete, reason="After the record: The tare drifted.", fault=True)
@@ -82,7 +82,7 @@ def test_the_disk_may_stall_at_the_end_as_long_as_in_the_record(close, monkeypat
         return polled
 
     monkeypatch.setattr("rigd.runner.session.time.monotonic", lambda: now_s)
-    complete = Finished("complete", "", fault=False, counts=COUNTS)
+    complete = SessionFinished("complete", "", fault=False, counts=COUNTS)
     if whole:
         assert close(complete, "", slow=poll).outcome == "complete"
     else:

@@ -10,7 +10,7 @@ from shipped_profile import load_shipped
 from rigd.engine import Ring, shared_memory_fd
 from rigd.engine.shared_state import Phase, StateField
 from rigd.runner import signal_blocks
-from rigd.runner.signal_blocks import SignalReader
+from rigd.runner.signal_blocks import SignalBlockReader
 from rigd.session.layout import SAMPLE_SIZE, pack_sample_into
 
 RATE_HZ = 1000.0
@@ -45,7 +45,7 @@ def channels():
 
 @pytest.fixture
 def reader(profile, clock, channels):
-    reader = SignalReader(profile)
+    reader = SignalBlockReader(profile)
     reader.take(channels)
     clock.now_s += 0.1
     return reader

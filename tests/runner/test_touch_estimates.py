@@ -9,7 +9,7 @@ import pytest
 
 from rigd.engine.messages import TouchReady, TouchReport
 from rigd.engine.workers import TOUCH
-from rigd.runner._touch_search import TouchEstimates
+from rigd.runner._touch_search import TouchClient
 from rigd.session.touches import touch_line, touches_of
 
 
@@ -17,7 +17,7 @@ class Group(dict):
     """Processes, of which any is the same one."""
 
     def __init__(self, messages):
-        self.channels = SimpleNamespace(specs=None, samples=SimpleNamespace(written=0))
+        self.channels = SimpleNamespace(specs=None, samples=SimpleNamespace(written_count=0))
         self.child = SimpleNamespace(send=lambda _: None, messages=messages)
 
     def idle_process(self, _):
@@ -29,7 +29,7 @@ class Group(dict):
 
 def estimates(messages):
     order = SimpleNamespace(shear_projection=None)
-    return TouchEstimates(Group(messages), SimpleNamespace(order=order, model=None), 1000.0)
+    return TouchClient(Group(messages), SimpleNamespace(order=order, model=None), 1000.0)
 
 
 def test_a_stop_does_not_wait_for_a_process_that_prepares():
@@ -45,7 +45,7 @@ def test_a_stop_does_not_wait_for_a_process_that_prepares():
     ("messages", "words"), [([TouchReady()], []), ([], ["was not ready within 0 s. Touches are"])]
 )
 def test_the_session_waits_until_it_is_ready_or_late(monkeypatch, messages, words):
-    monkeypatch.setattr(TouchEstimates, "worker", replace(TOUCH, start_s=0.0))
+    monkeypatch.setattr(TouchClient, "worker", replace(TOUCH, start_timeout_s=0.0))
     touches = estimates(lambda _: messages)
     touches.await_ready(lambda: True)
     told = [event.message for event in touches.poll()]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.safety import LimitWatch
+from rigd.safety import LimitMonitor
 from rigd.safety.limits import Limits
 
 LIMITS = Limits(
@@ -39,7 +39,7 @@ MOTOR = {
 
 @pytest.fixture
 def watch():
-    return LimitWatch(LIMITS, RANGE, 1000.0, **MOTOR)
+    return LimitMonitor(LIMITS, RANGE, 1000.0, **MOTOR)
 
 
 def test_ordinary_ticks_pass(watch):
@@ -100,7 +100,7 @@ def test_readings_that_are_no_numbers_end_the_session(watch, place, bad):
     fz=st.floats(-60, 60),
 )
 def test_fast_check_and_definition_agree(angle, error, tz, fz):
-    watch = LimitWatch(LIMITS, RANGE, 1000.0, **MOTOR)
+    watch = LimitMonitor(LIMITS, RANGE, 1000.0, **MOTOR)
     watch.reset(angle)
     reference = angle + error
     violation = watch.check(reference, angle, (0.0, 0.0, fz, 0.0, 0.0, tz))

@@ -14,7 +14,7 @@ from rigd.excitation import hold
 from rigd.profile import load_profile
 from rigd.runner import Series
 from rigd.runner.planning import RefusedError
-from rigd.safety import SLOW_CHECK_TICKS, SensorWatch
+from rigd.safety import SLOW_CHECK_TICKS, SensorMonitor
 
 PROFILE = load_profile("antenna_can")
 LIMITS = PROFILE.limits
@@ -278,9 +278,9 @@ def test_a_new_session_starts_without_the_missed_ticks_of_the_last_one(watch):
 
 @pytest.mark.parametrize(("readings", "judged"), [(90, False), (110, True)])
 def test_a_sensor_is_judged_by_enough_readings_at_rest_alone(readings, judged):
-    sensor_watch = SensorWatch(("fx", "fy"), (True, True), 1000.0)
+    sensor_monitor = SensorMonitor(("fx", "fy"), (True, True), 1000.0)
     for _ in range(readings):
-        assert sensor_watch.step((1.0, 2.0)) is None
-    assert (sensor_watch.finish_learning() is not None) == judged
+        assert sensor_monitor.step((1.0, 2.0)) is None
+    assert (sensor_monitor.finish_learning() is not None) == judged
     if not judged:
-        assert not any(sensor_watch.step((1.0, 2.0)) for _ in range(2000))
+        assert not any(sensor_monitor.step((1.0, 2.0)) for _ in range(2000))

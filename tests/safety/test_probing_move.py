@@ -86,5 +86,5 @@ def test_the_plan_keeps_to_the_limits_of_the_profile(profile):
     rig = probed_rig(profile)
     plan = plan_probe(rig)
     assert plan.travel_rad >= 0.1
-    assert plan.speed_rad_s < plan.fast_rad_s <= 0.2 * profile.limits.velocity_rad_s
+    assert plan.speed_rad_s < plan.fast_speed_rad_s <= 0.2 * profile.limits.velocity_rad_s
     assert plan.torque_limit_nm == 0.5 * profile.rig.motor.rated_torque_nm

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rigd.checks.on_paper import travel_rows, worst_travel
+from rigd.checks.offline import max_stopping_distance, stopping_distance_rows
 from rigd.profile import load_profile
 from rigd.safety.limits import INTERLOCKS
 
@@ -70,7 +70,7 @@ def test_every_level_is_a_key_of_a_profile():
 def test_the_travel_of_the_shipped_profiles_is_the_document_s(name):
     profile = load_profile(name)
     section = TEXT[TEXT.index("## How far it turns") :].partition("\n## ")[0]
-    for row in travel_rows(profile):
+    for row in stopping_distance_rows(profile):
         numbers = re.findall(r"\d+\.\d\d rad", row.found + row.wanted)
         assert len(numbers) == 4
         what = row.what.removeprefix("worst, ")
@@ -78,5 +78,7 @@ def test_the_travel_of_the_shipped_profiles_is_the_document_s(name):
         total, driven, coasting, room = numbers
         line = f"| {name} | {what} | {blind_ms} ms | {driven} | {coasting} | {total} | {room} |"
         assert line in section.splitlines(), f"docs/safety.md lacks the line\n{line}"
-    free = worst_travel(profile.rig, profile.limits, profile.rig.cia402.heartbeat_timeout_s)
+    free = max_stopping_distance(
+        profile.rig, profile.limits, profile.rig.cia402.heartbeat_timeout_s
+    )
     assert f"{free.total_rad:.2f} rad" in section

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from rigd.check_rows import CheckResult
-from rigd.checks.on_paper import travel_rows, worst_travel
+from rigd.checks.offline import max_stopping_distance, stopping_distance_rows
 from rigd.profile import load_profile
 
 
@@ -16,7 +16,7 @@ def profile():
 
 
 def worst_row(profile):
-    (row,) = [row for row in travel_rows(profile) if row.what.startswith("worst, ")]
+    (row,) = [row for row in stopping_distance_rows(profile) if row.what.startswith("worst, ")]
     return row
 
 
@@ -26,14 +26,14 @@ def with_motor(rig, **changes):
 
 def test_without_friction_it_turns_for_ever(profile):
     rig = with_motor(profile.rig, viscous_nm_s_per_rad=0.0, coulomb_nm=0.0)
-    travel = worst_travel(rig, profile.limits, 0.05)
+    travel = max_stopping_distance(rig, profile.limits, 0.05)
     assert travel.driven_rad == pytest.approx(4.0 * 0.05 + 0.5 * 450.0 * 0.05**2, rel=1e-6)
     assert travel.coasting_rad == math.inf
 
 
 def test_coulomb_friction_alone_brakes_evenly(profile):
     rig = with_motor(profile.rig, viscous_nm_s_per_rad=0.0, coulomb_nm=0.1)
-    travel = worst_travel(rig, profile.limits, 0.05)
+    travel = max_stopping_distance(rig, profile.limits, 0.05)
     speed_rad_s = 4.0 + 0.8 / 2e-3 * 0.05
     inertia_kg_m2 = 2e-3 + 4.7e-3 * 0.98**3 / 3
     assert travel.driven_rad == pytest.approx((4.0 + speed_rad_s) / 2 * 0.05, rel=1e-6)
@@ -44,22 +44,22 @@ def test_coulomb_friction_alone_brakes_evenly(profile):
 
 def test_viscous_friction_alone_brakes_by_its_time_constant(profile):
     rig = with_motor(profile.rig, coulomb_nm=1e-6)
-    travel = worst_travel(rig, profile.limits, 0.0)
+    travel = max_stopping_distance(rig, profile.limits, 0.0)
     inertia_kg_m2 = 2e-3 + 4.7e-3 * 0.98**3 / 3
     assert travel.driven_rad == 0.0
     assert travel.coasting_rad == pytest.approx(4.0 * inertia_kg_m2 / 0.02, rel=1e-2)
 
 
 def test_the_drive_s_own_speed_limit_shortens_it(profile):
-    free = worst_travel(profile.rig, profile.limits, 0.05)
-    limited = worst_travel(profile.rig, profile.limits, 0.05, 5.0)
+    free = max_stopping_distance(profile.rig, profile.limits, 0.05)
+    limited = max_stopping_distance(profile.rig, profile.limits, 0.05, 5.0)
     assert limited.driven_rad < 5.0 * 0.05
     assert limited.total_rad < free.total_rad / 4
 
 
 @pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
 def test_the_shipped_rigs_come_to_rest_in_time(name):
-    rows = list(travel_rows(load_profile(name)))
+    rows = list(stopping_distance_rows(load_profile(name)))
     assert [row.verdict for row in rows] == [CheckResult.OK] * 4
     (worst,) = [row for row in rows if row.what.startswith("worst, ")]
     assert worst.what == "worst, if the loop fails"
@@ -68,7 +68,7 @@ def test_the_shipped_rigs_come_to_rest_in_time(name):
 
 
 def test_a_drive_in_this_program_ends_with_it():
-    (row,) = travel_rows(load_profile("sim"))
+    (row,) = stopping_distance_rows(load_profile("sim"))
     assert row.verdict is CheckResult.SKIPPED
 
 
@@ -103,10 +103,10 @@ def test_a_loop_that_runs_blind_for_long_is_the_worst(profile, limits, what, key
     assert row.verdict is CheckResult.FAIL
     assert f"1000 {'old angles' if 'stale' in key else 'missed ticks'} ({key})" in row.found
     assert key in row.detail
-    others = [each for each in travel_rows(blind) if each.what != row.what]
+    others = [each for each in stopping_distance_rows(blind) if each.what != row.what]
     assert [each.verdict for each in others] == [CheckResult.OK] * 3
     # Five rad/s, the drive's own limit, for a second; then it runs out.
-    travel = worst_travel(blind.rig, blind.limits, 1.002, 5.0)
+    travel = max_stopping_distance(blind.rig, blind.limits, 1.002, 5.0)
     assert 4.9 < travel.driven_rad < 5.01
     assert row.found.startswith(f"{travel.total_rad:.2f} rad: {travel.driven_rad:.2f} rad in the")
 
@@ -121,17 +121,17 @@ def test_what_nothing_ends_is_told_and_takes_no_time(profile):
     row = worst_row(blind)
     assert row.verdict is CheckResult.FAIL
     assert row.found.startswith("more than 100 rad: more than 100 rad in the")
-    assert worst_travel(profile.rig, profile.limits, math.inf, 5.0).total_rad == math.inf
+    assert max_stopping_distance(profile.rig, profile.limits, math.inf, 5.0).total_rad == math.inf
 
 
 def test_a_speed_that_stays_is_not_followed_step_by_step(profile):
-    travel = worst_travel(profile.rig, profile.limits, 10.0, 5.0)
+    travel = max_stopping_distance(profile.rig, profile.limits, 10.0, 5.0)
     assert travel.driven_rad == pytest.approx(50.0, abs=0.02)
 
 
 def test_a_drive_that_is_accepted_without_a_watchdog_has_no_bound(profile):
     drive = replace(profile.rig.cia402, accept_without=("watchdog",))
-    rows = list(travel_rows(replace(profile, rig=replace(profile.rig, cia402=drive))))
+    rows = list(stopping_distance_rows(replace(profile, rig=replace(profile.rig, cia402=drive))))
     worst, *others = rows
     assert (worst.what, worst.verdict) == ("worst, if the loop fails", CheckResult.WARNING)
     assert "without bound" in worst.found

@@ -94,7 +94,7 @@ def test_a_test_of_uniformity_that_is_none_is_unknown(tmp_path, stated):
 )  # fmt: skip
 def test_a_test_of_uniformity_is_stated_in_words(found, sentence, short):
     assert (found.sentence, found.short) == (sentence, short)
-    assert BeamUniformity.of_document(found.as_json()) == found
+    assert BeamUniformity.from_document(found.as_json()) == found
 
 
 def test_what_is_missing_is_empty(tmp_path):

@@ -60,7 +60,7 @@ def unexplained(parameters, drag_m):
         tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
         delay_s=parameters.sensor.delay_s,
     )  # fmt: skip
-    compared = Comparison.of(measured, (0.0, 50.0))
+    compared = Comparison.from_measurement(measured, (0.0, 50.0))
     plant = Plant(
         parameters.beam, parameters.damping, measured.delay_s, measured.tool_inertia_kg_m2
     )

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.spectral._running import LowBins, Segments, bins_up_to
+from rigd.spectral._running import LowBinTransform, Segments, bins_up_to
 
 LENGTH, HOP, LONGEST_GAP = 40, 30, 5
 
@@ -85,7 +85,7 @@ def test_equals_the_whole_transform(data):
     length = data.draw(st.integers(1, 300))
     nfft = data.draw(st.integers(length, 1000))
     bins = data.draw(st.integers(1, nfft // 2 + 1))
-    transform = LowBins(length, nfft, bins)
+    transform = LowBinTransform(length, nfft, bins)
     rng = np.random.default_rng(length)
     # The shorter one after the longer: nothing of that may be left.
     for samples in (length, data.draw(st.integers(1, length))):
@@ -99,7 +99,7 @@ def test_equals_the_whole_transform(data):
 def test_equals_the_papers_transform():
     x = np.random.default_rng(5).normal(size=17_266) * np.hamming(17_266)
     whole = np.fft.rfft(x, 160_000)[:9601]
-    np.testing.assert_allclose(LowBins(17_266, 160_000, 9601)(x), whole, rtol=1e-10)
+    np.testing.assert_allclose(LowBinTransform(17_266, 160_000, 9601)(x), whole, rtol=1e-10)
 
 
 @pytest.mark.parametrize(

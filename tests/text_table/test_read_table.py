@@ -9,8 +9,8 @@ from rigd.text_table import MissingColumnError, TableError, decode_text, read_ta
 from rigd.text_table.titles import stated_unit_of
 
 
-def table(text, *names, encoding="utf-8", most_rows=1000):
-    return read_table(BytesIO(text.encode(encoding)), names, most_rows=most_rows)
+def table(text, *names, encoding="utf-8", max_rows=1000):
+    return read_table(BytesIO(text.encode(encoding)), names, max_rows=max_rows)
 
 
 def refused(text, *names):
@@ -147,7 +147,7 @@ def test_times_that_nobody_asked_for_are_found_with_their_unit():
 
 
 def test_reading_ends_after_the_most_rows():
-    assert len(table("a\n" + "1\n" * 50, "a", most_rows=10).columns["a"].values) == 11
+    assert len(table("a\n" + "1\n" * 50, "a", max_rows=10).columns["a"].values) == 11
 
 
 def test_empty_lines_within_are_remarked():

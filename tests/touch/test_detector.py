@@ -10,11 +10,11 @@ from touch_records import DAMPED, LINK
 from rigd.beam import Beam, Damping, PointForceGrid, transfer
 from rigd.touch import (
     ChannelNoise,
+    DetectorModel,
     DetectorSettings,
     InnovationFilter,
     SensorFilter,
     TouchDetector,
-    WatchedBeam,
     observed_beam,
     signatures,
 )
@@ -88,7 +88,7 @@ def innovations(model, readings):
 
 
 def detector_of(model):
-    beam = WatchedBeam(model, signatures(BEAM, DAMPING, RATE_HZ, model))
+    beam = DetectorModel(model, signatures(BEAM, DAMPING, RATE_HZ, model))
     return TouchDetector(beam, RATE_HZ, DetectorSettings())
 
 

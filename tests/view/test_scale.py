@@ -81,16 +81,16 @@ def test_axes_hold_two_labels_at_every_moment_and_forget(make_samples, shown):
         least = min(low, *tick_values[seen], high)
         greatest = max(high, *tick_values[seen], low)
         assert labels(least, greatest, view.height) >= 2, end
-        free.append(high - low > view.plot.least_span)
-        fills.append(max(high - low, view.plot.least_span) / (greatest - least))
+        free.append(high - low > view.plot.min_span)
+        fills.append(max(high - low, view.plot.min_span) / (greatest - least))
     assert min(fills) > 0.3
     assert np.mean(free) > 0.3
     assert np.mean(np.array(fills)[free] > 0.99) > 0.3
 
 
-@pytest.mark.parametrize("view", [view for view in TIME_VIEWS if view.plot.least_span])
+@pytest.mark.parametrize("view", [view for view in TIME_VIEWS if view.plot.min_span])
 def test_single_steps_and_noise_do_not_fill_an_axis(view):
-    least = view.plot.least_span
+    least = view.plot.min_span
     for middle in (0.0, 7.0 * least, -0.3 * least):
         for span in (0.0, 0.01 * least, 0.4 * least):
             low, high = middle - span / 2, middle + span / 2

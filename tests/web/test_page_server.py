@@ -17,7 +17,7 @@ import pytest
 from processes import eventually
 from web_daemon import TOKEN
 
-from rigd.engine.processes import Child, ChildError
+from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.workers import PAGE
 from rigd.excitation import KINDS
 
@@ -505,7 +505,7 @@ def test_a_page_stops_over_its_websocket(served, pages):
 
 @pytest.mark.process
 def test_the_process_writes_no_nonsense_that_it_is_sent_to_its_terminal(served):
-    page = Child(replace(PAGE, errors_hidden=True))
+    page = ChildProcess(replace(PAGE, captures_stderr=True))
     try:
         page.start(served._job)
         port = page.poll(60.0).port

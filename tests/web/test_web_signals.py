@@ -25,7 +25,7 @@ def test_a_block_is_what_the_event_tells():
         name: base64.b64encode(np.array([k, np.nan], dtype="<f4").tobytes()).decode()
         for k, name in enumerate(("angle_rad", "angle_reference_rad", "coupling_torque_nm"))
     }
-    found = PageSignalBlock.of_event(told | {"first_tick": 7, "rate_hz": RATE_HZ})
+    found = PageSignalBlock.from_event(told | {"first_tick": 7, "rate_hz": RATE_HZ})
     assert (found.first_tick, found.values[:, 0].tolist()) == (7, [0.0, 1.0, 2.0])
     assert np.isnan(found.values[0, 1])
 

@@ -10,8 +10,8 @@ from rigd.engine.shared_state import LogEvent, Phase
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 from rigd.runner import Rig
-from rigd.runner.request import Order
-from rigd.runner.session import RunResult, SessionProgress
+from rigd.runner.request import SessionOrder
+from rigd.runner.session import SessionProgress, SessionResult
 from rigd.runtime import StopRequest
 from rigd.sim.wire import inject
 
@@ -57,7 +57,7 @@ def run_order(tmp_path):
 
     def run(
         profile, name: str, *, fast: bool, faults=(), injected: list | None = None, **options
-    ) -> RunResult:
+    ) -> SessionResult:
         noted = [] if injected is None else injected
 
         def watch(progress: SessionProgress, _: list[LogEvent]) -> None:
@@ -69,7 +69,7 @@ def run_order(tmp_path):
 
         settings = {"duration_s": 2.0, "rest_s": 0.3, "ring_down_s": 0.5, "stop_hz": 20.0}
         excitation = chirp(rate_hz=profile.rig.rate_hz, **(settings | options))
-        order = Order(
+        order = SessionOrder(
             profile=profile,
             excitation=excitation,
             path=tmp_path / f"{name}.mcap",

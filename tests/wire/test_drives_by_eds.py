@@ -22,14 +22,14 @@ def test_a_drive_with_torque_mode_runs_fails_is_reset_and_runs_again(
     start_simulator(path, "--lock-step", "--log", log, "--eds", eds_path("elmo_gold"))
     profile = load(path)
     first = run_order(profile, "first", fast=True, **CHIRP)
-    assert first.went_well, first.reason
+    assert first.is_successful, first.reason
     written = {(e["index"], e["sub"]) for e in drive_log(log).of("sdo write")}
     assert ("1016", 1) in written
     assert ("60E0", 0) not in written  # read-only there
     inject(profile.name, ["emcy,code=0x2310"])
     assert "The fault is reset" in reset_drive(profile.rig)
     again = run_order(profile, "again", fast=True, **CHIRP)
-    assert again.went_well, again.reason
+    assert again.is_successful, again.reason
 
 
 def test_a_drive_without_torque_mode_is_refused_by_name(quiet_profile, start_simulator, load):

@@ -183,7 +183,7 @@ def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
     else:
         assert "start again" in row.back
     following = run_order(load(profile), "next", fast=True, **CHIRP | {"duration_s": 0.5})
-    assert following.went_well, following.reason
+    assert following.is_successful, following.reason
     assert following.recorded == following.scheduled
     simulator.terminate()
     assert simulator.wait(30.0) == 0
@@ -224,7 +224,7 @@ def test_passing_faults_are_flagged_and_borne(
         injected=injected,
         **CHIRP | {"duration_s": 5.0},
     )
-    assert result.went_well, result.reason
+    assert result.is_successful, result.reason
     assert len(injected) == len(borne)
     status = read_session(result.path).samples["status"]
     stale = status & (Status.ANGLE_STALE | Status.WRENCH_STALE)

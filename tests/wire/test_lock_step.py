@@ -9,7 +9,7 @@ import pytest
 from rigd.devices.parameters import DeviceSelection
 from rigd.excitation import hold
 from rigd.runner import Rig
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 from rigd.runtime import StopRequest
 from rigd.session import read_session
 from rigd.sim.wire import inject
@@ -63,7 +63,7 @@ def test_samples_equal_those_of_the_direct_simulation(
     start_simulator(path, "--lock-step")
     for which, rig_profile in (("wired", profile), ("direct", direct)):
         result = run_order(rig_profile, which, fast=True)
-        assert result.went_well, result.reason
+        assert result.is_successful, result.reason
         assert result.scheduled == result.recorded == 2800
         assert result.missed == result.lost == 0
     wired = read_session(tmp_path / "wired.mcap")
@@ -97,7 +97,7 @@ def test_a_rig_may_be_left_alone_between_sessions(quiet_profile, start_simulator
     rig = Rig(profile, fast=True)
 
     def run(name):
-        order = Order(profile, excitation, tmp_path / f"{name}.mcap")
+        order = SessionOrder(profile, excitation, tmp_path / f"{name}.mcap")
         return rig.run(order, StopRequest(), lambda *_: None)
 
     def leave_alone(duration_s):
@@ -108,9 +108,9 @@ def test_a_rig_may_be_left_alone_between_sessions(quiet_profile, start_simulator
 
     try:
         rig.connect()
-        assert run("first").went_well
+        assert run("first").is_successful
         leave_alone(5.5)
-        assert run("second").went_well
+        assert run("second").is_successful
         inject(profile.name, ["sto"])
         leave_alone(1.5)
         refused = run("third")

@@ -115,7 +115,7 @@ def test_a_rig_within_a_quarter_is_probed_once(rig_on_wire, tmp_path):
     told = Told()
     again.run(rig, StopRequest(), told, live=False)
     assert told.texts == []
-    assert again.results[0].went_well
+    assert again.results[0].is_successful
 
 
 @pytest.mark.further
@@ -137,4 +137,4 @@ def test_a_stop_ends_the_move(rig_on_wire):
 @pytest.mark.further
 def test_the_motor_that_is_to_be_identified_may_be_another(rig_on_wire):
     results, _, *_ = rig_on_wire({"motor.inertia_kg_m2": "6.0e-3"}, identifies_motor=True)
-    assert results[0].went_well
+    assert results[0].is_successful

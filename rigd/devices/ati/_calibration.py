@@ -54,7 +54,7 @@ _LARGEST_ENTRY, _SMALLEST_ENTRY = 1e6, 1e-6
 """Limits of a plausible matrix entry: N or N·m of one gauge at full scale.
 
 No sensor is built for more or for less: the largest has 40 kN, the smallest resolves 1 mN."""
-_LEAST_SINGULAR_VALUE_RATIO = 1e-6
+_MIN_SINGULAR_VALUE_RATIO = 1e-6
 """Smallest permitted ratio of smallest to largest singular value of the scaled matrix.
 
 Below it some loads are not distinguishable in single precision."""
@@ -148,7 +148,7 @@ class Calibration:
             np.abs(scaled_matrix).max(axis=0, keepdims=True).clip(min=np.finfo(float).tiny)
         )
         singular_values = np.linalg.svd(scaled_matrix, compute_uv=False)
-        if singular_values[-1] < _LEAST_SINGULAR_VALUE_RATIO * singular_values[0]:
+        if singular_values[-1] < _MIN_SINGULAR_VALUE_RATIO * singular_values[0]:
             raise ValueError(
                 "its calibration matrix is singular: some of its six axes are combinations of the "
                 "others. Its memory is damaged; choose another calibration, or have the sensor "

@@ -57,11 +57,11 @@ _EXCEPTION_MEANINGS = {
 """Meanings of Modbus exception codes."""
 
 
-class BadReply(ValueError):
+class InvalidReplyError(ValueError):
     """Error: the reply is missing, damaged or for another request; a repetition may help."""
 
 
-class ExceptionResponse(ValueError):
+class ModbusExceptionError(ValueError):
     """Error: the sensor refuses the request (Modbus exception); repeating it does not help."""
 
 
@@ -143,35 +143,37 @@ def reply_content(request: bytes, reply: bytes) -> bytes:
 
     Raises
     ------
-    BadReply
+    InvalidReplyError
         If the reply is not a valid reply to this request.
-    ExceptionResponse
+    ModbusExceptionError
         If the reply is valid and refuses the request.
     """
     if not reply:
-        raise BadReply("no reply came")
+        raise InvalidReplyError("no reply came")
     expected_length = REFUSAL_LENGTH if is_refusal(reply) else reply_length(request)
     if len(reply) != expected_length:
-        raise BadReply(
+        raise InvalidReplyError(
             f"{len(reply)} bytes came instead of {expected_length} ({reply[:16].hex(' ')})"
         )
     if crc16(reply):
-        raise BadReply(f"the checksum of the reply is wrong ({reply[:16].hex(' ')})")
+        raise InvalidReplyError(f"the checksum of the reply is wrong ({reply[:16].hex(' ')})")
     if reply[0] != ADDRESS or reply[1] & ~_EXCEPTION_FLAG != request[1]:
-        raise BadReply(f"the reply belongs to another request ({reply[:16].hex(' ')})")
+        raise InvalidReplyError(f"the reply belongs to another request ({reply[:16].hex(' ')})")
     reply_data = reply[2:-2]
     if is_refusal(reply):
         exception_code = reply_data[0]
-        raise ExceptionResponse(
+        raise ModbusExceptionError(
             _EXCEPTION_MEANINGS.get(exception_code, f"it declined with code {exception_code}")
         )
     function_code = request[1]
     if function_code == _READ_FUNCTION and reply_data[0] != expected_length - 5:
-        raise BadReply(f"{reply_data[0]} bytes of registers came instead of {expected_length - 5}")
+        raise InvalidReplyError(
+            f"{reply_data[0]} bytes of registers came instead of {expected_length - 5}"
+        )
     if function_code == _WRITE_FUNCTION and reply_data != request[2:6]:
-        raise BadReply("it confirmed other registers than were written")
+        raise InvalidReplyError("it confirmed other registers than were written")
     if function_code in (_LOCK_FUNCTION, _START_FUNCTION) and reply_data[0] != _ACCEPTED_CODE:
-        raise ExceptionResponse(f"it declined with code {reply_data[0]}")
+        raise ModbusExceptionError(f"it declined with code {reply_data[0]}")
     return reply_data[1:] if function_code == _READ_FUNCTION else reply_data
 
 

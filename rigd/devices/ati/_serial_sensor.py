@@ -30,7 +30,7 @@ from rigd.devices.running_simulator import SimulatorAddress
 
 _FIRST_RECORDS_TIMEOUT_S = 0.5
 """Time in seconds to wait for the first valid records of the stream."""
-_MOST_ERROR_RECORDS = 7
+_MAX_ERROR_RECORDS = 7
 """Number of consecutive records with the error bit that end a session.
 
 The checksum does not cover the error bit, and one flipped bit must not end a session."""
@@ -41,7 +41,7 @@ After a longer time the kernel's buffer of 4 kB may overflow at 91 kB/s, and its
 _GAP_PERIODS = 2.5
 """Number of periods without a byte that count as a gap; the stream has several records per
 period."""
-_STORED_GAPS, _FEWEST_EVALUATED_GAPS = 8, 4
+_STORED_GAPS, _MIN_EVALUATED_GAPS = 8, 4
 """Number of the latest gaps that are stored, and smallest number that is evaluated."""
 _LARGEST_GAP_RATIO = 1.5
 """Largest ratio of a gap to the median gap for which gaps count as equal."""
@@ -298,7 +298,7 @@ class AtiSerialSensor:
         gaps_ns = sorted(
             gap for arrival_ns, gap in self._latest_gaps if now_ns - arrival_ns < _GAP_EVALUATION_NS
         )
-        if len(gaps_ns) < _FEWEST_EVALUATED_GAPS:
+        if len(gaps_ns) < _MIN_EVALUATED_GAPS:
             return ""
         median_ns = gaps_ns[len(gaps_ns) // 2]
         if (
@@ -405,7 +405,7 @@ class AtiSerialSensor:
         """Count consecutive records with the error bit, and raise if there are too many."""
         for check_byte in records[RECORD_SIZE - 1 :: RECORD_SIZE]:
             self._error_records = self._error_records + 1 if check_byte & ERROR_BIT else 0
-            if self._error_records >= _MOST_ERROR_RECORDS:
+            if self._error_records >= _MAX_ERROR_RECORDS:
                 raise DeviceError(
                     f"{self._name}: its records report an error. Run rigd check to read its status "
                     "word."

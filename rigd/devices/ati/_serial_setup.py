@@ -355,12 +355,12 @@ class SerialSetup:
                 self._line.drain(_LATE_REPLY_S, 2 * _LATE_REPLY_S)
             try:
                 return modbus.reply_content(request, reply)
-            except modbus.ExceptionResponse as error:
+            except modbus.ModbusExceptionError as error:
                 raise DeviceError(
                     f"{self._name}: asked to {action_text}, it refused: {error}. Check that it is "
                     "a Digital F/T sensor, and ati_serial.calibration."
                 ) from None
-            except modbus.BadReply as error:
+            except modbus.InvalidReplyError as error:
                 last_error = str(error)
         raise DeviceError(
             f"{self._name}: asked to {action_text}, it gave no usable reply in {_REQUEST_ATTEMPTS} "

@@ -28,7 +28,7 @@ from rigd.devices.canbus.port import (
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
 from rigd.devices.running_simulator import SimulatorAddress
-from rigd.runtime import LockFile, LockHeldError
+from rigd.runtime.locks import LockFile, LockHeldError
 
 # Pairing of replies
 
@@ -177,10 +177,10 @@ _ERROR_PASSIVE_BITS = 0x30
 _NO_ACKNOWLEDGE_CLASS = 0x20
 """Class of an error frame: no device has acknowledged a sent frame."""
 
-_MOST_DRAIN_FAILURES = 10
+_MAX_DRAIN_FAILURES = 10
 """Most receive errors that one `drain` ignores within `ignore_errors`, since an adapter may queue
 them."""
-_MOST_WAIT_FAILURES = 100
+_MAX_WAIT_FAILURES = 100
 """Most receive errors within one wait in `ignore_errors` before the wait ends."""
 _FAILURE_PAUSE_S = 0.001
 """Pause in seconds after a receive error."""
@@ -277,7 +277,7 @@ class CanExchange:
             if self._bus_error:
                 raise DeviceError(self._bus_error)
             return
-        for _ in range(_MOST_DRAIN_FAILURES):
+        for _ in range(_MAX_DRAIN_FAILURES):
             try:
                 self._deliver()
             except Exception:  # an adapter's library may raise anything
@@ -323,7 +323,7 @@ class CanExchange:
                 wait_failures += 1
                 if not self._ignores_errors:
                     raise
-                if wait_failures > _MOST_WAIT_FAILURES:
+                if wait_failures > _MAX_WAIT_FAILURES:
                     return False  # the adapter has failed
                 time.sleep(min(_FAILURE_PAUSE_S, remaining_ns * 1e-9))
             self.drain()

@@ -34,7 +34,7 @@ A stopped simulated rig is then detected by its missing replies.
 A simulated rig that has stopped is detected by its missing replies, not by a full buffer."""
 _CAN_RAW_ERR_FILTER = 2
 """Number of the socket option that selects the error frames to receive (linux/can/raw.h)."""
-_MOST_DAMAGED_FRAMES = 20
+_MAX_DAMAGED_FRAMES = 20
 """Number of consecutive unreadable frames of an adapter that end a session."""
 
 
@@ -201,12 +201,12 @@ class PythonCanPort:
             ) from None
         except Exception as error:
             self._damaged_in_a_row += 1
-            if self._damaged_in_a_row < _MOST_DAMAGED_FRAMES:
+            if self._damaged_in_a_row < _MAX_DAMAGED_FRAMES:
                 return DAMAGED_FRAME
             self._damaged_in_a_row = 0
             raise DeviceError(
                 f"CAN bus {self.name}: the adapter sends what is no CAN frame, "
-                f"{_MOST_DAMAGED_FRAMES} times in a row ({_error_text(error)}); check the adapter, "
+                f"{_MAX_DAMAGED_FRAMES} times in a row ({_error_text(error)}); check the adapter, "
                 "its cable and its firmware."
             ) from None
         if raw is not None and not unpack_header(raw)[0] & ERROR_FLAG:

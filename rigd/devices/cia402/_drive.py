@@ -22,7 +22,7 @@ from rigd.devices.cia402._protocol import (
     drive_state,
 )
 from rigd.devices.cia402._setup import DriveCapabilities, set_up_drive
-from rigd.devices.cia402._standing import reset_fault
+from rigd.devices.cia402._switch_off import reset_fault
 from rigd.devices.cia402._transitions import (
     StopRequestedError,
     TorqueFollowingCheck,

@@ -44,7 +44,7 @@ _SDO_ATTEMPTS = 2
 """Number of attempts of one SDO transfer."""
 _HURRIED_TIMEOUT_S = 0.05
 """Time in seconds to wait for an SDO reply while the torque has to be switched off quickly."""
-_MOST_LATE_REPLIES = 3
+_MAX_LATE_REPLIES = 3
 """Most replies to earlier, abandoned requests that may arrive before the awaited reply."""
 _LATE_REPLY_SILENCE_S = 0.25
 """Silence in seconds after which all replies to abandoned requests have arrived."""
@@ -82,7 +82,7 @@ _DATA_TYPES = {
 """CANopen data type by the name of the integer type in a profile (``cia402.set_objects``)."""
 
 
-class SdoRefusal(DeviceError):
+class SdoAbortError(DeviceError):
     """Error: the drive refused to read or write an object; `code` is the SDO abort code."""
 
     def __init__(self, message: str, code: int) -> None:
@@ -100,7 +100,7 @@ class SdoRefusal(DeviceError):
         return self.code == _WRITE_ONLY_ABORT
 
 
-class ValueNotStored(DeviceError):
+class ValueNotStoredError(DeviceError):
     """Error: an object reads another value than was written to it; `got` is the value read."""
 
     def __init__(self, message: str, got: int) -> None:
@@ -173,7 +173,7 @@ class SdoAccess:
         self.request_pre_operational()
         try:
             self.read(objects.IDENTITY, 1)
-        except SdoRefusal:
+        except SdoAbortError:
             return
         except DeviceError as error:
             other_nodes = sorted(set(self._network.scanner.nodes) - {self._node.id})
@@ -232,7 +232,7 @@ class SdoAccess:
         Raises
         ------
         DeviceError
-            If the drive does not answer, or refuses (:class:`SdoRefusal`).
+            If the drive does not answer, or refuses (:class:`SdoAbortError`).
         """
         object_value = self._transfer(index, sub, None)
         if not isinstance(object_value, int):
@@ -249,7 +249,7 @@ class SdoAccess:
         """
         try:
             return self.read(index, sub)
-        except SdoRefusal as refusal:
+        except SdoAbortError as refusal:
             if refusal.is_absent:
                 return None
             raise
@@ -258,7 +258,7 @@ class SdoAccess:
         """Read a text object by SDO; return an empty text if the drive refuses to read it."""
         try:
             return str(self._transfer(index, 0, None)).strip("\0 ")
-        except SdoRefusal:
+        except SdoAbortError:
             return ""
 
     def write(self, index: int, sub: int, value: int) -> None:
@@ -277,13 +277,13 @@ class SdoAccess:
         Raises
         ------
         DeviceError
-            If the drive does not answer, refuses (:class:`SdoRefusal`), or stores another value in
-            the bits of `mask` (:class:`ValueNotStored`).
+            If the drive does not answer, refuses (:class:`SdoAbortError`), or stores another value
+            in the bits of `mask` (:class:`ValueNotStoredError`).
         """
         self.write(index, sub, value)
         got = self.read(index, sub)
         if (got ^ value) & mask:
-            raise ValueNotStored(
+            raise ValueNotStoredError(
                 f"{self._name}: {self._object_name(index, sub)} was set to {show_value(value)} "
                 f"and reads {show_value(got)}; check with the drive's own tool why it does not "
                 "keep it.",
@@ -317,7 +317,7 @@ class SdoAccess:
                 if error.code in _WRONG_LENGTH_ABORTS
                 else ""
             )
-            raise SdoRefusal(
+            raise SdoAbortError(
                 f"{self._name}: it refuses {action_text} {self._object_name(index, sub)}: {error}."
                 f"{remedy}",
                 error.code,
@@ -360,7 +360,7 @@ def _transfer_skipping_late_replies(
     client: SdoClient, variable: SdoVariable, value: int | None
 ) -> object:
     """Read or write a value by SDO, and skip late replies to abandoned requests."""
-    for attempts_left in reversed(range(_MOST_LATE_REPLIES + 1)):
+    for attempts_left in reversed(range(_MAX_LATE_REPLIES + 1)):
         try:
             if value is None:
                 return variable.raw

@@ -11,8 +11,14 @@ from math import tau
 from rigd.devices.canbus.port import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402._assignments import parse_assignment
-from rigd.devices.cia402._sdo import EVERY_BIT, SdoAccess, SdoRefusal, ValueNotStored, show_value
-from rigd.devices.cia402._standing import (
+from rigd.devices.cia402._sdo import (
+    EVERY_BIT,
+    SdoAbortError,
+    SdoAccess,
+    ValueNotStoredError,
+    show_value,
+)
+from rigd.devices.cia402._switch_off import (
     command_off,
     describe_remaining_torque,
     wait_for,
@@ -56,7 +62,7 @@ _RATED_TORQUE_TOLERANCE = 0.02
 _SCALE_TOLERANCE = 0.02
 """Largest difference, relative, between gear ratio or encoder step of the drive and of the
 profile."""
-_MOST_HEARTBEAT_CONSUMERS = 127
+_MAX_HEARTBEAT_CONSUMERS = 127
 """Largest number of heartbeat consumer entries in object 1016."""
 
 
@@ -262,7 +268,7 @@ class _DriveConfiguration:
             required = self._required_values[row.index, row.sub]
         try:
             present_value = self._sdo.read_or_none(row.index, row.sub)
-        except SdoRefusal as refusal:
+        except SdoAbortError as refusal:
             if not (refusal.is_write_only and row.index in MAY_BE_WRITE_ONLY):
                 raise
             self._sdo.write(row.index, row.sub, required)
@@ -271,10 +277,10 @@ class _DriveConfiguration:
             return True
         try:
             self._sdo.configure(row.index, row.sub, required)
-        except ValueNotStored as not_stored:
+        except ValueNotStoredError as not_stored:
             present_value = not_stored.got
             readback_error: DeviceError = not_stored
-        except SdoRefusal as refusal:
+        except SdoAbortError as refusal:
             if present_value is None and refusal.is_absent:
                 self._record_missing_object(row)
                 return False
@@ -388,7 +394,7 @@ class _DriveConfiguration:
         try:
             numerator = self._sdo.read_or_none(index, 1)
             denominator = self._sdo.read_or_none(index, 2)
-        except SdoRefusal:
+        except SdoAbortError:
             return None
         if (
             numerator is None
@@ -546,13 +552,13 @@ class _DriveConfiguration:
         present_value = sdo.read_or_none(index, 1)
         if present_value != required_value:
             # A second entry for one node is refused (0x06040043): clear stored entries first.
-            for sub in range(2, min(sdo.read_or_none(index) or 0, _MOST_HEARTBEAT_CONSUMERS) + 1):
+            for sub in range(2, min(sdo.read_or_none(index) or 0, _MAX_HEARTBEAT_CONSUMERS) + 1):
                 stored_value = sdo.read_or_none(index, sub)
                 if stored_value is not None and stored_value >> 16 & 0x7F == host_id:
                     sdo.configure(index, sub, 0)
             try:
                 sdo.configure(index, 1, required_value)
-            except SdoRefusal as refusal:
+            except SdoAbortError as refusal:
                 if refusal.is_absent or refusal.code == _READ_ONLY_ABORT:
                     return False
                 raise
@@ -611,12 +617,12 @@ class _DriveConfiguration:
         pdo_name = "RPDO1" if communication == objects.RPDO_COMMUNICATION else "TPDO1"
         try:
             sdo.configure(mapping_index, 0, 0)
-        except SdoRefusal as refusal:
+        except SdoAbortError as refusal:
             raise DeviceError(f"{refusal} {requirement(mapping_index).sentence}") from None
         for sub, mapping_entry in enumerate(entries, 1):
             try:
                 sdo.configure(mapping_index, sub, mapping_entry)
-            except SdoRefusal as refusal:
+            except SdoAbortError as refusal:
                 row = requirement(mapping_entry >> 16)
                 if refusal.is_absent:
                     raise DeviceError(f"{self._name}: {row.refusal_reason()}") from None
@@ -642,7 +648,7 @@ def _is_ratio_equal(drive_value: float, profile_value: float) -> bool:
 
 def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:
     """Disable all PDOs of the drive except the first, which the rig uses."""
-    for pdo_offset in range(1, objects.MOST_PDO_COUNT):
+    for pdo_offset in range(1, objects.MAX_PDO_COUNT):
         cob_id = sdo.read_or_none(communication + pdo_offset, 1)
         if cob_id is None:
             # Above the PDOs that CiA 301 predefines, indices are used without gaps.
@@ -652,6 +658,6 @@ def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:
             sdo.configure(communication + pdo_offset, 1, cob_id | objects.PDO_DISABLED)
 
 
-def _abort_meaning(refusal: SdoRefusal) -> str:
+def _abort_meaning(refusal: SdoAbortError) -> str:
     """Return the short meaning of the abort code of a refusal."""
     return _ABORT_MEANINGS.get(refusal.code, "see CiA 301")

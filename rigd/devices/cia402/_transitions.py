@@ -70,7 +70,7 @@ def operation_left_error(drive_name: str, statusword: int) -> DeviceError:
     )
 
 
-_MOST_DEVIATING_TICKS = 10
+_MAX_DEVIATING_TICKS = 10
 """Number of consecutive ticks with a wrong torque that raise an error.
 
 A single lost command is no error, since the next tick repeats it."""
@@ -143,11 +143,11 @@ class TorqueFollowingCheck:
             self._deviating_ticks = 0
             return
         self._deviating_ticks += 1
-        if self._deviating_ticks >= _MOST_DEVIATING_TICKS:
+        if self._deviating_ticks >= _MAX_DEVIATING_TICKS:
             raise DeviceError(
                 f"{self._name}: it exerts {actual_per_mille / 10:g} % of the rated torque (object "
                 f"6077) where {self._commanded_per_mille / 10:g} % were commanded, for "
-                f"{_MOST_DEVIATING_TICKS} ticks; commands are lost, or the drive limits them. "
+                f"{_MAX_DEVIATING_TICKS} ticks; commands are lost, or the drive limits them. "
                 "Check its diagnosis and cia402.torque_tolerance_percent; where it measures this "
                 "torque, check cia402.torque_response_s."
             )
@@ -161,9 +161,9 @@ _ENABLING_STEPS = (
     (ENABLE_OPERATION, DriveState.OPERATION_ENABLED),
 )
 """Controlwords that enable the drive in steps, each with the state that the drive then reaches."""
-_MOST_UNANSWERED_SYNCS = 10
+_MAX_UNANSWERED_SYNCS = 10
 """Number of consecutive unanswered SYNCs after which enabling fails."""
-_MOST_UNANSWERED_SYNCS_IN_LOCK_STEP = 3
+_MAX_UNANSWERED_SYNCS_IN_LOCK_STEP = 3
 """Number of consecutive unanswered SYNCs after which enabling fails, for a drive in lock-step."""
 _SWITCH_OFF_TIMEOUT_NS = 50_000_000
 """Time in nanoseconds within which the drive has to confirm that it is off."""
@@ -284,9 +284,7 @@ def _send_controlword_until(
     """Send a controlword with zero torque once a period until `is_reached` returns True."""
     rpdo_frame = node.frames.rpdo(controlword, 0)
     timeout_s = node.settings.enable_timeout_s
-    most_unanswered = (
-        _MOST_UNANSWERED_SYNCS_IN_LOCK_STEP if node.lock_step else _MOST_UNANSWERED_SYNCS
-    )
+    max_unanswered = _MAX_UNANSWERED_SYNCS_IN_LOCK_STEP if node.lock_step else _MAX_UNANSWERED_SYNCS
     unanswered_syncs = 0
     for _ in range(ceil(timeout_s * node.rate_hz)):
         if stop():
@@ -301,7 +299,7 @@ def _send_controlword_until(
         if is_answered and is_reached():
             return
         unanswered_syncs = 0 if is_answered else unanswered_syncs + 1
-        if unanswered_syncs >= most_unanswered:
+        if unanswered_syncs >= max_unanswered:
             raise DeviceError(
                 f"{node.name}: it has stopped answering SYNC while being enabled; check its supply "
                 "and the cable."

@@ -105,7 +105,7 @@ SYNC_ID: Final = 0x080
 """CAN identifier of SYNC."""
 PREDEFINED_PDO_COUNT: Final = 4
 """Number of RPDOs, and of TPDOs, whose CAN identifiers CiA 301 predefines."""
-MOST_PDO_COUNT: Final = 512
+MAX_PDO_COUNT: Final = 512
 """Largest number of RPDOs, and of TPDOs, that a drive can have."""
 
 AT_EVERY_SYNC: Final = 1

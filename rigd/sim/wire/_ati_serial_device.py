@@ -49,7 +49,7 @@ _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE = 1, 2, 3
 """Modbus exception codes."""
 _EXCEPTION_BIT = 0x80
 """Bit in the function code of a Modbus exception response."""
-_MOST_REGISTERS_READ, _MOST_REGISTERS_WRITTEN = 125, 123
+_MAX_REGISTERS_READ, _MAX_REGISTERS_WRITTEN = 125, 123
 """Largest number of registers in one request to read, and in one to write."""
 
 _GAIN_REGISTERS, _OFFSET_REGISTERS = range(0x06), range(0x06, 0x0C)
@@ -282,7 +282,7 @@ class AtiSerialDevice:
         first_register, register_count = _unpack_register_range(request_content[:4])
         register_bytes = request_content[5:]
         if (
-            not 1 <= register_count <= _MOST_REGISTERS_WRITTEN
+            not 1 <= register_count <= _MAX_REGISTERS_WRITTEN
             or len(register_bytes) != 2 * register_count
         ):
             return _ILLEGAL_VALUE
@@ -382,7 +382,7 @@ def _answer_with_registers(
 ) -> bytes | int:
     """Return the content of the reply to a Modbus read request, or an exception code."""
     first_register, register_count = _unpack_register_range(request_content)
-    if not 1 <= register_count <= _MOST_REGISTERS_READ:
+    if not 1 <= register_count <= _MAX_REGISTERS_READ:
         return _ILLEGAL_VALUE
     addresses = range(first_register, first_register + register_count)
     if not all(map(registers_by_address.__contains__, addresses)):

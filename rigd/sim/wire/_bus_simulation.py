@@ -159,7 +159,7 @@ _CAN_ONLY_KEYS = ("id",)
 """Keys of a fault that make sense only on the CAN bus."""
 _SERIAL_ONLY_KEYS = ("bytes",)
 """Keys of a fault that make sense only on the serial line."""
-_MOST_CAN_DATA_BYTES = 8
+_MAX_CAN_DATA_BYTES = 8
 """Largest number of data bytes of a CAN frame."""
 _DRIVE_ATTRIBUTES = {
     "no_pre_operational": "stays_operational",
@@ -520,11 +520,11 @@ class BusSimulation:
         if (
             fault.kind == "corrupt"
             and not is_on_serial
-            and int(fault_values["byte"]) >= _MOST_CAN_DATA_BYTES
+            and int(fault_values["byte"]) >= _MAX_CAN_DATA_BYTES
         ):
             raise FaultError(
                 f"Fault '{fault}': byte={fault_values['byte']} has no effect; a CAN frame has at "
-                f"most the bytes 0 to {_MOST_CAN_DATA_BYTES - 1}."
+                f"most the bytes 0 to {_MAX_CAN_DATA_BYTES - 1}."
             )
 
         if fault.kind in DISTURBANCE_KINDS:

@@ -23,7 +23,7 @@ _HISTORY_LENGTH = 8
 """Number of error codes in the error history."""
 
 
-class Emergencies:
+class EmergencyMessages:
     """Emergency messages of a node: active errors and error history.
 
     Parameters
@@ -247,7 +247,7 @@ COB_ID_DISABLED = 0x8000_0000
 """Bit in the COB-ID of a PDO or emergency message that disables it."""
 MAX_MAPPING_ENTRIES = 8
 """Largest number of objects in a PDO."""
-_MOST_PDO_BITS = 64
+_MAX_PDO_BITS = 64
 """Largest length of a PDO in bits."""
 _LAST_SYNC_TYPE = 240
 """Largest transmission type of a synchronous PDO."""
@@ -408,7 +408,7 @@ class Pdo:
                 self._mapped_entry(mapping_slot.value).bits
                 for mapping_slot in self._slots[:new_count]
             )
-            > _MOST_PDO_BITS
+            > _MAX_PDO_BITS
         ):
             raise Abort(AbortCode.PDO_LENGTH)
 

@@ -18,7 +18,7 @@ from rigd.sim.wire._canopen_services import (
     COB_ID_DISABLED,
     DEFAULT_MONITOR_COUNT,
     MAX_MAPPING_ENTRIES,
-    Emergencies,
+    EmergencyMessages,
     HeartbeatProducer,
     ReceivePdo,
     TransmitPdo,
@@ -209,7 +209,7 @@ class DriveNode:
         drive_entries = self._entries = add_drive_objects(
             object_dictionary, rig.motor, rig.cia402, rig.rate_hz, rig.encoder.resolution_rad
         )
-        self._emergencies = Emergencies(object_dictionary, node_id, self._send_emergency)
+        self._emergencies = EmergencyMessages(object_dictionary, node_id, self._send_emergency)
         self._producer = HeartbeatProducer(object_dictionary)
         monitor_count = DEFAULT_MONITOR_COUNT if file is None else file.sub_index_count(0x1016)
         self._heartbeat_monitors = add_heartbeat_monitors(

@@ -60,7 +60,7 @@ OnFrames = Callable[[list[bytes], object], None]
 _READ_SIZE = 65_536
 """Largest number of bytes in one read from a socket."""
 _SEND_BUFFER_SIZE = 425_984  # the kernel derives from it a buffer for some 0.2 s of a full bus
-_MOST_FRAMES_PER_READ = 256
+_MAX_FRAMES_PER_READ = 256
 """Largest number of frames in one read from a virtual interface."""
 
 # linux/rtnetlink.h and linux/if_link.h
@@ -277,7 +277,7 @@ class VirtualCan:
         """Receive frames from the kernel's CAN interface, and pass them to the simulation."""
         received_frames: list[bytes] = []
         with suppress(OSError):
-            while len(received_frames) < _MOST_FRAMES_PER_READ:
+            while len(received_frames) < _MAX_FRAMES_PER_READ:
                 received_frames.append(self._link.recv(FRAME_SIZE))
         if received_frames:
             self._on_frames(received_frames, self)

@@ -17,7 +17,7 @@ INTEGER_LETTERS = "bBhHiIqQ"
 """Letters of :mod:`struct` for the integer types."""
 _INTEGER_LAYOUTS = {kind: Struct("<" + kind) for kind in INTEGER_LETTERS}
 """Binary layout of each integer type, by its letter."""
-_MOST_TEXT_BYTES = 1024
+_MAX_TEXT_BYTES = 1024
 """Largest number of bytes that can be written to a text of variable length."""
 
 
@@ -54,7 +54,7 @@ class Abort(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Description:
+class EntryDescription:
     """Description of one sub-index in a device's file."""
 
     kind: str
@@ -141,7 +141,7 @@ class Entry:
         self.default_text = self.text
         self._set_range(self.low, self.high)
 
-    def adopt_description(self, description: Description, default: int | None) -> None:
+    def adopt_description(self, description: EntryDescription, default: int | None) -> None:
         """Adopt type, access, mapping and limits from a device's file.
 
         The functions that read, check and react to the value remain.
@@ -183,17 +183,15 @@ class Entry:
         if self.kind != "s":
             return 8 * byte_count == self.bits
         return (
-            byte_count == len(self.text)
-            if self.has_fixed_length
-            else byte_count <= _MOST_TEXT_BYTES
+            byte_count == len(self.text) if self.has_fixed_length else byte_count <= _MAX_TEXT_BYTES
         )
 
     @property
-    def most_bytes(self) -> int:
+    def max_bytes(self) -> int:
         """Largest number of bytes that can be written to the entry."""
         if self.kind != "s":
             return self.bits // 8
-        return len(self.text) if self.has_fixed_length else _MOST_TEXT_BYTES
+        return len(self.text) if self.has_fixed_length else _MAX_TEXT_BYTES
 
     def get(self) -> int:
         """Return the present value of an integer entry."""
@@ -276,7 +274,7 @@ class ObjectDictionary:
             self.add(index, sub_entry, sub)
 
     def adopt_file_entries(
-        self, file: Mapping[tuple[int, int], Description], unchanged_indices: Container[int]
+        self, file: Mapping[tuple[int, int], EntryDescription], unchanged_indices: Container[int]
     ) -> None:
         """Restrict the dictionary to the entries of a device's file, and adopt their descriptions.
 
@@ -459,7 +457,7 @@ class SdoServer:
         command_byte = data[0]
         target_entry = self._objects.find_writable(self._index, self._sub)
         if command_byte & _EXPEDITED_BIT:
-            data_size = min(target_entry.most_bytes, _EXPEDITED_SIZE)
+            data_size = min(target_entry.max_bytes, _EXPEDITED_SIZE)
             if command_byte & _SIZE_STATED_BIT:
                 data_size = _EXPEDITED_SIZE - (command_byte >> 2 & 0x03)
             self._write(data[4 : 4 + data_size])
@@ -507,7 +505,7 @@ class SdoServer:
         else:
             self._buffer += data[1 : 1 + _SEGMENT_SIZE - (command_byte >> 1 & 0x07)]
             # No writable entry is longer. Without this check a client could fill the memory.
-            if len(self._buffer) > self._objects.find_writable(self._index, self._sub).most_bytes:
+            if len(self._buffer) > self._objects.find_writable(self._index, self._sub).max_bytes:
                 raise Abort(AbortCode.LENGTH)
             is_last = bool(command_byte & _LAST_SEGMENT_BIT)
             if is_last:
@@ -559,7 +557,7 @@ class DeviceFile:
 
     name: str
     """Name of the file."""
-    entries: Mapping[tuple[int, int], Description]
+    entries: Mapping[tuple[int, int], EntryDescription]
     """Descriptions by index and sub-index."""
 
     def present_offsets(self, first_index: int, last_index: int) -> Iterator[int]:
@@ -612,13 +610,13 @@ def read_device(path: Path, node_id: int) -> DeviceFile:
     return DeviceFile(path.name, descriptions)
 
 
-def _to_description(eds_entry: EdsEntry) -> Description:
+def _to_description(eds_entry: EdsEntry) -> EntryDescription:
     """Convert the entry of an EDS file to a description for a simulated node."""
     sdo_access = _SDO_ACCESS.get(eds_entry.access, eds_entry.access)
     type_letter = _TYPE_LETTERS.get(eds_entry.data_type)
     if type_letter is None:
         size_bytes = _TIME_TYPE_LENGTHS.get(eds_entry.data_type) or (eds_entry.bits or 0) // 8
-        return Description(
+        return EntryDescription(
             "s",
             sdo_access,
             "",
@@ -645,7 +643,7 @@ def _to_description(eds_entry: EdsEntry) -> Description:
     default_value = (
         None if eds_entry.default is None else _to_type_range(eds_entry.default, type_letter)
     )
-    return Description(
+    return EntryDescription(
         type_letter, sdo_access, pdo_directions, default_value, lower_limit, upper_limit
     )
 

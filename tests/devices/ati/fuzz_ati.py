@@ -237,7 +237,7 @@ def fuzz_modbus(n, seed):
             del reply[rng.randrange(len(reply) + 1) :]
         try:
             content = protocol.reply_content(request, bytes(reply))
-        except (protocol.BadReply, protocol.ExceptionResponse):
+        except (protocol.InvalidReplyError, protocol.ModbusExceptionError):
             content = None
         if content is not None:
             taken += 1

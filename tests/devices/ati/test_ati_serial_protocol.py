@@ -70,14 +70,14 @@ def reply_to_status(fakes, body):
     ("code", "words"), [(1, "function"), (2, "no such register"), (4, "failed"), (99, "code 99")]
 )
 def test_a_refusal_is_told_in_words(fakes, code, words):
-    with pytest.raises(protocol.ExceptionResponse, match=words):
+    with pytest.raises(protocol.ModbusExceptionError, match=words):
         reply_to_status(fakes, bytes((0x0A, 0x83, code)))
 
 
 def test_a_declined_start_and_lock_are_refusals(fakes):
     for request in (protocol.START_STREAMING, protocol.UNLOCK):
         body = request[:2] + b"\x00"
-        with pytest.raises(protocol.ExceptionResponse, match="code 0"):
+        with pytest.raises(protocol.ModbusExceptionError, match="code 0"):
             protocol.reply_content(request, body + fakes.crc_bitwise(body))
 
 
@@ -92,19 +92,19 @@ def test_a_declined_start_and_lock_are_refusals(fakes):
     ],
 )
 def test_replies_that_do_not_fit_the_request(fakes, body, words):
-    with pytest.raises(protocol.BadReply, match=words):
+    with pytest.raises(protocol.InvalidReplyError, match=words):
         reply_to_status(fakes, hexed(body))
 
 
 def test_confirmation_of_other_registers(fakes):
     request = protocol.write_registers(0, (1, 2))
     body = hexed("0A 10 00 00 00 03")
-    with pytest.raises(protocol.BadReply, match="other registers"):
+    with pytest.raises(protocol.InvalidReplyError, match="other registers"):
         protocol.reply_content(request, body + fakes.crc_bitwise(body))
 
 
 def test_silence_is_a_bad_reply():
-    with pytest.raises(protocol.BadReply, match="no reply"):
+    with pytest.raises(protocol.InvalidReplyError, match="no reply"):
         protocol.reply_content(protocol.UNLOCK, b"")
 
 
@@ -123,7 +123,7 @@ def test_a_damaged_reply_is_never_taken(fakes, at, mask, cut, extra):
     request = protocol.read_registers(protocol.STATUS_WORD, 1)
     for reply in (bytes(damaged), sound[:cut] + extra):
         if reply != sound:
-            with pytest.raises(protocol.BadReply):
+            with pytest.raises(protocol.InvalidReplyError):
                 protocol.reply_content(request, reply)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.touch._kernels import ContactKernels
-from rigd.touch._physical import WhitenedWindow
+from rigd.touch._obstacle_contact import WhitenedWindow
 
 Real = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.engine._touch_watch import TouchWatch
+from rigd.engine._touch_monitor import TouchMonitor
 from rigd.engine.messages import TouchOrder
 from rigd.excitation import Approach, TouchPass, reference_after_touch
 from rigd.excitation.moves import braking_path, quintic
@@ -60,7 +60,7 @@ class ScriptedDetector:
 @pytest.fixture
 def search(monkeypatch):
     """Two passes, watched; the detector is scripted."""
-    monkeypatch.setattr("rigd.engine._touch_watch.TouchDetector", ScriptedDetector)
+    monkeypatch.setattr("rigd.engine._touch_monitor.TouchDetector", ScriptedDetector)
     first, one = one_pass(100)
     second, two = one_pass(100 + first.size)
     planned = np.concatenate([np.zeros(100), first, second, np.zeros(50)])
@@ -68,15 +68,15 @@ def search(monkeypatch):
     cycle = SimpleNamespace(flags=0, wrench=(0.0,) * 6, angle_rad=0.1, coupling_torque_nm=0.2)
     approach = Approach((one, two), BRAKING, 200, BACK, force_limit_n=5.0)
     order = TouchOrder(None, None, approach, SHEAR)
-    watch = TouchWatch(order, cycle, memoryview(reference), RATE_HZ)
+    monitor = TouchMonitor(order, cycle, memoryview(reference), RATE_HZ)
     return SimpleNamespace(
-        watch=watch,
+        monitor=monitor,
         cycle=cycle,
         reference=reference,
         planned=planned,
         one=one,
         two=two,
-        detector=watch._detector,
+        detector=monitor._detector,
     )
 
 
@@ -85,7 +85,7 @@ def run(search, until=None):
     contacts = {}
     for tick in range(until or search.planned.size):
         search.cycle.flags = 0
-        contact = search.watch.step(tick, 0)
+        contact = search.monitor.step(tick, 0)
         if contact is not None:
             contacts[tick] = contact
             if contact.ends:
@@ -157,7 +157,7 @@ def test_too_great_a_force_ends_as_a_fault(search):
 def test_the_detector_is_told_all(search):
     search.cycle.wrench = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     search.cycle.flags = int(Status.ANGLE_STALE | Status.WRENCH_STALE)
-    search.watch.step(3, 3)
+    search.monitor.step(3, 3)
     assert search.detector.seen == (0.1, 0.2, 2.0, 3, True, True)
 
 

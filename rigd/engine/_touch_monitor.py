@@ -28,7 +28,7 @@ class DetectedContact:
     """Whether the detector found a touch, which is then marked in the tick's sample."""
 
 
-class TouchWatch:
+class TouchMonitor:
     """Monitor that detects a touch during a search, and makes the motor react to it.
 
     After a touch on the way out, or in the pause after it, the motor brakes, waits, and returns to

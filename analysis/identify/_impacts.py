@@ -90,7 +90,7 @@ class DetectedImpact:
 
     Attributes
     ----------
-    knock : RecordedImpact
+    impact : RecordedImpact
         Time, poles and amplitudes of the impact.
     explained_fraction : float
         Fraction of the unexplained cost that the impact explains.
@@ -99,12 +99,12 @@ class DetectedImpact:
         the record once the impact is removed.
     """
 
-    knock: RecordedImpact
+    impact: RecordedImpact
     explained_fraction: float
     residual_power_ratio: float
 
     @property
-    def evident(self) -> bool:
+    def is_evident(self) -> bool:
         """Return whether the impact explains most of the torque residual and begins abruptly."""
         return (
             self.explained_fraction > _EVIDENT_FRACTION
@@ -112,7 +112,7 @@ class DetectedImpact:
         )
 
     @property
-    def obvious(self) -> bool:
+    def is_obvious(self) -> bool:
         """Return whether the impact explains so much that no other effect is tested first."""
         return (
             self.explained_fraction > _OBVIOUS_FRACTION
@@ -128,10 +128,10 @@ def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Itera
     also uses the residual of fits to either half. With `obvious` it is limited to obvious
     impacts.
     """
-    if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_IMPACTS:
+    if candidate_set.misread or len(candidate_set.comparison.measurement.impacts) == MAX_IMPACTS:
         return
     found_in_whole = find_impact(candidate_set)
-    if found_in_whole is not None and found_in_whole.obvious:
+    if found_in_whole is not None and found_in_whole.is_obvious:
         yield found_in_whole
         found_in_whole = None
     if obvious:
@@ -198,7 +198,7 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
             # The ringing after the impact may be far louder than the response to the reference,
             # and the part that follows the reference then identifies no beam.
             reference_rad=None,
-            knocks=(),
+            impacts=(),
         )
         try:
             analysis = fit_record(half_measurement, (_FREEST_STRUCTURE,), band_hz=band_hz)
@@ -207,10 +207,12 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         fit, used_bins = analysis.fits[0], analysis.noise.counts
         if not whiteness(
             fit.residual[used_bins], analysis.comparison.frequency_hz[used_bins]
-        ).white:
+        ).is_white:
             continue
         comparison_with_hum = comparison.remove_hum(()).recompute_incoherent_torque(fit.plant)
-        unknowns = Unknowns.of(_FREEST_STRUCTURE, measurement.nominal, candidate_set.free)
+        unknowns = Unknowns.for_structure(
+            _FREEST_STRUCTURE, measurement.nominal, candidate_set.free
+        )
         refit_at_start = partial(
             Refit.descend,
             comparison_with_hum,
@@ -227,7 +229,7 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
 
 def add_known_impact(measurement: Measurement, impact: DetectedImpact) -> Measurement:
     """Return the measurement with a detected impact added to its known impacts."""
-    return replace(measurement, knocks=(*measurement.knocks, impact.knock))
+    return replace(measurement, impacts=(*measurement.impacts, impact.impact))
 
 
 def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
@@ -457,7 +459,7 @@ def _impact_with_amplitudes(refit: Refit, first_sample: int, end_sample: int) ->
         ) : first_sample
     ]
     return DetectedImpact(
-        knock=replace(
+        impact=replace(
             impact,
             sizes=tuple(amplitudes.tolist()),
             largest_nm=float(np.abs(torque_nm[first_second_samples]).max()),

@@ -1,7 +1,7 @@
-"""Table of the checks on paper, which `rigd check` shows and every session requires.
+"""Table of the offline checks, which `rigd check` shows and every session requires.
 
 If one of them fails, no session is started, unless the operator accepts the failed row by its name.
-A new check is a function that yields rows, and an entry of `PAPER_CHECKS`.
+A new check is a function that yields rows, and an entry of `OFFLINE_CHECKS`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from rigd.check_rows import CheckResult, CheckRow
-from rigd.checks import on_paper as paper
+from rigd.checks import offline
 from rigd.devices import unknown_values
 from rigd.errors import FailureError, UserError
 from rigd.profile import Profile
@@ -32,11 +32,11 @@ class CheckFailedError(FailureError):
 
 
 class UnknownRowError(UserError):
-    """The operator accepts a row that no check on paper has; the message lists the valid names."""
+    """The operator accepts a row that no offline check has; the message lists the valid names."""
 
 
 @dataclass(frozen=True, slots=True)
-class PaperCheck:
+class OfflineCheck:
     """Check of a rig's profile or computer that needs no device."""
 
     rows: Callable[[Profile], Iterator[CheckRow]]
@@ -51,75 +51,77 @@ class PaperCheck:
     It is then omitted while any value is unknown."""
 
 
-PAPER_CHECKS: Final = (
-    PaperCheck(paper.drive_file_rows, (paper.EDS_ROW,), needs_values=False),
-    PaperCheck(paper.profile_rows, needs_values=False),
-    PaperCheck(paper.record_rows, needs_values=False),
-    PaperCheck(paper.axis_tilt_rows, needs_values=False),
-    PaperCheck(
-        paper.unknown_rows,
-        (paper.UNKNOWN_VALUES_ROW,),
+OFFLINE_CHECKS: Final = (
+    OfflineCheck(offline.drive_file_rows, (offline.EDS_ROW,), needs_values=False),
+    OfflineCheck(offline.profile_rows, needs_values=False),
+    OfflineCheck(offline.record_rows, needs_values=False),
+    OfflineCheck(offline.axis_tilt_rows, needs_values=False),
+    OfflineCheck(
+        offline.unknown_rows,
+        (offline.UNKNOWN_VALUES_ROW,),
         not_acceptable="nothing can be computed without it",
         needs_values=False,
     ),
-    PaperCheck(
-        lambda profile: paper.wiring_rows(profile.rig),
-        (paper.CAN_IDENTIFIERS_ROW, paper.CAN_LOAD_ROW, paper.SERIAL_LOAD_ROW),
+    OfflineCheck(
+        lambda profile: offline.wiring_rows(profile.rig),
+        (offline.CAN_IDENTIFIERS_ROW, offline.CAN_LOAD_ROW, offline.SERIAL_LOAD_ROW),
         not_acceptable="devices could receive what is not meant for them, or too late",
         needs_values=False,
     ),
-    PaperCheck(
-        paper.added_device_rows,
-        (paper.DEVICE_ROW,),
+    OfflineCheck(
+        offline.added_device_rows,
+        (offline.DEVICE_ROW,),
         not_acceptable="the device could not be used",
         needs_values=False,
     ),
-    PaperCheck(
-        paper.added_controller_rows,
-        (paper.CONTROLLER_ROW,),
+    OfflineCheck(
+        offline.added_controller_rows,
+        (offline.CONTROLLER_ROW,),
         not_acceptable="the shaft could not be held",
     ),
-    PaperCheck(
-        paper.stability_rows,
-        (paper.STABILITY_ROW,),
+    OfflineCheck(
+        offline.stability_rows,
+        (offline.STABILITY_ROW,),
         not_acceptable="the shaft could not be held",
     ),
-    PaperCheck(paper.margin_rows),
-    PaperCheck(
-        paper.travel_rows,
+    OfflineCheck(offline.margin_rows),
+    OfflineCheck(
+        offline.stopping_distance_rows,
         (
-            paper.TRAVEL_LOOP_FAILS_ROW,
-            paper.TRAVEL_NO_ANGLE_ROW,
-            paper.TRAVEL_ENCODER_FAILS_ROW,
-            paper.TRAVEL_MISSED_TICKS_ROW,
+            offline.STOPPING_LOOP_FAILS_ROW,
+            offline.STOPPING_NO_ANGLE_ROW,
+            offline.STOPPING_ENCODER_FAILS_ROW,
+            offline.STOPPING_MISSED_TICKS_ROW,
         ),
     ),
 )
-"""All checks on paper, in the order of their rows; checks of the same group are adjacent."""
+"""All offline checks, in the order of their rows; checks of the same group are adjacent."""
 
 ACCEPTABLE: Final = tuple(
-    name for check in PAPER_CHECKS for name in check.names if not check.not_acceptable
+    name for check in OFFLINE_CHECKS for name in check.names if not check.not_acceptable
 )
 """Names of the rows whose failure the operator can accept for a session."""
-_CHECK_BY_ROW_NAME: Final = {name: check for check in PAPER_CHECKS for name in check.names}
+_CHECK_BY_ROW_NAME: Final = {name: check for check in OFFLINE_CHECKS for name in check.names}
 """Map from the name of a row that can fail to its check."""
 
 
-def paper_rows(profile: Profile) -> list[CheckRow]:
-    """Return the rows of all checks on paper, which need no device.
+def offline_rows(profile: Profile) -> list[CheckRow]:
+    """Return the rows of all offline checks, which need no device.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     """
-    return [row for paper_check in PAPER_CHECKS for row in _rows_of_check(paper_check, profile)]
+    return [
+        row for offline_check in OFFLINE_CHECKS for row in _rows_of_check(offline_check, profile)
+    ]
 
 
-def _rows_of_check(paper_check: PaperCheck, profile: Profile) -> Iterator[CheckRow]:
+def _rows_of_check(offline_check: OfflineCheck, profile: Profile) -> Iterator[CheckRow]:
     """Yield a check's result rows, or none if it needs a value that the profile lacks."""
-    if not (paper_check.needs_values and unknown_values(profile.rig)):
-        yield from paper_check.rows(profile)
+    if not (offline_check.needs_values and unknown_values(profile.rig)):
+        yield from offline_check.rows(profile)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,8 +139,8 @@ class FailedCheck:
 
 
 @dataclass(frozen=True, slots=True)
-class PaperCheckResult:
-    """Result of the checks on paper for a session."""
+class OfflineCheckResult:
+    """Result of the offline checks for a session."""
 
     failed: tuple[FailedCheck, ...] = ()
     """All failed rows, accepted or not."""
@@ -172,8 +174,8 @@ class PaperCheckResult:
             raise CheckFailedError("\n".join(self.refusals), wrong_use=never_acceptable)
 
 
-def check_on_paper(profile: Profile, accepted_names: Sequence[str] = ()) -> PaperCheckResult:
-    """Run the checks on paper for a session, and return which rows failed or are accepted.
+def run_offline_checks(profile: Profile, accepted_names: Sequence[str] = ()) -> OfflineCheckResult:
+    """Run the offline checks for a session, and return which rows failed or are accepted.
 
     Parameters
     ----------
@@ -195,8 +197,8 @@ def check_on_paper(profile: Profile, accepted_names: Sequence[str] = ()) -> Pape
     for row_name in accepted_names:
         _check_name(row_name)
     failed_rows: dict[str, FailedCheck] = {}
-    for paper_check in PAPER_CHECKS:
-        for row in _rows_of_check(paper_check, profile) if paper_check.names else ():
+    for offline_check in OFFLINE_CHECKS:
+        for row in _rows_of_check(offline_check, profile) if offline_check.names else ():
             if row.verdict is not CheckResult.FAIL:
                 continue
             row_name, names_text = row.name, _failure_text(row)
@@ -205,12 +207,12 @@ def check_on_paper(profile: Profile, accepted_names: Sequence[str] = ()) -> Pape
             ):  # several rows of one name: an EDS file that lacks two objects
                 names_text = f"{failed_rows[row_name].text}\n{names_text}"
             failed_rows[row_name] = FailedCheck(
-                row_name, names_text, not paper_check.not_acceptable, row_name in accepted_names
+                row_name, names_text, not offline_check.not_acceptable, row_name in accepted_names
             )
     accepted_needlessly = [
         row_name for row_name in dict.fromkeys(accepted_names) if row_name not in failed_rows
     ]
-    return PaperCheckResult(
+    return OfflineCheckResult(
         tuple(failed_rows.values()),
         tuple(
             f"--accept {row_name}: it did not fail; nothing was accepted."
@@ -221,17 +223,17 @@ def check_on_paper(profile: Profile, accepted_names: Sequence[str] = ()) -> Pape
 
 def _check_name(row_name: str) -> None:
     """Raise UnknownRowError unless a failed check of this name can be accepted by the operator."""
-    paper_check = _CHECK_BY_ROW_NAME.get(row_name)
-    if paper_check is None:
+    offline_check = _CHECK_BY_ROW_NAME.get(row_name)
+    if offline_check is None:
         raise UnknownRowError(
             f"--accept {row_name[:60]}: no row of rigd check has that name; those that can "
             "be accepted "
             f"are {', '.join(ACCEPTABLE)}."
         )
-    if paper_check.not_acceptable:
+    if offline_check.not_acceptable:
         raise UnknownRowError(
             f"--accept {row_name}: a failure of that row cannot be accepted: "
-            f"{paper_check.not_acceptable}."
+            f"{offline_check.not_acceptable}."
         )
 
 

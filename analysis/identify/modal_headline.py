@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from analysis.identify._uncertainty import damping_size
+from analysis.identify._uncertainty import pivot_loss_factor
 from analysis.identify.headline import (
     DAMPING_PARAMETER_NAMES,
     Estimates,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify.beam_uniformity import UniformBeamTest
     from analysis.identify.headline import Headline, ReportedLossFactor, StructureStatus
-    from analysis.identify.profile_likelihood import LikelihoodProfile, Order
+    from analysis.identify.profile_likelihood import LikelihoodProfile, OrderName
     from analysis.identify.tolerant_estimate import TolerantEstimate
 
 NOT_UNIFORM: Final = (
@@ -103,7 +103,7 @@ def replace_by_modal_model(
         Half width of the modes' 95 % intervals, in standard deviations.
     """
     refusal = uniform_beam_refusal_reason(test)
-    exact_estimates = exact if refusal is None else exact.doubted(refusal)
+    exact_estimates = exact if refusal is None else exact.with_flag_on_all(refusal)
     # The effect of drag depends on how a mode decays, which the beam model includes.
     modes_of_beam = test.status == "passed" and (tolerant is None or "drag" in exact.parameters)
     modes = _reported_modes(exact_estimates, modal, mode_doubt, half_width, from_beam=modes_of_beam)
@@ -121,7 +121,7 @@ def replace_by_modal_model(
             **_reported_parameters(tolerant, doubt, refused=refusal is not None),
         },
         sizes=tuple(
-            loss_factor_found.flagged(doubt)
+            loss_factor_found.with_flag(doubt)
             for loss_factor_found in loss_factors_with_geometry_tolerance(test, tolerant)
         ),
         structures=_structure_status(exact_estimates, tolerant),
@@ -154,7 +154,7 @@ def flag_contradicted_damping(headline: Headline, causes: Sequence[CauseFit]) ->
     """
     parameters = {
         name: _flag_contradicted(
-            estimate, [(getattr(cause.damping, name), cause.words) for cause in causes]
+            estimate, [(getattr(cause.damping, name), cause.phrase) for cause in causes]
         )
         if name in ("zeta", "alpha")
         else estimate
@@ -168,7 +168,7 @@ def flag_contradicted_damping(headline: Headline, causes: Sequence[CauseFit]) ->
             size=_flag_contradicted(
                 loss_factor.size,
                 [
-                    (cause.damping.internal_loss_factor(loss_factor.omega_rad_s), cause.words)
+                    (cause.damping.internal_loss_factor(loss_factor.omega_rad_s), cause.phrase)
                     for cause in causes
                 ],
             ),
@@ -189,7 +189,7 @@ def flag_modes_changed_by_drag(headline: Headline, mode_numbers: Sequence[int]) 
         Modes whose damping ratio depends on air drag of unknown size.
     """
     modes = tuple(
-        replace(mode, damping_ratio=mode.damping_ratio.flagged(_CHANGED_BY_DRAG))
+        replace(mode, damping_ratio=mode.damping_ratio.with_flag(_CHANGED_BY_DRAG))
         if mode.number in mode_numbers
         else mode
         for mode in headline.modes
@@ -198,14 +198,14 @@ def flag_modes_changed_by_drag(headline: Headline, mode_numbers: Sequence[int]) 
 
 
 def _flag_contradicted(estimate: Estimate, rivals: Sequence[tuple[float, str]]) -> Estimate:
-    """Return an estimate with a flag if a cause, given by value and words, has another value."""
+    """Return an estimate with a flag if a cause, given by value and phrase, has another value."""
     if estimate.interval_95 is None:
         return estimate
     low, high = estimate.interval_95
-    for value, words in rivals:
+    for value, phrase in rivals:
         half_width = high - estimate.value if value > estimate.value else estimate.value - low
         if abs(value - estimate.value) > _CONTRADICTION_STDS / NORMAL_95 * half_width:
-            return estimate.flagged(f"{words} would explain the modes, too, with {value:.3g}")
+            return estimate.with_flag(f"{phrase} would explain the modes, too, with {value:.3g}")
     return estimate
 
 
@@ -281,17 +281,24 @@ def _reason_undetermined(estimate: TolerantEstimate, parameter_name: str) -> str
     if estimate.basis == "none":
         return NO_ORDER
     for order_name, coefficient_name in COEFFICIENT_OF.items():
-        if parameter_name in (order_name, coefficient_name) and not identifiable(
+        if parameter_name in (order_name, coefficient_name) and not is_order_identifiable(
             estimate, order_name
         ):
             return ORDER_NOT_DETERMINED_REASON
     return None
 
 
-def identifiable(estimate: TolerantEstimate, order_name: str) -> bool:
+def is_order_identifiable(estimate: TolerantEstimate, order_name: str) -> bool:
     """Return whether the modes determine a damping order.
 
     Its 95 % interval must be narrower than a quarter of its range, and its damping significant.
+
+    Parameters
+    ----------
+    estimate : TolerantEstimate
+        Parameters of a beam with a tolerance of the geometry.
+    order_name : str
+        "alpha" or "lambda".
     """
     order_low, order_high = estimate.interval[order_name]
     widest_interval = MAX_IDENTIFIABLE_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
@@ -343,7 +350,7 @@ def loss_factors_with_geometry_tolerance(
     parameter_values = dict(estimate.values)
     reported_factors = []
     for damping, (coefficient_name, order_name) in DAMPING_PARAMETER_NAMES.items():
-        loss_factor = damping_size(
+        loss_factor = pivot_loss_factor(
             coefficient_name,
             order_name,
             parameter_values,
@@ -374,7 +381,7 @@ def effective_reason(parameter_name: str, *, refused: bool) -> str | None:
 
 
 def order_verdict_with_geometry_tolerance(
-    order: Order,
+    order: OrderName,
     estimate: TolerantEstimate,
     profile: LikelihoodProfile,
     doubt: str | None,
@@ -383,9 +390,19 @@ def order_verdict_with_geometry_tolerance(
 ) -> OrderVerdict:
     """Return the verdict on one damping order, with a tolerance of the geometry.
 
-    `profile` is the likelihood profile of the order on an exactly uniform beam, `doubt` the reason
-    against every number of the record. With `refused`, a uniform beam does not predict the modes:
-    the cause may have a loss of its own, so no order is excluded.
+    Parameters
+    ----------
+    order : str
+        "alpha" or "lambda".
+    estimate : TolerantEstimate
+        Parameters of a beam with a tolerance of the geometry.
+    profile : LikelihoodProfile
+        Likelihood profile of the order on an exactly uniform beam.
+    doubt : str or None
+        Reason against every number of the record.
+    refused : bool
+        Whether a uniform beam does not predict the modes. No order is excluded then, because the
+        cause may have a loss of its own.
     """
     status, reason = order_status_with_geometry_tolerance(order, estimate, refused=refused)
     if reason is not None:
@@ -398,7 +415,7 @@ def order_verdict_with_geometry_tolerance(
 
 
 def order_status_with_geometry_tolerance(
-    order: Order, estimate: TolerantEstimate, *, refused: bool
+    order: OrderName, estimate: TolerantEstimate, *, refused: bool
 ) -> tuple[Status, str | None]:
     """Return the status of one damping order, and the reason if it is not identifiable.
 
@@ -413,7 +430,7 @@ def order_status_with_geometry_tolerance(
     """
     if estimate.basis == "none":
         return "not identifiable", NO_ORDER
-    if not identifiable(estimate, order):
+    if not is_order_identifiable(estimate, order):
         return "not identifiable", ORDER_NOT_DETERMINED_REASON
     order_low, order_high = estimate.interval[order]
     if order_low <= 1 <= order_high:

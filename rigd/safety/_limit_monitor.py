@@ -35,7 +35,7 @@ _CheckedValue = tuple[str, str, str, float, float, float]
 If channel or unit is empty, that of the interlock applies."""
 
 
-class LimitWatch:
+class LimitMonitor:
     """Compares the readings of every tick with the limits of the rig.
 
     Without a value near its limit a tick costs a few comparisons; only if these fail are details

@@ -15,7 +15,7 @@ from analysis.models import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from analysis.paper import WelchAnalysis
+    from analysis.paper.welch_analysis import WelchAnalysis
     from analysis.record import Record
 
 Band = tuple[float, float]
@@ -202,7 +202,7 @@ def welch_analysis(
         Whether the Welch fits may be omitted. Fits with a chosen estimator or chosen segments are
         not omitted.
     on_step : callable, optional
-        Called with the name of each step after it (see `analysis.paper.analyse`).
+        Called with the name of each step after it (see `analysis.paper.welch_analysis.analyse`).
 
     Returns
     -------
@@ -216,7 +216,8 @@ def welch_analysis(
     FrequencyResponseError
         The fits may not be omitted, and cannot be run.
     """
-    from analysis.paper import FrequencyResponseError, SettingsError, analyse
+    from analysis.paper import FrequencyResponseError, SettingsError
+    from analysis.paper.welch_analysis import analyse
 
     optional = optional and settings.are_from_paper
     exclusion_reason = welch_exclusion_reason(record, requested_hz) if optional else None

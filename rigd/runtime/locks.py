@@ -196,7 +196,7 @@ class RigLock:
         self.release()
 
 
-def holds_rig(pid: int, rig: str, folder: Path) -> bool:
+def holds_rig_lock(pid: int, rig: str, folder: Path) -> bool:
     """Return whether a process holds the lock of a rig, according to the kernel's table of locks.
 
     Parameters
@@ -229,7 +229,7 @@ def holds_rig(pid: int, rig: str, folder: Path) -> bool:
     return False
 
 
-def held_rig(pid: int) -> str | None:
+def locked_rig(pid: int) -> str | None:
     """Return the name of the rig whose lock file a process has open.
 
     Parameters

@@ -16,9 +16,14 @@ from rigd.touch._explanations import (
     Explanation,
     ExplanationSearch,
 )
-from rigd.touch._physical import MAX_LN_STIFFNESS, MIN_LN_STIFFNESS, ObstacleContact, WhitenedWindow
+from rigd.touch._obstacle_contact import (
+    MAX_LN_STIFFNESS,
+    MIN_LN_STIFFNESS,
+    ObstacleContact,
+    WhitenedWindow,
+)
 from rigd.touch._posterior import Posterior
-from rigd.touch._results import Estimated, TouchEstimate
+from rigd.touch._results import TouchEstimate, TouchQuantity
 
 Real = NDArray[np.float64]
 
@@ -121,7 +126,7 @@ def estimate_from_explanations(
     )
 
 
-def _unexplained_position(explanation_search: ExplanationSearch) -> Estimated:
+def _unexplained_position(explanation_search: ExplanationSearch) -> TouchQuantity:
     """Return the position of an unexplained touch in m, with a wide interval.
 
     The interval contains all positions at which any force could cause the first samples, or the
@@ -138,23 +143,25 @@ def _unexplained_position(explanation_search: ExplanationSearch) -> Estimated:
         ]
     )
     low_m, high_m = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
-    return Estimated(
+    return TouchQuantity(
         explanation_search.any_force.interval(_WIDE_LIKELIHOOD_DROP)[0],
         (high_m - low_m) / 4,
         (low_m, high_m),
     )
 
 
-def _with_wide_interval(explanation_search: ExplanationSearch, estimate: Estimated) -> Estimated:
+def _with_wide_interval(
+    explanation_search: ExplanationSearch, estimate: TouchQuantity
+) -> TouchQuantity:
     """Return a touch position in m, with an interval that includes that for any force over time."""
     *_, low_m, high_m = explanation_search.any_force.interval()
     low_m, high_m = min(low_m, estimate.interval_95[0]), max(high_m, estimate.interval_95[1])
-    return Estimated(estimate.value, max(estimate.std, (high_m - low_m) / 4), (low_m, high_m))
+    return TouchQuantity(estimate.value, max(estimate.std, (high_m - low_m) / 4), (low_m, high_m))
 
 
 def _position_estimate(
     explanation_search: ExplanationSearch, likely_explanations: list[Explanation]
-) -> Estimated:
+) -> TouchQuantity:
     """Return the position of the touch in m, with the additional uncertainty from bounces."""
     position = _common_parameter(likely_explanations, 0)
     is_near_tip = (
@@ -173,7 +180,7 @@ def _position_estimate(
         for end, interval_sign in zip(position.interval_95, (-1.0, 1.0), strict=True)
     )
     length_m = explanation_search.tables.model.plant.beam.length_m
-    return Estimated(
+    return TouchQuantity(
         position.value,
         float(np.hypot(position.std, additional_std_m)),
         (max(float(low_m), 0.0), min(float(high_m), length_m)),
@@ -184,7 +191,7 @@ def _force_estimate(
     explanation_search: ExplanationSearch,
     best_explanation: Explanation,
     sample_window: WhitenedWindow,
-) -> tuple[Real, Real, Estimated]:
+) -> tuple[Real, Real, TouchQuantity]:
     """Return the contact force over time, its instants, and its peak with an interval.
 
     Force and instants are those of the likeliest parameters. The interval of the peak contains the
@@ -221,7 +228,7 @@ def _force_estimate(
         )
         peak_forces_n = force_history_n.max(axis=1)
     low_n, high_n = np.quantile(peak_forces_n[1:], (0.025, 0.975))
-    peak_force = Estimated(
+    peak_force = TouchQuantity(
         float(peak_forces_n[1:].mean()),
         float(peak_forces_n[1:].std()),
         (float(low_n), float(high_n)),
@@ -250,7 +257,7 @@ def _is_about_as_likely(best_explanation: Explanation, other_explanation: Explan
 
 def _common_parameter(
     likely_explanations: list[Explanation], parameter_column: int, value_shift: float = 0.0
-) -> Estimated:
+) -> TouchQuantity:
     """Return the estimate of a parameter that all likely explanations of a touch have.
 
     `parameter_column` is the column of the parameter in the posterior's samples, and `value_shift`
@@ -273,12 +280,12 @@ def _common_parameter(
             (posterior_mean - low_end) / _NORMAL_QUANTILE_95,
             (high_end - posterior_mean) / _NORMAL_QUANTILE_95,
         )
-    return Estimated(
+    return TouchQuantity(
         posterior_mean + value_shift, posterior_std, (low_end + value_shift, high_end + value_shift)
     )
 
 
-def _stiffness_estimate(posterior: Posterior) -> Estimated | None:
+def _stiffness_estimate(posterior: Posterior) -> TouchQuantity | None:
     """Return the obstacle's estimated stiffness in N/m, or None if the data do not bound it.
 
     The value is the exponential of the logarithm's median.
@@ -293,7 +300,7 @@ def _stiffness_estimate(posterior: Posterior) -> Estimated | None:
     ):
         return None
     stiffness_n_per_m = float(np.exp(median_ln_stiffness))
-    return Estimated(
+    return TouchQuantity(
         stiffness_n_per_m,
         stiffness_n_per_m * posterior.std(2),
         (float(np.exp(low_ln_stiffness)), float(np.exp(high_ln_stiffness))),

@@ -7,7 +7,7 @@ import pytest
 from cases import further
 
 from analysis.identify import fit_freest_alone, select
-from analysis.identify._knock import find_impact
+from analysis.identify._impacts import find_impact
 from rigd.beam import PointForceGrid, modes
 
 RATE_HZ = 1000.0
@@ -70,7 +70,7 @@ def test_a_knock_is_named_with_its_instant(knocked, plants, link, force_n, at_s,
     assert headline.flags.keys() <= {"lambda", "gamma", "alpha", "zeta"}
     assert all(mode.damping_ratio.flag is None for mode in headline.modes)
     assert told(headline, plants, link) < 4
-    assert len(analysis.comparison.measurement.knocks) == 1
+    assert len(analysis.comparison.measurement.impacts) == 1
 
 
 @pytest.mark.further

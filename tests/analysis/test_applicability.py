@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import Comparison, Measurement
-from analysis.models import WelchSettings
-from analysis.paper import FrequencyResponseError, SettingsError
-from analysis.record import load_record
-from analysis.suited import (
+from analysis.applicability import (
     record_band_hz,
     remarks,
     welch_analysis,
     welch_exclusion_reason,
     welch_settings,
 )
+from analysis.identify import Comparison, Measurement
+from analysis.models import WelchSettings
+from analysis.paper import FrequencyResponseError, SettingsError
+from analysis.record import load_record
 
 
 @pytest.fixture
@@ -51,8 +51,10 @@ def test_the_band_ends_at_four_tenths_of_the_rate(record_of, every, last_hz):
     assert welch_settings(record, WelchSettings()).band_hz == (0.5875, last_hz)
     assert [f"{last_hz:g} Hz" in each for each in remarks(record)] == [True] * (last_hz < 50)
     # And that is what the estimator takes: 0.4 of the rate, and nothing beyond.
-    measurement = Measurement.of_record(record)
-    assert Comparison.of(measurement, record_band_hz(record)).frequency_hz[-1] <= last_hz
+    measurement = Measurement.from_record(record)
+    assert (
+        Comparison.from_measurement(measurement, record_band_hz(record)).frequency_hz[-1] <= last_hz
+    )
 
 
 def test_the_band_of_a_part_is_what_it_sweeps(record_of):

@@ -38,7 +38,7 @@ _MIN_LEARNED_READINGS = 100
 """Smallest number of readings at the tare that determines the fractions of repeated readings."""
 
 
-class SensorWatch:
+class SensorMonitor:
     """Compares each reading of the force-torque sensor with the previous one to detect failures.
 
     Parameters

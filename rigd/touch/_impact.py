@@ -1,10 +1,10 @@
-"""A knock from outside: one pulse of force that is independent of the antenna's motion."""
+"""An impact from outside: one pulse of force that is independent of the antenna's motion."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.touch._kernels import ContactKernels
-from rigd.touch._physical import ObstacleContact, ParameterRanges, WhitenedWindow
+from rigd.touch._obstacle_contact import ObstacleContact, ParameterRanges, WhitenedWindow
 
 Real = NDArray[np.float64]
 
@@ -12,8 +12,8 @@ _DURATIONS_S = np.array([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
 """Durations of the pulse in s with which the search starts."""
 
 
-class KnockResponse:
-    """Effect of a knock on the beam, a half-sine pulse of force, on torque and base shear.
+class ImpactResponse:
+    """Effect of an impact on the beam, a half-sine pulse of force, on torque and base shear.
 
     A candidate has four columns: position, instant, logarithm of the duration, and peak.
 
@@ -35,12 +35,12 @@ class KnockResponse:
         self._contact, self._kernels, self._stride = obstacle_contact, kernels, position_stride
 
     def predict(self, parameters: Real, sample_window: WhitenedWindow) -> Real:
-        """Return the effect of knocks on torque and base shear, shape (k, c, samples).
+        """Return the effect of impacts on torque and base shear, shape (k, c, samples).
 
         Parameters
         ----------
         parameters
-            Position, instant, logarithm of the duration and peak of each knock, shape (k, 4).
+            Position, instant, logarithm of the duration and peak of each impact, shape (k, 4).
         sample_window
             Samples for which the effect is predicted.
         """
@@ -54,17 +54,17 @@ class KnockResponse:
         kernel_tables = (local_kernels.torque, local_kernels.shear)[: free_motion.noise.size]
         return self._contact.effects(kernel_tables, forces_n, parameters[:, 1], sample_window)
 
-    def starts(self, sample_window: WhitenedWindow, latest_sample: int, knock_count: int) -> Real:
-        """Return the likeliest knocks of a grid, each with its best peak, (knock_count, 4).
+    def starts(self, sample_window: WhitenedWindow, latest_sample: int, impact_count: int) -> Real:
+        """Return the likeliest impacts of a grid, each with its best peak, (impact_count, 4).
 
         Parameters
         ----------
         sample_window
-            Whitened innovations with which the knocks are compared.
+            Whitened innovations with which the impacts are compared.
         latest_sample
-            Index of the last sample at which the knock may begin.
-        knock_count
-            Number of knocks that are returned.
+            Index of the last sample at which the impact may begin.
+        impact_count
+            Number of impacts that are returned.
         """
         positions_m = self._kernels.x_m[:: self._stride]
         knock_grid = np.stack(
@@ -89,7 +89,7 @@ class KnockResponse:
             effect_power = np.einsum("kn,kn->k", delayed_effects, delayed_effects) + 1e-300
             peaks_n = delayed_effects @ sample_window.data / effect_power
             chi2_gain = peaks_n**2 * effect_power
-            best_rows = np.argsort(-chi2_gain)[:knock_count]
+            best_rows = np.argsort(-chi2_gain)[:impact_count]
             candidate_parts.append(
                 np.column_stack(
                     [
@@ -102,11 +102,11 @@ class KnockResponse:
                 )
             )
         all_candidates = np.concatenate(candidate_parts)
-        return all_candidates[np.argsort(all_candidates[:, 0])[:knock_count], 1:]
+        return all_candidates[np.argsort(all_candidates[:, 0])[:impact_count], 1:]
 
     @staticmethod
     def space(x_m: tuple[float, float], instants: tuple[float, float]) -> ParameterRanges:
-        """Return the allowed ranges of a knock's four parameters.
+        """Return the allowed ranges of an impact's four parameters.
 
         Parameters
         ----------

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rigd.touch._free_motion import SPLINE_FADE_SAMPLES, STEPS_PER_SAMPLE, TouchRecord
 from rigd.touch._kernels import contact_kernels
-from rigd.touch._physical import ObstacleContact, WhitenedWindow
+from rigd.touch._obstacle_contact import ObstacleContact, WhitenedWindow
 from rigd.touch._tables import TouchTables
 
 Real = NDArray[np.float64]

@@ -42,7 +42,7 @@ _CHECK_WINDOWS = 8
 """Number of windows from one check of the ratio to the next."""
 
 
-class ScaleWatch:
+class ScaleMonitor:
     """Estimates the ratio of net torque to inertia times acceleration, and checks it.
 
     The estimate uses windows of `WINDOW_TICKS` ticks.

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from rigd.engine.messages import Failed
+from rigd.engine.messages import ProcessFailed
 from rigd.engine.processes import ChildError
 from rigd.engine.shared_state import Level, LogEvent
 
@@ -17,7 +17,7 @@ _POLL_S: Final = 0.05
 """Time in seconds to wait for a message at once."""
 
 
-class SessionWorker(ABC):
+class WorkerClient(ABC):
     """Client of a worker without which a session continues.
 
     A subclass names the worker, sends its job by `_start`, and processes its messages.
@@ -48,9 +48,11 @@ class SessionWorker(ABC):
 
         The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
         """
-        start_s = self.worker.start_s
-        if not self._wait(lambda: self._is_ready, start_s, call_while_waiting):
-            self._lose(f"The {self.worker.name} process was not ready within {start_s:g} s.")
+        start_timeout_s = self.worker.start_timeout_s
+        if not self._wait(lambda: self._is_ready, start_timeout_s, call_while_waiting):
+            self._restart_or_give_up(
+                f"The {self.worker.name} process was not ready within {start_timeout_s:g} s."
+            )
         return self.failure
 
     def poll(self) -> list[LogEvent]:
@@ -61,11 +63,11 @@ class SessionWorker(ABC):
 
     def check(self) -> None:
         """Process the received messages, and give the worker up or restart it if it hangs."""
-        if self.process_messages(0.0) and self.worker.hung_after_s is not None:
-            limit_s = self.worker.hung_after_s if self._is_ready else self.worker.start_s
+        if self.process_messages(0.0) and self.worker.max_silence_s is not None:
+            limit_s = self.worker.max_silence_s if self._is_ready else self.worker.start_timeout_s
             if self._group.stalled_s(self.worker) > limit_s:
                 self._group[self.worker].kill()
-                self._lose(
+                self._restart_or_give_up(
                     f"The {self.worker.name} process was killed: no response for {limit_s:g} s."
                 )
 
@@ -75,14 +77,14 @@ class SessionWorker(ABC):
             try:
                 for message in self._group[self.worker].messages(timeout_s):
                     self._is_ready |= type(message).__name__ == self.worker.sends[0]
-                    if isinstance(message, Failed):
+                    if isinstance(message, ProcessFailed):
                         self._process_failure(message.reason)
                     else:
                         self._process_message(message)
                     if self._is_done:  # the worker may end now
                         break
             except ChildError as error:
-                self._lose(str(error))
+                self._restart_or_give_up(str(error))
         return not (self.failure or self._is_done)
 
     def _start(self, *messages: object) -> None:
@@ -101,7 +103,7 @@ class SessionWorker(ABC):
             try:
                 self._group[self.worker].send(message)
             except ChildError as error:
-                self._lose(str(error))
+                self._restart_or_give_up(str(error))
 
     def _wait(
         self,
@@ -122,7 +124,7 @@ class SessionWorker(ABC):
                 return is_met() or bool(self.failure)
         return True
 
-    def _lose(self, reason: str) -> None:
+    def _restart_or_give_up(self, reason: str) -> None:
         """Restart the lost process, or give it up after its number of restarts."""
         self._restart_count += 1
         if self._restart_count > self.worker.restarts:

@@ -8,8 +8,8 @@ import pytest
 
 from rigd.beam import mode_shape, undamped_frequencies_rad_s
 from rigd.check_rows import CheckResult, CheckRow, overall
-from rigd.checks import check_on_paper, check_without_devices
-from rigd.checks.on_paper import axis_tilt_rows, profile_rows, record_rows, wiring_rows
+from rigd.checks import check_without_devices, run_offline_checks
+from rigd.checks.offline import axis_tilt_rows, profile_rows, record_rows, wiring_rows
 from rigd.devices.canbus import bus_load
 from rigd.excitation import ExcitationError, chirp
 from rigd.profile import load_profile
@@ -65,7 +65,7 @@ def test_an_unknown_tilt_of_the_axis_is_a_warning_that_refuses_nothing(can_profi
     for words in ("0.027 % for 0.5°", "level", "rig.axis_tilt_deg"):
         assert words in row.detail
     assert row in check_without_devices(can_profile, None)
-    assert not check_on_paper(can_profile).refusals
+    assert not run_offline_checks(can_profile).refusals
     (row,) = axis_tilt_rows(load_profile("sim"))
     assert row.verdict is CheckResult.SKIPPED
 

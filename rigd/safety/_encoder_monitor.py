@@ -21,7 +21,7 @@ from collections import deque
 from math import copysign, inf, sqrt
 
 from rigd.safety._beam_prediction import BeamPrediction
-from rigd.safety._scale_watch import SPEED_TICKS, WINDOW_TICKS, ScaleWatch
+from rigd.safety._scale_monitor import SPEED_TICKS, WINDOW_TICKS, ScaleMonitor
 from rigd.safety.limits import INTERLOCKS_BY_NAME, Violation
 
 ENCODER_FAILURE_S = 0.004
@@ -73,7 +73,7 @@ _MIN_REPEAT_STEPS = 3.5
 """Smallest movement per tick before and after a repeated reading, in encoder steps."""
 
 
-class EncoderWatch:
+class EncoderMonitor:
     """Compares the encoder's readings with the torques on the shaft to detect a failed encoder.
 
     It runs in every tick in which the motor may exert torque.
@@ -93,7 +93,7 @@ class EncoderWatch:
         Net torque that exceeds any friction of the shaft.
     delay_ticks
         Ticks from a torque command to the torque.
-    scale_watch
+    scale_monitor
         Check of the scales of encoder and motor, or None to omit it.
 
     Attributes
@@ -122,7 +122,7 @@ class EncoderWatch:
         "_rate_hz",
         "_repeat_ticks",
         "_resolution_rad",
-        "_scale_watch",
+        "_scale_monitor",
         "_standstill_count",
         "_test_start_rad",
         "_test_step_nm",
@@ -141,10 +141,10 @@ class EncoderWatch:
         inertia_kg_m2: float,
         breakaway_nm: float,
         delay_ticks: int,
-        scale_watch: ScaleWatch | None = None,
+        scale_monitor: ScaleMonitor | None = None,
     ) -> None:
         self._prediction = prediction
-        self._scale_watch = scale_watch
+        self._scale_monitor = scale_monitor
         self._rate_hz = rate_hz
         self._resolution_rad = resolution_rad
         self._inertia_kg_m2 = inertia_kg_m2
@@ -200,8 +200,8 @@ class EncoderWatch:
         self._angles.append(angle_rad)
         self._delayed_commands_nm.extend([0.0] * (self._delayed_commands_nm.maxlen or 0))
         self._coupling_nm2 = 0.0
-        if self._scale_watch is not None:
-            self._scale_watch.reset()
+        if self._scale_monitor is not None:
+            self._scale_monitor.reset()
         self._standstill_count = self._count = self._next_test_tick = 0
         self._irregular_ticks = 0
         self.tests = 0
@@ -245,8 +245,8 @@ class EncoderWatch:
         angles.append(angle_rad)
         if self._irregular_ticks:
             self._irregular_ticks -= 1
-        elif self._count % WINDOW_TICKS == 0 and self._scale_watch is not None:
-            violation = self._compare_scales(self._scale_watch)
+        elif self._count % WINDOW_TICKS == 0 and self._scale_monitor is not None:
+            violation = self._compare_scales(self._scale_monitor)
             if violation is not None:
                 return violation
         if moved_rad:
@@ -278,7 +278,7 @@ class EncoderWatch:
         return None
 
     def skip(self, ticks: int, angle_rad: float) -> None:
-        """Advance the watch over ticks that were missed or have only old readings.
+        """Advance the monitor over ticks that were missed or have only old readings.
 
         The torque was constant in these ticks.
 
@@ -407,7 +407,7 @@ class EncoderWatch:
             return None
         return INTERLOCKS_BY_NAME["repeated angle"].violated(len(repeat_ticks), _MAX_REPEATS - 1)
 
-    def _compare_scales(self, scale_watch: ScaleWatch) -> Violation | None:
+    def _compare_scales(self, scale_monitor: ScaleMonitor) -> Violation | None:
         """Pass acceleration and net torque over the last `WINDOW_TICKS` to the scale watch."""
         angles, torque_history = self._angles, self._torque_history
         n = WINDOW_TICKS
@@ -435,7 +435,7 @@ class EncoderWatch:
         speed_rad_s = (
             (recent_movement_rad + previous_movement_rad) * self._rate_hz / (2 * SPEED_TICKS)
         )
-        return scale_watch.add(acceleration_rad_s2, speed_rad_s, motor_nm - net_nm, net_nm)
+        return scale_monitor.add(acceleration_rad_s2, speed_rad_s, motor_nm - net_nm, net_nm)
 
     def _torque_sums(self, ticks: int) -> tuple[float, float]:
         """Return the sums of net torque and motor torque over the last `ticks` ticks in N·m.

@@ -21,7 +21,7 @@ from rigd.devices.cia402._protocol import (
     describe_error,
     drive_state,
 )
-from rigd.devices.cia402._sdo import SdoAccess, SdoRefusal
+from rigd.devices.cia402._sdo import SdoAbortError, SdoAccess
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 
@@ -72,7 +72,7 @@ def reset_fault(port: CanPort, rig: RigParameters, drive_name: str) -> str | Non
     with SdoAccess(port, settings.node_id, drive_name) as sdo:
         _confirm_off(sdo, drive_name)
         sdo.enter_pre_operational()
-        with suppress(SdoRefusal):
+        with suppress(SdoAbortError):
             # No heartbeat is sent now, whose absence would be the next fault.
             sdo.write(objects.HEARTBEAT_CONSUMER, 1, 0)
         patience_s = settings.enable_timeout_s
@@ -218,7 +218,7 @@ def _confirm_ready(
     DeviceError
         If the drive does not get ready, so that no session could be started.
     """
-    with suppress(SdoRefusal):
+    with suppress(SdoAbortError):
         sdo.write(objects.CONTROLWORD, 0, SHUTDOWN)
     is_ready = wait_for(lambda: _read_state(sdo) is DriveState.READY, patience_s)
     statusword = sdo.read(objects.STATUSWORD)
@@ -261,7 +261,7 @@ def _describe_fault(sdo: SdoAccess) -> str:
     """Return a description of the cause of the drive's fault."""
     try:
         error_code = sdo.read(objects.ERROR_CODE)
-    except SdoRefusal:
+    except SdoAbortError:
         error_code = 0
     error_code = error_code or sdo.last_emergency()
     return describe_error(error_code) if error_code else "the drive names no cause"

@@ -34,7 +34,11 @@ def use_one_thread() -> None:
     os.environ.update(SINGLE_THREADED)
 
 
-RUN_PROGRAM: Final = (*OWN_PYTHON, "-c", "from rigd.runtime import run_program; run_program()")
+RUN_PROGRAM: Final = (
+    *OWN_PYTHON,
+    "-c",
+    "from rigd.runtime.background import run_program; run_program()",
+)
 """First words of a command line that becomes another program. The process id of its parent follows,
 with which the system ends the program, and then the program's own command line."""
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Indices:
+class FitIndices:
     """Fit indices: distances between a measured and a modelled frequency response.
 
     Attributes
@@ -58,7 +58,7 @@ def fit_indices(
     omega_rad_s: NDArray[np.float64],
     measured_response: NDArray[np.complex128],
     model_response: NDArray[np.complex128],
-) -> Indices:
+) -> FitIndices:
     """Return the fit indices of a model (Eqs. 28 to 30), from the deviations ``|G - Ĝ|``.
 
     Parameters
@@ -75,7 +75,7 @@ def fit_indices(
     """
     absolute_deviation = np.abs(measured_response - model_response)
     squared_deviation = absolute_deviation**2
-    return Indices(
+    return FitIndices(
         mse=float(squared_deviation.mean()),
         wmse=float(weights(omega_rad_s, "omega") @ squared_deviation),
         md=float(absolute_deviation.max()),
@@ -100,7 +100,9 @@ class PeakDeviation:
     """Deviation of one session's resonant peak from a model's: a term of Eqs. (31) and (32)."""
 
     frequency_rad_s: float
+    """Magnitude of the difference in frequency, in rad/s."""
     magnitude_db: float
+    """Magnitude of the difference in magnitude, in dB."""
 
 
 def resonant_peaks(
@@ -129,7 +131,7 @@ def resonant_peaks(
     Examples
     --------
     >>> import numpy as np
-    >>> from analysis.paper import resonant_peaks
+    >>> from analysis.paper.welch_analysis import resonant_peaks
     >>> frequency_hz = np.linspace(1, 4, 301)
     >>> response = 1 / (2.5**2 - frequency_hz**2 + 0.05j * frequency_hz)
     >>> (peak,) = resonant_peaks(frequency_hz, response, np.array([2.5]))
@@ -178,7 +180,7 @@ def peak_deviation(measured_peak: Peak, model_peak: Peak) -> PeakDeviation:
 
     Examples
     --------
-    >>> from analysis.paper import Peak, peak_deviation
+    >>> from analysis.paper.welch_analysis import Peak, peak_deviation
     >>> found = peak_deviation(Peak(2.55, -10.0), Peak(2.56, -10.4))
     >>> print(f"{found.frequency_rad_s:.4f} rad/s, {found.magnitude_db:.1f} dB")
     0.0628 rad/s, 0.4 dB
@@ -279,7 +281,7 @@ def largest_oscillation_time_s(
     Examples
     --------
     >>> import numpy as np
-    >>> from analysis.paper import largest_oscillation_time_s
+    >>> from analysis.paper.welch_analysis import largest_oscillation_time_s
     >>> t = np.arange(10_000) / 1000
     >>> values = np.exp(-((t - 4) ** 2)) * np.sin(2 * np.pi * 5 * t)
     >>> print(f"{largest_oscillation_time_s(values, 1000, 5.0):.2f} s")
@@ -316,7 +318,7 @@ class FittedModel:
         The fit.
     response : ndarray of complex, shape (n,)
         Response of the model, with the tool inertia, at the fitted bins, in N·m/rad.
-    indices : Indices
+    indices : FitIndices
         Distances from the measured response.
     modes : tuple of Mode
         Modes of the beam without tool inertia, from its poles; empty if strong damping leaves a
@@ -332,7 +334,7 @@ class FittedModel:
 
     fit: FrfFit
     response: NDArray[np.complex128]
-    indices: Indices
+    indices: FitIndices
     modes: tuple[Mode, ...]
     followed: tuple[bool, ...]
     peaks: tuple[Peak | None, ...]

@@ -59,13 +59,13 @@ if TYPE_CHECKING:
 
 # Closed loop
 
-LEAST_TORQUE_GAIN_FACTOR = 1.2
+MIN_TORQUE_GAIN_FACTOR = 1.2
 """Smallest gain margin at torque command and torque reading, as a factor up and down."""
-LEAST_ANGLE_GAIN_FACTOR = 2.0
+MIN_ANGLE_GAIN_FACTOR = 2.0
 """Smallest gain margin at the angle reading, as a factor up and down."""
-LEAST_PHASE_MARGIN_RAD = radians(20.0)
+MIN_PHASE_MARGIN_RAD = radians(20.0)
 """Smallest phase margin in rad without a warning."""
-LEAST_DELAY_MARGIN_PERIODS = 1.0
+MIN_DELAY_MARGIN_PERIODS = 1.0
 """Smallest delay margin without a warning, in periods of the loop."""
 
 
@@ -123,22 +123,22 @@ def margin_rows(profile: Profile) -> Iterator[CheckRow]:
         yield CheckRow("loop", "margins", skip_reason, "", CheckResult.SKIPPED)
         return
     period_s = 1.0 / profile.rig.rate_hz
-    for cut_margins in loop_margins(closed_loop):
-        least_gain_factor = (
-            LEAST_ANGLE_GAIN_FACTOR
-            if cut_margins.cut == "angle reading"
-            else LEAST_TORQUE_GAIN_FACTOR
+    for opening_margins in loop_margins(closed_loop):
+        min_gain_factor = (
+            MIN_ANGLE_GAIN_FACTOR
+            if opening_margins.opening == "angle reading"
+            else MIN_TORQUE_GAIN_FACTOR
         )
         yield from _margin_rows(
-            cut_margins, least_gain_factor, LEAST_DELAY_MARGIN_PERIODS * period_s
+            opening_margins, min_gain_factor, MIN_DELAY_MARGIN_PERIODS * period_s
         )
 
 
 def _margin_rows(
-    margins: "Margins", least_gain_factor: float, least_delay_s: float
+    margins: "Margins", min_gain_factor: float, min_delay_s: float
 ) -> Iterator[CheckRow]:
     """Yield check results on the stability margins at one signal of the loop."""
-    row_group = f"loop, {margins.cut}"
+    row_group = f"loop, {margins.opening}"
     gain_up_text = (
         "any"
         if margins.gain_up == inf
@@ -153,18 +153,18 @@ def _margin_rows(
         row_group,
         "gain margin",
         f"{gain_down_text} / {gain_up_text}",
-        f"{_decibels(1 / least_gain_factor)} / {_decibels(least_gain_factor)}",
+        f"{_decibels(1 / min_gain_factor)} / {_decibels(min_gain_factor)}",
         grade(
             fail=False,
-            warn=margins.gain_up < least_gain_factor or margins.gain_down > 1 / least_gain_factor,
+            warn=margins.gain_up < min_gain_factor or margins.gain_down > 1 / min_gain_factor,
         ),
     )
     yield CheckRow(
         row_group,
         "phase margin",
         _with_frequency(f"{degrees(margins.phase_rad):.1f}°", margins.phase_hz),
-        f"{degrees(LEAST_PHASE_MARGIN_RAD):.0f}°",
-        grade(fail=False, warn=margins.phase_rad < LEAST_PHASE_MARGIN_RAD),
+        f"{degrees(MIN_PHASE_MARGIN_RAD):.0f}°",
+        grade(fail=False, warn=margins.phase_rad < MIN_PHASE_MARGIN_RAD),
     )
     yield CheckRow(
         row_group,
@@ -172,8 +172,8 @@ def _margin_rows(
         "any"
         if margins.delay_s == inf
         else _with_frequency(f"{margins.delay_s * 1e3:.2f} ms", margins.delay_hz),
-        f"{least_delay_s * 1e3:.2f} ms",
-        grade(fail=False, warn=margins.delay_s < least_delay_s),
+        f"{min_delay_s * 1e3:.2f} ms",
+        grade(fail=False, warn=margins.delay_s < min_delay_s),
     )
     yield CheckRow(
         row_group,
@@ -197,27 +197,27 @@ def _with_frequency(value_text: str, frequency_hz: float) -> str:
 # Stopping distance
 
 _TIME_STEP_S = 5e-5
-"""Time step in seconds of the simulated travel under torque."""
-_MAX_TRAVEL_RAD = 100.0
-"""Travel in rad above which the travel counts as infinite."""
+"""Time step in seconds of the simulated motion under torque."""
+_MAX_STOPPING_DISTANCE_RAD = 100.0
+"""Stopping distance in rad above which it counts as infinite."""
 _NEGLIGIBLE_VISCOUS_RATIO = 1e-6
 """Ratio of viscous to Coulomb friction torque below which viscous friction is neglected."""
-_TRAVEL_GROUP = "travel"
+_STOPPING_GROUP = "travel"
 """Group of the rows on the stopping distance."""
 _LOOP_FAILS_LABEL = "if the loop fails"
-"""Label of the row on the travel after a failure of the loop."""
-TRAVEL_LOOP_FAILS_ROW = "travel_loop_fails"
-"""Name of the row on the travel after the loop has stopped."""
-TRAVEL_ENCODER_FAILS_ROW = "travel_encoder_fails"
-"""Name of the row on the travel after a failure of the encoder."""
-TRAVEL_NO_ANGLE_ROW = "travel_no_angle"
-"""Name of the row on the travel while no new angles arrive."""
-TRAVEL_MISSED_TICKS_ROW = "travel_missed_ticks"
-"""Name of the row on the travel during missed ticks."""
+"""Label of the row on the stopping distance after a failure of the loop."""
+STOPPING_LOOP_FAILS_ROW = "travel_loop_fails"
+"""Name of the row on the stopping distance after the loop has stopped."""
+STOPPING_ENCODER_FAILS_ROW = "travel_encoder_fails"
+"""Name of the row on the stopping distance after a failure of the encoder."""
+STOPPING_NO_ANGLE_ROW = "travel_no_angle"
+"""Name of the row on the stopping distance while no new angles arrive."""
+STOPPING_MISSED_TICKS_ROW = "travel_missed_ticks"
+"""Name of the row on the stopping distance during missed ticks."""
 
 
 @dataclass(frozen=True, slots=True)
-class Travel:
+class StoppingDistance:
     """Stopping distance of the shaft after a failure: angle under torque, then while coasting."""
 
     driven_rad: float
@@ -234,9 +234,9 @@ class Travel:
 
 
 @lru_cache(maxsize=64)
-def worst_travel(
+def max_stopping_distance(
     rig: RigParameters, limits: Limits, torque_on_s: float, max_speed_rad_s: float = inf
-) -> Travel:
+) -> StoppingDistance:
     """Return the longest stopping distance that the limits allow while nothing controls the shaft.
 
     Parameters
@@ -254,7 +254,7 @@ def worst_travel(
     with the shaft like a rigid body afterwards.
     """
     if isinf(torque_on_s):
-        return Travel(inf, inf)
+        return StoppingDistance(inf, inf)
     motor, beam = rig.motor, rig.beam
     without_beam_kg_m2 = motor.inertia_kg_m2 + rig.sensor.tool_inertia_kg_m2
     with_beam_kg_m2 = without_beam_kg_m2 + beam.density_kg_per_m * beam.length_m**3 / 3
@@ -269,12 +269,14 @@ def worst_travel(
         if speed_rad_s == previous_rad_s:  # it goes on like this
             under_torque_rad += speed_rad_s * (step_count - 1 - step_number) * _TIME_STEP_S
             break
-        if under_torque_rad > _MAX_TRAVEL_RAD:
+        if under_torque_rad > _MAX_STOPPING_DISTANCE_RAD:
             break
-    if under_torque_rad > _MAX_TRAVEL_RAD:
-        return Travel(inf, inf)
+    if under_torque_rad > _MAX_STOPPING_DISTANCE_RAD:
+        return StoppingDistance(inf, inf)
     coasting_rad = _coasting_rad(with_beam_kg_m2, motor, speed_rad_s)
-    return Travel(under_torque_rad, coasting_rad if coasting_rad <= _MAX_TRAVEL_RAD else inf)
+    return StoppingDistance(
+        under_torque_rad, coasting_rad if coasting_rad <= _MAX_STOPPING_DISTANCE_RAD else inf
+    )
 
 
 def _coasting_rad(inertia_kg_m2: float, motor: "Motor", speed_rad_s: float) -> float:
@@ -317,7 +319,7 @@ def _uncontrolled_failures(profile: Profile) -> tuple[_UncontrolledFailure, ...]
     watchdog_key = "cia402.own_watchdog_s" if own_watchdog else "cia402.heartbeat_timeout_s"
     return (
         _UncontrolledFailure(
-            TRAVEL_LOOP_FAILS_ROW,
+            STOPPING_LOOP_FAILS_ROW,
             _LOOP_FAILS_LABEL,
             drive_settings.watchdog_s,
             f"of the drive's watchdog ({watchdog_key})",
@@ -325,21 +327,21 @@ def _uncontrolled_failures(profile: Profile) -> tuple[_UncontrolledFailure, ...]
         ),
         # The tick that finds one old angle too many removes the torque, after the command's delay.
         _UncontrolledFailure(
-            TRAVEL_NO_ANGLE_ROW,
+            STOPPING_NO_ANGLE_ROW,
             "if no angle comes",
             (stale_ticks + 1) / rig.rate_hz + rig.actuation.delay_s,
             f"of {stale_ticks} old angles (limits.stale_ticks_in_a_row)",
             "limits.stale_ticks_in_a_row",
         ),
         _UncontrolledFailure(
-            TRAVEL_ENCODER_FAILS_ROW,
+            STOPPING_ENCODER_FAILS_ROW,
             "if the encoder fails",
             ENCODER_FAILURE_S + 2 / rig.rate_hz + rig.actuation.delay_s,
             "of the encoder watch",
             "limits.standstill_torque_nm",
         ),
         _UncontrolledFailure(
-            TRAVEL_MISSED_TICKS_ROW,
+            STOPPING_MISSED_TICKS_ROW,
             "if ticks are missed",
             (missed_ticks + 1) / rig.rate_hz + rig.actuation.delay_s,
             f"of {missed_ticks} missed ticks (limits.missed_ticks_in_a_row)",
@@ -348,7 +350,7 @@ def _uncontrolled_failures(profile: Profile) -> tuple[_UncontrolledFailure, ...]
     )
 
 
-def travel_rows(profile: Profile) -> Iterator[CheckRow]:
+def stopping_distance_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield results that compare the stopping distance after each failure with the free angle.
 
     The free angle is that between the limit of the angle and the mechanical stop.
@@ -357,12 +359,12 @@ def travel_rows(profile: Profile) -> Iterator[CheckRow]:
     if drive_settings is None:
         skip_reason = "the drive is part of this program and ends with it"
         yield CheckRow(
-            _TRAVEL_GROUP,
+            _STOPPING_GROUP,
             _LOOP_FAILS_LABEL,
             skip_reason,
             "",
             CheckResult.SKIPPED,
-            name=TRAVEL_LOOP_FAILS_ROW,
+            name=STOPPING_LOOP_FAILS_ROW,
         )
         return
     uncontrolled_failures = _uncontrolled_failures(profile)
@@ -376,19 +378,19 @@ def travel_rows(profile: Profile) -> Iterator[CheckRow]:
             if not isinf(uncontrolled_failure.duration_s)
         )
         yield CheckRow(
-            _TRAVEL_GROUP,
+            _STOPPING_GROUP,
             f"worst, {_LOOP_FAILS_LABEL}",
             "without bound: the profile accepts a drive without a watchdog",
             bound_text,
             CheckResult.WARNING,
             f"Travel {_LOOP_FAILS_LABEL}: nothing but the wired stop ends it "
             '(cia402.accept_without = ["watchdog"]).',
-            TRAVEL_LOOP_FAILS_ROW,
+            STOPPING_LOOP_FAILS_ROW,
         )
     has_speed_limit = drive_settings.max_speed_rad_s > 0
     highest_rad_s = drive_settings.max_speed_rad_s if has_speed_limit else inf
     travels = [
-        worst_travel(rig, limits, uncontrolled_failure.duration_s, highest_rad_s)
+        max_stopping_distance(rig, limits, uncontrolled_failure.duration_s, highest_rad_s)
         for uncontrolled_failure in uncontrolled_failures
     ]
     longest_index = max(
@@ -401,7 +403,7 @@ def travel_rows(profile: Profile) -> Iterator[CheckRow]:
         exceeds_margin = not stopping_travel.total_rad <= margin_rad
         detail_text = ""
         if failure_index == longest_index:
-            unlimited_failures = worst_travel(rig, limits, uncontrolled_failure.duration_s)
+            unlimited_failures = max_stopping_distance(rig, limits, uncontrolled_failure.duration_s)
             detail_text = (
                 "" if has_no_bound else f"Travel: the worst is {uncontrolled_failure.what}. "
             )
@@ -422,7 +424,7 @@ def travel_rows(profile: Profile) -> Iterator[CheckRow]:
             )
         worst_failure = "worst, " if failure_index == longest_index and not has_no_bound else ""
         yield CheckRow(
-            _TRAVEL_GROUP,
+            _STOPPING_GROUP,
             f"{worst_failure}{uncontrolled_failure.what}",
             f"{_format_angle(stopping_travel.total_rad)}: "
             f"{_format_angle(stopping_travel.driven_rad)} in the "
@@ -437,7 +439,11 @@ def travel_rows(profile: Profile) -> Iterator[CheckRow]:
 
 def _format_angle(angle_rad: float) -> str:
     """Format an angle in rad; an infinite one as "more than 100 rad"."""
-    return f"more than {_MAX_TRAVEL_RAD:g} rad" if isinf(angle_rad) else f"{angle_rad:.2f} rad"
+    return (
+        f"more than {_MAX_STOPPING_DISTANCE_RAD:g} rad"
+        if isinf(angle_rad)
+        else f"{angle_rad:.2f} rad"
+    )
 
 
 def _friction_nm(rig: RigParameters, speed_rad_s: float) -> float:
