@@ -200,14 +200,7 @@ def _print_tables(
     console: Console, record_results: Sequence[RecordResult], *, single: bool, verbose: bool
 ) -> None:
     """Print the tables of a single file, or a summary of several files."""
-    from analysis.report import (
-        FileWarnings,
-        result_text,
-        shared_warnings,
-        shown_warnings,
-        summary_table,
-        warning_lines,
-    )
+    from analysis.report import result_text, shown_warnings, summary_table, warning_lines
 
     welch_results = [
         record_result for record_result in record_results if record_result.welch is not None
@@ -216,6 +209,8 @@ def _print_tables(
         for record_result in record_results:
             console.print(result_text(record_result, verbose=verbose))
     elif not welch_results:
+        from analysis.report import FileWarnings, shared_warnings
+
         for record_result in record_results:
             console.print(result_text(record_result, verbose=verbose, with_warnings=False))
         for line in warning_lines(
@@ -248,7 +243,6 @@ def _analyse_all(
     from analysis.identify import MeasurementError
     from analysis.paper import FrequencyResponseError, SettingsError
     from analysis.record import RecordError
-    from analysis.report import FileWarnings, shared_warnings
     from analysis.report.folder import OutputError
     from rigd.printable import progress_bar
     from rigd.session import SessionError
@@ -295,13 +289,16 @@ def _analyse_all(
                 error_messages[str(session_file)] = error_text = _error_message(session_file, error)
                 file_progress.update(progress_task, completed=file_number * step_count)
                 print_message(f"Error: {error_text}")
-        for line in shared_warnings(
-            [
-                FileWarnings(str(session_file), session_file, warning_texts)
-                for session_file, warning_texts in zip(files, file_warnings, strict=True)
-            ]
-        ):
-            print_message(f"Warning: {line}")
+        if len(files) > 1:
+            from analysis.report import FileWarnings, shared_warnings
+
+            for line in shared_warnings(
+                [
+                    FileWarnings(str(session_file), session_file, warning_texts)
+                    for session_file, warning_texts in zip(files, file_warnings, strict=True)
+                ]
+            ):
+                print_message(f"Warning: {line}")
     return record_results, error_messages, exit_code
 
 

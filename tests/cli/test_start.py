@@ -98,7 +98,7 @@ def test_no_bar_is_drawn_after_a_session_before_the_next(follow):
     _, done, _ = follow(*events, series(1, 2), quick_looks=False)
     updates = [each[0] for each in done if each[0] == "update"]
     assert len(updates) == 2
-    first = done.index(("say", "Complete: 1200 of 1200 samples, 0 missed, 0 late."))
+    first = done.index(("write_message", "Complete: 1200 of 1200 samples, 0 missed, 0 late."))
     assert done[first + 1 : first + 4] == [("close",), "new", ("update", done[first + 3][1])]
     assert done[-1] == ("close",)
 
@@ -110,7 +110,7 @@ def test_the_last_quick_look_is_waited_for(follow):
         "out/1.look.json",
         "out/2.look.json",
     ]
-    said = [each[1] for each in done if each[0] == "say"]
+    said = [each[1] for each in done if each[0] == "write_message"]
     assert said[-2:] == ["Quick look at the session; Ctrl-C skips it.", "Last"]
     assert said.count("Quick look") == 1
 
@@ -119,7 +119,7 @@ def test_a_quick_look_that_does_not_follow_is_not_waited_for(follow):
     first, second = (session(k) | {"look_follows": k == 1} for k in (1, 2))
     ended, done, _ = follow(first, look(1), second, series(1, 2))
     assert [each["look"] for each in ended["sessions"]] == ["out/1.look.json", None]
-    assert not any("Ctrl-C skips it" in each[1] for each in done if each[0] == "say")
+    assert not any("Ctrl-C skips it" in each[1] for each in done if each[0] == "write_message")
 
 
 @pytest.mark.parametrize("interrupts", [(), (1,)])  # the session was stopped by a first one
@@ -144,7 +144,7 @@ def test_what_is_notable_is_told_and_the_fit_is_in_the_document(follow):
     ended, done, _ = follow(
         *told, session(1) | {"fit": fit}, session(2), series(1, 2), quick_looks=False
     )
-    said = [each[1] for each in done if each[0] == "say"]
+    said = [each[1] for each in done if each[0] == "write_message"]
     assert said[0] == "  8.0 s 0.910 ± 0.010 %"
     assert not any("Next" in each for each in said)
     assert not any("Fault" in each for each in said)  # the session's own event tells it

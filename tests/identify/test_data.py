@@ -51,7 +51,7 @@ COUNT_RAD = 7e-5
 def counts_used(counts, reference_rad):
     """Angle in counts that a fit uses for an encoder's readings."""
     record = {"angle_rad": counts * COUNT_RAD, "reference_rad": reference_rad}
-    return Measurement.of_record(SimpleNamespace(**vars(RECORD) | record)).angle_rad / COUNT_RAD
+    return Measurement.from_record(SimpleNamespace(**vars(RECORD) | record)).angle_rad / COUNT_RAD
 
 
 def test_an_encoder_between_two_counts_at_rest_is_at_the_edge():
