@@ -224,6 +224,8 @@ class DragResponse:
         measured_poles = measured_modes.poles_rad_s if measured_modes else {}
         for mode_number, pole in measured_poles.items():
             assert measured_modes is not None
+            if mode_number > DRAG_MODES:
+                continue
             mode_index, pole_pair = mode_number - 1, np.array([pole, pole.conjugate()])
             # The external damping of a fit without drag is arbitrary; pole and phase contain it.
             p[mode_index] = inertia
@@ -287,7 +289,7 @@ class DragResponse:
         mode_numbers = [
             mode_number
             for mode_number in mode_numbers
-            if self._pole_pairs[mode_number - 1][0].imag > 0
+            if mode_number <= DRAG_MODES and self._pole_pairs[mode_number - 1][0].imag > 0
         ]
         force_spectra = self._transform_forces(modal_forces)
         modal_speeds = self._modal_speed_by_angle + self._speed_per_force * force_spectra[:-1]

@@ -200,3 +200,14 @@ def test_the_torque_has_the_measured_phase_of_each_mode(short):
     assert abs(lag_rad(true_modes.residue)) < 0.01
     without_external_damping = 1j * true_modes.poles_rad_s[1] ** 4
     assert lag_rad(lambda _: without_external_damping) == pytest.approx(-0.24, abs=0.02)
+
+
+def test_modes_beyond_those_that_drag_moves_are_left_out(short):
+    soft_beam = replace(LINK, bending_stiffness_n_m2=0.004)
+    soft = Plant(soft_beam, Damping(zeta=7e-5, alpha=1.0))
+    poles = {pole.mode: pole.at_rad_s for pole in soft.mode_poles(7, ())}
+    modes = SimpleNamespace(poles_rad_s=poles, residue=lambda mode: 1j * poles[mode] ** 4)
+    drag = DragResponse(short.angle_rad, short.decimation.rate_hz, soft, modes)
+    torque = drag.torque(DragLaw(1e-3), range(1, 8))
+    assert list(torque.by_pole) == [1, 2, 3, 4, 5]
+    assert np.isfinite(torque.torque_nm).all()
