@@ -45,7 +45,7 @@ other pages report of many. `python benchmarks/bench_NAME.py --help` says what a
 and has an option for its size; `--report` prints without judging; `build/bench.json` has all rows.
 
 This page is written by `python benchmarks/run_all.py --release`, which appends the values of the
-last `make bench` to `docs/validation/benchmarks.json`; a column stands for a release.
+last `make bench` to `docs/validation/benchmarks.json`; each column is one release.
 """
 
 

@@ -216,29 +216,31 @@ class DragResponse:
         self._grid = DragGrid.of(beam, DRAG_MODES, DRAG_POINTS)
         k = (eigenvalues(DRAG_MODES) / beam.length_m) ** 4
         log_s, inertia = np.log(s), beam.density_over_stiffness * s * s
-        p = np.tile(inertia + damping.gamma * np.exp(damping.lambda_ * log_s), (DRAG_MODES, 1))
+        p = inertia + damping.gamma * np.exp(damping.lambda_ * log_s)
         z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * log_s))
         self._pole_pairs = _pole_pairs(k * beam.length_m**4, plant)
         self._impedance_slopes = _impedance_slopes(self._pole_pairs, plant)
-        self._phase_factors = np.ones_like(z)
+        self._inertia_terms = [p] * DRAG_MODES
+        self._phase_factors: list[Complex | float] = [1.0] * DRAG_MODES
         measured_poles = measured_modes.poles_rad_s if measured_modes else {}
-        for mode_number, pole in measured_poles.items():
-            assert measured_modes is not None
-            if mode_number > DRAG_MODES:
+        for mode_index in range(DRAG_MODES):
+            pole = measured_poles.get(mode_index + 1)
+            if pole is None or measured_modes is None:
                 continue
-            mode_index, pole_pair = mode_number - 1, np.array([pole, pole.conjugate()])
             # The external damping of a fit without drag is arbitrary; pole and phase contain it.
-            p[mode_index] = inertia
+            self._inertia_terms[mode_index] = inertia
             z[mode_index] = beam.density_over_stiffness * (s - pole) * (s - pole.conjugate())
-            self._pole_pairs[mode_index] = pole_pair
+            self._pole_pairs[mode_index] = pole_pair = np.array([pole, pole.conjugate()])
             self._impedance_slopes[mode_index] = beam.density_over_stiffness * (
                 pole_pair - pole_pair.conjugate()
             )
-            residue = measured_modes.residue(mode_number)
+            residue = measured_modes.residue(mode_index + 1)
             self._phase_factors[mode_index] = self._phase_factor(pole, residue)
-        self._inertial_response = p / z  # p / Z_i, shape (modes, bins)
+        # Response p over Z of each mode, one row for each
+        self._inertial_response = np.array(
+            [inertia_term / row for inertia_term, row in zip(self._inertia_terms, z, strict=True)]
+        )
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
-        self._inertia_terms = p
         self._torque_channel = plant.channel_response(s)
         angle_transform = self._transform.forward(angle_rad)
         self._modal_speed_by_angle = -self._grid.leverage_m[:, None] * (
@@ -332,7 +334,7 @@ class DragResponse:
             torque_derivatives[2 * len(mode_numbers) : len(direct_torques)],
             torque_derivatives[len(direct_torques) :],
         )
-        torque_transform = self._torque_transform(force_spectra)
+        torque_transform = modal_torques.sum(axis=0) - force_spectra[-1]
         return DragTorque(
             law=law,
             torque_nm=self.in_time(torque_transform),
@@ -554,24 +556,25 @@ class DragResponse:
             ]
         )
 
-    def _torque_transform(self, force_spectra: Complex) -> Complex:
-        """Return the Laplace transform of the torque that modal forces and root moment cause.
-
-        It is in N·m·s at the points `s`, without the delay of the torque.
-        """
-        torque_spectrum: Complex = self._modal_torques(force_spectra).sum(axis=0)
-        torque_spectrum -= force_spectra[-1]
-        return torque_spectrum
-
     def _modal_torques(self, force_spectra: Complex) -> Complex:
         """Return the transforms of the torque that each modal force causes, shape (modes, bins)."""
-        torque_per_force = self._inertial_response * self._phase_factors
-        modal_torques: Complex = self._leverage[:, None] * torque_per_force * force_spectra[:-1]
-        return modal_torques
+        return np.array(
+            [
+                leverage * (response * phase_factor) * force_spectrum
+                for leverage, response, phase_factor, force_spectrum in zip(
+                    self._leverage,
+                    self._inertial_response,
+                    self._phase_factors,
+                    force_spectra[:-1],
+                    strict=True,
+                )
+            ]
+        )
 
     def _torque_over_time(self, modal_forces: Real) -> Real:
         """Return the torque in N·m, shape (m,), that modal forces and root moment cause."""
-        return self.in_time(self._torque_transform(self._transform_forces(modal_forces)))
+        force_spectra = self._transform_forces(modal_forces)
+        return self.in_time(self._modal_torques(force_spectra).sum(axis=0) - force_spectra[-1])
 
     def in_time(self, torque_transform: Complex) -> Real:
         """Convert the Laplace transform of a torque to samples in N·m, shape (..., m).
