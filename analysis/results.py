@@ -35,8 +35,8 @@ FigureFormat = Literal["png", "svg", "pdf"]
 """File format of figures."""
 FIGURE_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg", "pdf")
 """File formats in which figures can be written."""
-DEFAULT_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg")
-"""Default file formats of the figures. PDF takes as long as PNG and SVG together."""
+DEFAULT_FORMATS: Final[tuple[FigureFormat, ...]] = ("svg",)
+"""Default file formats of the figures: that of the page. PNG and PDF take as long again each."""
 
 
 @dataclass(frozen=True, slots=True)

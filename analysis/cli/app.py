@@ -291,7 +291,7 @@ def analyze(
         typer.Option(
             metavar="LIST", help="File formats of the figures: png, svg, pdf, comma-separated."
         ),
-    ] = "png,svg",
+    ] = "svg",
     json: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write all results as JSON; - for standard output."),

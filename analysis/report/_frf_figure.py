@@ -144,7 +144,7 @@ def _draw_type_panel(
         )
         if curve_label.startswith("measured"):
             # Dots, because a line would jump wherever noise wraps the phase.
-            point_indices = style.log_spaced_indices(line_hz, 2 * _CURVE_COLUMNS)
+            point_indices = style.log_spaced_indices(line_hz, _CURVE_COLUMNS)
             style.dots(
                 phase_axes,
                 line_hz[point_indices],

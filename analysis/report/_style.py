@@ -63,6 +63,8 @@ DPI: Final = 150
 """Resolution of PNG figures, in dots per inch."""
 _PNG_COMPRESSION_LEVEL: Final = 1
 """Compression level of PNG figures: fast, with a tenth more bytes for a quarter of the time."""
+_MAX_SVG_BYTES: Final = 1_000_000
+"""Size of an SVG figure beyond which a page shows the figure as a PNG image."""
 _VECTOR_FORMAT_SETTINGS: Final[dict[Any, Any]] = {
     "svg.fonttype": "none", "svg.hashsalt": "rigd", "pdf.fonttype": 42,
 }  # fmt: skip
@@ -174,28 +176,22 @@ class Picture:
         Name of the image file without its suffix.
     description : str
         Text that is used as caption and as alternative text.
-    png : bytes
-        Content of the PNG file.
-    svg : bytes or None
-        Content of the SVG file; None if there is none.
+    image : bytes
+        Content of the image file.
+    file_format : {"svg", "png"}
+        Format of the image.
     """
 
     name: str
     description: str
-    png: bytes
-    svg: bytes | None = None
+    image: bytes
+    file_format: FigureFormat = "svg"
 
     @property
     def source(self) -> str:
-        """Image as a data URL, for an HTML page.
-
-        It is the SVG image, which can be searched and is sharp on paper. It is the PNG image if the
-        SVG image is more than twice as large, as with many sessions' responses.
-        """
-        image_format, image_bytes = "png", self.png
-        if self.svg is not None and len(self.svg) < 2 * len(self.png):
-            image_format, image_bytes = "svg+xml", self.svg
-        return f"data:image/{image_format};base64,{base64.b64encode(image_bytes).decode('ascii')}"
+        """Image as a data URL, for an HTML page."""
+        media_type = "image/svg+xml" if self.file_format == "svg" else f"image/{self.file_format}"
+        return f"data:{media_type};base64,{base64.b64encode(self.image).decode('ascii')}"
 
 
 def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
@@ -273,25 +269,32 @@ def save_picture(
     description : str
         Caption of the picture.
     formats : collection of str
-        Formats of the files. PNG and SVG are rendered for the page in any case.
+        Formats of the files.
+
+    Returns
+    -------
+    Picture
+        Image in one of the formats: SVG, which can be searched and is sharp on paper, else PNG. It
+        is a PNG image, too, if the SVG image is large, as with the responses of many sessions.
 
     Raises
     ------
     OutputError
         If a file exists or cannot be written.
     """
-    file_formats: set[FigureFormat] = {"png", "svg", *formats}
-    bytes_by_format = {
-        file_format: render_figure(figure, file_format)
-        for file_format in FIGURE_FORMATS
-        if file_format in file_formats
-    }
+    rendered: dict[FigureFormat, bytes] = {}
     for file_format in formats:
+        rendered[file_format] = render_figure(figure, file_format)
         # The suffix is appended, because a name may contain dots.
-        write_new(
-            path_stem.with_name(f"{path_stem.name}.{file_format}"), bytes_by_format[file_format]
-        )
-    return Picture(path_stem.name, description, bytes_by_format["png"], bytes_by_format["svg"])
+        write_new(path_stem.with_name(f"{path_stem.name}.{file_format}"), rendered[file_format])
+    shown_format: FigureFormat = "png" if "png" in formats and "svg" not in formats else "svg"
+    if shown_format not in rendered:
+        rendered["svg"] = render_figure(figure, "svg")
+    if len(rendered[shown_format]) > _MAX_SVG_BYTES and shown_format == "svg":
+        shown_format = "png"
+        if shown_format not in rendered:
+            rendered["png"] = render_figure(figure, "png")
+    return Picture(path_stem.name, description, rendered[shown_format], shown_format)
 
 
 def envelope(

@@ -161,7 +161,7 @@ def test_analyze_offers_fits_and_reports_it(packages, session, tmp_path):
     assert "of lab-broken 1" in output  # none is imported
     report, results = tmp_path / "report", tmp_path / "a.json"
     code, output, errors = rigd_with(
-        packages, session, "--method", "record", "--structure", "zener", "--figures", "png",
+        packages, session, "--method", "record", "--structure", "zener",
         "--report", report, "--json", results, program=analyze,
     )  # fmt: skip
     assert code == 0, output + errors

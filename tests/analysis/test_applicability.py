@@ -153,7 +153,7 @@ def slow(write_session, make_signals, tmp_path):
 @pytest.mark.fit
 @pytest.mark.usefixtures("slow")
 def test_a_record_of_100_hz_is_analysed(analyze_here, without_drawing, tmp_path):
-    brief = ("--types", "I", "--weights", "const", "--figures", "png")
+    brief = ("--types", "I", "--weights", "const")
     with without_drawing():
         result = analyze_here("slow.mcap", "--json", "slow.json", "--report", "r", *brief)
     assert result.returncode == 0, result.stderr

@@ -107,7 +107,7 @@ def test_error_of_a_forecast_is_that_of_the_torque(done, short_sessions, truth):
 def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     found, _ = done
     steps = []
-    write_campaign(found, tmp_path, with_paper=True, on_step=steps.append)
+    write_campaign(found, tmp_path, with_paper=True, on_step=steps.append, formats=("png", "svg"))
     figures, tables = tmp_path / "figures", tmp_path / "tables"
     for figure in (
         "figure5_signals", "figure6_nominal", "figure7_indices", "figure8_best", "pooled",

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.fit
 
 QUICK = (
     "--types", "I", "--weights", "const", "--segment", "2000", "--nfft", "8000", "--band", "1,50",
-    "--figures", "png",
+    "--figures", "svg",
 )  # fmt: skip
 
 
@@ -52,7 +52,7 @@ def test_a_file_given_twice_is_called_that(run_here, short_sessions, tmp_path):
     result = run_here("ok.mcap", "./ok.mcap", "--method", "welch", "--report", "r")
     assert result.returncode == 1
     assert errors(result) == ["Error: ok.mcap: the file is given more than once, and counts once."]
-    assert (tmp_path / "r" / "figures" / "welch_frf.png").exists()
+    assert (tmp_path / "r" / "figures" / "welch_frf.svg").exists()
 
 
 def test_samples_that_two_files_have_in_common_count_once(

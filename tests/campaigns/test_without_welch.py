@@ -45,7 +45,7 @@ def test_the_whole_records_are_pooled_and_nothing_else(found, truth):
 def test_the_folder_has_no_table_or_figure_of_the_paper(found, tmp_path):
     write_campaign(found, tmp_path)
     names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}
-    wanted = {"figures/pooled.png", "figures/pooled_response.png", "tables/pooled.csv"}
+    wanted = {"figures/pooled.svg", "figures/pooled_response.svg", "tables/pooled.csv"}
     assert wanted | {"tables/session_list.csv", "tables.txt"} <= names
     assert not [name for name in names if "/figure" in name or "/table" in name]
     assert "Table 3" not in (tmp_path / "tables.txt").read_text()

@@ -57,8 +57,8 @@ case "${0##*/} $*" in
     "rigd run multisine "*) set -- "$@" --period 2 --duration 6 ;;
     "rigd run modes "*) set -- "$@" --fast --duration 20 --ring-down 3 ;;
     "rigd run move "*|"rigd run touch "*|"rigd run until "*) set -- "$@" --fast ;;
-    "analyze "*"-chirp.mcap") set -- "$@" --types VI --weights omega --figures png ;;
-    "analyze "*) set -- "$@" --types VI --figures png ;;
+    "analyze "*"-chirp.mcap") set -- "$@" --types VI --weights omega ;;
+    "analyze "*) set -- "$@" --types VI ;;
 esac
 exec "FOLDER/${0##*/}" "$@"
 """
@@ -166,7 +166,7 @@ def test_every_how_to_from_a_session_to_what_becomes_of_it_runs_as_written(start
             assert_went_well(process)
     assert len(list((tmp_path / "sessions").glob("*.mcap"))) == 8
     for report in ("one_look", "another_look"):
-        assert (tmp_path / report / "figures" / "welch_frf.png").stat().st_size > 50_000
+        assert (tmp_path / report / "figures" / "welch_frf.svg").stat().st_size > 50_000
 
     (hold,) = (tmp_path / "sessions").glob("*-hold.mcap")
     tear(hold, tmp_path / "torn" / re.search(r"rigd recover (\S+)", recover)[1])

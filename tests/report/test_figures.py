@@ -156,13 +156,32 @@ def test_a_picture_is_written_in_the_formats_asked_for(tmp_path):
         )
     assert [path.name for path in tmp_path.iterdir()] == ["v1.0.pdf"]
     assert picture.name == "v1.0"
-    assert picture.svg.startswith(b"<?xml")
+    assert picture.image.startswith(b"<?xml")
 
 
-def test_a_figure_stands_in_the_page_as_svg_unless_that_is_far_larger():
-    longer = b"twice or more"
-    assert style.Picture("name", "seen", b"png", longer).source == "data:image/png;base64,cG5n"
-    assert style.Picture("name", "seen", b"png", b"svg").source == "data:image/svg+xml;base64,c3Zn"
+@pytest.mark.parametrize(
+    ("formats", "svg_bytes", "shown"),
+    [
+        (("svg",), 3, "svg+xml;base64,c3Zn"),
+        (("png",), 3, "png;base64,cG5n"),
+        (("png", "svg"), 3, "svg+xml;base64,c3Zn"),
+        (("pdf",), 3, "svg+xml;base64,c3Zn"),
+        (("svg",), 2_000_000, "png;base64,cG5n"),
+    ],
+)
+def test_a_page_shows_a_format_that_is_written_and_no_huge_svg(
+    monkeypatch, tmp_path, formats, svg_bytes, shown
+):
+    drawn = []
+
+    def render(_figure, file_format):
+        drawn.append(file_format)
+        return file_format.encode().ljust(svg_bytes if file_format == "svg" else 3)
+
+    monkeypatch.setattr(style, "render_figure", render)
+    picture = style.save_picture(None, tmp_path / "a", "A figure.", formats)
+    assert picture.source == f"data:image/{shown}"
+    assert len(drawn) == len({*formats, picture.file_format, *(("svg",) if svg_bytes > 3 else ())})
 
 
 def test_a_title_that_is_no_text_is_no_obstacle(tmp_path):

@@ -52,7 +52,7 @@ from contextlib import redirect_stdout
 from matplotlib.figure import Figure
 Figure.savefig = lambda *_, **__: None  # drawing takes longer than all the rest
 settings = WelchSettings(types=("I",), weightings=("const",), estimator="fft", band_hz=(1.0, 20.0))
-routes = AnalysisOptions(settings, paper=True, whole_record=True, fixed=(), figures=("png",))
+routes = AnalysisOptions(settings, paper=True, whole_record=True, fixed=())
 with redirect_stdout(sys.stderr):
     assert session_command([Path(sys.argv[1])], routes, Outputs(Path(sys.argv[2]))) == 0
 print(*sys.modules)

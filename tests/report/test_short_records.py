@@ -11,7 +11,7 @@ from analysis.record import RecordError, load_record
 from analysis.report import document_text
 from analysis.report.folder import write_new
 
-ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega", "--figures", "png")
+ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega")
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +37,9 @@ def test_what_there_is_is_reported(cut, analyze_here, tmp_path):
     content = json.loads((tmp_path / "r.json").read_text())
     assert {fit["estimator"] for fit in content["fits"]} == {"welch", "record"}
     assert "cut short" in " ".join(content["files"][0]["warnings"])
-    figures = {path.name for path in (tmp_path / "r" / "figures").glob("*.png")}
+    figures = {path.name for path in (tmp_path / "r" / "figures").glob("*.svg")}
     assert figures == {
-        "record_frf.png", "loss_factor.png", "residual.png", "record_signals.png", "welch_frf.png",
+        "record_frf.svg", "loss_factor.svg", "residual.svg", "record_signals.svg", "welch_frf.svg",
     }  # fmt: skip
 
 

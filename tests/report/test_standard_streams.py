@@ -23,8 +23,6 @@ QUICK = (
     "I",
     "--weights",
     "const",
-    "--figures",
-    "png",
 )
 GREEK = """
 from analysis.cli.standard_streams import standard_streams

@@ -80,7 +80,7 @@ def test_the_report_has_a_map_and_the_evidence(touched, tmp_path):
     assert "<title>2 sessions: touches</title>" in page
     assert "Left out: b.mcap is damaged." in page
     names = {path.name for path in (tmp_path / "figures").iterdir()}
-    assert names >= {"map.png", "touch_1.png", "touch_2.png"}
+    assert names >= {"map.svg", "touch_1.svg", "touch_2.svg"}
     assert page.count("<figure ") == 3
     assert "http" not in page.replace("http://www.w3.org", "")
     assert json.loads((tmp_path / "touches.json").read_text()) == touches_document(
@@ -98,7 +98,7 @@ def test_of_a_lopsided_interval_the_ends_are_told(touched, tmp_path):
     assert "0.48 to 0.94" in [cell.text for cell in cells]
     assert "cannot tell" in [cell.text for cell in cells]
     write_touch_report([session], {}, tmp_path)
-    drawn = sorted(path.stem for path in (tmp_path / "figures").glob("*.png"))
+    drawn = sorted(path.stem for path in (tmp_path / "figures").glob("*.svg"))
     assert drawn == ["map", "touch_1"]
 
 
