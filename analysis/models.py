@@ -189,7 +189,7 @@ def _fractional(name: str, description: str, fixed_values: dict[str, float]) -> 
         description,
         tuple(PARAMETERS[parameter] for parameter in DAMPING_PARAMETERS),
         _fractional_factors,
-        MappingProxyType(fixed_values),
+        fixed_values,
     )
 
 

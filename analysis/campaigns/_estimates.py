@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from analysis.identify import Candidate, ModeEstimate
+    from analysis.identify import Candidate, RecordFit
     from analysis.paper.welch_analysis import FitIndices, FittedModel
-    from rigd.beam import Damping, Plant
+    from rigd.beam import Damping
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,30 +64,12 @@ class WelchFit:
 
 @dataclass(frozen=True, slots=True)
 class RecordEstimate:
-    """Fit of one damping structure to one whole record (see `analysis.identify.RecordFit`).
+    """Fit of one damping structure to one whole record, and how well it explains the session.
 
     Attributes
     ----------
-    structure : str
-        Name of the structure, "I" to "VII".
-    plant : Plant
-        Fitted plant.
-    parameters : dict of str to float
-        Values of all parameters, fixed parameters included.
-    std : dict of str to (float or None)
-        Standard deviations: 0 of a fixed parameter, None of a parameter at a bound.
-    determined : tuple of str
-        The k free parameters in the order of `covariance`, without those at a bound.
-    covariance : ndarray, shape (k, k)
-        Covariance of the determined parameters, of the logarithms of positive ones.
-    at_bounds : tuple of str
-        Free parameters at a bound of their range.
-    modes : tuple of ModeEstimate
-        Frequencies and damping ratios of the modes in the band.
-    cost : float
-        Sum of squares of the whitened residual.
-    degrees_of_freedom : int
-        Expectation of `cost` if the residual is only noise.
+    fit : RecordFit
+        Fit without its residual, which would take most of the memory of a campaign.
     deviance : float
         ``-2 ln`` likelihood, up to a constant common to all estimates of the session.
     bic : float
@@ -100,16 +81,7 @@ class RecordEstimate:
         the Welch fits. They contain the bias of that method.
     """
 
-    structure: str
-    plant: Plant
-    parameters: Mapping[str, float]
-    std: Mapping[str, float | None]
-    determined: tuple[str, ...]
-    covariance: NDArray[np.float64]
-    at_bounds: tuple[str, ...]
-    modes: tuple[ModeEstimate, ...]
-    cost: float
-    degrees_of_freedom: int
+    fit: RecordFit
     deviance: float
     bic: float
     values: int
@@ -118,16 +90,11 @@ class RecordEstimate:
     @property
     def name(self) -> str:
         """Name of the damping structure as shown in tables."""
-        return self.structure
-
-    @property
-    def free(self) -> frozenset[str]:
-        """Names of the free parameters, determined or at a bound."""
-        return frozenset((*self.determined, *self.at_bounds))
+        return self.fit.structure.name
 
     @classmethod
     def from_candidate(cls, candidate: Candidate, indices: FitIndices) -> RecordEstimate:
-        """Return the results of a whole-record fit that a campaign retains: all but the residual.
+        """Return what a campaign retains of a whole-record fit.
 
         Parameters
         ----------
@@ -136,18 +103,8 @@ class RecordEstimate:
         indices : FitIndices
             Fit indices relative to the measured response.
         """
-        fit = candidate.fit
         return cls(
-            structure=fit.structure.name,
-            plant=fit.plant,
-            parameters=dict(fit.parameters),
-            std=dict(fit.std),
-            determined=fit.determined,
-            covariance=fit.covariance,
-            at_bounds=fit.at_bounds,
-            modes=fit.modes,
-            cost=fit.cost,
-            degrees_of_freedom=fit.degrees_of_freedom,
+            fit=replace(candidate.fit, residual=np.empty(0, np.complex128)),
             deviance=candidate.deviance,
             bic=candidate.bic,
             values=candidate.values,

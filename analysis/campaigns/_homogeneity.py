@@ -213,14 +213,14 @@ def _mode_values(
     estimates: Sequence[tuple[str, RecordEstimate]],
 ) -> Iterator[tuple[str, SessionValues]]:
     """Yield frequencies and damping ratios of the modes that all sessions have."""
-    mode_count = min((len(estimate.modes) for _, estimate in estimates), default=0)
+    mode_count = min((len(estimate.fit.modes) for _, estimate in estimates), default=0)
     for quantity, std in _MODE_QUANTITIES.items():
         for mode_index in range(mode_count):
             session_values = (
                 (
                     file_name,
-                    getattr(estimate.modes[mode_index], quantity),
-                    getattr(estimate.modes[mode_index], std),
+                    getattr(estimate.fit.modes[mode_index], quantity),
+                    getattr(estimate.fit.modes[mode_index], std),
                 )
                 for file_name, estimate in estimates
             )
@@ -234,10 +234,14 @@ def _parameter_values(
     for parameter in freest_fit.parameters:
         parameter_name = parameter.name
         session_values = (
-            (session.name, estimate.parameters[parameter_name], estimate.std[parameter_name] or 0.0)
+            (
+                session.name,
+                estimate.fit.parameters[parameter_name],
+                estimate.fit.std[parameter_name] or 0.0,
+            )
             for session in sessions
             for estimate in session.record_estimates
-            if estimate.name == freest_fit.name and parameter_name in estimate.determined
+            if estimate.name == freest_fit.name and parameter_name in estimate.fit.determined
         )
         yield parameter_name, _with_known_std(session_values)
 

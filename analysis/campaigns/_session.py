@@ -309,5 +309,5 @@ def _record_estimates(
         if candidate.fit.structure.name in structure_names or candidate.fit is whole_record.fit
     ]
     return tuple(
-        sorted(requested_estimates, key=lambda estimate: structure_order.index(estimate.structure))
+        sorted(requested_estimates, key=lambda estimate: structure_order.index(estimate.name))
     )

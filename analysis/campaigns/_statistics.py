@@ -339,12 +339,12 @@ def ranked_structures(
     lowest_bic = pooled_fits[0].bic if pooled_fits else min(bic.values(), default=0.0)
     ranked_list = [
         RankedStructure(
-            structure=estimates[0].structure,
+            structure=structure_name,
             fitted=len(estimates),
             determined=sum(map(determines_damping, estimates)),
             selected_alone=single_selections[structure_name],
             misfit=misfit_by_name.get(structure_name)
-            or float(np.median([one.cost / one.degrees_of_freedom for one in estimates])),
+            or float(np.median([one.fit.cost / one.fit.degrees_of_freedom for one in estimates])),
             bic_above_lowest=bic[structure_name] - lowest_bic if structure_name in bic else None,
             pooled=structure_name in misfit_by_name,
         )

@@ -84,7 +84,7 @@ def models_without_session(
     """Return the models estimated from all sessions but one, to predict that session."""
     session = sessions[left_out_index]
     other_sessions = [*sessions[:left_out_index], *sessions[left_out_index + 1 :]]
-    own_plants = {estimate.name: estimate.plant for estimate in session.record_estimates}
+    own_plants = {estimate.name: estimate.fit.plant for estimate in session.record_estimates}
     predictions = [
         PlantPrediction("record", estimate.name, None, estimate.plant, own_plants[estimate.name])
         for estimate in pooled_estimates(other_sessions)

@@ -173,7 +173,7 @@ class PooledMode:
 def pool_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
     """Pool frequency and damping ratio, separately, of each mode that all sessions have."""
     pooled_list = []
-    for session_modes in zip(*(estimate.modes for estimate in estimates), strict=False):
+    for session_modes in zip(*(estimate.fit.modes for estimate in estimates), strict=False):
         pooled_frequency = _pool_quantity(
             [(mode.frequency_hz, mode.frequency_std_hz) for mode in session_modes]
         )
@@ -349,7 +349,7 @@ def estimates_by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, lis
 
 def determines_damping(estimate: RecordEstimate) -> bool:
     """Return whether an estimate determines all free parameters of its damping structure."""
-    return set(STRUCTURES[estimate.structure].free) <= set(estimate.determined)
+    return set(estimate.fit.structure.free) <= set(estimate.fit.determined)
 
 
 def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
@@ -363,8 +363,8 @@ def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None
         return None
     determined_names = [
         parameter_name
-        for parameter_name in used_estimates[0].determined
-        if all(parameter_name in e.determined for e in used_estimates)
+        for parameter_name in used_estimates[0].fit.determined
+        if all(parameter_name in e.fit.determined for e in used_estimates)
     ]
     parameter_values, covariances = _stack_estimates(used_estimates, determined_names)
     pooled_effects = random_effects(parameter_values, covariances)
@@ -380,11 +380,11 @@ def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None
         )
     )
     mean_settings = {
-        parameter_name: float(np.mean([e.parameters[parameter_name] for e in used_estimates]))
+        parameter_name: float(np.mean([e.fit.parameters[parameter_name] for e in used_estimates]))
         for parameter_name in SETTINGS
     }
     return PooledEstimate(
-        structure=used_estimates[0].structure,
+        structure=used_estimates[0].name,
         plant=_pooled_plant(
             used_estimates[0],
             mean_settings | {parameter.name: parameter.value for parameter in parameters},
@@ -393,7 +393,7 @@ def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None
         covariance=pooled_effects.covariance,
         modes=pool_modes(used_estimates),
         sessions=len(used_estimates),
-        misfit=float(np.median([e.cost / e.degrees_of_freedom for e in used_estimates])),
+        misfit=float(np.median([e.fit.cost / e.fit.degrees_of_freedom for e in used_estimates])),
         bic=pooled_bic(estimates),
     )
 
@@ -409,11 +409,11 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
     out here. A parameter that some session does not determine cannot be common, and counts once for
     each session. A single session loses no likelihood.
     """
-    damping_parameters = STRUCTURES[estimates[0].structure].free
+    damping_parameters = estimates[0].fit.structure.free
     common_names = [
         parameter_name
         for parameter_name in damping_parameters
-        if all(parameter_name in e.determined for e in estimates)
+        if all(parameter_name in e.fit.determined for e in estimates)
     ]
     common_deviance = sum(e.deviance for e in estimates)
     if common_names and len(estimates) >= _MIN_SESSIONS:
@@ -434,7 +434,7 @@ def _stack_estimates(
     """Return the estimates, shape (K, k), and their covariances, shape (K, k, k)."""
     coordinates = [
         [
-            _coordinate(parameter_name, e.parameters[parameter_name])
+            _coordinate(parameter_name, e.fit.parameters[parameter_name])
             for parameter_name in parameter_names
         ]
         for e in estimates
@@ -487,16 +487,16 @@ def _covariance_block(
     estimate: RecordEstimate, parameter_names: Sequence[str]
 ) -> NDArray[np.float64]:
     """Return the covariance of some parameters of an estimate."""
-    indices = [estimate.determined.index(parameter_name) for parameter_name in parameter_names]
-    return estimate.covariance[np.ix_(indices, indices)]
+    indices = [estimate.fit.determined.index(parameter_name) for parameter_name in parameter_names]
+    return estimate.fit.covariance[np.ix_(indices, indices)]
 
 
 def _pooled_plant(estimate: RecordEstimate, parameter_values: dict[str, float]) -> Plant:
     """Return a plant with given parameters and all other properties of a session's plant."""
-    structure = STRUCTURES[estimate.structure]
+    structure = estimate.fit.structure
     values: dict[str, float] = dict(structure.fixed.items())
     values |= {name: parameter_values[name] for name in (*structure.free, *SETTINGS)}
-    return estimate.plant.with_parameters(values)
+    return estimate.fit.plant.with_parameters(values)
 
 
 # Freest structure that all sessions support
@@ -560,4 +560,4 @@ def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
 
 def _free_parameter_count(estimate: RecordEstimate) -> int:
     """Return the number of free parameters of an estimate's damping structure."""
-    return len(STRUCTURES[estimate.structure].free)
+    return len(estimate.fit.structure.free)

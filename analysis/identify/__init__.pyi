@@ -18,6 +18,7 @@ from ._data import Measurement as Measurement
 from ._data import MeasurementError as MeasurementError
 from ._estimates import ModeEstimate as ModeEstimate
 from ._estimates import PivotLossFactor as PivotLossFactor
+from ._estimates import Ringing as Ringing
 from ._finding import Finding as Finding
 from ._fit import BAND_HZ as BAND_HZ
 from ._fit import fit_record as fit_record

@@ -99,6 +99,11 @@ class RecordFit:
         return correlation
 
     @property
+    def std_of_free_parameters(self) -> dict[str, float | None]:
+        """Return the standard deviations of all parameters, with None for fixed ones too."""
+        return {name: std if name in self.interval else None for name, std in self.std.items()}
+
+    @property
     def free_parameters(self) -> int:
         """Return the number of estimated parameters."""
         return len(self.determined) + len(self.at_bounds)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
@@ -331,7 +330,7 @@ def with_free_order(structure: Structure, order: OrderName) -> Structure:
         for parameter_name, at in structure.fixed.items()
         if parameter_name not in (damping_coefficient, order)
     }
-    return replace(structure, fixed=MappingProxyType(fixed_values))
+    return replace(structure, fixed=fixed_values)
 
 
 class OrderProfiler:

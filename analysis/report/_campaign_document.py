@@ -13,8 +13,6 @@ from analysis.report.table import json_rows
 from analysis.results import finite
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
     from analysis.campaigns import CampaignResult, RecordEstimate, SessionAnalysis, WelchFit
     from analysis.identify import ModeEstimate
 
@@ -94,7 +92,7 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
                 for session_analysis in campaign.sessions
                 for estimate in session_analysis.record_estimates
                 if estimate.name == session_analysis.selected
-                for mode in estimate.modes
+                for mode in estimate.fit.modes
             ],
             **{
                 table_name: json_rows(report_table)
@@ -115,44 +113,42 @@ def _fit_identity(session: SessionAnalysis, estimator: str, structure_name: str)
 
 def _welch_fit_json(session: SessionAnalysis, fit: WelchFit) -> dict[str, Any]:
     """Return the JSON object of the model that is fitted to a session's Welch response."""
+    free_names = STRUCTURES[fit.structure].free
     return {
         **_fit_identity(session, "welch", fit.structure),
         "weighting": fit.weighting,
         "parameters": fit.parameters,
-        "std": fit.std and _std_of_free_parameters(fit.std, STRUCTURES[fit.structure].free),
+        "std": fit.std
+        and {
+            parameter_name: parameter_std if parameter_name in free_names else None
+            for parameter_name, parameter_std in fit.std.items()
+        },
         "cost": fit.cost,
         "at_bounds": fit.at_bounds,
         "indices": None if fit.indices is None else asdict(fit.indices),
     }
 
 
-def _record_fit_json(session: SessionAnalysis, fit: RecordEstimate) -> dict[str, Any]:
+def _record_fit_json(session: SessionAnalysis, estimate: RecordEstimate) -> dict[str, Any]:
     """Return the JSON object of the model that is fitted to a session's whole record."""
+    fit = estimate.fit
     return {
-        **_fit_identity(session, "record", fit.structure),
-        "candidate": fit.name,
+        **_fit_identity(session, "record", estimate.name),
+        "candidate": estimate.name,
         "parameters": fit.parameters,
-        "std": _std_of_free_parameters(fit.std, fit.free),
+        "std": fit.std_of_free_parameters,
         "cost": fit.cost,
         "at_bounds": fit.at_bounds,
-        "indices": asdict(fit.indices),
+        "indices": asdict(estimate.indices),
     }
 
 
-def _std_of_free_parameters(
-    std: Mapping[str, float | None], free_parameters: Collection[str]
-) -> dict[str, float | None]:
-    """Return the parameters' standard deviations by name, with None for fixed parameters."""
-    return {
-        parameter_name: parameter_std if parameter_name in free_parameters else None
-        for parameter_name, parameter_std in std.items()
-    }
-
-
-def _mode_json(session: SessionAnalysis, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:
+def _mode_json(
+    session: SessionAnalysis, estimate: RecordEstimate, mode: ModeEstimate
+) -> dict[str, Any]:
     """Return the JSON object of a mode of a session's whole-record fit."""
     mode_values = asdict(mode)
-    return _fit_identity(session, "record", fit.structure) | {
+    return _fit_identity(session, "record", estimate.name) | {
         "mode": mode_values.pop("number"),
         **mode_values,
     }

@@ -185,10 +185,10 @@ def _draw_parameter_panel(
     session_positions, session_values, half_widths = [], [], []
     for session_number, session in enumerate(campaign.sessions, start=1):
         for estimate in session.record_estimates:
-            std = estimate.std.get(parameter.name)
+            std = estimate.fit.std.get(parameter.name)
             if estimate.name == structure_name and std is not None:
                 session_positions.append(session_number)
-                session_values.append(display_factor * estimate.parameters[parameter.name])
+                session_values.append(display_factor * estimate.fit.parameters[parameter.name])
                 half_widths.append(1.96 * display_factor * std)
     panel_axes.axhspan(
         *(display_factor * end for end in parameter.next_interval),

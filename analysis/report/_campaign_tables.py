@@ -177,16 +177,13 @@ def sessions_record_table(campaign: CampaignResult) -> Table:
     table_rows = [
         {
             "file": str(session.path),
-            "type": estimate.structure,
-            **estimate.parameters,
-            **{
-                _std_key(parameter_name): parameter_std if parameter_name in estimate.free else None
-                for parameter_name, parameter_std in estimate.std.items()
-            },
-            "cost": estimate.cost,
-            "degrees_of_freedom": estimate.degrees_of_freedom,
+            "type": estimate.name,
+            **estimate.fit.parameters,
+            **{_std_key(name): std for name, std in estimate.fit.std_of_free_parameters.items()},
+            "cost": estimate.fit.cost,
+            "degrees_of_freedom": estimate.fit.degrees_of_freedom,
             "bic": estimate.bic,
-            "at_bounds": " ".join(estimate.at_bounds),
+            "at_bounds": " ".join(estimate.fit.at_bounds),
         }
         for session in campaign.sessions
         for estimate in session.record_estimates

@@ -172,7 +172,7 @@ def record_entries(
                 "withheld": sorted(
                     unreported_parameters(fit.structure, whole_record.unsupported_orders)
                 ),
-                "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
+                "std": fit.std_of_free_parameters,
                 "interval_95": {
                     key: None if order_interval is None else list(order_interval)
                     for key, order_interval in fit.interval.items()

@@ -189,7 +189,7 @@ def _session_estimates_of_mode(
         mode_estimate
         for session in campaign.sessions
         for estimate in session.record_estimates
-        for mode_estimate in estimate.modes
+        for mode_estimate in estimate.fit.modes
         if estimate.name == pooled_estimate.name and mode_estimate.number == mode.number
     ]
 
@@ -363,9 +363,9 @@ def _draw_sessions(
             if not session_estimates:
                 continue
             frequency_hz = grid_hz
-            response = ResponseGrid(2j * np.pi * grid_hz).evaluate(session_estimates[0].plant, ())[
-                0
-            ]
+            response = ResponseGrid(2j * np.pi * grid_hz).evaluate(
+                session_estimates[0].fit.plant, ()
+            )[0]
         lowest_db = min(lowest_db, float(np.quantile(magnitude_db(response), 0.005)))
         draw_session(
             magnitude_axes, phase_axes, frequency_hz, response, _RESPONSE_COLUMNS, _RESPONSE_COLUMNS

@@ -17,7 +17,7 @@ from analysis.campaigns import (
     campaign,
 )
 from analysis.campaigns._experiment import Experiment
-from analysis.identify import ModeEstimate
+from analysis.identify import ModeEstimate, RecordFit, Ringing
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper.welch_analysis import FitIndices, Peak
 from rigd.beam import Beam, Damping, Plant
@@ -166,13 +166,17 @@ def record_estimate(structure, values, covariance, determined, at_bounds=(), cos
         every["delay_s"],
         every["tool_inertia_kg_m2"],
     )
-    return RecordEstimate(
-        structure=structure, plant=plant, parameters=every,
-        std=dict.fromkeys(every, 0.0), determined=tuple(determined),
-        covariance=np.asarray(covariance), at_bounds=at_bounds,
-        modes=(ModeEstimate(1, 2.5, 1e-4, 0.01, 1e-5),), cost=cost, degrees_of_freedom=100,
-        deviance=cost, bic=bic, values=100, indices=FitIndices(1.0, 1.0, 1.0),
+    fit = RecordFit(
+        structure=STRUCTURES[structure], plant=plant, parameters=every,
+        std=dict.fromkeys(every, 0.0), interval=dict.fromkeys((*determined, *at_bounds)),
+        determined=tuple(determined),
+        covariance=np.asarray(covariance), at_bounds=at_bounds, internal=None, external=None,
+        modes=(ModeEstimate(1, 2.5, 1e-4, 0.01, 1e-5),), ringing=Ringing((), 0.0, 0), cost=cost,
+        degrees_of_freedom=100, residual=np.empty(0, complex),
     )  # fmt: skip
+    return RecordEstimate(
+        fit, deviance=cost, bic=bic, values=100, indices=FitIndices(1.0, 1.0, 1.0)
+    )
 
 
 def experiment(name="a.mcap", sweep_s=30.0, **facts):

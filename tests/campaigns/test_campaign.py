@@ -45,7 +45,7 @@ def test_workers_find_what_this_process_finds(done, short_sessions, settings):
     for one, two in zip(here.welch_fits, there.welch_fits, strict=True):
         assert one.parameters == pytest.approx(two.parameters, rel=1e-9)
     for one, two in zip(here.record_estimates, there.record_estimates, strict=True):
-        assert one.parameters == pytest.approx(two.parameters, rel=1e-6, abs=1e-12)
+        assert one.fit.parameters == pytest.approx(two.fit.parameters, rel=1e-6, abs=1e-12)
 
 
 def test_the_pooled_estimate_is_the_truth_within_its_interval(done, truth):
@@ -82,7 +82,8 @@ def test_a_left_out_session_has_no_say_in_its_own_forecast(done):
             for fit in sessions[-1].welch_fits
         ),
         record_estimates=tuple(
-            replace(each, covariance=9 * each.covariance) for each in sessions[-1].record_estimates
+            replace(each, fit=replace(each.fit, covariance=9 * each.fit.covariance))
+            for each in sessions[-1].record_estimates
         ),
     )
     before = models_without_session(sessions, len(sessions) - 1)
@@ -257,7 +258,7 @@ def test_indices_of_a_whole_record_estimate_are_of_its_response(done):
     found, _ = done
     session = found.sessions[0]
     for each in session.record_estimates:
-        plant = each.plant
+        plant = each.fit.plant
         model = FrequencyResponseModel(session.frequency_hz, plant.beam, plant.tool_inertia_kg_m2)
         late = np.exp(-2j * np.pi * session.frequency_hz * plant.delay_s)
         away = np.abs(model.evaluate(plant.damping) * late - session.response)

@@ -14,6 +14,10 @@ SHIFT_HZ = 26e-4
 """What type VII makes of mode 3 where alpha is 0.996: nine standard deviations of type VI."""
 
 
+def moved_mode(mode, by_hz):
+    return replace(mode, frequency_hz=mode.frequency_hz + by_hz)
+
+
 @pytest.fixture
 def sessions(make_estimate, make_session):
     """Forty of one beam: seven select type VI, the others type VII, whose mode 3 is elsewhere."""
@@ -23,9 +27,9 @@ def sessions(make_estimate, make_session):
         values = {name: FREE[name] for name in names}
         std = np.diag([(0.01 * FREE[name]) ** 2 for name in names])
         found = make_estimate(structure, values, std, names, cost=bic, bic=bic)
-        (mode,) = found.modes
+        (mode,) = found.fit.modes
         mode = replace(mode, frequency_hz=frequency_hz, frequency_std_hz=STD_HZ)
-        return replace(found, modes=(mode,))
+        return replace(found, fit=replace(found.fit, modes=(mode,)))
 
     def make(number):
         noise_hz = rng.normal(scale=STD_HZ)
@@ -51,10 +55,7 @@ def test_another_beam_among_them_is_still_told_apart(sessions, campaign_of):
     for number, session in enumerate(sessions):
         by = 5e-4 * FREQUENCY_HZ if number >= 20 else 0.0
         estimates = tuple(
-            replace(
-                each,
-                modes=(replace(each.modes[0], frequency_hz=each.modes[0].frequency_hz + by),),
-            )
+            replace(each, fit=replace(each.fit, modes=(moved_mode(each.fit.modes[0], by),)))
             for each in session.record_estimates
         )
         moved.append(replace(session, record_estimates=estimates))

@@ -20,6 +20,10 @@ pytestmark = pytest.mark.fit
 STIFFER = 1.03
 
 
+def with_modes(estimate, *modes):
+    return replace(estimate, fit=replace(estimate.fit, modes=modes))
+
+
 @pytest.fixture
 def of_frequencies(make_session, make_estimate, campaign_of):
     """Sessions whose first mode has these frequencies in Hz, each of its own std."""
@@ -28,10 +32,8 @@ def of_frequencies(make_session, make_estimate, campaign_of):
         sessions = []
         for number, (value, own) in enumerate(np.broadcast(values, std)):
             estimate = make_estimate("I", {"zeta": 1e-4}, [[1e-4]], ("zeta",))
-            mode = replace(estimate.modes[0], frequency_hz=value, frequency_std_hz=own)
-            sessions.append(
-                make_session(f"{number}.mcap", estimates=[replace(estimate, modes=(mode,))])
-            )
+            mode = replace(estimate.fit.modes[0], frequency_hz=value, frequency_std_hz=own)
+            sessions.append(make_session(f"{number}.mcap", estimates=[with_modes(estimate, mode)]))
         return campaign_of(sessions).homogeneity
 
     return found
@@ -110,10 +112,8 @@ def test_files_of_one_name_in_two_folders_are_two(make_session, make_estimate, c
     sessions = []
     for folder, value in zip("abcd", (2.5, 2.6, 2.5, 2.6), strict=True):
         estimate = make_estimate("I", {"zeta": 1e-4}, [[1e-4]], ("zeta",))
-        mode = replace(estimate.modes[0], frequency_hz=value, frequency_std_hz=1e-3)
-        sessions.append(
-            make_session(f"/{folder}/x.mcap", estimates=[replace(estimate, modes=(mode,))])
-        )
+        mode = replace(estimate.fit.modes[0], frequency_hz=value, frequency_std_hz=1e-3)
+        sessions.append(make_session(f"/{folder}/x.mcap", estimates=[with_modes(estimate, mode)]))
     found = campaign_of(sessions).homogeneity
     _, where, *_ = specimen_sentences.specimens(found)
     assert "2.500 Hz in 2 files (a/x.mcap, c/x.mcap); 2.600 Hz in 2 files" in where
