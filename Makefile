@@ -34,6 +34,7 @@ test-all: $(VENV)/ready
 
 # The documentation as a site, in build/site, and whether it is whole and complete without the internet.
 docs: $(VENV)/docs-ready
+	rm -rf build/site  # pages of modules that no longer exist
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -d build/doctrees docs build/site
 	RIGD_SITE=build/site $(BIN)/python -m pytest -n 0 -q tests/docs/test_site.py
 	@echo "The documentation: build/site/index.html"
