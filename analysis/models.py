@@ -22,7 +22,7 @@ beam and rig are free as well.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from types import MappingProxyType
@@ -38,7 +38,6 @@ from rigd.beam import (
     Beam,
     Damping,
     Parameter,
-    TransferGrid,
     undamped_frequencies_rad_s,
 )
 from rigd.spectral import (
@@ -216,65 +215,6 @@ STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
     }
 )
 """Damping structures of the analyser by name, I to VII."""
-
-
-# Response of a structure
-
-
-class FrequencyResponseModel:
-    """Model of torque per motor angle, ``G(j omega) + J_tool (j omega)²``, on a frequency grid.
-
-    The torque sensor is under the clamp, so its signal includes the tool inertia. This inertia is
-    added to the model, and never subtracted from the data.
-
-    Parameters
-    ----------
-    frequency_hz : ndarray, shape (n,)
-        Frequencies of the grid.
-    beam : Beam
-        Beam on the clamp.
-    tool_inertia_kg_m2 : float
-        Inertia between the sensor and the beam about the motor's axis.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from analysis.models import FrequencyResponseModel
-    >>> from rigd.beam import Beam, Damping
-    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
-    >>> model = FrequencyResponseModel(np.array([1.0, 10.0]), beam, tool_inertia_kg_m2=1e-5)
-    >>> print(np.abs(model.evaluate(Damping(zeta=1e-4))).round(4))
-    [0.0688 0.0911]
-    """
-
-    __slots__ = ("_grid", "_tool_response", "beam")
-
-    def __init__(
-        self, frequency_hz: NDArray[np.float64], beam: Beam, tool_inertia_kg_m2: float = 0.0
-    ) -> None:
-        s = 2j * np.pi * frequency_hz
-        self.beam = beam
-        self._grid = TransferGrid(s)
-        self._tool_response = tool_inertia_kg_m2 * s * s
-
-    def evaluate(self, damping: Damping) -> NDArray[np.complex128]:
-        """Return the modelled torque per motor angle in N·m/rad at all frequencies, shape (n,)."""
-        return self._grid.evaluate(self.beam, damping) + self._tool_response
-
-    def evaluate_with_gradient(
-        self, damping: Damping, wrt: Sequence[str]
-    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return torque per angle, shape (n,), and its derivatives by parameters, shape (k, n).
-
-        Parameters
-        ----------
-        damping : Damping
-            Damping at which response and derivatives are evaluated.
-        wrt : sequence of str
-            Names of the k parameters, from `rigd.beam.GRADIENT_NAMES`.
-        """
-        response, gradient = self._grid.evaluate_with_gradient(self.beam, damping, wrt)
-        return response + self._tool_response, gradient
 
 
 # Weights of the cost

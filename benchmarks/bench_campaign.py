@@ -21,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -35,12 +36,12 @@ from analysis.identify import BAND_HZ
 from analysis.models import (
     STRUCTURES,
     DampingUnknowns,
-    FrequencyResponseModel,
     WelchSettings,
     weights,
 )
 from analysis.paper import fit_many
 from analysis.report.campaign_report import write_campaign
+from rigd.beam import Damping, Plant, ResponseGrid
 
 JOBS = 2
 STARTS = 4
@@ -83,13 +84,15 @@ def welch_only(paths: list[Path]) -> int:
 
 def _cost(
     measured: NDArray[np.complex128],
-    model: FrequencyResponseModel,
+    response_grid: ResponseGrid,
+    plant: Plant,
     unknowns: DampingUnknowns,
     weight: NDArray[np.float64],
     x: NDArray[np.float64],
 ) -> float:
     """Eq. (26)."""
-    return float(weight @ np.abs(model.evaluate(unknowns.damping(x)) - measured) ** 2)
+    (response,) = response_grid.evaluate(replace(plant, damping=unknowns.damping(x)))
+    return float(weight @ np.abs(response - measured) ** 2)
 
 
 def searched(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
@@ -100,7 +103,8 @@ def searched(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
     from scipy.optimize import minimize
 
     result = analyse_session(path, SessionTask(WelchSettings(), (), (), BAND_HZ))
-    model = FrequencyResponseModel(result.frequency_hz, result.beam, result.tool_inertia_kg_m2)
+    response_grid = ResponseGrid(2j * np.pi * result.frequency_hz)
+    plant = Plant(result.beam, Damping(), tool_inertia_kg_m2=result.tool_inertia_kg_m2)
     rng = np.random.default_rng(0)
     found = {}
     for fit in result.welch_fits:
@@ -109,7 +113,7 @@ def searched(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
         low, high = unknowns.bounds
         low = np.maximum(low, math.log(1e-5))
         weight = weights(2 * np.pi * result.frequency_hz, fit.weighting)
-        cost = partial(_cost, result.response, model, unknowns, weight)
+        cost = partial(_cost, result.response, response_grid, plant, unknowns, weight)
         begun = time.process_time()
         ends = [
             minimize(

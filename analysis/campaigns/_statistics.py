@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns.pooling import determines_damping, estimates_by_structure, pooled_bic
-from analysis.models import STRUCTURES, FrequencyResponseModel
+from analysis.models import STRUCTURES
 from analysis.paper.welch_analysis import fit_indices, peak_deviation, resonant_peaks
-from rigd.beam import DAMPING_PARAMETERS, undamped_frequencies_rad_s
+from rigd.beam import DAMPING_PARAMETERS, Plant, ResponseGrid, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.paper.welch_analysis import FitIndices, Peak
-    from rigd.beam import Beam, Damping
+    from rigd.beam import Damping
 
 
 # Parameters
@@ -165,12 +165,9 @@ def nominal_models(sessions: Sequence[SessionAnalysis]) -> tuple[NominalModel, .
     first_session = sessions[0]
     if not first_session.frequency_hz.size:
         return ()
-    frequency_hz, beam = first_session.frequency_hz, first_session.beam
-    response_model = FrequencyResponseModel(frequency_hz, beam, first_session.tool_inertia_kg_m2)
+    response_grid = ResponseGrid(2j * np.pi * first_session.frequency_hz)
     return tuple(
-        _nominal_model(
-            structure, weighting, model_fits, sessions, response_model, frequency_hz, beam
-        )
+        _nominal_model(structure, weighting, model_fits, sessions, response_grid)
         for (structure, weighting), model_fits in fits_by_model(sessions).items()
     )
 
@@ -229,14 +226,15 @@ def _nominal_model(
     weighting: str,
     welch_fits: Sequence[WelchFit],
     sessions: Sequence[SessionAnalysis],
-    response_model: FrequencyResponseModel,
-    frequency_hz: NDArray[np.float64],
-    beam: Beam,
+    response_grid: ResponseGrid,
 ) -> NominalModel:
     """Return the nominal model of one damping structure and weighting."""
     mean_damping_model = mean_damping(structure, welch_fits)
-    model_response = response_model.evaluate(mean_damping_model)
-    mode_count = len(sessions[0].peaks)
+    first_session = sessions[0]
+    frequency_hz, beam = first_session.frequency_hz, first_session.beam
+    plant = Plant(beam, mean_damping_model, tool_inertia_kg_m2=first_session.tool_inertia_kg_m2)
+    (model_response,) = response_grid.evaluate(plant)
+    mode_count = len(first_session.peaks)
     peaks = resonant_peaks(
         frequency_hz, model_response, undamped_frequencies_rad_s(beam, mode_count) / (2 * np.pi)
     )

@@ -28,8 +28,8 @@ confidence intervals.
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -38,14 +38,13 @@ from numpy.typing import NDArray
 from analysis.models import (
     STRUCTURES,
     DampingUnknowns,
-    FrequencyResponseModel,
     Structure,
     Weighting,
     weighting_name,
     weights,
 )
 from analysis.optimizer import ConstantBounds, Minimum, NormalEquations, RecentValues, descend
-from rigd.beam import DAMPING_PARAMETERS, Beam, Damping
+from rigd.beam import DAMPING_PARAMETERS, Beam, Damping, Plant, ResponseGrid
 
 # Fits
 
@@ -185,22 +184,28 @@ def fit_many(
     structures, weightings = tuple(structures), tuple(weightings)
     _check_response(frequency_hz, response, structures)
     omega_rad_s = 2 * np.pi * frequency_hz
-    whole_model = FrequencyResponseModel(frequency_hz, beam, tool_inertia_kg_m2)
+    s = 2j * np.pi * frequency_hz
+    # The torque sensor is under the clamp: the inertia of the tool is added to the model, and never
+    # subtracted from the data.
+    undamped_plant = Plant(beam, Damping(), tool_inertia_kg_m2=tool_inertia_kg_m2)
+    whole_grid = ResponseGrid(s)
     grids_by_weighting: list[tuple[_FrequencyGrid, _FrequencyGrid]] = []
     for weighting in weightings:
         all_weights = weights(omega_rad_s, weighting)
         point_index, point_weights = representative_points(response, all_weights, _FEW_POINTS)
-        thinned_model = FrequencyResponseModel(frequency_hz[point_index], beam, tool_inertia_kg_m2)
+        few_points_grid = ResponseGrid(s[point_index])
         grids_by_weighting.append(
             (
-                _FrequencyGrid(thinned_model, response[point_index], point_weights),
-                _FrequencyGrid(whole_model, response, all_weights),
+                _FrequencyGrid(
+                    few_points_grid, undamped_plant, response[point_index], point_weights
+                ),
+                _FrequencyGrid(whole_grid, undamped_plant, response, all_weights),
             )
         )
     return tuple(
-        _fit(structure, weighting_name(weighting), few, whole_grid)
+        _fit(structure, weighting_name(weighting), few, whole)
         for structure in structures
-        for weighting, (few, whole_grid) in zip(weightings, grids_by_weighting, strict=True)
+        for weighting, (few, whole) in zip(weightings, grids_by_weighting, strict=True)
     )
 
 
@@ -212,9 +217,14 @@ _Linearization = tuple[NDArray[np.complex128], NDArray[np.complex128]]
 class _FrequencyGrid:
     """Frequency points, with weights, at which model and measurement are compared."""
 
-    model: FrequencyResponseModel
+    response_grid: ResponseGrid
+    undamped_plant: Plant
     measured: NDArray[np.complex128]
     weights: NDArray[np.float64]
+
+    def evaluate(self, damping: Damping, wrt: Sequence[str] = ()) -> NDArray[np.complex128]:
+        """Return the response of the damped plant, then its derivatives, shape (1 + k, n)."""
+        return self.response_grid.evaluate(replace(self.undamped_plant, damping=damping), wrt)
 
 
 class _FrfProblem:
@@ -227,7 +237,7 @@ class _FrfProblem:
 
     def cost(self, x: NDArray[np.float64]) -> float:
         """Return the cost (Eq. 26) at the unknowns x."""
-        deviation = self.grid.model.evaluate(self.unknowns.damping(x)) - self.grid.measured
+        deviation = self.grid.evaluate(self.unknowns.damping(x))[0] - self.grid.measured
         return float(self.grid.weights @ (deviation.real**2 + deviation.imag**2))
 
     def deviation_and_jacobian(self, x: NDArray[np.float64]) -> _Linearization:
@@ -236,11 +246,11 @@ class _FrfProblem:
 
     def _linearize(self, x: NDArray[np.float64]) -> _Linearization:
         """Return model minus measurement and its derivatives with respect to x."""
-        model_response, gradient = self.grid.model.evaluate_with_gradient(
+        response_and_derivatives = self.grid.evaluate(
             self.unknowns.damping(x), self.unknowns.structure.free
         )
-        jacobian = self.unknowns.derivative_of_parameters(x).T @ gradient
-        return model_response - self.grid.measured, jacobian
+        jacobian = self.unknowns.derivative_of_parameters(x).T @ response_and_derivatives[1:]
+        return response_and_derivatives[0] - self.grid.measured, jacobian
 
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
         """Return cost, gradient and Gauss-Newton Hessian at the unknowns x."""
@@ -260,7 +270,7 @@ def _fit(
     whole_grid: _FrequencyGrid,
 ) -> FrfFit:
     """Fit a damping structure: descents on few points, then refinement on all points."""
-    unknowns = DampingUnknowns.for_beam(structure, whole_grid.model.beam)
+    unknowns = DampingUnknowns.for_beam(structure, whole_grid.undamped_plant.beam)
     bounds = ConstantBounds(*unknowns.bounds)
     thinned_problem, whole_problem = (
         _FrfProblem(unknowns, few_points_grid),

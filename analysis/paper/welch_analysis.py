@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.models import STRUCTURES, FrequencyResponseModel, WeightingError, weights
+from analysis.models import STRUCTURES, WeightingError, weights
 from analysis.paper._estimate import (
     FrequencyResponseError,
     SettingsError,
@@ -21,7 +21,14 @@ from analysis.paper._estimate import (
     estimate_warnings,
 )
 from analysis.paper._fit import FitError, FrfFit, fit_many
-from rigd.beam import CausalTransform, modes, transfer, undamped_frequencies_rad_s
+from rigd.beam import (
+    CausalTransform,
+    Plant,
+    ResponseGrid,
+    modes,
+    transfer,
+    undamped_frequencies_rad_s,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -403,9 +410,7 @@ def analyse(
     main_response, whole_record = estimate(record, settings)
     on_step("frequency response")
     measured_peaks = _mode_peaks(record.beam, main_response.frequency_hz, main_response.response)
-    beam_on_tool = FrequencyResponseModel(
-        main_response.frequency_hz, record.beam, record.tool_inertia_kg_m2
-    )
+    response_grid = ResponseGrid(2j * np.pi * main_response.frequency_hz)
     fitted_models: list[FittedModel] = []
     for fit_name in settings.types:
         # One type at a time, so that progress can be shown. Common grids would save little time.
@@ -421,7 +426,7 @@ def analyse(
         except (FitError, WeightingError) as error:
             raise SettingsError(f"{record.path}: {error}") from error
         fitted_models.extend(
-            _evaluate_fit(fit, record.beam, main_response, beam_on_tool, measured_peaks)
+            _evaluate_fit(fit, record, main_response, response_grid, measured_peaks)
             for fit in frf_fits
         )
         on_step(f"type {fit_name}")
@@ -454,13 +459,15 @@ def _check_excited(record: Record) -> None:
 
 def _evaluate_fit(
     fit: FrfFit,
-    beam: Beam,
+    record: Record,
     measured: FrequencyResponse,
-    beam_on_tool: FrequencyResponseModel,
+    response_grid: ResponseGrid,
     measured_peaks: tuple[Peak | None, ...],
 ) -> FittedModel:
     """Return a fitted model with its indices, modes and peaks."""
-    model_response = beam_on_tool.evaluate(fit.damping)
+    beam = record.beam
+    plant = Plant(beam, fit.damping, tool_inertia_kg_m2=record.tool_inertia_kg_m2)
+    (model_response,) = response_grid.evaluate(plant)
     model_peaks = _mode_peaks(beam, measured.frequency_hz, model_response)
     try:
         beam_modes = modes(beam, fit.damping, MODES)

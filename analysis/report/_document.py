@@ -17,14 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rigd
-from analysis.models import FrequencyResponseModel
 from analysis.paper.welch_analysis import fit_indices
 from analysis.report._shown_model import ShownModel
 from analysis.report.bands import loss_estimate, loss_factors, supported_band_hz
 from analysis.report.table import unreported_parameters
 from analysis.results import finite
 from analysis.statistics import nrmse_percent
-from rigd.beam import ResponseGrid
+from rigd.beam import Plant, ResponseGrid
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -84,11 +83,12 @@ def indices_of_record_fit(
 def whole_record_indices(welch_analysis: WelchAnalysis) -> list[IndexValues]:
     """Return MSE, WMSE and MD of each Welch fit against the ratio of the record's transforms."""
     measured_frf, record = welch_analysis.whole_record, welch_analysis.record
-    grid = FrequencyResponseModel(measured_frf.frequency_hz, record.beam, record.tool_inertia_kg_m2)
-    return [
-        _fit_indices(measured_frf, grid.evaluate(model.fit.damping))
+    response_grid = ResponseGrid(2j * np.pi * measured_frf.frequency_hz)
+    plants = (
+        Plant(record.beam, model.fit.damping, tool_inertia_kg_m2=record.tool_inertia_kg_m2)
         for model in welch_analysis.models
-    ]
+    )
+    return [_fit_indices(measured_frf, response_grid.evaluate(plant)[0]) for plant in plants]
 
 
 def _fit_indices(

@@ -10,9 +10,9 @@ from cases import further
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.models import STRUCTURES, FrequencyResponseModel, WeightingError, weights
+from analysis.models import STRUCTURES, WeightingError, weights
 from analysis.paper import fit_frf, fit_many
-from rigd.beam import TransferGrid
+from rigd.beam import Plant, ResponseGrid, TransferGrid, transfer
 
 pytestmark = pytest.mark.fit
 
@@ -37,9 +37,9 @@ def assert_parameters(fit, damping, relative=1e-6):
 def test_noise_free_fits_return_the_parameters_of_table_3(
     link, paper_grid_hz, paper_dampings, weighting
 ):
-    model = FrequencyResponseModel(paper_grid_hz, link)
+    s = 2j * np.pi * paper_grid_hz
     for (name, _), damping in paper_dampings.items():
-        fit = fit_frf(paper_grid_hz, model.evaluate(damping), link, STRUCTURES[name], weighting)
+        fit = fit_frf(paper_grid_hz, transfer(s, link, damping), link, STRUCTURES[name], weighting)
         assert_parameters(fit, damping)
         assert fit.at_bounds == ()
         assert fit.cost < 1e-15
@@ -70,7 +70,8 @@ def test_noise_free_fits_return_any_physical_parameters(
             "lambda": lambda_,
         }
     )
-    measured = FrequencyResponseModel(paper_grid_hz, link, tool_inertia).evaluate(damping)
+    plant = Plant(link, damping, tool_inertia_kg_m2=tool_inertia)
+    (measured,) = ResponseGrid(2j * np.pi * paper_grid_hz).evaluate(plant)
     fit = fit_frf(
         paper_grid_hz, measured, link, structure, weighting, tool_inertia_kg_m2=tool_inertia
     )
@@ -208,7 +209,7 @@ def test_standard_deviations_of_the_free_parameters_only(fits):
 
 
 def test_standard_deviations_agree_with_scatter_where_errors_are_chance(link, plant, paper_grid_hz):
-    exact = FrequencyResponseModel(paper_grid_hz, link).evaluate(plant)
+    exact = transfer(2j * np.pi * paper_grid_hz, link, plant)
     rng = np.random.default_rng(60_221)
     repeats = [
         fit_frf(
@@ -226,9 +227,9 @@ def test_standard_deviations_agree_with_scatter_where_errors_are_chance(link, pl
 
 
 def test_damping_that_is_not_there_rests_on_its_bound(link, paper_grid_hz, paper_dampings):
-    model = FrequencyResponseModel(paper_grid_hz, link)
     truth = paper_dampings["II", "const"]
-    measured = model.evaluate(truth) * (1 + 1e-4j)  # a lead that internal damping cannot explain
+    measured = transfer(2j * np.pi * paper_grid_hz, link, truth)
+    measured *= 1 + 1e-4j  # a lead that internal damping cannot explain
     fit = fit_frf(paper_grid_hz, measured, link, STRUCTURES["III"], "const")
     assert fit.parameters["zeta"] * 100.55 < 1e-3
     assert fit.parameters["gamma"] == pytest.approx(truth.gamma, rel=0.01)
