@@ -125,6 +125,6 @@ def uniform_beam_test(
         p_value=p_value,
         modes=mode_numbers,
         measured=measured_constants,
-        predicted=problem.constants(best_minimum.x[None])[0],
+        predicted=problem.constants(best_minimum.x),
         std=std,
     )
