@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -174,13 +175,11 @@ class ModeTerms:
 
     def by_mode(self) -> Iterable[tuple[complex, ...]]:
         """Return the coefficients of each mode, in the order of the attributes."""
-        return zip(
-            *(getattr(self, field.name).tolist() for field in _COEFFICIENT_FIELDS), strict=True
-        )
+        return zip(*(terms.tolist() for terms in _coefficients(self)), strict=True)
 
 
-_COEFFICIENT_FIELDS: Final = fields(ModeTerms)[:-2]
-"""Fields of `ModeTerms` that are arrays."""
+_coefficients: Final = attrgetter(*(field.name for field in fields(ModeTerms)[:-2]))
+"""Function that returns the attributes of `ModeTerms` that are arrays."""
 
 
 @dataclass(frozen=True, slots=True)

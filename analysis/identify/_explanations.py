@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from analysis.identify._altered_beam import ModeTerms
     from analysis.identify._causes import Cause
-    from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify.beam_uniformity import UniformBeamTest
     from rigd.beam import Damping, Plant
@@ -121,25 +120,17 @@ class CauseFit:
         }
 
 
-def explanations(
-    fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
-) -> tuple[CauseFit, ...]:
+def explanations(test: UniformBeamTest) -> tuple[CauseFit, ...]:
     """Return fits of the causes that each alone explain the modes, by falling p-value.
 
     Parameters
     ----------
-    fit : ModalEstimate
-        Modal model of the record.
-    nominal : Plant
-        Rig and specimen as the file states them, with the mass at the tip if it states one.
-    tilt_deg : float, optional
-        Inclination of the plane of motion along the beam at rest as the file states it.
+    test : UniformBeamTest
+        Test that refused the plain uniform beam.
     """
-    visible_modes = fit.visible
-    if not visible_modes:
+    problem, best_beam = test.problem, test.unknowns
+    if problem is None:
         return ()
-    problem = UniformBeamProblem(fit, visible_modes, nominal, tilt_deg=tilt_deg)
-    best_beam = problem.minima()[0].x
     middle_start = problem.starts()[len(problem.starts()) // 2]
     without_internal = np.where(np.arange(best_beam.size) == 0, problem.lower, middle_start)
     explained_by: dict[str, CauseFit] = {}
