@@ -253,7 +253,6 @@ class _CauseSearch:
         tolerance: float = _CONSTANT_TOLERANCES[0],
     ) -> None:
         self._problem, self._cause, self._beam_x = problem, cause, x
-        self._plain_terms = galerkin_mode_terms(Alteration(), problem.nominal.beam, problem.modes)
         self._lower = np.concatenate([problem.lower, cause.lower])
         upper = np.where(x <= problem.lower, problem.lower, problem.upper)
         self._upper = np.concatenate([upper, cause.upper])
@@ -325,7 +324,7 @@ class _CauseSearch:
         beam = self._problem.plant(x).beam
         alteration = self._cause.alter(self._problem.stated, cause_unknowns, beam)
         if alteration.has_same_shapes(Alteration()):
-            return replace(self._plain_terms, alteration=alteration)
+            return replace(self._problem.plain_terms, alteration=alteration)
         terms = galerkin_mode_terms(alteration, beam, self._problem.modes)
         # The mass of a cause is a fraction of the beam's: the mode shapes do not change with that.
         return terms if self._problem.stated.lumps else replace(terms, density_kg_per_m=None)

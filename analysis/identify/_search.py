@@ -180,11 +180,9 @@ class CoarseResponse:
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
         """Return `cost` with its gradient and Gauss-Newton matrix by the unknowns."""
         plant, unknown_slopes = unknowns.plant_and_gradient(x)
-        predicted_response, *response_gradient = self._response.evaluate(
-            plant, unknowns.gradient_names
-        )
-        response_deviation = predicted_response - self._measured
-        jacobian = unknown_slopes.T @ np.array(response_gradient)
+        spectra = self._response.evaluate(plant, unknowns.gradient_names)
+        response_deviation = spectra[0] - self._measured
+        jacobian = unknown_slopes.T @ spectra[1:]
         weighted_jacobian = jacobian.conj() * self._weights
         return NormalEquations(
             cost=self._mean_square(response_deviation),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -180,6 +181,11 @@ class UniformBeamProblem:
         self.transform[6, 6] = _DELAY_UNIT_S
         self._offset = np.zeros(len(PARAMETERS))
         self._offset[2] = 2 * ln_first_omega
+
+    @cached_property
+    def plain_terms(self) -> ModeTerms:
+        """Return the Galerkin coefficients of the uniform beam alone."""
+        return galerkin_mode_terms(Alteration(), self.nominal.beam, self.modes)
 
     def parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert unknowns, shape (..., 7), to the values of `PARAMETERS`.
