@@ -11,10 +11,12 @@ import pytest
 from cauchy_residues import modal_constants
 
 from analysis.identify import ModalEstimate, ModalModel
+from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
 from analysis.identify._explanations import explanations, finding
 from analysis.identify._step_in_time import StiffnessStep
 from analysis.identify.beam_uniformity import uniform_beam_test
 from analysis.identify.tolerant_estimate import tolerant_estimate
+from analysis.identify.uniform_beam import UniformBeamProblem
 from rigd.beam import Beam, Damping, Plant
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
@@ -320,3 +322,26 @@ def test_losses_of_a_beam_that_is_not_uniform_have_a_tolerance():
     assert loss == pytest.approx(true, rel=3 * std)
     # Three thousandths of each damping ratio, besides 1.5 thousandths of noise.
     assert std > 1.05 * loss_and_std(is_uniform=True)[1]
+
+
+@pytest.mark.parametrize(
+    "altered",
+    [
+        {},
+        {"lumps": ((1.0, 2e-4),), "gravity_m_s2": 0.3},
+        {"clamp_compliance": 0.01, "clamp_loss": 0.1, "lag_s": 1e-4},
+        {"relaxation": (0.02, 0.01), "sensor": (3e-4, 0.5)},
+    ],
+)
+def test_derivatives_of_modal_constants_are_those_of_differences(plain, altered):
+    fit, rig = fitted(plain), replace(NOMINAL, filter_time_constant_s=2e-4, delay_s=1e-3)
+    problem = UniformBeamProblem(fit, fit.visible, rig)
+    terms = galerkin_mode_terms(Alteration(**altered), rig.beam, problem.modes)
+    x, unit, step = problem.starts()[0], np.eye(problem.compared), 1e-5
+    slopes = problem.deviations(x, unit, terms)[1]()
+    differences = [
+        problem.deviations(x + change, unit, terms)[0]
+        - problem.deviations(x - change, unit, terms)[0]
+        for change in step * np.eye(x.size)
+    ]
+    np.testing.assert_allclose(slopes, np.array(differences) / (2 * step), rtol=1e-5, atol=1e-8)
