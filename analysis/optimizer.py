@@ -154,7 +154,7 @@ class ConstantBounds:
         step : ndarray, shape (k,)
             Requested step.
         """
-        return np.clip(x + step, self.lower, self.upper)
+        return np.minimum(np.maximum(x + step, self.lower), self.upper)
 
 
 # Descent
@@ -288,26 +288,28 @@ def _compute_step(
     smallest_step, largest_step = step_limits
     step = np.zeros(is_free.size)
     curvatures = current_equations.hessian.diagonal()
-    damped_model = model_hessian + np.diag(
-        damping * np.maximum(curvatures, _SMALLEST_CURVATURE * curvatures[is_free].max())
+    damped_model = model_hessian.copy()
+    damped_model.flat[:: step.size + 1] += damping * np.maximum(
+        curvatures, _SMALLEST_CURVATURE * curvatures[is_free].max()
     )
+    gradient = current_equations.gradient
     free_indices = np.flatnonzero(is_free)
     while free_indices.size:
         hessian_block = damped_model[free_indices[:, None], free_indices]
-        step[free_indices] = 0.0
-        gradient = current_equations.gradient[free_indices] + model_hessian[free_indices] @ step
         try:
             np.linalg.cholesky(hessian_block)
-            free_step = np.linalg.solve(hessian_block, -gradient)
+            free_step = np.linalg.solve(hessian_block, -gradient[free_indices])
         except np.linalg.LinAlgError:
             return None
-        step[free_indices] = np.clip(
-            free_step, smallest_step[free_indices], largest_step[free_indices]
+        step[free_indices] = limited_step = np.minimum(
+            np.maximum(free_step, smallest_step[free_indices]), largest_step[free_indices]
         )
-        is_limited = step[free_indices] != free_step
+        is_limited = limited_step != free_step
         if not is_limited.any():
             break
         free_indices = free_indices[~is_limited]
+        step[free_indices] = 0.0
+        gradient = current_equations.gradient + model_hessian @ step
     return step
 
 
@@ -334,12 +336,12 @@ def _update_second_part(
             overlap_factor * predicted_change,
         )
     change_error = second_change - predicted_change
-    outer_update = np.outer(change_error, gradient_change)
+    outer_update = change_error[:, None] * gradient_change
     return (
         second_estimate
         + (outer_update + outer_update.T) / step_curvature
         - (float(change_error @ step) / step_curvature**2)
-        * np.outer(gradient_change, gradient_change)
+        * (gradient_change[:, None] * gradient_change)
     )
 
 

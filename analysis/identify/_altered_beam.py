@@ -18,8 +18,9 @@ clamped-free beam follows from its loads alone, so few modes suffice.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 from rigd.beam import clamped_free_eigenvalues, mode_shape
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from rigd.beam import Beam, Plant
 
@@ -127,17 +128,11 @@ class Alteration:
             other_alteration, relaxation=self.relaxation, sensor=self.sensor, lag_s=self.lag_s
         )
 
-    def channel(self, s: NDArray[np.complex128]) -> NDArray[np.complex128] | float:
-        """Return the dimensionless transfer function of the torque channel's lags.
-
-        `s` is the Laplace variable in rad/s. The result is 1.0 if the channel has no lag.
-        """
-        sensor_time_s, inverse_quality = self.sensor
-        response: NDArray[np.complex128] | float = 1.0
-        if sensor_time_s:
-            q = s * sensor_time_s
-            response = 1 / (1 + inverse_quality * q + q * q)
-        return response / (1 + self.lag_s * s) if self.lag_s else response
+    @property
+    def lags(self) -> tuple[tuple[float, float], ...]:
+        """Coefficients of s and s² in the denominators of the torque channel's lags."""
+        time_s, inverse_quality = self.sensor
+        return ((inverse_quality * time_s, time_s**2), (self.lag_s, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +172,14 @@ class ModeTerms:
     turn_by_internal: Terms
     density_kg_per_m: float | None
     alteration: Alteration
+
+    def by_mode(self) -> Iterable[tuple[complex, ...]]:
+        """Return the coefficients of each mode, in the order of the attributes."""
+        return zip(*(terms.tolist() for terms in _coefficients(self)), strict=True)
+
+
+_coefficients: Final = attrgetter(*(field.name for field in fields(ModeTerms)[:-2]))
+"""Function that returns the attributes of `ModeTerms` that are arrays."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,13 +21,12 @@ from analysis.identify.uniform_beam import UniformBeamProblem
 from analysis.statistics import chi_square_p_value
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
     from analysis.identify._altered_beam import ModeTerms
     from analysis.identify._causes import Cause
-    from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify.beam_uniformity import UniformBeamTest
     from rigd.beam import Damping, Plant
@@ -121,25 +120,17 @@ class CauseFit:
         }
 
 
-def explanations(
-    fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
-) -> tuple[CauseFit, ...]:
+def explanations(test: UniformBeamTest) -> tuple[CauseFit, ...]:
     """Return fits of the causes that each alone explain the modes, by falling p-value.
 
     Parameters
     ----------
-    fit : ModalEstimate
-        Modal model of the record.
-    nominal : Plant
-        Rig and specimen as the file states them, with the mass at the tip if it states one.
-    tilt_deg : float, optional
-        Inclination of the plane of motion along the beam at rest as the file states it.
+    test : UniformBeamTest
+        Test that refused the plain uniform beam.
     """
-    visible_modes = fit.visible
-    if not visible_modes:
+    problem, best_beam = test.problem, test.unknowns
+    if problem is None:
         return ()
-    problem = UniformBeamProblem(fit, visible_modes, nominal, tilt_deg=tilt_deg)
-    best_beam = problem.minima()[0].x
     middle_start = problem.starts()[len(problem.starts()) // 2]
     without_internal = np.where(np.arange(best_beam.size) == 0, problem.lower, middle_start)
     explained_by: dict[str, CauseFit] = {}
@@ -262,7 +253,6 @@ class _CauseSearch:
         tolerance: float = _CONSTANT_TOLERANCES[0],
     ) -> None:
         self._problem, self._cause, self._beam_x = problem, cause, x
-        self._plain_terms = galerkin_mode_terms(Alteration(), problem.nominal.beam, problem.modes)
         self._lower = np.concatenate([problem.lower, cause.lower])
         upper = np.where(x <= problem.lower, problem.lower, problem.upper)
         self._upper = np.concatenate([upper, cause.upper])
@@ -282,15 +272,11 @@ class _CauseSearch:
         for cause_start in self._cause.starts:
             y = np.concatenate([x, cause_start])
             mode_terms = self._mode_terms(y)
+            deviations, slopes = self._deviations(x, mode_terms)
             if derivatives is None:
-                _, derivatives = self._deviations_by_beam(y)
-            beam_step = _limited_step(
-                self._whitened_deviations(x[None], mode_terms)[0],
-                derivatives,
-                lowest_step,
-                highest_step,
-            )[0]
-            deviations = self._whitened_deviations((x + beam_step)[None], mode_terms)[0]
+                derivatives = slopes()
+            beam_step, _ = _limited_step(deviations, derivatives, lowest_step, highest_step)
+            deviations, _ = self._deviations(x + beam_step, mode_terms)
             stepped_starts.append(
                 (float(deviations @ deviations), np.concatenate([x + beam_step, cause_start]))
             )
@@ -303,13 +289,14 @@ class _CauseSearch:
         direction it rises first and then falls further.
         """
         unknown_scale, lowest_chi_square, best_y = self._scale, math.inf, y
+        deviations, beam_slopes = self._deviations_at(y)
         for _ in range(_MAX_DESCENT_STEPS):
-            whitened_deviation, derivatives = self._deviations_by_all(y)
-            chi_square = float(whitened_deviation @ whitened_deviation)
+            chi_square = float(deviations @ deviations)
             if chi_square < lowest_chi_square:
                 lowest_chi_square, best_y = chi_square, y
+            derivatives = np.concatenate([beam_slopes(), self._slopes_by_cause(y, deviations)])
             scaled_step, predicted_chi_square = _limited_step(
-                whitened_deviation,
+                deviations,
                 derivatives * unknown_scale[:, None],
                 (self._lower - y) / unknown_scale,
                 (self._upper - y) / unknown_scale,
@@ -323,12 +310,12 @@ class _CauseSearch:
                 * unknown_scale
                 * min(1.0, _MAX_RELATIVE_STEP / float(np.abs(scaled_step).max()))
             )
-            for _ in range(_MAX_STEP_HALVINGS):
-                new_deviation = self._deviations(np.clip(y + scaled_step, self._lower, self._upper))
-                if new_deviation @ new_deviation < _MAX_CHI_SQUARE_RISE * chi_square:
+            for halving in range(_MAX_STEP_HALVINGS + 1):
+                next_y = np.clip(y + scaled_step / 2**halving, self._lower, self._upper)
+                deviations, beam_slopes = self._deviations_at(next_y)
+                if deviations @ deviations < _MAX_CHI_SQUARE_RISE * chi_square:
                     break
-                scaled_step /= 2
-            y = np.clip(y + scaled_step, self._lower, self._upper)
+            y = next_y
         return lowest_chi_square, best_y
 
     def _mode_terms(self, y: NDArray[np.float64]) -> ModeTerms:
@@ -337,60 +324,35 @@ class _CauseSearch:
         beam = self._problem.plant(x).beam
         alteration = self._cause.alter(self._problem.stated, cause_unknowns, beam)
         if alteration.has_same_shapes(Alteration()):
-            return replace(self._plain_terms, alteration=alteration)
+            return replace(self._problem.plain_terms, alteration=alteration)
         terms = galerkin_mode_terms(alteration, beam, self._problem.modes)
         # The mass of a cause is a fraction of the beam's: the mode shapes do not change with that.
         return terms if self._problem.stated.lumps else replace(terms, density_kg_per_m=None)
 
-    def _whitened_deviations(
+    def _deviations(
         self, x: NDArray[np.float64], mode_terms: ModeTerms
-    ) -> NDArray[np.float64]:
-        """Return the whitened deviations of the modal constants for m beams, shape (m, 4 n).
+    ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
+        """Return the whitened deviations of the modal constants, and a function for derivatives.
 
-        `x` are the unknowns of the beams, shape (m, 7), and `mode_terms` describe the beam with the
-        cause.
+        `x` are the unknowns of the beam, shape (7,), and `mode_terms` describe the beam with the
+        cause. The derivatives are those by the unknowns of the beam at constant mode shapes.
         """
-        differences = self._problem.differences(x, mode_terms)
-        whitened: NDArray[np.float64] = np.nan_to_num(differences @ self._whitener.T, nan=1e6)
-        return whitened
+        return self._problem.deviations(x, self._whitener, mode_terms)
 
-    def _deviations(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the whitened deviations of the modal constants at one point, shape (4 n,)."""
-        whitened_deviations: NDArray[np.float64] = self._whitened_deviations(
-            y[None, : self._beam_x.size], self._mode_terms(y)
-        )[0]
-        return whitened_deviations
-
-    def _deviations_by_beam(
+    def _deviations_at(
         self, y: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the whitened deviations of the modal constants, and their derivatives.
+    ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
+        """Return `_deviations` for the unknowns of beam and cause."""
+        return self._deviations(y[: self._beam_x.size], self._mode_terms(y))
 
-        The derivatives are those by the beam's unknowns.
-        """
-        beam_unknowns = self._beam_x.size
-        unknown_steps = np.concatenate(
-            [np.zeros((1, beam_unknowns)), _DERIVATIVE_STEP * np.eye(beam_unknowns)]
-        )
-        deviations = self._whitened_deviations(
-            y[:beam_unknowns] + unknown_steps, self._mode_terms(y)
-        )
-        return deviations[0], (deviations[1:] - deviations[0]) / _DERIVATIVE_STEP
-
-    def _deviations_by_all(
-        self, y: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the whitened deviations of the modal constants, and their derivatives.
-
-        The derivatives are those by the unknowns of beam and cause.
-        """
-        whitened_deviation, beam_rows = self._deviations_by_beam(y)
-        cause_steps = _DERIVATIVE_STEP * np.diag(self._scale)[self._beam_x.size :]
-        cause_rows = [
-            (self._deviations(y + cause_step) - whitened_deviation) / cause_step.sum()
-            for cause_step in cause_steps
+    def _slopes_by_cause(
+        self, y: NDArray[np.float64], deviations: NDArray[np.float64]
+    ) -> list[NDArray[np.float64]]:
+        """Return the derivatives of the whitened deviations by the unknowns of the cause."""
+        return [
+            (self._deviations_at(y + cause_step)[0] - deviations) / cause_step.sum()
+            for cause_step in _DERIVATIVE_STEP * np.diag(self._scale)[self._beam_x.size :]
         ]
-        return whitened_deviation, np.concatenate([beam_rows, cause_rows])
 
 
 def _limited_step(

@@ -25,7 +25,7 @@ from analysis.paper import representative_points
 from rigd.beam import ResponseGrid
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
     from numpy.typing import NDArray
 
@@ -44,17 +44,15 @@ _SCAN_DAMPING: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0
 """Damping for the scan of these shifts, as `Unknowns.start` accepts it."""
 
 
-def resonance_shift(
-    coarse_cost: Callable[[Plant], float], unknowns: Unknowns
-) -> NDArray[np.float64]:
+def resonance_shift(coarse_response: CoarseResponse, unknowns: Unknowns) -> NDArray[np.float64]:
     """Return the shift of the unknowns that aligns the resonances with the record, (k,).
 
     If a resonance is off by more than its width, no descent finds it.
 
     Parameters
     ----------
-    coarse_cost : callable
-        Function from a plant to its cost, on few points of a frequency response.
+    coarse_response : CoarseResponse
+        Some points of the frequency response of the record.
     unknowns : Unknowns
         Unknowns of the structure.
     """
@@ -63,12 +61,9 @@ def resonance_shift(
     )
     aligning_shift = np.zeros(moderate_damping_start.size)
     if "density_over_stiffness" in unknowns.names:
-        ratio_index = unknowns.names.index("density_over_stiffness")
-        shift_costs = []
-        for ratio_shift in _LN_RATIO_SHIFTS:
-            aligning_shift[ratio_index] = ratio_shift
-            shift_costs.append(coarse_cost(unknowns.plant(moderate_damping_start + aligning_shift)))
-        aligning_shift[ratio_index] = _LN_RATIO_SHIFTS[int(np.argmin(shift_costs))]
+        aligning_shift[unknowns.names.index("density_over_stiffness")] = (
+            coarse_response.best_ln_ratio_shift(unknowns.plant(moderate_damping_start))
+        )
     return aligning_shift
 
 
@@ -102,7 +97,7 @@ class CoarseResponse:
     A cost on it is cheap to compute.
     """
 
-    __slots__ = ("_costs", "_frequency_hz", "_measured", "_response", "_weights")
+    __slots__ = ("_frequency_hz", "_measured", "_response", "_responses", "_shifts", "_weights")
 
     def __init__(self, comparison: Comparison) -> None:
         sample_count = comparison.angle_rad.size
@@ -125,7 +120,8 @@ class CoarseResponse:
         self._measured = measured_response[selected_bins]
         self._frequency_hz = hz[band_bins][is_excited][selected_bins]
         self._response = ResponseGrid(2j * np.pi * self._frequency_hz)
-        self._costs: dict[Plant, float] = {}
+        self._responses: dict[Plant, NDArray[np.complex128]] = {}
+        self._shifts: dict[Plant, float] = {}
 
     def whitened(self, noise: NoiseSpectrum, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
         """Return the measured response with the weights for another noise spectrum.
@@ -140,22 +136,40 @@ class CoarseResponse:
         noise_weight = np.interp(self._frequency_hz, frequency_hz, noise.weight**2)
         whitened_response = copy(self)
         whitened_response._weights = self._weights * noise_weight / (self._weights @ noise_weight)
-        whitened_response._costs = {}
+        whitened_response._shifts = {}
         return whitened_response
 
     def cost(self, plant: Plant) -> float:
         """Return the weighted mean square of predicted minus measured response, in (N·m/rad)²."""
-        # Cached: structures that differ only in the free parameters are scanned at the same plants.
-        if plant not in self._costs:
-            response_deviation = self._response.evaluate(plant)[0] - self._measured
-            self._costs[plant] = self._mean_square(response_deviation)
-        return self._costs[plant]
+        return self._mean_square(self._predicted(plant) - self._measured)
+
+    def _predicted(self, plant: Plant) -> NDArray[np.complex128]:
+        """Return the predicted response of a plant, from the cache if it has been computed."""
+        if plant not in self._responses:
+            self._responses[plant] = self._response.evaluate(plant)[0]
+        return self._responses[plant]
+
+    def best_ln_ratio_shift(self, plant: Plant) -> float:
+        """Return the shift of ln(rho/EI) of a plant, with constant losses, of the lowest cost."""
+        # Cached: structures that differ only in what is free begin at the same plant.
+        if plant not in self._shifts:
+            ratio, gamma = plant.beam.density_over_stiffness, plant.damping.gamma
+            shifted_plants = (
+                plant.with_parameters(
+                    {"density_over_stiffness": factor * ratio, "gamma": factor * gamma}
+                )
+                for factor in np.exp(_LN_RATIO_SHIFTS).tolist()
+            )
+            shift_costs = [
+                self._mean_square(self._response.evaluate(shifted)[0] - self._measured)
+                for shifted in shifted_plants
+            ]
+            self._shifts[plant] = float(_LN_RATIO_SHIFTS[int(np.argmin(shift_costs))])
+        return self._shifts[plant]
 
     def distance(self, first_plant: Plant, second_plant: Plant) -> float:
         """Return the weighted mean square of the difference between two plants' responses."""
-        return self._mean_square(
-            self._response.evaluate(first_plant)[0] - self._response.evaluate(second_plant)[0]
-        )
+        return self._mean_square(self._predicted(first_plant) - self._predicted(second_plant))
 
     def alike(self, first_plant: Plant, second_plant: Plant) -> bool:
         """Return whether the responses of two plants are so similar that they are one minimum."""
@@ -166,11 +180,9 @@ class CoarseResponse:
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
         """Return `cost` with its gradient and Gauss-Newton matrix by the unknowns."""
         plant, unknown_slopes = unknowns.plant_and_gradient(x)
-        predicted_response, *response_gradient = self._response.evaluate(
-            plant, unknowns.gradient_names
-        )
-        response_deviation = predicted_response - self._measured
-        jacobian = unknown_slopes.T @ np.array(response_gradient)
+        spectra = self._response.evaluate(plant, unknowns.gradient_names)
+        response_deviation = spectra[0] - self._measured
+        jacobian = unknown_slopes.T @ spectra[1:]
         weighted_jacobian = jacobian.conj() * self._weights
         return NormalEquations(
             cost=self._mean_square(response_deviation),
@@ -191,7 +203,7 @@ def initial_guesses(
     The first is the best fit with all orders 1, which is close to most materials and to air. The
     others have the same losses with different orders.
     """
-    aligning_shift = resonance_shift(coarse_response.cost, unknowns)
+    aligning_shift = resonance_shift(coarse_response, unknowns)
     damping_sizes = [
         _START_LN_SIZES.get(parameter_name, (1.0,)) for parameter_name in unknowns.structure.free
     ]

@@ -391,7 +391,7 @@ def _explain_deviations(
     """
     if len(modal_fit.visible) <= MODES_WITHOUT_REDUNDANCY:
         return (), ()
-    causes = explanations(modal_fit, measurement.nominal, measurement.axis_tilt_deg)
+    causes = explanations(beam_test)
     stiffness_step = (
         best_stiffness_step(candidate_set.comparison, modal_fit)
         if measurement.is_single_sweep

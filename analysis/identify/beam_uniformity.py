@@ -45,6 +45,10 @@ class UniformBeamTest:
     measured, predicted, std : ndarray, shape (4 n,)
         Measured and predicted `MODE_CONSTANT_NAMES`, mode by mode, and the standard deviations of
         the measured ones.
+    problem : UniformBeamProblem or None
+        Fit of the uniform beam; None if not tested.
+    unknowns : ndarray, shape (7,)
+        Unknowns of the fitted beam; NaN if not tested.
     """
 
     status: TestStatus
@@ -55,6 +59,8 @@ class UniformBeamTest:
     measured: NDArray[np.float64]
     predicted: NDArray[np.float64]
     std: NDArray[np.float64]
+    problem: UniformBeamProblem | None
+    unknowns: NDArray[np.float64]
 
     @property
     def summary(self) -> BeamUniformity:
@@ -110,9 +116,17 @@ def uniform_beam_test(
     )
     degrees_of_freedom = len(constant_rows) - len(PARAMETERS)
     if degrees_of_freedom <= 0:
-        nan_prediction = np.full(measured_constants.size, np.nan)
         return UniformBeamTest(
-            "not tested", math.nan, 0, None, mode_numbers, measured_constants, nan_prediction, std
+            "not tested",
+            math.nan,
+            0,
+            None,
+            mode_numbers,
+            measured_constants,
+            np.full(measured_constants.size, np.nan),
+            std,
+            None,
+            np.full(len(PARAMETERS), np.nan),
         )
     problem = UniformBeamProblem(fit, mode_numbers, nominal, tilt_deg=tilt_deg)
     best_minimum = problem.minima()[0]
@@ -125,6 +139,8 @@ def uniform_beam_test(
         p_value=p_value,
         modes=mode_numbers,
         measured=measured_constants,
-        predicted=problem.constants(best_minimum.x[None])[0],
+        predicted=problem.constants(best_minimum.x),
         std=std,
+        problem=problem,
+        unknowns=best_minimum.x,
     )

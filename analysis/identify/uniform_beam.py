@@ -9,12 +9,14 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
 from analysis.identify._modal_model import MODE_CONSTANT_NAMES
+from analysis.identify._mode_constants import BeamVibration
 from analysis.optimizer import ConstantBounds, NormalEquations, descend
 from rigd.beam import (
     BEAM_PARAMETERS,
@@ -60,14 +62,8 @@ _SHAPE_UPDATES: Final = 4
 """Number of times that the mode shapes of a loaded or tilted beam are recomputed for the fitted
 beam."""
 
-_DIFFERENCE_STEP: Final = 1e-5
-"""Step of the central differences, the same for all unknowns."""
-
-_MAX_NEWTON_ITERATIONS: Final = 6
-"""Largest number of Newton iterations for the poles of a beam."""
-
-_POLE_TOLERANCE: Final = 1e-13
-"""Relative change of the poles at which the Newton iterations end."""
+_DEVIATION_WITHOUT_POLE: Final = 1e6
+"""Whitened deviation of every constant if a mode has no pole."""
 
 _COST_TOLERANCE: Final = 1e-4
 """Relative tolerance of chi-square at which a descent ends."""
@@ -141,7 +137,7 @@ class UniformBeamProblem:
         constants_by_mode = self.measured.reshape(-1, len(MODE_CONSTANT_NAMES))
         self._omega_rad_s = 2 * np.pi * np.exp(constants_by_mode[:, 0])
         self._damping_ratios = np.exp(constants_by_mode[:, 1])
-        self._poles = self._omega_rad_s * (1j - self._damping_ratios)
+        self._measured_poles = (self._omega_rad_s * (1j - self._damping_ratios)).tolist()
         # The search starts at the mean of all modes.
         modal_masses = self.terms.mass + self.terms.lump
         self._ln_density_over_stiffness = float(
@@ -186,6 +182,11 @@ class UniformBeamProblem:
         self._offset = np.zeros(len(PARAMETERS))
         self._offset[2] = 2 * ln_first_omega
 
+    @cached_property
+    def plain_terms(self) -> ModeTerms:
+        """Return the Galerkin coefficients of the uniform beam alone."""
+        return galerkin_mode_terms(Alteration(), self.nominal.beam, self.modes)
+
     def parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert unknowns, shape (..., 7), to the values of `PARAMETERS`.
 
@@ -212,138 +213,74 @@ class UniformBeamProblem:
             delay_s=delay_s,
         )
 
-    def constants(
-        self, x: NDArray[np.float64], mode_terms: ModeTerms | None = None
-    ) -> NDArray[np.float64]:
-        """Predict the modal constants of m uniform beams with n modes each, shape (m, 4 n).
+    def constants(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Predict the modal constants of a uniform beam with n modes, shape (4 n,).
 
         The four constants of a mode are `MODE_CONSTANT_NAMES`. A mode without pole gives NaN.
 
         Parameters
         ----------
-        x : ndarray of float, shape (m, 7)
-            One vector of unknowns for each beam.
-        mode_terms : ModeTerms, optional
-            Modal integrals of another beam than the one the file states.
+        x : ndarray of float, shape (7,)
+            Vector of unknowns.
         """
-        mode_terms = self.terms if mode_terms is None else mode_terms
-        zeta, alpha, gamma, lambda_, density_over_stiffness, ln_stiffness, delay_s = (
-            self.parameters(x).T[..., None]
-        )
-        zeta, gamma = np.exp(zeta), np.exp(gamma)
-        density_ratio = 1.0
-        if mode_terms.density_kg_per_m is not None:
-            density_ratio = mode_terms.density_kg_per_m * np.exp(
-                -density_over_stiffness - ln_stiffness
-            )
-        density_over_stiffness = np.exp(density_over_stiffness)
-        modal_mass, lever_arm = (
-            mode_terms.mass + density_ratio * mode_terms.lump,
-            mode_terms.mass_arm + density_ratio * mode_terms.lump_arm,
-        )
-        static_modal_stiffness = (
-            mode_terms.stiffness + mode_terms.clamp + density_over_stiffness * mode_terms.tension
-        )
-        relaxation_strength, relaxation_time_s = mode_terms.alteration.relaxation
-        s = np.broadcast_to(self._poles, (len(x), self._poles.size))
-        for _ in range(_MAX_NEWTON_ITERATIONS):
-            log_s = np.log(s)
-            internal_damping = zeta * np.exp(alpha * log_s) * mode_terms.stiffness
-            external_damping = gamma * np.exp(lambda_ * log_s)
-            inertia_term = density_over_stiffness * s * s
-            impedance_slope = (
-                alpha * internal_damping + lambda_ * external_damping
-            ) / s + 2 * density_over_stiffness * s * modal_mass
-            modal_impedance = (
-                static_modal_stiffness
-                + internal_damping
-                + inertia_term * modal_mass
-                + external_damping
-            )
-            if relaxation_strength:
-                relaxed_stiffness = (
-                    relaxation_strength
-                    * relaxation_time_s
-                    / (1 + relaxation_time_s * s)
-                    * mode_terms.stiffness
-                )
-                modal_impedance = modal_impedance + relaxed_stiffness * s
-                impedance_slope = impedance_slope + relaxed_stiffness / (1 + relaxation_time_s * s)
-            pole_step = modal_impedance / impedance_slope
-            s = s - pole_step
-            if np.abs(pole_step).max() < _POLE_TOLERANCE * np.abs(s).max():
-                break
-        s = np.where((s.imag > 0) & (s.real < 0), s, complex(np.nan, np.nan))
-        channel_response = replace(self.nominal, delay_s=0.0).channel_response(s) * np.exp(
-            -delay_s * s
-        )
-        channel_response = channel_response * mode_terms.alteration.channel(s)
-        rotation_arm = external_damping * mode_terms.turn_by_medium
-        rotation_arm = (
-            rotation_arm + internal_damping / mode_terms.stiffness * mode_terms.turn_by_internal
-        )
-        modal_force = inertia_term * (lever_arm + rotation_arm)
-        modal_force = (
-            modal_force
-            + external_damping * mode_terms.medium_arm
-            + density_over_stiffness * mode_terms.tension_arm
-        )
-        length_cubed = self.nominal.beam.length_m**3
-        log_residues = (
-            np.log(1j * length_cubed * modal_force**2 / impedance_slope * channel_response)
-            + ln_stiffness
-        )
-        constant_rows = (
-            np.log(s.imag / (2 * np.pi)),
-            np.log(-s.real / np.abs(s)),
-            log_residues.real,
-            log_residues.imag,
-        )
-        return np.stack(constant_rows, axis=-1).reshape(len(x), -1)
+        return self._vibration(x, self.terms).constants()
 
-    def differences(
-        self, x: NDArray[np.float64], mode_terms: ModeTerms | None = None
-    ) -> NDArray[np.float64]:
-        """Return predicted minus measured modal constants, shape (m, 4 n).
+    def _vibration(self, x: NDArray[np.float64], terms: ModeTerms) -> BeamVibration:
+        """Return poles and residues of the beam with the given Galerkin coefficients."""
+        return BeamVibration(
+            self.parameters(x).tolist(),
+            terms,
+            self.nominal.beam.length_m,
+            self.nominal.lags + terms.alteration.lags,
+            self._measured_poles,
+        )
 
-        Differences of phases are between -pi and pi.
+    def deviations(
+        self,
+        x: NDArray[np.float64],
+        whitener: NDArray[np.float64],
+        terms: ModeTerms | None = None,
+    ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
+        """Return predicted minus measured modal constants, whitened, and their derivatives.
+
+        Differences of phases are between -pi and pi. If a mode has no pole, all deviations are
+        large and constant.
 
         Parameters
         ----------
-        x : ndarray of float, shape (m, 7)
-            One vector of unknowns for each beam.
-        mode_terms : ModeTerms, optional
-            Modal integrals of another beam than the one the file states.
+        x : ndarray of float, shape (7,)
+            Vector of unknowns.
+        whitener : ndarray of float, shape (4 n, 4 n)
+            Matrix by which the differences are multiplied.
+        terms : ModeTerms, optional
+            Galerkin coefficients of another beam than the one the file states.
+
+        Returns
+        -------
+        deviations : ndarray of float, shape (4 n,)
+            Whitened differences.
+        slopes : callable
+            Function that computes their derivatives by the unknowns, shape (7, 4 n).
         """
-        with np.errstate(all="ignore"):  # a mode without a pole gives NaN
-            constant_deviations = self.constants(x, mode_terms) - self.measured
-        phase_deviations = constant_deviations[
-            :, MODE_CONSTANT_NAMES.index("residue_phase_rad") :: len(MODE_CONSTANT_NAMES)
+        vibration = self._vibration(x, self.terms if terms is None else terms)
+        differences = vibration.constants() - self.measured
+        if np.isnan(differences).any():
+            return (
+                np.full(self.compared, _DEVIATION_WITHOUT_POLE),
+                lambda: np.zeros((x.size, self.compared)),
+            )
+        phase_differences = differences[
+            MODE_CONSTANT_NAMES.index("residue_phase_rad") :: len(MODE_CONSTANT_NAMES)
         ]
-        phase_deviations -= 2 * np.pi * np.round(phase_deviations / (2 * np.pi))
-        return constant_deviations
-
-    def _deviations(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return predicted minus measured modal constants, shape (m, 4 n).
-
-        They are whitened: without error of the model their covariance is the unit matrix.
-        """
-        return np.nan_to_num(self.differences(x) @ self._whitener.T, nan=1e6)
+        phase_differences -= 2 * np.pi * np.round(phase_differences / (2 * np.pi))
+        return whitener @ differences, lambda: (whitener @ vibration.slopes() @ self.transform).T
 
     def equations(self, x: NDArray[np.float64]) -> NormalEquations:
         """Return chi-square at one vector of unknowns with its gradient and Gauss-Newton matrix."""
-        unknown_steps = _DIFFERENCE_STEP * np.eye(x.size)
-        whitened_deviations = self._deviations(
-            np.concatenate([x[None], x + unknown_steps, x - unknown_steps])
-        )
-        central_deviation = whitened_deviations[0]
-        jacobian = (whitened_deviations[1 : 1 + x.size] - whitened_deviations[1 + x.size :]) / (
-            2 * _DIFFERENCE_STEP
-        )
+        deviations, slopes = self.deviations(x, self._whitener)
+        jacobian = slopes()
         return NormalEquations(
-            float(central_deviation @ central_deviation),
-            jacobian @ central_deviation,
-            jacobian @ jacobian.T,
+            float(deviations @ deviations), jacobian @ deviations, jacobian @ jacobian.T
         )
 
     def starts(self) -> list[NDArray[np.float64]]:

@@ -104,16 +104,17 @@ fast."""
 
 _SERIES_LIMIT = 40.0
 """Magnitude of q below which F is computed from its power series."""
-_NUMERATOR_SERIES = np.array([4.0 * (-4.0) ** k / factorial(4 * k + 3) for k in range(10)])
-"""Power series coefficients of the numerator N(q), lowest power first."""
-_DENOMINATOR_SERIES = (
-    np.array([(-4.0) ** k / factorial(4 * k) for k in range(10)]) + np.eye(1, 10)[0]
+_SERIES = np.array(
+    [
+        [4.0 * (-4.0) ** k / factorial(4 * k + 3) for k in range(10)],
+        [(-4.0) ** k / factorial(4 * k) + (k == 0) for k in range(10)],
+    ]
 )
-"""Power series coefficients of the denominator D(q), lowest power first."""
-_NUMERATOR_SLOPE_SERIES = _NUMERATOR_SERIES[1:] * np.arange(1.0, 10.0)
-"""Power series coefficients of the derivative of N(q)."""
-_DENOMINATOR_SLOPE_SERIES = _DENOMINATOR_SERIES[1:] * np.arange(1.0, 10.0)
-"""Power series coefficients of the derivative of D(q)."""
+"""Power series coefficients of the numerator N(q) and the denominator D(q), lowest power first."""
+_SERIES_WITH_SLOPES = np.concatenate(
+    [_SERIES, np.pad(_SERIES[:, 1:] * np.arange(1.0, 10.0), ((0, 0), (0, 1)))]
+)
+"""The same, followed by those of their derivatives."""
 
 
 class TransferGrid:
@@ -312,13 +313,16 @@ def transfer_and_gradient(
     return TransferGrid(s).evaluate_with_gradient(beam, damping, wrt)
 
 
-def _polynomial(coefficients: Real, x: Complex) -> Complex:
-    """Return the polynomial's value at `x`; `coefficients` start with the lowest power."""
-    polynomial_sum = np.full_like(x, coefficients[-1])
-    for coefficient in coefficients[-2::-1]:
-        polynomial_sum *= x
-        polynomial_sum += coefficient
-    return polynomial_sum
+def _polynomials(coefficients: Real, x: Complex) -> Complex:
+    """Return the values of k polynomials at n points, shape (k, n).
+
+    `coefficients` have the shape (k, degree + 1), the lowest power first.
+    """
+    polynomial_sums = np.zeros((len(coefficients), x.size), dtype=np.complex128)
+    for column in coefficients.T[::-1, :, None]:
+        polynomial_sums *= x
+        polynomial_sums += column
+    return polynomial_sums
 
 
 def _scaled_form(q: Complex) -> tuple[Complex, Complex]:
@@ -370,11 +374,8 @@ def _evaluate_f(q: Complex) -> Complex:
     is_small = np.abs(q) < _SERIES_LIMIT
     if is_small.any():
         small_q = q[is_small]
-        f[is_small] = (
-            small_q
-            * _polynomial(_NUMERATOR_SERIES, small_q)
-            / _polynomial(_DENOMINATOR_SERIES, small_q)
-        )
+        n, d = _polynomials(_SERIES, small_q)
+        f[is_small] = small_q * n / d
     is_large = ~is_small
     f[is_large] = _scaled_form(q[is_large])[0]
     return f
@@ -386,11 +387,8 @@ def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
     is_small = np.abs(q) < _SERIES_LIMIT
     if is_small.any():
         small_q = q[is_small]
-        n, d = _polynomial(_NUMERATOR_SERIES, small_q), _polynomial(_DENOMINATOR_SERIES, small_q)
-        wronskian = (
-            n * _polynomial(_DENOMINATOR_SLOPE_SERIES, small_q)
-            - _polynomial(_NUMERATOR_SLOPE_SERIES, small_q) * d
-        )
+        n, d, n_slope, d_slope = _polynomials(_SERIES_WITH_SLOPES, small_q)
+        wronskian = n * d_slope - n_slope * d
         d_squared = d * d
         f[is_small] = small_q * n / d
         f_slope[is_small] = (n * d - small_q * wronskian) / d_squared

@@ -314,11 +314,16 @@ class Plant:
         """
         s = np.asarray(s, dtype=np.complex128)
         response: Complex = np.exp(-self.delay_s * s)
-        if time_constant_s := self.filter_time_constant_s:
-            response /= 1 + time_constant_s * s
-        if time_constant_s := self.second_order_filter_time_constant_s:
-            response /= 1 + time_constant_s * (_BUTTERWORTH_LOSS * s + time_constant_s * s * s)
+        for first, second in self.lags:
+            response /= 1 + s * (first + s * second)
         return response
+
+    @property
+    def lags(self) -> tuple[tuple[float, float], ...]:
+        """Coefficients of s and s² in the denominators of the torque channel's filters."""
+        first_s, second_s = self.filter_time_constant_s, self.second_order_filter_time_constant_s
+        lags = ((first_s, 0.0), (_BUTTERWORTH_LOSS * second_s, second_s * second_s))
+        return tuple(lag for lag in lags if any(lag))
 
     def pole_gradients(self, poles_rad_s: Complex, wrt: Sequence[str]) -> Complex:
         """Return the derivatives of poles with respect to parameters, shape (n, len(wrt)).

@@ -11,10 +11,12 @@ import pytest
 from cauchy_residues import modal_constants
 
 from analysis.identify import ModalEstimate, ModalModel
+from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
 from analysis.identify._explanations import explanations, finding
 from analysis.identify._step_in_time import StiffnessStep
 from analysis.identify.beam_uniformity import uniform_beam_test
 from analysis.identify.tolerant_estimate import tolerant_estimate
+from analysis.identify.uniform_beam import UniformBeamProblem
 from rigd.beam import Beam, Damping, Plant
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
@@ -207,7 +209,7 @@ TILT = 9.81 * math.sin(math.radians(2))
 def test_cause_is_named_with_its_size(name, beam, size, within):
     fit = fitted(beam.constants())
     assert uniform_beam_test(fit, NOMINAL).status == "refused"
-    found = {each.name: each for each in explanations(fit, NOMINAL)}
+    found = {each.name: each for each in explanations(uniform_beam_test(fit, NOMINAL))}
     assert found[name].size == pytest.approx(size, rel=within)
     assert found[name].p_value > 0.01
     assert_stated(found[name])
@@ -230,14 +232,18 @@ def test_cause_is_named_with_its_size(name, beam, size, within):
 )
 def test_instrument_is_named_with_its_frequency(plain, name, channel, hz):
     fit = fitted(through(plain, channel))
-    found = {each.name: each for each in explanations(fit, NOMINAL)}
+    found = {each.name: each for each in explanations(uniform_beam_test(fit, NOMINAL))}
     assert found[name].size == pytest.approx(hz, rel=0.1)
     assert_stated(found[name])
 
 
 def test_rig_with_the_cause_predicts_the_modes():
     constants = Elements(root_nm_per_rad=50.0).constants()
-    plants = [each.plant for each in explanations(fitted(constants), NOMINAL) if each.plant]
+    plants = [
+        each.plant
+        for each in explanations(uniform_beam_test(fitted(constants), NOMINAL))
+        if each.plant
+    ]
     off = [(modal_constants(plant, MODES) - constants) / STD for plant in plants]
     assert min(np.abs(each).max() for each in off) < 4
 
@@ -261,7 +267,9 @@ def test_tilt_that_is_measured_is_part_of_the_plain_beam():
 def test_tilt_is_found_beside_a_weighed_mass():
     fit = fitted(Elements(gravity_m_s2=TILT, masses=((ELEMENTS, 1e-4),)).constants())
     weighed = replace(NOMINAL, tip_mass_kg=1e-4)
-    (tilt,) = (each for each in explanations(fit, weighed) if each.name == "tilt")
+    (tilt,) = (
+        each for each in explanations(uniform_beam_test(fit, weighed)) if each.name == "tilt"
+    )
     assert tilt.size == pytest.approx(2.0, rel=0.1)
 
 
@@ -269,7 +277,7 @@ def test_no_simple_cause_is_named_for_modes_of_nothing_on_the_list(plain):
     moved = plain.copy()
     moved[4] += 0.1  # mode 2 alone, by a tenth
     fit = fitted(moved)
-    assert explanations(fit, NOMINAL) == ()
+    assert explanations(uniform_beam_test(fit, NOMINAL)) == ()
     said = finding(uniform_beam_test(fit, NOMINAL), ())
     assert "None of the simple causes" in said.sentence
     assert (said.kind, said.value, said.interval) == ("rival explanations", None, None)
@@ -277,7 +285,8 @@ def test_no_simple_cause_is_named_for_modes_of_nothing_on_the_list(plain):
 
 def test_causes_are_named_and_never_facts():
     fit = fitted(Elements(gravity_m_s2=TILT).constants())
-    test, found = uniform_beam_test(fit, NOMINAL), explanations(fit, NOMINAL)
+    test = uniform_beam_test(fit, NOMINAL)
+    found = explanations(test)
     assert 2 <= len(found) <= 5
     assert {each.name: each.size for each in found}["tilt"] == pytest.approx(2.0, rel=0.1)
     assert [each.p_value for each in found] == sorted((e.p_value for e in found), reverse=True)
@@ -294,7 +303,7 @@ def test_causes_are_named_and_never_facts():
 def test_two_modes_leave_nothing_to_compare_causes_by():
     fit = fitted(Elements(gravity_m_s2=TILT).constants())
     two = replace(fit, numbers=(1, 2, 0))  # the third is of something else
-    assert explanations(two, NOMINAL) == ()
+    assert explanations(uniform_beam_test(two, NOMINAL)) == ()
 
 
 def test_losses_of_a_beam_that_is_not_uniform_have_a_tolerance():
@@ -313,3 +322,26 @@ def test_losses_of_a_beam_that_is_not_uniform_have_a_tolerance():
     assert loss == pytest.approx(true, rel=3 * std)
     # Three thousandths of each damping ratio, besides 1.5 thousandths of noise.
     assert std > 1.05 * loss_and_std(is_uniform=True)[1]
+
+
+@pytest.mark.parametrize(
+    "altered",
+    [
+        {},
+        {"lumps": ((1.0, 2e-4),), "gravity_m_s2": 0.3},
+        {"clamp_compliance": 0.01, "clamp_loss": 0.1, "lag_s": 1e-4},
+        {"relaxation": (0.02, 0.01), "sensor": (3e-4, 0.5)},
+    ],
+)
+def test_derivatives_of_modal_constants_are_those_of_differences(plain, altered):
+    fit, rig = fitted(plain), replace(NOMINAL, filter_time_constant_s=2e-4, delay_s=1e-3)
+    problem = UniformBeamProblem(fit, fit.visible, rig)
+    terms = galerkin_mode_terms(Alteration(**altered), rig.beam, problem.modes)
+    x, unit, step = problem.starts()[0], np.eye(problem.compared), 1e-5
+    slopes = problem.deviations(x, unit, terms)[1]()
+    differences = [
+        problem.deviations(x + change, unit, terms)[0]
+        - problem.deviations(x - change, unit, terms)[0]
+        for change in step * np.eye(x.size)
+    ]
+    np.testing.assert_allclose(slopes, np.array(differences) / (2 * step), rtol=1e-5, atol=1e-8)
