@@ -623,10 +623,10 @@ def _orthonormalise(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     gram, row_lengths = _scaled_gram(rows, regularization=1e-13)
     triangular_factor = np.linalg.cholesky(gram)
+    # A product takes a third of the time of a solution for many columns.
+    orthonormalising_matrix = np.linalg.inv(triangular_factor) / row_lengths
     for columns in _column_blocks(rows.shape[1]):
-        rows[:, columns] = np.linalg.solve(
-            triangular_factor, rows[:, columns] / row_lengths[:, None]
-        )
+        rows[:, columns] = orthonormalising_matrix @ rows[:, columns]
     restoring_matrix: NDArray[np.float64] = triangular_factor * row_lengths[:, None]
     return restoring_matrix
 
@@ -737,12 +737,10 @@ class _ModalProblem:
     ) -> NDArray[np.float64]:
         """Return the whitened torque spectra of transfer functions from the angle, (n, 2 K)."""
         comparison = self._comparison
-        # One row after another: the transforms take many times the memory of their spectra.
         predicted_spectra = np.empty((len(responses), 2 * self._weight.size))
-        for predicted_spectrum, response in zip(predicted_spectra, responses, strict=True):
-            predicted_spectrum[:] = self._whiten(
-                comparison.spectrum(comparison.prediction.in_time(response))
-            )
+        for rows in comparison.prediction.row_blocks(len(responses)):
+            torque_nm = comparison.prediction.in_time(np.asarray(responses[rows]))
+            predicted_spectra[rows] = self._whiten(comparison.spectrum(torque_nm))
         return predicted_spectra
 
     def _poles(self, x: NDArray[np.float64]) -> list[Pole]:
@@ -900,17 +898,15 @@ class _ModalProblem:
             del decay_gradient
         for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
             q, inverse_denominator, numerators = self._numerators(log_omega, eta)
-            derivative_rows: list[NDArray[np.complex128]] = []
-            # Derivatives by ln omega and eta of either numerator over the denominator
-            for numerator_power, row in zip((2, 3), numerators, strict=True):
-                derivative_rows.append(
-                    row * ((eta * q + 2 * q * q) * inverse_denominator - numerator_power)
-                )
-                derivative_rows.append(-row * q * inverse_denominator)
-            derivatives = self._predicted_spectra(derivative_rows)
             a, b = linear_parameters[2 * k : 2 * k + 2]
-            jacobian[2 * k] += a * derivatives[0] + b * derivatives[2]
-            jacobian[2 * k + 1] += a * derivatives[1] + b * derivatives[3]
+            response = a * numerators[0] + b * numerators[1]
+            denominator_by_ln_omega = (eta * q + 2 * q * q) * inverse_denominator
+            jacobian[2 * k : 2 * k + 2] += self._predicted_spectra(
+                [
+                    response * (denominator_by_ln_omega - 2) - b * numerators[1],
+                    -response * q * inverse_denominator,
+                ]
+            )
 
     def model(self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64]) -> ModalModel:
         """Return the modal model with given frequencies, damping and linear parameters."""

@@ -127,19 +127,18 @@ class Objective:
         comparison, unknowns = self.comparison, self.unknowns
         gradient_names = unknowns.gradient_names
         plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
-        # One row after another: time series and their transforms take much memory.
-        predicted_rows = comparison.prediction.torque_rows(plant, gradient_names)
-        predicted_nm = next(predicted_rows)
+        spectra = np.empty((1 + len(gradient_names), comparison.frequency_hz.size), np.complex128)
+        for rows, torque_nm in comparison.prediction.torque_blocks(plant, gradient_names):
+            if rows.start == 0:
+                torque_nm[0] -= comparison.torque_nm[comparison.retained]
+            spectra[rows] = comparison.spectrum(torque_nm)
+        residual, derivatives = spectra[0], spectra[1:]
         poles = tuple(
             Pole(
                 plant_pole.mode, plant_pole.at_rad_s, plant_pole.derivative @ parameters_by_unknowns
             )
             for plant_pole in comparison.poles(plant, gradient_names)
         )
-        residual = comparison.spectrum(predicted_nm - comparison.torque_nm[comparison.retained])
-        derivatives = np.empty((len(gradient_names), residual.size), dtype=np.complex128)
-        for derivative_spectrum, derivative_nm in zip(derivatives, predicted_rows, strict=True):
-            derivative_spectrum[:] = comparison.spectrum(derivative_nm)
         jacobian = (parameters_by_unknowns.T @ _as_real_rows(derivatives)).view(np.complex128)
         if comparison.drag is not None:
             drag_change, drag_derivatives = comparison.drag.change_to(
@@ -174,23 +173,22 @@ class Objective:
             Weight of `NoiseSpectrum`; with 1 nothing is whitened.
         """
         residual, jacobian = linearisation.residual * weight, linearisation.jacobian * weight
-        unit_columns = _as_real_rows(self.unknown_torques(linearisation) * weight)
-        column_lengths = np.sqrt(np.einsum("ij,ij->i", unit_columns, unit_columns))
+        columns = _as_real_rows(self.unknown_torques(linearisation) * weight)
+        column_gram = columns @ columns.T
+        column_lengths = np.sqrt(np.diag(column_gram))
         column_lengths[column_lengths == 0] = 1.0  # the spectrum of a decay that ends at once
-        unit_columns /= column_lengths[:, None]
-        column_gram = unit_columns @ unit_columns.T
-        inverse_gram = np.linalg.inv(column_gram + 1e-12 * np.eye(column_lengths.size))
-        amplitudes = -inverse_gram @ (unit_columns @ _as_real_rows(residual))
-        jacobian += weight * self.comparison.decay_gradient(
-            linearisation.poles, amplitudes / column_lengths
-        )
+        length_products = np.outer(column_lengths, column_lengths)
+        regularised_gram = column_gram / length_products + 1e-12 * np.eye(column_lengths.size)
+        inverse_gram = np.linalg.inv(regularised_gram) / length_products
+        amplitudes = -inverse_gram @ (columns @ _as_real_rows(residual))
+        jacobian += weight * self.comparison.decay_gradient(linearisation.poles, amplitudes)
         real_jacobian = _as_real_rows(jacobian)
-        real_jacobian -= ((real_jacobian @ unit_columns.T) @ inverse_gram) @ unit_columns
+        real_jacobian -= ((real_jacobian @ columns.T) @ inverse_gram) @ columns
         return ProjectedResidual(
-            residual=residual + (amplitudes @ unit_columns).view(np.complex128),
+            residual=residual + (amplitudes @ columns).view(np.complex128),
             jacobian=jacobian,
-            amplitudes=amplitudes / column_lengths,
-            amplitude_gram=column_gram * np.outer(column_lengths, column_lengths),
+            amplitudes=amplitudes,
+            amplitude_gram=column_gram,
         )
 
     def normal_equations(
