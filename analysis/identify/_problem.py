@@ -132,7 +132,8 @@ class Objective:
             if rows.start == 0:
                 torque_nm[0] -= comparison.torque_nm[comparison.retained]
             spectra[rows] = comparison.spectrum(torque_nm)
-        residual, derivatives = spectra[0], spectra[1:]
+        # A copy, so that the derivatives are not stored with the residual.
+        residual, derivatives = spectra[0].copy(), spectra[1:]
         poles = tuple(
             Pole(
                 plant_pole.mode, plant_pole.at_rad_s, plant_pole.derivative @ parameters_by_unknowns
