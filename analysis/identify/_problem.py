@@ -174,22 +174,23 @@ class Objective:
             Weight of `NoiseSpectrum`; with 1 nothing is whitened.
         """
         residual, jacobian = linearisation.residual * weight, linearisation.jacobian * weight
-        columns = _as_real_rows(self.unknown_torques(linearisation) * weight)
-        column_gram = columns @ columns.T
-        column_lengths = np.sqrt(np.diag(column_gram))
+        unit_columns = _as_real_rows(self.unknown_torques(linearisation) * weight)
+        column_lengths = np.sqrt(np.einsum("ij,ij->i", unit_columns, unit_columns))
         column_lengths[column_lengths == 0] = 1.0  # the spectrum of a decay that ends at once
-        length_products = np.outer(column_lengths, column_lengths)
-        regularised_gram = column_gram / length_products + 1e-12 * np.eye(column_lengths.size)
-        inverse_gram = np.linalg.inv(regularised_gram) / length_products
-        amplitudes = -inverse_gram @ (columns @ _as_real_rows(residual))
-        jacobian += weight * self.comparison.decay_gradient(linearisation.poles, amplitudes)
+        unit_columns /= column_lengths[:, None]
+        column_gram = unit_columns @ unit_columns.T
+        inverse_gram = np.linalg.inv(column_gram + 1e-12 * np.eye(column_lengths.size))
+        amplitudes = -inverse_gram @ (unit_columns @ _as_real_rows(residual))
+        jacobian += weight * self.comparison.decay_gradient(
+            linearisation.poles, amplitudes / column_lengths
+        )
         real_jacobian = _as_real_rows(jacobian)
-        real_jacobian -= ((real_jacobian @ columns.T) @ inverse_gram) @ columns
+        real_jacobian -= ((real_jacobian @ unit_columns.T) @ inverse_gram) @ unit_columns
         return ProjectedResidual(
-            residual=residual + (amplitudes @ columns).view(np.complex128),
+            residual=residual + (amplitudes @ unit_columns).view(np.complex128),
             jacobian=jacobian,
-            amplitudes=amplitudes,
-            amplitude_gram=column_gram,
+            amplitudes=amplitudes / column_lengths,
+            amplitude_gram=column_gram * np.outer(column_lengths, column_lengths),
         )
 
     def normal_equations(
