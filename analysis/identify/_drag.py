@@ -141,19 +141,22 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
     )
     if first_start is None:
         return candidate_set
-    drag_fit = _converged_drag_fit(
+    rough_fit = _converged_drag_fit(
         candidate_set, first_start, STRUCTURES[_FIRST_STRUCTURE], tolerance=_ROUGH_COST_TOLERANCE
     )
-    if drag_fit is None:
+    if rough_fit is None:
         return candidate_set
     # The freest structure starts from this fit: its fit without drag may be far off.
-    start_comparison, next_start = drag_fit.objective.comparison, _DragFitStart.of(drag_fit)
+    start_comparison, next_start = rough_fit.objective.comparison, _DragFitStart.of(rough_fit)
     for structure_name in (_FREEST_STRUCTURE, _FIRST_STRUCTURE):
         drag_fit = _converged_drag_fit(
             candidate_set, next_start, STRUCTURES[structure_name], start_comparison=start_comparison
         )
         if drag_fit is not None:
             break
+        # A converged fit of the same structure is better than the rough one by far less than this.
+        if _bic_under_own_noise(rough_fit) > candidate_set.bic + 2 * _ROUGH_COST_TOLERANCE:
+            return candidate_set
     else:
         return candidate_set
     set_with_drag = _fit_all_structures(candidate_set, drag_fit)
@@ -163,6 +166,13 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
         if set_with_drag.drag.value_m > 0 and set_with_drag.bic < candidate_set.bic
         else candidate_set
     )
+
+
+def _bic_under_own_noise(refit: Refit) -> float:
+    """Return the BIC of a refit under the noise of its residual, comparable to that of a set."""
+    noise_power = refit.residual_noise().power[refit.noise.counts]
+    parameter_count = refit.x.size + len(refit.columns)
+    return float(parameter_count * math.log(2 * noise_power.size) + 2 * np.sum(np.log(noise_power)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,6 +53,9 @@ FORCE_KINDS: Final[tuple[ForceKind, ...]] = (
 )
 """All kinds of nonlinear restoring forces that are tested."""
 
+_DEFLECTION_EXPONENTS: Final = {"cubic stiffness": 3, "quadratic stiffness": 2}
+"""Exponent of the deflection in each force that depends on it."""
+
 _OVERSAMPLING: Final = 3
 """Factor by which the sampling rate is raised to compute a nonlinear force. The band ends at 0.4 of
 the rate, so harmonics up to three times its end do not alias into the band."""
@@ -131,13 +134,14 @@ class NonlinearForceSpectra:
             / dynamic_stiffness
             * self._transform.forward(self._comparison.angle_rad)
         )
-        force_transform = self._force_transform(term.kind, linear_motion, linear_motion)
+        force_scale = self._force_scale(term.kind, linear_motion)
+        force_transform = self._force_transform(term.kind, linear_motion, force_scale)
         if force_size:
             motion_per_force = -force_size * k / dynamic_stiffness
             with np.errstate(over="ignore", invalid="ignore"):
                 for _ in range(_MAX_SUBSTITUTIONS):
                     new_force_transform = self._force_transform(
-                        term.kind, linear_motion + motion_per_force * force_transform, linear_motion
+                        term.kind, linear_motion + motion_per_force * force_transform, force_scale
                     )
                     force_change, force_norm = (
                         np.linalg.norm(new_force_transform - force_transform),
@@ -176,32 +180,36 @@ class NonlinearForceSpectra:
         )
         return wavenumber_fourth_power, damped_stiffness.astype(np.complex128)
 
+    def _force_scale(
+        self, force_kind: ForceKind, linear_motion_transform: NDArray[np.complex128]
+    ) -> float:
+        """Return the factor of a power of deflection or speed in a nonlinear force of unit size.
+
+        The linear motion determines the largest deflection R and the largest speed V of the mode.
+        """
+        largest_deflection = np.abs(self._oversampled_values(linear_motion_transform)).max()
+        if force_kind == "quadratic drag":
+            speed = self._oversampled_values(linear_motion_transform * self._s)
+            return float(2 * largest_deflection / np.abs(speed).max() ** 2)
+        return float(1 / largest_deflection ** (_DEFLECTION_EXPONENTS[force_kind] - 1))
+
     def _force_transform(
         self,
         force_kind: ForceKind,
         motion_transform: NDArray[np.complex128],
-        linear_motion_transform: NDArray[np.complex128],
+        force_scale: float,
     ) -> NDArray[np.complex128]:
         """Return the transform of the nonlinear force of a mode's motion, shape (length // 2 + 1,).
 
-        The force is relative to its size. The linear motion determines the largest deflection R and
-        the largest speed V of the mode.
+        The force is relative to its size.
         """
         if force_kind == "quadratic drag":
             speed = self._oversampled_values(motion_transform * self._s)
-            largest_speed = np.abs(
-                self._oversampled_values(linear_motion_transform * self._s)
-            ).max()
-            frequency_rad_s = (
-                largest_speed / np.abs(self._oversampled_values(linear_motion_transform)).max()
-            )
-            n = 2 * speed * np.abs(speed) / (largest_speed * frequency_rad_s)
+            n = speed * np.abs(speed)
         else:
             deflection = self._oversampled_values(motion_transform)
-            largest_deflection = np.abs(self._oversampled_values(linear_motion_transform)).max()
-            deflection_exponent = 3 if force_kind == "cubic stiffness" else 2
-            n = deflection**deflection_exponent / largest_deflection ** (deflection_exponent - 1)
-        return self._transform.forward(n, oversampling=_OVERSAMPLING)
+            n = deflection ** _DEFLECTION_EXPONENTS[force_kind]
+        return force_scale * self._transform.forward(n, oversampling=_OVERSAMPLING)
 
     def _oversampled_values(self, motion_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Return the oversampled time series, over the record, of a mode's Laplace transform."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from copy import copy
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -40,6 +40,11 @@ def eigenvalues(count: int) -> NDArray[np.float64]:
 
 
 # Prediction
+
+_VALUES_AT_ONCE: Final = 1 << 17
+"""Number of values of time series that are transformed at once. A transform of two rows takes
+little longer than that of one, and what exceeds the processor's cache takes longer again. The rows
+of long records are transformed one by one, since their transforms take much memory."""
 
 
 class TorquePredictor:
@@ -106,18 +111,33 @@ class TorquePredictor:
         torque_and_derivatives = self._transform.inverse(torque_spectra, self._retained)
         return torque_and_derivatives[0], torque_and_derivatives[1:]
 
-    def torque_rows(
+    def torque_blocks(
         self, plant: Plant | ModalModel, wrt: Sequence[str]
-    ) -> Iterator[NDArray[np.float64]]:
-        """Yield the predicted torque in N·m at the retained samples, then its derivatives, (m,).
+    ) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+        """Yield the predicted torque in N·m at the retained samples and its derivatives, in blocks.
+
+        Each block, shape (b, m), comes with its rows among the torque and its k derivatives.
 
         Parameters
         ----------
         plant, wrt
             As for `torque`.
         """
-        for torque_spectrum in self._torque_spectra(plant, wrt):
-            yield self._transform.inverse(torque_spectrum, self._retained)
+        torque_spectra = self._torque_spectra(plant, wrt)
+        for rows in self.row_blocks(len(torque_spectra)):
+            yield rows, self._transform.inverse(torque_spectra[rows], self._retained)
+
+    def row_blocks(self, row_count: int) -> Iterator[slice]:
+        """Yield the ranges of rows that are transformed at once.
+
+        Parameters
+        ----------
+        row_count : int
+            Number of time series.
+        """
+        block_rows = max(_VALUES_AT_ONCE // self._transform.length, 1)
+        for first_row in range(0, row_count, block_rows):
+            yield slice(first_row, min(first_row + block_rows, row_count))
 
     def _torque_spectra(
         self, plant: Plant | ModalModel, wrt: Sequence[str]

@@ -127,19 +127,19 @@ class Objective:
         comparison, unknowns = self.comparison, self.unknowns
         gradient_names = unknowns.gradient_names
         plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
-        # One row after another: time series and their transforms take much memory.
-        predicted_rows = comparison.prediction.torque_rows(plant, gradient_names)
-        predicted_nm = next(predicted_rows)
+        spectra = np.empty((1 + len(gradient_names), comparison.frequency_hz.size), np.complex128)
+        for rows, torque_nm in comparison.prediction.torque_blocks(plant, gradient_names):
+            if rows.start == 0:
+                torque_nm[0] -= comparison.torque_nm[comparison.retained]
+            spectra[rows] = comparison.spectrum(torque_nm)
+        # A copy, so that the derivatives are not stored with the residual.
+        residual, derivatives = spectra[0].copy(), spectra[1:]
         poles = tuple(
             Pole(
                 plant_pole.mode, plant_pole.at_rad_s, plant_pole.derivative @ parameters_by_unknowns
             )
             for plant_pole in comparison.poles(plant, gradient_names)
         )
-        residual = comparison.spectrum(predicted_nm - comparison.torque_nm[comparison.retained])
-        derivatives = np.empty((len(gradient_names), residual.size), dtype=np.complex128)
-        for derivative_spectrum, derivative_nm in zip(derivatives, predicted_rows, strict=True):
-            derivative_spectrum[:] = comparison.spectrum(derivative_nm)
         jacobian = (parameters_by_unknowns.T @ _as_real_rows(derivatives)).view(np.complex128)
         if comparison.drag is not None:
             drag_change, drag_derivatives = comparison.drag.change_to(

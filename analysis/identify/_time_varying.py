@@ -67,6 +67,10 @@ _RIVAL_BIC_FRACTION: Final = 0.75
 """Fraction of the BIC advantage of another explanation that an effect must be predicted to reach.
 The first order predicts this advantage to a tenth."""
 
+_PREDICTED_BIC_FRACTION: Final = 0.5
+"""Fraction of the BIC advantage with which an effect would rival the best fitted one that it must
+be predicted to reach. The first order predicts at least this fraction of the advantage of a fit."""
+
 UNIT_BACKLASH_RAD: Final = 1e-4
 """Backlash that corresponds to 1 of the fitted size, in rad."""
 
@@ -137,7 +141,10 @@ def find_temporal_changes(
         for changing_property, predicted_bic in _promising_changes(
             candidate_set, candidate, backlash_angle, highest_bic
         ):
-            if predicted_bic < fitted_changes.get(changing_property, (math.inf,))[0]:
+            if predicted_bic < min(
+                fitted_changes.get(changing_property, (math.inf,))[0],
+                _highest_predicted_bic(candidate_set, fitted_changes),
+            ):
                 best_refit, bic = _fit_with_change(
                     candidate_set, candidate, changing_property, backlash_angle
                 )
@@ -171,6 +178,17 @@ def find_temporal_changes(
     ), equivalent_changes
 
 
+def _highest_predicted_bic(
+    candidate_set: CandidateSet, fitted_changes: Mapping[Effect, tuple[float, Refit]]
+) -> float:
+    """Return the predicted BIC above which no change would rival the best of the fitted ones."""
+    lowest_bic = min((bic for bic, _ in fitted_changes.values()), default=math.inf)
+    needed_advantage = candidate_set.best.bic - lowest_bic - BIC_DECISIVE
+    if needed_advantage <= 0:
+        return math.inf
+    return candidate_set.best.bic - _PREDICTED_BIC_FRACTION * needed_advantage
+
+
 def _has_possible_size(temporal_change: TemporalChange) -> bool:
     """Return whether the size of a change is possible.
 
@@ -200,17 +218,18 @@ def _promising_changes(
     backlash_angle: NDArray[np.float64],
     highest_bic: float,
 ) -> Iterator[tuple[Effect, float]]:
-    """Yield the changes that would make a candidate the best one, with their predicted BIC.
+    """Yield the changes that would make a candidate the best one, by rising predicted BIC.
 
-    A change must reduce the deviance significantly, and its BIC must be below `highest_bic`.
+    The BIC comes with each. A change must reduce the deviance significantly, and its BIC must be
+    below `highest_bic`.
     """
     candidate_refit = candidate_set.refit(candidate, 1)
     effect_spectra = _torque_spectra(candidate_set.comparison, candidate.fit.plant, backlash_angle)
     cost_reductions = candidate_refit.cost_reduction_by_spectrum(
         np.array(list(effect_spectra.values()))
     )
-    for changing_property, cost_reduction in zip(
-        effect_spectra, cost_reductions.tolist(), strict=True
+    for changing_property, cost_reduction in sorted(
+        zip(effect_spectra, cost_reductions.tolist(), strict=True), key=lambda pair: -pair[1]
     ):
         remaining_cost = max(candidate_refit.cost - cost_reduction, 1e-3 * candidate_refit.cost)
         deviance_reduction = candidate.values * math.log(candidate_refit.cost / remaining_cost)
@@ -338,19 +357,35 @@ def backlash_spectrum(comparison: Comparison, plant: Plant) -> NDArray[np.comple
 def _backlash_angle(comparison: Comparison) -> NDArray[np.float64]:
     """Return the hub angle minus the shaft angle under backlash, in rad, at the decimated rate."""
     highest_hz = float(comparison.frequency_hz[-1])
-    half_play_rad, hub_angle_rad, hub_angles_rad = UNIT_BACKLASH_RAD / 2, 0.0, []
     shaft_angle_rad = comparison.measurement.angle_from_rest(highest_hz)
-    for sample_angle_rad in shaft_angle_rad.tolist():
-        # A comparison each: min and max take three times as long, at every tick of the record.
-        if hub_angle_rad < sample_angle_rad - half_play_rad:
-            hub_angle_rad = sample_angle_rad - half_play_rad
-        elif hub_angle_rad > sample_angle_rad + half_play_rad:
-            hub_angle_rad = sample_angle_rad + half_play_rad
-        hub_angles_rad.append(hub_angle_rad)
-    lag_rad: NDArray[np.float64] = comparison.decimation.apply(
-        np.array(hub_angles_rad) - shaft_angle_rad
-    )
+    hub_angle_rad = _hub_angle(shaft_angle_rad, UNIT_BACKLASH_RAD / 2)
+    lag_rad: NDArray[np.float64] = comparison.decimation.apply(hub_angle_rad - shaft_angle_rad)
     return lag_rad
+
+
+def _hub_angle(
+    shaft_angle_rad: NDArray[np.float64], half_backlash_rad: float
+) -> NDArray[np.float64]:
+    """Return the angle of a hub that starts at 0 and follows a shaft with backlash, shape (n,).
+
+    At each sample the shaft limits the last angle of the hub to a range about its own. The limits
+    of successive samples are combined until a single angle remains.
+    """
+    lowest_rad, highest_rad = (
+        shaft_angle_rad - half_backlash_rad,
+        shaft_angle_rad + half_backlash_rad,
+    )
+    lowest_rad[0] = highest_rad[0] = np.clip(0.0, lowest_rad[0], highest_rad[0])
+    combined_samples = 1
+    while (undecided := np.flatnonzero(lowest_rad < highest_rad)).size:
+        limits = lowest_rad[undecided], highest_rad[undecided]
+        before = undecided - combined_samples
+        lowest_rad[undecided], highest_rad[undecided] = (
+            np.clip(lowest_rad[before], *limits),
+            np.clip(highest_rad[before], *limits),
+        )
+        combined_samples *= 2
+    return lowest_rad
 
 
 # Effect of past values of damping and stiffness

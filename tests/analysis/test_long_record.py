@@ -141,8 +141,8 @@ def test_a_fit_in_blocks_of_bins_finds_the_same(monkeypatch, write_session, tmp_
     whole = fit_freest_alone(measurement, BAND_HZ)[0]
     for module, name, most in (
         ("_comparison", "MAX_BINS_OF_STORED_RESULTS", 300),
-        ("_modal_fit", "MAX_BINS_OF_STORED_RESULTS", 300),
-        ("_modal_fit", "_COLUMNS_AT_ONCE", 500),
+        ("_modal_problem", "MAX_BINS_OF_STORED_RESULTS", 300),
+        ("_modal_problem", "_COLUMNS_AT_ONCE", 500),
     ):
         monkeypatch.setattr(f"analysis.identify.{module}.{name}", most)
     in_blocks = fit_freest_alone(measurement, BAND_HZ)[0]

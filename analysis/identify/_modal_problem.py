@@ -1,0 +1,483 @@
+"""Least-squares problem of the modal model: frequencies and damping of modes, all else eliminated.
+
+At each point the linear parameters (residues, background and disturbances) have their best values,
+and the spectra that they multiply are projected out. The fitted form and its reasons are those of
+`analysis.identify._modal_fit`. The rows of a long record are processed in blocks of columns.
+"""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._comparison import MAX_BINS_OF_STORED_RESULTS
+from analysis.identify._estimates import Ringing
+from analysis.identify._modal_model import BACKGROUND_COEFFICIENTS, ModalModel
+from analysis.optimizer import NormalEquations, RecentValues
+from rigd.beam import Pole
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._comparison import Comparison
+
+_COLUMNS_AT_ONCE: Final = 1 << 14
+"""Number of columns of the rows of a long record that are processed at once."""
+
+
+def column_blocks(column_count: int) -> Iterator[slice]:
+    """Yield the ranges of columns that are processed at once: all, unless the record is long."""
+    is_long = column_count > 2 * MAX_BINS_OF_STORED_RESULTS
+    block_columns = _COLUMNS_AT_ONCE if is_long else max(column_count, 1)
+    for first_column in range(0, column_count, block_columns):
+        yield slice(first_column, min(first_column + block_columns, column_count))
+
+
+def _scaled_gram(
+    *matrices: NDArray[np.float64], regularization: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the Gram matrix of all rows of matrices, scaled to length 1, and their lengths.
+
+    `regularization` is added to the diagonal of the Gram matrix.
+    """
+    row_count = sum(len(matrix) for matrix in matrices)
+    row_squares, gram = np.zeros(row_count), np.zeros((row_count, row_count))
+    blocks = list(column_blocks(matrices[0].shape[1]))
+    for columns in blocks:
+        row_squares += np.concatenate(
+            [np.einsum("ij,ij->i", matrix[:, columns], matrix[:, columns]) for matrix in matrices]
+        )
+    row_lengths = np.sqrt(row_squares)
+    row_lengths[row_lengths == 0] = 1.0  # the spectrum of a decay that ends at once
+    for columns in blocks:
+        unit_rows = np.concatenate([matrix[:, columns] for matrix in matrices])
+        unit_rows /= row_lengths[:, None]
+        gram += unit_rows @ unit_rows.T
+    gram[np.diag_indices_from(gram)] += regularization
+    return gram, row_lengths
+
+
+def _orthonormalise(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Replace rows by orthonormal rows with the same span.
+
+    Return the matrix whose product with them restores the given rows.
+    """
+    gram, row_lengths = _scaled_gram(rows, regularization=1e-13)
+    triangular_factor = np.linalg.cholesky(gram)
+    # A product takes a third of the time of a solution for many columns.
+    orthonormalising_matrix = np.linalg.inv(triangular_factor) / row_lengths
+    for columns in column_blocks(rows.shape[1]):
+        rows[:, columns] = orthonormalising_matrix @ rows[:, columns]
+    restoring_matrix: NDArray[np.float64] = triangular_factor * row_lengths[:, None]
+    return restoring_matrix
+
+
+def _remove_span(rows: NDArray[np.float64], span: NDArray[np.float64]) -> None:
+    """Subtract from rows, in place, their part in the span of orthonormal rows."""
+    coefficients = rows @ span.T
+    for columns in column_blocks(rows.shape[1]):
+        rows[:, columns] -= coefficients @ span[:, columns]
+
+
+@dataclass(frozen=True, slots=True)
+class _LinearSolution:
+    """Best linear parameters of the modal model for one set of frequencies and damping.
+
+    `jacobian` are the derivatives of the whitened `residual` outside the span of the spectra that
+    the linear parameters multiply. Real and imaginary parts are interleaved, so that rows have 2 K
+    values.
+    """
+
+    residual: NDArray[np.float64]
+    linear_parameters: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Uncertainty:
+    """Uncertainty of the modal model at a minimum.
+
+    `covariance` is the joint one of frequencies, damping and linear parameters, `span` are
+    orthonormal rows that span all derivatives of the residual, and `ln_damping_by_torque`, shape
+    (n, 2 K), is the derivative of the logarithm of each eta by the whitened torque.
+    """
+
+    covariance: NDArray[np.float64]
+    span: NDArray[np.float64]
+    ln_damping_by_torque: NDArray[np.float64]
+
+
+def _ln_damping_by_torque(
+    jacobian: NDArray[np.float64], x: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the derivative of each ln(eta) at a minimum `x` by the whitened torque, (n, 2 K)."""
+    gram, row_lengths = _scaled_gram(jacobian, regularization=1e-14)
+    derivatives = np.empty((x.size // 2, jacobian.shape[1]))
+    for columns in column_blocks(jacobian.shape[1]):
+        # The residual is predicted minus measured: the torque enters it with the opposite sign.
+        unit_rows = jacobian[:, columns] / row_lengths[:, None]
+        x_by_torque = np.linalg.solve(gram, unit_rows) / row_lengths[:, None]
+        derivatives[:, columns] = x_by_torque[1::2] / x[1::2, None]
+    return derivatives
+
+
+def _relative_pole(eta: float) -> complex:
+    """Return the pole of a mode over its undamped frequency in rad/s, for the loss factor eta.
+
+    It is the root of ``1 + eta q + q²`` with positive imaginary part.
+    """
+    return complex(-eta / 2, math.sqrt(1 - eta * eta / 4))
+
+
+def _relative_pole_derivative(eta: float) -> complex:
+    """Return the derivative of `_relative_pole` with respect to the loss factor eta."""
+    return complex(-0.5, -eta / (4 * math.sqrt(1 - eta * eta / 4)))
+
+
+class ModalProblem:
+    """Least-squares problem of the modal model: its unknowns are mode frequencies and damping."""
+
+    def __init__(
+        self,
+        comparison: Comparison,
+        weight: NDArray[np.float64],
+        effect_spectra: NDArray[np.complex128],
+        numbers: tuple[int, ...],
+    ) -> None:
+        self._recent: RecentValues[_LinearSolution] = (
+            comparison.shared_values if comparison.is_long else RecentValues()
+        )
+        self._numbers = numbers
+        self._comparison = comparison
+        self._weight = weight
+        self._effect_spectra = effect_spectra
+        self._s = comparison.prediction.s
+        self.scale_rad_s = 2 * math.pi * float(comparison.frequency_hz[-1])
+        self._measured_torque = self._whiten(
+            comparison.spectrum(comparison.torque_nm[comparison.retained])
+        )
+        background_responses = np.array(
+            [(self._s / self.scale_rad_s) ** n for n in range(BACKGROUND_COEFFICIENTS)]
+        )
+        self._background = self._predicted_spectra(background_responses)
+
+    def for_modes(self, numbers: tuple[int, ...]) -> ModalProblem:
+        """Return the problem of other modes of the same record."""
+        problem = copy(self)
+        problem._numbers = numbers
+        if not self._comparison.is_long:
+            problem._recent = RecentValues()
+        return problem
+
+    def _whiten(self, spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
+        return np.ascontiguousarray(spectra * self._weight).view(np.float64)
+
+    def _predicted_spectra(
+        self, responses: Sequence[NDArray[np.complex128]] | NDArray[np.complex128]
+    ) -> NDArray[np.float64]:
+        """Return the whitened torque spectra of transfer functions from the angle, (n, 2 K)."""
+        comparison = self._comparison
+        predicted_spectra = np.empty((len(responses), 2 * self._weight.size))
+        for rows in comparison.prediction.row_blocks(len(responses)):
+            torque_nm = comparison.prediction.in_time(np.asarray(responses[rows]))
+            predicted_spectra[rows] = self._whiten(comparison.spectrum(torque_nm))
+        return predicted_spectra
+
+    def _poles(self, x: NDArray[np.float64]) -> list[Pole]:
+        """Return the poles of the modes, with their derivatives by frequencies and damping.
+
+        `x` is ``(ln omega_1, eta_1, ln omega_2, …)``.
+        """
+        poles = []
+        for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
+            omega_rad_s, q = math.exp(log_omega), _relative_pole(eta)
+            pole_derivative = np.zeros(x.size, dtype=np.complex128)
+            pole_derivative[2 * k] = omega_rad_s * q
+            pole_derivative[2 * k + 1] = omega_rad_s * _relative_pole_derivative(eta)
+            poles.append(Pole(self._numbers[k], omega_rad_s * q, pole_derivative))
+        return poles
+
+    def _nuisance_spectra(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Return the torque spectra of all disturbances and effects of unknown amplitude, (m, K).
+
+        They are not whitened.
+        """
+        return np.concatenate([self._comparison.nuisance_spectra(poles), self._effect_spectra])
+
+    def _drag_change(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Return the change of the air-drag torque with the poles, and its derivatives, (1 + k, K).
+
+        Row 0 is the change of the spectrum relative to the plant for which the drag was computed.
+        """
+        change_and_derivatives = np.zeros(
+            (1 + 2 * len(poles), self._weight.size), dtype=np.complex128
+        )
+        drag_expansion = self._comparison.drag
+        if drag_expansion is None:
+            return change_and_derivatives
+        for pole in poles:
+            if pole.mode in drag_expansion.by_pole:
+                own_pole = complex(drag_expansion.response.poles[pole.mode - 1])
+                pole_difference = pole.at_rad_s - own_pole
+                remainder, remainder_slopes = drag_expansion.torque_beyond_first_order(
+                    pole.mode, own_pole, pole.at_rad_s
+                )
+                change_and_derivatives[0] -= remainder
+                by_real, by_imaginary = drag_expansion.by_pole[pole.mode]
+                change_and_derivatives[0] += (
+                    pole_difference.real * by_real + pole_difference.imag * by_imaginary
+                )
+                by_real_at_pole, by_imaginary_at_pole = (
+                    drag_expansion.by_pole[pole.mode] - remainder_slopes
+                )
+                change_and_derivatives[1:] += np.outer(pole.derivative.real, by_real_at_pole)
+                change_and_derivatives[1:] += np.outer(pole.derivative.imag, by_imaginary_at_pole)
+        return change_and_derivatives
+
+    def solution_at(self, x: NDArray[np.float64]) -> _LinearSolution:
+        """Return the best linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
+
+        The solutions at the last points are cached.
+        """
+        return self._recent.at(x, self._solve_at, self if self._comparison.is_long else None)
+
+    def _solve_at(self, x: NDArray[np.float64]) -> _LinearSolution:
+        """Return the best linear parameters at a point `x`, computed without the cache."""
+        span = self._linear_spectra(x)
+        residual, linear_parameters = self._solve(x, span)
+        jacobian = np.empty((x.size, residual.size))
+        self._write_jacobian(x, linear_parameters, jacobian)
+        _remove_span(jacobian, span)
+        return _LinearSolution(residual, linear_parameters, jacobian)
+
+    def best_fit(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the whitened residual and the best linear parameters at a point `x`."""
+        if self._comparison.is_long:
+            self._recent.clear()
+        return self._solve(x, self._linear_spectra(x))
+
+    def cost(self, x: NDArray[np.float64]) -> float:
+        """Return the sum of the squared whitened residual at a point `x`."""
+        residual, _ = self.best_fit(x)
+        return float(residual @ residual)
+
+    def uncertainty(
+        self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64]
+    ) -> _Uncertainty:
+        """Return covariance and derivatives at a minimum `x` with its linear parameters."""
+        if self._comparison.is_long:
+            self._recent.clear()
+        rows = self._linear_spectra(x, x.size)
+        spectra, jacobian = rows[: -x.size], rows[-x.size :]
+        self._write_jacobian(x, linear_parameters, jacobian)
+        gram, row_lengths = _scaled_gram(jacobian, spectra, regularization=1e-14)
+        covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(row_lengths, row_lengths)
+        # From here on in place: the rows of a long record take much memory.
+        _orthonormalise(spectra)
+        _remove_span(jacobian, spectra)
+        ln_damping_by_torque = _ln_damping_by_torque(jacobian, x)
+        _orthonormalise(jacobian)
+        return _Uncertainty(covariance, rows, ln_damping_by_torque)
+
+    def _linear_spectra(self, x: NDArray[np.float64], further_rows: int = 0) -> NDArray[np.float64]:
+        """Return the whitened spectra that the linear parameters multiply, shape (m, 2 K).
+
+        They are those of the numerators of the modes, of the background and of the nuisances, in
+        this order. `further_rows` is the number of rows that are added without values.
+        """
+        nuisance_spectra = self._nuisance_spectra(self._poles(x))
+        nuisance_start = x.size + BACKGROUND_COEFFICIENTS
+        nuisance_end = nuisance_start + len(nuisance_spectra)
+        rows = np.empty((nuisance_end + further_rows, 2 * self._weight.size))
+        for row, spectrum in zip(rows[nuisance_start:nuisance_end], nuisance_spectra, strict=True):
+            row[:] = self._whiten(spectrum)
+        del nuisance_spectra
+        for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
+            _, _, numerators = self._numerators(log_omega, eta)
+            rows[2 * k : 2 * k + 2] = self._predicted_spectra(numerators)
+        rows[x.size : nuisance_start] = self._background
+        return rows
+
+    def _numerators(
+        self, log_omega: float, eta: float
+    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128], tuple[NDArray[np.complex128], ...]]:
+        """Return q, one over the denominator, and both numerators over it, of a mode."""
+        q = self._s / math.exp(log_omega)
+        inverse_denominator = 1 / (1 + eta * q + q * q)
+        return q, inverse_denominator, (q * q * inverse_denominator, q**3 * inverse_denominator)
+
+    def _solve(
+        self, x: NDArray[np.float64], spectra: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the residual and linear parameters; make their spectra at `x` orthonormal."""
+        triangular_factor = _orthonormalise(spectra)
+        measured_torque = self._measured_torque
+        if self._comparison.drag is not None:
+            measured_torque = measured_torque - self._whiten(self._drag_change(self._poles(x))[0])
+        projections = spectra @ measured_torque
+        residual: NDArray[np.float64] = projections @ spectra - measured_torque
+        linear_parameters = np.linalg.solve(triangular_factor.T, projections)
+        return residual, linear_parameters.astype(np.float64, copy=False)
+
+    def _write_jacobian(
+        self,
+        x: NDArray[np.float64],
+        linear_parameters: NDArray[np.float64],
+        jacobian: NDArray[np.float64],
+    ) -> None:
+        """Write the derivatives of the whitened residual by `x` into an array, shape (k, 2 K)."""
+        poles = self._poles(x)
+        jacobian[:] = 0.0
+        if self._comparison.drag is not None:
+            jacobian[:] = self._whiten(self._drag_change(poles)[1:])
+        if poles:
+            nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
+            decay_gradient = self._comparison.decay_gradient(poles, nuisance_amplitudes)
+            for k, derivative in enumerate(decay_gradient):
+                jacobian[k] += self._whiten(derivative)
+            del decay_gradient
+        for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
+            q, inverse_denominator, numerators = self._numerators(log_omega, eta)
+            a, b = linear_parameters[2 * k : 2 * k + 2]
+            response = a * numerators[0] + b * numerators[1]
+            denominator_by_ln_omega = (eta * q + 2 * q * q) * inverse_denominator
+            jacobian[2 * k : 2 * k + 2] += self._predicted_spectra(
+                [
+                    response * (denominator_by_ln_omega - 2) - b * numerators[1],
+                    -response * q * inverse_denominator,
+                ]
+            )
+
+    def model(self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64]) -> ModalModel:
+        """Return the modal model with given frequencies, damping and linear parameters."""
+        mode_points = x.reshape(-1, 2)
+        poles, residues = [], []
+        background_start = 2 * len(mode_points)
+        background_coefficients = linear_parameters[
+            background_start : background_start + BACKGROUND_COEFFICIENTS
+        ] / self.scale_rad_s ** np.arange(BACKGROUND_COEFFICIENTS)
+        for k, (log_omega, eta) in enumerate(mode_points):
+            omega_rad_s, (a, b) = math.exp(log_omega), linear_parameters[2 * k : 2 * k + 2]
+            q = _relative_pole(eta)
+            poles.append(omega_rad_s * q)
+            residues.append(omega_rad_s * (a + b * q) * q * q / (2j * q.imag))
+            # Add the polynomial part of (a + b q) q² over the denominator.
+            background_coefficients[0] += a - b * eta
+            background_coefficients[1] += b / omega_rad_s
+        return ModalModel(tuple(poles), tuple(residues), tuple(background_coefficients.tolist()))
+
+    def residual(
+        self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64], model: ModalModel
+    ) -> NDArray[np.complex128]:
+        """Return the residual spectrum of a model at a point in N·m, not whitened, shape (K,)."""
+        nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
+        poles = self._poles(x)
+        comparison = self._comparison
+        predicted_nm = comparison.prediction.torque(model)[0]
+        modal_residual = comparison.spectrum(
+            predicted_nm - comparison.torque_nm[comparison.retained]
+        )
+        drag_change: NDArray[np.complex128] = self._drag_change(poles)[0]
+        return drag_change + modal_residual + nuisance_amplitudes @ self._nuisance_spectra(poles)
+
+    def ringing(
+        self, linear_parameters: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> Ringing:
+        """Return amplitudes and chi-square of the free decay at the beginning of the record.
+
+        The decay of each mode has two amplitudes, which are free linear parameters of the fit.
+        """
+        mode_count = len(self._numbers)
+        decay_start = 2 * mode_count + BACKGROUND_COEFFICIENTS
+        decay_amplitudes = linear_parameters[decay_start : decay_start + 2 * mode_count]
+        decay_rows = slice(
+            2 * mode_count + decay_start, 2 * mode_count + decay_start + 2 * mode_count
+        )
+        return Ringing(
+            amplitude_nm=tuple(np.hypot(decay_amplitudes[::2], decay_amplitudes[1::2]).tolist()),
+            chi_square=float(
+                decay_amplitudes
+                @ np.linalg.solve(covariance[decay_rows, decay_rows], decay_amplitudes)
+            ),
+            degrees_of_freedom=decay_amplitudes.size,
+        )
+
+    def constants(
+        self,
+        linear_parameters: NDArray[np.float64],
+        x: NDArray[np.float64],
+        covariance: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the constants of all modes, and their covariance with the background coefficients.
+
+        The constants are `MODE_CONSTANT_NAMES`. The shapes are (4 n,) and (4 n + 5, 4 n + 5).
+        """
+        mode_count = x.size // 2
+        mode_constants = np.empty(4 * mode_count)
+        background_start = x.size + 2 * mode_count
+        derivatives = np.zeros(
+            (4 * mode_count + BACKGROUND_COEFFICIENTS, background_start + BACKGROUND_COEFFICIENTS)
+        )
+        background_rows = derivatives[4 * mode_count :]
+        background_rows[:, background_start:] = np.diag(
+            self.scale_rad_s ** -np.arange(float(BACKGROUND_COEFFICIENTS))
+        )
+        for k in range(mode_count):
+            log_omega, eta = x[2 * k : 2 * k + 2]
+            a, b = linear_parameters[2 * k : 2 * k + 2]
+            q = _relative_pole(eta)
+            residue_numerator = a + b * q
+            # ln of the residue over j: ln omega + ln (a + b q) + 2 ln q - ln(2 Im q) + j pi
+            log_residue = np.log(-residue_numerator * q * q / (2 * q.imag)) + log_omega
+            pole_derivative = _relative_pole_derivative(eta)
+            residue_by_eta = (
+                b / residue_numerator + 2 / q
+            ) * pole_derivative - pole_derivative.imag / q.imag
+            residue_by_a, residue_by_b = 1 / residue_numerator, q / residue_numerator
+            mode_constants[4 * k : 4 * k + 4] = (
+                log_omega + math.log(q.imag / (2 * math.pi)),
+                math.log(eta / 2),
+                log_residue.real,
+                log_residue.imag,
+            )
+            mode_rows = derivatives[4 * k : 4 * k + 4]
+            omega_index, eta_index, a_index, b_index = (
+                2 * k,
+                2 * k + 1,
+                x.size + 2 * k,
+                x.size + 2 * k + 1,
+            )
+            mode_rows[0, [omega_index, eta_index]] = 1.0, pole_derivative.imag / q.imag
+            mode_rows[1, eta_index] = 1 / eta
+            mode_rows[2, [omega_index, eta_index, a_index, b_index]] = (
+                1.0,
+                residue_by_eta.real,
+                residue_by_a.real,
+                residue_by_b.real,
+            )
+            mode_rows[3, [eta_index, a_index, b_index]] = (
+                residue_by_eta.imag,
+                residue_by_a.imag,
+                residue_by_b.imag,
+            )
+            # The remainder of the division of the numerator by the denominator, as in `model`.
+            background_rows[0, [a_index, b_index, eta_index]] = 1.0, -eta, -b
+            background_rows[1, [b_index, omega_index]] = np.array([1.0, -b]) / math.exp(log_omega)
+        used_covariance = covariance[: derivatives.shape[1], : derivatives.shape[1]]
+        return mode_constants, derivatives @ used_covariance @ derivatives.T
+
+    def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
+        """Return cost, gradient and Hessian at a point `x`, with Kaufman's Jacobian."""
+        solution = self.solution_at(x)
+        return NormalEquations(
+            cost=float(solution.residual @ solution.residual),
+            gradient=solution.jacobian @ solution.residual,
+            hessian=solution.jacobian @ solution.jacobian.T,
+        )
