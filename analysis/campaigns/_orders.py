@@ -179,7 +179,7 @@ def tolerant_pooled_order(
         return replace(tolerant_order.with_doubt(exact_order.reason), mixture=True)
     if not _nearly_all_adequate(verdicts):
         return tolerant_order.with_doubt(_UNEXPLAINED_REASON)
-    final_reason = effective_reason(order, refused=refused)
+    final_reason = effective_reason(estimate, order, refused=refused)
     return tolerant_order if final_reason is None else tolerant_order.with_doubt(final_reason)
 
 

@@ -261,7 +261,7 @@ def _reported_parameters(
 
     `doubt` is the reason against every number. With `refused`, stiffness, density, delay and
     external damping are effective values: a tip mass or a compliant clamp changes all modes alike,
-    by far more than the tolerance.
+    by far more than the tolerance. So is internal damping if an order makes up for the frequencies.
     """
     return {
         parameter_name: Estimate(
@@ -269,7 +269,7 @@ def _reported_parameters(
             estimate.std[parameter_name],
             estimate.interval[parameter_name],
             doubt
-            or effective_reason(parameter_name, refused=refused)
+            or effective_reason(estimate, parameter_name, refused=refused)
             or _reason_undetermined(estimate, parameter_name),
         )
         for parameter_name in PARAMETERS
@@ -361,23 +361,29 @@ def loss_factors_with_geometry_tolerance(
         if loss_factor is None:
             continue
         flag_reason = NO_ORDER if estimate.basis == "none" else None
-        if damping == "external" and test.status == "refused":
-            flag_reason = flag_reason or NOT_UNIFORM
+        flag_reason = flag_reason or effective_reason(
+            estimate, coefficient_name, refused=test.status == "refused"
+        )
         reported_factors.append(reported_loss_factor(damping, loss_factor, flag_reason))
     return tuple(reported_factors)
 
 
-def effective_reason(parameter_name: str, *, refused: bool) -> str | None:
+def effective_reason(
+    estimate: TolerantEstimate, parameter_name: str, *, refused: bool
+) -> str | None:
     """Return why a parameter is only an effective value; None if it is a property of the beam.
 
     Parameters
     ----------
+    estimate : TolerantEstimate
+        Parameters of a beam with a tolerance of the geometry.
     parameter_name : str
         Name of the parameter.
     refused : bool
         Whether the test refused a uniform beam.
     """
-    return NOT_UNIFORM if refused and parameter_name in _EFFECTIVE_PARAMETERS else None
+    is_effective = parameter_name in _EFFECTIVE_PARAMETERS or estimate.rests_on_frequencies
+    return NOT_UNIFORM if refused and is_effective else None
 
 
 def order_verdict_with_geometry_tolerance(
@@ -408,7 +414,7 @@ def order_verdict_with_geometry_tolerance(
     if reason is not None:
         return OrderVerdict(order, status, None, None, reason, profile)
     order_value, order_interval = estimate.values[order], estimate.interval[order]
-    doubt = doubt or effective_reason(order, refused=refused)
+    doubt = doubt or effective_reason(estimate, order, refused=refused)
     if doubt is not None:
         return OrderVerdict(order, "open", order_value, order_interval, doubt, profile)
     return OrderVerdict(order, status, order_value, order_interval, None, profile)

@@ -54,6 +54,10 @@ _LOSS_TOLERANCE: Final = 0.01
 _MIN_VISIBLE_MODES: Final = 2
 """Smallest number of visible modes for an estimate with tolerance."""
 
+_AGREEING_DEVIANCE: Final = 1.0
+"""Increase of chi-square up to which the losses agree with an order of 1: one standard
+deviation."""
+
 _DAMPING_COEFFICIENTS: Final = ("zeta", "gamma")
 """Damping coefficients that are tested for their absence."""
 
@@ -114,6 +118,18 @@ class TolerantEstimate:
     first_rad_s: float
     deviance_of_order_one: dict[str, float]
     deviance_without_damping: dict[str, float]
+
+    @property
+    def rests_on_frequencies(self) -> bool:
+        """Return whether an order differs from 1 although the losses alone agree with 1.
+
+        Then the order was chosen for its elastic part, which shifts the frequencies.
+        """
+        return any(
+            not self.interval[order_name][0] <= 1 <= self.interval[order_name][1]
+            and deviance < _AGREEING_DEVIANCE
+            for order_name, deviance in self.deviance_of_order_one.items()
+        )
 
     def covariance_json(self) -> dict[str, Any]:
         """Return names and covariance matrix of the beam parameters as a dict for JSON.

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from analysis.identify.noise import smooth_power
 from analysis.identify.residual_tests import (
     cumulative_periodogram,
     harmonics,
@@ -25,6 +26,13 @@ def test_noise_is_white_and_the_band_means_what_it_says():
     outside = np.mean([test.distance > test.band for test in found])
     assert 0.01 < outside < 0.10
     assert np.mean([test.is_white for test in found]) > 0.98
+    assert not any(test.loud for test in found)
+
+
+def test_noise_whose_spectrum_is_estimated_is_not_loud():
+    """The spectrum is estimated from the noise itself, as the modal fit does it."""
+    drawn = (noise(seed) for seed in range(1000))
+    found = [whiteness(each * np.sqrt(2 / smooth_power(each, finely=True)), HZ) for each in drawn]
     assert not any(test.loud for test in found)
 
 
