@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -48,13 +47,11 @@ _DOUBTFUL_PROBABILITY: Final = 0.01
 """Probability of chance below which a residual is doubtful. A false alarm costs only computing time
 there."""
 
-_WINDOW_BINS: Final = (8, 32)
-"""Numbers of bins in which the power of the residual is tested."""
-
-_NOISE_DEGREES_OF_FREEDOM: Final = 115
-"""Degrees of freedom of the noise power, which is known to 13 %: it is interpolated between medians
-of some 60 bins, each known to 18 %. If it were exact, one record of white noise in 160 would be
-loud."""
+_LOUD_POWER_RATIOS: Final = {8: 5.4, 32: 2.75}
+"""Power over that of the noise from which a window of 8 or 32 bins is loud. One record of white
+noise in 100 000 has such a window, extrapolated from 12 000 records with the noise estimated from
+medians of 60 bins. Such an estimate is uncertain by up to 18 %: with the limits for a noise that is
+known exactly, 4.3 and 2.3, one record in 160 would be loud."""
 
 _COHERENT_BINS: Final = 9
 """Number of neighbouring bins over which the coherence is computed."""
@@ -174,7 +171,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
     bin_power = residual.real**2 + residual.imag**2
     cumulative_power = np.concatenate([[0.0], np.cumsum(bin_power)])
     largest_deviate, loudest_hz, loudest_ratio, is_loud = -math.inf, (0.0, 0.0), 1.0, False
-    for window_bins in _WINDOW_BINS:
+    for window_bins, loud_ratio in _LOUD_POWER_RATIOS.items():
         if window_bins >= bin_count:
             continue
         window_power = cumulative_power[window_bins:] - cumulative_power[:-window_bins]
@@ -184,7 +181,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
             largest_deviate = window_deviate
             loudest_hz = (float(frequency_hz[i]), float(frequency_hz[i + window_bins - 1]))
             loudest_ratio = float(window_power[i]) / (2 * window_bins)
-        is_loud |= float(window_power[i]) / (2 * window_bins) > _loud_power_ratio(window_bins)
+        is_loud |= float(window_power[i]) / (2 * window_bins) > loud_ratio
     return Whiteness(
         distance=largest_distance,
         band=KOLMOGOROV_95 / math.sqrt(bin_count),
@@ -193,15 +190,6 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
         loudest_ratio=loudest_ratio,
         loud=is_loud,
     )
-
-
-@lru_cache(maxsize=4)
-def _loud_power_ratio(window_bins: int) -> float:
-    """Return the power over that of the noise from which a window is loud."""
-    from scipy.special import fdtri, ndtr
-
-    probability = ndtr(SIGNIFICANT_STD + 0.5)  # of a lower ratio; half a deviate for all windows
-    return float(fdtri(2 * window_bins, _NOISE_DEGREES_OF_FREEDOM, probability))
 
 
 def input_relation(
