@@ -47,11 +47,11 @@ _DOUBTFUL_PROBABILITY: Final = 0.01
 """Probability of chance below which a residual is doubtful. A false alarm costs only computing time
 there."""
 
-_LOUD_POWER_RATIOS: Final = {8: 5.4, 32: 2.75}
+_LOUD_POWER_RATIOS: Final = {8: 5.0, 32: 2.6}
 """Power over that of the noise from which a window of 8 or 32 bins is loud. One record of white
-noise in 100 000 has such a window, extrapolated from 12 000 records with the noise estimated from
-medians of 60 bins. Such an estimate is uncertain by up to 18 %: with the limits for a noise that is
-known exactly, 4.3 and 2.3, one record in 160 would be loud."""
+noise in 5000 has such a window (of 12 000 records with the noise estimated from medians of 60
+bins). Such an estimate is uncertain by up to 18 %: with the limits for a noise that is known
+exactly, 4.3 and 2.3, one record in 160 would be loud."""
 
 _COHERENT_BINS: Final = 9
 """Number of neighbouring bins over which the coherence is computed."""
