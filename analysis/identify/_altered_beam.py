@@ -132,7 +132,8 @@ class Alteration:
     def lags(self) -> tuple[tuple[float, float], ...]:
         """Coefficients of s and s² in the denominators of the torque channel's lags."""
         time_s, inverse_quality = self.sensor
-        return ((inverse_quality * time_s, time_s**2), (self.lag_s, 0.0))
+        lags = ((inverse_quality * time_s, time_s**2), (self.lag_s, 0.0))
+        return tuple(lag for lag in lags if any(lag))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,10 @@ import numpy as np
 
 from analysis.decimation import Decimation, fast_length_below
 from analysis.identify._data import MeasurementError
+from analysis.identify._drag_expansion import DragExpansion
 from analysis.identify._instrument import reference_coherent_part
 from analysis.identify._predictor import TorquePredictor
-from analysis.identify.drag_torque import DragExpansion, DragResponse
+from analysis.identify.drag_torque import DragResponse
 from analysis.identify.free_decay import DecaySpectra, LaterDecaySpectra, count_decay_spectra
 from analysis.models import LARGEST_FRACTION_OF_RATE
 from analysis.optimizer import RecentValues

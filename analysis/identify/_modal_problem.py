@@ -211,36 +211,6 @@ class ModalProblem:
         """
         return np.concatenate([self._comparison.nuisance_spectra(poles), self._effect_spectra])
 
-    def _drag_change(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Return the change of the air-drag torque with the poles, and its derivatives, (1 + k, K).
-
-        Row 0 is the change of the spectrum relative to the plant for which the drag was computed.
-        """
-        change_and_derivatives = np.zeros(
-            (1 + 2 * len(poles), self._weight.size), dtype=np.complex128
-        )
-        drag_expansion = self._comparison.drag
-        if drag_expansion is None:
-            return change_and_derivatives
-        for pole in poles:
-            if pole.mode in drag_expansion.by_pole:
-                own_pole = complex(drag_expansion.response.poles[pole.mode - 1])
-                pole_difference = pole.at_rad_s - own_pole
-                remainder, remainder_slopes = drag_expansion.torque_beyond_first_order(
-                    pole.mode, own_pole, pole.at_rad_s
-                )
-                change_and_derivatives[0] -= remainder
-                by_real, by_imaginary = drag_expansion.by_pole[pole.mode]
-                change_and_derivatives[0] += (
-                    pole_difference.real * by_real + pole_difference.imag * by_imaginary
-                )
-                by_real_at_pole, by_imaginary_at_pole = (
-                    drag_expansion.by_pole[pole.mode] - remainder_slopes
-                )
-                change_and_derivatives[1:] += np.outer(pole.derivative.real, by_real_at_pole)
-                change_and_derivatives[1:] += np.outer(pole.derivative.imag, by_imaginary_at_pole)
-        return change_and_derivatives
-
     def solution_at(self, x: NDArray[np.float64]) -> _LinearSolution:
         """Return the best linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
 
@@ -319,8 +289,9 @@ class ModalProblem:
         """Return the residual and linear parameters; make their spectra at `x` orthonormal."""
         triangular_factor = _orthonormalise(spectra)
         measured_torque = self._measured_torque
-        if self._comparison.drag is not None:
-            measured_torque = measured_torque - self._whiten(self._drag_change(self._poles(x))[0])
+        if (drag := self._comparison.drag) is not None:
+            drag_change, _ = drag.change_by_poles(self._poles(x), x.size)
+            measured_torque = measured_torque - self._whiten(drag_change)
         projections = spectra @ measured_torque
         residual: NDArray[np.float64] = projections @ spectra - measured_torque
         linear_parameters = np.linalg.solve(triangular_factor.T, projections)
@@ -335,8 +306,8 @@ class ModalProblem:
         """Write the derivatives of the whitened residual by `x` into an array, shape (k, 2 K)."""
         poles = self._poles(x)
         jacobian[:] = 0.0
-        if self._comparison.drag is not None:
-            jacobian[:] = self._whiten(self._drag_change(poles)[1:])
+        if (drag := self._comparison.drag) is not None:
+            jacobian[:] = self._whiten(drag.change_by_poles(poles, x.size)[1])
         if poles:
             nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
             decay_gradient = self._comparison.decay_gradient(poles, nuisance_amplitudes)
@@ -384,8 +355,9 @@ class ModalProblem:
         modal_residual = comparison.spectrum(
             predicted_nm - comparison.torque_nm[comparison.retained]
         )
-        drag_change: NDArray[np.complex128] = self._drag_change(poles)[0]
-        return drag_change + modal_residual + nuisance_amplitudes @ self._nuisance_spectra(poles)
+        if comparison.drag is not None:
+            modal_residual += comparison.drag.change_by_poles(poles, x.size)[0]
+        return modal_residual + nuisance_amplitudes @ self._nuisance_spectra(poles)
 
     def ringing(
         self, linear_parameters: NDArray[np.float64], covariance: NDArray[np.float64]

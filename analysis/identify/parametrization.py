@@ -25,7 +25,7 @@ are the same.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
@@ -34,14 +34,7 @@ import numpy as np
 
 from analysis.identify._settings import SETTINGS
 from analysis.models import ORDER_RANGE, SIZE_RANGE
-from rigd.beam import (
-    DAMPING_PARAMETERS,
-    Beam,
-    Damping,
-    Plant,
-    gradient_name,
-    undamped_frequencies_rad_s,
-)
+from rigd.beam import DAMPING_PARAMETERS, Plant, gradient_name, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -251,18 +244,8 @@ class Unknowns:
 
     def _plant_of(self, parameter_values: Mapping[str, float]) -> Plant:
         """Return the rig and beam for values of all parameters, by name."""
-        stiffness_n_m2 = parameter_values["bending_stiffness_n_m2"]
-        return replace(
-            self.nominal,
-            beam=Beam(
-                self.nominal.beam.length_m,
-                parameter_values["density_over_stiffness"] * stiffness_n_m2,
-                stiffness_n_m2,
-            ),
-            damping=Damping(*(parameter_values[name] for name in DAMPING_PARAMETERS)),
-            delay_s=parameter_values["delay_s"],
-            tool_inertia_kg_m2=parameter_values["tool_inertia_kg_m2"],
-        )
+        names = (*DAMPING_PARAMETERS, *SETTINGS)
+        return self.nominal.with_parameters({name: parameter_values[name] for name in names})
 
     def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Return all plant parameters by name, free and fixed, for a vector of unknowns."""

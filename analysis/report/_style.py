@@ -287,14 +287,12 @@ def save_picture(
         rendered[file_format] = render_figure(figure, file_format)
         # The suffix is appended, because a name may contain dots.
         write_new(path_stem.with_name(f"{path_stem.name}.{file_format}"), rendered[file_format])
-    shown_format: FigureFormat = "png" if "png" in formats and "svg" not in formats else "svg"
-    if shown_format not in rendered:
-        rendered["svg"] = render_figure(figure, "svg")
-    if len(rendered[shown_format]) > _MAX_SVG_BYTES and shown_format == "svg":
-        shown_format = "png"
-        if shown_format not in rendered:
-            rendered["png"] = render_figure(figure, "png")
-    return Picture(path_stem.name, description, rendered[shown_format], shown_format)
+    if "svg" in rendered or "png" not in rendered:
+        svg = rendered.get("svg") or render_figure(figure, "svg")
+        if len(svg) <= _MAX_SVG_BYTES:
+            return Picture(path_stem.name, description, svg)
+    png = rendered.get("png") or render_figure(figure, "png")
+    return Picture(path_stem.name, description, png, "png")
 
 
 def envelope(

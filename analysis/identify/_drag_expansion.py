@@ -1,0 +1,251 @@
+"""Change of the torque by air drag with beam and drag, to first order.
+
+The torque by drag is not linear in the motion, so no frequency response function describes it. In a
+fit it is computed at one beam and drag and removed from the measured torque. Its change with beam
+or drag is linear (`DragExpansion`) in
+
+* the poles of the modes, on which the motion near a resonance depends,
+* the external damping ``gamma s^lambda`` at these poles, since it also drives the modes,
+* the logarithm of the mass per length, which the force has to move,
+* the delay between the channels,
+* the drag itself.
+
+The first four follow from a fit's unknowns. The drag is free: its columns are projected out as
+those of a free decay are. A fit with drag repeats both steps until they agree.
+
+Without drag a resonance peak grows without limit as the damping falls. With drag it hardly grows.
+Where the linear torque curves with a pole, the torque by drag curves against it. So only the first
+order in the poles of the linear torque counts, and its remainder is subtracted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify.drag_torque import LOWEST_MODE_INDICES
+from rigd.beam import BEAM_PARAMETERS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.identify.drag_torque import DragLaw, DragResponse
+    from rigd.beam import Plant, Pole
+
+    Real = NDArray[np.float64]
+    Complex = NDArray[np.complex128]
+
+_EXTERNAL_PARAMETERS: Final = ("gamma", "lambda")
+"""Parameters of the external damping."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DragExpansion:
+    """First-order expansion of the drag torque about one beam and drag, as spectra in the band.
+
+    Attributes
+    ----------
+    plant : Plant
+        Rig and beam for which the drag torque was removed from the record.
+    law : DragLaw
+        Drag law for which the drag torque was removed from the record.
+    response : DragResponse
+        Response of this beam to drag.
+    band : callable
+        Function from torque samples, at the times of the angle, to their spectrum in the band.
+    by_pole : dict of int to ndarray of complex, shape (2, K)
+        Derivatives by the real and the imaginary part of the upper pole of each mode.
+    by_external : ndarray of complex, shape (2, 2, K)
+        Derivatives by the external damping that drives each of the two lowest modes, as in
+        `DragTorque`.
+    by_ln_density, by_delay : ndarray of complex, shape (K,)
+        Derivatives by ln(mass per length) and by the delay of the torque.
+    by_law : ndarray of complex, shape (2, K)
+        Derivatives by `DragLaw.constant_m` and `DragLaw.slowing`.
+    speed_m_s, top_speed_m_s : float
+        Mean and highest speed of the beam, as in `DragTorque`.
+    """
+
+    plant: Plant
+    law: DragLaw
+    response: DragResponse
+    band: Callable[[Real], Complex]
+    by_pole: dict[int, Complex]
+    by_external: Complex
+    by_ln_density: Complex
+    by_delay: Complex
+    by_law: Complex
+    speed_m_s: float
+    top_speed_m_s: float
+
+    def change_to(
+        self,
+        plant: Plant,
+        poles: Sequence[Pole],
+        parameter_names: Sequence[str],
+        parameter_slopes: Real,
+    ) -> tuple[Complex, Complex]:
+        """Return the change of the drag torque if another beam replaces this one.
+
+        Its derivatives by the unknowns of the other beam are returned as well.
+
+        Parameters
+        ----------
+        plant : Plant
+            Rig with the other beam.
+        poles : sequence of Pole
+            Poles of the other beam, differentiated by the unknowns.
+        parameter_names : sequence of str
+            Names of the parameters, as in `Unknowns`.
+        parameter_slopes : ndarray, shape (len(names), k)
+            Derivatives of the parameters by the unknowns, with density over stiffness and stiffness
+            as logarithms.
+
+        Returns
+        -------
+        torque_change : ndarray of complex, shape (K,)
+            Spectrum of the change of the torque, in the band.
+        torque_jacobian : ndarray of complex, shape (k, K)
+            Derivatives of the change by the unknowns.
+        """
+        derivative_spectra = [self.by_ln_density]
+        own_density, other_density = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
+        parameter_steps = [np.log(other_density / own_density)]
+        # ln(mass per length) is the sum of ln(rho/EI) and ln(EI).
+        step_slopes = [
+            _parameter_rows(parameter_slopes, parameter_names, BEAM_PARAMETERS).sum(axis=0)
+        ]
+        for by_external, damping_change in zip(
+            self.by_external, self._external_damping_change(plant), strict=True
+        ):
+            derivative_spectra += list(by_external)
+            parameter_steps += damping_change[:, 0].tolist()
+            step_slopes += list(
+                damping_change[:, 1:]
+                @ _parameter_rows(parameter_slopes, parameter_names, _EXTERNAL_PARAMETERS)
+            )
+        derivative_spectra.append(self.by_delay)
+        parameter_steps.append(plant.delay_s - self.plant.delay_s)
+        step_slopes += list(_parameter_rows(parameter_slopes, parameter_names, ("delay_s",)))
+        # A real view suffices, since the spectra are multiplied by real numbers only.
+        real_spectra = np.array(derivative_spectra).view(np.float64)
+        torque_change: Complex = (np.array(parameter_steps) @ real_spectra).view(np.complex128)
+        torque_jacobian: Complex = (np.array(step_slopes).T @ real_spectra).view(np.complex128)
+        change_by_poles, jacobian_by_poles = self.change_by_poles(poles, parameter_slopes.shape[1])
+        return torque_change + change_by_poles, torque_jacobian + jacobian_by_poles
+
+    def change_by_poles(self, poles: Sequence[Pole], unknown_count: int) -> tuple[Complex, Complex]:
+        """Return the change of the drag torque with the poles alone, and its derivatives.
+
+        The spectra have the shapes (K,) and (unknown_count, K).
+
+        Parameters
+        ----------
+        poles : sequence of Pole
+            Poles of another beam, differentiated by the unknowns.
+        unknown_count : int
+            Number of unknowns.
+        """
+        change = np.zeros(self.by_delay.size, dtype=np.complex128)
+        jacobian = np.zeros((unknown_count, change.size), dtype=np.complex128)
+        for pole in poles:
+            if pole.mode not in self.by_pole or not pole.oscillates:
+                continue
+            own_pole = complex(self.response.poles[pole.mode - 1])
+            pole_step = pole.at_rad_s - own_pole
+            remainder, remainder_slopes = self._torque_beyond_first_order(
+                pole.mode, own_pole, pole.at_rad_s
+            )
+            by_real, by_imaginary = self.by_pole[pole.mode]
+            change += pole_step.real * by_real + pole_step.imag * by_imaginary - remainder
+            by_real_at_pole, by_imaginary_at_pole = self.by_pole[pole.mode] - remainder_slopes
+            jacobian += np.outer(pole.derivative.real, by_real_at_pole)
+            jacobian += np.outer(pole.derivative.imag, by_imaginary_at_pole)
+        return change, jacobian
+
+    def _external_damping_change(self, plant: Plant) -> list[Real]:
+        """Return the external damping of another beam minus that of this beam, for two modes.
+
+        The difference is taken at the pole of each mode: with another order ``gamma s^lambda`` is
+        not linear in gamma and lambda, and a fit with insignificant external damping may reach any
+        order.
+
+        Returns
+        -------
+        list of ndarray, shape (2, 3)
+            For each mode c_0 and c_1 of ``c_0 + c_1 s``, each with its derivatives by gamma and
+            lambda.
+        """
+        own_damping, other_damping = self.plant.damping, plant.damping
+        linear_terms = []
+        for s in self.response.poles[LOWEST_MODE_INDICES].tolist():
+            if not s.imag > 0:  # no such oscillation
+                linear_terms.append(np.zeros((2, 3)))
+                continue
+            log_s, per_gamma = np.log(s), s**other_damping.lambda_
+            damping_difference = (
+                other_damping.gamma * per_gamma - own_damping.gamma * s**own_damping.lambda_
+            )
+            damping_and_slopes = np.array(
+                [damping_difference, per_gamma, other_damping.gamma * log_s * per_gamma]
+            )
+            linear_term = damping_and_slopes.imag / s.imag
+            linear_terms.append(
+                np.array([damping_and_slopes.real - linear_term * s.real, linear_term])
+            )
+        return linear_terms
+
+    def _torque_beyond_first_order(
+        self, mode_number: int, own_pole: complex, other_pole: complex
+    ) -> tuple[Complex, Complex]:
+        """Return the change of one mode's torque with its pole, without the first-order part.
+
+        The spectrum has the shape (K,). It is returned with its derivatives by the real and
+        the imaginary part of the pole, shape (2, K).
+
+        Parameters
+        ----------
+        mode_number : int
+            Number of the mode.
+        own_pole, other_pole : complex
+            Upper pole of the mode on this beam, and that on the other beam, in rad/s.
+        """
+        s, torque_spectrum = self.response.s, self.response.modal_torque(mode_number)
+        pole_step = other_pole - own_pole
+        own_term, own_conjugate_term = 1 / (s - own_pole), 1 / (s - own_pole.conjugate())
+        other_term, other_conjugate_term = 1 / (s - other_pole), 1 / (s - other_pole.conjugate())
+        term_ratio = other_term * other_conjugate_term / (own_term * own_conjugate_term)
+        first_order_change = pole_step * own_term + pole_step.conjugate() * own_conjugate_term
+        by_real_part = term_ratio * (other_term + other_conjugate_term) - (
+            own_term + own_conjugate_term
+        )
+        by_imaginary_part = 1j * (
+            term_ratio * (other_term - other_conjugate_term) - (own_term - own_conjugate_term)
+        )
+        remainder_transforms = torque_spectrum * np.array(
+            [term_ratio - 1 - first_order_change, by_real_part, by_imaginary_part]
+        )
+        remainder, *remainder_slopes = self.band(self.response.in_time(remainder_transforms))
+        return remainder, np.array(remainder_slopes)
+
+
+def _parameter_rows(
+    derivatives: Real, derivative_names: Sequence[str], wanted_names: Sequence[str]
+) -> Real:
+    """Return the derivatives of the wanted parameters by the unknowns, shape (n, k).
+
+    `derivative_names` are the parameters of the given rows. A missing parameter gets zeros.
+    """
+    zero_row = np.zeros(derivatives.shape[1])
+    return np.array(
+        [
+            derivatives[derivative_names.index(parameter_name)]
+            if parameter_name in derivative_names
+            else zero_row
+            for parameter_name in wanted_names
+        ]
+    )
