@@ -23,9 +23,10 @@ def main() -> None:
             f"{', '.join(_PORTABLE_COMMANDS)}."
         )
     from rigd.runtime import ignore_handled_signals
-    from rigd.runtime.background import use_one_thread
+    from rigd.runtime.background import collect_garbage_rarely, use_one_thread
 
     use_one_thread()
+    collect_garbage_rarely()
     if sys.argv[1:] == ["stop"]:
         from rigd.cli.stop_report import main as run
     elif sys.argv[1:] in (["status"], ["status", "--json"]):
