@@ -12,7 +12,8 @@ a deficiency of the model.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -21,6 +22,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from analysis.decimation import fast_length
 from analysis.report import _style as style
 from analysis.report._shown_model import ShownModel
+from analysis.report._style import Illustration
 from analysis.report._uniformity import UNIFORMITY, uniformity_description, uniformity_figure
 from analysis.report.bands import dense_grid, loss_estimate, loss_factors, supported_band_hz
 from analysis.statistics import KOLMOGOROV_95, NORMAL_95
@@ -527,15 +529,6 @@ def residual_power(
     return times_s, interval_power
 
 
-@dataclass(frozen=True, slots=True)
-class Illustration:
-    """Figure of a report with the name of its files and its description."""
-
-    name: str
-    figure: Figure
-    description: str
-
-
 FIGURES: Final = ("record_frf", UNIFORMITY, "loss_factor", "residual", "record_signals")
 """File names of a whole record's figures.
 
@@ -543,7 +536,7 @@ The second figure is omitted if too few modes are visible for the test."""
 
 
 def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
-    """Yield the figures of a whole record one after the other; call it within `figure_style`."""
+    """Yield the figures of a whole record."""
     from analysis.report._signal_figures import signals_figure
 
     highest_hz, headline = whole_record.band_hz[1], whole_record.headline
@@ -555,7 +548,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     delay_text = "delay" if model.modal is None else "the delay that the file states"
     yield Illustration(
         frf,
-        frf_figure(measured_frf, model),
+        partial(frf_figure, measured_frf, model),
         "Frequency response from motor angle to coupling torque: magnitude and phase, measured "
         f"(empirical transfer function estimate, {delay_text} removed) and of {model.name}; "
         f"half-width of the model's 95 % band; details of the modes ({modes_text} Hz). The band is "
@@ -565,13 +558,16 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     uniformity_test = headline.uniform_beam
     if uniformity_test is not None and uniformity_test.p_value is not None:
         yield Illustration(
-            UNIFORMITY, uniformity_figure(uniformity_test), uniformity_description(uniformity_test)
+            UNIFORMITY,
+            partial(uniformity_figure, uniformity_test),
+            uniformity_description(uniformity_test),
         )
     loss_model = loss_estimate(whole_record)
     flagged_modes = [mode.number for mode in headline.modes if mode.damping_ratio.flag is not None]
     yield Illustration(
         loss_name,
-        loss_figure(
+        partial(
+            loss_figure,
             model.modes,
             loss_model,
             (float(measured_frf.frequency_hz[0]), highest_hz),
@@ -584,7 +580,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     mean_power_ratio = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
     yield Illustration(
         residual_name,
-        residual_figure(model, analysis),
+        partial(residual_figure, model, analysis),
         f"Residual of the torque, measured minus that of {model.name}: its spectrum beside the "
         "noise model; its cumulative periodogram, which stays in the shaded range in 95 of 100 "
         "records or more if only noise is left; and its power through the record. Excess at a "
@@ -593,7 +589,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     )
     yield Illustration(
         signals_name,
-        signals_figure(whole_record.record, model, highest_hz),
+        partial(signals_figure, whole_record.record, model, highest_hz),
         f"Motor angle; coupling torque from 0 to {highest_hz:g} Hz, measured and as {model.name} "
         "predicts it from the measured angle "
         f"(fit {model.fit_percent(whole_record.analysis):.2f} % NRMSE); residual; below, "

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from analysis.report import _style as style
-from analysis.report._record_figures import Illustration
+from analysis.report._style import Illustration
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
@@ -34,11 +35,11 @@ _SESSION_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE
 
 
 def touch_illustrations(sessions: Sequence[SessionTouches]) -> Iterator[Illustration]:
-    """Yield a map of all contacts and a figure of each touch; call it within `figure_style`."""
+    """Yield a map of all contacts and a figure of each touch."""
     if any(touch.point_m is not None for session in sessions for touch in session.touches):
         yield Illustration(
             "map",
-            map_figure(sessions),
+            partial(map_figure, sessions),
             "Points of contact as seen from above, with their 95 % intervals (hollow: the kind of "
             "contact cannot be told); the antenna (grey) as it was bent at each touch, from the "
             "motor's axis (black). The angle is zero along x.",
@@ -51,7 +52,7 @@ def touch_illustrations(sessions: Sequence[SessionTouches]) -> Iterator[Illustra
             touch_number += 1
             yield Illustration(
                 f"touch_{touch_number}",
-                touch_figure(touch, touch.estimate),
+                partial(touch_figure, touch, touch.estimate),
                 f"Touch {touch.number} of {session.path.name}: log-likelihood of each point "
                 "whatever the force, with the estimate and its 95 % interval; innovations of "
                 "torque and base shear, linear up to 5 standard deviations; contact force of the "

@@ -23,7 +23,7 @@ from analysis.report.table import csv_text
 from analysis.results import DEFAULT_FORMATS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from matplotlib.figure import Figure
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns import CampaignResult
     from analysis.report._page import Facts
-    from analysis.report._style import Picture
+    from analysis.report._style import Illustration, Picture
     from analysis.results import FigureFormat
 
 # Text
@@ -282,18 +282,10 @@ def write_campaign(
     OutputExistsError, OutputError
         If a file exists or cannot be written.
     """
-    from analysis.report import _style as style
+    from analysis.report._style import save_pictures
 
-    pictures = []
-    for table_name, (draw_figure, figure_description) in _figures_with_data(campaign).items():
-        with style.figure_style():
-            figure = draw_figure()
-            pictures.append(
-                style.save_picture(
-                    figure, folder / "figures" / table_name, figure_description, formats
-                )
-            )
-        on_step(f"figure {table_name}")
+    illustrations = list(_illustrations(campaign))
+    pictures = save_pictures(illustrations, folder / "figures", formats, on_step)
     for table_name, report_table in all_tables(campaign, with_paper=with_paper).items():
         write_new(folder / "tables" / f"{table_name}.csv", csv_text(report_table))
     document_json = document_text(campaign_document(campaign, with_paper=with_paper))
@@ -304,8 +296,8 @@ def write_campaign(
     write_new(folder / "report.html", page_html)
 
 
-def _figures_with_data(campaign: CampaignResult) -> dict[str, tuple[Callable[[], Figure], str]]:
-    """Return the functions that draw the campaign's figures and their descriptions, by name."""
+def _illustrations(campaign: CampaignResult) -> Iterator[Illustration]:
+    """Yield the figures for which the campaign has data."""
     from analysis.report._campaign_figures import (
         best_figure,
         index_figure,
@@ -314,50 +306,56 @@ def _figures_with_data(campaign: CampaignResult) -> dict[str, tuple[Callable[[],
         validation_figure,
     )
     from analysis.report._pooled_figures import damping_figure, response_figure
+    from analysis.report._style import Illustration
 
-    figures_by_name: dict[str, tuple[Callable[[], Figure], str]] = {}
     if campaign.headline is not None and campaign.modes:
-        figures_by_name["damping"] = (
+        yield Illustration(
+            "damping",
             partial(damping_figure, campaign),
             "Damping ratios of all sessions' modes against frequency, and the pooled ones with "
             "their 95 % intervals; below, each mode enlarged.",
         )
     if campaign.headline is not None:
-        figures_by_name["pooled_response"] = (
+        yield Illustration(
+            "pooled_response",
             partial(response_figure, campaign),
             "Frequency response of the pooled estimate over that of every session: magnitude, "
             "phase, and half-width of the 95 % band.",
         )
-        figures_by_name["pooled"] = (
+        yield Illustration(
+            "pooled",
             partial(pooled_figure, campaign),
             "Whole-record estimate of each session with its 95 % interval, and the pooled one.",
         )
     if campaign.validation:
-        figures_by_name["validation"] = (
+        yield Illustration(
+            "validation",
             partial(validation_figure, campaign),
             "Each session's torque predicted from the other sessions: error by model.",
         )
     if not campaign.nominal:
-        return figures_by_name
-    return figures_by_name | {
-        "figure5_signals": (
-            partial(_draw_example_signals, campaign),
-            "Reference, angle and torque of the first session (Figure 5 of the paper).",
-        ),
-        "figure6_nominal": (
-            partial(nominal_figure, campaign),
-            "Measured responses of all sessions, and the nominal models of each type (Figure 6).",
-        ),
-        "figure7_indices": (
-            partial(index_figure, campaign),
-            "Mean square error, its weighted kind and maximum deviation of each nominal model "
-            "over the sessions (Figure 7).",
-        ),
-        "figure8_best": (
-            partial(best_figure, campaign),
-            "Measured responses of all sessions, and the two best nominal models (Figure 8).",
-        ),
-    }
+        return
+    yield Illustration(
+        "figure5_signals",
+        partial(_draw_example_signals, campaign),
+        "Reference, angle and torque of the first session (Figure 5 of the paper).",
+    )
+    yield Illustration(
+        "figure6_nominal",
+        partial(nominal_figure, campaign),
+        "Measured responses of all sessions, and the nominal models of each type (Figure 6).",
+    )
+    yield Illustration(
+        "figure7_indices",
+        partial(index_figure, campaign),
+        "Mean square error, its weighted kind and maximum deviation of each nominal model "
+        "over the sessions (Figure 7).",
+    )
+    yield Illustration(
+        "figure8_best",
+        partial(best_figure, campaign),
+        "Measured responses of all sessions, and the two best nominal models (Figure 8).",
+    )
 
 
 def _draw_example_signals(campaign: CampaignResult) -> Figure:

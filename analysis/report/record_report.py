@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from datetime import UTC, datetime
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from analysis.models import ESTIMATOR_NAMES
@@ -19,13 +20,13 @@ from analysis.results import DEFAULT_FORMATS
 from rigd.spectral import WINDOW
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from analysis.paper.welch_analysis import WelchAnalysis
     from analysis.record import Record
     from analysis.report._page import Facts
-    from analysis.report._style import Picture
+    from analysis.report._style import Illustration, Picture
     from analysis.results import FigureFormat, RecordResult, WholeRecord
 
 # Page
@@ -275,24 +276,10 @@ def _write_page(
     result: RecordResult,
     whole_record: WholeRecord,
     folder: Path,
-    on_step: Callable[[str], None],
-    formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
-    paper_pictures: Sequence[Picture] = (),
+    pictures: Sequence[Picture],
+    paper_pictures: Sequence[Picture],
 ) -> None:
-    """Write a record's report: ``report.html``, and the files in ``figures/`` and ``tables/``."""
-    from analysis.report import _style as style
-    from analysis.report._record_figures import illustrations
-
-    pictures = []
-    with style.figure_style():
-        for illustration in illustrations(whole_record):
-            figure_stem = folder / "figures" / illustration.name
-            pictures.append(
-                style.save_picture(
-                    illustration.figure, figure_stem, illustration.description, formats
-                )
-            )
-            on_step(f"figure {illustration.name}")
+    """Write the page of a record's report, ``report.html``, and the files in ``tables/``."""
     mode_table, record_tables, paper_tables = report_tables(result)
     for report_table in (
         mode_table,
@@ -385,18 +372,24 @@ def write_report(
     OutputExistsError, OutputError
         If a file exists or cannot be written.
     """
+    from analysis.report._style import save_pictures
+
     whole_record = result.whole
-    pictures: list[Picture] = []
-    if result.welch is not None:
-        figure_names = welch_figure_names(
-            with_paper_figures=True, has_whole_record=whole_record is not None
-        )
-        pictures = _write_welch_figures(
-            result.welch, figure_names, folder / "figures", on_step, formats
-        )
+    paper_illustrations = (
+        []
+        if result.welch is None
+        else list(_welch_illustrations(result.welch, has_whole_record=whole_record is not None))
+    )
+    illustrations = paper_illustrations
+    if whole_record is not None:
+        from analysis.report._record_figures import illustrations as record_illustrations
+
+        illustrations = [*paper_illustrations, *record_illustrations(whole_record)]
+    pictures = save_pictures(illustrations, folder / "figures", formats, on_step)
     write_new(folder / "tables.txt", tables_text(result))
     if whole_record is not None:
-        _write_page(result, whole_record, folder, on_step, formats, pictures)
+        paper_count = len(paper_illustrations)
+        _write_page(result, whole_record, folder, pictures[paper_count:], pictures[:paper_count])
     write_new(folder / "analysis.json", document_text(document([result])))
 
 
@@ -415,27 +408,16 @@ def welch_figure_names(*, with_paper_figures: bool, has_whole_record: bool) -> t
     return _WELCH_FIGURES_WITH_RECORD if has_whole_record else _WELCH_FIGURES
 
 
-def _write_welch_figures(
-    analysis: WelchAnalysis,
-    figure_names: Sequence[str],
-    folder: Path,
-    on_step: Callable[[str], None],
-    formats: Sequence[FigureFormat],
-) -> list[Picture]:
-    """Draw and write figures of the Welch fits, and return them for the page."""
-    from analysis.report import _style as style
+def _welch_illustrations(
+    analysis: WelchAnalysis, *, has_whole_record: bool
+) -> Iterator[Illustration]:
+    """Yield the figures of the Welch fits."""
     from analysis.report._frf_figure import frf_figure
     from analysis.report._signal_figures import paper_signals_figure, torque_figure
+    from analysis.report._style import Illustration
 
     drawing_functions = dict(
         zip(_WELCH_FIGURES, (paper_signals_figure, frf_figure, torque_figure), strict=True)
     )
-    pictures = []
-    for figure_name in figure_names:
-        with style.figure_style():
-            figure = drawing_functions[figure_name](analysis)
-            pictures.append(
-                style.save_picture(figure, folder / figure_name, _WELCH_DESCRIPTION, formats)
-            )
-        on_step(f"figure {figure_name}")
-    return pictures
+    for name in welch_figure_names(with_paper_figures=True, has_whole_record=has_whole_record):
+        yield Illustration(name, partial(drawing_functions[name], analysis), _WELCH_DESCRIPTION)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from analysis.report._document import document_text, versions
 from analysis.report.folder import write_new
 from analysis.report.table import TEXT_FORMAT, Cell, Column, Entry, Table, csv_text, number_cell
-from analysis.results import DEFAULT_FORMATS, finite
+from analysis.results import finite
 from rigd.units import decimals, with_half_width
 
 if TYPE_CHECKING:
@@ -214,17 +214,10 @@ def write_touch_report(
         If a file exists or cannot be written.
     """
     from analysis.report import _page as pages
-    from analysis.report import _style as style
+    from analysis.report._style import save_pictures
     from analysis.report._touch_figures import touch_illustrations
 
-    pictures = []
-    with style.figure_style():
-        for illustration in touch_illustrations(session_touches):
-            figure_stem = folder / "figures" / illustration.name
-            picture = style.save_picture(
-                illustration.figure, figure_stem, illustration.description, DEFAULT_FORMATS
-            )
-            pictures.append(picture)
+    pictures = save_pictures(list(touch_illustrations(session_touches)), folder / "figures")
     touch_table = touches_table(session_touches)
     write_new(folder / "tables" / "touches.csv", csv_text(touch_table))
     write_new(

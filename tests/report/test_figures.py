@@ -1,6 +1,8 @@
 """Each figure as pixels: it is there, filled, in the colours that carry its meaning."""
 
+import os
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -149,13 +151,21 @@ def test_a_figure_is_the_same_each_time_in_every_format(tmp_path, kind, start):
         assert b"/Type3" not in content
 
 
+def lines(*values):
+    """Illustrations of a line each; their names have dots, as those of files may."""
+
+    def drawn(value):
+        figure = style.new_figure(4.0, 3.0)
+        figure.add_subplot().plot([0.0, value])
+        return figure
+
+    return [style.Illustration(f"v1.{value}", partial(drawn, value), "A line.") for value in values]
+
+
 def test_a_picture_is_written_in_the_formats_asked_for(tmp_path):
-    with style.figure_style():
-        picture = style.save_picture(
-            style.new_figure(4.0, 3.0), tmp_path / "v1.0", "A figure.", ("pdf",)
-        )
-    assert [path.name for path in tmp_path.iterdir()] == ["v1.0.pdf"]
-    assert picture.name == "v1.0"
+    (picture,) = style.save_pictures(lines(1), tmp_path, ("pdf",))
+    assert [path.name for path in tmp_path.iterdir()] == ["v1.1.pdf"]
+    assert picture.name == "v1.1"
     assert picture.image.startswith(b"<?xml")
 
 
@@ -179,9 +189,52 @@ def test_a_page_shows_a_format_that_is_written_and_no_huge_svg(
         return file_format.encode().ljust(svg_bytes if file_format == "svg" else 3)
 
     monkeypatch.setattr(style, "render_figure", render)
-    picture = style.save_picture(None, tmp_path / "a", "A figure.", formats)
+    (picture,) = style.save_pictures(lines(1), tmp_path, formats)
     assert picture.source == f"data:image/{shown}"
     assert len(drawn) == len({*formats, picture.file_format, *(("svg",) if svg_bytes > 3 else ())})
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="COPY NOT TESTED: not Linux")
+@pytest.mark.parametrize("copy", ["draws", "fails", "none"])
+def test_pictures_are_the_same_whoever_draws_them(monkeypatch, tmp_path, copy):
+    own_pid, drawn_here, done = os.getpid(), [], []
+
+    def render(figure, file_format, rendered=style.render_figure):
+        if os.getpid() == own_pid:
+            drawn_here.append(file_format)
+        elif copy == "fails":
+            raise MemoryError
+        return rendered(figure, file_format)
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0} if copy == "none" else {0, 1})
+    monkeypatch.setattr(style, "render_figure", render)
+    pictures = style.save_pictures(lines(1, 2, 3), tmp_path, ("svg",), done.append)
+    assert len(drawn_here) == (2 if copy == "draws" else 3)
+    assert [picture.name for picture in pictures] == ["v1.1", "v1.2", "v1.3"]
+    assert sorted(done) == ["figure v1.1", "figure v1.2", "figure v1.3"]
+    for value, picture in enumerate(pictures, start=1):
+        assert picture.image == (tmp_path / f"v1.{value}.svg").read_bytes()
+        (alone,) = style.save_pictures(lines(value), tmp_path / f"{value}", ("svg",))
+        assert picture.image == alone.image
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="COPY NOT TESTED: not Linux")
+def test_no_copy_is_left_when_drawing_fails(monkeypatch, tmp_path):
+    def fail():
+        raise ZeroDivisionError
+
+    def fork(fork=os.fork):
+        copies.append(fork())
+        return copies[-1]
+
+    copies = []
+    monkeypatch.setattr(os, "fork", fork)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    with pytest.raises(ZeroDivisionError):
+        style.save_pictures([style.Illustration("a", fail, ""), *lines(1)], tmp_path, ("svg",))
+    (copy,) = copies
+    with pytest.raises(ChildProcessError):
+        os.waitpid(copy, os.WNOHANG)
 
 
 def test_a_title_that_is_no_text_is_no_obstacle(tmp_path):

@@ -162,7 +162,7 @@ def test_of_modes_that_do_not_show_no_damping_is_told(careful, retold, as_text):
 
 def loss_axes(result):
     (found,) = [each for each in illustrations(result.whole) if each.name == "loss_factor"]
-    return found.figure.axes[0], found.description
+    return found.draw().axes[0], found.description
 
 
 def test_the_loss_factor_is_drawn_where_the_data_support_it(careful, record_result):

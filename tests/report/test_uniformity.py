@@ -122,7 +122,7 @@ def test_constants_are_compared_with_those_of_a_uniform_beam(modal_result):
     away = np.array([row["deviation_std"].value for row in constants.rows])
     assert np.abs(away).max() < 4
     figure = drawn(modal_result)["uniform_beam"]
-    axes = figure.figure.axes
+    axes = figure.draw().axes
     assert len(axes) == 2 * len(MODE_CONSTANT_NAMES)
     for column, name in enumerate(MODE_CONSTANT_NAMES):
         (points,) = [line for line in axes[2 * column].get_lines() if line.get_marker() == "o"]
@@ -153,7 +153,7 @@ def test_labels_of_the_uniformity_figure_are_whole(modal_result, retold, factor)
     test = replace(test, predicted=predicted, std=factor * test.std)
     result = retold(modal_result, headline=replace(told, uniform_beam=test))
     with style.figure_style():
-        figure = drawn(result)["uniform_beam"].figure
+        figure = drawn(result)["uniform_beam"].draw()
         figure.canvas.draw()
         for axes in figure.axes:
             for label in (axes.xaxis.label, axes.yaxis.label, axes.title):
@@ -189,7 +189,7 @@ def test_a_turn_of_a_phase_is_no_deviation(modal_result, retold):
 def test_losses_that_no_beam_explains_are_points_alone(unexplained_losses):
     assert loss_estimate(unexplained_losses.whole) is None
     figures = drawn(unexplained_losses)
-    labels = [handle.get_label() for handle in figures["loss_factor"].figure.axes[0].get_lines()]
+    labels = [handle.get_label() for handle in figures["loss_factor"].draw().axes[0].get_lines()]
     assert not {"total", "internal (material and clamp)", "external (surroundings)"} & set(labels)
     assert "There is no curve" in figures["loss_factor"].description
     assert "not properties of the material" in figures["uniform_beam"].description
