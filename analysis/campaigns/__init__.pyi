@@ -1,5 +1,7 @@
+from . import labels as labels
 from . import pooling as pooling
 from . import sentences as sentences
+from . import specimen_sentences as specimen_sentences
 from . import workers as workers
 from ._campaign import CampaignResult as CampaignResult
 from ._campaign import campaign as campaign

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.campaigns import group_errors_by_model
-from analysis.campaigns.sentences import failed_predictions, label
+from analysis.campaigns.labels import label
+from analysis.campaigns.sentences import failed_predictions
 from analysis.report._paper_tables import FIT_NAME_COLUMNS, paper_tables
 from analysis.report._pooled_tables import (
     homogeneity_table,
