@@ -34,7 +34,6 @@ from analysis.campaigns import SessionTask, analyse_session, campaign
 from analysis.campaigns.workers import process_pool
 from analysis.identify import BAND_HZ
 from analysis.models import (
-    STRUCTURES,
     DampingUnknowns,
     WelchSettings,
     weights,
@@ -79,7 +78,7 @@ def welch_only(paths: list[Path]) -> int:
     task = SessionTask(WelchSettings(), (), (), BAND_HZ)
     with process_pool(JOBS) as pool:
         results = pool.run(analyse_session, [(path, task) for path in paths])
-    return sum(len(result.welch_fits) for result in results)
+    return sum(len(result.welch_models) for result in results)
 
 
 def _cost(
@@ -107,8 +106,8 @@ def searched(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
     plant = Plant(result.beam, Damping(), tool_inertia_kg_m2=result.tool_inertia_kg_m2)
     rng = np.random.default_rng(0)
     found = {}
-    for fit in result.welch_fits:
-        structure = STRUCTURES[fit.structure]
+    for fit in (model.fit for model in result.welch_models):
+        structure = fit.structure
         unknowns = DampingUnknowns.for_beam(structure, result.beam)
         low, high = unknowns.bounds
         low = np.maximum(low, math.log(1e-5))
@@ -130,7 +129,7 @@ def searched(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
             tool_inertia_kg_m2=result.tool_inertia_kg_m2,
         )  # fmt: skip
         ratio = peer_s / (time.process_time() - begun)
-        found[fit.structure, fit.weighting] = fit.cost / min(ends) - 1, ratio
+        found[structure.name, fit.weighting] = fit.cost / min(ends) - 1, ratio
     return found
 
 

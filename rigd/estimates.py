@@ -86,7 +86,8 @@ class Estimate:
     def from_json(cls, document: object) -> "Estimate | None":
         """Return the estimate that a JSON value describes, or None if it is none.
 
-        Numbers are finite. An interval without two finite ends is unknown.
+        Numbers are finite. An interval without two finite ends is unknown. A flag that is no text
+        is a reason to doubt as well.
 
         Parameters
         ----------
@@ -107,7 +108,7 @@ class Estimate:
             value,
             finite_number(document.get("std")),
             interval_95,
-            printable(flag, _MAX_FLAG_CHARACTERS) if isinstance(flag, str) else None,
+            None if flag is None else printable(str(flag), _MAX_FLAG_CHARACTERS),
         )
 
 

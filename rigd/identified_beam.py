@@ -5,7 +5,7 @@ that names it; none is ignored.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from math import hypot, pi
 from pathlib import Path
@@ -23,6 +23,8 @@ from rigd.beam import (
 )
 from rigd.documents import DocumentError, read_json
 from rigd.errors import UserError
+from rigd.estimates import Estimate, EstimatedMode
+from rigd.session import BeamUniformity
 from rigd.units import finite_number, is_usable_size
 
 _HALF_WIDTH_95_STDS: Final = 1.959964
@@ -171,113 +173,91 @@ def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> 
         If the file cannot be read or lacks parameters, if it has an effect or a finding that this
         use does not take into account, or if a required number is flagged.
     """
-    document_path = Path(document_path)
-    headline_label, headline, refusal = _read_headline(document_path)
+    label, headline, refusal = _read_headline(Path(document_path))
     if refusal and not use.modes:
         raise IdentifiedBeamError(
-            f"{headline_label}.validity.uniform_beam: {refusal}, and {use.name} relies on a "
-            "uniform beam; "
+            f"{label}.validity.uniform_beam: {refusal}, and {use.name} relies on a uniform beam; "
             "remove what makes it differ (a mass, a soft clamp, an axis that is not plumb), and "
             "record and analyze again, or leave out --model."
         )
-    _require_known_findings(headline_label, headline.get("named"), use)
-    parameter_object = headline
-    if not refusal and isinstance(exact_geometry := headline.get("exact_geometry"), dict):
-        headline_label, parameter_object = f"{headline_label}.exact_geometry", exact_geometry
-    parameters = parameter_object.get("parameters")
-    if not isinstance(parameters, dict):
-        raise IdentifiedBeamError(f"{headline_label}.parameters is missing; {_ADVICE}.")
-    values_by_name = parameter_values(headline_label, parameters)
+    _require_known_findings(label, headline.get("named"), use)
+    exact_geometry = headline.get("exact_geometry")
+    if not refusal and isinstance(exact_geometry, dict):
+        label, headline = f"{label}.exact_geometry", exact_geometry
+    estimates = parameter_estimates(label, _with_covering_std(headline.get("parameters")))
     if refusal:
         # Effective values of a uniform beam do not describe the rig: the modes replace them.
-        values_by_name = {
-            n: v
-            for n, v in values_by_name.items()
-            if _effect_key(n) not in (OFFSET_PREFIX, *END_PARAMETERS)
+        estimates = {
+            name: estimate
+            for name, estimate in estimates.items()
+            if _effect_key(name) not in (OFFSET_PREFIX, *END_PARAMETERS)
         }
-    _require_known_effects(headline_label, values_by_name, use)
-    std = {}
-    for parameter_name in values_by_name:
-        parameter_std = (
-            _standard_deviation(parameters[parameter_name])
-            if refusal
-            else _required_deviation(
-                headline_label, parameter_name, parameters[parameter_name], use
-            )
-        )
-        if parameter_std is not None:
-            std[parameter_name] = parameter_std
-    _check_offset_modes(headline_label, values_by_name)
+    values = {name: estimate.value for name, estimate in estimates.items()}
+    _require_known_effects(label, values, use)
+    if not refusal:
+        _require_certain(label, estimates, use)
+    _check_offset_modes(label, values)
     plant_values = {
-        parameter_name: parameter_value
-        for parameter_name, parameter_value in values_by_name.items()
-        if (effect_key := _effect_key(parameter_name)) not in _EFFECTS or effect_key in use.effects
+        name: value
+        for name, value in values.items()
+        if (effect_key := _effect_key(name)) not in _EFFECTS or effect_key in use.effects
     }
     channel_values = {name: getattr(stated, name) for name in ("delay_s", "tool_inertia_kg_m2")}
     identified_beam = IdentifiedBeam(
         Plant.from_parameters(stated.beam.length_m, channel_values | plant_values),
-        std,
-        _mode_uncertainty(headline_label, parameter_object.get("modes")),
+        {
+            name: std
+            for name, estimate in estimates.items()
+            if (std := _standard_deviation(estimate)) is not None
+        },
+        tuple(_mode_uncertainties(label, headline.get("modes"))),
     )
     return (
-        _with_observed_modes(headline_label, identified_beam, headline.get("modes"), refusal)
+        _with_observed_modes(label, identified_beam, headline.get("modes"), refusal)
         if refusal
         else identified_beam
     )
 
 
 def _with_observed_modes(
-    label: str, identified_beam: IdentifiedBeam, modes: object, refusal: str
+    label: str, identified_beam: IdentifiedBeam, documents: object, refusal: str
 ) -> IdentifiedBeam:
     """Return the beam after its modes are replaced by the observed ones.
 
     Stiffness offsets give it the observed frequencies, and its inertia follows from the first
     mode's participation. `refusal` is the reason why no uniform beam can be used.
     """
-    observed_modes: list[tuple[float, float, float | None]] = []
-    for entry in modes if isinstance(modes, list) else []:
-        if not isinstance(entry, dict) or not entry.get("shown", True):
+    modes: list[EstimatedMode] = []
+    for number, document in enumerate(documents if isinstance(documents, list) else [], start=1):
+        mode = EstimatedMode.from_json(document, number)
+        if mode is None or not mode.shown or not mode.damping_ratio.value or mode.flag:
             break
-        mode_quantities = [
-            entry.get(key) for key in ("frequency_hz", "damping_ratio", "participation")
-        ]
-        hz, damping_ratio, mode_inertia = (
-            finite_number(quantity_name.get("value")) if isinstance(quantity_name, dict) else None
-            for quantity_name in mode_quantities
-        )
-        quantity_flags = [
-            quantity_name.get("flag")
-            for quantity_name in mode_quantities
-            if isinstance(quantity_name, dict)
-        ]
-        if not hz or not damping_ratio or hz < 0 or any(quantity_flags):
+        if mode.participation is not None and mode.participation.flag:
             break
-        observed_modes.append((hz, damping_ratio, mode_inertia))
-    if not observed_modes:
+        modes.append(mode)
+    if not modes:
         raise IdentifiedBeamError(
             f"{label}.modes: {refusal}, and no mode is shown without a flag that could take its "
             "place; record a session that shows more modes and analyze it, or leave out --model."
         )
     try:
-        plant = identified_beam.plant.with_frequencies([hz for hz, _, _ in observed_modes])
+        plant = identified_beam.plant.with_frequencies([mode.frequency_hz.value for mode in modes])
     except ValueError as error:
         raise IdentifiedBeamError(f"{label}.parameters: {error} Leave out --model.") from None
-    beam, mode_inertia = plant.beam, observed_modes[0][2]
-    if mode_inertia and mode_inertia > 0:
-        mass_scale = mode_inertia / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
+    beam, mode_inertia = plant.beam, modes[0].participation
+    if mode_inertia is not None and mode_inertia.value > 0:
+        mass_scale = mode_inertia.value / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
         beam = replace(
             beam,
             density_kg_per_m=mass_scale * beam.density_kg_per_m,
             bending_stiffness_n_m2=mass_scale * beam.bending_stiffness_n_m2,
         )
         plant = replace(plant, beam=beam)
-    poles = plant.poles(clamped_free_eigenvalues(len(observed_modes)))[:, 0]
+    poles = plant.poles(clamped_free_eigenvalues(len(modes)))[:, 0]
     # The difference between the damping of the beam and of the modes counts as uncertainty.
     pole_uncertainties = (
-        hypot(parameter_std, abs(damping_ratio + pole.real / abs(pole)))
-        for parameter_std, (_, damping_ratio, _), pole in zip(
-            identified_beam.mode_uncertainty, observed_modes, poles, strict=False
-        )
+        hypot(std, abs(mode.damping_ratio.value + pole.real / abs(pole)))
+        for std, mode, pole in zip(identified_beam.mode_uncertainty, modes, poles, strict=False)
     )
     return replace(identified_beam, plant=plant, mode_uncertainty=tuple(pole_uncertainties))
 
@@ -291,13 +271,9 @@ def _read_headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
     label, headline = select_headline(path, document)
     # A single record of a campaign can exclude a uniform beam.
     pooled = headline.get("file", "") is None
-    headlines = filter(_is_json_object, document["headlines"]) if pooled else [headline]
-    return label, headline, next(filter(None, map(_uniform_beam_refusal, headlines)), "")
-
-
-def _is_json_object(entry: object) -> bool:
-    """Return whether a value of a document is a JSON object."""
-    return isinstance(entry, dict)
+    headlines = document["headlines"] if pooled else [headline]
+    refusals = [_uniform_beam_refusal(path, each) for each in headlines if isinstance(each, dict)]
+    return label, headline, next(filter(None, refusals), "")
 
 
 def read_document(path: Path) -> object:
@@ -337,64 +313,68 @@ def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any
         If the document has no headline with parameters.
     """
     headlines = document.get("headlines") if isinstance(document, dict) else None
-    if not isinstance(headlines, list):
-        headlines = []
     numbered_headlines = [
-        (k, headline_entry)
-        for k, headline_entry in enumerate(headlines)
-        if isinstance(headline_entry, dict)
+        (k, headline)
+        for k, headline in enumerate(headlines if isinstance(headlines, list) else [])
+        if isinstance(headline, dict)
     ]
-    pooled_headlines = [
-        (k, headline_entry)
-        for k, headline_entry in numbered_headlines
-        if headline_entry.get("file", "") is None
-    ]
-    headline_index, headline = next(iter(pooled_headlines + numbered_headlines), (0, {}))
+    headline_index, headline = min(  # the pooled one, else the first
+        numbered_headlines, key=_is_of_one_file, default=(0, {})
+    )
     if not isinstance(headline.get("parameters"), dict):
         raise IdentifiedBeamError(f"{path}: has no headlines[0].parameters; {_ADVICE}.")
     return f"{path}: headlines[{headline_index}]", headline
 
 
-def _uniform_beam_refusal(headline: Mapping[str, Any]) -> str:
+def _is_of_one_file(numbered_headline: tuple[int, Mapping[str, Any]]) -> bool:
+    """Return whether a headline is of a single file, and not of all together."""
+    return numbered_headline[1].get("file", "") is not None
+
+
+def _uniform_beam_refusal(path: Path, headline: Mapping[str, Any]) -> str:
     """Return why a uniform beam does not predict the modes of a record, or "" if it may."""
-    model_validity = headline.get("validity")
-    uniform_beam_test = (
-        model_validity.get("uniform_beam") if isinstance(model_validity, dict) else None
-    )
-    if not isinstance(uniform_beam_test, dict) or uniform_beam_test.get("status") != "refused":
+    validity = headline.get("validity")
+    stated_test = validity.get("uniform_beam") if isinstance(validity, dict) else None
+    if stated_test is None:
         return ""
-    p_value = finite_number(uniform_beam_test.get("p_value"))
-    p = "" if p_value is None else f" (p = {p_value:.1g})"
-    return f"a uniform beam does not predict the modes that the record shows{p}"
+    test = BeamUniformity.from_document(stated_test)
+    if test is None:
+        raise IdentifiedBeamError(
+            f"{path}: validity.uniform_beam = {json.dumps(stated_test, default=str)[:60]} of a "
+            f"headline is not the result of a test; {_ADVICE}."
+        )
+    if test.status != "refused":
+        return ""
+    return (
+        f"a uniform beam does not predict the modes that the record shows (p = {test.p_value:.1g})"
+    )
 
 
-def parameter_values(label: str, parameter_entries: Mapping[str, Any]) -> dict[str, float]:
-    """Return the values of a headline's parameters, after a check of their ranges.
+def parameter_estimates(label: str, documents: object) -> dict[str, Estimate]:
+    """Return the estimates of a headline's parameters by name, after a check of their ranges.
 
     Parameters
     ----------
     label
         Name of the headline in messages.
-    parameter_entries
-        Object ``parameter_entries`` of the headline.
+    documents
+        Value of the key ``parameters`` of the headline.
 
     Raises
     ------
     IdentifiedBeamError
         If a parameter is unknown or out of range, or a required parameter is missing.
     """
-    values_by_name = {
-        parameter_name: _parameter_value(label, parameter_name, parameter_entry)
-        for parameter_name, parameter_entry in parameter_entries.items()
-    }
-    for parameter_name in BEAM_PARAMETERS:
-        if parameter_name not in values_by_name:
+    if not isinstance(documents, dict):
+        raise IdentifiedBeamError(f"{label}.parameters is missing; {_ADVICE}.")
+    estimates = {name: _estimate(label, name, document) for name, document in documents.items()}
+    for name in BEAM_PARAMETERS:
+        if name not in estimates:
             raise IdentifiedBeamError(
-                f"{label}.parameters.{parameter_name} is missing; take the document of an "
-                "analysis that "
+                f"{label}.parameters.{name} is missing; take the document of an analysis that "
                 "found it (analyze session.mcap --json model.json)."
             )
-    return values_by_name
+    return estimates
 
 
 def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
@@ -408,18 +388,16 @@ def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
     named
         List ``named`` of a headline.
     """
-    unmodelled_findings = []
-    for finding_index, finding_entry in enumerate(named if isinstance(named, list) else []):
-        finding = finding_entry if isinstance(finding_entry, dict) else {}
-        finding_kind = finding.get("what")
-        if (
-            finding_kind not in _FINDINGS_IN_ESTIMATES
-            and finding_kind not in _FINDINGS_IN_PARAMETERS
-        ):
-            unmodelled_findings.append(
-                (finding_index, str(finding_kind)[:60], str(finding.get("sentence"))[:200])
-            )
-    return unmodelled_findings
+    findings = (
+        (index, finding if isinstance(finding, dict) else {})
+        for index, finding in enumerate(named if isinstance(named, list) else [])
+    )
+    return [
+        (index, kind[:60], str(finding.get("sentence"))[:200])
+        for index, finding in findings
+        if (kind := str(finding.get("what")))
+        not in _FINDINGS_IN_ESTIMATES | _FINDINGS_IN_PARAMETERS
+    ]
 
 
 def _effect_key(parameter_name: str) -> str:
@@ -427,8 +405,8 @@ def _effect_key(parameter_name: str) -> str:
     return OFFSET_PREFIX if parameter_name.startswith(OFFSET_PREFIX) else parameter_name
 
 
-def _parameter_value(label: str, name: str, entry: object) -> float:
-    """Return the value of a parameter, or raise if it is unknown or outside its range."""
+def _estimate(label: str, name: str, document: object) -> Estimate:
+    """Return the estimate of a parameter, or raise if it is unknown or outside its range."""
     try:
         definition = parameter_named(name)
     except KeyError:
@@ -436,18 +414,31 @@ def _parameter_value(label: str, name: str, entry: object) -> float:
             f"{label}.parameters.{name[:60]!r} is not known to this version, so what it changes "
             "cannot be taken into account; update rigd, or do without this document."
         ) from None
-    stated_value = entry.get("value") if isinstance(entry, dict) else None
-    finite_value = finite_number(stated_value)
-    if (
-        finite_value is not None
-        and definition.is_valid(finite_value)
-        and is_usable_size(finite_value)
-    ):
-        return finite_value
+    estimate = Estimate.from_json(document)
+    if estimate and definition.is_valid(estimate.value) and is_usable_size(estimate.value):
+        return estimate
+    stated_value = document.get("value") if isinstance(document, dict) else None
     raise IdentifiedBeamError(
         f"{label}.parameters.{name}.value = {json.dumps(stated_value, default=str)[:60]} "
         f"must be a number of {definition.range_text}; {_ADVICE}."
     )
+
+
+def _with_covering_std(documents: object) -> object:
+    """Return a JSON object in whose estimates a deviation that covers a doubt replaces it.
+
+    Documents of older versions state one, as ``std_any_rig``.
+    """
+    if not isinstance(documents, dict):
+        return documents
+    return {
+        name: {**document, "std": std, "interval_95": None, "flag": None}
+        if isinstance(document, dict)
+        and (std := finite_number(document.get("std_any_rig"))) is not None
+        and std > 0
+        else document
+        for name, document in documents.items()
+    }
 
 
 def _require_known_effects(label: str, values_by_name: Mapping[str, float], use: Use) -> None:
@@ -487,41 +478,29 @@ def _require_known_findings(label: str, named: object, use: Use) -> None:
         )
 
 
-def _required_deviation(label: str, name: str, entry: Mapping[str, Any], use: Use) -> float | None:
-    """Return the standard deviation of a parameter, or None if it is unknown.
-
-    Raises if the parameter is flagged and the use relies on it.
-    """
-    entry_flag = entry.get("flag")
-    if entry_flag is None:
-        return _standard_deviation(entry)
-    # From analyses with other model variants: the deviation over all of them.
-    std_any_rig = finite_number(entry.get("std_any_rig"))
-    if std_any_rig is not None and std_any_rig > 0:
-        return std_any_rig
-    parameter_std = _standard_deviation(entry)
-    # For a move the uncertainty of the modes includes the damping.
-    covered_by_modes = use is MOVE and _effect_key(name) not in _EFFECTS
-    if _effect_key(name) not in use.certain and (parameter_std is not None or covered_by_modes):
-        return parameter_std
-    raise IdentifiedBeamError(
-        f"{label}.parameters.{name} is flagged ({str(entry_flag)[:100]}), and {use.name} "
-        "relies on it; "
-        "record a session that shows more modes or is longer and analyze it, or leave out --model."
-    )
+def _require_certain(label: str, estimates: Mapping[str, Estimate], use: Use) -> None:
+    """Raise IdentifiedBeamError if a parameter is flagged on which the use relies."""
+    for name, estimate in estimates.items():
+        # For a move the uncertainty of the modes includes the damping.
+        covered_by_modes = use is MOVE and _effect_key(name) not in _EFFECTS
+        covered = covered_by_modes or _standard_deviation(estimate) is not None
+        if estimate.flag is not None and (_effect_key(name) in use.certain or not covered):
+            raise IdentifiedBeamError(
+                f"{label}.parameters.{name} is flagged ({estimate.flag[:100]}), and {use.name} "
+                "relies on it; record a session that shows more modes or is longer and analyze it, "
+                "or leave out --model."
+            )
 
 
-def _standard_deviation(entry: Mapping[str, Any]) -> float | None:
-    """Return the standard deviation of a parameter, or None if it is unknown.
+def _standard_deviation(estimate: Estimate) -> float | None:
+    """Return the standard deviation of an estimate, or None if it is unknown.
 
     It follows from the 95 % interval, which is valid for all structures, if there is one.
     """
-    interval_95, std = entry.get("interval_95"), finite_number(entry.get("std"))
-    if isinstance(interval_95, list) and len(interval_95) == 2:
-        low, upper_end = map(finite_number, interval_95)
-        if low is not None and upper_end is not None:
-            return abs(upper_end - low) / (2 * _HALF_WIDTH_95_STDS)
-    return std if std is not None and std > 0 else None
+    if estimate.interval_95 is not None:
+        low, high = estimate.interval_95
+        return abs(high - low) / (2 * _HALF_WIDTH_95_STDS)
+    return estimate.std if estimate.std is not None and estimate.std > 0 else None
 
 
 def _check_offset_modes(label: str, values_by_name: Mapping[str, float]) -> None:
@@ -537,26 +516,16 @@ def _check_offset_modes(label: str, values_by_name: Mapping[str, float]) -> None
         )
 
 
-def _mode_uncertainty(label: str, modes: object) -> tuple[float, ...]:
-    """Return the relative standard uncertainty of the pole of each mode in the document."""
-    uncertainties: list[float] = []
-    for mode_index, mode_entry in enumerate(modes if isinstance(modes, Sequence) else [], start=1):
-        mode_object = mode_entry if isinstance(mode_entry, dict) else {}
-        hz, damping_ratio = (
-            of if isinstance(of := mode_object.get(quantity_name), dict) else {}
-            for quantity_name in ("frequency_hz", "damping_ratio")
-        )
-        value_hz = finite_number(hz.get("value"))
-        if not value_hz or not damping_ratio or mode_object.get("mode") != mode_index:
+def _mode_uncertainties(label: str, documents: object) -> Iterator[float]:
+    """Yield the relative standard uncertainty of the pole of each mode in the document."""
+    for number, document in enumerate(documents if isinstance(documents, list) else [], start=1):
+        mode = EstimatedMode.from_json(_with_covering_std(document), 0)
+        if mode is None or mode.number != number:
             raise IdentifiedBeamError(
-                f"{label}.modes[{mode_index - 1}] is not mode {mode_index} with frequency_hz and "
+                f"{label}.modes[{number - 1}] is not mode {number} with frequency_hz and "
                 f"damping_ratio; {_ADVICE}."
             )
-        uncertainties.append(hypot(_mode_deviation(hz) / value_hz, _mode_deviation(damping_ratio)))
-    return tuple(uncertainties)
-
-
-def _mode_deviation(entry: Mapping[str, Any]) -> float:
-    """Return the standard deviation of a mode's quantity, or 0 if it is unknown."""
-    std_any_rig = finite_number(entry.get("std_any_rig"))
-    return max(std_any_rig or 0.0, _standard_deviation(entry) or 0.0)
+        yield hypot(
+            (_standard_deviation(mode.frequency_hz) or 0.0) / mode.frequency_hz.value,
+            _standard_deviation(mode.damping_ratio) or 0.0,
+        )

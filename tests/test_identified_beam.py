@@ -136,6 +136,15 @@ def test_findings_that_no_parameter_carries_are_refused(analysed, use, what, acc
         assert f"named[1]: {what}, which {use.name} does not take" in refusal(path, use)
 
 
+@pytest.mark.parametrize("stated", [{"status": "refused"}, {"status": []}, [], "passed"])
+def test_a_test_of_uniformity_that_cannot_be_read_is_refused(analysed, stated):
+    path = changed(analysed(), validity={"uniform_beam": stated})
+    with pytest.raises(
+        IdentifiedBeamError, match=r"model\.json: validity\.uniform_beam = .* is not"
+    ):
+        read_identified_beam(path, STATED, MOVE)
+
+
 def flagged(value, **more):
     return {"value": value, "std": 0.1 * value, "flag": "another explanation fits", **more}
 
@@ -148,6 +157,8 @@ def test_a_flagged_number_is_refused_unless_a_deviation_covers_it(analysed):
             assert f"{name} is flagged (another explanation fits), and {use.name}" in refused
         covered = analysed(**{name: flagged(0.05, std_any_rig=0.02)})
         assert read_identified_beam(covered, STATED, TOUCH).std[name] == 0.02
+        no_text = analysed(**{name: {"value": 0.05, "flag": 3}})
+        assert f"{name} is flagged (3), and a move" in refusal(no_text, MOVE)
     assert "tip_mass_kg is flagged" in refusal(analysed(tip_mass_kg=flagged(1e-4)), MOVE)
 
 

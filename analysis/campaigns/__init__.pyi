@@ -1,10 +1,11 @@
+from . import labels as labels
 from . import pooling as pooling
 from . import sentences as sentences
+from . import specimen_sentences as specimen_sentences
 from . import workers as workers
 from ._campaign import CampaignResult as CampaignResult
 from ._campaign import campaign as campaign
 from ._estimates import RecordEstimate as RecordEstimate
-from ._estimates import WelchFit as WelchFit
 from ._experiment import CampaignError as CampaignError
 from ._experiment import SessionFailure as SessionFailure
 from ._experiment import SingleSessionError as SingleSessionError

@@ -1,4 +1,4 @@
-"""Results of one session's Welch fits and whole-record fits that a campaign retains."""
+"""Results of one session's whole-record fits that a campaign retains."""
 
 from __future__ import annotations
 
@@ -8,58 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from analysis.identify import Candidate, RecordFit
-    from analysis.paper.welch_analysis import FitIndices, FittedModel
-    from rigd.beam import Damping
-
-
-@dataclass(frozen=True, slots=True)
-class WelchFit:
-    """Fit of one damping structure and weighting to a session's response by the Welch method.
-
-    Attributes
-    ----------
-    structure, weighting : str
-        Names of damping structure and weighting.
-    damping : Damping
-        Fitted damping.
-    parameters : dict
-        Values of zeta, alpha, gamma and lambda, fixed parameters included.
-    cost : float
-        Minimum of the cost function (Eq. 26), in (N·m/rad)².
-    at_bounds : tuple of str
-        Free parameters at a bound of the range searched.
-    std : dict or None
-        Standard deviations of the free parameters, as in `analysis.paper.FrfFit`.
-    indices : FitIndices or None
-        Fit indices relative to the session's response.
-    """
-
-    structure: str
-    weighting: str
-    damping: Damping
-    parameters: Mapping[str, float]
-    cost: float
-    at_bounds: tuple[str, ...]
-    std: Mapping[str, float] | None = None
-    indices: FitIndices | None = None
-
-    @classmethod
-    def from_model(cls, model: FittedModel) -> WelchFit:
-        """Return the results of a fitted model that a campaign retains."""
-        fit = model.fit
-        return cls(
-            structure=fit.structure.name,
-            weighting=fit.weighting,
-            damping=fit.damping,
-            parameters=dict(fit.parameters),
-            cost=fit.cost,
-            at_bounds=fit.at_bounds,
-            std=None if fit.std is None else dict(fit.std),
-            indices=model.indices,
-        )
+    from analysis.paper.welch_analysis import FitIndices
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns.sentences import describe_single_sessions, probability
+from analysis.campaigns.labels import probability
+from analysis.campaigns.sentences import describe_single_sessions
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.identify.sentences import LOSS_NAMES, loss_slope_sentence
 from analysis.statistics import NORMAL_95

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.campaigns._estimates import RecordEstimate, WelchFit
+from analysis.campaigns._estimates import RecordEstimate
 from analysis.campaigns._experiment import Experiment, SessionFailure, session_error_types
 from analysis.models import RECORD_BAND_HZ, WelchSettings
 from analysis.paper.welch_analysis import FitIndices, fit_indices
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from analysis.identify import Candidate, ModalEstimate, Setting
     from analysis.identify.verdict import Verdict
-    from analysis.paper.welch_analysis import Peak
+    from analysis.paper.welch_analysis import FittedModel, Peak
     from analysis.results import WholeRecord
     from rigd.beam import Beam, Plant
 
@@ -62,8 +62,9 @@ class SessionAnalysis:
         Measured torque per angle in N·m/rad, without the channels' delays.
     peaks : tuple of Peak or None
         Measured resonant peaks, one for each mode.
-    welch_fits : tuple of WelchFit
-        Welch fits by type, then by weighting; empty if Welch's method is not applicable.
+    welch_models : tuple of FittedModel
+        Welch fits by type, then by weighting, without their responses, which would take most of
+        the memory of a campaign; empty if Welch's method is not applicable.
     record_estimates : tuple of RecordEstimate
         Whole-record fits by type; empty if none was requested, or the record could not be used.
     verdict : Verdict or None
@@ -100,7 +101,7 @@ class SessionAnalysis:
     frequency_hz: NDArray[np.float64]
     response: NDArray[np.complex128]
     peaks: tuple[Peak | None, ...]
-    welch_fits: tuple[WelchFit, ...]
+    welch_models: tuple[FittedModel, ...]
     record_estimates: tuple[RecordEstimate, ...]
     verdict: Verdict | None
     warnings: tuple[str, ...]
@@ -125,7 +126,7 @@ class SessionAnalysis:
             frequency_hz=_NO_RESPONSE.frequency_hz,
             response=_NO_RESPONSE.response,
             peaks=(),
-            welch_fits=(),
+            welch_models=(),
             segments=0,
         )
 
@@ -255,9 +256,11 @@ def _session_result(
         frequency_hz=measured_response.frequency_hz,
         response=measured_response.response,
         peaks=() if welch_results is None else welch_results.peaks,
-        welch_fits=()
+        welch_models=()
         if welch_results is None
-        else tuple(map(WelchFit.from_model, welch_results.models)),
+        else tuple(
+            replace(model, response=_NO_RESPONSE.response) for model in welch_results.models
+        ),
         record_estimates=()
         if whole_fits is None
         else _record_estimates(whole_fits, session_task.structures, measured_response, delay_s),

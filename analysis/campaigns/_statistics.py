@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns.pooling import determines_damping, estimates_by_structure, pooled_bic
-from analysis.models import STRUCTURES
 from analysis.paper.welch_analysis import fit_indices, peak_deviation, resonant_peaks
 from rigd.beam import DAMPING_PARAMETERS, Plant, ResponseGrid, undamped_frequencies_rad_s
 
@@ -24,10 +23,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.campaigns._estimates import WelchFit
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
-    from analysis.paper.welch_analysis import FitIndices, Peak
+    from analysis.paper.welch_analysis import FitIndices, FittedModel, Peak
     from rigd.beam import Damping
 
 
@@ -61,18 +59,18 @@ class ParameterStatistics:
 
 def fits_by_model(
     sessions: Sequence[SessionAnalysis],
-) -> dict[tuple[str, str], tuple[WelchFit, ...]]:
+) -> dict[tuple[str, str], tuple[FittedModel, ...]]:
     """Return the Welch fits of all sessions by damping structure and weighting."""
-    fits_per_model = zip(*(session.welch_fits for session in sessions), strict=True)
-    return {(row[0].structure, row[0].weighting): row for row in fits_per_model}
+    fits_per_model = zip(*(session.welch_models for session in sessions), strict=True)
+    return {(row[0].fit.structure.name, row[0].fit.weighting): row for row in fits_per_model}
 
 
 def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[ParameterStatistics, ...]:
     """Return statistics of the free parameters of all Welch fits (Table 3 of the paper)."""
     all_statistics = []
     for (structure, weighting), model_fits in fits_by_model(sessions).items():
-        for parameter in STRUCTURES[structure].free:
-            parameter_values = np.array([fit.parameters[parameter] for fit in model_fits])
+        for parameter in model_fits[0].fit.structure.free:
+            parameter_values = np.array([model.fit.parameters[parameter] for model in model_fits])
             all_statistics.append(
                 ParameterStatistics(
                     structure=structure,
@@ -85,7 +83,7 @@ def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[Parameter
                     else float("nan"),
                     min=float(parameter_values.min()),
                     max=float(parameter_values.max()),
-                    at_bounds=sum(parameter in fit.at_bounds for fit in model_fits),
+                    at_bounds=sum(parameter in model.fit.at_bounds for model in model_fits),
                 )
             )
     return tuple(all_statistics)
@@ -155,9 +153,9 @@ class NominalModel:
         return float(np.mean([index_set.wmse for index_set in self.indices]))
 
 
-def mean_damping(structure: str, welch_fits: Sequence[WelchFit]) -> Damping:
+def mean_damping(welch_models: Sequence[FittedModel]) -> Damping:
     """Return the damping whose parameters are the means over the sessions' fits."""
-    return STRUCTURES[structure].damping(_mean_parameters(welch_fits))
+    return welch_models[0].fit.structure.damping(_mean_parameters(welch_models))
 
 
 def nominal_models(sessions: Sequence[SessionAnalysis]) -> tuple[NominalModel, ...]:
@@ -224,12 +222,12 @@ def mean_deviations(
 def _nominal_model(
     structure: str,
     weighting: str,
-    welch_fits: Sequence[WelchFit],
+    welch_models: Sequence[FittedModel],
     sessions: Sequence[SessionAnalysis],
     response_grid: ResponseGrid,
 ) -> NominalModel:
     """Return the nominal model of one damping structure and weighting."""
-    mean_damping_model = mean_damping(structure, welch_fits)
+    mean_damping_model = mean_damping(welch_models)
     first_session = sessions[0]
     frequency_hz, beam = first_session.frequency_hz, first_session.beam
     plant = Plant(beam, mean_damping_model, tool_inertia_kg_m2=first_session.tool_inertia_kg_m2)
@@ -243,7 +241,7 @@ def _nominal_model(
         structure=structure,
         weighting=weighting,
         damping=mean_damping_model,
-        parameters=_mean_parameters(welch_fits),
+        parameters=_mean_parameters(welch_models),
         response=model_response,
         peaks=peaks,
         indices=tuple(fit_indices(omega, session.response, model_response) for session in sessions),
@@ -251,10 +249,12 @@ def _nominal_model(
     )
 
 
-def _mean_parameters(welch_fits: Sequence[WelchFit]) -> dict[str, float]:
+def _mean_parameters(welch_models: Sequence[FittedModel]) -> dict[str, float]:
     """Return the mean of each damping parameter over the sessions' fits."""
     return {
-        parameter_name: float(np.mean([fit.parameters[parameter_name] for fit in welch_fits]))
+        parameter_name: float(
+            np.mean([model.fit.parameters[parameter_name] for model in welch_models])
+        )
         for parameter_name in DAMPING_PARAMETERS
     }
 

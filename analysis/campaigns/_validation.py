@@ -90,13 +90,14 @@ def models_without_session(
         for estimate in pooled_estimates(other_sessions)
         if estimate.name in own_plants
     ]
-    for model_index, fit in enumerate(session.welch_fits):
+    for model_index, model in enumerate(session.welch_models):
         damping = mean_damping(
-            fit.structure,
-            [other_session.welch_fits[model_index] for other_session in other_sessions],
+            [other_session.welch_models[model_index] for other_session in other_sessions]
         )
         plant = Plant(session.beam, damping, session.delay_s, session.tool_inertia_kg_m2)
-        predictions.append(PlantPrediction("welch", fit.structure, fit.weighting, plant, None))
+        predictions.append(
+            PlantPrediction("welch", model.fit.structure.name, model.fit.weighting, plant, None)
+        )
     return tuple(predictions)
 
 

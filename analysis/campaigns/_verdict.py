@@ -9,8 +9,7 @@ from statistics import median_low
 from typing import TYPE_CHECKING, Final
 
 from analysis.campaigns import _geometry_sentences as geometry
-from analysis.campaigns import sentences
-from analysis.campaigns import sentences as specimen_sentences
+from analysis.campaigns import sentences, specimen_sentences
 from analysis.campaigns._modal import OppositeSweeps, opposite_sweeps
 from analysis.campaigns._orders import (
     PooledOrder,

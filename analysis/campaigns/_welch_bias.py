@@ -118,21 +118,23 @@ def welch_biases(
         for record_estimate in pooled
         if record_estimate.misfit <= LARGEST_MISFIT
     }
-    for (structure, weighting), welch_fits in fits_by_model(sessions).items():
+    for (structure, weighting), welch_models in fits_by_model(sessions).items():
         pooled_estimate = pooled_by_name.get(structure)
-        if pooled_estimate is None or len(welch_fits) < _MIN_SESSIONS:
+        if pooled_estimate is None or len(welch_models) < _MIN_SESSIONS:
             continue
-        significance_limit = student_t_quantile(_CONFIDENCE_LEVEL, len(welch_fits) - 1)
+        significance_limit = student_t_quantile(_CONFIDENCE_LEVEL, len(welch_models) - 1)
         parameters = []
         for parameter_name in STRUCTURES[structure].free:
             if parameter_name not in pooled_estimate.by_name:
                 continue
             record_value = pooled_estimate.by_name[parameter_name]
-            welch_values = np.array([fit.parameters[parameter_name] for fit in welch_fits])
+            welch_values = np.array(
+                [model.fit.parameters[parameter_name] for model in welch_models]
+            )
             welch_mean, std = float(welch_values.mean()), float(welch_values.std(ddof=1))
             bias, bias_std = (
                 welch_mean - record_value.value,
-                math.hypot(std / len(welch_fits) ** 0.5, record_value.std),
+                math.hypot(std / len(welch_models) ** 0.5, record_value.std),
             )
             parameters.append(
                 ParameterBias(
@@ -144,7 +146,7 @@ def welch_biases(
                     bias=bias,
                     bias_std=bias_std,
                     significant=abs(bias) > significance_limit * bias_std,
-                    at_bounds=sum(parameter_name in fit.at_bounds for fit in welch_fits),
+                    at_bounds=sum(parameter_name in model.fit.at_bounds for model in welch_models),
                 )
             )
         biases.append(
@@ -152,7 +154,7 @@ def welch_biases(
                 structure,
                 weighting,
                 tuple(parameters),
-                _mean_or_nan([fit.indices.wmse for fit in welch_fits if fit.indices]),
+                _mean_or_nan([model.indices.wmse for model in welch_models]),
                 _mean_or_nan(
                     [
                         record_estimate.indices.wmse

@@ -1,4 +1,4 @@
-"""Sentences of a campaign's verdict: whether the sessions are of one specimen, and its damping."""
+"""Sentences of a campaign's verdict on the damping of its specimen."""
 
 from __future__ import annotations
 
@@ -6,21 +6,19 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns._experiment import differing_fact_keys, fact_text
 from analysis.campaigns._statistics import PAPER_BEST_MODELS
 from analysis.campaigns._welch_bias import LARGEST_MISFIT
+from analysis.campaigns.labels import first_few, label, probability
 from analysis.identify.sentences import LOSS_NAMES
 from analysis.models import STRUCTURES
 from analysis.statistics import student_t_quantile
-from rigd.beam import COEFFICIENT_OF, PARAMETERS
+from rigd.beam import COEFFICIENT_OF
 from rigd.printable import listed
 from rigd.units import decimals, to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from analysis.campaigns._experiment import StatedSpecimen
-    from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, SessionValues
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._validation import FailedPrediction, LeaveOneOutResult
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
@@ -28,258 +26,6 @@ if TYPE_CHECKING:
     from analysis.identify.headline import ReportedLossFactor
     from analysis.identify.profile_likelihood import OrderName
 
-
-# Names and numbers
-
-_CLEARER_NAMES: Final = {"delay_s": "delay of the torque", "tool_inertia_kg_m2": "tool inertia"}
-"""Names shown for parameters whose symbol alone is not clear."""
-_FINER_UNITS: Final = {"bending_stiffness_n_m2": ("1e-3 N·m²", 1e3)}
-"""Display unit and factor of parameters that need more digits here than for a single session."""
-_SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-"""Translation of the digits and the minus sign of an exponent to superscripts."""
-
-_SMALLEST_P_VALUE: Final = 1e-99
-"""Smallest p-value that is shown as a number."""
-_MODE_QUANTITIES: Final = {
-    "frequency_hz": ("frequency", 1.0, "Hz"),
-    "damping_ratio": ("damping ratio", 100.0, "%"),
-}
-"""Name, display factor and display unit of each quantity of a mode."""
-
-
-def label(quantity: str) -> tuple[str, float, str]:
-    """Return the symbol or name, the display factor and the display unit of a quantity.
-
-    The quantity is a parameter, or ``frequency_hz_N`` or ``damping_ratio_N`` of mode N. A value
-    times the factor is in the display unit.
-    """
-    if quantity in PARAMETERS:
-        definition = PARAMETERS[quantity]
-        display_unit, display_factor = _FINER_UNITS.get(
-            quantity, (definition.display_unit, definition.display_factor)
-        )
-        power_text, _, unit_rest = display_unit.partition(" ")
-        if power_text.startswith("1e"):
-            display_unit = f"10{power_text.removeprefix('1e').translate(_SUPERSCRIPTS)} {unit_rest}"
-        return (
-            _CLEARER_NAMES.get(quantity, definition.symbol),
-            display_factor,
-            "" if display_unit == "1" else display_unit,
-        )
-    quantity_name, mode_number = quantity.rsplit("_", 1)
-    mode_quantity, display_factor, display_unit = _MODE_QUANTITIES[quantity_name]
-    return f"{mode_quantity} of mode {mode_number}", display_factor, display_unit
-
-
-def symbol_with_unit(quantity: str) -> str:
-    """Return the symbol or name of a quantity, followed by its display unit in parentheses.
-
-    Examples
-    --------
-    >>> from analysis.campaigns.sentences import symbol_with_unit
-    >>> symbol_with_unit("zeta"), symbol_with_unit("frequency_hz_2")
-    ('ζ (10⁻⁵ s^α)', 'frequency of mode 2 (Hz)')
-    """
-    symbol, _, display_unit = label(quantity)
-    return f"{symbol} ({display_unit})" if display_unit else symbol
-
-
-def probability(p_value: float) -> str:
-    """Format a p-value, with a lower bound for values that are too small to be shown.
-
-    Examples
-    --------
-    >>> from analysis.campaigns.sentences import probability
-    >>> probability(0.0312), probability(0.0)
-    ('0.031', '< 1e-99')
-    """
-    return f"{p_value:.2g}" if p_value > _SMALLEST_P_VALUE else f"< {_SMALLEST_P_VALUE:g}"
-
-
-def percent(fraction: float) -> str:
-    """Format a fraction as a percentage; a fraction above 99.9 % is not rounded up to 100 %.
-
-    Examples
-    --------
-    >>> from analysis.campaigns.sentences import percent
-    >>> percent(0.4321), percent(0.99999)
-    ('43.2 %', '> 99.9 %')
-    """
-    return "> 99.9 %" if fraction > 0.999 else f"{100 * fraction:.3g} %"
-
-
-# One specimen or several
-
-MIXTURE_MARK: Final = "‡"
-"""Mark of values in tables and figures that are pooled over different specimens."""
-_MIXTURE_TITLE: Final = "of a mixture"
-"""Addition to the title of a table whose values are pooled over different specimens."""
-MIXTURE_NOTE: Final = (
-    f"{MIXTURE_MARK} sessions differ by more than their uncertainties: the mean of a "
-    "mixture, which may be valid for none of them."
-)
-"""Footnote that explains `MIXTURE_MARK`."""
-_MAX_FILES_LISTED: Final = 5
-"""Largest number of file names that a sentence lists."""
-_SLIGHT_FREQUENCY_SCATTER: Final = 2e-3
-"""Relative scatter of a frequency that one beam may show: ten kelvin change the stiffness of steel
-by 0.3 %."""
-
-
-def specimens(homogeneity: Homogeneity) -> list[str]:
-    """Return sentences about different specimens; an empty list if the sessions agree."""
-    sentences = (
-        _describe_stated_specimens(homogeneity.specimens) if len(homogeneity.specimens) > 1 else []
-    )
-    leading_scatter = homogeneity.leading
-    return (
-        sentences
-        if leading_scatter is None
-        else [*sentences, *_describe_different_specimens(homogeneity, leading_scatter)]
-    )
-
-
-def title(text: str, homogeneity: Homogeneity) -> str:
-    """Return the title of a table or figure, with an addition for values of several specimens.
-
-    Parameters
-    ----------
-    text : str
-        Title without the mark.
-    homogeneity : Homogeneity
-        Whether the sessions are of one specimen.
-    """
-    return f"{text}, {_MIXTURE_TITLE}" if homogeneity.mixed else text
-
-
-def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]:
-    """Describe the different specimens that the session files state."""
-    differing_keys = differing_fact_keys(specimens)
-    specimen_texts = "; ".join(
-        ", ".join(
-            f"{key} {fact_text(key, specimen.facts[key])}"
-            for key in differing_keys
-            if key in specimen.facts
-        )
-        + f" in {_list_files(specimen.files)}"
-        for specimen in specimens
-    )
-    first_specimen = ", ".join(
-        f"{key} {fact_text(key, specimens[0].facts[key])}" for key in differing_keys
-    )
-    return [
-        f"The files state {len(specimens)} different specimens: {specimen_texts}. Specimens are "
-        "never "
-        f"pooled: all results below are for {first_specimen}. Analyse the files of the others "
-        "separately, "
-        "or correct the metadata where they are wrong."
-    ]
-
-
-def _describe_different_specimens(
-    homogeneity: Homogeneity, leading_scatter: Heterogeneity
-) -> list[str]:
-    """Describe how the estimates show that the sessions are of different specimens."""
-    other_labels = [
-        label(scatter.quantity)[0]
-        for scatter in homogeneity.quantities
-        if scatter.mixed and not scatter.is_of_rig and scatter is not leading_scatter
-    ]
-    others_sentence = f" The same holds of {', '.join(other_labels)}." if other_labels else ""
-    return [
-        "The sessions are not of one specimen in one state: "
-        f"{_describe_heterogeneity(leading_scatter)}.{others_sentence}",
-        f"{_describe_groups(leading_scatter)} Pooled values are then means of a mixture (marked "
-        f"{MIXTURE_MARK}) that "
-        "may hold for none of the specimens: analyse the sessions of each specimen separately, or "
-        "find what changed between sessions (clamp, temperature, "
-        f"wear).{_small_scatter_remark(homogeneity)}",
-    ]
-
-
-def _small_scatter_remark(homogeneity: Homogeneity) -> str:
-    """Return a remark that the frequencies vary little in relative terms, or an empty text."""
-    frequency_scatters = [
-        scatter for scatter in homogeneity.quantities if scatter.quantity.startswith("frequency_hz")
-    ]
-    mixed_scatters = [scatter for scatter in frequency_scatters if scatter.mixed]
-    if not mixed_scatters or any(
-        scatter.between_std > _SLIGHT_FREQUENCY_SCATTER * scatter.mean for scatter in mixed_scatters
-    ):
-        return ""
-    return (
-        f" Frequencies vary by less than {100 * _SLIGHT_FREQUENCY_SCATTER:g} %, as those of one "
-        "beam may when its "
-        "temperature or clamp changes."
-    )
-
-
-def _describe_heterogeneity(scatter: Heterogeneity) -> str:
-    """Describe the between-session scatter of a quantity, relative to its uncertainty and size."""
-    i_squared_text = percent(scatter.i_squared)
-    equals_sign = "" if i_squared_text.startswith(">") else "= "
-    between_text = _mean_text([scatter.between_std], scatter)
-    scatter_text = (
-        f"{between_text}, {100 * scatter.between_std / abs(scatter.mean):.2g} %; "
-        if scatter.mean
-        else ""
-    )
-    return (
-        f"{label(scatter.quantity)[0]} varies between sessions by "
-        f"{scatter.between_std_in_own_stds:.3g} of its own "
-        f"standard deviations ({scatter_text}Cochran's Q = {scatter.cochran_q:.3g} where "
-        f"{scatter.degrees_of_freedom} is expected, I² {equals_sign}{i_squared_text})"
-    )
-
-
-def _describe_groups(scatter: Heterogeneity) -> str:
-    """Describe the groups of sessions, or the sessions of lowest and highest value."""
-    quantity_label, _, _ = label(scatter.quantity)
-    values_by_file = {
-        file_name: (session_value, std) for file_name, session_value, std in scatter.values
-    }
-    if scatter.groups:
-        groups_text = "; ".join(
-            f"{_mean_text([values_by_file[file_name][0] for file_name in group], scatter)} in "
-            f"{_list_files(group)}"
-            for group in scatter.groups
-        )
-        return f"By the {quantity_label} they are {len(scatter.groups)} groups: {groups_text}."
-    low, high = _extreme_sessions(scatter.values)
-    return (
-        f"There are no clear groups: the {quantity_label} goes from "
-        f"{_mean_text([low[1]], scatter)} in {low[0]} "
-        f"to {_mean_text([high[1]], scatter)} in {high[0]}."
-    )
-
-
-def _extreme_sessions(
-    session_values: SessionValues,
-) -> tuple[tuple[str, float, float], tuple[str, float, float]]:
-    """Return the entries of the sessions with the lowest and the highest value."""
-    sorted_entries = sorted(session_values, key=lambda entry: entry[1])
-    return sorted_entries[0], sorted_entries[-1]
-
-
-def _mean_text(session_values: Sequence[float], scatter: Heterogeneity) -> str:
-    """Format the mean of values with its unit, and enough digits to distinguish the groups."""
-    _, factor, display_unit = label(scatter.quantity)
-    digits = min(decimals(factor * max(scatter.between_std, 1e-300)), 9)
-    separator = "·" if display_unit.startswith("10") else " "
-    return f"{factor * float(np.mean(session_values)):.{digits}f}{separator}{display_unit}".rstrip()
-
-
-def _list_files(file_names: Sequence[str]) -> str:
-    """Return the number of files and the names of the first few."""
-    listed_names = ", ".join(file_names[:_MAX_FILES_LISTED]) + (
-        f" and {len(file_names) - _MAX_FILES_LISTED} more"
-        if len(file_names) > _MAX_FILES_LISTED
-        else ""
-    )
-    return f"{len(file_names)} file{'' if len(file_names) == 1 else 's'} ({listed_names})"
-
-
-# Verdict
 
 _DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
 """Name of the damping whose order each parameter is."""
@@ -669,18 +415,11 @@ def describe_dissent(
     """
     if not sessions:
         return []
-    session_texts = ", ".join(
-        f"{file_name} (type {structure})" for file_name, structure in sessions[:_MAX_FILES_LISTED]
-    )
-    more_text = (
-        f" and {len(sessions) - _MAX_FILES_LISTED} more"
-        if len(sessions) > _MAX_FILES_LISTED
-        else ""
-    )
+    session_texts = [f"{file_name} (type {structure})" for file_name, structure in sessions]
     return [
         f"Type {lowest_bic_estimate.name} is excluded by {len(sessions)} single "
         f"session{'s' if len(sessions) > 1 else ''}: "
-        f"{session_texts}{more_text}. Check their reports (analyze --each) before relying on the "
+        f"{first_few(session_texts)}. Check their reports (analyze --each) before relying on the "
         "mean."
     ]
 
@@ -771,20 +510,12 @@ def failed_predictions(lost_sessions: Sequence[FailedPrediction], requested: int
     """
     if not lost_sessions:
         return []
-    reasons_text = "; ".join(
-        f"{lost_trial.path.name}: {lost_trial.reason}"
-        for lost_trial in lost_sessions[:_MAX_FILES_LISTED]
-    )
-    more_text = (
-        f"; and {len(lost_sessions) - _MAX_FILES_LISTED} more"
-        if len(lost_sessions) > _MAX_FILES_LISTED
-        else ""
-    )
+    reasons = [f"{lost_trial.path.name}: {lost_trial.reason}" for lost_trial in lost_sessions]
     return [
         f"Of {requested} sessions to be predicted from the others, "
         f"{requested - len(lost_sessions)} "
         f"{'was' if requested - len(lost_sessions) == 1 else 'were'} and {len(lost_sessions)} "
-        f"{'was' if len(lost_sessions) == 1 else 'were'} not ({reasons_text}{more_text}). "
+        f"{'was' if len(lost_sessions) == 1 else 'were'} not ({first_few(reasons, '; ')}). "
         "Prediction errors are averaged over those predicted."
     ]
 

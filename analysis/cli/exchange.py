@@ -352,8 +352,10 @@ def export_model_command(
 def _model_lines(model: LinearModel, source: Path, target: Path) -> list[str]:
     """Return the printed summary of an exported model, one statement per line."""
     state_space, accuracy = model.system, model.accuracy
-    test_status, p_value = model.identified.uniform_beam_test
-    uniformity_text = test_status if p_value is None else f"{test_status}, p = {p_value:.2g}"
+    test = model.identified.uniform_beam_test
+    uniformity_text = test.status
+    if test.p_value is not None:
+        uniformity_text += f", p = {test.p_value:.2g}"
     model_name = "exact beam" if model.kind == "beam" else "modal model"
     relaxation_count = sum(
         model_name.startswith("relaxation") for model_name in state_space.states.names

@@ -162,7 +162,7 @@ class LinearModel:
         """Return remarks for users of the model: doubts, and effects that it leaves out."""
         if self.kind == "modal":
             return self.identified.modal_notes
-        test_status, _ = self.identified.uniform_beam_test
+        test_status = self.identified.uniform_beam_test.status
         doubt_note = (
             ""
             if test_status == PASSED_STATUS
@@ -179,7 +179,7 @@ class LinearModel:
         modal_model = self.identified.modal
         modal_names_and_covariance = self.identified.modal_covariance()
         modal_names, modal_covariance = modal_names_and_covariance or ((), np.zeros((0, 0)))
-        test_status, p_value = self.identified.uniform_beam_test
+        test = self.identified.uniform_beam_test
         n, (p, m) = state_space.order, state_space.d.shape
         stacked_matrices = {
             matrix_name: np.array(
@@ -200,8 +200,8 @@ class LinearModel:
             "format_version": 1,
             "source": self.identified.source,
             "model": self.kind,
-            "uniform_beam_status": test_status,
-            "uniform_beam_p_value": np.nan if p_value is None else p_value,
+            "uniform_beam_status": test.status,
+            "uniform_beam_p_value": np.nan if test.p_value is None else test.p_value,
             "notes": list(self.notes),
             "order": n,
             "A": state_space.a,
@@ -271,7 +271,7 @@ def linear_model(
     LinearModelError, rigd.identified_beam.IdentifiedBeamError
         If the model cannot be realised, or samples are requested without a stated covariance.
     """
-    export_beam = options.beam or identified.uniform_beam_test[0] == PASSED_STATUS
+    export_beam = options.beam or identified.uniform_beam_test.status == PASSED_STATUS
     uncertain_dynamics = identified.beam() if export_beam else identified.modes()
     if options.samples and not uncertain_dynamics.names:
         key = "covariance" if export_beam else "modal_model.covariance"

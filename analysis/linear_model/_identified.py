@@ -18,12 +18,14 @@ from analysis.linear_model._dynamics import (
 )
 from analysis.linear_model._modal_constants import constant_value, with_changed_constants
 from rigd.beam import OFFSET_PREFIX, Plant, parameter_named
+from rigd.estimates import modes_from_json
 from rigd.identified_beam import (
     findings_without_parameter,
-    parameter_values,
+    parameter_estimates,
     read_document,
     select_headline,
 )
+from rigd.session import BeamUniformity, Validity
 from rigd.units import finite_number, is_usable_size
 
 if TYPE_CHECKING:
@@ -85,20 +87,10 @@ class IdentifiedModel:
     band_hz: tuple[float, float]
 
     @property
-    def uniform_beam_test(self) -> tuple[str, float | None]:
-        """Return status and p-value of the test whether a uniform beam predicts the modes.
-
-        The p-value is None if it was not tested.
-        """
-        validity_entry = self.headline.get("validity")
-        uniform_beam_entry = (
-            validity_entry.get("uniform_beam") if isinstance(validity_entry, dict) else None
-        )
-        if not isinstance(uniform_beam_entry, dict):
-            return "not tested", None
-        return str(uniform_beam_entry.get("status", "not tested")), finite_number(
-            uniform_beam_entry.get("p_value")
-        )
+    def uniform_beam_test(self) -> BeamUniformity:
+        """Return the result of the test whether a uniform beam predicts the modes."""
+        validity = Validity.from_document(self.headline.get("validity"))
+        return validity.uniform_beam or BeamUniformity("not tested")
 
     @property
     def modal(self) -> ModalModel | None:
@@ -137,19 +129,15 @@ class IdentifiedModel:
     @property
     def beam_notes(self) -> tuple[str, ...]:
         """Return doubts about the beam parameters, and effects that a linear model leaves out."""
-        parameter_entries = self._beam_part["parameters"]
-        flagged_names = [
-            parameter_name
-            for parameter_name, parameter_entry in parameter_entries.items()
-            if _doubt_about(parameter_entry)
-        ]
+        estimates = parameter_estimates(self.headline_name, self._beam_part["parameters"])
+        flagged_names = [name for name, estimate in estimates.items() if estimate.flag]
         note_texts = (
             [f"flagged by the analysis: {', '.join(flagged_names)}"] if flagged_names else []
         )
         note_texts += [
             f"{parameter_name} is not part of the model: {why}"
             for parameter_name, why in _REASONS_TO_LEAVE_OUT.items()
-            if parameter_name in parameter_entries and parameter_entries[parameter_name]["value"]
+            if parameter_name in estimates and estimates[parameter_name].value
         ]
         effect_entries = self.headline.get("named")
         note_texts += [
@@ -161,13 +149,10 @@ class IdentifiedModel:
     @property
     def modal_notes(self) -> tuple[str, ...]:
         """Return a note on the doubtful modes of the modal model, if there are any."""
-        mode_entries = self.headline.get("modes")
         flagged_modes = [
-            str(mode_entry.get("mode"))
-            for mode_entry in (mode_entries if isinstance(mode_entries, list) else [])
-            if isinstance(mode_entry, dict)
-            and mode_entry.get("source") == "modal"
-            and any(_doubt_about(mode_entry.get(key)) for key in ("frequency_hz", "damping_ratio"))
+            str(mode.number)
+            for mode in modes_from_json(self.headline.get("modes"))
+            if mode.source == "modal" and mode.flag
         ]
         return (
             (f"flagged by the analysis: mode {', '.join(flagged_modes)}",) if flagged_modes else ()
@@ -195,7 +180,8 @@ class IdentifiedModel:
         LinearModelError
             If the length or the covariance cannot be used.
         """
-        beam_values = parameter_values(self.headline_name, self._beam_part["parameters"])
+        estimates = parameter_estimates(self.headline_name, self._beam_part["parameters"])
+        beam_values = {name: estimate.value for name, estimate in estimates.items()}
         length_m = self.length_m
         if length_m is None:
             raise LinearModelError(
@@ -415,11 +401,6 @@ def identify_session(path: Path) -> IdentifiedModel:
         record.beam.length_m,
         _band_hz(list(record_analysis.band_hz)),
     )
-
-
-def _doubt_about(reported_entry: object) -> object:
-    """Return why a reported number is doubtful, or a false value if it is not."""
-    return reported_entry.get("flag") if isinstance(reported_entry, dict) else None
 
 
 def _band_hz(stated_band: object) -> tuple[float, float]:

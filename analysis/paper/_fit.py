@@ -96,6 +96,14 @@ class FrfFit:
     cost: float
     at_bounds: tuple[str, ...]
 
+    @property
+    def std_of_free_parameters(self) -> dict[str, float | None] | None:
+        """Return the standard deviations of all parameters, with None for fixed ones, or None."""
+        if self.std is None:
+            return None
+        free = self.structure.free
+        return {name: std if name in free else None for name, std in self.std.items()}
+
 
 def fit_frf(
     frequency_hz: NDArray[np.float64],

@@ -6,15 +6,16 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from analysis.campaigns import headlines
-from analysis.models import STRUCTURES
 from analysis.report._campaign_tables import all_tables
 from analysis.report._document import versions
 from analysis.report.table import json_rows
 from analysis.results import finite
 
 if TYPE_CHECKING:
-    from analysis.campaigns import CampaignResult, RecordEstimate, SessionAnalysis, WelchFit
-    from analysis.identify import ModeEstimate
+    from analysis.campaigns import CampaignResult, RecordEstimate, SessionAnalysis
+    from analysis.identify import ModeEstimate, RecordFit
+    from analysis.paper import FrfFit
+    from analysis.paper.welch_analysis import FitIndices, FittedModel
 
 
 def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Any]:
@@ -78,8 +79,8 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
                 for session_analysis in campaign.sessions
                 for fit in (
                     *(
-                        _welch_fit_json(session_analysis, welch)
-                        for welch in session_analysis.welch_fits
+                        _welch_fit_json(session_analysis, model)
+                        for model in session_analysis.welch_models
                     ),
                     *(
                         _record_fit_json(session_analysis, estimate)
@@ -111,35 +112,33 @@ def _fit_identity(session: SessionAnalysis, estimator: str, structure_name: str)
     }  # fmt: skip
 
 
-def _welch_fit_json(session: SessionAnalysis, fit: WelchFit) -> dict[str, Any]:
-    """Return the JSON object of the model that is fitted to a session's Welch response."""
-    free_names = STRUCTURES[fit.structure].free
+def _welch_fit_json(session: SessionAnalysis, model: FittedModel) -> dict[str, Any]:
+    """Return the JSON object of a model that is fitted to a session's Welch response."""
+    fit = model.fit
     return {
-        **_fit_identity(session, "welch", fit.structure),
+        **_fit_identity(session, "welch", fit.structure.name),
         "weighting": fit.weighting,
-        "parameters": fit.parameters,
-        "std": fit.std
-        and {
-            parameter_name: parameter_std if parameter_name in free_names else None
-            for parameter_name, parameter_std in fit.std.items()
-        },
-        "cost": fit.cost,
-        "at_bounds": fit.at_bounds,
-        "indices": None if fit.indices is None else asdict(fit.indices),
+        **_fit_values(fit, model.indices),
     }
 
 
 def _record_fit_json(session: SessionAnalysis, estimate: RecordEstimate) -> dict[str, Any]:
     """Return the JSON object of the model that is fitted to a session's whole record."""
-    fit = estimate.fit
     return {
         **_fit_identity(session, "record", estimate.name),
         "candidate": estimate.name,
+        **_fit_values(estimate.fit, estimate.indices),
+    }
+
+
+def _fit_values(fit: FrfFit | RecordFit, indices: FitIndices) -> dict[str, Any]:
+    """Return the keys with the results of a fit."""
+    return {
         "parameters": fit.parameters,
         "std": fit.std_of_free_parameters,
         "cost": fit.cost,
         "at_bounds": fit.at_bounds,
-        "indices": asdict(estimate.indices),
+        "indices": asdict(indices),
     }
 
 

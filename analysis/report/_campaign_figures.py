@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from analysis.campaigns import best_models, group_errors_by_model
-from analysis.campaigns.sentences import MIXTURE_MARK, label, probability, symbol_with_unit, title
+from analysis.campaigns.labels import label, probability, symbol_with_unit
+from analysis.campaigns.specimen_sentences import MIXTURE_MARK, title
 from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._frf_figure import line_styles

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.campaigns import group_errors_by_model
-from analysis.campaigns.sentences import failed_predictions, label
+from analysis.campaigns.labels import label
+from analysis.campaigns.sentences import failed_predictions
 from analysis.report._paper_tables import FIT_NAME_COLUMNS, paper_tables
 from analysis.report._pooled_tables import (
     homogeneity_table,
@@ -156,18 +157,18 @@ def sessions_welch_table(campaign: CampaignResult) -> Table:
     table_rows = [
         {
             "file": str(session.path),
-            "type": fit.structure,
-            "weighting": fit.weighting,
-            **fit.parameters,
-            "cost": fit.cost,
-            "at_bounds": " ".join(fit.at_bounds),
+            "type": model.fit.structure.name,
+            "weighting": model.fit.weighting,
+            **model.fit.parameters,
+            "cost": model.fit.cost,
+            "at_bounds": " ".join(model.fit.at_bounds),
             **{
-                f"nominal_{parameter_name}": parameter_value
-                for parameter_name, parameter_value in asdict(model.indices[session_index]).items()
+                f"nominal_{index_name}": index_value
+                for index_name, index_value in asdict(nominal.indices[session_index]).items()
             },
         }
         for session_index, session in enumerate(campaign.sessions)
-        for fit, model in zip(session.welch_fits, campaign.nominal, strict=True)
+        for model, nominal in zip(session.welch_models, campaign.nominal, strict=True)
     ]
     return _file_only_table("sessions_welch", table_rows)
 

@@ -480,10 +480,7 @@ def _welch_fit_json(
         "free": list(fit.structure.free),
         "parameters": dict(fit.parameters),
         "withheld": sorted(unreported_parameters(fit.structure, unsupported_orders)),
-        # Fixed parameters have no standard deviation: they were not estimated.
-        "std": None
-        if fit.std is None
-        else {name: std if name in fit.structure.free else None for name, std in fit.std.items()},
+        "std": fit.std_of_free_parameters,
         "cost": fit.cost,
         "at_bounds": list(fit.at_bounds),
         "nrmse_percent": response_fit_percent(analysis, model),

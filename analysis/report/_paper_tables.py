@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns import best_models
-from analysis.campaigns.sentences import title
+from analysis.campaigns.specimen_sentences import title
 from analysis.models import STRUCTURES, estimate_text
 from analysis.report.table import (
     NOT_REPORTED_MARK,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns.sentences import title
+from analysis.campaigns.specimen_sentences import title
 from analysis.models import ESTIMATOR_NAMES, STRUCTURES
 from analysis.report import _style as style
 from analysis.report._campaign_figures import (

@@ -6,15 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.campaigns import campaign_estimates, differing_fact_keys, fact_text
-from analysis.campaigns.sentences import (
-    MIXTURE_MARK,
-    MIXTURE_NOTE,
-    label,
-    percent,
-    probability,
-    symbol_with_unit,
-    title,
-)
+from analysis.campaigns.labels import label, percent, probability, symbol_with_unit
+from analysis.campaigns.specimen_sentences import MIXTURE_MARK, MIXTURE_NOTE, title
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.models import STRUCTURES
 from analysis.report.table import (

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Final
 from rich.console import Group
 from rich.text import Text
 
-from analysis.campaigns.sentences import failed_predictions, specimens
+from analysis.campaigns.sentences import failed_predictions
+from analysis.campaigns.specimen_sentences import specimens
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables

@@ -71,10 +71,10 @@ class SessionRecordReader:
         seen_samples: int = 0,
         last_response: LastResponse | None = None,
     ) -> None:
-        self.scene = Scene(session.subject, last_response=last_response)
+        self.scene = Scene(session.description, last_response=last_response)
         self.t_ns = 0
         self.read_duration_s = 0.0
-        self._rate_hz = session.subject.rate_hz
+        self._rate_hz = session.description.rate_hz
         self._seen_samples = seen_samples
         self._readers = {
             topic: _RingReader(ring_buffer, first_record, seen_samples if topic is SAMPLE else 0)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rigd.engine.channels import ChannelSpecs
-from rigd.view import Subject
+from rigd.view import SessionDescription
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class LiveSession:
 
     Attributes
     ----------
-    subject
+    description
         Data of the session for its drawings.
     recording_id
         Identifier of the session in viewers, also for a publisher that replaces this one.
@@ -48,7 +48,7 @@ class LiveSession:
         Folder of its file and of earlier sessions, or None if it is unknown.
     """
 
-    subject: Subject
+    description: SessionDescription
     recording_id: str
     begins: tuple[int, ...]
     folder: Path | None = None

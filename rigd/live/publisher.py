@@ -232,13 +232,13 @@ class _ShownSession:
             shared_state[StateField.LIVE_DROPPED] if seen_samples > first_sample else 0
         )
         self.reader = SessionRecordReader(session, channels, seen_samples, earlier_response)
-        self.backlog = Backlog(round(_MAX_QUEUED_S * session.subject.rate_hz))
+        self.backlog = Backlog(round(_MAX_QUEUED_S * session.description.rate_hz))
         self.has_ended = False
         self.supervisor_lost = False
         self._health_reader = HealthReader(channels)
         self._state_reader = SessionStateReader(channels)
         self._unsent_samples = 0
-        session_folder, session_name = session.folder, session.subject.name
+        session_folder, session_name = session.folder, session.description.name
         self._quick_look_path = (
             None
             if session_folder is None
@@ -444,7 +444,7 @@ def last_response(
     LastResponse or None
         Response for comparison, or None if there is none.
     """
-    specimen = session.subject.specimen
+    specimen = session.description.specimen
     if shown_response is not None and shown_response.specimen != specimen:
         shown_response = None
     if session.folder is None:
@@ -452,7 +452,7 @@ def last_response(
     newest_pair = last_quick_look(
         session.folder,
         specimen,
-        excluded_session=session.subject.name,
+        excluded_session=session.description.name,
         is_usable=itemgetter("response"),
     )
     if newest_pair is None:

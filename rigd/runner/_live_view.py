@@ -24,7 +24,7 @@ from rigd.runner._worker_client import WorkerClient
 from rigd.runner.request import SessionOrder
 from rigd.runtime import StopRequest
 from rigd.sweep_response import sweep_ticks
-from rigd.view import Subject, linear_sweep_band_hz
+from rigd.view import SessionDescription, linear_sweep_band_hz
 from rigd.view.plots import BUS_PLOT_COMPONENTS, REAL_TIME_PLOT_COMPONENTS
 
 _ADDRESS_TIMEOUT_S = 10.0
@@ -63,7 +63,7 @@ class LiveViewClient(WorkerClient):
         self._wait(lambda: self._is_ready, _ADDRESS_TIMEOUT_S, is_not_stopped)
         start_positions = tuple(ring.written_count for ring in self._group.channels.rings)
         self._session = LiveSession(
-            subject_of(order, fast=self._fast),
+            describe_planned_session(order, fast=self._fast),
             str(uuid.uuid4()),
             start_positions,
             order.path.parent,
@@ -124,7 +124,7 @@ class LiveViewClient(WorkerClient):
         self.address = None
 
 
-def subject_of(order: SessionOrder, *, fast: bool = False) -> Subject:
+def describe_planned_session(order: SessionOrder, *, fast: bool = False) -> SessionDescription:
     """Return the data of a session that the live view shows, such as beam, sweep and limits."""
     rig_parameters, excitation = order.profile.rig, order.excitation
     absent_plots: set[str] = set()
@@ -132,7 +132,7 @@ def subject_of(order: SessionOrder, *, fast: bool = False) -> Subject:
         absent_plots |= BUS_PLOT_COMPONENTS
     if fast:
         absent_plots |= REAL_TIME_PLOT_COMPONENTS
-    return Subject(
+    return SessionDescription(
         name=order.path.stem,
         rate_hz=rig_parameters.rate_hz,
         ticks=excitation.reference_rad.size,

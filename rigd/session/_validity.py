@@ -53,9 +53,11 @@ class BeamUniformity:
         document
             Value of the key ``uniform_beam`` of a document from any source.
         """
-        if not isinstance(document, Mapping) or document.get("status") not in _UNIFORM_BY_STATUS:
+        if not isinstance(document, Mapping):
             return None
-        test_status, p_value = str(document["status"]), finite_number(document.get("p_value"))
+        test_status, p_value = str(document.get("status")), finite_number(document.get("p_value"))
+        if test_status not in _UNIFORM_BY_STATUS:
+            return None
         if test_status == _NOT_TESTED:
             return cls(test_status)
         return None if p_value is None or not 0.0 <= p_value <= 1.0 else cls(test_status, p_value)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
     from rerun import RecordingStream
 
-    from rigd.view._session_info import Subject
+    from rigd.view._session_info import SessionDescription
 
 Records = npt.NDArray[Any]
 """Structured array of samples, shape (n,)."""
@@ -94,23 +94,23 @@ class Antenna:
 
     Parameters
     ----------
-    subject
+    session
         The session.
     """
 
-    def __init__(self, subject: "Subject") -> None:
-        damping = subject.damping or _assumed_damping(subject.beam)
-        self._filter = DeflectionFilter(subject.beam, damping, subject.rate_hz)
-        self._rate_hz = subject.rate_hz
-        self._length_m = subject.beam.length_m
-        self._shape_ticks = max(1, round(subject.rate_hz / _SHAPE_HZ))
-        shape_hz = subject.rate_hz / self._shape_ticks
+    def __init__(self, session: "SessionDescription") -> None:
+        damping = session.damping or _assumed_damping(session.beam)
+        self._filter = DeflectionFilter(session.beam, damping, session.rate_hz)
+        self._rate_hz = session.rate_hz
+        self._length_m = session.beam.length_m
+        self._shape_ticks = max(1, round(session.rate_hz / _SHAPE_HZ))
+        shape_hz = session.rate_hz / self._shape_ticks
         self._shapes_per_drawing = math.ceil(shape_hz / DRAWN_HZ)
         self._shapes_per_label = math.ceil(shape_hz / _LABEL_HZ)
         self._shape_count = 0
         trail_shapes = max(1, round(shape_hz * TRAIL_S))
         self._tips_m: collections.deque[float] = collections.deque(maxlen=trail_shapes)
-        self._to_scale = subject.excitation in _UNSCALED_EXCITATIONS
+        self._to_scale = session.excitation in _UNSCALED_EXCITATIONS
         self._newest: tuple[int, Real] | None = None  # tick, time and angle of the newest sample
         self._waiting: Real = np.zeros((0, 2))  # times and angles since the last shape
         self._trail: list[_TimedLines] = []  # lines that are not sent yet

@@ -22,7 +22,7 @@ from rigd.view._scene import Scene
 from rigd.view._session_info import (
     Health,
     Note,
-    Subject,
+    SessionDescription,
     linear_sweep_band_hz,
     outcome_note,
 )
@@ -51,9 +51,9 @@ _ATTACHMENTS_WITH_DAMPING: Final = ("specimen.toml", "profile.toml")
 """Attachments of a session file that may state the nominal damping; the first that does is used."""
 
 
-def subject_of_session(
+def describe_recorded_session(
     session: Session, tick_timings: Records | None = None, *, has_fit: bool = False
-) -> Subject:
+) -> SessionDescription:
     """Return the description of a recorded session that its views need.
 
     A stopped session is shown with its planned length, as it was live. If the file states no
@@ -91,7 +91,7 @@ def subject_of_session(
         session.attachments.get(attachment_name, b"")
         for attachment_name in _ATTACHMENTS_WITH_DAMPING
     ]
-    return Subject(
+    return SessionDescription(
         name=session.metadata.get("id") or session.path.stem,
         rate_hz=_number_in_range(session, "rate_hz", 1.0, 1e5),
         ticks=max(end_tick, *(segment_end for _, segment_end in session.segments.values()), 0),
@@ -178,12 +178,13 @@ def draw_session(
     Raises
     ------
     SessionError
-        As `subject_of_session` does.
+        As `describe_recorded_session` does.
     """
     fit_document = fit_of(session.outcome)
-    subject = subject_of_session(session, tick_timings, has_fit=fit_document is not None)
+    description = describe_recorded_session(session, tick_timings, has_fit=fit_document is not None)
     scene = Scene(
-        subject, lambda: recorded_blueprint(front_tabs, subject.absent, fit_modes=subject.fit_modes)
+        description,
+        lambda: recorded_blueprint(front_tabs, description.absent, fit_modes=description.fit_modes),
     )
     outcome_document = session.outcome or {}
     banner_state = ended(
@@ -204,7 +205,7 @@ def draw_session(
     recorded_samples = session.samples
     faulty_tick_counts = np.zeros(3, np.int64)
     drawn_samples, last_tick = 0, -1
-    block_ticks = max(1, round(_BLOCK_S * subject.rate_hz))
+    block_ticks = max(1, round(_BLOCK_S * description.rate_hz))
     for sample_block, block_timings in _blocks(recorded_samples, tick_timings, block_ticks):
         drawn_samples += len(sample_block)
         faulty_tick_counts += _count_faulty_ticks(sample_block, last_tick)

@@ -18,7 +18,7 @@ from rigd.view._layout import TIME_VIEWS, Scale, blueprint, fit_views
 from rigd.view._session_info import (
     Health,
     Note,
-    Subject,
+    SessionDescription,
     health_record,
     send_note,
     send_recent,
@@ -35,7 +35,7 @@ from rigd.view.plots import HEALTH, READINGS, SIGNALS, Drawing, Source, send_col
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-    from rigd.view._session_info import Health, Note, Subject
+    from rigd.view._session_info import Health, Note, SessionDescription
 
 Records = npt.NDArray[Any]
 """Structured array of samples, timings or other records of a session, shape (n,)."""
@@ -59,7 +59,7 @@ class Scene:
 
     Parameters
     ----------
-    subject
+    session
         The session.
     make_layout
         Function that returns the layout of the window; None: the layout of the live view.
@@ -69,49 +69,49 @@ class Scene:
 
     def __init__(
         self,
-        subject: Subject,
+        session: SessionDescription,
         make_layout: "Callable[[], rrb.Blueprint] | None" = None,
         last_response: LastResponse | None = None,
     ) -> None:
-        self._subject = subject
-        with_target_std = subject.excitation == "until"
+        self._session = session
+        with_target_std = session.excitation == "until"
         self._layout = make_layout or partial(
             blueprint,
-            absent_components=subject.absent,
-            fit_modes=subject.fit_modes,
+            absent_components=session.absent,
+            fit_modes=session.fit_modes,
             with_target_std=with_target_std,
         )
-        last_hz = min(LAST_HZ, subject.rate_hz / 2)
-        self._antenna = Antenna(subject)
-        self._response = SweepResponse(subject.sweep, subject.rate_hz, last_hz)
-        self.response_charts = ResponseCharts(subject, last_response)
+        last_hz = min(LAST_HZ, session.rate_hz / 2)
+        self._antenna = Antenna(session)
+        self._response = SweepResponse(session.sweep, session.rate_hz, last_hz)
+        self.response_charts = ResponseCharts(session, last_response)
         self._response_is_final = False
         self._spectrogram = RunningSpectrogram(
-            subject.rate_hz, step_s=_SPECTROGRAM_STEP_S, last_hz=last_hz
+            session.rate_hz, step_s=_SPECTROGRAM_STEP_S, last_hz=last_hz
         )
         self._spectrogram_chart = SpectrogramChart(
-            subject, self._spectrogram.frequency_hz, _SPECTROGRAM_STEP_S
+            session, self._spectrogram.frequency_hz, _SPECTROGRAM_STEP_S
         )
         self._columns: list[tuple[float, npt.NDArray[Any]]] = []
         self._notes: collections.deque[Note] = collections.deque(maxlen=_MAX_STORED_NOTES)
         self._touches: dict[int, list[Drawing]] = {}
         self._charts_due = _PeriodicTimer(_CHART_UPDATE_PERIOD_S)
-        self._samples = _BlockBuffer(subject.rate_hz)
-        self._timings = _BlockBuffer(subject.rate_hz)
+        self._samples = _BlockBuffer(session.rate_hz)
+        self._timings = _BlockBuffer(session.rate_hz)
         self._scales = {
             record_source: Scale(record_source, TIME_VIEWS)
             for record_source in (SIGNALS, READINGS, HEALTH)
         }
         # An empty record first: a view reports missing components as errors.
-        self._fits = [fit_record(None, subject.fit_modes or 0)]
+        self._fits = [fit_record(None, session.fit_modes or 0)]
         self._fit: Mapping[str, Any] | None = None
         self._fit_source: Source | None = None
-        if subject.fit_modes:
+        if session.fit_modes:
             record_source = self._fit_source = fit_source(
-                subject.fit_modes, with_target_std=with_target_std
+                session.fit_modes, with_target_std=with_target_std
             )
             self._scales[record_source] = Scale(record_source, fit_views(record_source))
-        self._gauges = Gauges(subject.rate_hz, subject.limits, subject.thermal_time_constant_s)
+        self._gauges = Gauges(session.rate_hz, session.limits, session.thermal_time_constant_s)
         self._peaks: dict[str, Gauge] = {}
         self._peaks_are_drawn = False
         self._state, self._health, self._health_ns = preparing(), Health(), 0
@@ -120,11 +120,11 @@ class Scene:
     @property
     def last_response(self) -> LastResponse | None:
         """Frequency response of this session so far, to compare a later session with."""
-        return self.response_charts.as_last_response(self._subject)
+        return self.response_charts.as_last_response(self._session)
 
     def frame(self) -> list[Drawing]:
         """Return functions that draw the whole window for a newly connected viewer."""
-        session_name = self._subject.name
+        session_name = self._session.name
         return [
             lambda stream: stream.send_recording_name(session_name),
             lambda stream: stream.send_blueprint(self._layout()),
@@ -179,7 +179,7 @@ class Scene:
     def fit(self, fit_document: Mapping[str, Any]) -> list[Drawing]:
         """Return functions that draw a fit (JSON document) of the record so far."""
         self._fit = fit_document
-        self._fits.append(fit_record(fit_document, self._subject.fit_modes or 0))
+        self._fits.append(fit_record(fit_document, self._session.fit_modes or 0))
         return self._draw_fits(self._fits[-1])
 
     def state(self, t_ns: int, banner_state: BannerState) -> list[Drawing]:
@@ -210,7 +210,7 @@ class Scene:
         self._health, self._health_ns = health_reading, t_ns
         drawings: list[Drawing] = [
             *self._plot(HEALTH, health_record(t_ns, health_reading)),
-            partial(send_summary, subject=self._subject, t_ns=t_ns, health=health_reading),
+            partial(send_summary, session=self._session, t_ns=t_ns, health=health_reading),
             *self._draw_banner(),
         ]
         self._peaks_are_drawn = True
@@ -226,7 +226,7 @@ class Scene:
 
     def _draw_fits(self, fit_records: Records) -> list[Drawing]:
         """Return functions that draw records of fits and the table of the last fit."""
-        if self._subject.fit_modes is None:
+        if self._session.fit_modes is None:
             return []
         record_source = self._fit_source
         plot_drawings = [] if record_source is None else self._plot(record_source, fit_records)
@@ -257,12 +257,12 @@ class Scene:
 
     def _draw_banner(self) -> list[Drawing]:
         """Return functions that draw the session's state and its gauges."""
-        subject, t_ns, health_reading = self._subject, self._health_ns, self._health
-        gauge_of_missed_ticks = banner.missed_gauge(subject, t_ns, health_reading)
+        session, t_ns, health_reading = self._session, self._health_ns, self._health
+        gauge_of_missed_ticks = banner.missed_gauge(session, t_ns, health_reading)
         return [
             partial(
                 banner.send_banner,
-                subject=subject,
+                session=session,
                 state=self._state,
                 t_ns=t_ns,
                 health=health_reading,

@@ -32,7 +32,7 @@ _LEVEL_PREFIXES: Final = {"warning": "⚠ ", "error": "⚠ **ERROR** ", "fatal":
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
+class SessionDescription:
     """Description of a session that its views need: length, beam, limits and excitation.
 
     Attributes
@@ -278,10 +278,10 @@ def plain(text: str) -> str:
     return escaped_text.replace("\n", "  \n")
 
 
-def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
+def summary(session: "SessionDescription", t_ns: int, health: "Health") -> str:
     """Return a Markdown table of the session's progress and health, without unknown values."""
     elapsed_s = 1e-9 * t_ns
-    total_s = subject.ticks / subject.rate_hz
+    total_s = session.ticks / session.rate_hz
     table_rows = [
         ("rate", _number_text(health.rate_hz, "{:.1f} Hz"), True),
         ("missed ticks", _number_text(health.missed_ticks), not health.missed_ticks),
@@ -304,13 +304,13 @@ def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
 
 
 def send_summary(
-    stream: "RecordingStream", subject: "Subject", t_ns: int, health: "Health"
+    stream: "RecordingStream", session: "SessionDescription", t_ns: int, health: "Health"
 ) -> None:
     """Send the table of the session's health to Rerun, for a time of the session."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    summary_text = summary(subject, t_ns, health)
+    summary_text = summary(session, t_ns, health)
     stream.log(SUMMARY_ENTITY, rr.TextDocument(summary_text, media_type=rr.MediaType.MARKDOWN))
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
     from rerun import RecordingStream
 
-    from rigd.view._session_info import Health, Subject
+    from rigd.view._session_info import Health, SessionDescription
 
 STATE_ENTITY: Final = "/state"
 """Entity path in Rerun of the text with the session's state."""
@@ -110,12 +110,12 @@ def ended(outcome_name: str, end_reason: str) -> BannerState:
 # State in words
 
 
-def banner(subject: "Subject", state: BannerState, t_ns: int, health: "Health") -> str:
+def banner(session: "SessionDescription", state: BannerState, t_ns: int, health: "Health") -> str:
     """Return the banner's text as Markdown: state, remaining time, reason and excitation.
 
     Parameters
     ----------
-    subject
+    session
         The session.
     state
         State of the session.
@@ -124,8 +124,8 @@ def banner(subject: "Subject", state: BannerState, t_ns: int, health: "Health") 
     health
         Health reading at that time.
     """
-    remaining_s = subject.ticks / subject.rate_hz - 1e-9 * t_ns
-    heading = f"# {'Recorded: ' if subject.recorded else ''}{state.word}"
+    remaining_s = session.ticks / session.rate_hz - 1e-9 * t_ns
+    heading = f"# {'Recorded: ' if session.recorded else ''}{state.word}"
     if state is RUNNING and remaining_s > 0.0:
         heading += f" · {math.ceil(remaining_s)} s left"
     banner_lines = [heading]
@@ -134,26 +134,30 @@ def banner(subject: "Subject", state: BannerState, t_ns: int, health: "Health") 
             f"**{plain(state.reason)}**" if state.color == RED else plain(state.reason)
         )
     if not state.over and health.missed_ticks:
-        missed_percent = 100.0 * health.missed_ticks / max(1e-9 * t_ns * subject.rate_hz, 1.0)
+        missed_percent = 100.0 * health.missed_ticks / max(1e-9 * t_ns * session.rate_hz, 1.0)
         banner_lines.append(
             f"Computer overloaded: {health.missed_ticks:.0f} ticks missed ({missed_percent:.2g} %)."
         )
-    excitation_text = f"**{plain(subject.excitation or 'session')}**"
-    if subject.sweep_hz is not None:
-        start_hz, stop_hz = subject.sweep_hz
-        back_sweep_text = "" if subject.back is None else f" → {start_hz:g}"
+    excitation_text = f"**{plain(session.excitation or 'session')}**"
+    if session.sweep_hz is not None:
+        start_hz, stop_hz = session.sweep_hz
+        back_sweep_text = "" if session.back is None else f" → {start_hz:g}"
         excitation_text += f" {start_hz:g} → {stop_hz:g}{back_sweep_text} Hz"
-    sweep_tick = round(1e-9 * t_ns * subject.rate_hz)
-    if not state.over and (frequency_hz := subject.frequency_hz(sweep_tick)) is not None:
+    sweep_tick = round(1e-9 * t_ns * session.rate_hz)
+    if not state.over and (frequency_hz := session.frequency_hz(sweep_tick)) is not None:
         excitation_text += f", now **{frequency_hz:.3g} Hz**"
-    if subject.specimen:
-        excitation_text += f", specimen **{plain(subject.specimen)}**"
-    banner_lines.append(f"{excitation_text}, session {plain(subject.name)}")
+    if session.specimen:
+        excitation_text += f", specimen **{plain(session.specimen)}**"
+    banner_lines.append(f"{excitation_text}, session {plain(session.name)}")
     return "\n\n".join(banner_lines)
 
 
 def send_banner(
-    stream: "RecordingStream", subject: "Subject", state: BannerState, t_ns: int, health: "Health"
+    stream: "RecordingStream",
+    session: "SessionDescription",
+    state: BannerState,
+    t_ns: int,
+    health: "Health",
 ) -> None:
     """Send the banner's text to Rerun, for a time of the session.
 
@@ -161,7 +165,7 @@ def send_banner(
     ----------
     stream
         Recording to send to.
-    subject
+    session
         The session.
     state
         State of the session.
@@ -173,7 +177,7 @@ def send_banner(
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    banner_text = banner(subject, state, t_ns, health)
+    banner_text = banner(session, state, t_ns, health)
     stream.log(STATE_ENTITY, rr.TextDocument(banner_text, media_type=rr.MediaType.MARKDOWN))
 
 
@@ -209,22 +213,22 @@ _GAUGE_LABELS: Final = {
 """Labels of the gauges by signal name: first the left column, then the right one."""
 
 
-def missed_gauge(subject: "Subject", t_ns: int, health: "Health") -> Gauge:
+def missed_gauge(session: "SessionDescription", t_ns: int, health: "Health") -> Gauge:
     """Return the gauge of missed ticks, in percent of the ticks so far, with its limit.
 
     Parameters
     ----------
-    subject
+    session
         The session.
     t_ns
         Time since the start of the session.
     health
         Health reading at that time.
     """
-    scheduled_ticks = max(1e-9 * t_ns, 10.0) * subject.rate_hz
+    scheduled_ticks = max(1e-9 * t_ns, 10.0) * session.rate_hz
     missed_ticks = health.missed_ticks
     missed_percent = None if missed_ticks is None else 100.0 * missed_ticks / scheduled_ticks
-    return Gauge(missed_percent, subject.limits.get("missed"), "%")
+    return Gauge(missed_percent, session.limits.get("missed"), "%")
 
 
 def gauge_text(gauge_label: str, gauge: Gauge) -> str:

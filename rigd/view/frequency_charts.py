@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
     from rigd.spectral import FrequencyResponse, RunningEstimate
-    from rigd.view._session_info import Subject
+    from rigd.view._session_info import SessionDescription
 
 
 Real = npt.NDArray[np.float64]
@@ -128,20 +128,22 @@ class ResponseCharts:
 
     Parameters
     ----------
-    subject
+    session
         The session.
     last_response
         Response of the last session of the specimen, which is drawn beneath the present one; None
         if there is none.
     """
 
-    def __init__(self, subject: "Subject", last_response: LastResponse | None = None) -> None:
+    def __init__(
+        self, session: "SessionDescription", last_response: LastResponse | None = None
+    ) -> None:
         frequency_hz, model_response = nominal_response(
-            subject.beam, subject.damping or _ASSUMED_DAMPING, subject.tool_inertia_kg_m2
+            session.beam, session.damping or _ASSUMED_DAMPING, session.tool_inertia_kg_m2
         )
         model_db = magnitude_db(model_response)
         magnitude_chart_axis = magnitude_axis(model_db.min() - 3.0, model_db.max() + 6.0)
-        damping_is_known = subject.damping is not None
+        damping_is_known = session.damping is not None
         extra_entries = ((MODEL_ENTRY,) if damping_is_known else ()) + (
             (LAST_SESSION_ENTRY,) if last_response else ()
         )
@@ -174,8 +176,8 @@ class ResponseCharts:
             ),
         )
         self._delays_s = {
-            "input_delay_s": subject.angle_delay_s,
-            "output_delay_s": subject.torque_delay_s,
+            "input_delay_s": session.angle_delay_s,
+            "output_delay_s": session.torque_delay_s,
         }
         decimation = response_decimation(frequency_hz)
         magnitude_strips = decimation.strips(model_db)
@@ -294,19 +296,19 @@ class ResponseCharts:
                 chart.move_shade(stream, name, first_hz, last_hz)
         self.chart(COHERENCE_ENTITY).draw_note(stream, self._note, COHERENCE_ENTRY.color)
 
-    def as_last_response(self, subject: "Subject") -> LastResponse | None:
+    def as_last_response(self, session: "SessionDescription") -> LastResponse | None:
         """Return the newest frequency response for comparison with a later session.
 
         It is None before the first estimate.
 
         Parameters
         ----------
-        subject
+        session
             Session of these charts.
         """
         if self._last_update is None:
             return None
-        return LastResponse(subject.name, subject.specimen, *self._last_update)
+        return LastResponse(session.name, session.specimen, *self._last_update)
 
 
 def _last_response_curves(
@@ -428,7 +430,7 @@ class SpectrogramChart:
 
     Parameters
     ----------
-    subject
+    session
         The session.
     frequency_hz
         Frequencies of the rows in Hz, shape (m,), evenly spaced from 0.
@@ -441,8 +443,8 @@ class SpectrogramChart:
         Axes of the spectrogram.
     """
 
-    def __init__(self, subject: "Subject", frequency_hz: Real, step_s: float) -> None:
-        duration_s = max(subject.ticks / subject.rate_hz, step_s)
+    def __init__(self, session: "SessionDescription", frequency_hz: Real, step_s: float) -> None:
+        duration_s = max(session.ticks / session.rate_hz, step_s)
         self._column_s = max(step_s, duration_s / MAX_COLUMNS)
         column_count = int(np.ceil(duration_s / self._column_s))
         end_s = column_count * self._column_s

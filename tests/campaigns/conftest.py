@@ -12,14 +12,14 @@ from rich.console import Console
 from analysis.campaigns import (
     RecordEstimate,
     SessionAnalysis,
-    WelchFit,
     analyse_session,
     campaign,
 )
 from analysis.campaigns._experiment import Experiment
 from analysis.identify import ModeEstimate, RecordFit, Ringing
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper.welch_analysis import FitIndices, Peak
+from analysis.paper import FrfFit
+from analysis.paper.welch_analysis import FitIndices, FittedModel, Peak
 from rigd.beam import Beam, Damping, Plant
 from rigd.testing import PAPER_BEAM, chirp_signals, write_session
 
@@ -149,7 +149,9 @@ def in_this_process():
 def welch_fit(structure, weighting, at_bounds=(), **free):
     values = {**STRUCTURES[structure].fixed, **{k.rstrip("_"): v for k, v in free.items()}}
     damping = STRUCTURES[structure].damping(values)
-    return WelchFit(structure, weighting, damping, values, 1.0, at_bounds)
+    fit = FrfFit(STRUCTURES[structure], weighting, damping, values, None, 1.0, at_bounds)
+    no_response, indices = np.empty(0, complex), FitIndices(1.0, 1.0, 1.0)
+    return FittedModel(fit, no_response, indices, modes=(), followed=(), peaks=(), deviations=())
 
 
 def record_estimate(structure, values, covariance, determined, at_bounds=(), cost=100.0, bic=0.0):
@@ -196,7 +198,7 @@ def session_result(
         frequency_hz=1.0 + np.arange(response.size),
         response=response,
         peaks=tuple(Peak(*each) if each else None for each in peaks),
-        welch_fits=tuple(fits),
+        welch_models=tuple(fits),
         record_estimates=tuple(estimates),
         verdict=verdict,
         warnings=(),

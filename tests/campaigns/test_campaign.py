@@ -41,8 +41,8 @@ def test_workers_find_what_this_process_finds(done, short_sessions, settings):
     here = analyse_session(short_sessions[2], task)
     there = found.sessions[2]
     assert np.array_equal(here.response, there.response)
-    for one, two in zip(here.welch_fits, there.welch_fits, strict=True):
-        assert one.parameters == pytest.approx(two.parameters, rel=1e-9)
+    for one, two in zip(here.welch_models, there.welch_models, strict=True):
+        assert one.fit.parameters == pytest.approx(two.fit.parameters, rel=1e-9)
     for one, two in zip(here.record_estimates, there.record_estimates, strict=True):
         assert one.fit.parameters == pytest.approx(two.fit.parameters, rel=1e-6, abs=1e-12)
 
@@ -76,9 +76,9 @@ def test_a_left_out_session_has_no_say_in_its_own_forecast(done):
     sessions = list(found.sessions)
     strange = replace(
         sessions[-1],
-        welch_fits=tuple(
-            replace(fit, parameters={k: 9 * v for k, v in fit.parameters.items()})
-            for fit in sessions[-1].welch_fits
+        welch_models=tuple(
+            replace(each, fit=replace(each.fit, parameters=dict.fromkeys(each.fit.parameters, 9.0)))
+            for each in sessions[-1].welch_models
         ),
         record_estimates=tuple(
             replace(each, fit=replace(each.fit, covariance=9 * each.fit.covariance))

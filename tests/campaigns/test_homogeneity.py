@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.campaigns import SessionFailure, campaign
-from analysis.campaigns import sentences as specimen_sentences
+from analysis.campaigns import SessionFailure, campaign, specimen_sentences
 from analysis.report import campaign_document
 from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 from rigd.beam import undamped_frequencies_rad_s

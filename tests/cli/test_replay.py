@@ -28,7 +28,7 @@ from analysis.record import load_record
 from rigd.session import SessionError, SessionWriter, read_session, read_timings
 from rigd.session.layout import SAMPLE_SIZE, TIMING_SIZE, Status, pack_sample_into, pack_timing_into
 from rigd.view import draw_session
-from rigd.view._recorded import subject_of_session
+from rigd.view._recorded import describe_recorded_session
 from rigd.view.frequency_charts import MAGNITUDE_ENTITY, ResponseCharts
 from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
 
@@ -136,7 +136,7 @@ def test_every_sample_is_shown_in_the_units_of_the_plots(paper):
 
 def test_the_frequency_response_grows_with_the_sweep(paper):
     session, found, _ = paper
-    chart = ResponseCharts(subject_of_session(session)).chart(MAGNITUDE_ENTITY)
+    chart = ResponseCharts(describe_recorded_session(session)).chart(MAGNITUDE_ENTITY)
     left, _, right, _ = chart.frame
     first_hz, last_hz = chart.x.first, chart.x.last
     drawn = rows(found[f"{MAGNITUDE_ENTITY}/measured"], "LineStrips2D:strips")
@@ -155,7 +155,7 @@ def test_the_frequency_response_grows_with_the_sweep(paper):
 
 def test_the_last_frequency_response_is_that_of_analyze(paper):
     session, found, _ = paper
-    chart = ResponseCharts(subject_of_session(session)).chart(MAGNITUDE_ENTITY)
+    chart = ResponseCharts(describe_recorded_session(session)).chart(MAGNITUDE_ENTITY)
     left, top, right, bottom = chart.frame
     # All of it, coherent or not.
     *_, (_, strips) = rows(found[f"{MAGNITUDE_ENTITY}/uncertain"], "LineStrips2D:strips")

@@ -12,7 +12,7 @@ from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.engine.processes import ChildError
 from rigd.engine.shared_state import StateField
 from rigd.session import read_session
-from rigd.view._recorded import subject_of_session
+from rigd.view._recorded import describe_recorded_session
 
 SHORT = {
     "excitation": "hold",
@@ -79,13 +79,13 @@ def test_specimen_metadata_and_predictions_of_a_start_stand_in_the_file(
     assert session.number("predicted_peak_tip_slope_rad") == plan["tip"]["slope_rad"]
     assert session.number("limit_torque_nm") == plan["limits"]["torque_nm"]
     assert session.attachments["specimen.toml"].decode() == SPECIMEN
-    assert subject_of_session(session).damping.zeta == 8e-5
+    assert describe_recorded_session(session).damping.zeta == 8e-5
     # The next one that names none has the profile's beam again.
     operated.ask("start", **SHORT)
     session = read_session(operated.last["sessions"][0]["path"])
     assert session.metadata["beam_length_m"] == "0.98"
     assert "specimen.toml" not in session.attachments
-    assert subject_of_session(session).damping.zeta == 7.1e-5
+    assert describe_recorded_session(session).damping.zeta == 7.1e-5
     (tmp_path / "specimens" / "antenna 4.toml").write_text("[beam]")
     refused = operated.ask("start", **SHORT, notes=notes)
     assert str(refused) == "specimens/antenna 4.toml: section [beam] is missing."

@@ -21,7 +21,7 @@ from rigd.engine.shared_state import LogEvent, SharedState, StateField, write_ev
 from rigd.live.address import LiveAddress
 from rigd.live.messages import LiveJob, LiveSession, LiveSessionEnded, LiveSessionShown
 from rigd.session.layout import pack_sample_into, pack_timing_into
-from rigd.view import Subject
+from rigd.view import SessionDescription
 
 RATE_HZ = 1000.0
 BEAM = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
@@ -163,8 +163,10 @@ class Publisher:
         """Have it show a session; `begins` says how many records were written before it."""
         begins = begins or (0,) * len(TOPICS)
         ticks = 120_000
-        subject = Subject(name, RATE_HZ, ticks, (0, ticks), BEAM, Damping(zeta=1e-3), **members)
-        self.send(LiveSession(subject, f"recording of {name}", begins, folder))
+        description = SessionDescription(
+            name, RATE_HZ, ticks, (0, ticks), BEAM, Damping(zeta=1e-3), **members
+        )
+        self.send(LiveSession(description, f"recording of {name}", begins, folder))
         self._hear(LiveSessionShown)
 
     def finish(self, outcome: str = "stopped", reason: str = "The test is over.") -> None:

@@ -13,7 +13,7 @@ from rigd.beam import Beam
 from rigd.engine.shared_state import Phase, StateField, StopReason
 from rigd.live.messages import LiveSession
 from rigd.live.publisher import SessionStateReader, last_response
-from rigd.view import Subject
+from rigd.view import SessionDescription
 from rigd.view.banner import (
     FINISHING,
     RETURNING,
@@ -150,8 +150,10 @@ def own(session: str, specimen: str) -> LastResponse:
 
 def asked(folder: Path | None, specimen: str) -> LiveSession:
     beam = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
-    subject = Subject("20261122-120000-chirp", 1000.0, 10, (0, 10), beam, None, specimen=specimen)
-    return LiveSession(subject, "id", (0,), folder)
+    description = SessionDescription(
+        "20261122-120000-chirp", 1000.0, 10, (0, 10), beam, None, specimen=specimen
+    )
+    return LiveSession(description, "id", (0,), folder)
 
 
 def test_the_newest_quick_look_of_the_specimen_is_taken(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 from shipped_profile import load_shipped
 
 from rigd.excitation import make_excitation
-from rigd.runner._live_view import subject_of
+from rigd.runner._live_view import describe_planned_session
 from rigd.runner.request import SessionOrder
 
 
@@ -26,4 +26,4 @@ def test_plots_are_of_the_modes_that_are_expected_in_the_band(kind, parameters, 
     profile = load_shipped("sim")
     excitation = make_excitation(kind, parameters, profile.rig.rate_hz)
     order = SessionOrder(profile, excitation, Path("a.mcap"), watch_fit=watch_fit)
-    assert subject_of(order).fit_modes == modes
+    assert describe_planned_session(order).fit_modes == modes

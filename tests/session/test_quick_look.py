@@ -69,7 +69,7 @@ def test_a_validity_that_is_none_is_unknown_and_not_good(tmp_path, stated):
 
 @pytest.mark.parametrize(
     "stated",
-    [None, 7, {}, {"status": "perhaps", "p_value": 0.5}, {"status": "passed"},
+    [None, 7, {}, {"status": "perhaps", "p_value": 0.5}, {"status": "passed"}, {"status": []},
      {"status": "refused", "p_value": -1.0}, {"status": "passed", "p_value": "0.5"}],
 )  # fmt: skip
 def test_a_test_of_uniformity_that_is_none_is_unknown(tmp_path, stated):

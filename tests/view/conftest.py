@@ -7,7 +7,7 @@ import pytest
 
 from rigd.beam import Beam, Damping
 from rigd.session.layout import TIMING_SIZE, decode_timings, pack_timing_into
-from rigd.view import Scene, Subject
+from rigd.view import Scene, SessionDescription
 from rigd.view.plots import TIMELINE
 
 
@@ -107,10 +107,10 @@ class _LayoutTaker:
 
 
 @pytest.fixture
-def layout_of(subject):
+def layout_of(description):
     """Return the root of the layout that a scene sends to a new connection."""
 
-    def taken(of=subject):
+    def taken(of=description):
         stream = _LayoutTaker()
         for drawing in Scene(of).frame():
             drawing(stream)
@@ -134,9 +134,9 @@ def make_timings():
 
 
 @pytest.fixture
-def subject():
+def description():
     """The paper's antenna and session."""
-    return Subject(
+    return SessionDescription(
         name="20261121-101500-chirp",
         rate_hz=1000.0,
         ticks=136_000,

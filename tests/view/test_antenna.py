@@ -39,10 +39,10 @@ def blocks(samples, size: int):
 
 
 @pytest.fixture
-def follow(subject, drawn):
+def follow(description, drawn):
     """Feed a scene with blocks of samples; return what it sent, by entity."""
 
-    def run(blocks_of_samples, of=subject):
+    def run(blocks_of_samples, of=description):
         scene = Scene(of)
         drawings = [d for block in blocks_of_samples for d in scene.samples(block)]
         return drawn([*drawings, *scene.finish()])
@@ -55,16 +55,16 @@ def samples(make_samples):
     return make_samples(3000, angle_rad=angle_rad(3000))
 
 
-def test_what_is_drawn_is_the_computed_shape_times_the_factor(subject, samples, follow):
+def test_what_is_drawn_is_the_computed_shape_times_the_factor(description, samples, follow):
     beams = moments(follow(blocks(samples, 50))[BEAM])
     assert len(beams) == 60
-    bends = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
+    bends = DeflectionFilter(description.beam, description.damping, description.rate_hz)
     largest_m = 0.0
     for (t_ns, (line, beam)), block in zip(beams, blocks(samples, 50), strict=True):
         deflection_m = bends.feed(block["angle_rad"])
         largest_m = max(largest_m, abs(deflection_m[-1]))
         assert t_ns == block["t_ns"][-1]
-        length_m = subject.beam.length_m
+        length_m = description.beam.length_m
         np.testing.assert_allclose(beam[:, 0] * length_m, bends.x_m, atol=1e-6)
         # What moves it across the line it rests on: the angle, and what it bends from there.
         np.testing.assert_allclose(
@@ -101,14 +101,14 @@ def last_label(batches):
 
 
 @pytest.mark.parametrize("excitation", ["move", "touch"])
-def test_where_the_motor_goes_far_all_is_drawn_to_scale(subject, samples, drawn, excitation):
-    scene = Scene(dataclasses.replace(subject, excitation=excitation))
+def test_where_the_motor_goes_far_all_is_drawn_to_scale(description, samples, drawn, excitation):
+    scene = Scene(dataclasses.replace(description, excitation=excitation))
     turned = samples.copy()
     turned["angle_rad"] += 1.0
-    bends = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
+    bends = DeflectionFilter(description.beam, description.damping, description.rate_hz)
     for block in blocks(turned, 100):
         sent = drawn(scene.samples(block))
-        deflection = bends.feed(block["angle_rad"]) / subject.beam.length_m
+        deflection = bends.feed(block["angle_rad"]) / description.beam.length_m
         line, beam = moments(sent[BEAM])[-1][1]
         angle_rad = block["angle_rad"][-1]
         assert line[-1] == pytest.approx([np.cos(angle_rad), np.sin(angle_rad), 0.0], abs=1e-6)
@@ -120,10 +120,10 @@ def test_where_the_motor_goes_far_all_is_drawn_to_scale(subject, samples, drawn,
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.01, 0.1, 1.0])
-def test_the_label_tells_the_largest_deflection_of_late(subject, samples, follow, amplitude):
+def test_the_label_tells_the_largest_deflection_of_late(description, samples, follow, amplitude):
     samples["angle_rad"] = amplitude * (samples["angle_rad"] - 0.3)
     last_ns, last = last_label(follow(blocks(samples, 50))[LABEL])
-    bends = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
+    bends = DeflectionFilter(description.beam, description.damping, description.rate_hz)
     tips_m = np.array([abs(bends.feed(block["angle_rad"])[-1]) for block in blocks(samples, 1)])
     lately = (samples["t_ns"] <= last_ns) & (samples["t_ns"] > last_ns - 1e9 * TRAIL_S)
     assert last == label(tips_m[lately][9::10].max())
@@ -169,32 +169,34 @@ def test_after_a_gap_of_hours_it_goes_on_at_once(make_samples, follow):
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 250.0, 4000.0])
-def test_other_rates_are_drawn_at_most_20_times_a_second(rate_hz, subject, make_samples, follow):
+def test_other_rates_are_drawn_at_most_20_times_a_second(
+    rate_hz, description, make_samples, follow
+):
     n = int(10 * rate_hz)
     samples = make_samples(n, angle_rad=0.02 * np.sin(np.arange(n) / rate_hz))
     samples["t_ns"] = np.arange(n) * round(1e9 / rate_hz)
-    of = dataclasses.replace(subject, rate_hz=rate_hz)
+    of = dataclasses.replace(description, rate_hz=rate_hz)
     beams = moments(follow(blocks(samples, 500), of)[BEAM])
     assert 0.85 <= len(beams) / (10 * min(rate_hz, DRAWN_HZ)) <= 1.0
     assert all(np.isfinite(lines).all() for _, lines in beams)
 
 
-def test_without_a_damping_the_beam_swings_on(subject, make_samples, follow):
+def test_without_a_damping_the_beam_swings_on(description, make_samples, follow):
     n = 4000
     step = make_samples(n, angle_rad=np.where(np.arange(n) < 500, 0.0, 0.02))
-    unknown = dataclasses.replace(subject, damping=None)
+    unknown = dataclasses.replace(description, damping=None)
     beams = moments(follow(blocks(step, 50), unknown)[BEAM])
     bends = np.array([lines[1, -1, 1] - lines[0, -1, 1] for _, lines in beams])
     assert np.abs(bends[:9]).max() < 1e-6
     assert 0.5 < np.abs(bends[-20:]).max() / np.abs(bends[10:30]).max() < 1.0
 
 
-def test_nothing_comes_of_nothing(subject, make_samples):
-    assert Scene(subject).samples(make_samples(0)) == []
+def test_nothing_comes_of_nothing(description, make_samples):
+    assert Scene(description).samples(make_samples(0)) == []
 
 
-def test_frame_draws_the_motor_and_how_the_beam_looks(subject, drawn):
-    sent = drawn(Scene(subject).frame())
+def test_frame_draws_the_motor_and_how_the_beam_looks(description, drawn):
+    sent = drawn(Scene(description).frame())
     assert {f"{ANTENNA}/motor", f"{ANTENNA}/positive", BEAM, TRAIL, LABEL} <= sent.keys()
     # Nothing of it moves, so nothing of it has a time.
     of_antenna = [b for entity in sent if entity.startswith(ANTENNA) for b in sent[entity]]
@@ -232,28 +234,30 @@ def values_of(batches, component):
     return times, np.array(batch.column(component).to_pylist()[0])
 
 
-def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(subject, samples, drawn):
-    scene = Scene(subject)
+def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(description, samples, drawn):
+    scene = Scene(description)
     for block in blocks(samples, 100):
         scene.samples(block)
     sent = drawn(scene.touches([TOUCH_AT_2_S]))
     times, (point,) = values_of(sent[f"{TOUCH}/3/point"], "Points3D:positions")
     assert times == [2_012_300_000]
     # The exact shape of that very tick.
-    filter_ = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
+    filter_ = DeflectionFilter(description.beam, description.damping, description.rate_hz)
     deflection_m = filter_.feed(samples["angle_rad"][:2013])
-    place = 0.49 / subject.beam.length_m
-    across = np.interp(0.49, filter_.x_m, deflection_m) / subject.beam.length_m
+    place = 0.49 / description.beam.length_m
+    across = np.interp(0.49, filter_.x_m, deflection_m) / description.beam.length_m
     y = ENLARGEMENT * (samples["angle_rad"][2012] * place + across)
     # Between two drawn shapes, 50 ms apart, it is interpolated.
     assert point == pytest.approx([place, y, 0.0], abs=4e-3)
     _, (interval,) = values_of(sent[f"{TOUCH}/3/interval"], STRIPS)
-    assert interval[:, 0] * subject.beam.length_m == pytest.approx([0.47, 0.51], abs=1e-6)
+    assert interval[:, 0] * description.beam.length_m == pytest.approx([0.47, 0.51], abs=1e-6)
     _, (force,) = values_of(sent[f"{TOUCH}/3/force"], "Arrows3D:vectors")
     _, (origin,) = values_of(sent[f"{TOUCH}/3/force"], "Arrows3D:origins")
-    before = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
+    before = DeflectionFilter(description.beam, description.damping, description.rate_hz)
     then = np.interp(0.49, before.x_m, before.feed(samples["angle_rad"][:1970]))
-    forward = y - ENLARGEMENT * (samples["angle_rad"][1969] * place + then / subject.beam.length_m)
+    forward = y - ENLARGEMENT * (
+        samples["angle_rad"][1969] * place + then / description.beam.length_m
+    )
     assert force[1] * forward < 0
     assert origin + force == pytest.approx(point, abs=1e-6)
     _, labels = values_of(sent[f"{TOUCH}/label"], "Points3D:labels")
@@ -263,12 +267,12 @@ def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(subject, sam
 @pytest.mark.parametrize(
     "changes", [{"x_m": None}, {"time_s": None}, {"time_s": known(0.01, 0.001)}]
 )
-def test_a_touch_of_unknown_place_or_time_is_not_drawn(subject, samples, changes):
-    scene = Scene(subject)
+def test_a_touch_of_unknown_place_or_time_is_not_drawn(description, samples, changes):
+    scene = Scene(description)
     scene.samples(samples)
     assert scene.touches([TOUCH_AT_2_S | changes]) == []
     assert scene.touches([TOUCH_AT_2_S])
 
 
-def test_before_the_beam_is_drawn_there_is_no_place_for_a_touch(subject):
-    assert Scene(subject).touches([TOUCH_AT_2_S]) == []
+def test_before_the_beam_is_drawn_there_is_no_place_for_a_touch(description):
+    assert Scene(description).touches([TOUCH_AT_2_S]) == []

@@ -24,10 +24,14 @@ FAULT = ended("fault", "The disk is full.")
 
 
 @pytest.fixture
-def sweep(subject):
+def sweep(description):
     """The paper's session with all that a banner tells."""
     return replace(
-        subject, excitation="chirp", sweep_hz=(0.05, 50.0), specimen="A_3", limits={"angle": 1.0}
+        description,
+        excitation="chirp",
+        sweep_hz=(0.05, 50.0),
+        specimen="A_3",
+        limits={"angle": 1.0},
     )
 
 
@@ -73,11 +77,11 @@ def test_a_recorded_session_is_not_taken_for_one_that_runs(sweep):
     assert said.startswith("# Recorded: FAULT")
 
 
-def test_only_a_linear_sweep_has_a_frequency(subject, sweep):
+def test_only_a_linear_sweep_has_a_frequency(description, sweep):
     assert sweep.frequency_hz(999) is None
     assert sweep.frequency_hz(1000) == pytest.approx(0.05)
     assert sweep.frequency_hz(121_000) is None
-    assert subject.frequency_hz(5000) is None
+    assert description.frequency_hz(5000) is None
     down = replace(sweep, sweep_hz=(60.0, 50.0))
     assert down.frequency_hz(61_000) == pytest.approx(55.0)
 

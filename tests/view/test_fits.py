@@ -16,9 +16,9 @@ TABLE = "/fit_table"
 
 
 @pytest.fixture
-def fitted(subject):
+def fitted(description):
     """The paper's session as a search, of which the fits of so many modes are plotted."""
-    return lambda modes=3: replace(subject, fit_modes=modes, excitation="until")
+    return lambda modes=3: replace(description, fit_modes=modes, excitation="until")
 
 
 @pytest.fixture
@@ -97,9 +97,9 @@ def test_the_table_says_what_is_reached_and_how_long_it_takes(fit_table):
     assert "doubtful: It depends" in fit_table(online_fit(third="doubtful"))
 
 
-def test_sessions_that_are_fitted_have_a_tab_with_two_plots_of_each_mode(subject, layout_of):
+def test_sessions_that_are_fitted_have_a_tab_with_two_plots_of_each_mode(description, layout_of):
     first, *others = [tab.name for tab in layout_of().contents]
-    layout = layout_of(replace(subject, fit_modes=2))
+    layout = layout_of(replace(description, fit_modes=2))
     assert [tab.name for tab in layout.contents] == [first, "Fit", *others]
     grid, table = layout.contents[1].contents
     assert [view.name for view in grid.contents] == [
@@ -107,7 +107,7 @@ def test_sessions_that_are_fitted_have_a_tab_with_two_plots_of_each_mode(subject
         "Damping ratio of mode 2 (%)", "Frequency of mode 2 (Hz)",
     ]  # fmt: skip
     assert table.origin == TABLE
-    (only,) = layout_of(replace(subject, fit_modes=0)).contents[1].contents
+    (only,) = layout_of(replace(description, fit_modes=0)).contents[1].contents
     assert only.origin == TABLE
 
 
@@ -127,8 +127,8 @@ def test_fits_grow_with_the_session_and_are_all_there_for_new_connections(fitted
     assert (high - low)[1:] == pytest.approx([2 * 2 * 1.96 * 3e-3, 2 * 1.96 * 3e-3])
 
 
-def test_a_session_that_is_not_fitted_draws_none(subject, shown):
-    picture = Scene(subject)
+def test_a_session_that_is_not_fitted_draws_none(description, shown):
+    picture = Scene(description)
     assert picture.fit(online_fit()) == []
     assert TABLE not in shown(picture.frame())
 

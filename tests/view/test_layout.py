@@ -72,7 +72,7 @@ def test_every_plot_has_a_view_with_all_its_curves(time_series):
     assert seen == {plot for source in sources.values() for plot in source.plots}
 
 
-def test_ticks_are_among_the_values_but_not_seen(time_series, subject, shown):
+def test_ticks_are_among_the_values_but_not_seen(time_series, description, shown):
     seen = []
     for view, lines in time_series:
         for entity in {*view.visualizer_overrides} - {view.origin}:
@@ -86,7 +86,7 @@ def test_ticks_are_among_the_values_but_not_seen(time_series, subject, shown):
     # A view complains of what it never got.
     sent = {
         (entity, name)
-        for entity, found in shown(Scene(subject).frame()).items()
+        for entity, found in shown(Scene(description).frame()).items()
         for name in found.values
         if entity.endswith("/ticks")
     }
@@ -105,11 +105,11 @@ def test_plots_show_a_window_up_to_the_cursor(time_series):
     assert windows_s == {2, 10, 60}
 
 
-def test_plots_of_which_nothing_comes_are_left_out(subject, layout_of):
+def test_plots_of_which_nothing_comes_are_left_out(description, layout_of):
     absent = plots.BUS_PLOT_COMPONENTS | plots.REAL_TIME_PLOT_COMPONENTS
     health = {
         view.name
-        for tab in layout_of(replace(subject, absent=absent)).contents
+        for tab in layout_of(replace(description, absent=absent)).contents
         if tab.name == "Health"
         for view in leaves(tab)
     }

@@ -14,7 +14,7 @@ from analysis.paper import estimate
 from analysis.record import load_record
 from rigd.beam import Damping
 from rigd.session import read_session
-from rigd.view import Health, Note, Scene, Subject, draw_session
+from rigd.view import Health, Note, Scene, SessionDescription, draw_session
 from rigd.view.frequency_charts import MAGNITUDE_ENTITY
 
 pytestmark = pytest.mark.process
@@ -32,8 +32,8 @@ def record(path):
     return load_record(path)
 
 
-def subject_of(record) -> Subject:
-    return Subject(
+def description_of(record) -> SessionDescription:
+    return SessionDescription(
         name=record.path.stem,
         rate_hz=record.rate_hz,
         ticks=len(record.time_s),
@@ -52,7 +52,7 @@ def blocks(samples, size=50):
 
 @pytest.mark.further  # charts: test_response_charts.py
 def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, shown):
-    picture = Scene(subject_of(record))
+    picture = Scene(description_of(record))
     for block in blocks(read_session(path).samples):
         picture.samples(block)
     drawings = picture.finish()
@@ -76,8 +76,8 @@ def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, show
     assert points[inside, 1].min() == pytest.approx(at[:, 1].min(), abs=1e-3)
 
 
-def test_everything_has_its_place(subject, make_samples, make_timings, shown):
-    picture = Scene(subject)
+def test_everything_has_its_place(description, make_samples, make_timings, shown):
+    picture = Scene(description)
     frame = picture.frame()
     t_s = np.arange(3000) / 1000.0
     samples = make_samples(3000, angle_rad=0.01 * np.sin(t_s), coupling_torque_nm=0.1)
@@ -112,7 +112,7 @@ def test_everything_has_its_place(subject, make_samples, make_timings, shown):
 
 
 def test_a_new_connection_is_shown_what_is_known_already(path, record, shown):
-    picture = Scene(subject_of(record))
+    picture = Scene(description_of(record))
     for block in blocks(read_session(path).samples[:30_000], 1000):
         picture.samples(block)
     picture.events([Note(1_000_000, "info", "The record begins.")])
@@ -126,8 +126,8 @@ def known(value):
     return {"value": value, "std": 1e-3, "interval_95": [value - 2e-3, value + 2e-3]}
 
 
-def test_touches_stay_on_the_antenna_for_new_connections(subject, make_samples, shown):
-    picture = Scene(subject)
+def test_touches_stay_on_the_antenna_for_new_connections(description, make_samples, shown):
+    picture = Scene(description)
     for block in blocks(make_samples(2000), 100):
         picture.samples(block)
     touch = {"number": 1, "x_m": known(0.4), "time_s": known(1.5), "force_n": None}
@@ -135,7 +135,7 @@ def test_touches_stay_on_the_antenna_for_new_connections(subject, make_samples, 
     picture.touches([touch | {"x_m": known(0.5)}])  # with more data
     found = shown(picture.frame())["/antenna/touch/1/point"]
     ((place,),) = found.values["Points3D:positions"]
-    assert place[0] == pytest.approx(0.5 / subject.beam.length_m)
+    assert place[0] == pytest.approx(0.5 / description.beam.length_m)
 
 
 def test_a_recorded_session_shows_its_touches(touch_file, drawn, make_timings):
@@ -163,8 +163,8 @@ def test_a_recorded_session_shows_its_touches(touch_file, drawn, make_timings):
         further({"ticks": 0, "sweep": (0, 0)}),
     ],
 )
-def test_any_session_can_be_shown(subject, make_samples, shown, changes):
-    picture = Scene(replace(subject, **changes))
+def test_any_session_can_be_shown(description, make_samples, shown, changes):
+    picture = Scene(replace(description, **changes))
     drawings = [*picture.frame(), *picture.samples(make_samples(0))]
     for samples in blocks(make_samples(3000, angle_rad=np.nan, coupling_torque_nm=np.nan), 700):
         drawings += picture.samples(samples)

@@ -46,11 +46,11 @@ def test_ages_have_the_unit_their_name_ends_in(make_timings):
 
 
 @pytest.fixture
-def health_values(subject, shown):
+def health_values(description, shown):
     """Return what the plots of the health are sent of a reading, by component."""
 
     def values(health):
-        found = shown(Scene(subject).health(5, health))["/health"]
+        found = shown(Scene(description).health(5, health))["/health"]
         assert set(map(tuple, found.times_ns.values())) == {(5,)}
         return {name: column[0] for name, column in found.values.items()}
 

@@ -20,10 +20,12 @@ from rigd.view.plots import GREY
 GRID = np.arange(9601) / 160.0
 
 
-def estimate(subject, *, excited_up_to_hz=20.0, delays_s=(0.0, 0.0)) -> RunningEstimate:
+def estimate(description, *, excited_up_to_hz=20.0, delays_s=(0.0, 0.0)) -> RunningEstimate:
     """Estimate that is the model as channels of such ages (angle, torque) show it."""
     s = 2j * np.pi * GRID
-    exact = transfer(s, subject.beam, subject.damping) + subject.tool_inertia_kg_m2 * s * s
+    exact = (
+        transfer(s, description.beam, description.damping) + description.tool_inertia_kg_m2 * s * s
+    )
     late = np.exp(-s * (delays_s[1] - delays_s[0]))
     response = FrequencyResponse(GRID, exact * late, np.full(GRID.shape, 0.9), 3, "h1")
     below, above = np.searchsorted(GRID, [0.1, excited_up_to_hz], side="right")
@@ -50,16 +52,16 @@ def values(charts: ResponseCharts, entity: str, strip: np.ndarray) -> tuple[np.n
 @pytest.mark.parametrize("delays_s", [(0.0, 0.0), (1e-3, 0.2e-3), (0.0, 1.5e-3)])
 @pytest.mark.parametrize("tool_inertia_kg_m2", [0.0, 1e-5])
 def test_measured_response_lies_on_the_model_it_was_made_of(
-    subject, shown, delays_s, tool_inertia_kg_m2
+    description, shown, delays_s, tool_inertia_kg_m2
 ):
-    subject = replace(
-        subject,
+    description = replace(
+        description,
         tool_inertia_kg_m2=tool_inertia_kg_m2,
         angle_delay_s=delays_s[0],
         torque_delay_s=delays_s[1],
     )
-    charts = ResponseCharts(subject)
-    charts.update(20_000_000_000, estimate(subject, delays_s=delays_s))
+    charts = ResponseCharts(description)
+    charts.update(20_000_000_000, estimate(description, delays_s=delays_s))
     found = shown([charts.draw_frames, charts.draw])
     for entity, of in (
         (MAGNITUDE_ENTITY, magnitude_db),
@@ -72,7 +74,7 @@ def test_measured_response_lies_on_the_model_it_was_made_of(
             assert frequency_hz[0] == pytest.approx(FIRST_HZ, rel=1e-3)
             assert frequency_hz[-1] == pytest.approx(last_hz, rel=5e-3)
             s = 2j * np.pi * frequency_hz
-            exact = transfer(s, subject.beam, subject.damping) + tool_inertia_kg_m2 * s * s
+            exact = transfer(s, description.beam, description.damping) + tool_inertia_kg_m2 * s * s
             axis = charts.chart(entity).y
             expected = np.clip(of(exact), axis.first, axis.last)
             # Read off a canvas, at a frequency read off a canvas: where it is steep, not so well.
@@ -84,12 +86,12 @@ def test_measured_response_lies_on_the_model_it_was_made_of(
     )
 
 
-def test_peaks_of_the_model_are_drawn_at_their_height(subject, shown):
-    charts = ResponseCharts(subject)
+def test_peaks_of_the_model_are_drawn_at_their_height(description, shown):
+    charts = ResponseCharts(description)
     (strip,) = strips(shown([charts.draw_frames])[f"{MAGNITUDE_ENTITY}/model"])
     frequency_hz, seen = values(charts, MAGNITUDE_ENTITY, strip)
     fine_hz = np.arange(0.5, 60.0, 1e-3)
-    exact_db = magnitude_db(transfer(2j * np.pi * fine_hz, subject.beam, subject.damping))
+    exact_db = magnitude_db(transfer(2j * np.pi * fine_hz, description.beam, description.damping))
     assert len(strip) <= 400
     for first_hz, last_hz in ((2.0, 4.0), (14.0, 18.0), (40.0, 50.0)):
         near = (frequency_hz > first_hz) & (frequency_hz < last_hz)
@@ -100,11 +102,11 @@ def test_peaks_of_the_model_are_drawn_at_their_height(subject, shown):
     assert axis.last > exact_db.max()
 
 
-def test_band_not_yet_excited_is_shaded_and_empty(subject, shown):
-    charts = ResponseCharts(subject)
+def test_band_not_yet_excited_is_shaded_and_empty(description, shown):
+    charts = ResponseCharts(description)
     before = shown([charts.draw_frames, charts.draw])
     assert strips(before[f"{MAGNITUDE_ENTITY}/measured"]) == []
-    charts.update(20_000_000_000, estimate(subject, excited_up_to_hz=20.0))
+    charts.update(20_000_000_000, estimate(description, excited_up_to_hz=20.0))
     after = shown([charts.draw])
     chart = charts.chart(MAGNITUDE_ENTITY)
     left, _, right, _ = chart.frame
@@ -125,9 +127,9 @@ def test_band_not_yet_excited_is_shaded_and_empty(subject, shown):
     assert times_ns == [20_000_000_000]
 
 
-def test_where_the_coherence_is_low_the_response_is_grey(subject, shown):
-    charts = ResponseCharts(subject)
-    known = estimate(subject)
+def test_where_the_coherence_is_low_the_response_is_grey(description, shown):
+    charts = ResponseCharts(description)
+    known = estimate(description)
     coherence = np.where((GRID > 5.0) & (GRID < 8.0), 0.5, 0.9)
     charts.update(0, replace(known, response=replace(known.response, coherence=coherence)))
     found = shown([charts.draw])
@@ -143,13 +145,13 @@ def test_where_the_coherence_is_low_the_response_is_grey(subject, shown):
     assert values(charts, COHERENCE_ENTITY, whole)[1].min() == pytest.approx(0.5, abs=1e-3)
 
 
-def test_the_last_session_s_response_is_drawn_beneath(subject, shown):
-    before = ResponseCharts(replace(subject, name="before", specimen="A"))
-    assert before.as_last_response(subject) is None
-    before.update(0, estimate(subject))
-    last = before.as_last_response(replace(subject, name="before", specimen="A"))
+def test_the_last_session_s_response_is_drawn_beneath(description, shown):
+    before = ResponseCharts(replace(description, name="before", specimen="A"))
+    assert before.as_last_response(description) is None
+    before.update(0, estimate(description))
+    last = before.as_last_response(replace(description, name="before", specimen="A"))
     assert (last.session, last.specimen) == ("before", "A")
-    charts = ResponseCharts(subject, last)
+    charts = ResponseCharts(description, last)
     found = shown([charts.draw_frames])
     for entity in (MAGNITUDE_ENTITY, OVERVIEW_MAGNITUDE_ENTITY, PHASE_ENTITY):
         (strip,) = strips(found[f"{entity}/last"])
@@ -165,14 +167,14 @@ def packed(color) -> int:
     return int.from_bytes(bytes((*color, 255)), "big")
 
 
-def test_an_empty_coherence_chart_says_why(subject, shown):
-    charts = ResponseCharts(subject)
+def test_an_empty_coherence_chart_says_why(description, shown):
+    charts = ResponseCharts(description)
 
     def note() -> list[str]:
         return shown([charts.draw])[f"{COHERENCE_ENTITY}/note"].values["Points2D:labels"][-1]
 
     assert note() == ["Coherence begins with the second segment"]
-    known = estimate(subject)
+    known = estimate(description)
     single = replace(known, response=replace(known.response, coherence=None))
     charts.update(1_000_000_000, single)
     assert note() == ["Coherence begins with the second segment"]
@@ -182,8 +184,8 @@ def test_an_empty_coherence_chart_says_why(subject, shown):
     assert note() == []
 
 
-def test_without_a_nominal_model_none_is_drawn(subject, shown):
-    charts = ResponseCharts(replace(subject, damping=None))
+def test_without_a_nominal_model_none_is_drawn(description, shown):
+    charts = ResponseCharts(replace(description, damping=None))
     found = shown([charts.draw_frames])
     assert not [entity for entity in found if entity.endswith("/model")]
     (labels,) = found[f"{MAGNITUDE_ENTITY}/labels"].values["Points2D:labels"]
@@ -191,8 +193,8 @@ def test_without_a_nominal_model_none_is_drawn(subject, shown):
     assert "measured" in labels
 
 
-def test_axes_state_their_units(subject, shown):
-    found = shown([ResponseCharts(subject).draw_frames])
+def test_axes_state_their_units(description, shown):
+    found = shown([ResponseCharts(description).draw_frames])
     titles = {
         MAGNITUDE_ENTITY: "Magnitude (dB re 1 N·m/rad)",
         OVERVIEW_MAGNITUDE_ENTITY: "dB re 1 N·m/rad",  # the title of its view says of what

@@ -28,10 +28,10 @@ def placed(shown) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture
-def tone(subject, shown):
+def tone(description, shown):
     """A tone of 0.1 N·m at 25 Hz from 20 to 30 s, as it is drawn at 40 s."""
     spectrogram = RunningSpectrogram(1000.0, step_s=STEP_S)
-    chart = SpectrogramChart(subject, spectrogram.frequency_hz, STEP_S)
+    chart = SpectrogramChart(description, spectrogram.frequency_hz, STEP_S)
     t_s = np.arange(40_000) / 1000.0
     torque_nm = 1e-3 + 0.1 * np.sin(2 * np.pi * 25.0 * t_s) * ((t_s >= 20.0) & (t_s < 30.0))
     chart.update(40_000_000_000, spectrogram.feed(np.arange(40_000), torque_nm))
@@ -76,11 +76,11 @@ def test_the_bar_has_the_colours_of_the_levels(tone):
     assert "dB re 1 N·m" in labels
 
 
-def test_a_long_session_has_no_larger_image(subject):
+def test_a_long_session_has_no_larger_image(description):
     from dataclasses import replace
 
     spectrogram = RunningSpectrogram(1000.0, step_s=STEP_S)
-    hour = replace(subject, ticks=3_600_000)
+    hour = replace(description, ticks=3_600_000)
     chart = SpectrogramChart(hour, spectrogram.frequency_hz, STEP_S)
     levels = np.full(spectrogram.frequency_hz.size, -40.0)
     chart.update(0, [(t_s, levels) for t_s in np.arange(0.5, 3600.0, STEP_S)])

@@ -21,11 +21,11 @@ def rows(text: str) -> dict[str, str]:
 
 
 @pytest.fixture
-def summary(subject, shown):
+def summary(description, shown):
     """Return the text that is shown of a reading of the health."""
 
     def text(t_ns, health):
-        found = shown(Scene(subject).health(t_ns, health))
+        found = shown(Scene(description).health(t_ns, health))
         return found["/summary"].last("TextDocument:text")
 
     return text

@@ -1,0 +1,178 @@
+"""Sentences on the specimens of a campaign: whether its sessions are of one or of several."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.campaigns._experiment import differing_fact_keys, fact_text
+from analysis.campaigns.labels import first_few, label, percent
+from rigd.units import decimals
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.campaigns._experiment import StatedSpecimen
+    from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, SessionValues
+
+MIXTURE_MARK: Final = "‡"
+"""Mark of values in tables and figures that are pooled over different specimens."""
+_MIXTURE_TITLE: Final = "of a mixture"
+"""Addition to the title of a table whose values are pooled over different specimens."""
+MIXTURE_NOTE: Final = (
+    f"{MIXTURE_MARK} sessions differ by more than their uncertainties: the mean of a "
+    "mixture, which may be valid for none of them."
+)
+"""Footnote that explains `MIXTURE_MARK`."""
+_SLIGHT_FREQUENCY_SCATTER: Final = 2e-3
+"""Relative scatter of a frequency that one beam may show: ten kelvin change the stiffness of steel
+by 0.3 %."""
+
+
+def specimens(homogeneity: Homogeneity) -> list[str]:
+    """Return sentences about different specimens; an empty list if the sessions agree."""
+    sentences = (
+        _describe_stated_specimens(homogeneity.specimens) if len(homogeneity.specimens) > 1 else []
+    )
+    leading_scatter = homogeneity.leading
+    return (
+        sentences
+        if leading_scatter is None
+        else [*sentences, *_describe_different_specimens(homogeneity, leading_scatter)]
+    )
+
+
+def title(text: str, homogeneity: Homogeneity) -> str:
+    """Return the title of a table or figure, with an addition for values of several specimens.
+
+    Parameters
+    ----------
+    text : str
+        Title without the mark.
+    homogeneity : Homogeneity
+        Whether the sessions are of one specimen.
+    """
+    return f"{text}, {_MIXTURE_TITLE}" if homogeneity.mixed else text
+
+
+def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]:
+    """Describe the different specimens that the session files state."""
+    differing_keys = differing_fact_keys(specimens)
+    specimen_texts = "; ".join(
+        ", ".join(
+            f"{key} {fact_text(key, specimen.facts[key])}"
+            for key in differing_keys
+            if key in specimen.facts
+        )
+        + f" in {_list_files(specimen.files)}"
+        for specimen in specimens
+    )
+    first_specimen = ", ".join(
+        f"{key} {fact_text(key, specimens[0].facts[key])}" for key in differing_keys
+    )
+    return [
+        f"The files state {len(specimens)} different specimens: {specimen_texts}. Specimens are "
+        "never "
+        f"pooled: all results below are for {first_specimen}. Analyse the files of the others "
+        "separately, "
+        "or correct the metadata where they are wrong."
+    ]
+
+
+def _describe_different_specimens(
+    homogeneity: Homogeneity, leading_scatter: Heterogeneity
+) -> list[str]:
+    """Describe how the estimates show that the sessions are of different specimens."""
+    other_labels = [
+        label(scatter.quantity)[0]
+        for scatter in homogeneity.quantities
+        if scatter.mixed and not scatter.is_of_rig and scatter is not leading_scatter
+    ]
+    others_sentence = f" The same holds of {', '.join(other_labels)}." if other_labels else ""
+    return [
+        "The sessions are not of one specimen in one state: "
+        f"{_describe_heterogeneity(leading_scatter)}.{others_sentence}",
+        f"{_describe_groups(leading_scatter)} Pooled values are then means of a mixture (marked "
+        f"{MIXTURE_MARK}) that "
+        "may hold for none of the specimens: analyse the sessions of each specimen separately, or "
+        "find what changed between sessions (clamp, temperature, "
+        f"wear).{_small_scatter_remark(homogeneity)}",
+    ]
+
+
+def _small_scatter_remark(homogeneity: Homogeneity) -> str:
+    """Return a remark that the frequencies vary little in relative terms, or an empty text."""
+    frequency_scatters = [
+        scatter for scatter in homogeneity.quantities if scatter.quantity.startswith("frequency_hz")
+    ]
+    mixed_scatters = [scatter for scatter in frequency_scatters if scatter.mixed]
+    if not mixed_scatters or any(
+        scatter.between_std > _SLIGHT_FREQUENCY_SCATTER * scatter.mean for scatter in mixed_scatters
+    ):
+        return ""
+    return (
+        f" Frequencies vary by less than {100 * _SLIGHT_FREQUENCY_SCATTER:g} %, as those of one "
+        "beam may when its "
+        "temperature or clamp changes."
+    )
+
+
+def _describe_heterogeneity(scatter: Heterogeneity) -> str:
+    """Describe the between-session scatter of a quantity, relative to its uncertainty and size."""
+    i_squared_text = percent(scatter.i_squared)
+    equals_sign = "" if i_squared_text.startswith(">") else "= "
+    between_text = _mean_text([scatter.between_std], scatter)
+    scatter_text = (
+        f"{between_text}, {100 * scatter.between_std / abs(scatter.mean):.2g} %; "
+        if scatter.mean
+        else ""
+    )
+    return (
+        f"{label(scatter.quantity)[0]} varies between sessions by "
+        f"{scatter.between_std_in_own_stds:.3g} of its own "
+        f"standard deviations ({scatter_text}Cochran's Q = {scatter.cochran_q:.3g} where "
+        f"{scatter.degrees_of_freedom} is expected, I² {equals_sign}{i_squared_text})"
+    )
+
+
+def _describe_groups(scatter: Heterogeneity) -> str:
+    """Describe the groups of sessions, or the sessions of lowest and highest value."""
+    quantity_label, _, _ = label(scatter.quantity)
+    values_by_file = {
+        file_name: (session_value, std) for file_name, session_value, std in scatter.values
+    }
+    if scatter.groups:
+        groups_text = "; ".join(
+            f"{_mean_text([values_by_file[file_name][0] for file_name in group], scatter)} in "
+            f"{_list_files(group)}"
+            for group in scatter.groups
+        )
+        return f"By the {quantity_label} they are {len(scatter.groups)} groups: {groups_text}."
+    low, high = _extreme_sessions(scatter.values)
+    return (
+        f"There are no clear groups: the {quantity_label} goes from "
+        f"{_mean_text([low[1]], scatter)} in {low[0]} "
+        f"to {_mean_text([high[1]], scatter)} in {high[0]}."
+    )
+
+
+def _extreme_sessions(
+    session_values: SessionValues,
+) -> tuple[tuple[str, float, float], tuple[str, float, float]]:
+    """Return the entries of the sessions with the lowest and the highest value."""
+    sorted_entries = sorted(session_values, key=lambda entry: entry[1])
+    return sorted_entries[0], sorted_entries[-1]
+
+
+def _mean_text(session_values: Sequence[float], scatter: Heterogeneity) -> str:
+    """Format the mean of values with its unit, and enough digits to distinguish the groups."""
+    _, factor, display_unit = label(scatter.quantity)
+    digits = min(decimals(factor * max(scatter.between_std, 1e-300)), 9)
+    separator = "·" if display_unit.startswith("10") else " "
+    return f"{factor * float(np.mean(session_values)):.{digits}f}{separator}{display_unit}".rstrip()
+
+
+def _list_files(file_names: Sequence[str]) -> str:
+    """Return the number of files and the names of the first few."""
+    return f"{len(file_names)} file{'' if len(file_names) == 1 else 's'} ({first_few(file_names)})"
