@@ -542,12 +542,21 @@ class Comparison:
         """Return the torque of the removed hum in N·m at times since the first compared sample."""
         return sum((hum.torque(time_s) for hum in self.hum), start=0.0)
 
-    def nuisance_spectra(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+    def nuisance_spectra(
+        self, poles: Sequence[Pole], effect_spectra: NDArray[np.complex128]
+    ) -> NDArray[np.complex128]:
         """Return the spectra of disturbing torques with unknown amplitudes, shape (m, K).
 
         They are, in this order, the free decays from the beginning and from each long gap, hum,
-        impacts, and a linear drift of the torque sensor's zero. Without the drift, the step from
-        the end of the record to its beginning would leak into all bins.
+        impacts, a linear drift of the torque sensor's zero, and the given effects. Without the
+        drift, the step from the end of the record to its beginning would leak into all bins.
+
+        Parameters
+        ----------
+        poles : sequence of Pole
+            Poles of the free decays.
+        effect_spectra : ndarray of complex, shape (c, K)
+            Torque spectra of effects of unknown size.
         """
         hum_spectra = self.decays.hum([hum_spectra.frequency_hz for hum_spectra in self.hum])
         drift_spectrum = _drift_spectrum(self.samples)[None, self.bins]
@@ -555,7 +564,9 @@ class Comparison:
         decay_columns = [
             decay_spectra.columns(poles) for decay_spectra in (self.decays, *self.later_decays)
         ]
-        return np.concatenate([*decay_columns, hum_spectra, impact_spectra, drift_spectrum])
+        return np.concatenate(
+            [*decay_columns, hum_spectra, impact_spectra, drift_spectrum, effect_spectra]
+        )
 
     def decay_gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]

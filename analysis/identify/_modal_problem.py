@@ -209,7 +209,7 @@ class ModalProblem:
 
         They are not whitened.
         """
-        return np.concatenate([self._comparison.nuisance_spectra(poles), self._effect_spectra])
+        return self._comparison.nuisance_spectra(poles, self._effect_spectra)
 
     def solution_at(self, x: NDArray[np.float64]) -> _LinearSolution:
         """Return the best linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.

@@ -154,7 +154,7 @@ class Objective:
 
         They are free decays, other disturbances and effects.
         """
-        return np.concatenate([self.comparison.nuisance_spectra(linearisation.poles), self.columns])
+        return self.comparison.nuisance_spectra(linearisation.poles, self.columns)
 
     def project(
         self, linearisation: Linearisation, weight: NDArray[np.float64] | float

@@ -283,10 +283,15 @@ of the hum to the beam."""
 
 @dataclass(frozen=True, slots=True)
 class Descent:
-    """Current point of a least-squares fit of one structure: objective and vector of unknowns."""
+    """Current point of a least-squares fit of one structure: objective and vector of unknowns.
+
+    `noise_and_cost` is the cost at the end of a descent, with the noise spectrum under which it was
+    computed.
+    """
 
     objective: Objective
     x: NDArray[np.float64]
+    noise_and_cost: tuple[NoiseSpectrum, float] | None = None
 
     @property
     def plant(self) -> Plant:
@@ -311,10 +316,12 @@ class Descent:
         objective, minimum = self.objective.minimum(
             self.x, noise.weight, descent_steps, relative_tolerance=tolerance, hopeless=hopeless
         )
-        return Descent(objective, minimum.x)
+        return Descent(objective, minimum.x, (noise, minimum.cost))
 
     def cost(self, noise: NoiseSpectrum) -> float:
         """Return the sum of squares at the current point under a noise spectrum."""
+        if self.noise_and_cost is not None and self.noise_and_cost[0] is noise:
+            return self.noise_and_cost[1]
         return self.objective.normal_equations(self.x, noise.weight).cost
 
     def with_reestimated_angle(self, noise: NoiseSpectrum, tolerance: float) -> Descent:

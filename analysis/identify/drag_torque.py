@@ -238,14 +238,11 @@ class DragResponse:
         modal_speeds = self._oversampled_modal_speeds()
         step_count = modal_speeds.shape[1]
         chunk_length = step_count if step_count <= _LONGEST_UNDIVIDED_STEPS else _STEPS_PER_CHUNK
-        modal_forces = np.empty((DRAG_MODES + 1, step_count))
         for first_step in range(0, step_count, chunk_length):
-            steps = slice(first_step, first_step + chunk_length)
-            modal_forces[:, steps] = self._modal_forces(
-                _drag_force(self._point_speed(modal_speeds[:, steps]), DragLaw(1.0))
-            )
-        del modal_speeds
-        return self._torque_over_time(modal_forces)
+            # The forces replace the speeds: the rows of a long record take much memory.
+            steps = modal_speeds[:, first_step : first_step + chunk_length]
+            steps[:] = self._modal_forces(_drag_force(self._point_speed(steps), DragLaw(1.0)))
+        return self._torque_over_time(modal_speeds)
 
     def torque(self, law: DragLaw, mode_numbers: Sequence[int] = ()) -> DragTorque:
         """Return the torque by air drag in N·m, and its derivatives by poles, damping and law.
@@ -359,12 +356,11 @@ class DragResponse:
 
     def _oversampled_modal_speeds(self) -> Real:
         """Return the speeds of rotation and of each mode without drag, shape (1 + modes, 3 m)."""
-        return np.array(
-            [
-                self._oversampled_values(speed_transform)
-                for speed_transform in (self._speed_transform, *self._modal_speed_by_angle)
-            ]
-        )
+        modal_speeds = np.empty((1 + DRAG_MODES, _OVERSAMPLING * self._samples))
+        speed_transforms = (self._speed_transform, *self._modal_speed_by_angle)
+        for modal_speed, speed_transform in zip(modal_speeds, speed_transforms, strict=True):
+            modal_speed[:] = self._oversampled_values(speed_transform)
+        return modal_speeds
 
     def _point_speed(self, modal_speeds: Real) -> Real:
         """Return the speeds of the beam points in m/s, shape (n, points).

@@ -318,6 +318,8 @@ class TopicBuffer:
         self.decoder.finish(contents)
         if self._on_messages is None:
             self._array.resize(self._message_count, refcheck=False)
+        # The decoder refers to this buffer: the cycle would retain the array of a long file.
+        del self.decoder
         return self._array
 
 

@@ -3,6 +3,7 @@ import pytest
 
 from analysis.identify import SETTINGS, Comparison, Objective
 from analysis.identify._refit import Refit
+from analysis.identify._search import Descent
 from analysis.identify.noise import NoiseSpectrum
 from analysis.identify.parametrization import VANISHING_LOSS, StepRule, Unknowns
 from analysis.models import STRUCTURES
@@ -49,6 +50,18 @@ def test_a_descent_goes_on_as_one_begun_there_but_evaluates_once_less(objective,
     assert (on.x == anew.x).all()
     assert on.cost == anew.cost < first.cost
     assert going_on == len(evaluated) - 1 == 3
+
+
+def test_the_cost_at_the_end_of_a_descent_is_that_of_its_noise(objective):
+    bins = objective.comparison.frequency_hz.size
+    noise, louder = (
+        NoiseSpectrum(np.full(bins, power), np.ones(bins, dtype=bool), ()) for power in (1e-2, 4e-2)
+    )
+    x = objective.unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8]))
+    end = Descent(objective, x).descend_to_minimum(noise, 1e-2)
+    anew = Descent(end.objective, end.x)
+    assert end.cost(noise) == anew.cost(noise)
+    assert end.cost(louder) == anew.cost(louder) == pytest.approx(end.cost(noise) / 4)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """Reader of sound files: this writer's, and any other MCAP and protobuf library's."""
 
 import dataclasses
+import gc
+import weakref
 
 import numpy as np
 import pytest
@@ -50,6 +52,18 @@ def test_a_recorded_session_is_read_back(kit, recorded):
     ]
     assert session.number("beam_length_m") == 0.98
     assert session.number("angle_delay_s", 0.0) == 0.0
+
+
+def test_the_samples_of_a_session_are_freed_with_it(recorded):
+    # Without the collector of cycles, which starts late in a process of few objects.
+    gc.disable()
+    try:
+        session = read_session(recorded.path)
+        samples = weakref.ref(session.samples)
+        del session
+        assert samples() is None
+    finally:
+        gc.enable()
 
 
 def test_samples_that_are_passed_on_are_not_stored(recorded):
