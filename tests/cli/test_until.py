@@ -33,8 +33,8 @@ ROW = re.compile(r" *\d+\.\d s 0\.")
 def done(made_once, write_profile_in):
     """A session that went on until the damping was known to 10 %: exit code, errors, result.
 
-    Its sensor is quieter than the shipped one, so that the first fit of all damping structures is enough. Where the
-    operator works there are files that have names of modules.
+    Its sensor is quieter than the shipped one, so that the first fit of all damping structures is
+    enough. Where the operator works there are files that have names of modules.
     """
 
     def make(folder):
