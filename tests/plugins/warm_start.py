@@ -3,12 +3,14 @@
 The imports of one `rigd` take half a second of a processor, a copy takes a twentieth. `run` is used
 like that of `subprocess`, `start` like its `Popen`. The processes that a copy starts, such as those
 of a session, are copies of it in turn. What depends on how Python itself starts is tested with
-`subprocess`, and so are a session and an analysis from end to end.
+`subprocess`, and so are a session and an analysis from end to end. Within `children_copied` the
+processes of a rig that the test's own process starts are copies of the latter.
 """
 
 import atexit
 import contextlib
 import ctypes
+import faulthandler
 import functools
 import gc
 import inspect
@@ -37,6 +39,8 @@ _STARTS_THREADS = ("pyarrow", "rerun", "rerun_bindings")
 _RIG_PROCESSES = ("rigd.engine.", "rigd.runner.", "rigd.daemon.", "rigd.web")
 """Modules that copies start as copies; the live view's import starts threads."""
 _PR_SET_MM, _PR_SET_MM_MAP = 35, 14  # linux/prctl.h
+_reports_imports = False
+"""Whether descriptor 3 is for the names of imported modules, as in copies of the warm process."""
 
 
 def run(command, *, capture_output=False, timeout=None, check=False, input=None, **options):  # noqa: A002
@@ -63,6 +67,10 @@ def _settings_of_python(environment):
 
 
 _OWN_SETTINGS = _settings_of_python(os.environ)
+_FILTERS = [
+    ("ignore", None, category, None, 0) for category in (DeprecationWarning, ResourceWarning)
+]
+"""Warnings of a new process, of which a test runner makes errors."""
 
 
 def start(command, *, env=None, packages=None, **options):
@@ -247,6 +255,8 @@ def _finish(pidfd, pid, status, imported):
 
 def _become_new_process(job, descriptors, importing):
     """Make this copy what a process is that has just started; returns its command."""
+    global _reports_imports
+    _reports_imports = True
     command, folder, environment, start_new_session = job
     os.environ.clear()
     os.environ.update(environment)
@@ -285,6 +295,8 @@ def _open_standard_streams():
 
 
 def _report_imports(before):
+    if not _reports_imports:
+        return
     new = (name for name in sys.modules if name not in before and not name.endswith("__main__"))
     harmless = [name for name in new if name.partition(".")[0] not in _STARTS_THREADS]
     with contextlib.suppress(BrokenPipeError):  # the tests are over
@@ -366,6 +378,16 @@ def _be_child(command, given):
         os._exit(exit_code)  # the finalizers are of what is the parent's
 
 
+@contextlib.contextmanager
+def children_copied():
+    """Start processes of the rig, within this context, as copies of this process."""
+    before, subprocess.Popen = subprocess.Popen, _PopenOfCopy
+    try:
+        yield
+    finally:
+        subprocess.Popen = before
+
+
 _streams_of_parent = []
 """Streams whose content the parent will write."""
 
@@ -373,8 +395,11 @@ _streams_of_parent = []
 def _forget_parent(given):
     """Undo what a process does not inherit from its parent, and set what it is given."""
     atexit._clear()
+    faulthandler.disable()
     signal.set_wakeup_fd(-1)
-    sys.unraisablehook = sys.__unraisablehook__
+    sys.unraisablehook, threading.excepthook = sys.__unraisablehook__, threading.__excepthook__
+    warnings.filters[:] = _FILTERS
+    warnings._filters_mutated()
     for number in signal.valid_signals():
         if callable(signal.getsignal(number)):
             signal.signal(number, signal.SIG_DFL)
@@ -389,7 +414,7 @@ def _forget_parent(given):
     for number, end in enumerate((given["p2cread"], given["c2pwrite"], given["errwrite"])):
         if end != -1:
             os.dup2(end, number)
-    first = 4
+    first = 4 if _reports_imports else 3
     for descriptor in (*sorted(given["pass_fds"]), os.sysconf("SC_OPEN_MAX")):
         os.closerange(first, descriptor)
         first = descriptor + 1
