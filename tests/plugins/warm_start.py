@@ -39,8 +39,8 @@ _STARTS_THREADS = ("pyarrow", "rerun", "rerun_bindings")
 _RIG_PROCESSES = ("rigd.engine.", "rigd.runner.", "rigd.daemon.", "rigd.web")
 """Modules that copies start as copies; the live view's import starts threads."""
 _PR_SET_MM, _PR_SET_MM_MAP = 35, 14  # linux/prctl.h
-_reports_imports = False
-"""Whether descriptor 3 is for the names of imported modules, as in copies of the warm process."""
+_report_to = []
+"""Descriptor for the names of imported modules, in copies of the warm process."""
 
 
 def run(command, *, capture_output=False, timeout=None, check=False, input=None, **options):  # noqa: A002
@@ -255,8 +255,6 @@ def _finish(pidfd, pid, status, imported):
 
 def _become_new_process(job, descriptors, importing):
     """Make this copy what a process is that has just started; returns its command."""
-    global _reports_imports
-    _reports_imports = True
     command, folder, environment, start_new_session = job
     os.environ.clear()
     os.environ.update(environment)
@@ -267,7 +265,7 @@ def _become_new_process(job, descriptors, importing):
     for number, descriptor in enumerate(descriptors[:3]):
         os.dup2(descriptor, number)
     os.write(descriptors[3], _number(os.getpid()))
-    os.dup2(importing, 3, inheritable=False)
+    _report_to.append(os.dup2(importing, 3, inheritable=False))
     os.closerange(4, os.sysconf("SC_OPEN_MAX"))
     _open_standard_streams()
     if _settings_of_python(environment) != _OWN_SETTINGS:  # packages are installed for it
@@ -295,12 +293,12 @@ def _open_standard_streams():
 
 
 def _report_imports(before):
-    if not _reports_imports:
+    if not _report_to:
         return
     new = (name for name in sys.modules if name not in before and not name.endswith("__main__"))
     harmless = [name for name in new if name.partition(".")[0] not in _STARTS_THREADS]
     with contextlib.suppress(BrokenPipeError):  # the tests are over
-        os.write(3, "\n".join(harmless).encode())
+        os.write(*_report_to, "\n".join(harmless).encode())
 
 
 def _run(command):
@@ -414,7 +412,7 @@ def _forget_parent(given):
     for number, end in enumerate((given["p2cread"], given["c2pwrite"], given["errwrite"])):
         if end != -1:
             os.dup2(end, number)
-    first = 4 if _reports_imports else 3
+    first = 4 if _report_to else 3
     for descriptor in (*sorted(given["pass_fds"]), os.sysconf("SC_OPEN_MAX")):
         os.closerange(first, descriptor)
         first = descriptor + 1
