@@ -264,6 +264,16 @@ def run_here(app, *arguments) -> Done:
 
 
 @pytest.fixture
+def children_copied():
+    """Have the processes of a rig that this process starts be spared their imports."""
+    import rigd.engine.control_process
+    import rigd.engine.recorder  # noqa: F401
+
+    with warm_start.children_copied():
+        yield
+
+
+@pytest.fixture
 def start_simulator(runtime_folder, tmp_path):
     """Start `rigd simulate` for a profile and wait until it can be found."""
     from rigd.devices.running_simulator import find_simulator

@@ -33,12 +33,12 @@ ROW = re.compile(r" *\d+\.\d s 0\.")
 def done(made_once, write_profile_in):
     """A session that went on until the damping was known to 10 %: exit code, errors, result.
 
-    Its sensor is quieter than the shipped one, so that fewer decisions are enough. Where the
-    operator works there are files that have names of modules.
+    Its sensor is quieter than the shipped one, so that the first fit of all damping structures is
+    enough. Where the operator works there are files that have names of modules.
     """
 
     def make(folder):
-        profile = write_profile_in(folder, "sim", {"simulation.torque_noise_nm": "2.0e-3"})
+        profile = write_profile_in(folder, "sim", {"simulation.torque_noise_nm": "1.0e-3"})
         for name in ("analysis", "random", "rigd"):
             (folder / f"{name}.py").write_text("raise SystemExit('of the operator')")
         command = [RIGD, "run", "until", "--damping", f"{100 * ASKED}%", "--at-most", "60"]
@@ -110,6 +110,7 @@ def test_segments_name_what_was_played(done, record):
     assert segments.pop("sweep") == (1000, ticks)
     assert segments.pop("scan") == (1000, 6000)
     pieces = done[2]["fit"]["search"]["pieces"]
+    assert pieces
     assert list(segments) == [f"piece_{number + 1}" for number in range(len(pieces))]
     ends = [6000]
     for (first, end), piece in zip(segments.values(), pieces, strict=True):

@@ -49,7 +49,9 @@ def test_a_session_in_the_foreground_is_stopped_from_another_folder(
         profile = write_profile("sim", patient=True)
         hold = ("hold", "--duration", "100", "--rest", "0.2", "--no-look")
         run = start_rigd("run", *hold, "--profile", profile, cold=True)
-    assert eventually(lambda: run.poll() is not None or control_of(run.pid) == SESSION_NAME)
+    assert eventually(
+        lambda: run.poll() is not None or control_of(run.pid) == SESSION_NAME, every_s=0.1
+    )
     assert run.poll() is None, run.communicate()
     code, out, err = stop_here("--profile", "sim")
     assert (code, err) == (0, "")
@@ -95,12 +97,12 @@ def test_an_impostor_on_the_socket_is_not_believed(
     profile = write_profile("sim", patient=True)
     daemon = start_rigd("serve", "--profile", profile, "--no-look", cold=True)
     path = socket_path("sim")
-    assert eventually(lambda: answers(path) and control_of(daemon.pid) == IDLE_NAME)
+    assert eventually(lambda: answers(path) and control_of(daemon.pid) == IDLE_NAME, every_s=0.1)
     parameters = {"duration_s": 100.0, "rest_s": 0.2}
     with Client(path) as client:
         eventually(lambda: client.ask("status")["state"] == "ready")
         client.ask("start", excitation="hold", parameters=parameters)
-    assert eventually(lambda: control_of(daemon.pid) == SESSION_NAME)
+    assert eventually(lambda: control_of(daemon.pid) == SESSION_NAME, every_s=0.1)
     impostor = Impostor(path)
     code, out, err = stop_here()
     assert code == 1

@@ -17,6 +17,7 @@ from rigd.engine.shared_state import Phase, StateField, read_events
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp
 from rigd.runtime import StopRequest
+from rigd.safety.limits import RECORDER_BUFFER_S
 from rigd.session.layout import decode_samples
 
 
@@ -135,7 +136,7 @@ class Session:
     The record is small enough for the rings to hold it, so that nobody needs to read meanwhile.
     """
 
-    def __init__(self, clock=None, profile=None, excitation=None):
+    def __init__(self, clock=None, profile=None, excitation=None, buffered_s=RECORDER_BUFFER_S):
         self.profile = profile or strict(load_shipped("sim"))
         self.excitation = excitation or chirp(
             rate_hz=self.profile.rig.rate_hz,
@@ -145,7 +146,7 @@ class Session:
             stop_hz=5.0,
         )
         self.channels = create_channels(
-            self.profile.rig.rate_hz, [shared_memory_fd() for _ in range(DESCRIPTORS)]
+            self.profile.rig.rate_hz, [shared_memory_fd() for _ in range(DESCRIPTORS)], buffered_s
         )
         self.shared_state = self.channels.shared_state
         self.parent = FakeParent(self.shared_state)

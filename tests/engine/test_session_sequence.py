@@ -288,7 +288,9 @@ def test_a_device_that_fails_at_the_stop_does_not_spoil_the_ending(make_session)
 
 
 def test_it_refuses_to_start_while_the_motor_moves(make_session):
-    session = make_session()
+    profile = make_session().profile
+    brief = replace(profile.session, rest_timeout_s=2.0)
+    session = make_session(profile=replace(profile, session=brief))
     session.drive.fault_at = 1
     session.drive.fault = lambda angle: angle + 1e-5 * session.drive.reads
     session.run()
@@ -296,6 +298,7 @@ def test_it_refuses_to_start_while_the_motor_moves(make_session):
     assert session.drive.torques == []
     assert session.finished.outcome == "fault"
     assert "not at rest" in session.finished.reason
+    assert "rest_timeout_s = 2 s" in session.finished.reason
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -429,25 +432,26 @@ def test_ticks_missed_beyond_the_end_of_the_record_do_not_count(make_session):
 
 
 def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
-    # The ring holds 16 s. In real time nobody waits for the reader, which here sleeps that long.
+    # The ring holds 2 s. In real time nobody waits for the reader, which here sleeps that long.
     profile = make_session().profile
     read_late = []
 
     class ReaderWakes(StopAt):
         virtual = False
 
-    session = make_session(excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=20.0))
+    excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=2.0)
+    session = make_session(excitation=excitation, buffered_s=2.0)
     session.clock = ReaderWakes(
-        17_004_000_000, lambda: read_late.append(session.channels.samples.take(1000))
+        3_004_000_000, lambda: read_late.append(session.channels.samples.take(1000))
     )
     session.run()
     session.assert_safe()
     samples = np.concatenate([decode_samples(read_late[0]), session.samples])
     assert session.finished.outcome == "fault"
     assert "recorder" in session.finished.reason
-    assert session.finished.counts == books(scheduled=16_002, lost=1)
+    assert session.finished.counts == books(scheduled=2002, lost=1)
     assert_books_balance(session, samples)
-    assert samples["tick"][-2:].tolist() == [15_999, 16_001]
+    assert samples["tick"][-2:].tolist() == [1999, 2001]
     assert session.drive.torques[-1] != 0.0
     assert samples["status"][-1] & Status.AFTER_LOST
     assert samples["status"][-1] & Status.TORQUE_OFF
@@ -456,13 +460,14 @@ def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
 def test_a_computer_that_stands_still_takes_no_recorder_s_time(make_session, monkeypatch):
     """Under the virtual clock it is waited for; here it reads once the ring has been full."""
     profile = make_session().profile
-    session = make_session(excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=20.0))
+    excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=2.0)
+    session = make_session(excitation=excitation, buffered_s=2.0)
     now_s, taken = [0.0], []
 
     def stand_still(_):
         now_s[0] += 5.0
         if len(taken) < 2:  # the first time the recorder stands still as well
-            taken.append(b"" if not taken else session.channels.samples.take(8000))
+            taken.append(b"" if not taken else session.channels.samples.take(1500))
 
     clock = SimpleNamespace(monotonic=lambda: now_s[0], sleep=stand_still)
     monkeypatch.setattr("rigd.engine._publish.time", clock)
@@ -474,7 +479,8 @@ def test_a_computer_that_stands_still_takes_no_recorder_s_time(make_session, mon
 
 def test_a_recorder_that_does_not_read_is_not_waited_for_for_ever(make_session, monkeypatch):
     profile = make_session().profile
-    session = make_session(excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=20.0))
+    excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=2.0)
+    session = make_session(excitation=excitation, buffered_s=2.0)
     seconds = itertools.count(step=0.1)
     clock = SimpleNamespace(monotonic=lambda: next(seconds), sleep=lambda _: None)
     monkeypatch.setattr("rigd.engine._publish.time", clock)
@@ -489,7 +495,8 @@ def test_a_sample_lost_in_the_last_tick_is_a_fault_too(make_session):
     profile = make_session().profile
     session = make_session(
         clock=LateAt({}),
-        excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=15.001, rest_s=1.0),
+        excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=1.001, rest_s=1.0),
+        buffered_s=2.0,
     )
     session.run()
     session.assert_safe()

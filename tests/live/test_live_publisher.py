@@ -45,7 +45,7 @@ def accepts(port: int) -> bool:
     return True
 
 
-def test_first_line_is_where_the_view_is_which_is_on_loopback(publisher):
+def test_the_view_is_on_loopback_where_the_first_line_says_and_ends_with_its_input(publisher):
     assert isinstance(publisher.answer, LiveAddress)
     address = publisher.address
     assert (address.rig, address.pid) == ("rig under test", publisher.process.pid)
@@ -59,6 +59,20 @@ def test_first_line_is_where_the_view_is_which_is_on_loopback(publisher):
     assert len(listening) == 3  # the third is where the server has the page's files
     addresses = {address for pid in pids for end in sockets(pid) for address in end.addresses}
     assert addresses == {LOOPBACK, "00000000"}  # the latter is the far end of a listening socket
+
+    # An interrupt is the supervisor's business.
+    server = publisher.server_pid
+    for number in (signal.SIGINT, signal.SIGTERM):
+        os.kill(publisher.process.pid, number)
+        os.kill(server, signal.SIGINT)
+        time.sleep(0.3)
+        assert publisher.process.poll() is None
+        assert not has_ended(server)
+    own = listeners(publisher.process.pid) | listeners(server)
+    assert len(own) == 3
+    assert publisher.end() == (0, "", "")
+    assert has_ended(server)
+    assert not own & listeners()
 
 
 def test_every_record_arrives_in_the_units_of_the_plots(unhurried, receive):
@@ -136,7 +150,9 @@ def test_the_quick_look_is_added_to_the_events(publisher, save, tmp_path):
 
 
 @pytest.mark.parametrize("at_once", [pytest.param(False, marks=pytest.mark.further), True])
-def test_two_rigs_have_a_view_each(publisher, start_producer, start_publisher, at_once):
+def test_two_rigs_have_a_view_each_and_one_that_is_killed_leaves_no_server(
+    publisher, start_producer, start_publisher, at_once
+):
     own = publisher.ports
     # The port was free when it was looked at, and taken a moment later.
     race = f"outlet.free_port = lambda _: {publisher.address.grpc_port}" if at_once else "pass"
@@ -144,22 +160,11 @@ def test_two_rigs_have_a_view_each(publisher, start_producer, start_publisher, a
     other = start_publisher(start_producer(), first=first)
     assert not other.ports & own
     assert all(accepts(port) for port in other.ports | own)
-
-
-def test_ends_with_its_input_alone_and_takes_the_server_along(publisher):
-    """An interrupt is the supervisor's business."""
+    # One that is killed leaves no server, and the other its own.
     server = publisher.server_pid
-    for number in (signal.SIGINT, signal.SIGTERM):
-        os.kill(publisher.process.pid, number)
-        os.kill(server, signal.SIGINT)
-        time.sleep(0.3)
-        assert publisher.process.poll() is None
-        assert not has_ended(server)
-    own = listeners(publisher.process.pid) | listeners(server)
-    assert len(own) == 3
-    assert publisher.end() == (0, "", "")
-    assert has_ended(server)
-    assert not own & listeners()
+    publisher.process.kill()
+    assert eventually(lambda: has_ended(server))
+    assert not has_ended(other.server_pid)
 
 
 @pytest.mark.slow
@@ -172,12 +177,6 @@ def test_stays_open_for_as_long_as_asked(start_publisher):
     assert page(publisher)
     assert publisher.process.wait(300.0) == 0
     assert time.monotonic() - began_s >= 2.5
-
-
-def test_a_killed_publisher_leaves_no_server(publisher):
-    server = publisher.server_pid
-    publisher.process.kill()
-    assert eventually(lambda: has_ended(server))
 
 
 @pytest.mark.further  # as when killed

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.process
 
 
 @pytest.fixture
-def rig(write_profile, runtime_folder, monkeypatch):
+def rig(children_copied, write_profile, runtime_folder, monkeypatch):
     # How long its start takes is the machine's affair: what is asked for is what it shows then.
     monkeypatch.setattr(live_view, "_ADDRESS_TIMEOUT_S", 60.0)
     monkeypatch.setattr(live_view, "_SHOW_TIMEOUT_S", 60.0)
@@ -40,7 +40,7 @@ def rig(write_profile, runtime_folder, monkeypatch):
 def order(rig, tmp_path):
     """Return the order for a session."""
 
-    def order(name: str, duration_s: float = 5.0) -> SessionOrder:
+    def order(name: str, duration_s: float = 1.0) -> SessionOrder:
         profile = rig._profile
         excitation = make_excitation(
             "hold", {"duration_s": duration_s, "rest_s": 0.0}, profile.rig.rate_hz
@@ -54,7 +54,7 @@ def order(rig, tmp_path):
 def run(rig, order):
     """Run a session under the virtual clock; returns its result and what the operator was told."""
 
-    def run(name: str, duration_s: float = 5.0, meanwhile=lambda progress: None, stop=None):
+    def run(name: str, duration_s: float = 1.0, meanwhile=lambda progress: None, stop=None):
         given = order(name, duration_s)
         stop = stop or StopRequest()
         told = [rig.show(given, stop)]

@@ -38,15 +38,16 @@ def run(*command, folder, **variables):
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("wheel")
-    # With the build back end of this environment, so that nothing is downloaded.
-    run(
-        *(sys.executable, "-m", "pip", "wheel", PROJECT, "--quiet", "--no-deps"),
-        *("--no-build-isolation", "--no-index", "--wheel-dir", folder),
-        folder=folder,
-    )
-    (path,) = folder.glob("rigd-*.whl")
+def wheel(made_once):
+    def make(folder):
+        # With the build back end of this environment, so that nothing is downloaded.
+        run(
+            *(sys.executable, "-m", "pip", "wheel", PROJECT, "--quiet", "--no-deps"),
+            *("--no-build-isolation", "--no-index", "--wheel-dir", folder),
+            folder=folder,
+        )
+
+    (path,) = made_once("wheel", make).glob("rigd-*.whl")
     return path
 
 
@@ -84,22 +85,24 @@ def required(distributions):
 
 
 @pytest.fixture(scope="module")
-def bare(wheel, tmp_path_factory):
+def bare(wheel, made_once):
     """An environment with the wheel and what it requires, without any extra."""
-    folder = tmp_path_factory.mktemp("bare")
-    venv.create(folder, symlinks=True)
-    (packages,) = folder.glob("lib/python3*/site-packages")
-    run(
-        *(sys.executable, "-m", "pip", "--python", folder / "bin" / "python"),
-        *("install", "--quiet", "--no-deps", "--no-index", wheel),
-        folder=folder,
-    )
-    (metadata,) = packages.glob("rigd-*.dist-info")
-    for each in required([Distribution.at(metadata)]).values():
-        for name in {file.parts[0] for file in each.files} - {".."}:
-            if not (packages / name).exists():
-                (packages / name).symlink_to(each.locate_file(name))
-    return folder
+
+    def make(folder):
+        venv.create(folder, symlinks=True)
+        (packages,) = folder.glob("lib/python3*/site-packages")
+        run(
+            *(sys.executable, "-m", "pip", "--python", folder / "bin" / "python"),
+            *("install", "--quiet", "--no-deps", "--no-index", "--no-compile", wheel),
+            folder=folder,
+        )
+        (metadata,) = packages.glob("rigd-*.dist-info")
+        for each in required([Distribution.at(metadata)]).values():
+            for name in {file.parts[0] for file in each.files} - {".."}:
+                if not (packages / name).exists():
+                    (packages / name).symlink_to(each.locate_file(name))
+
+    return made_once("bare", make)
 
 
 def test_the_analyser_needs_no_extra(bare, tmp_path):

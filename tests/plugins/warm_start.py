@@ -3,12 +3,14 @@
 The imports of one `rigd` take half a second of a processor, a copy takes a twentieth. `run` is used
 like that of `subprocess`, `start` like its `Popen`. The processes that a copy starts, such as those
 of a session, are copies of it in turn. What depends on how Python itself starts is tested with
-`subprocess`, and so are a session and an analysis from end to end.
+`subprocess`, and so are a session and an analysis from end to end. Within `children_copied` the
+processes of a rig that the test's own process starts are copies of the latter.
 """
 
 import atexit
 import contextlib
 import ctypes
+import faulthandler
 import functools
 import gc
 import inspect
@@ -37,6 +39,8 @@ _STARTS_THREADS = ("pyarrow", "rerun", "rerun_bindings")
 _RIG_PROCESSES = ("rigd.engine.", "rigd.runner.", "rigd.daemon.", "rigd.web")
 """Modules that copies start as copies; the live view's import starts threads."""
 _PR_SET_MM, _PR_SET_MM_MAP = 35, 14  # linux/prctl.h
+_report_to = []
+"""Descriptor for the names of imported modules, in copies of the warm process."""
 
 
 def run(command, *, capture_output=False, timeout=None, check=False, input=None, **options):  # noqa: A002
@@ -63,6 +67,10 @@ def _settings_of_python(environment):
 
 
 _OWN_SETTINGS = _settings_of_python(os.environ)
+_FILTERS = [
+    ("ignore", None, category, None, 0) for category in (DeprecationWarning, ResourceWarning)
+]
+"""Warnings of a new process, of which a test runner makes errors."""
 
 
 def start(command, *, env=None, packages=None, **options):
@@ -257,7 +265,7 @@ def _become_new_process(job, descriptors, importing):
     for number, descriptor in enumerate(descriptors[:3]):
         os.dup2(descriptor, number)
     os.write(descriptors[3], _number(os.getpid()))
-    os.dup2(importing, 3, inheritable=False)
+    _report_to.append(os.dup2(importing, 3, inheritable=False))
     os.closerange(4, os.sysconf("SC_OPEN_MAX"))
     _open_standard_streams()
     if _settings_of_python(environment) != _OWN_SETTINGS:  # packages are installed for it
@@ -285,10 +293,12 @@ def _open_standard_streams():
 
 
 def _report_imports(before):
+    if not _report_to:
+        return
     new = (name for name in sys.modules if name not in before and not name.endswith("__main__"))
     harmless = [name for name in new if name.partition(".")[0] not in _STARTS_THREADS]
     with contextlib.suppress(BrokenPipeError):  # the tests are over
-        os.write(3, "\n".join(harmless).encode())
+        os.write(*_report_to, "\n".join(harmless).encode())
 
 
 def _run(command):
@@ -366,6 +376,16 @@ def _be_child(command, given):
         os._exit(exit_code)  # the finalizers are of what is the parent's
 
 
+@contextlib.contextmanager
+def children_copied():
+    """Start processes of the rig, within this context, as copies of this process."""
+    before, subprocess.Popen = subprocess.Popen, _PopenOfCopy
+    try:
+        yield
+    finally:
+        subprocess.Popen = before
+
+
 _streams_of_parent = []
 """Streams whose content the parent will write."""
 
@@ -373,8 +393,11 @@ _streams_of_parent = []
 def _forget_parent(given):
     """Undo what a process does not inherit from its parent, and set what it is given."""
     atexit._clear()
+    faulthandler.disable()
     signal.set_wakeup_fd(-1)
-    sys.unraisablehook = sys.__unraisablehook__
+    sys.unraisablehook, threading.excepthook = sys.__unraisablehook__, threading.__excepthook__
+    warnings.filters[:] = _FILTERS
+    warnings._filters_mutated()
     for number in signal.valid_signals():
         if callable(signal.getsignal(number)):
             signal.signal(number, signal.SIG_DFL)
@@ -389,7 +412,7 @@ def _forget_parent(given):
     for number, end in enumerate((given["p2cread"], given["c2pwrite"], given["errwrite"])):
         if end != -1:
             os.dup2(end, number)
-    first = 4
+    first = 4 if _report_to else 3
     for descriptor in (*sorted(given["pass_fds"]), os.sysconf("SC_OPEN_MAX")):
         os.closerange(first, descriptor)
         first = descriptor + 1

@@ -239,7 +239,7 @@ def test_a_record_that_stays_doubtful_is_given_up_with_its_findings(bench):
     assert told[0].document["text"][-1].count("doubtful") == 3
 
 
-def test_ticks_that_were_held_shift_what_follows(bench):
+def test_ticks_that_were_held_shift_what_follows(bench, quick_pieces):
     bench.told(ON_THE_WAY)
     bench.told(ON_THE_WAY, held=300)
     end = bench.search.end_of_record(9000, 300, bench.writer.ticks)
@@ -249,7 +249,7 @@ def test_ticks_that_were_held_shift_what_follows(bench):
     assert not end.reached
 
 
-def test_ticks_that_were_held_after_a_piece_do_not_shift_it(bench):
+def test_ticks_that_were_held_after_a_piece_do_not_shift_it(bench, quick_pieces):
     """As where a decision takes longer than what is planned: the scan was played at once."""
     bench.told(ON_THE_WAY, held=1200, before=0)
     bench.told(ON_THE_WAY, held=2000, before=1700)
@@ -261,7 +261,7 @@ def test_ticks_that_were_held_after_a_piece_do_not_shift_it(bench):
     assert segments["piece_2"][0] == end - 1700 + 2050
 
 
-def test_a_piece_that_was_not_begun_is_no_segment(bench):
+def test_a_piece_that_was_not_begun_is_no_segment(bench, quick_pieces):
     assert bench.search.has_last_segment_begun(0)
     bench.told(ON_THE_WAY)
     place = bench.search.due_tick
@@ -281,7 +281,7 @@ def test_a_scan_that_told_nothing_is_repeated_and_then_given_up(bench):
     assert (end.reached, end.reason) == (False, "Given up: Nothing is excited yet.")
 
 
-def test_a_record_that_cannot_be_fitted_any_more_is_given_up_at_once(bench):
+def test_a_record_that_cannot_be_fitted_any_more_is_given_up_at_once(bench, quick_pieces):
     bench.told(ON_THE_WAY)
     (end,) = bench.problem("The angle is missing for 16 ms.")
     assert (end.reached, end.reason) == (False, "Given up: The angle is missing for 16 ms.")

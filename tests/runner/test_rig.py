@@ -17,7 +17,7 @@ from rigd.runner.request import SessionOrder
 from rigd.runtime import StopRequest
 from rigd.session import read_session
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.usefixtures("children_copied")]
 
 
 @pytest.fixture

@@ -181,7 +181,7 @@ def test_rest_against_an_obstacle(at_m, stiffness):
         damping=Damping(zeta=0.05),
     )
     push = START_RAD_S2 * HEAVY_KG_M2
-    record = Record(rig, [push] * 40 + [0.0] * 20 + [-push] * 40 + [0.0] * 1200)
+    record = Record(rig, [push] * 40 + [0.0] * 20 + [-push] * 40 + [0.0] * 500)
     yielding = np.inf if stiffness == "rigid" else float(stiffness)
     expected = pressing_force_n(BEAM, at_m, record.angle[-1] - 0.01, yielding)
     assert expected > 0.01

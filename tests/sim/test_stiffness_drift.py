@@ -95,7 +95,7 @@ def test_poles_are_those_of_the_stiffness_at_each_time(rig, damping, more, rate)
 
 def test_after_the_drift_it_is_a_beam_of_that_stiffness(rig):
     rig = replace(rig, motor=replace(rig.motor, coulomb_nm=0.03))
-    torques = noise(8000, 0.2)
+    torques = noise(3000, 0.2)
     for sign in (1, -1):
         drifted = plant_of(rig, stiffness_drift_per_s=sign * FASTEST)
         drifted.enable()
@@ -184,9 +184,9 @@ def test_it_moves_as_its_modal_equations(rig, rate):
     rig = replace(rig, actuation=replace(rig.actuation, delay_s=0.0))
     plant = plant_of(rig, stiffness_drift_per_s=rate)
     plant.enable()
-    ticks = 6000
+    ticks = 2000
     t = np.arange(ticks) / RATE_HZ
-    torques = 0.1 * np.hanning(ticks) * np.sin(2 * np.pi * (1.0 + 1.5 * t) * t)
+    torques = 0.1 * np.hanning(ticks) * np.sin(2 * np.pi * (1.0 + 4.5 * t) * t)
     found = run(plant, torques)
 
     motor, tool = rig.motor, rig.sensor.tool_inertia_kg_m2
@@ -216,7 +216,7 @@ def test_it_moves_as_its_modal_equations(rig, rate):
             state = state + h / 6 * (a + 2 * b + 2 * c + d)
     for column, name in enumerate(("angle_rad", "coupling_torque_nm")):
         seen = found[:, STATE.index(name)]
-        # Without drift the torque would be another by a tenth.
+        # Without drift the angle would be another by a thousandth, the torque by more.
         assert np.std(seen - expected[:, column]) < 5e-5 * np.std(seen)
 
 
@@ -226,7 +226,7 @@ def test_a_beam_on_a_locked_shaft_rings_as_its_modal_equations(rig, rate):
     plant = plant_of(rig, stiffness_drift_per_s=rate)
     plant.enable()
     run(plant, [0.3] * 60 + [-0.3] * 30)
-    record = run(plant, [0.0] * 25_000)
+    record = run(plant, [0.0] * 9000)
     first = np.flatnonzero(record[:, 1])[-1] + 2000  # the higher modes have decayed
     assert first < 5000
     torque = record[first:, STATE.index("coupling_torque_nm")]

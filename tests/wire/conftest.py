@@ -48,7 +48,7 @@ def quiet_profile(write_profile):
 
 
 @pytest.fixture
-def run_order(tmp_path):
+def run_order(children_copied, tmp_path):
     """Run a short chirp on a profile, without the command line.
 
     Faults are injected in the middle of the record, however long the start takes, one after the

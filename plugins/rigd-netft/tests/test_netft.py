@@ -297,10 +297,11 @@ def rigd(*arguments):
      ('"silence@1.2"', 1, "sends no records"), ('"restart@1.2"', 1, "has restarted")],
 )  # fmt: skip
 def test_sessions(tmp_path, faults, code, text):
-    path = write_rig(tmp_path, f"faults = [{faults}]")
+    brief = {"session.tare_s": 0.5, "session.return_s": 0.3}
+    path = write_rig(tmp_path, f"faults = [{faults}]", **brief)
     done = rigd(
         "run", "chirp", "--profile", path, "--fast", "--seed", "1", "--output", tmp_path / "out",
-        "--duration", "3", "--rest", "0.5", "--ring-down", "0.5",
+        "--duration", "1", "--rest", "0.5", "--ring-down", "0.5",
     )  # fmt: skip
     assert done.returncode == code, done.stdout + done.stderr
     assert text in done.stdout + done.stderr
