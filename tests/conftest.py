@@ -7,6 +7,7 @@ import gc
 import io
 import json
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -327,6 +328,19 @@ def made_once(tmp_path_factory, request):
         return folder
 
     return made
+
+
+@pytest.fixture(scope="session")
+def computed_once(made_once):
+    """Have a result that can be pickled computed once for all workers."""
+
+    def result(name, compute):
+        def make(folder):
+            (folder / "result.pickle").write_bytes(pickle.dumps(compute()))
+
+        return pickle.loads((made_once(name, make) / "result.pickle").read_bytes())
+
+    return result
 
 
 @pytest.fixture(scope="session")

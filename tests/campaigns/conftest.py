@@ -33,10 +33,10 @@ SETTINGS = WelchSettings(
 
 
 def short_session(path, seed, beam=LINK, damping=PLANT, **stated):
-    """One second of rest, 0.5-50 Hz in 30 s, 5 s after it."""
+    """One second of rest, 0.5-50 Hz in 20 s, 4 s after it."""
     signals = chirp_signals(
-        sweep_s=30.0, ring_down_s=5.0, rate_hz=RATE_HZ, start_hz=0.5, beam=beam, damping=damping,
-        noise_nm=NOISE_NM, quantum_rad=0.0, seed=seed,
+        sweep_s=20.0, ring_down_s=4.0, rate_hz=RATE_HZ, start_hz=0.5, amplitude_rad=0.028,
+        beam=beam, damping=damping, noise_nm=NOISE_NM, quantum_rad=0.0, seed=seed,
     )  # fmt: skip
     segments = {name: signals.segments[name] for name in ("rest", "sweep")}
     return write_session(

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import numpy as np
@@ -107,14 +106,13 @@ def test_error_of_a_forecast_is_that_of_the_torque(done, short_sessions, truth):
 def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     found, _ = done
     steps = []
-    write_campaign(found, tmp_path, with_paper=True, on_step=steps.append, formats=("png", "svg"))
+    write_campaign(found, tmp_path, with_paper=True, on_step=steps.append, formats=("png",))
     figures, tables = tmp_path / "figures", tmp_path / "tables"
     for figure in (
         "figure5_signals", "figure6_nominal", "figure7_indices", "figure8_best", "pooled",
         "validation", "damping", "pooled_response",
     ):  # fmt: skip
         assert np.asarray(Image.open(figures / f"{figure}.png").convert("L")).std() > 5
-        assert ET.parse(figures / f"{figure}.svg").getroot().tag.endswith("svg")
         assert f"figure {figure}" in steps
     with (tables / "table3.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -68,7 +68,7 @@ def mat_element(dims, claimed, payload):
 MAT_HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<HH", 0x0100, 0x4D49)
 
 
-@pytest.mark.parametrize("dims", [(1, 2**28), (1, 1000)])
+@pytest.mark.parametrize("dims", [further((1, 2**28)), (1, 1000)])
 def test_two_gigabytes_in_two_megabytes(tmp_path, dims):
     """Zeros, compressed; the dimensions say so, or do not."""
     size = 2**31

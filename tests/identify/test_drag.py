@@ -20,8 +20,8 @@ DRAG_M = 2.3e-3
 
 @pytest.fixture(scope="module")
 def braked(sessions, plants, link, brake):
-    """Forty seconds of a session of type III in air, past two modes, made by steps in time."""
-    still = sessions("III").cut(0, 40_000)
+    """The first 26 s of a session of type III in air, past two modes, made by steps in time."""
+    still = sessions("III").cut(0, 26_000)
     more = brake.drag_torque(still.angle_rad, 1000.0, link, plants["III"], DRAG_M)
     return replace(still, torque_nm=still.torque_nm + more)
 

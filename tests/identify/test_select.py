@@ -203,7 +203,10 @@ def test_one_mode_tells_no_order(one_mode):
 
 
 def test_of_two_modes_one_damping_that_is_enough_tells_no_order(sessions):
-    """Its two numbers explain any two loss factors, those of two dampings too."""
+    """Its two numbers explain any two loss factors, those of two dampings too.
+
+    What three modes tell of it is above.
+    """
     done = select(sessions("IV").measured(noise_nm=NOISE_NM, seed=44), band_hz=(0.0, 30.0))
     verdict, told = done.verdict, done.headline
     assert verdict.visible_modes == (1, 2)
@@ -214,9 +217,6 @@ def test_of_two_modes_one_damping_that_is_enough_tells_no_order(sessions):
     assert all(each.size.flag for each in told.sizes)
     assert all(mode.damping_ratio.flag is None for mode in told.modes)
     assert any(said.startswith("Internal damping alone would do.") for said in verdict.sentences)
-    three = select(sessions("IV").measured(noise_nm=NOISE_NM, seed=44)).verdict
-    assert three.alpha.status == "fractional"
-    assert three.lambda_.status == "absent"
 
 
 def test_what_cannot_be_told_apart_is_said(one_mode):
@@ -253,7 +253,7 @@ def test_hum_and_a_stiffness_that_rises_become_neither_mode_nor_order(sessions, 
 
 @pytest.fixture(scope="module")
 def field(sessions, candidates_of):
-    made = sessions("III", offsets=(0.006, -0.013))
+    made = sessions("III", offsets=(0.006, -0.013)).cut(0, 25_000)
     return candidates_of(made.measured(noise_nm=NOISE_NM, seed=46))
 
 

@@ -65,9 +65,12 @@ def test_measured_peaks_lie_on_the_modes(paper_analysis):
 
 def test_known_delays_and_tool_inertia_are_taken_out(write_session, make_signals, tmp_path):
     """The same plant seen through late channels and under a clamp gives the same parameters."""
-    plain = make_signals(noise_nm=0, quantum_rad=0)
-    late = make_signals(
-        noise_nm=0, quantum_rad=0, tool_inertia_kg_m2=1e-5, angle_delay_s=5e-4, torque_delay_s=2e-3
+    plain, late = (
+        make_signals(noise_nm=0, quantum_rad=0, sweep_s=60.0, ring_down_s=2.0, **channels)
+        for channels in (
+            {},
+            {"tool_inertia_kg_m2": 1e-5, "angle_delay_s": 5e-4, "torque_delay_s": 2e-3},
+        )
     )
     declared = {"tool_inertia_kg_m2": "1e-5", "angle_delay_s": "5e-4", "torque_delay_s": "2e-3"}
     settings = WelchSettings(types=("VI",), weightings=("omega",))

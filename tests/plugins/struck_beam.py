@@ -30,8 +30,11 @@ MISTAKEN = {
 of two, the first is met first."""
 
 ALIKE = {
-    "two": (Obstacle(0.062, 0.441, 466.0), Obstacle(0.195, 0.4345, 540.0)),
-    "one": Obstacle(0.11, 0.44, 580.0),
+    "two alike": (
+        (Obstacle(0.062, 0.441, 466.0), Obstacle(0.195, 0.4345, 540.0)),
+        Slew(0.87, 30.0),
+    ),
+    "one alike": (Obstacle(0.11, 0.44, 580.0), Slew(0.87, 30.0)),
 }
 """Two soft obstacles near the axis, met 6 ms after each other at 0.87 rad/s, and what they are
 like."""

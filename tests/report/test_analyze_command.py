@@ -40,15 +40,27 @@ def refused(result, code, *words):
     return errors[0]
 
 
+@pytest.fixture(scope="module")
+def short_file(make_signals, write_session, tmp_path_factory):
+    """Session of a minute, in place of two."""
+    folder = tmp_path_factory.mktemp("command")
+    return write_session(folder / "a.mcap", make_signals(sweep_s=60.0, ring_down_s=10.0))
+
+
 @pytest.fixture
-def session(paper_file, tmp_path):
+def session(short_file, tmp_path):
+    return shutil.copy(short_file, tmp_path / "session.mcap")
+
+
+@pytest.fixture
+def long_session(paper_file, tmp_path):
     return shutil.copy(paper_file, tmp_path / "session.mcap")
 
 
 @pytest.mark.process
-def test_one_session_from_end_to_end(session, tmp_path):
+def test_one_session_from_end_to_end(long_session, tmp_path):
     result = subprocess.run(
-        [sys.executable, "-m", "analysis", session.name, "--json", "fits.json"],
+        [sys.executable, "-m", "analysis", long_session.name, "--json", "fits.json"],
         cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
@@ -93,11 +105,11 @@ def test_one_session_from_end_to_end(session, tmp_path):
 def test_the_numbers_of_a_part_state_it(session, tmp_path, analyze_here, without_drawing):
     with without_drawing():
         result = analyze_here(
-            session.name, "--to", "60", "--json", "fits.json", "--report", "out",
+            session.name, "--to", "30", "--json", "fits.json", "--report", "out",
             "--types", "VI", "--weights", "omega",
         )  # fmt: skip
     assert result.returncode == 0, result.stderr
-    part = {"from_s": 0.0, "to_s": 60.0}
+    part = {"from_s": 0.0, "to_s": 30.0}
     content = json.loads((tmp_path / "fits.json").read_text())
     (headline,), (file,), (from_record,) = (
         content["headlines"],
@@ -105,11 +117,11 @@ def test_the_numbers_of_a_part_state_it(session, tmp_path, analyze_here, without
         content["records"],
     )
     assert (headline["part"], file["part"]) == (part, part)
-    assert from_record["verdict"][0] == "All results are of 0 to 60 s of the session."
+    assert from_record["verdict"][0] == "All results are of 0 to 30 s of the session."
     assert result.stdout.startswith(from_record["verdict"][0])
-    assert "0 to 60 s of the session" in (tmp_path / "out" / "report.html").read_text()
-    # The sweep is at 24.6 Hz then, and no fit uses what lies beyond.
-    assert any("24.6" in warning for warning in file["warnings"])
+    assert "0 to 30 s of the session" in (tmp_path / "out" / "report.html").read_text()
+    # The sweep is at 24.19 Hz then, and no fit uses what lies beyond.
+    assert any("24.19" in warning for warning in file["warnings"])
     assert [round(mode["frequency_hz"]["value"], 2) for mode in headline["modes"][:2]] == [
         2.57,
         16.01,

@@ -65,7 +65,7 @@ def test_warnings_are_told_where_welch_s_fits_are_not_made(
     monkeypatch.chdir(tmp_path)
     signals = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
     write_session("a.mcap", signals, metadata={"excitation": "touch"})
-    brief = ("--band", "1,20")
+    brief = ("--band", "1,15")
     with without_drawing():
         result = CliRunner().invoke(app, ["a.mcap", "--method", method, "--report", method, *brief])
     assert result.stdout.count("Warning: The session is a touch") == 1
@@ -79,7 +79,7 @@ def test_a_warning_that_files_share_is_printed_once(
     signals = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
     for name in ("a.mcap", "b.mcap"):
         write_session(name, signals, metadata={"excitation": "touch"})
-    options = ("--each", "--band", "1,20", "--report", "r", "--json", "r.json")
+    options = ("--each", "--band", "1,15", "--report", "r", "--json", "r.json")
     with without_drawing():
         result = CliRunner().invoke(app, ["a.mcap", "b.mcap", *options])
     assert result.exit_code == 0, result.stderr

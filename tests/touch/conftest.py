@@ -9,39 +9,31 @@ from rigd.touch import TouchEstimator, TouchModel
 
 
 @pytest.fixture(scope="session")
-def struck():
+def simulated(computed_once):
+    """Simulate records of obstacles by name, once for all workers."""
+
+    def records(name, obstacles, slews, duration_s):
+        def march():
+            return simulate(
+                obstacles.values(), slews, duration_s=duration_s, steps=20, modes=20, seed=4
+            )
+
+        return dict(zip(obstacles, computed_once(f"touch_{name}", march), strict=True))
+
+    return records
+
+
+@pytest.fixture(scope="session")
+def struck(simulated):
     """Name → record of one second or so, and the truth."""
-    records = simulate(
-        list(OBSTACLES.values()),
-        [Slew(1.0)] * len(OBSTACLES),
-        duration_s=0.8,
-        steps=40,
-        modes=20,
-        seed=4,
-    )
-    return dict(zip(OBSTACLES, records, strict=True))
+    return simulated("struck", OBSTACLES, [Slew(1.0)] * len(OBSTACLES), 0.8)
 
 
 @pytest.fixture(scope="session")
-def mistaken():
-    """Name → record of what could be taken for an obstacle at rest."""
-    obstacles, slews = zip(*MISTAKEN.values(), strict=True)
-    records = simulate(obstacles, slews, duration_s=0.85, steps=40, modes=20, seed=4)
-    return dict(zip(MISTAKEN, records, strict=True))
-
-
-@pytest.fixture(scope="session")
-def alike():
-    """Name → record of two obstacles and of one that is like them."""
-    records = simulate(
-        list(ALIKE.values()),
-        [Slew(0.87, 30.0)] * len(ALIKE),
-        duration_s=0.85,
-        steps=40,
-        modes=20,
-        seed=4,
-    )
-    return dict(zip(ALIKE, records, strict=True))
+def mistaken(simulated):
+    """Name → record of what could be taken for an obstacle at rest, or elsewhere."""
+    met, slews = zip(*(MISTAKEN | ALIKE).values(), strict=True)
+    return simulated("mistaken", dict(zip(MISTAKEN | ALIKE, met, strict=True)), slews, 0.85)
 
 
 @pytest.fixture(scope="session")
