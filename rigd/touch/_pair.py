@@ -201,7 +201,8 @@ class TwoObstacleContact:
             residual_without_second
             + effect_factors[chosen_rows, None] * second_effects[chosen_rows]
         ) @ q
-        first_obstacle_changes = -np.linalg.solve(triangle, first_obstacle_residuals.T).T
+        # Singular if a parameter has no effect: the first obstacle may not be reached by then.
+        first_obstacle_changes = -first_obstacle_residuals @ np.linalg.pinv(triangle).T
         starts[:, :3] += np.clip(
             first_obstacle_changes, -4 * parameter_ranges.scale[:3], 4 * parameter_ranges.scale[:3]
         )

@@ -11,6 +11,8 @@ from struck_beam import ALIKE, MISTAKEN, NOTICED, OBSTACLES, begin_s, cut
 from touch_records import Obstacle, Slew, simulate
 
 from rigd.touch import TouchRecord, estimate_touch
+from rigd.touch._explanations import ExplanationSearch
+from rigd.touch._tables import DETECTION_DELAYS_S
 
 AT_REST = ["soft", "middle", "hard"]
 
@@ -258,3 +260,14 @@ def test_without_samples_before_the_touch_nothing_is_told(estimator, struck):
 def test_once_is_the_same_as_prepared(model, struck, told):
     estimate = estimate_touch(cut(struck["hard"], 100), model)
     assert estimate.x_m == told["hard"].x_m
+
+
+def test_a_second_obstacle_is_sought_beyond_one_that_is_not_reached(estimator, struck):
+    """Its parameters have no effect in the first samples."""
+    search = ExplanationSearch(estimator._tables, cut(struck["middle"], 50), DETECTION_DELAYS_S[0])
+    pairing, window = search.pairing(), search.window(0.05)
+    not_reached = np.array([0.62, window.end / 1000, np.log(3000.0)])
+    no_effect = pairing.predict_channels(np.tile(not_reached, (1, 2)), window)
+    assert not no_effect.any()
+    starts = pairing.starts(not_reached, window, pairing.space(search.space(3)), 2)
+    assert np.isfinite(starts).all()
