@@ -100,7 +100,7 @@ def test_a_sweep_that_ended_early_is_left_out_and_one_stopped_after_it_is_not(ma
 
 
 def test_a_stopped_session_says_so_and_not_that_it_is_short(make_file, settings, tmp_path):
-    """30 s of sweep where the file says that 120 s were planned."""
+    """20 s of sweep where the file says that 120 s were planned."""
     path = make_file(tmp_path / "stopped.mcap", 0, duration_s="120.0", excitation="chirp")
     failure = analyse_session(path, SessionTask(settings, (), (), None))
     assert "stopped.mcap: its sweep ended after 20 s of 120 s" in failure.message
