@@ -12,9 +12,6 @@ import base64
 import io
 import logging
 import os
-import pickle
-import signal
-import tempfile
 import warnings
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -33,6 +30,7 @@ from analysis.models import STRUCTURES
 from analysis.report.folder import write_new
 from analysis.results import DEFAULT_FORMATS, FIGURE_FORMATS
 from rigd.beam import parameter_named
+from rigd.runtime.computations import ComputationError, ForkedComputation
 from rigd.spectral import magnitude_db
 
 if TYPE_CHECKING:
@@ -310,12 +308,23 @@ def save_pictures(
     OutputError
         If a file exists or cannot be written.
     """
+    own, others = illustrations[::2], illustrations[1::2]
     images: dict[str, Images] = {}
-    with _drawn_by_copy(illustrations[1::2], formats) as images_of_copy:
-        for illustration in illustrations[::2]:
+    copy = (
+        ForkedComputation(lambda: {each.name: _images(each, formats) for each in others})
+        if others and _may_use_two_processors()
+        else None
+    )
+    try:
+        for illustration in own:
             images[illustration.name] = _images(illustration, formats)
             on_step(f"figure {illustration.name}")
-        images |= images_of_copy()
+        if copy is not None:
+            with suppress(ComputationError):  # what is missing is drawn here, and meets the reason
+                images |= copy.value()
+    finally:
+        if copy is not None:
+            copy.stop()
     pictures = []
     for position, illustration in enumerate(illustrations):
         rendered = images.get(illustration.name) or _images(illustration, formats)
@@ -344,49 +353,6 @@ def _images(illustration: Illustration, formats: Collection[FigureFormat]) -> Im
         if len(rendered.get("svg", b"")) > _MAX_SVG_BYTES and "png" not in rendered:
             rendered["png"] = render_figure(figure, "png")
     return rendered
-
-
-@contextmanager
-def _drawn_by_copy(
-    illustrations: Sequence[Illustration], formats: Collection[FigureFormat]
-) -> Iterator[Callable[[], dict[str, Images]]]:
-    """Draw figures in a copy of this process; yields a function that returns its images.
-
-    They have the names of the figures. There are none if there is no second processor, or if the
-    copy fails for whatever reason: the caller then draws what is missing, and meets the reason.
-    """
-    if not illustrations or not _may_use_two_processors():
-        yield dict
-        return
-    with tempfile.TemporaryFile() as images_file:
-        with warnings.catch_warnings():
-            # Of threads, such as that of a progress bar, which the copy does not have.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            process_id = os.fork()
-        if process_id == 0:
-            has_failed = True
-            with suppress(BaseException):
-                images = {each.name: _images(each, formats) for each in illustrations}
-                pickle.dump(images, images_file, protocol=5)
-                images_file.flush()
-                has_failed = False
-            os._exit(has_failed)
-        exit_statuses: list[int] = []
-
-        def images_of_copy() -> dict[str, Images]:
-            exit_statuses.append(os.waitpid(process_id, 0)[1])
-            if exit_statuses != [0]:
-                return {}
-            images_file.seek(0)
-            images: dict[str, Images] = pickle.load(images_file)
-            return images
-
-        try:
-            yield images_of_copy
-        finally:
-            if not exit_statuses:  # an error of this process
-                os.kill(process_id, signal.SIGKILL)
-                os.waitpid(process_id, 0)
 
 
 def _may_use_two_processors() -> bool:

@@ -1,5 +1,6 @@
 from . import addresses as addresses
 from . import background as background
+from . import computations as computations
 from . import locks as locks
 from . import processes as processes
 from ._plain_files import open_plain_file as open_plain_file

@@ -5,7 +5,6 @@ the loop missed, the last torque keeps acting, as on a real rig.
 """
 
 import os
-import pickle
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -13,7 +12,7 @@ from dataclasses import replace
 from itertools import chain
 from math import sin, tau
 from operator import mul
-from typing import IO, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from rigd.devices import fresh_seed
 from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
 from rigd.devices.obstacles import Disturbance, ObstacleError, describe_obstacle, with_obstacles
 from rigd.devices.parameters import RigParameters, Simulation, WrenchSensorSettings
+from rigd.runtime.computations import ComputationError, ForkedComputation
 from rigd.sim._plant import SimulatedPlant
 from rigd.sim._session_scatter import scatters_between_sessions, session_parameters
 
@@ -119,7 +119,7 @@ class SimulatedRig:
         self._parameters = rig
         self._added_disturbances: list[Disturbance] = []
         self._removed_disturbances: list[Disturbance] = []
-        self._preparation: tuple[int, IO[bytes]] | None = None
+        self._preparation: ForkedComputation[tuple[int, SimulatedPlant]] | None = None
         self.plant = SimulatedPlant(rig)
         self.sensor = SimulatedSensor(
             self.plant, rig.sensor, rig.simulation, rig.rate_hz, filter_weights
@@ -198,24 +198,14 @@ class SimulatedRig:
         return len(texts), SimulatedPlant(with_obstacles(self._parameters, texts))
 
     def _start_preparation(self) -> None:
-        """Start computing the plant with all obstacles and impacts in another process.
+        """Start computing the plant with all obstacles and impacts in another process."""
 
-        A thread would block the interpreter.
-        """
-        import tempfile  # imported late, because no session needs it
+        def prepared() -> tuple[int, SimulatedPlant]:
+            with suppress(OSError):  # it has time
+                os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+            return self._plant_with_disturbances()
 
-        plant_file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it was read
-        process_id = os.fork()
-        if process_id == 0:
-            has_failed = True
-            with suppress(BaseException):
-                with suppress(OSError):  # it has time
-                    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-                pickle.dump(self._plant_with_disturbances(), plant_file, protocol=5)
-                plant_file.flush()
-                has_failed = False
-            os._exit(has_failed)
-        self._preparation = process_id, plant_file
+        self._preparation = ForkedComputation(prepared)
 
     def _poll_preparation(self) -> None:
         """Use the plant computed in the other process if it is ready.
@@ -223,16 +213,13 @@ class SimulatedRig:
         The computation of disturbances added since then is started.
         """
         assert self._preparation is not None
-        process_id, plant_file = self._preparation
-        ended_id, exit_status = os.waitpid(process_id, os.WNOHANG)
-        if not ended_id:
+        if not self._preparation.has_ended():
             return
-        self._preparation = None
-        with plant_file:
-            if exit_status != 0:
-                raise DeviceError("The simulated rig could not make ready for an obstacle.")
-            plant_file.seek(0)
-            disturbance_count, prepared_plant = pickle.load(plant_file)
+        preparation, self._preparation = self._preparation, None
+        try:
+            disturbance_count, prepared_plant = preparation.value()
+        except ComputationError:
+            raise DeviceError("The simulated rig could not make ready for an obstacle.") from None
         self._use_prepared_plant(prepared_plant)
         if disturbance_count < len(self._added_disturbances):
             self._start_preparation()

@@ -1,0 +1,80 @@
+"""Computations in a copy of this process, which has all of its objects and imports."""
+
+import os
+import pickle
+import signal
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Generic, TypeVar
+
+ValueT = TypeVar("ValueT")
+"""Type of the value that is computed."""
+
+
+class ComputationError(Exception):
+    """The copy of the process has ended without a value."""
+
+
+class ForkedComputation(Generic[ValueT]):
+    """Computation that has been started in a copy of this process (fork).
+
+    A thread would not do: it would block the interpreter. The copy has the current thread only.
+
+    Parameters
+    ----------
+    compute
+        Function that returns the value, which can be pickled.
+    """
+
+    def __init__(self, compute: Callable[[], ValueT]) -> None:
+        import tempfile  # imported late, because few sessions need it
+
+        self._value_file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it was read
+        with warnings.catch_warnings():
+            # Of threads, such as that of a progress bar, which the copy does not have.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            self._process_id = os.fork()
+        if self._process_id == 0:
+            has_failed = True
+            with suppress(BaseException):
+                pickle.dump(compute(), self._value_file, protocol=5)
+                self._value_file.flush()
+                has_failed = False
+            os._exit(has_failed)
+        self._exit_status: int | None = None
+
+    def has_ended(self) -> bool:
+        """Return whether the copy has ended, without waiting for it."""
+        return self._wait(os.WNOHANG)
+
+    def value(self) -> ValueT:
+        """Wait for the end of the computation, and return its value, once.
+
+        Raises
+        ------
+        ComputationError
+            If the copy has failed.
+        """
+        self._wait()
+        with self._value_file:
+            if self._exit_status != 0:
+                raise ComputationError
+            self._value_file.seek(0)
+            computed_value: ValueT = pickle.load(self._value_file)
+        return computed_value
+
+    def stop(self) -> None:
+        """End the copy if it still computes; nothing happens if its value has been returned."""
+        if self._exit_status is None:
+            os.kill(self._process_id, signal.SIGKILL)
+            self._wait()
+        self._value_file.close()
+
+    def _wait(self, options: int = 0) -> bool:
+        """Wait for the end of the copy, and return whether it has ended."""
+        if self._exit_status is None:
+            process_id, exit_status = os.waitpid(self._process_id, options)
+            if process_id:
+                self._exit_status = exit_status
+        return self._exit_status is not None
