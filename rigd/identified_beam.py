@@ -25,7 +25,7 @@ from rigd.documents import DocumentError, read_json
 from rigd.errors import UserError
 from rigd.estimates import Estimate, EstimatedMode
 from rigd.session import BeamUniformity
-from rigd.units import finite_number, is_usable_size
+from rigd.units import is_usable_size
 
 _HALF_WIDTH_95_STDS: Final = 1.959964
 """Half-width of the two-sided 95 % interval of a normal distribution, in standard deviations."""
@@ -184,7 +184,7 @@ def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> 
     exact_geometry = headline.get("exact_geometry")
     if not refusal and isinstance(exact_geometry, dict):
         label, headline = f"{label}.exact_geometry", exact_geometry
-    estimates = parameter_estimates(label, _with_covering_std(headline.get("parameters")))
+    estimates = parameter_estimates(label, headline.get("parameters"))
     if refusal:
         # Effective values of a uniform beam do not describe the rig: the modes replace them.
         estimates = {
@@ -424,23 +424,6 @@ def _estimate(label: str, name: str, document: object) -> Estimate:
     )
 
 
-def _with_covering_std(documents: object) -> object:
-    """Return a JSON object in whose estimates a deviation that covers a doubt replaces it.
-
-    Documents of older versions state one, as ``std_any_rig``.
-    """
-    if not isinstance(documents, dict):
-        return documents
-    return {
-        name: {**document, "std": std, "interval_95": None, "flag": None}
-        if isinstance(document, dict)
-        and (std := finite_number(document.get("std_any_rig"))) is not None
-        and std > 0
-        else document
-        for name, document in documents.items()
-    }
-
-
 def _require_known_effects(label: str, values_by_name: Mapping[str, float], use: Use) -> None:
     """Raise IdentifiedBeamError if the analysis found an effect that the use cannot include."""
     for parameter_name, parameter_value in values_by_name.items():
@@ -519,7 +502,7 @@ def _check_offset_modes(label: str, values_by_name: Mapping[str, float]) -> None
 def _mode_uncertainties(label: str, documents: object) -> Iterator[float]:
     """Yield the relative standard uncertainty of the pole of each mode in the document."""
     for number, document in enumerate(documents if isinstance(documents, list) else [], start=1):
-        mode = EstimatedMode.from_json(_with_covering_std(document), 0)
+        mode = EstimatedMode.from_json(document, 0)
         if mode is None or mode.number != number:
             raise IdentifiedBeamError(
                 f"{label}.modes[{number - 1}] is not mode {number} with frequency_hz and "
