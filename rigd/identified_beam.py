@@ -331,18 +331,37 @@ def _is_of_one_file(numbered_headline: tuple[int, Mapping[str, Any]]) -> bool:
     return numbered_headline[1].get("file", "") is not None
 
 
-def _uniform_beam_refusal(path: Path, headline: Mapping[str, Any]) -> str:
-    """Return why a uniform beam does not predict the modes of a record, or "" if it may."""
+def uniform_beam_test(label: str, headline: Mapping[str, Any]) -> BeamUniformity:
+    """Return the result of a headline's test whether a uniform beam predicts the modes.
+
+    Parameters
+    ----------
+    label
+        Name of the headline, or of its file, in messages.
+    headline
+        Headline of an analysis.
+
+    Raises
+    ------
+    IdentifiedBeamError
+        If the headline states a result that cannot be read.
+    """
     validity = headline.get("validity")
     stated_test = validity.get("uniform_beam") if isinstance(validity, dict) else None
     if stated_test is None:
-        return ""
+        return BeamUniformity("not tested")
     test = BeamUniformity.from_document(stated_test)
     if test is None:
         raise IdentifiedBeamError(
-            f"{path}: validity.uniform_beam = {json.dumps(stated_test, default=str)[:60]} of a "
+            f"{label}: validity.uniform_beam = {json.dumps(stated_test, default=str)[:60]} of a "
             f"headline is not the result of a test; {_ADVICE}."
         )
+    return test
+
+
+def _uniform_beam_refusal(path: Path, headline: Mapping[str, Any]) -> str:
+    """Return why a uniform beam does not predict the modes of a record, or "" if it may."""
+    test = uniform_beam_test(str(path), headline)
     if test.status != "refused":
         return ""
     return (

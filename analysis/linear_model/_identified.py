@@ -24,8 +24,9 @@ from rigd.identified_beam import (
     parameter_estimates,
     read_document,
     select_headline,
+    uniform_beam_test,
 )
-from rigd.session import BeamUniformity, Validity
+from rigd.session import BeamUniformity
 from rigd.units import finite_number, is_usable_size
 
 if TYPE_CHECKING:
@@ -89,8 +90,7 @@ class IdentifiedModel:
     @property
     def uniform_beam_test(self) -> BeamUniformity:
         """Return the result of the test whether a uniform beam predicts the modes."""
-        validity = Validity.from_document(self.headline.get("validity"))
-        return validity.uniform_beam or BeamUniformity("not tested")
+        return uniform_beam_test(self.headline_name, self.headline)
 
     @property
     def modal(self) -> ModalModel | None:

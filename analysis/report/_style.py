@@ -13,7 +13,7 @@ import io
 import logging
 import os
 import warnings
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, Final
@@ -308,26 +308,10 @@ def save_pictures(
     OutputError
         If a file exists or cannot be written.
     """
-    own, others = illustrations[::2], illustrations[1::2]
-    images: dict[str, Images] = {}
-    copy = (
-        ForkedComputation(lambda: {each.name: _images(each, formats) for each in others})
-        if others and _may_use_two_processors()
-        else None
-    )
-    try:
-        for illustration in own:
-            images[illustration.name] = _images(illustration, formats)
-            on_step(f"figure {illustration.name}")
-        if copy is not None:
-            with suppress(ComputationError):  # what is missing is drawn here, and meets the reason
-                images |= copy.value()
-    finally:
-        if copy is not None:
-            copy.stop()
+    images = _draw_by_two(illustrations, formats, on_step)
     pictures = []
-    for position, illustration in enumerate(illustrations):
-        rendered = images.get(illustration.name) or _images(illustration, formats)
+    for illustration in illustrations:
+        rendered = images[illustration.name]
         for file_format in formats:
             # The suffix is appended, because a name may contain dots.
             write_new(folder / f"{illustration.name}.{file_format}", rendered[file_format])
@@ -336,9 +320,34 @@ def save_pictures(
         pictures.append(
             Picture(illustration.name, illustration.description, rendered[page_format], page_format)
         )
-        if position % 2:
-            on_step(f"figure {illustration.name}")
     return pictures
+
+
+def _draw_by_two(
+    illustrations: Sequence[Illustration],
+    formats: Collection[FigureFormat],
+    on_step: Callable[[str], None],
+) -> dict[str, Images]:
+    """Return the image files of figures by their names, half of them drawn by a copy."""
+    own, others = illustrations[::2], illustrations[1::2]
+    images: dict[str, Images] = {}
+    copy = (
+        ForkedComputation(lambda: {each.name: _images(each, formats) for each in others})
+        if others and _may_use_two_processors()
+        else None
+    )
+    with copy or nullcontext():
+        for illustration in own:
+            images[illustration.name] = _images(illustration, formats)
+            on_step(f"figure {illustration.name}")
+        if copy is not None:
+            with suppress(ComputationError):  # what is missing is drawn here, and meets the reason
+                images |= copy.value()
+    for illustration in others:
+        if illustration.name not in images:
+            images[illustration.name] = _images(illustration, formats)
+        on_step(f"figure {illustration.name}")
+    return images
 
 
 def _images(illustration: Illustration, formats: Collection[FigureFormat]) -> Images:
@@ -357,7 +366,7 @@ def _images(illustration: Illustration, formats: Collection[FigureFormat]) -> Im
 
 def _may_use_two_processors() -> bool:
     """Return whether a copy of this process would have a processor of its own."""
-    # Not on macOS, whose libraries do not bear copies.
+    # Not on macOS, whose libraries cannot be used in a copy of a process.
     return hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) > 1
 
 

@@ -6,7 +6,7 @@ import signal
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Generic, TypeVar
+from typing import Generic, Self, TypeVar
 
 ValueT = TypeVar("ValueT")
 """Type of the value that is computed."""
@@ -19,7 +19,8 @@ class ComputationError(Exception):
 class ForkedComputation(Generic[ValueT]):
     """Computation that has been started in a copy of this process (fork).
 
-    A thread would not do: it would block the interpreter. The copy has the current thread only.
+    A thread would not do: it would block the interpreter. The copy has the current thread only. As
+    a context manager it ends the copy if it still computes at the end of the context.
 
     Parameters
     ----------
@@ -64,8 +65,10 @@ class ForkedComputation(Generic[ValueT]):
             computed_value: ValueT = pickle.load(self._value_file)
         return computed_value
 
-    def stop(self) -> None:
-        """End the copy if it still computes; nothing happens if its value has been returned."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         if self._exit_status is None:
             os.kill(self._process_id, signal.SIGKILL)
             self._wait()

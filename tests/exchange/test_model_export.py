@@ -16,6 +16,7 @@ from analysis.cli.app import app
 from analysis.identify import ModalModel
 from analysis.linear_model import ModelOptions, identify_session, linear_model
 from rigd.beam import Beam, Damping, Plant
+from rigd.identified_beam import IdentifiedBeamError
 
 BAND_HZ = (0.05, 100.0)
 RELATIVE_STD = 1e-3
@@ -445,6 +446,9 @@ def test_beam_and_modal_model_of_a_session_agree_within_what_the_record_knows(si
     found = identify_session(simulated)
     assert found.uniform_beam_test.status == "passed"
     beam = linear_model(found, ModelOptions(order=20, samples=0))
+    unreadable = found.headline | {"validity": {"uniform_beam": {"status": "refused"}}}
+    with pytest.raises(IdentifiedBeamError, match=r"validity\.uniform_beam"):
+        linear_model(dataclasses.replace(found, headline=unreadable), ModelOptions(samples=0))
     refused = found.headline | {
         "validity": {"uniform_beam": {"status": "refused", "p_value": 1e-9}}
     }
