@@ -13,8 +13,6 @@ from analysis.models import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from analysis.paper.welch_analysis import WelchAnalysis
     from analysis.record import Record
 
@@ -186,7 +184,6 @@ def welch_analysis(
     requested_hz: Band | None = None,
     *,
     optional: bool,
-    on_step: Callable[[str], None] = lambda _done: None,
 ) -> tuple[WelchAnalysis | None, str | None]:
     """Run the Welch fits if they are applicable to a record.
 
@@ -201,8 +198,6 @@ def welch_analysis(
     optional : bool
         Whether the Welch fits may be omitted. Fits with a chosen estimator or chosen segments are
         not omitted.
-    on_step : callable, optional
-        Called with the name of each step after it (see `analysis.paper.welch_analysis.analyse`).
 
     Returns
     -------
@@ -223,7 +218,7 @@ def welch_analysis(
     exclusion_reason = welch_exclusion_reason(record, requested_hz) if optional else None
     if exclusion_reason is None:
         try:
-            return analyse(record, welch_settings(record, settings, requested_hz), on_step), None
+            return analyse(record, welch_settings(record, settings, requested_hz)), None
         except FrequencyResponseError as error:
             if not optional or isinstance(error, SettingsError):
                 raise

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 if TYPE_CHECKING:
@@ -364,6 +365,7 @@ def record_result(
     )
     from analysis.identify import MeasurementError
     from analysis.record import load_record
+    from rigd.runtime.computations import computed_meanwhile
 
     record = load_record(path, routes.part_s, highest_hz=highest_frequency_hz(routes.band_hz))
     record = with_uniformity(record, routes.uniformity)
@@ -371,27 +373,44 @@ def record_result(
     on_step("read")
     if not routes.paper:
         check_record_band(record, routes.band_hz)
-    welch_results, omission_remark = None, None
-    if routes.paper:
-        welch_results, omission_remark = welch_analysis(
-            record, routes.settings, routes.band_hz,
-            optional=routes.whole_record, on_step=on_step,
-        )  # fmt: skip
-    if omission_remark:
+        on_step("whole record")
+        return RecordResult(record, _fit_whole_record(record, routes, warn))
+    fit_welch = partial(
+        welch_analysis, record, routes.settings, routes.band_hz, optional=routes.whole_record
+    )
+    if not routes.whole_record:
+        on_step("Welch fits")
+        return RecordResult(record, None, fit_welch()[0])
+    whole_fits, measurement_error = None, None
+    with computed_meanwhile(fit_welch) as welch_fits:
+        on_step("Welch fits and whole record")
+        if not routes.settings.are_from_paper:
+            welch_fits()  # settings that do not suit the record are reported first
+        try:
+            whole_fits = _fit_whole_record(record, routes, warn)
+        except MeasurementError as error:
+            measurement_error = error
+        welch_results, omission_remark = welch_fits()
+    if omission_remark is not None:
         warn(f"{path}: {omission_remark}")
         record = _add_warnings(record, (omission_remark,))
-    whole_fits = None
-    if routes.whole_record:
-        on_step("whole record")
-        try:
-            whole_fits = whole_record(record, routes.fixed, routes.band_hz)
-        except MeasurementError as error:
-            if welch_results is None:
-                raise
-            warn(f"{error} Only the Welch fits were run.")
-        else:
-            whole_fits = _with_structures(whole_fits, routes.structures, warn)
-    return RecordResult(record, whole_fits, welch_results)
+    if measurement_error is not None:
+        if welch_results is None:
+            raise measurement_error
+        warn(f"{measurement_error} Only the Welch fits were run.")
+    return RecordResult(
+        record,
+        None if whole_fits is None else replace(whole_fits, record=record),
+        None if welch_results is None else replace(welch_results, record=record),
+    )
+
+
+def _fit_whole_record(
+    record: Record, routes: AnalysisOptions, warn: Callable[[str], None]
+) -> WholeRecord:
+    """Run the fits to a whole record, with those of packages' structures."""
+    whole_fits = whole_record(record, routes.fixed, routes.band_hz)
+    return _with_structures(whole_fits, routes.structures, warn)
 
 
 def _with_structures(

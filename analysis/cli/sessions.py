@@ -324,8 +324,7 @@ def _count_steps(routes: AnalysisOptions, rerun_file: Path | None) -> int:
     figure_count = (
         len(figure_names) + routes.whole_record * len(RECORD_FIGURES) + (rerun_file is not None)
     )
-    step_count = 1 + routes.whole_record + routes.paper * (1 + len(routes.settings.types))
-    return step_count + _STEPS_PER_FIGURE * figure_count
+    return 2 + _STEPS_PER_FIGURE * figure_count  # reading, and all fits
 
 
 def _analyse_file(

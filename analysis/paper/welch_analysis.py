@@ -31,8 +31,6 @@ from rigd.beam import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from analysis.models import WelchSettings
     from analysis.record import Record
     from rigd.beam import Beam, Damping, Mode
@@ -383,11 +381,7 @@ class WelchAnalysis:
     warnings: tuple[str, ...]
 
 
-def analyse(
-    record: Record,
-    settings: WelchSettings,
-    on_step: Callable[[str], None] = lambda _done: None,
-) -> WelchAnalysis:
+def analyse(record: Record, settings: WelchSettings) -> WelchAnalysis:
     """Estimate the frequency response of a record and fit the models to it.
 
     Parameters
@@ -396,8 +390,6 @@ def analyse(
         Record of a session.
     settings : WelchSettings
         Estimator, segments, band, types and weightings.
-    on_step : callable, optional
-        Called with the name of each step after it: the estimate, then each type.
 
     Raises
     ------
@@ -408,28 +400,19 @@ def analyse(
     """
     _check_excited(record)
     main_response, whole_record = estimate(record, settings)
-    on_step("frequency response")
     measured_peaks = _mode_peaks(record.beam, main_response.frequency_hz, main_response.response)
     response_grid = ResponseGrid(2j * np.pi * main_response.frequency_hz)
-    fitted_models: list[FittedModel] = []
-    for fit_name in settings.types:
-        # One type at a time, so that progress can be shown. Common grids would save little time.
-        try:
-            frf_fits = fit_many(
-                main_response.frequency_hz,
-                main_response.response,
-                record.beam,
-                [STRUCTURES[fit_name]],
-                settings.weightings,
-                tool_inertia_kg_m2=record.tool_inertia_kg_m2,
-            )
-        except (FitError, WeightingError) as error:
-            raise SettingsError(f"{record.path}: {error}") from error
-        fitted_models.extend(
-            _evaluate_fit(fit, record, main_response, response_grid, measured_peaks)
-            for fit in frf_fits
+    try:
+        frf_fits = fit_many(
+            main_response.frequency_hz,
+            main_response.response,
+            record.beam,
+            [STRUCTURES[name] for name in settings.types],
+            settings.weightings,
+            tool_inertia_kg_m2=record.tool_inertia_kg_m2,
         )
-        on_step(f"type {fit_name}")
+    except (FitError, WeightingError) as error:
+        raise SettingsError(f"{record.path}: {error}") from error
     return WelchAnalysis(
         record=record,
         settings=settings,
@@ -437,7 +420,10 @@ def analyse(
         response=main_response,
         whole_record=whole_record,
         peaks=measured_peaks,
-        models=tuple(fitted_models),
+        models=tuple(
+            _evaluate_fit(fit, record, main_response, response_grid, measured_peaks)
+            for fit in frf_fits
+        ),
         warnings=record.warnings + estimate_warnings(record, settings, main_response),
     )
 

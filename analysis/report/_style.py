@@ -11,9 +11,8 @@ from __future__ import annotations
 import base64
 import io
 import logging
-import os
 import warnings
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, Final
@@ -30,7 +29,7 @@ from analysis.models import STRUCTURES
 from analysis.report.folder import write_new
 from analysis.results import DEFAULT_FORMATS, FIGURE_FORMATS
 from rigd.beam import parameter_named
-from rigd.runtime.computations import ComputationError, ForkedComputation
+from rigd.runtime.computations import computed_meanwhile
 from rigd.spectral import magnitude_db
 
 if TYPE_CHECKING:
@@ -331,21 +330,14 @@ def _draw_by_two(
     """Return the image files of figures by their names, half of them drawn by a copy."""
     own, others = illustrations[::2], illustrations[1::2]
     images: dict[str, Images] = {}
-    copy = (
-        ForkedComputation(lambda: {each.name: _images(each, formats) for each in others})
-        if others and _may_use_two_processors()
-        else None
-    )
-    with copy or nullcontext():
+    with computed_meanwhile(
+        lambda: {each.name: _images(each, formats) for each in others}
+    ) as other_images:
         for illustration in own:
             images[illustration.name] = _images(illustration, formats)
             on_step(f"figure {illustration.name}")
-        if copy is not None:
-            with suppress(ComputationError):  # what is missing is drawn here, and meets the reason
-                images |= copy.value()
+        images |= other_images()
     for illustration in others:
-        if illustration.name not in images:
-            images[illustration.name] = _images(illustration, formats)
         on_step(f"figure {illustration.name}")
     return images
 
@@ -362,12 +354,6 @@ def _images(illustration: Illustration, formats: Collection[FigureFormat]) -> Im
         if len(rendered.get("svg", b"")) > _MAX_SVG_BYTES and "png" not in rendered:
             rendered["png"] = render_figure(figure, "png")
     return rendered
-
-
-def _may_use_two_processors() -> bool:
-    """Return whether a copy of this process would have a processor of its own."""
-    # Not on macOS, whose libraries cannot be used in a copy of a process.
-    return hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) > 1
 
 
 # Lines

@@ -19,7 +19,6 @@ from ._modes import mode_mean as mode_mean
 from ._modes import mode_shape as mode_shape
 from ._modes import modes as modes
 from ._modes import participation as participation
-from ._modes import pole_gradient as pole_gradient
 from ._modes import poles as poles
 from ._modes import poles_for_eigenvalues as poles_for_eigenvalues
 from ._modes import root_shear_ratio as root_shear_ratio

@@ -10,8 +10,6 @@ from ._named import excitation_options as excitation_options
 from ._named import find_excitation as find_excitation
 from ._named import make_excitation as make_excitation
 from ._narrow_sweeps import modes as modes
-from ._options import RIG_ARGUMENTS as RIG_ARGUMENTS
-from ._options import ExcitationOption as ExcitationOption
 from ._options import RestS as RestS
 from ._options import RingDownS as RingDownS
 from ._segment_search import SHORTEST_S as SHORTEST_S

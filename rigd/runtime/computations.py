@@ -4,8 +4,9 @@ import os
 import pickle
 import signal
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
 from typing import Generic, Self, TypeVar
 
 ValueT = TypeVar("ValueT")
@@ -81,3 +82,41 @@ class ForkedComputation(Generic[ValueT]):
             if process_id:
                 self._exit_status = exit_status
         return self._exit_status is not None
+
+
+@contextmanager
+def computed_meanwhile(compute: Callable[[], ValueT]) -> Iterator[Callable[[], ValueT]]:
+    """Compute a value in a copy of this process, if this computer has two processors for it.
+
+    If not, or if the copy fails, the value is computed here when it is requested. An error of the
+    computation is then raised there.
+
+    Parameters
+    ----------
+    compute
+        Function that returns the value, which can be pickled.
+
+    Yields
+    ------
+    callable
+        Function that returns the value, and waits for it if necessary.
+    """
+    if not _may_use_two_processors():
+        yield cache(compute)
+        return
+    with ForkedComputation(compute) as copy:
+
+        @cache
+        def value() -> ValueT:
+            try:
+                return copy.value()
+            except ComputationError:
+                return compute()
+
+        yield value
+
+
+def _may_use_two_processors() -> bool:
+    """Return whether a copy of this process would have a processor of its own."""
+    # Not on macOS, whose libraries cannot be used in a copy of a process.
+    return hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) > 1

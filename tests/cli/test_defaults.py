@@ -4,30 +4,31 @@ import inspect
 
 import pytest
 
-from rigd import excitation
 from rigd.cli import run
-from rigd.excitation import RIG_ARGUMENTS
+from rigd.excitation import excitation_options
 
 
 @pytest.mark.parametrize(
-    ("command", "function"),
+    ("command", "kind"),
     [
-        (run.chirp, excitation.chirp),
-        (run.hold, excitation.hold),
-        (run.step, excitation.step),
-        (run.multisine, excitation.multisine),
-        (run.file, excitation.from_csv),
-        (run.modes, excitation.modes),
-        (run.move, excitation.move),
-        (run.touch, excitation.touch),
+        (run.chirp, "chirp"),
+        (run.hold, "hold"),
+        (run.step, "step"),
+        (run.multisine, "multisine"),
+        (run.file, "file"),
+        (run.modes, "modes"),
+        (run.move, "move"),
+        (run.touch, "touch"),
     ],
 )
-def test_defaults_agree(command, function):
-    def defaults(thing):
-        return {
-            name.replace("phase_seed", "seed"): parameter.default
-            for name, parameter in inspect.signature(thing).parameters.items()
-            if name not in {*RIG_ARGUMENTS, "path"}  # no file: None here, "" there
-        }
-
-    assert defaults(command) == defaults(function)
+def test_defaults_agree(command, kind):
+    options = {
+        option.name: inspect.Parameter.empty if option.required else option.default
+        for option in excitation_options(kind)
+    }
+    defaults = {
+        name.replace("phase_seed", "seed"): argument.default
+        for name, argument in inspect.signature(command).parameters.items()
+    }
+    # No file: None in a command, "" in the function.
+    assert {**options, "path": ""} == {**defaults, "path": ""}
