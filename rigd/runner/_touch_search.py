@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 
 _ROUNDING_STD_PER_STEP: Final = 1 / sqrt(12)
 """Standard deviation of the rounding error, as a fraction of the quantisation step."""
-_FINAL_ESTIMATES_TIMEOUT_S: Final = 30.0
-"""Maximum time in seconds for the last estimates after the end of a record."""
+_FINAL_ESTIMATES_TIMEOUT_S: Final = 120.0
+"""Maximum time in seconds for the last estimates after the end of a record. They take seconds, but
+more than half a minute if each processor has five busy programs."""
 
 
 @dataclass(frozen=True, slots=True)
