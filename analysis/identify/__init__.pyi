@@ -1,4 +1,5 @@
 from . import beam_uniformity as beam_uniformity
+from . import deviance_curve as deviance_curve
 from . import drag_torque as drag_torque
 from . import free_decay as free_decay
 from . import headline as headline

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from rigd.check_rows import CheckResult, CheckRow
-from rigd.checks import offline
+from rigd.checks import closed_loop, offline, stopping_distance
 from rigd.devices import unknown_values
 from rigd.errors import FailureError, UserError
 from rigd.profile import Profile
@@ -80,18 +80,18 @@ OFFLINE_CHECKS: Final = (
         not_acceptable="the shaft could not be held",
     ),
     OfflineCheck(
-        offline.stability_rows,
-        (offline.STABILITY_ROW,),
+        closed_loop.stability_rows,
+        (closed_loop.STABILITY_ROW,),
         not_acceptable="the shaft could not be held",
     ),
-    OfflineCheck(offline.margin_rows),
+    OfflineCheck(closed_loop.margin_rows),
     OfflineCheck(
-        offline.stopping_distance_rows,
+        stopping_distance.stopping_distance_rows,
         (
-            offline.STOPPING_LOOP_FAILS_ROW,
-            offline.STOPPING_NO_ANGLE_ROW,
-            offline.STOPPING_ENCODER_FAILS_ROW,
-            offline.STOPPING_MISSED_TICKS_ROW,
+            stopping_distance.STOPPING_LOOP_FAILS_ROW,
+            stopping_distance.STOPPING_NO_ANGLE_ROW,
+            stopping_distance.STOPPING_ENCODER_FAILS_ROW,
+            stopping_distance.STOPPING_MISSED_TICKS_ROW,
         ),
     ),
 )
@@ -186,7 +186,7 @@ def run_offline_checks(profile: Profile, accepted_names: Sequence[str] = ()) -> 
 
     Returns
     -------
-    Clearance
+    OfflineCheckResult
         Failed rows, and warnings.
 
     Raises

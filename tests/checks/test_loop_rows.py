@@ -6,7 +6,7 @@ import pytest
 
 from rigd.beam import Damping
 from rigd.check_rows import CheckResult, overall
-from rigd.checks.offline import margin_rows, stability_rows
+from rigd.checks.closed_loop import margin_rows, stability_rows
 from rigd.profile import load_profile
 
 

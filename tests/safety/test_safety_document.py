@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rigd.checks.offline import max_stopping_distance, stopping_distance_rows
+from rigd.checks.stopping_distance import max_stopping_distance, stopping_distance_rows
 from rigd.profile import load_profile
 from rigd.safety.limits import INTERLOCKS
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from rigd.check_rows import CheckResult
-from rigd.checks.offline import max_stopping_distance, stopping_distance_rows
+from rigd.checks.stopping_distance import max_stopping_distance, stopping_distance_rows
 from rigd.profile import load_profile
 
 
