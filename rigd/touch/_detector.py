@@ -135,6 +135,7 @@ class TouchDetector:
 
     def arm(self) -> None:
         """Start to detect touches with the next tick."""
+        self._filter.follow_zeros()
         if self._ticks:
             torque_std, shear_std = (sqrt(square_sum / self._ticks) for square_sum in self._squares)
             self.noise = torque_std or 1.0, shear_std or 1.0
@@ -147,8 +148,12 @@ class TouchDetector:
         self._recent = 1.0
 
     def disarm(self) -> None:
-        """Stop detecting touches; the beam model still follows the readings of each tick."""
+        """Stop detecting touches until the beam is free again and `arm` is called.
+
+        The beam model still follows the readings of each tick, but not the zeros of the sensor.
+        """
         self._armed = False
+        self._filter.hold_zeros()
         self.level = 0.0
 
     def contact_force_n(self, shear_n: float) -> float:

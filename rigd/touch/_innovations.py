@@ -178,12 +178,14 @@ class InnovationFilter:
     __slots__ = (
         "_angle_rad",
         "_gain",
+        "_held_zeros",
         "_multiply",
         "_previous_angle_rad",
         "_start_rad",
         "_states",
         "_unwhitening",
         "_vectors",
+        "_zero_states",
         "predicted",
         "whitened",
     )
@@ -198,6 +200,8 @@ class InnovationFilter:
         self._multiply = np.asfortranarray(model.matrix).dot
         # In turn input [state, angle, torque, shear] and output [state, whitened, predicted].
         self._vectors = tuple(np.zeros((2, n + 4)))
+        self._zero_states = slice(n - model.channels, n)
+        self._held_zeros: Real | None = None
         self._start_rad: float | None = None
         self._angle_rad = self._previous_angle_rad = 0.0
         self.whitened = (0.0, 0.0)
@@ -243,6 +247,14 @@ class InnovationFilter:
         else:
             self._step_with_wrench(relative_angle_rad, torque_nm, shear_n)
 
+    def hold_zeros(self) -> None:
+        """Hold the zeros of torque and shear, which a contact force would shift for seconds."""
+        self._held_zeros = self._vectors[0][self._zero_states].copy()
+
+    def follow_zeros(self) -> None:
+        """Follow the zeros of torque and shear again."""
+        self._held_zeros = None
+
     @property
     def predicted_shear_n(self) -> float:
         """Base shear in N predicted from the angle alone; 0 if the model has no shear."""
@@ -260,6 +272,8 @@ class InnovationFilter:
         input_vector[n + 1] = torque_nm
         input_vector[n + 2] = shear_n
         self._multiply(input_vector[: n + 3], output_vector)
+        if self._held_zeros is not None:
+            output_vector[self._zero_states] = self._held_zeros
         self._vectors = output_vector, input_vector
         torque_innovation, shear_innovation, predicted_torque, predicted_shear = output_vector[
             n:
@@ -274,6 +288,8 @@ class InnovationFilter:
         """Process one tick without a valid wrench, whose effect on the filter's state is undone."""
         self._step_with_wrench(relative_angle_rad, torque_nm, shear_n)
         self._vectors[0][: self._states] -= self._gain @ np.array(self.whitened)
+        if self._held_zeros is not None:
+            self._vectors[0][self._zero_states] = self._held_zeros
         self.whitened = 0.0, 0.0
 
 

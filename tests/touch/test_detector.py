@@ -195,6 +195,21 @@ def test_no_two_signatures_are_alike(model):
     assert alike.max() < 0.9
 
 
+def test_a_contact_makes_no_touch_after_its_end(model):
+    """The zero of the sensor does not follow a force that lasts for seconds."""
+    tick = np.arange(6000)
+    force = -3.0 * np.clip((tick - 1500) / 2, 0, 1) * np.clip((3500 - tick) / 200, 0, 1)
+    detector, touches = detector_of(model), []
+    for now, readings in enumerate(np.column_stack(record(np.zeros(6000), force_n=force)).tolist()):
+        if now in (REST, 4500):
+            detector.arm()
+        if detector.step(*readings):
+            touches.append(now)
+            detector.disarm()
+    (touch,) = touches
+    assert 1500 < touch <= 1510
+
+
 @pytest.mark.parametrize("name", ["soft", "middle", "hard"])
 def test_a_contact_looks_like_a_signature(name, struck):
     # Of records that another simulation has made; the innovations are large beside their noise.
