@@ -57,6 +57,7 @@ def test_a_recorder_alone_knows_a_whole_record(channels, tmp_path, ticks, outcom
 
 
 @pytest.mark.process
+@pytest.mark.usefixtures("children_copied")
 def test_a_control_process_that_dies_on_the_way_back_leaves_a_whole_record(tmp_path):
     profile = load_shipped("sim")
     # A virtual machine that is short of processor time stands still for 0.1 s at a time.

@@ -134,7 +134,7 @@ def test_too_great_a_force_is_a_fault(rigd):
         further(("0.5", "--speed", "0"), "speed_rad_s = 0 rad/s must be more than 0 rad/s"),
         further(("0.5", "--hold", "0.001"), "ends before the motor has stopped"),
         (("1.8",), "limits.angle_rad); go less far or slower.\n"),
-        (("0.5", "--model", "none.json"), "none.json"),
+        further(("0.5", "--model", "none.json"), "none.json"),
     ],
 )
 def test_wrong_options_are_refused(rigd, arguments, said):

@@ -1,11 +1,14 @@
 """The daemon's service on a rig whose processes are threads; `rigd stop` in this process."""
 
 import os
+from dataclasses import replace
 
 import pytest
 from operated_daemons import Operated, run_processes_as_threads
 
 from rigd.daemon import _stop as stop_module
+from rigd.daemon import background
+from rigd.engine.workers import PREDICTION
 from rigd.profile import load_profile
 from rigd.runtime.processes import read_processes
 
@@ -16,9 +19,15 @@ def profile(write_profile):
 
 
 @pytest.fixture
-def operate(profile, tmp_path, monkeypatch):
-    """Make a service on a rig of threads, not connected yet."""
+def operate(profile, tmp_path, monkeypatch, children_copied):
+    """Make a service on a rig of threads, not connected yet; its jobs are copies of this process.
+
+    These have no limit of memory, of which this process has more, and do not wait for others.
+    """
     run_processes_as_threads(monkeypatch)
+    copied = replace(PREDICTION, memory=None, niceness=0)
+    for job in (background.PredictionJob, background.CheckJob):
+        monkeypatch.setattr(job, "worker", copied)
     made = []
 
     def make():

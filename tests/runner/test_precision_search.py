@@ -179,9 +179,11 @@ def test_a_value_below_its_uncertainty_does_not_put_a_relative_precision_out_of_
     assert estimate.ratio == pytest.approx(10.0)
 
 
-def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench):
+def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench, monkeypatch):
     """Only after a pause, and a fit of every structure, does anything count as reached."""
+    designed_at_once(monkeypatch, std=1.0)
     bench.told(ON_THE_WAY)
+    designed_at_once(monkeypatch, std=0.01)
     planned = bench.writer.ticks
     while not bench.search.may_be_last:
         *_, last = bench.told(CERTAIN)
@@ -323,7 +325,8 @@ def test_what_goes_too_slowly_is_out_of_reach(profile, quick_pieces):
     assert bench.writer.ticks < 40 * RATE_HZ
 
 
-def test_damping_that_is_absent_cannot_be_told(profile):
+def test_damping_that_is_absent_cannot_be_told(profile, monkeypatch):
+    monkeypatch.setattr("rigd.runner._precision_search._MAX_UNREACHABLE_FORECASTS", 1)
     bench = Bench(profile, "zeta 15%")
     ends = []
     while not ends:

@@ -80,8 +80,8 @@ def rows(page, count, outcome):
     says(page, "#rows tr >> nth=0", outcome)
 
 
-def test_a_session_in_real_time_is_watched_and_stopped_and_what_fails_is_told(operate, open_page):
-    daemon, page = operate()
+def test_a_session_in_real_time_is_watched_and_stopped(operate):
+    _, page = operate()
     start(page)
     says(page, "#phase", "recording")
     says(page, "#frequency", "Hz")
@@ -93,6 +93,12 @@ def test_a_session_in_real_time_is_watched_and_stopped_and_what_fails_is_told(op
     says(page, "#state-reason", "was stopped")
     assert delay_s(page, "READY", "→ ready: chirp was stopped") < TELL_S
     rows(page, 1, "stopped")
+
+
+# As test_page_states.py of the page, test_page_server.py of its server, and tests/daemon of the rest.
+@pytest.mark.further
+def test_what_fails_is_told(operate, open_page):
+    daemon, page = operate()
 
     def begin():
         start(page)

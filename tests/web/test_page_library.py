@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from cases import further
 from processes import eventually
 from web_daemon import MAX_JOBS, TOKEN, JobError, Jobs
 
@@ -247,8 +248,15 @@ time.sleep(600)
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("end", ["killed", "ended"])
-@pytest.mark.parametrize("state", ["suspended", "running"])
+@pytest.mark.parametrize(
+    ("state", "end"),
+    [
+        ("suspended", "killed"),
+        ("running", "ended"),
+        further("suspended", "ended"),
+        further("running", "killed"),
+    ],
+)
 @pytest.mark.usefixtures("jobs")
 def test_a_job_ends_with_the_page(tmp_path, state, end):
     page = subprocess.Popen(
