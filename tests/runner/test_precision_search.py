@@ -4,8 +4,8 @@ import re
 
 import numpy as np
 import pytest
+from known_beam import CERTAIN, ON_THE_WAY, answer
 
-from rigd.beam import modes
 from rigd.engine import shared_memory_fd
 from rigd.engine.messages import FitReport, PlannedSegment, SearchEnded
 from rigd.engine.reference import ReferenceWriter, write_reference
@@ -21,63 +21,12 @@ from rigd.runner._precision_search import (
 )
 from rigd.runner.planning import RigPreview
 
-NAMES = ("zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "bending_stiffness_n_m2")
 RATE_HZ = 1000
-ON_THE_WAY, CERTAIN = 0.03, 0.001
-"""Relative standard deviations of the damping: a few pieces away from 1 %, and below it."""
 
 
 @pytest.fixture(scope="module")
 def profile():
     return load_profile("sim")
-
-
-def answer(profile, tick, share, flag=None, with_air_drag=False):
-    """What the fit answers where every number has a share of itself as its deviation."""
-    beam, damping = profile.rig.beam, profile.rig.damping
-
-    def quantity(value):
-        std = share * value
-        ends = [value - 2 * std, value + 2 * std]
-        return {"value": value, "std": std, "interval_95": ends, "flag": flag}
-
-    found = [mode for mode in modes(beam, damping, 3) if mode.frequency_hz < 50]
-    return {
-        "tick": tick,
-        "type": "VI",
-        "uniformity_percent": 0.1,
-        "problem": "",
-        "doubt": flag,
-        "findings": ["Something struck the beam."] if flag else [],
-        "with_air_drag": with_air_drag,
-        "modes": [
-            {
-                "mode": number,
-                "shown": True,
-                "frequency_hz": quantity(mode.frequency_hz),
-                "damping_ratio": quantity(mode.damping_ratio),
-            }
-            for number, mode in enumerate(found, start=1)
-        ],
-        "parameters": {"zeta": quantity(damping.zeta)},
-        "plant": {
-            "beam": {
-                "length_m": beam.length_m,
-                "density_kg_per_m": beam.density_kg_per_m,
-                "bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
-            },
-            "damping": {
-                "zeta": damping.zeta,
-                "alpha": damping.alpha,
-                "gamma": damping.gamma,
-                "lambda": damping.lambda_,
-            },
-            "delay_s": 0.0,
-            "tool_inertia_kg_m2": 0.0,
-        },
-        "covariance": {"names": list(NAMES), "matrix": np.eye(len(NAMES)).tolist()},
-        "noise": {"frequency_hz": [0.1, 50.0], "nm2_per_hz": [5e-8, 5e-8]},
-    }
 
 
 class Bench:
