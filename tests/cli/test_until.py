@@ -77,8 +77,8 @@ def search(made_once):
 
     def run(estimator, folder):
         with pytest.MonkeyPatch.context() as patch, warm_start.children_copied():
-            group = ProcessGroup(live=False, extra_processes=[FIT])
             patch.setattr("rigd.engine.workers.ONLINE_ESTIMATOR", f"known_beam:{estimator}")
+            group = ProcessGroup(live=False, extra_processes=[FIT])
             patch.setattr("rigd.cli.run.start_processes", lambda **_: (StopRequest(), group))
             patch.setattr("rigd.runtime.ignore", lambda **_: None)  # of the test runner
             command = ["run", "until", "--damping", "1%", "--at-most", "20", "--json", "--no-look"]
