@@ -7,24 +7,18 @@ import resource
 import signal
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-import warm_start
 from cases import further
 from processes import child_running
-from typer.testing import CliRunner
 
 from analysis.record import load_record
 from analysis.results import whole_record
 from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
-from rigd.cli.app import app
 from rigd.engine.workers import FIT
 from rigd.profile import load_profile
-from rigd.runner import ProcessGroup
-from rigd.runtime import StopRequest
 from rigd.session import read_session
 
 pytestmark = pytest.mark.process
@@ -69,25 +63,16 @@ def record(done):
 
 
 @pytest.fixture(scope="module")
-def search(made_once):
+def search(run_patched):
     """Search until the damping is known to 1 %, by an estimator that knows the beam.
 
     Returns a function of the estimator's class; its value is exit code, errors, result.
     """
 
-    def run(estimator, folder):
-        with pytest.MonkeyPatch.context() as patch, warm_start.children_copied():
-            patch.setattr("rigd.engine.workers.ONLINE_ESTIMATOR", f"known_beam:{estimator}")
-            group = ProcessGroup(live=False, extra_processes=[FIT])
-            patch.setattr("rigd.cli.run.start_processes", lambda **_: (StopRequest(), group))
-            patch.setattr("rigd.runtime.ignore", lambda **_: None)  # of the test runner
-            command = ["run", "until", "--damping", "1%", "--at-most", "20", "--json", "--no-look"]
-            done = CliRunner().invoke(app, [*command, *SEEDED, "--output", str(folder)])
-        (folder / "told.json").write_text(json.dumps([done.exit_code, done.stdout, done.stderr]))
-
     def search(estimator):
-        folder = made_once(f"until-{estimator}", partial(run, estimator))
-        code, output, errors = json.loads((folder / "told.json").read_text())
+        command = ["until", "--damping", "1%", "--at-most", "20", "--json", "--no-look", *SEEDED]
+        patches = {"rigd.engine.workers.ONLINE_ESTIMATOR": f"known_beam:{estimator}"}
+        code, output, errors = run_patched(f"until-{estimator}", command, patches, FIT)
         assert output, errors
         (session,) = json.loads(output)["sessions"]
         return code, errors, session
