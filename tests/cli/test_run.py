@@ -120,9 +120,11 @@ def test_each_session_gets_a_quick_look(rigd, tmp_path, brief_looks):
     assert session["look"] is None
 
 
-def test_ctrl_c_skips_a_quick_look_and_stops_nothing(start_rigd, tmp_path, brief_looks):
+def test_ctrl_c_skips_a_quick_look_and_stops_nothing(start_rigd, monkeypatch, brief_looks):
     brief_looks.write_text("import time; time.sleep(600)\n")
-    process = start_rigd("run", "hold", "--fast", "--duration", "1", "--json")
+    monkeypatch.delenv("PYTHONPATH")
+    options = ("--fast", "--duration", "1", "--json")
+    process = start_rigd("run", "hold", *options, packages=brief_looks.parents[1])
     while "Ctrl-C skips it" not in (said := process.stderr.readline()):
         assert said
     look = child_running(process.pid, "analysis.quick_look")
@@ -216,11 +218,11 @@ def test_a_series_is_reproduced_by_its_seed_and_its_sessions_differ(rigd, tmp_pa
 
 
 def test_real_time_keeps_its_books(rigd, patient, tmp_path):
-    lengths = ("--duration", "1", "--rest", "0.5", "--ring-down", "0.5")
+    lengths = ("--duration", "0.5", "--rest", "0.1", "--ring-down", "0.1")
     session = the_session(rigd("run", "chirp", "--json", "--profile", patient, *lengths))
-    assert session["scheduled"] == 2000
+    assert session["scheduled"] == 700
     assert session["lost"] == 0
-    assert session["recorded"] + session["missed"] == 2000
+    assert session["recorded"] + session["missed"] == 700
     record = read_session(tmp_path / session["path"])
     assert len(record.samples) == session["recorded"]
     began_s = 1e-9 * (record.samples["t_ns"] + record.samples["lateness_ns"].astype(int))
@@ -240,7 +242,7 @@ def to_one(process, number):
     process.send_signal(number)
 
 
-def recorded(folder, size=50_000, timeout_s=60.0):
+def recorded(folder, size=10_000, timeout_s=60.0):
     """Wait until a session is being recorded in a folder; return its file."""
 
     def grown():
@@ -518,6 +520,7 @@ def test_a_dead_supervisor_ends_the_session_safely(start_rigd, patient, tmp_path
     assert eventually(lambda: has_ended(control))
 
 
+@pytest.mark.further  # as below, and tests/excitation/test_signals.py
 def test_a_chirp_there_and_back_begins_as_a_plain_one_and_so_does_its_welch_estimate(
     short_chirps, tmp_path
 ):
@@ -544,6 +547,24 @@ def test_a_chirp_there_and_back_begins_as_a_plain_one_and_so_does_its_welch_esti
     # The reference passes the same angles, and the frequency at equal distances from the turn.
     reference = both.reference_rad - both.reference_rad[0]
     assert np.abs(np.diff(reference[20_400:20_600])).max() < 0.025 * 2 * np.pi * 50 / 1000
+
+
+def test_the_welch_estimate_of_a_chirp_there_and_back_is_that_of_its_way_there(short_chirps):
+    """Of half of a plain chirp, then: what comes behind it is no matter."""
+    session = read_session(short_chirps[0])
+    planned = {"sweep": (500, 20_500), "there": (500, 10_500), "back": (10_500, 20_500)}
+    stated = {**session.metadata, "duration_s": "10.0", "stop_hz": "25.0"}
+    both = record_of(
+        replace(session, segments=planned, metadata={**stated, "there_and_back": "1"})
+    )
+    half = {"sweep": (500, 10_500), "ring_down": (10_500, 20_500)}
+    plain = record_of(replace(session, segments=half, metadata=stated))
+    assert (both.there, both.sweep) == (slice(500, 10_500), slice(500, 20_500))
+    settings = welch_settings(both, WelchSettings(segment_length=1439, overlap=216))
+    responses = [estimate(record, settings)[0].response for record in (both, plain)]
+    np.testing.assert_array_equal(*responses)
+    assert any("use the way there alone" in remark for remark in remarks(both))
+    assert welch_exclusion_reason(both) is None
 
 
 def test_a_chirp_there_and_back_that_is_stopped_on_its_way_back_keeps_its_welch_estimate(

@@ -176,3 +176,5 @@ def test_predicted_peaks_of_a_tiny_motion_are_numbers(rigd_here, monkeypatch):
     assert 0.9e-6 < angle < 1.1e-6
     assert 1e-6 < speed < 1e-5
     assert torque > 0.0
+    told = rigd_here("run", "chirp", "--fast", *options, "--there-and-back").stdout
+    assert "and back, 5 s each way, record of 11 s" in told

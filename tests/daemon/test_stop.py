@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 import pytest
-from processes import eventually
+from processes import children, eventually
 from stop_scenarios import SITUATIONS, can_isolate, isolated
 
 from rigd.daemon.address import socket_path
@@ -25,7 +25,7 @@ from rigd.runtime.processes import read_process, read_processes
 
 def control_of(pid):
     """Short name of the control process of a supervisor."""
-    for process in read_processes():
+    for process in filter(None, map(read_process, children(pid))):
         if supervisor_of_control(process.command) == pid:
             return process.name
     return None
