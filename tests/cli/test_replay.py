@@ -21,10 +21,12 @@ import warm_start
 from graphics import NO_GRAPHICS, viewer_ended
 from processes import children, eventually, has_ended, listeners
 from rerun_files import batches
+from typer.testing import CliRunner
 
 from analysis.models import WelchSettings
 from analysis.paper import estimate
 from analysis.record import load_record
+from rigd.cli.app import app
 from rigd.session import SessionError, SessionWriter, read_session, read_timings
 from rigd.session.layout import SAMPLE_SIZE, TIMING_SIZE, Status, pack_sample_into, pack_timing_into
 from rigd.view import draw_session
@@ -83,8 +85,10 @@ def chirp(made_once, short_chirps):
     path = short_chirps[0]
 
     def make(folder):
-        done = run("replay", path, "--save", "chirp.rrd", cwd=folder)
-        assert (done.returncode, done.stdout) == (0, ""), done.stderr
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            done = CliRunner().invoke(app, ["replay", str(path), "--save", "chirp.rrd"])
+        assert (done.exit_code, done.stdout) == (0, ""), done.stderr
         assert done.stderr == "chirp.rrd: open it with rigd replay chirp.rrd.\n"
 
     folder = made_once("replayed", make)
