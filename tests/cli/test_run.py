@@ -355,7 +355,7 @@ def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, t
     assert len(record.samples) == session["recorded"]
 
 
-@pytest.mark.further  # as tests/runner/test_rig.py, with the advice of tests/recovery/test_advice.py
+@pytest.mark.further  # as tests/runner/test_rig.py and tests/recovery/test_advice.py
 def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, tmp_path):
     process = start_rigd("run", "hold", "--duration", "3", "--rest", "0", "--profile", patient)
     part = recorded(tmp_path, 1000)  # before, its name is only being tried
@@ -554,9 +554,7 @@ def test_the_welch_estimate_of_a_chirp_there_and_back_is_that_of_its_way_there(s
     session = read_session(short_chirps[0])
     planned = {"sweep": (500, 20_500), "there": (500, 10_500), "back": (10_500, 20_500)}
     stated = {**session.metadata, "duration_s": "10.0", "stop_hz": "25.0"}
-    both = record_of(
-        replace(session, segments=planned, metadata={**stated, "there_and_back": "1"})
-    )
+    both = record_of(replace(session, segments=planned, metadata={**stated, "there_and_back": "1"}))
     half = {"sweep": (500, 10_500), "ring_down": (10_500, 20_500)}
     plain = record_of(replace(session, segments=half, metadata=stated))
     assert (both.there, both.sweep) == (slice(500, 10_500), slice(500, 20_500))

@@ -106,7 +106,7 @@ def test_a_search_ends_when_it_is_reached(searched, searched_record):
     assert decided_s == sorted(set(decided_s))  # by one estimate of each part of the record
 
 
-@pytest.mark.further  # as above with an estimator that knows the beam, and tests/analysis/test_online.py
+@pytest.mark.further  # as above with an estimator, and tests/analysis/test_online.py
 def test_it_ends_when_the_precision_is_reached(done):
     code, errors, session = done
     assert code == 0, errors

@@ -142,9 +142,7 @@ def impatient(monkeypatch):
 
 
 @pytest.mark.process
-def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(
-    path, deaf, impatient
-):
+def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(path, deaf, impatient):
     process = deaf()
     with pytest.raises(DaemonUnreachableError) as raised:
         stop_session(path)

@@ -233,7 +233,9 @@ def test_a_record_is_fitted_while_it_is_recorded(serve, ask, ask_here):
     assert told["text"][0] in out
 
 
-def test_a_session_survives_its_client_and_ends_by_a_stop_or_with_its_daemon(serve, stop_here, rigd):
+def test_a_session_survives_its_client_and_ends_by_a_stop_or_with_its_daemon(
+    serve, stop_here, rigd
+):
     daemon = serve()
     client = rigd("start", "hold", *LONG, "--repeat", "3")
     until(recording, daemon)

@@ -18,7 +18,7 @@ from processes import eventually
 from rigd.daemon import _page, page_address
 from rigd.engine.workers import PAGE
 from rigd.profile import load_profile
-from rigd.web._server import OperatorPageServer
+from rigd.web import run_page  # noqa: F401 - copies are spared its imports
 
 pytestmark = pytest.mark.process
 
@@ -134,7 +134,7 @@ def test_a_page_that_fails_ends_and_its_reason_is_logged(serve, monkeypatch, cap
     async def run(self):
         raise RuntimeError("such a thing")
 
-    monkeypatch.setattr(OperatorPageServer, "run", run)  # and so in the copy
+    monkeypatch.setattr("rigd.web._server.OperatorPageServer.run", run)  # and so in the copy
     monkeypatch.setattr(_page, "PAGE", replace(PAGE, restarts=0))
     page = serve()
     page._thread.join(60.0)

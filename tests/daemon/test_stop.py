@@ -20,7 +20,7 @@ from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.engine.workers import CONTROL
 from rigd.runtime import STOP_SIGNAL
 from rigd.runtime.addresses import answers
-from rigd.runtime.processes import read_process, read_processes
+from rigd.runtime.processes import read_process
 
 
 def control_of(pid):

@@ -107,16 +107,6 @@ def test_what_has_no_amplitude_has_no_largest(profile, tmp_path):
         assert largest_amplitude(profile, excitation) is None
 
 
-@pytest.mark.parametrize(
-    ("kind", "parameters"),
-    [("touch", {"angle_rad": 0.6, "speed_rad_s": 30.0}), ("move", {"angle_rad": 1.5})],
-)
-def test_what_goes_to_an_angle_is_told_of_no_amplitude(profile, kind, parameters):
-    plan = predict_session(profile, excitation_for(profile, kind, parameters))
-    assert "At slopes above" in plan.tip_in_words
-    assert "amplitude" not in plan.tip_in_words
-
-
 @pytest.mark.parametrize("projection", [(0.0,) * 6, None])
 def test_a_search_whose_contact_force_is_not_known_is_warned_of(profile, projection):
     sensor = profile.rig.sensor

@@ -95,8 +95,7 @@ def test_a_session_in_real_time_is_watched_and_stopped(operate):
     rows(page, 1, "stopped")
 
 
-# As test_page_states.py of the page, test_page_server.py of its server, and tests/daemon of the rest.
-@pytest.mark.further
+@pytest.mark.further  # as test_page_states.py, test_page_server.py and tests/daemon
 def test_what_fails_is_told(operate, open_page):
     daemon, page = operate()
 
