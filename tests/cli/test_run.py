@@ -26,6 +26,8 @@ from analysis.paper import estimate
 from analysis.record import record_of
 from rigd.beam import modes
 from rigd.profile import load_profile
+from rigd.runner import ProcessGroup
+from rigd.runtime import StopRequest
 from rigd.session import read_controls, read_session
 from rigd.session.layout import Status
 
@@ -420,19 +422,31 @@ def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, patient, 
     assert part.name in errors
 
 
-@pytest.mark.further  # as tests/runner/test_series.py and tests/daemon/test_service.py
-def test_a_series_whose_folder_goes_tells_of_those_before(start_rigd, tmp_path):
-    (tmp_path / "moved").mkdir()
-    (tmp_path / "sessions").symlink_to("moved")
-    options = ("--json", "--duration", "1", "--rest", "0", "--repeat", "999", "--fast")
-    process = start_rigd("run", "hold", *options)
-    assert eventually(lambda: list(tmp_path.glob("sessions/*-02.mcap")))
-    (tmp_path / "file").write_text("in the way")
-    (tmp_path / "file").rename(tmp_path / "sessions")  # in one step: a missing folder is recreated
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 1, errors
-    assert len(json.loads(output)["sessions"]) >= 2
-    assert "Traceback" not in errors
+class FolderGoes(StopRequest):
+    """A stop that never comes; the folder of the sessions goes once there is one."""
+
+    @property
+    def requested(self):
+        if list(Path("sessions").glob("*-01.mcap")):
+            Path("sessions").rename("moved")
+            Path("sessions").touch()
+        return False
+
+    @requested.setter
+    def requested(self, _):
+        pass
+
+
+@pytest.mark.usefixtures("children_copied")
+def test_a_series_whose_folder_goes_tells_of_those_before(rigd_here, monkeypatch):
+    processes = FolderGoes(), ProcessGroup(live=False)
+    monkeypatch.setattr("rigd.cli.run.start_processes", lambda **_: processes)
+    brief = ("--duration", "0.3", "--rest", "0", "--fast", "--no-look")
+    done = rigd_here("run", "hold", *brief, "--repeat", "3", "--json")
+    assert done.returncode == 1, done.stderr
+    (session,) = json.loads(done.stdout)["sessions"]
+    assert session["outcome"] == "complete"
+    assert "cannot be created" in done.stderr
 
 
 @pytest.mark.further  # as names that are taken
