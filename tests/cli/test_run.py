@@ -219,6 +219,7 @@ def test_a_series_is_reproduced_by_its_seed_and_its_sessions_differ(rigd, tmp_pa
         assert np.array_equal(first.samples, second.samples)
 
 
+@pytest.mark.further  # as the sessions below that are stopped
 def test_real_time_keeps_its_books(rigd, patient, tmp_path):
     lengths = ("--duration", "0.5", "--rest", "0.1", "--ring-down", "0.1")
     session = the_session(rigd("run", "chirp", "--json", "--profile", patient, *lengths))
@@ -227,6 +228,11 @@ def test_real_time_keeps_its_books(rigd, patient, tmp_path):
     assert session["recorded"] + session["missed"] == 700
     record = read_session(tmp_path / session["path"])
     assert len(record.samples) == session["recorded"]
+    keeps_real_time(record, session)
+
+
+def keeps_real_time(record, session):
+    """Check that a record was made in real time, and that its counts are those of its samples."""
     began_s = 1e-9 * (record.samples["t_ns"] + record.samples["lateness_ns"].astype(int))
     rate_hz = (len(began_s) - 1) / (began_s[-1] - began_s[0])
     assert float(record.outcome["true_rate_hz"]) == pytest.approx(rate_hz, rel=0.01)
@@ -292,7 +298,10 @@ def test_every_stop_leaves_the_torque_off_and_a_complete_file(
         (session,) = json.loads(output)["sessions"]
         assert session["outcome"] == "stopped"
         assert session["scheduled"] == session["recorded"] + session["missed"]
+        assert session["lost"] == 0
         record = read_session(folder / session["path"])
+        assert len(record.samples) == session["recorded"]
+        keeps_real_time(record, session)
         assert record.outcome["outcome"] == "stopped"
         last = record.samples[-1]
         assert last["torque_command_nm"] == 0.0

@@ -84,7 +84,9 @@ def test_predicted_saturation_is_what_the_controller_does(profile):
     [
         lambda rad: chirp(rate_hz=1000.0, amplitude_rad=rad, duration_s=20.0, taper_s=1.0),
         lambda rad: step(rate_hz=1000.0, amplitude_rad=-rad, duration_s=1.0, ring_down_s=1.0),
-        lambda rad: multisine(rate_hz=1000.0, amplitude_rad=rad, period_s=5.0, duration_s=10.0),
+        further(
+            lambda rad: multisine(rate_hz=1000.0, amplitude_rad=rad, period_s=5.0, duration_s=10.0)
+        ),
     ],
 )
 def test_the_largest_amplitude_passes_and_a_little_more_does_not(profile, make, force):
@@ -135,7 +137,8 @@ def test_angle_speed_and_tracking_can_never_be_forced(profile):
 
 
 @pytest.mark.parametrize(
-    "projection", [(0, 0, 0, 0, 0, 1.0), (0, 0, 0, 0, 0, -2.0), (0, 0.03, 0, 0, 0, 0.5)]
+    "projection",
+    [further((0, 0, 0, 0, 0, 1.0)), further((0, 0, 0, 0, 0, -2.0)), (0, 0.03, 0, 0, 0, 0.5)],
 )
 def test_the_sensor_s_range_bounds_the_coupling_torque(profile, projection):
     excitation = chirp(rate_hz=1000.0, duration_s=20.0)

@@ -70,7 +70,7 @@ def designed_at_once(monkeypatch, std):
     rest, planned = np.zeros(RATE_HZ), []
 
     def design(estimate, angle_rad, targets, rig, time_left_s, **options):
-        planned.append(options)
+        planned.append({"targets": targets, **options})
         k = len(estimate.names)
         now = (Precision(targets[0], 1.0, std, 0.1),)
         return Segment(
@@ -323,16 +323,17 @@ def test_modes_that_are_not_those_of_a_uniform_beam_are_excited_where_they_are(p
     assert pytest.approx(16.01 * np.sqrt(1.04), abs=0.06) in bands_hz
 
 
-def test_deviations_are_designed_for_as_fits_state_them(profile):
+def test_deviations_are_designed_for_as_fits_state_them(profile, monkeypatch):
     """A fit that states more than the design expects needs more information."""
-    expected = []
+    planned = designed_at_once(monkeypatch, std=1.0)
     for share in (0.01, 0.02):
         bench = Bench(profile, "damping 1:0.2%")
         *_, piece = bench.told(share)
-        (one,) = piece.document["expected"]
-        assert one["asked_std"] == pytest.approx(0.002 * 0.0089, rel=0.05)
-        expected.append(one["std"])
-    assert expected[1] > 1.1 * expected[0]
+        (target,), (one,) = planned[-1]["targets"], piece.document["expected"]
+        # What the design is asked for is told as fits state it: of its deviation of 0.1.
+        assert target.std * one["asked_std"] / 0.1 == pytest.approx(0.002)
+    less, more = (each["targets"][0].std for each in planned)
+    assert less > 1.1 * more
 
 
 def parameter_floor(targets, **given):
