@@ -136,7 +136,8 @@ def test_a_check_is_for_a_rig_without_a_session(operated):
 
     told = []
     operated.world.then, operated.world.countdown = check, 50
-    operated.ask("start", **CHIRP)
+    brief = {"duration_s": 0.3, "rest_s": 0.0, "ring_down_s": 0.0}
+    operated.ask("start", excitation="hold", parameters=brief)
     assert "without a running session" in str(told[0])
 
 
