@@ -81,12 +81,11 @@ def rows(page, count, outcome):
 
 
 def test_a_session_in_real_time_is_watched_and_stopped(operate):
-    _, page = operate()
+    _, page = operate("--no-look")
     start(page)
     says(page, "#phase", "recording")
     says(page, "#frequency", "Hz")
     says(page, "#time-left", "0:")
-    says(page, "#response-keys", "measured")
     assert page.locator("#gauge-angle .percent").inner_text() != "–"
     assert page.get_attribute("#strip-angle", "aria-label") != "Angle: no data yet"
     page.click("#stop")
@@ -111,6 +110,7 @@ def test_what_fails_is_told(operate, open_page):
         says(page, "#state-word", "READY")
 
     begin()
+    says(page, "#response-keys", "measured")
     os.kill(child_running(daemon.process.pid, "control_process"), signal.SIGKILL)
     fails("control")
 

@@ -52,13 +52,25 @@ STATES = [
 ]
 
 
-def test_each_state_is_told_within_a_second(server, page):
+def test_each_state_and_a_failed_stop_are_told_within_a_second(server, page, open_page):
     for message, word, reason, tone in STATES:
         server.tell(message)
         says(page, "#state-word", word)
         says(page, "#state-reason", reason)
         assert page.get_attribute("#bar", "data-tone") == tone
         assert page.is_visible("#fault") == (word == "FAULT")
+    # A stop that fails says what to do, also where the server answers no more.
+    server.replies["stop"] = {"ok": False, "error": "The daemon gave no answer."}
+    page.click("#stop")
+    says(page, "#state-reason", "Not stopped: The daemon gave no answer. Use rigd stop")
+    page.wait_for_timeout(100)
+    assert page.inner_text("#state-word") == "READY"
+    server.close()
+    page.click("#stop")
+    says(page, "#state-reason", "Not stopped: The page's server does not answer.")
+    # That it cannot be reached is what is tested; an open page would try again.
+    page.close()
+    open_page.complaints.clear()
 
 
 @pytest.mark.further
@@ -114,20 +126,6 @@ def test_progress_tells_time_left_phase_and_frequency(server, page):
     # Where time is skipped there is no time left to tell.
     server.tell(progress(0.25, time_left_s=None))
     says(page, "#time-left", "25 %")
-
-
-def test_a_stop_that_fails_says_what_to_do(server, page, open_page):
-    server.replies["stop"] = {"ok": False, "error": "The daemon gave no answer."}
-    page.click("#stop")
-    says(page, "#state-reason", "Not stopped: The daemon gave no answer. Use rigd stop")
-    page.wait_for_timeout(100)
-    assert page.inner_text("#state-word") == "READY"
-    server.close()
-    page.click("#stop")
-    says(page, "#state-reason", "Not stopped: The page's server does not answer.")
-    # That it cannot be reached is what is tested; an open page would try again.
-    page.close()
-    open_page.complaints.clear()
 
 
 @pytest.mark.further
