@@ -184,10 +184,13 @@ def start_rigd(tmp_path):
     """Start `rigd` in an empty folder; it is killed if a test leaves it running."""
     started = []
 
-    def start(*arguments, folder=tmp_path, cold=False):
-        """A `cold` start is of a new interpreter, whose command line others may read."""
+    def start(*arguments, folder=tmp_path, cold=False, packages=None):
+        """A `cold` start is of a new interpreter, whose command line others may read.
+
+        What is in a folder of `packages` is installed for any other.
+        """
         started.append(
-            (subprocess.Popen if cold else warm_start.start)(
+            (subprocess.Popen if cold else partial(warm_start.start, packages=packages))(
                 [RIGD, *map(str, arguments)],
                 cwd=folder,
                 stdout=subprocess.PIPE,

@@ -68,7 +68,7 @@ def test_the_judge_sees_a_drive_that_goes_on(rig, tmp_path, off_s, torque_nm, co
 
 def test_a_command_that_takes_too_long_is_a_complaint_of_its_case(rig, tmp_path, monkeypatch):
     monkeypatch.setattr(rig, "BIN", tmp_path)
-    monkeypatch.setattr(rig, "_COMMAND_S", 0.2)
+    monkeypatch.setattr(rig, "_COMMAND_S", 0.05)
     for name in ("analyze", "rigd"):
         (tmp_path / name).write_text("#!/bin/sh\nexec sleep 20\n")
         (tmp_path / name).chmod(0o700)
@@ -78,6 +78,6 @@ def test_a_command_that_takes_too_long_is_a_complaint_of_its_case(rig, tmp_path,
     part.write_bytes(b"x")
     assert rig._recovered(verdict, part, SimpleNamespace(folder=tmp_path)) is None
     assert verdict.complaints == [
-        "analyze a.mcap: not done after 0.2 s",
-        "rigd recover: not done after 0.2 s",
+        "analyze a.mcap: not done after 0.05 s",
+        "rigd recover: not done after 0.05 s",
     ]

@@ -149,6 +149,7 @@ class StopAfterOne(StopRequest):
 
 
 @pytest.mark.process
+@pytest.mark.usefixtures("children_copied")
 @pytest.mark.parametrize("repeat", [1, 3])
 def test_a_stop_between_two_sessions_is_told(rigd_here, monkeypatch, repeat):
     monkeypatch.setattr(

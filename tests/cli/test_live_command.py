@@ -1,6 +1,7 @@
 """``rigd live``: which view it finds, what it says where there is none, how it opens a window."""
 
 import json
+import sys
 from dataclasses import replace
 
 import pytest
@@ -34,12 +35,13 @@ def view(nobody_else):
 @pytest.fixture
 def fake_viewer(tmp_path, monkeypatch):
     """Have a script take the place of Rerun's program; returns what it saw."""
+    monkeypatch.delitem(sys.modules, "rerun_cli", raising=False)
     package = tmp_path / "packages" / "rerun_cli"
     package.mkdir(parents=True)
     (package / "__init__.py").touch()
     (package / "rerun").write_text(VIEWER)
     (package / "rerun").chmod(0o755)
-    monkeypatch.setenv("PYTHONPATH", str(package.parent))
+    monkeypatch.syspath_prepend(package.parent)
     monkeypatch.setenv("DISPLAY", ":no-such-screen")
     monkeypatch.setenv("SEEN", str(tmp_path / "seen"))
     monkeypatch.setenv("CODE", "0")
@@ -97,9 +99,9 @@ def test_it_waits_if_it_is_to(rigd_here, nobody_else, monkeypatch):
 
 @pytest.mark.process
 def test_the_window_keeps_to_this_computer_and_leaves_the_users_settings_alone(
-    rigd, view, fake_viewer, runtime_folder
+    rigd_here, view, fake_viewer, runtime_folder
 ):
-    done = rigd("live")
+    done = rigd_here("live")
     assert done.returncode == 0, done.stderr
     arguments = fake_viewer("arguments")
     assert "--bind 127.0.0.1" in arguments
@@ -113,9 +115,11 @@ def test_the_window_keeps_to_this_computer_and_leaves_the_users_settings_alone(
 
 
 @pytest.mark.process
-def test_a_window_that_cannot_be_opened_is_told_in_a_sentence(rigd, view, fake_viewer, monkeypatch):
+def test_a_window_that_cannot_be_opened_is_told_in_a_sentence(
+    rigd_here, view, fake_viewer, monkeypatch
+):
     monkeypatch.setenv("CODE", "3")
-    done = rigd("live")
+    done = rigd_here("live")
     assert done.returncode == 1
     assert "(it is dark here). rigd live --web shows the same in a browser." in done.stderr
     assert "Traceback" not in done.stderr
@@ -123,7 +127,7 @@ def test_a_window_that_cannot_be_opened_is_told_in_a_sentence(rigd, view, fake_v
 
 @pytest.mark.process
 def test_a_computer_that_cannot_draw_is_told_which_package_it_lacks(
-    rigd, view, fake_viewer, monkeypatch
+    rigd_here, view, fake_viewer, monkeypatch
 ):
     # As Rerun says it, with the backtrace that follows: longer than what is kept of its log.
     frames = "".join(f"{frame:4}: rerun::main\n" for frame in range(6, 25))
@@ -131,7 +135,7 @@ def test_a_computer_that_cannot_draw_is_told_which_package_it_lacks(
         "SAID", f"thread 'main' panicked at 'Failed to get render context'\n{frames}"
     )
     monkeypatch.setenv("CODE", "101")
-    done = rigd("live")
+    done = rigd_here("live")
     assert done.returncode == 1
     assert "no Vulkan driver" in done.stderr
     assert "the package mesa-vulkan-drivers" in done.stderr

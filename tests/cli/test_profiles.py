@@ -41,7 +41,7 @@ def asked(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("start_from", ["antenna_can", further("antenna_serial")])
-@pytest.mark.parametrize("name", WITH_TORQUE)
+@pytest.mark.parametrize("name", [WITH_TORQUE[0], *map(further, WITH_TORQUE[1:])])
 def test_it_loads_and_has_what_the_file_tells(new, tmp_path, name, start_from):
     done = new(eds_path(name), "--from", start_from)
     assert done.returncode == 0, done.stderr
@@ -209,12 +209,12 @@ def test_a_terminal_is_asked(asked, tmp_path):
 @pytest.mark.parametrize(
     ("lacking", "answers", "accepted", "left"),
     [
-        (("6072", "6077"), ("y", "yes"), ("torque_limit", "torque_feedback"), ""),
+        further(("6072", "6077"), ("y", "yes"), ("torque_limit", "torque_feedback"), ""),
         (("6072", "6077"), ("", "y"), ("torque_feedback",), "torque_limit"),
-        (("6072", "6077"), ("n", "n"), (), "torque_limit, torque_feedback"),
+        further(("6072", "6077"), ("n", "n"), (), "torque_limit, torque_feedback"),
         # Without a watchdog nothing acts on a silent computer, whatever 6007 is.
         (("1016:1", "6007"), ("y",), ("watchdog",), ""),
-        (("1016:1", "6007"), ("n",), (), "watchdog"),
+        further(("1016:1", "6007"), ("n",), (), "watchdog"),
     ],
 )
 def test_what_is_missing_is_accepted_by_a_yes_only(

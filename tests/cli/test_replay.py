@@ -21,10 +21,12 @@ import warm_start
 from graphics import NO_GRAPHICS, viewer_ended
 from processes import children, eventually, has_ended, listeners
 from rerun_files import batches
+from typer.testing import CliRunner
 
 from analysis.models import WelchSettings
 from analysis.paper import estimate
 from analysis.record import load_record
+from rigd.cli.app import app
 from rigd.session import SessionError, SessionWriter, read_session, read_timings
 from rigd.session.layout import SAMPLE_SIZE, TIMING_SIZE, Status, pack_sample_into, pack_timing_into
 from rigd.view import draw_session
@@ -83,8 +85,10 @@ def chirp(made_once, short_chirps):
     path = short_chirps[0]
 
     def make(folder):
-        done = run("replay", path, "--save", "chirp.rrd", cwd=folder)
-        assert (done.returncode, done.stdout) == (0, ""), done.stderr
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            done = CliRunner().invoke(app, ["replay", str(path), "--save", "chirp.rrd"])
+        assert (done.exit_code, done.stdout) == (0, ""), done.stderr
         assert done.stderr == "chirp.rrd: open it with rigd replay chirp.rrd.\n"
 
     folder = made_once("replayed", make)
@@ -309,19 +313,16 @@ def test_missing_and_late_ticks_are_counted_as_the_file_tells_them(write, saved)
     assert len(columns(found["/signals"], "angle_mrad")["t_ns"]) == ticks.size
 
 
-def test_the_ages_of_the_readings_are_shown(write, saved):
-    ticks = np.arange(2500)
-    shown = columns(saved(write("ages.mcap", ticks))["/readings"], "ages_ms")
-    assert np.array_equal(shown["t_ns"], ticks * 1_000_000)
-    age_ms = 1e-3 * (ticks % 100)
-    assert shown["ages_ms"] == pytest.approx(np.column_stack([age_ms, -age_ms]))
-
-
 def test_a_file_with_the_least_there_may_be_is_shown_without_a_model(write, saved):
-    found = saved(write("least.mcap", np.arange(6000)))
+    ticks = np.arange(2000)
+    found = saved(write("least.mcap", ticks))
     assert f"{MAGNITUDE_ENTITY}/model" not in found
     assert f"{MAGNITUDE_ENTITY}/measured" in found
-    assert len(columns(found["/antenna/beam"], "LineStrips3D:strips")["t_ns"]) == 120
+    assert len(columns(found["/antenna/beam"], "LineStrips3D:strips")["t_ns"]) == 40
+    ages = columns(found["/readings"], "ages_ms")
+    assert np.array_equal(ages["t_ns"], ticks * 1_000_000)
+    age_ms = 1e-3 * (ticks % 100)
+    assert ages["ages_ms"] == pytest.approx(np.column_stack([age_ms, -age_ms]))
 
 
 def test_a_session_that_was_stopped_ends_with_the_reason(write, saved):
@@ -341,7 +342,8 @@ def test_a_session_that_was_stopped_ends_with_the_reason(write, saved):
     assert "1 of 20 s" in state
 
 
-def test_wrong_use_is_told(rigd_here, short, tmp_path):
+def test_wrong_use_is_told(rigd_here, short_chirps, tmp_path):
+    short = short_chirps[0]
     taken = tmp_path / "taken.rrd"
     taken.write_bytes(b"mine")
     refused(
@@ -354,7 +356,8 @@ def test_wrong_use_is_told(rigd_here, short, tmp_path):
     assert not (tmp_path / "a.rrd").exists()
 
 
-def test_files_that_cannot_be_shown_are_told(rigd_here, short, write, tmp_path):
+def test_files_that_cannot_be_shown_are_told(rigd_here, short_chirps, write, tmp_path):
+    short = short_chirps[0]
     out = ("--save", tmp_path / "out.rrd")
     refused(rigd_here("replay", tmp_path / "none.mcap", *out), 1, "none.mcap cannot be read")
     torn = tmp_path / "torn.mcap.part"
@@ -378,21 +381,22 @@ def test_files_that_cannot_be_shown_are_told(rigd_here, short, write, tmp_path):
     assert not (tmp_path / "out.rrd").exists()
 
 
-def test_what_is_set_for_programs_of_ones_own_is_no_matter(rigd_here, short, tmp_path, monkeypatch):
+def test_what_is_set_for_programs_of_ones_own_is_no_matter(rigd_here, write, tmp_path, monkeypatch):
     monkeypatch.setenv("RERUN", "off")
     monkeypatch.setenv("_RERUN_TEST_FORCE_SAVE", str(tmp_path / "elsewhere.rrd"))
     monkeypatch.setenv("RERUN_FLUSH_NUM_BYTES", "one")
     out = tmp_path / f"{'x' * 250}.rrd"  # as long as a name can be
-    done = rigd_here("replay", short, "--save", out)
+    done = rigd_here("replay", write("brief.mcap", np.arange(700)), "--save", out)
     assert done.returncode == 0, done.stderr
     assert batches(out)["/signals"]
     assert not (tmp_path / "elsewhere.rrd").exists()
 
 
-def test_a_start_after_all_times_is_told(short):
-    late = replace(read_session(short), start_utc_ns=2**63)
+def test_a_start_after_all_times_is_told(write):
+    path = write("late.mcap", np.arange(700))
+    late = replace(read_session(path), start_utc_ns=2**63)
     with pytest.raises(SessionError, match="start_utc_ns is 9223372036854775808 ns, after"):
-        draw_session(None, late, read_timings(short))
+        draw_session(None, late, read_timings(path))
 
 
 @pytest.mark.further  # as the full disk of a session is
@@ -408,24 +412,26 @@ def test_a_full_disk_is_told_and_leaves_nothing_behind(short, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_progress_appears_when_it_takes_long(rigd_here, short, monkeypatch, tmp_path):
+def test_progress_appears_when_it_takes_long(rigd_here, write, monkeypatch, tmp_path):
     monkeypatch.setattr("rigd.cli.options._PROGRESS_DELAY_S", -1.0)
     monkeypatch.setenv("FORCE_COLOR", "1")
-    done = rigd_here("replay", short, "--save", tmp_path / "out.rrd")
+    path = write("brief.mcap", np.arange(700))
+    done = rigd_here("replay", path, "--save", tmp_path / "out.rrd")
     assert done.returncode == 0, done.stderr
-    assert short.name in done.stderr.partition("open it with")[0]
+    assert path.name in done.stderr.partition("open it with")[0]
 
 
-def test_without_a_screen_it_says_what_else_there_is(rigd_here, short, monkeypatch):
+def test_without_a_screen_it_says_what_else_there_is(rigd_here, write, monkeypatch):
+    session = write("brief.mcap", np.arange(700))
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    refused(rigd_here("replay", short), 1, "no screen", "--web", "--save")
+    refused(rigd_here("replay", session), 1, "no screen", "--web", "--save")
     for name in ("nonsense.txt", "nonsense.rrd"):
-        nonsense = short.with_name(name)
+        nonsense = session.with_name(name)
         nonsense.write_text("hello")
         refused(rigd_here("replay", nonsense), 1, str(nonsense), "Give a")
         refused(rigd_here("replay", f"{nonsense}.gone.mcap"), 1, "No such file")
-    seen = short.with_name("seen.rrd")
+    seen = session.with_name("seen.rrd")
     seen.write_bytes(b"RRF2")
     recording = rigd_here("replay", seen)
     refused(recording, 1, "no screen", "--web")

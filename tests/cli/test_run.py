@@ -26,6 +26,8 @@ from analysis.paper import estimate
 from analysis.record import record_of
 from rigd.beam import modes
 from rigd.profile import load_profile
+from rigd.runner import ProcessGroup
+from rigd.runtime import StopRequest
 from rigd.session import read_controls, read_session
 from rigd.session.layout import Status
 
@@ -120,9 +122,11 @@ def test_each_session_gets_a_quick_look(rigd, tmp_path, brief_looks):
     assert session["look"] is None
 
 
-def test_ctrl_c_skips_a_quick_look_and_stops_nothing(start_rigd, tmp_path, brief_looks):
+def test_ctrl_c_skips_a_quick_look_and_stops_nothing(start_rigd, monkeypatch, brief_looks):
     brief_looks.write_text("import time; time.sleep(600)\n")
-    process = start_rigd("run", "hold", "--fast", "--duration", "1", "--json")
+    monkeypatch.delenv("PYTHONPATH")
+    options = ("--fast", "--duration", "1", "--json")
+    process = start_rigd("run", "hold", *options, packages=brief_looks.parents[1])
     while "Ctrl-C skips it" not in (said := process.stderr.readline()):
         assert said
     look = child_running(process.pid, "analysis.quick_look")
@@ -215,14 +219,20 @@ def test_a_series_is_reproduced_by_its_seed_and_its_sessions_differ(rigd, tmp_pa
         assert np.array_equal(first.samples, second.samples)
 
 
+@pytest.mark.further  # as the sessions below that are stopped
 def test_real_time_keeps_its_books(rigd, patient, tmp_path):
-    lengths = ("--duration", "1", "--rest", "0.5", "--ring-down", "0.5")
+    lengths = ("--duration", "0.5", "--rest", "0.1", "--ring-down", "0.1")
     session = the_session(rigd("run", "chirp", "--json", "--profile", patient, *lengths))
-    assert session["scheduled"] == 2000
+    assert session["scheduled"] == 700
     assert session["lost"] == 0
-    assert session["recorded"] + session["missed"] == 2000
+    assert session["recorded"] + session["missed"] == 700
     record = read_session(tmp_path / session["path"])
     assert len(record.samples) == session["recorded"]
+    keeps_real_time(record, session)
+
+
+def keeps_real_time(record, session):
+    """Check that a record was made in real time, and that its counts are those of its samples."""
     began_s = 1e-9 * (record.samples["t_ns"] + record.samples["lateness_ns"].astype(int))
     rate_hz = (len(began_s) - 1) / (began_s[-1] - began_s[0])
     assert float(record.outcome["true_rate_hz"]) == pytest.approx(rate_hz, rel=0.01)
@@ -240,7 +250,7 @@ def to_one(process, number):
     process.send_signal(number)
 
 
-def recorded(folder, size=50_000, timeout_s=60.0):
+def recorded(folder, size=10_000, timeout_s=60.0):
     """Wait until a session is being recorded in a folder; return its file."""
 
     def grown():
@@ -288,7 +298,10 @@ def test_every_stop_leaves_the_torque_off_and_a_complete_file(
         (session,) = json.loads(output)["sessions"]
         assert session["outcome"] == "stopped"
         assert session["scheduled"] == session["recorded"] + session["missed"]
+        assert session["lost"] == 0
         record = read_session(folder / session["path"])
+        assert len(record.samples) == session["recorded"]
+        keeps_real_time(record, session)
         assert record.outcome["outcome"] == "stopped"
         last = record.samples[-1]
         assert last["torque_command_nm"] == 0.0
@@ -338,6 +351,7 @@ def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
         read_session(tmp_path / path)
 
 
+@pytest.mark.further  # as tests/runner/test_rig.py
 def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, tmp_path):
     process = start_rigd("run", "chirp", "--json", "--duration", "60", "--profile", patient)
     recorded(tmp_path)
@@ -352,6 +366,7 @@ def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, t
     assert len(record.samples) == session["recorded"]
 
 
+@pytest.mark.further  # as tests/runner/test_rig.py and tests/recovery/test_advice.py
 def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, tmp_path):
     process = start_rigd("run", "hold", "--duration", "3", "--rest", "0", "--profile", patient)
     part = recorded(tmp_path, 1000)  # before, its name is only being tried
@@ -416,18 +431,31 @@ def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, patient, 
     assert part.name in errors
 
 
-def test_a_series_whose_folder_goes_tells_of_those_before(start_rigd, tmp_path):
-    (tmp_path / "moved").mkdir()
-    (tmp_path / "sessions").symlink_to("moved")
-    options = ("--json", "--duration", "1", "--rest", "0", "--repeat", "999", "--fast")
-    process = start_rigd("run", "hold", *options)
-    assert eventually(lambda: list(tmp_path.glob("sessions/*-02.mcap")))
-    (tmp_path / "file").write_text("in the way")
-    (tmp_path / "file").rename(tmp_path / "sessions")  # in one step: a missing folder is recreated
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 1, errors
-    assert len(json.loads(output)["sessions"]) >= 2
-    assert "Traceback" not in errors
+class FolderGoes(StopRequest):
+    """A stop that never comes; the folder of the sessions goes once there is one."""
+
+    @property
+    def requested(self):
+        if list(Path("sessions").glob("*-01.mcap")):
+            Path("sessions").rename("moved")
+            Path("sessions").touch()
+        return False
+
+    @requested.setter
+    def requested(self, _):
+        pass
+
+
+@pytest.mark.usefixtures("children_copied")
+def test_a_series_whose_folder_goes_tells_of_those_before(rigd_here, monkeypatch):
+    processes = FolderGoes(), ProcessGroup(live=False)
+    monkeypatch.setattr("rigd.cli.run.start_processes", lambda **_: processes)
+    brief = ("--duration", "0.3", "--rest", "0", "--fast", "--no-look")
+    done = rigd_here("run", "hold", *brief, "--repeat", "3", "--json")
+    assert done.returncode == 1, done.stderr
+    (session,) = json.loads(done.stdout)["sessions"]
+    assert session["outcome"] == "complete"
+    assert "cannot be created" in done.stderr
 
 
 @pytest.mark.further  # as names that are taken
@@ -465,14 +493,18 @@ def test_a_beam_that_cannot_be_simulated_is_refused_in_one_sentence(rigd, write_
     assert "Traceback" not in done.stderr
 
 
-def test_closed_descriptors_are_no_obstacle(tmp_path):
+def test_a_session_needs_neither_descriptors_nor_scipy(tmp_path):
+    """Scipy would add 0.15 s of processor time to every start; what is found first here ends."""
+    (tmp_path / "scipy.py").write_text("raise SystemExit('scipy was imported')\n")
     done = subprocess.run(
         ["sh", "-c", f"exec {RIGD} run hold --duration 1 --fast --output out <&- >&- 2>&-"],
         cwd=tmp_path,
         check=False,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
     )
     assert done.returncode == 0
-    assert len(list(tmp_path.glob("out/*.mcap"))) == 1
+    (path,) = tmp_path.glob("out/*.mcap")
+    assert read_session(path).outcome["outcome"] == "complete"
 
 
 @pytest.mark.further  # as tests/daemon/test_log.py
@@ -511,20 +543,7 @@ def test_a_dead_supervisor_ends_the_session_safely(start_rigd, patient, tmp_path
     assert eventually(lambda: has_ended(control))
 
 
-@pytest.mark.parametrize(
-    "arguments", [("--help",), ("run", "hold", "--fast", "--duration", "1", "--output", "out")]
-)
-def test_no_process_of_a_session_imports_scipy(tmp_path, arguments):
-    """It would add 0.15 s of processor time to every start; what is found first here cannot be."""
-    (tmp_path / "scipy.py").write_text("raise SystemExit('scipy was imported')\n")
-    done = subprocess.run(
-        [RIGD, *arguments], capture_output=True, text=True, check=False, cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(tmp_path)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "scipy" not in done.stderr
-
-
+@pytest.mark.further  # as below, and tests/excitation/test_signals.py
 def test_a_chirp_there_and_back_begins_as_a_plain_one_and_so_does_its_welch_estimate(
     short_chirps, tmp_path
 ):
@@ -551,6 +570,22 @@ def test_a_chirp_there_and_back_begins_as_a_plain_one_and_so_does_its_welch_esti
     # The reference passes the same angles, and the frequency at equal distances from the turn.
     reference = both.reference_rad - both.reference_rad[0]
     assert np.abs(np.diff(reference[20_400:20_600])).max() < 0.025 * 2 * np.pi * 50 / 1000
+
+
+def test_the_welch_estimate_of_a_chirp_there_and_back_is_that_of_its_way_there(short_chirps):
+    """Of half of a plain chirp, then: what comes behind it is no matter."""
+    session = read_session(short_chirps[0])
+    planned = {"sweep": (500, 20_500), "there": (500, 10_500), "back": (10_500, 20_500)}
+    stated = {**session.metadata, "duration_s": "10.0", "stop_hz": "25.0"}
+    both = record_of(replace(session, segments=planned, metadata={**stated, "there_and_back": "1"}))
+    half = {"sweep": (500, 10_500), "ring_down": (10_500, 20_500)}
+    plain = record_of(replace(session, segments=half, metadata=stated))
+    assert (both.there, both.sweep) == (slice(500, 10_500), slice(500, 20_500))
+    settings = welch_settings(both, WelchSettings(segment_length=1439, overlap=216))
+    responses = [estimate(record, settings)[0].response for record in (both, plain)]
+    np.testing.assert_array_equal(*responses)
+    assert any("use the way there alone" in remark for remark in remarks(both))
+    assert welch_exclusion_reason(both) is None
 
 
 def test_a_chirp_there_and_back_that_is_stopped_on_its_way_back_keeps_its_welch_estimate(

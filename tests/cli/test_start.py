@@ -11,6 +11,7 @@ import threading
 import pytest
 import typer
 import warm_start
+from cases import further
 
 from rigd.cli import start
 from rigd.daemon.address import socket_path
@@ -185,7 +186,7 @@ def interrupting_daemon(runtime_folder):
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("options", [(), ("--detach",)])
+@pytest.mark.parametrize("options", [(), further(("--detach",))])
 def test_ctrl_c_cancels_a_start_that_waits(interrupting_daemon, options):
     done = warm_start.run(
         [sys.executable, "-m", "rigd", "start", "hold", "--profile", "sim", *options],

@@ -20,6 +20,7 @@ class Witness:
     def find_spec(name, path=None, target=None):
         if name == "numpy":
             print({variables} <= os.environ.items(), flush=True)
+            os._exit(0)
         return None
 
 
@@ -48,7 +49,7 @@ def test_numpy_finds_the_threads_limited_when_it_is_imported(module, arguments):
         [sys.executable, "-c", code], env=clean, capture_output=True, text=True, check=False
     )
 
-    assert run.stdout.splitlines()[:1] == ["True"], run.stderr
+    assert run.stdout == "True\n", run.stderr
 
 
 def test_help_needs_no_arrays():

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import further
 from processes import child_running
 
 from analysis.record import load_record
 from analysis.results import whole_record
 from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
+from rigd.engine.workers import FIT
 from rigd.profile import load_profile
 from rigd.session import read_session
 
@@ -60,6 +62,51 @@ def record(done):
     return read_session(done[2]["path"])
 
 
+@pytest.fixture(scope="module")
+def search(run_patched):
+    """Search until the damping is known to 1 %, by an estimator that knows the beam.
+
+    Returns a function of the estimator's class; its value is exit code, errors, result.
+    """
+
+    def search(estimator):
+        command = ["until", "--damping", "1%", "--at-most", "20", "--json", "--no-look", *SEEDED]
+        patches = {"rigd.engine.workers.ONLINE_ESTIMATOR": f"known_beam:{estimator}"}
+        code, output, errors = run_patched(f"until-{estimator}", command, patches, FIT)
+        assert output, errors
+        (session,) = json.loads(output)["sessions"]
+        return code, errors, session
+
+    return search
+
+
+@pytest.fixture(scope="module")
+def searched(search):
+    return search("KnownBeamEstimator")
+
+
+@pytest.fixture(scope="module")
+def searched_record(searched):
+    return read_session(searched[2]["path"])
+
+
+def test_a_search_ends_when_it_is_reached(searched, searched_record):
+    code, errors, session = searched
+    assert code == 0, errors
+    assert (session["outcome"], session["reason"], session["lost"]) == ("complete", "", 0)
+    assert session["scheduled"] == session["recorded"] + session["missed"] <= 20_000
+    fit = session["fit"]
+    assert fit["search"]["reached"]
+    assert fit["search"]["asked"] == ["damping to 1 %"]
+    assert json.loads(searched_record.outcome["fit"]) == fit
+    assert "Reached: damping of mode 1" in errors
+    assert errors.count("± one standard deviation") == 1
+    decided_s = [float(row.split()[0]) for row in errors.splitlines() if ROW.match(row)]
+    assert decided_s[0] == 6.0
+    assert decided_s == sorted(set(decided_s))  # by one estimate of each part of the record
+
+
+@pytest.mark.further  # as above with an estimator, and tests/analysis/test_online.py
 def test_it_ends_when_the_precision_is_reached(done):
     code, errors, session = done
     assert code == 0, errors
@@ -80,6 +127,7 @@ def test_it_ends_when_the_precision_is_reached(done):
     assert decided_s == sorted(set(decided_s))  # by one estimate of each part of the record
 
 
+@pytest.mark.further
 def test_analyze_says_of_the_file_what_the_session_said_last(done, record):
     told = whole_record(load_record(record.path)).headline
     fit = done[2]["fit"]
@@ -91,6 +139,7 @@ def test_analyze_says_of_the_file_what_the_session_said_last(done, record):
         assert quantity.as_json() == fit["parameters"][name]
 
 
+@pytest.mark.further
 def test_the_numbers_are_those_of_the_simulated_beam(done):
     from rigd.beam import modes
 
@@ -103,13 +152,13 @@ def test_the_numbers_are_those_of_the_simulated_beam(done):
             assert abs(mode[key]["value"] - value) < 4 * mode[key]["std"]
 
 
-def test_segments_name_what_was_played(done, record):
-    segments = dict(record.segments)
-    ticks = done[2]["scheduled"]
+def test_segments_name_what_was_played(searched, searched_record):
+    segments = dict(searched_record.segments)
+    ticks = searched[2]["scheduled"]
     assert segments.pop("rest") == (0, 1000)
     assert segments.pop("sweep") == (1000, ticks)
     assert segments.pop("scan") == (1000, 6000)
-    pieces = done[2]["fit"]["search"]["pieces"]
+    pieces = searched[2]["fit"]["search"]["pieces"]
     assert pieces
     assert list(segments) == [f"piece_{number + 1}" for number in range(len(pieces))]
     ends = [6000]
@@ -119,15 +168,16 @@ def test_segments_name_what_was_played(done, record):
         ends.append(end)
 
 
-def test_the_file_is_described_by_its_modes(rigd, record):
-    told = rigd("info", record.path).stdout
+def test_the_file_is_described_by_its_modes(rigd_here, searched_record):
+    told = rigd_here("info", searched_record.path).stdout
     assert told.count("\nfit ") == 3
     assert "mode 1: 2.5" in told
     assert "covariance" not in told
 
 
-def test_pieces_join_at_rest(record):
+def test_pieces_join_at_rest(searched_record):
     """At the joints: no step in angle, speed or acceleration beside those of the pieces."""
+    record = searched_record
     reference_rad = record.samples["angle_reference_rad"]
     relative_rad = reference_rad - reference_rad[0]
     speed = np.gradient(relative_rad, 1e-3)
@@ -140,9 +190,9 @@ def test_pieces_join_at_rest(record):
         assert np.abs(acceleration[near]).max(initial=0.0) < 0.02 * np.abs(acceleration).max()
 
 
-def test_the_free_end_stays_within_small_slopes(record):
+def test_the_free_end_stays_within_small_slopes(searched_record):
     profile = load_profile("sim")
-    angle_rad = record.samples["angle_rad"]
+    angle_rad = searched_record.samples["angle_rad"]
     slope_rad = tip_motion(profile.plant, angle_rad, profile.rig.rate_hz).slope_rad
     assert 0.5 * SMALL_SLOPE_RAD < slope_rad < SMALL_SLOPE_RAD
 
@@ -179,8 +229,20 @@ def test_what_makes_no_sense_is_refused(rigd_here, options, words):
         assert word in done.stdout + done.stderr
 
 
+def test_a_lost_planner_leaves_what_was_recorded(search):
+    code, errors, session = search("KilledEstimator")
+    assert code == 1, errors
+    assert "Traceback" not in errors
+    assert session["outcome"] == "complete"
+    assert "The fit process was killed" in session["reason"]
+    assert session["scheduled"] == session["recorded"] + session["missed"]
+    # Nothing was cut short: no more was planned.
+    _, end = read_session(session["path"]).segments["sweep"]
+    assert end == session["scheduled"]
+
+
 @pytest.mark.parametrize(
-    "number", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)]
+    "number", [further(signal.SIGKILL), pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)]
 )
 def test_a_lost_planner_ends_the_session_with_what_was_recorded(start_rigd, tmp_path, number):
     process = start_rigd(*LONG)

@@ -101,7 +101,7 @@ def test_a_job_is_the_first_that_is_killed_for_lack_of_memory():
 
 @pytest.mark.process
 def test_a_prediction_without_the_memory_is_refused(profile, monkeypatch):
-    little = replace(PREDICTION, memory=replace(PREDICTION.memory, fraction=0.0))
+    little = replace(PREDICTION, memory=replace(PREDICTION.memory, fraction=0.0), niceness=0)
     monkeypatch.setattr(background.PredictionJob, "worker", little)
     job = background.PredictionJob(profile, "chirp", {"duration_s": 2300.0}, False, "")
     with pytest.raises(CommandError, match="not enough free memory") as refused:
@@ -136,7 +136,8 @@ def test_a_check_is_for_a_rig_without_a_session(operated):
 
     told = []
     operated.world.then, operated.world.countdown = check, 50
-    operated.ask("start", **CHIRP)
+    brief = {"duration_s": 0.3, "rest_s": 0.0, "ring_down_s": 0.0}
+    operated.ask("start", excitation="hold", parameters=brief)
     assert "without a running session" in str(told[0])
 
 

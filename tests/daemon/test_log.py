@@ -12,7 +12,7 @@ import logging
 from rigd.daemon._log import LOGGER_NAME, DaemonLog
 
 with DaemonLog():
-    for number in range(20_000):
+    for number in range(3000):  # more than the log and a pipe take
         logging.getLogger(LOGGER_NAME).info("line %d %s", number, "x" * 100)
 print("through")
 """

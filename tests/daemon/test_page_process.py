@@ -18,6 +18,7 @@ from processes import eventually
 from rigd.daemon import _page, page_address
 from rigd.engine.workers import PAGE
 from rigd.profile import load_profile
+from rigd.web import run_page  # noqa: F401 - copies are spared its imports
 
 pytestmark = pytest.mark.process
 
@@ -28,7 +29,7 @@ STATUS = {
 
 
 @pytest.fixture
-def serve(runtime_folder, tmp_path, monkeypatch):
+def serve(runtime_folder, tmp_path, monkeypatch, children_copied):
     monkeypatch.setattr(_page, "_RESTART_PAUSE_S", 0.05)
     started = []
 
@@ -129,21 +130,12 @@ def test_a_port_that_is_taken_is_said_if_it_was_asked_for(serve, monkeypatch, ca
         assert other.told[0] != f"http://127.0.0.1:{port}/"
 
 
-FAILING = """
-import rigd.web._server as server
+def test_a_page_that_fails_ends_and_its_reason_is_logged(serve, monkeypatch, caplog):
+    async def run(self):
+        raise RuntimeError("such a thing")
 
-async def run(self):
-    raise RuntimeError("such a thing")
-
-server.OperatorPageServer.run = run
-server.run_page()
-"""
-
-
-def test_a_page_that_fails_ends_and_its_reason_is_logged(serve, monkeypatch, caplog, tmp_path):
-    (tmp_path / "failing_page.py").write_text(FAILING)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(_page, "PAGE", replace(PAGE, module="failing_page", restarts=0))
+    monkeypatch.setattr("rigd.web._server.OperatorPageServer.run", run)  # and so in the copy
+    monkeypatch.setattr(_page, "PAGE", replace(PAGE, restarts=0))
     page = serve()
     page._thread.join(60.0)
     assert not page._thread.is_alive()

@@ -158,7 +158,7 @@ def test_a_refusal_says_whose_request_it_was():
     assert refused.value.request_id == "mine"
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(st.binary(max_size=300))
 @example(b'{"command": "status"}')
 def test_no_bytes_break_it(line):
@@ -176,7 +176,7 @@ JSON = st.recursive(
 NAMES = sorted({name for make in KINDS.values() for name in inspect.signature(make).parameters})
 
 
-@settings(max_examples=200)
+@settings(max_examples=50)
 @given(
     kind=st.sampled_from([*KINDS, "dance"]),
     parameters=st.dictionaries(st.sampled_from(NAMES), JSON | st.floats(-10.0, 100.0), max_size=4),

@@ -115,7 +115,7 @@ def test_a_series_runs_on_one_connection_and_stops_at_the_first_that_fails(opera
     operated.ask("start", **SHORT, repeat=2)
     assert [s["outcome"] for s in operated.last["sessions"]] == ["complete", "complete"]
     assert len(operated.world.drives) == 1
-    operated.world.countdown, operated.world.then = 3200, fail
+    operated.world.countdown, operated.world.then = 1560, fail
     operated.ask("start", **SHORT, repeat=3)
     assert [s["outcome"] for s in operated.last["sessions"]] == ["complete", "fault"]
     assert operated.last["failed"]
@@ -129,7 +129,7 @@ def test_a_stop_may_come_from_anybody_and_ends_the_series(operated):
         assert reply == {"stopping": True}
         assert operated.state == "stopping"
 
-    operated.world.countdown, operated.world.then = 1200, stop
+    operated.world.countdown, operated.world.then = 500, stop
     operated.ask("start", **SHORT, repeat=5)
     (session,) = operated.last["sessions"]
     assert session["outcome"] == "stopped"
@@ -147,7 +147,7 @@ def test_what_a_state_does_not_allow_is_refused(operated):
         for command, fields in (("start", SHORT), ("tare", {}), ("zero", {}), ("reset", {})):
             refused.append(operated.meanwhile(command, **fields))
 
-    operated.world.countdown, operated.world.then = 1200, ask_everything
+    operated.world.countdown, operated.world.then = 500, ask_everything
     operated.ask("start", **SHORT)
     assert len(refused) == 4
     assert all(isinstance(error, CommandError) for error in refused)
@@ -172,7 +172,7 @@ def test_a_client_that_leaves_stops_nothing(operated):
     def leave(drive):
         operated.service.release(operated.peer)
 
-    operated.world.countdown, operated.world.then = 1200, leave
+    operated.world.countdown, operated.world.then = 500, leave
     operated.ask("start", **SHORT)
     assert operated.last["sessions"][0]["outcome"] == "complete"
 
@@ -185,7 +185,7 @@ def test_tare_and_zero_without_torque(operated):
 
 
 def test_only_reset_leaves_a_fault(operated):
-    operated.world.countdown, operated.world.then = 1200, fail
+    operated.world.countdown, operated.world.then = 500, fail
     operated.ask("start", **SHORT)
     assert operated.state == "fault"
     for command, fields in (("start", SHORT), ("tare", {}), ("zero", {})):
@@ -202,7 +202,7 @@ def test_only_reset_leaves_a_fault(operated):
 
 def test_a_limit_that_ends_a_session_is_a_fault_and_the_zero_survives_its_reset(operated):
     operated.ask("zero")
-    operated.world.countdown, operated.world.then = 1200, fall_silent
+    operated.world.countdown, operated.world.then = 500, fall_silent
     operated.ask("start", **SHORT)
     assert operated.state == "fault"
     assert operated.rig.connected
@@ -224,7 +224,7 @@ def test_an_encoder_that_jumps_makes_the_zero_void(operated, when):
     if when == "ready":  # no time passes under the virtual clock until something is asked for
         slip(operated.world.drives[0])
     else:
-        operated.world.countdown, operated.world.then = 1900, slip
+        operated.world.countdown, operated.world.then = 1150, slip
     operated.ask("start", **SHORT)
     assert operated.state == "fault"
     assert "encoder" in operated.last["reason"]
@@ -248,7 +248,7 @@ def test_an_encoder_that_jumps_before_the_zero_is_set_is_told(operated):
 
 def test_a_zero_that_was_lost_has_to_be_set_before_the_next_session(operated):
     operated.ask("zero")
-    operated.world.countdown, operated.world.then = 1200, fail
+    operated.world.countdown, operated.world.then = 500, fail
     operated.ask("start", **SHORT)
     assert operated.ask("reset") == {"zero_lost": True}
     assert "rigd zero" in str(operated.ask("start", **SHORT))
@@ -271,7 +271,7 @@ def test_a_rig_that_cannot_be_connected_is_a_fault_until_it_can(operate):
 
 
 def test_the_hardware_does_not_take_the_place_of_a_simulation(operated):
-    operated.world.countdown, operated.world.then = 1200, fail
+    operated.world.countdown, operated.world.then = 500, fail
     operated.ask("start", **SHORT)
     operated.moving = ActuationTarget.HARDWARE
     assert "restart the daemon" in str(operated.ask("reset"))
@@ -294,7 +294,7 @@ def test_a_fault_is_one_though_a_stop_was_asked_for(operated):
         operated.meanwhile("stop")
         drive.offset_rad = 3.0
 
-    operated.world.countdown, operated.world.then = 3000, stop_and_jump
+    operated.world.countdown, operated.world.then = 1500, stop_and_jump
     operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
     assert operated.last["stopped"]
     assert operated.last["failed"]
@@ -303,7 +303,7 @@ def test_a_fault_is_one_though_a_stop_was_asked_for(operated):
 
 
 def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
-    operated.world.countdown = 3000
+    operated.world.countdown = 1500
     operated.world.then = lambda _: operated.rig._group.recorder.kill()
     operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
     assert operated.state == "fault"
@@ -324,7 +324,7 @@ def test_a_drive_that_does_not_show_itself_off_is_told_whatever_else_has_failed(
         drive.off_doubt = doubt
         operated.rig._group.recorder.kill()
 
-    operated.world.countdown, operated.world.then = 3000, fail_both
+    operated.world.countdown, operated.world.then = 1500, fail_both
     operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
     assert operated.state == "fault"
     reason = operated.last["reason"]
@@ -363,7 +363,7 @@ def test_a_folder_that_cannot_be_written_any_more_ends_the_series_as_a_fault(ope
         (tmp_path / "out").rename(tmp_path / "gone")
         (tmp_path / "out").write_text("in the way")
 
-    operated.world.countdown, operated.world.then = 2500, take_away
+    operated.world.countdown, operated.world.then = 1250, take_away
     operated.ask("start", **SHORT, repeat=2)
     assert operated.last["failed"]
     assert operated.world.drives[0].safe
@@ -455,7 +455,7 @@ def refuse_to_start(*_):
 
 
 def test_a_reset_does_not_connect_what_is_being_closed(operated):
-    operated.world.countdown, operated.world.then = 1200, fail
+    operated.world.countdown, operated.world.then = 500, fail
     operated.ask("start", **SHORT)
     assert operated.state == "fault"
 
@@ -474,7 +474,7 @@ def test_a_session_whose_daemon_hears_nobody_is_given_no_sign_of_life(operated, 
     heard = iter([True, True, False])
     monkeypatch.setattr(operated.service, "_can_receive_stop", lambda: next(heard, False))
     beats = []
-    operated.world.countdown = 1200
+    operated.world.countdown = 500
     operated.world.then = lambda _: beats.append(shared_state(operated)[StateField.SUPERVISOR_BEAT])
     operated.ask("start", **SHORT, repeat=2)
     assert shared_state(operated)[StateField.SUPERVISOR_BEAT] == beats[0]
@@ -487,7 +487,7 @@ def shared_state(operated):
 
 
 def test_the_end_of_the_daemon_stops_a_session_safely(operated):
-    operated.world.countdown = 1200
+    operated.world.countdown = 500
     operated.world.then = lambda drive: operated.loop.call_soon_threadsafe(close)
     closed = []
 
@@ -512,7 +512,7 @@ def test_status_tells_of_progress_processes_and_topics(operated):
         seen.append(operated.service.status())
 
     operated.service.poll_status()  # from now on it sees the samples
-    operated.world.countdown, operated.world.then = 1200, look
+    operated.world.countdown, operated.world.then = 500, look
     operated.ask("start", **SHORT)
     (status,) = seen
     assert status["state"] == "running"
@@ -593,14 +593,14 @@ def test_the_log_tells_of_warnings(operated, caplog):
     def doubt(drive):
         drive.health = lambda: LineHealth(doubt="Angles are old.")
 
-    operated.world.countdown, operated.world.then = 1200, doubt
+    operated.world.countdown, operated.world.then = 500, doubt
     operated.ask("start", **SHORT)
     (told,) = [r for r in caplog.records if r.getMessage() == "series 1: Angles are old."]
     assert told.levelname == "WARNING"
 
 
 def test_a_reset_that_fails_does_not_lose_what_was_to_be_reset(operated, caplog):
-    operated.world.countdown, operated.world.then = 1200, fail
+    operated.world.countdown, operated.world.then = 500, fail
     operated.ask("start", **SHORT)
     first = operated.service.status()["reason"]
     operated.world.absent = True
@@ -611,6 +611,6 @@ def test_a_reset_that_fails_does_not_lose_what_was_to_be_reset(operated, caplog)
         )
     operated.world.absent = False
     operated.ask("reset")
-    operated.world.countdown, operated.world.then = 1200, fail
+    operated.world.countdown, operated.world.then = 500, fail
     operated.ask("start", **SHORT)
     assert operated.service.status()["reason"] == first

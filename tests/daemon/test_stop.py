@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 import pytest
-from processes import eventually
+from processes import children, eventually
 from stop_scenarios import SITUATIONS, can_isolate, isolated
 
 from rigd.daemon.address import socket_path
@@ -20,12 +20,12 @@ from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.engine.workers import CONTROL
 from rigd.runtime import STOP_SIGNAL
 from rigd.runtime.addresses import answers
-from rigd.runtime.processes import read_process, read_processes
+from rigd.runtime.processes import read_process
 
 
 def control_of(pid):
     """Short name of the control process of a supervisor."""
-    for process in read_processes():
+    for process in filter(None, map(read_process, children(pid))):
         if supervisor_of_control(process.command) == pid:
             return process.name
     return None

@@ -245,4 +245,4 @@ def run_instead(replace_in_page, monkeypatch, tmp_path):
 @pytest.fixture
 def hurried(replace_in_page):
     """Who says nothing is let go soon."""
-    replace_in_page(silent_s=0.2, read_s=0.2)
+    replace_in_page(silent_s=0.05, read_s=0.05)

@@ -4,8 +4,8 @@ import re
 
 import numpy as np
 import pytest
+from known_beam import CERTAIN, ON_THE_WAY, answer
 
-from rigd.beam import modes
 from rigd.engine import shared_memory_fd
 from rigd.engine.messages import FitReport, PlannedSegment, SearchEnded
 from rigd.engine.reference import ReferenceWriter, write_reference
@@ -21,63 +21,12 @@ from rigd.runner._precision_search import (
 )
 from rigd.runner.planning import RigPreview
 
-NAMES = ("zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "bending_stiffness_n_m2")
 RATE_HZ = 1000
-ON_THE_WAY, CERTAIN = 0.03, 0.001
-"""Relative standard deviations of the damping: a few pieces away from 1 %, and below it."""
 
 
 @pytest.fixture(scope="module")
 def profile():
     return load_profile("sim")
-
-
-def answer(profile, tick, share, flag=None, with_air_drag=False):
-    """What the fit answers where every number has a share of itself as its deviation."""
-    beam, damping = profile.rig.beam, profile.rig.damping
-
-    def quantity(value):
-        std = share * value
-        ends = [value - 2 * std, value + 2 * std]
-        return {"value": value, "std": std, "interval_95": ends, "flag": flag}
-
-    found = [mode for mode in modes(beam, damping, 3) if mode.frequency_hz < 50]
-    return {
-        "tick": tick,
-        "type": "VI",
-        "uniformity_percent": 0.1,
-        "problem": "",
-        "doubt": flag,
-        "findings": ["Something struck the beam."] if flag else [],
-        "with_air_drag": with_air_drag,
-        "modes": [
-            {
-                "mode": number,
-                "shown": True,
-                "frequency_hz": quantity(mode.frequency_hz),
-                "damping_ratio": quantity(mode.damping_ratio),
-            }
-            for number, mode in enumerate(found, start=1)
-        ],
-        "parameters": {"zeta": quantity(damping.zeta)},
-        "plant": {
-            "beam": {
-                "length_m": beam.length_m,
-                "density_kg_per_m": beam.density_kg_per_m,
-                "bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
-            },
-            "damping": {
-                "zeta": damping.zeta,
-                "alpha": damping.alpha,
-                "gamma": damping.gamma,
-                "lambda": damping.lambda_,
-            },
-            "delay_s": 0.0,
-            "tool_inertia_kg_m2": 0.0,
-        },
-        "covariance": {"names": list(NAMES), "matrix": np.eye(len(NAMES)).tolist()},
-        "noise": {"frequency_hz": [0.1, 50.0], "nm2_per_hz": [5e-8, 5e-8]},
-    }
 
 
 class Bench:
@@ -121,7 +70,7 @@ def designed_at_once(monkeypatch, std):
     rest, planned = np.zeros(RATE_HZ), []
 
     def design(estimate, angle_rad, targets, rig, time_left_s, **options):
-        planned.append(options)
+        planned.append({"targets": targets, **options})
         k = len(estimate.names)
         now = (Precision(targets[0], 1.0, std, 0.1),)
         return Segment(
@@ -179,9 +128,11 @@ def test_a_value_below_its_uncertainty_does_not_put_a_relative_precision_out_of_
     assert estimate.ratio == pytest.approx(10.0)
 
 
-def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench):
+def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench, monkeypatch):
     """Only after a pause, and a fit of every structure, does anything count as reached."""
+    designed_at_once(monkeypatch, std=1.0)
     bench.told(ON_THE_WAY)
+    designed_at_once(monkeypatch, std=0.01)
     planned = bench.writer.ticks
     while not bench.search.may_be_last:
         *_, last = bench.told(CERTAIN)
@@ -323,7 +274,8 @@ def test_what_goes_too_slowly_is_out_of_reach(profile, quick_pieces):
     assert bench.writer.ticks < 40 * RATE_HZ
 
 
-def test_damping_that_is_absent_cannot_be_told(profile):
+def test_damping_that_is_absent_cannot_be_told(profile, monkeypatch):
+    monkeypatch.setattr("rigd.runner._precision_search._MAX_UNREACHABLE_FORECASTS", 1)
     bench = Bench(profile, "zeta 15%")
     ends = []
     while not ends:
@@ -371,16 +323,17 @@ def test_modes_that_are_not_those_of_a_uniform_beam_are_excited_where_they_are(p
     assert pytest.approx(16.01 * np.sqrt(1.04), abs=0.06) in bands_hz
 
 
-def test_deviations_are_designed_for_as_fits_state_them(profile):
+def test_deviations_are_designed_for_as_fits_state_them(profile, monkeypatch):
     """A fit that states more than the design expects needs more information."""
-    expected = []
+    planned = designed_at_once(monkeypatch, std=1.0)
     for share in (0.01, 0.02):
         bench = Bench(profile, "damping 1:0.2%")
         *_, piece = bench.told(share)
-        (one,) = piece.document["expected"]
-        assert one["asked_std"] == pytest.approx(0.002 * 0.0089, rel=0.05)
-        expected.append(one["std"])
-    assert expected[1] > 1.1 * expected[0]
+        (target,), (one,) = planned[-1]["targets"], piece.document["expected"]
+        # What the design is asked for is told as fits state it: of its deviation of 0.1.
+        assert target.std * one["asked_std"] / 0.1 == pytest.approx(0.002)
+    less, more = (each["targets"][0].std for each in planned)
+    assert less > 1.1 * more
 
 
 def parameter_floor(targets, **given):

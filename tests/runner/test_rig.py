@@ -14,6 +14,7 @@ from rigd.engine.shared_state import Phase
 from rigd.excitation import hold
 from rigd.runner import Rig, RigError
 from rigd.runner.request import SessionOrder
+from rigd.runner.session import SessionFailedError
 from rigd.runtime import StopRequest
 from rigd.session import read_session
 
@@ -122,6 +123,33 @@ def test_a_control_process_that_dies_between_sessions_is_noticed(rig):
     assert not rig.connected
 
 
+def test_a_control_process_that_hangs_is_killed_at_a_stop(rig, run, monkeypatch):
+    monkeypatch.setattr("rigd.runner.session._DRIVE_TIMEOUT_S", 0.3)  # under the virtual clock
+    stop = StopRequest()
+
+    def listener(progress, events):
+        if progress.phase is Phase.RUNNING and not stop.requested:
+            (control,) = (p for p in rig.status().processes if p.name == "control")
+            os.kill(control.pid, signal.SIGSTOP)
+            stop.request()
+
+    result = run(rig, stop=stop, listener=listener, duration_s=100.0)
+    assert (result.outcome, result.fault) == ("fault", True)  # whatever was asked for
+    assert "did not stop within 0.3 s and was killed" in result.reason
+    assert len(read_session(result.path).samples) == result.recorded
+
+
+def test_a_name_that_appears_meanwhile_is_not_overwritten(rig, run, tmp_path):
+    def listener(progress, events):
+        if progress.phase is Phase.RUNNING:
+            (tmp_path / "0.mcap").write_text("somebody else's")
+
+    with pytest.raises(SessionFailedError, match="not overwritten"):
+        run(rig, listener=listener)
+    assert (tmp_path / "0.mcap").read_text() == "somebody else's"
+    assert (tmp_path / "0.mcap.part").exists()
+
+
 @pytest.mark.further  # as in the daemon's service
 def test_a_stop_ends_one_session_and_not_the_next(rig, run, tmp_path):
     stop = StopRequest()
@@ -144,8 +172,6 @@ def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_pa
             (recorder,) = (p for p in rig.status().processes if p.name == "recorder")
             if recorder.state != "ended":
                 os.kill(recorder.pid, signal.SIGKILL)
-
-    from rigd.runner.session import SessionFailedError
 
     with pytest.raises(SessionFailedError, match="killed by signal 9") as caught:
         run(rig, listener=listener, duration_s=100.0)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rigd.safety import LimitMonitor
@@ -93,6 +93,7 @@ def test_readings_that_are_no_numbers_end_the_session(watch, place, bad):
     assert "not a number" in str(violation)
 
 
+@settings(max_examples=50)
 @given(
     angle=st.floats(-1.2, 1.2),
     error=st.floats(-0.12, 0.12),

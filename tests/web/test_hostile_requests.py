@@ -334,6 +334,7 @@ def rig(tmp_path, tmp_path_factory, write_profile_in):
         yield rig
 
 
+@pytest.mark.further  # as the page's server above, and test_page_daemon.py of a session
 def test_the_real_daemon_obeys_none_of_them_and_runs_a_session_afterwards(rig):
     def meant(headers):
         """Give headers the daemon's own token, where they have that of these tests."""

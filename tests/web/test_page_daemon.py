@@ -80,19 +80,23 @@ def rows(page, count, outcome):
     says(page, "#rows tr >> nth=0", outcome)
 
 
-def test_a_session_in_real_time_is_watched_and_stopped_and_what_fails_is_told(operate, open_page):
-    daemon, page = operate()
+def test_a_session_in_real_time_is_watched_and_stopped(operate):
+    _, page = operate("--no-look")
     start(page)
     says(page, "#phase", "recording")
     says(page, "#frequency", "Hz")
     says(page, "#time-left", "0:")
-    says(page, "#response-keys", "measured")
     assert page.locator("#gauge-angle .percent").inner_text() != "–"
     assert page.get_attribute("#strip-angle", "aria-label") != "Angle: no data yet"
     page.click("#stop")
     says(page, "#state-reason", "was stopped")
     assert delay_s(page, "READY", "→ ready: chirp was stopped") < TELL_S
     rows(page, 1, "stopped")
+
+
+@pytest.mark.further  # as test_page_states.py, test_page_server.py and tests/daemon
+def test_what_fails_is_told(operate, open_page):
+    daemon, page = operate()
 
     def begin():
         start(page)
@@ -106,6 +110,7 @@ def test_a_session_in_real_time_is_watched_and_stopped_and_what_fails_is_told(op
         says(page, "#state-word", "READY")
 
     begin()
+    says(page, "#response-keys", "measured")
     os.kill(child_running(daemon.process.pid, "control_process"), signal.SIGKILL)
     fails("control")
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from cases import further
 from processes import eventually
 from web_daemon import MAX_JOBS, TOKEN, JobError, Jobs
 
@@ -92,13 +93,16 @@ def test_files_looks_reports_and_responses_are_served(served, two):
 @pytest.mark.parametrize(
     ("look", "status"),
     [
-        (b"[" * 100_000, 404),
-        (b'{"version": 1, "response": ' * 50_000, 404),
-        (b'{"version": 1, "peak": 1e999, "response": {"magnitude": [1e999, NaN]}}', 200),
-        (b'{"version": 1, "response": [1]}', 200),
-        (b"7", 404),
+        pytest.param(b"[" * 100_000, 404, id="nested lists"),
+        further(b'{"version": 1, "response": ' * 50_000, 404, id="nested objects"),
+        pytest.param(
+            b'{"version": 1, "peak": 1e999, "response": {"magnitude": [1e999, NaN]}}',
+            200,
+            id="no numbers",
+        ),
+        further(b'{"version": 1, "response": [1]}', 200, id="no response"),
+        further(b"7", 404, id="no look"),
     ],
-    ids=["nested lists", "nested objects", "no numbers", "no response", "no look"],
 )
 def test_a_damaged_look_breaks_neither_list_nor_overlay(served, two, look, status):
     (served.folder / "first.look.json").write_bytes(look)
@@ -247,8 +251,15 @@ time.sleep(600)
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("end", ["killed", "ended"])
-@pytest.mark.parametrize("state", ["suspended", "running"])
+@pytest.mark.parametrize(
+    ("state", "end"),
+    [
+        ("suspended", "killed"),
+        ("running", "ended"),
+        further("suspended", "ended"),
+        further("running", "killed"),
+    ],
+)
 @pytest.mark.usefixtures("jobs")
 def test_a_job_ends_with_the_page(tmp_path, state, end):
     page = subprocess.Popen(

@@ -504,6 +504,7 @@ def test_a_page_stops_over_its_websocket(served, pages):
 
 
 @pytest.mark.process
+@pytest.mark.usefixtures("children_copied")
 def test_the_process_writes_no_nonsense_that_it_is_sent_to_its_terminal(served):
     page = ChildProcess(replace(PAGE, captures_stderr=True))
     try:

@@ -3,7 +3,6 @@
 import re
 
 import pytest
-from cases import further
 from fake_web_server import STATIC, TOKEN, UTC_NS, fake_web_server, gauges, progress, status, strip
 from playwright.sync_api import expect
 from processes import eventually
@@ -42,27 +41,36 @@ def change(before, after, reason):
 FULL_DISK = "Free space on the session's disk 12 MB below limit 50 MB."
 
 
-@pytest.mark.parametrize(
-    ("message", "word", "reason", "tone"),
-    [
-        (change("ready", "running", "chirp was started"), "PREPARING", "Chirp was", "stopping"),
-        further(
-            change("running", "stopping", "stop asked for"), "STOPPING", "Stop asked", "stopping"
-        ),
-        further(change("stopping", "ready", "chirp was stopped"), "READY", "was stopped", "ready"),
-        (change("running", "fault", FULL_DISK), "FAULT", "Free space", "alarm"),
-        ({"type": "lost", "reason": "The daemon is gone."}, "OFFLINE", "press the STO", "quiet"),
-        further(status("idle", doing="connecting"), "CONNECTING", "", "quiet"),
-        further(status(zero_lost=True), "READY", "The zero is lost", "ready"),
-    ],
-    ids=["running", "stopping", "stopped", "full-disk", "lost-daemon", "connecting", "zero-lost"],
-)
-def test_the_state_is_told_within_a_second(server, page, message, word, reason, tone):
-    server.tell(message)
-    says(page, "#state-word", word)
-    says(page, "#state-reason", reason)
-    assert page.get_attribute("#bar", "data-tone") == tone
-    assert page.is_visible("#fault") == (word == "FAULT")
+STATES = [
+    (change("ready", "running", "chirp was started"), "PREPARING", "Chirp was", "stopping"),
+    (change("running", "stopping", "stop asked for"), "STOPPING", "Stop asked", "stopping"),
+    (change("stopping", "ready", "chirp was stopped"), "READY", "was stopped", "ready"),
+    (change("running", "fault", FULL_DISK), "FAULT", "Free space", "alarm"),
+    ({"type": "lost", "reason": "The daemon is gone."}, "OFFLINE", "press the STO", "quiet"),
+    (status("idle", doing="connecting"), "CONNECTING", "", "quiet"),
+    (status(zero_lost=True), "READY", "The zero is lost", "ready"),
+]
+
+
+def test_each_state_and_a_failed_stop_are_told_within_a_second(server, page, open_page):
+    for message, word, reason, tone in STATES:
+        server.tell(message)
+        says(page, "#state-word", word)
+        says(page, "#state-reason", reason)
+        assert page.get_attribute("#bar", "data-tone") == tone
+        assert page.is_visible("#fault") == (word == "FAULT")
+    # A stop that fails says what to do, also where the server answers no more.
+    server.replies["stop"] = {"ok": False, "error": "The daemon gave no answer."}
+    page.click("#stop")
+    says(page, "#state-reason", "Not stopped: The daemon gave no answer. Use rigd stop")
+    page.wait_for_timeout(100)
+    assert page.inner_text("#state-word") == "READY"
+    server.close()
+    page.click("#stop")
+    says(page, "#state-reason", "Not stopped: The page's server does not answer.")
+    # That it cannot be reached is what is tested; an open page would try again.
+    page.close()
+    open_page.complaints.clear()
 
 
 @pytest.mark.further
@@ -120,25 +128,6 @@ def test_progress_tells_time_left_phase_and_frequency(server, page):
     says(page, "#time-left", "25 %")
 
 
-@pytest.mark.parametrize("token", ["", further(f"#token={TOKEN}")], ids=["no-token", "token"])
-def test_stop_is_for_everybody_and_says_what_came_of_it(server, open_page, token):
-    page = open_page(server.address + token)
-    server.replies["stop"] = {"stopping": True}
-    page.focus("#stop")
-    page.keyboard.press("Enter")
-    says(page, "#state-reason", "Stop requested.")
-    assert server.asked == [("stop", False)]
-    assert "not an emergency stop" in page.inner_text(".stop")
-
-
-def test_a_stop_that_fails_says_what_to_do(server, page):
-    server.replies["stop"] = {"ok": False, "error": "The daemon gave no answer."}
-    page.click("#stop")
-    says(page, "#state-reason", "Not stopped: The daemon gave no answer. Use rigd stop")
-    page.wait_for_timeout(100)
-    assert page.inner_text("#state-word") == "READY"
-
-
 @pytest.mark.further
 def test_a_stop_does_not_wait_behind_downloads(server, page):
     server.replies["stop"] = {"stopping": True}
@@ -159,16 +148,7 @@ def test_a_stop_that_is_not_answered_in_time_is_told(server, page):
     assert not page.get_attribute("#stop", "aria-busy")
 
 
-def test_stop_works_where_the_server_answers_no_more(server, page, open_page):
-    server.close()
-    page.click("#stop")
-    says(page, "#state-reason", "Not stopped: The page's server does not answer.")
-    # That it cannot be reached is what is tested; an open page would try again.
-    page.close()
-    open_page.complaints.clear()
-
-
-def test_without_the_token_the_page_is_read_only_and_says_how_to_act(server, open_page):
+def test_without_the_token_the_page_is_read_only_and_stops(server, open_page):
     page = open_page(server.address)
     expect(page.locator("#state-word")).to_have_text("READY")
     assert "rigd serve --web" in page.inner_text("#read-only")
@@ -179,6 +159,12 @@ def test_without_the_token_the_page_is_read_only_and_says_how_to_act(server, ope
         assert page.is_disabled(needs_right)
     for free in ("#stop", "#predict", "#overlay"):
         assert page.is_enabled(free)
+    server.replies["stop"] = {"stopping": True}
+    page.focus("#stop")
+    page.keyboard.press("Enter")
+    says(page, "#state-reason", "Stop requested.")
+    assert server.asked == [("stop", False)]
+    assert "not an emergency stop" in page.inner_text(".stop")
 
 
 @pytest.mark.further

@@ -60,7 +60,18 @@ def drawn(page, canvas):
 
 
 def test_a_start_sends_what_the_form_says(server, page):
-    server.tell(hello(required_meta=["temperature_c"]), status())
+    told = "The predicted peak angle of 0.6 rad exceeds 0.5 rad; lower the amplitude."
+    server.replies["start"] = {"ok": False, "error": told}
+    page.click("#start-button")
+    says(page, "#start-result", told)
+    page.wait_for_selector("#start-button:enabled")
+    server.tell(hello(required_meta=["operator", "temperature_c"]), status())
+    # The operator has a field of his own.
+    expect(page.locator("#operator")).to_have_attribute("placeholder", "required")
+    assert page.evaluate("document.getElementById('operator').required")
+    assert not page.evaluate("document.getElementById('specimen').required")
+    assert page.input_value("#metadata-rows .pair input >> nth=0") == "temperature_c"
+    assert page.locator("#metadata-rows .pair").count() == 1
     page.fill("#parameter-amplitude_rad", "0,02")
     page.fill("#parameter-taper_s", "")
     page.fill("#repeat", "2")
@@ -74,8 +85,8 @@ def test_a_start_sends_what_the_form_says(server, page):
     server.replies["start"] = {"series": 1, "plan": PLAN}
     page.click("#start-button")
     says(page, "#prediction", "Predicted peaks")
-    assert server.asked == [("start", True)]
-    assert server.requests == [
+    assert server.asked == [("start", True)] * 2
+    assert server.requests[1:] == [
         {
             "command": "start", "excitation": "chirp", "repeat": 2, "force": True,
             "parameters": {
@@ -89,44 +100,25 @@ def test_a_start_sends_what_the_form_says(server, page):
         }
     ]  # fmt: skip
     assert not page.is_checked("#force")  # it is asked for again
-
-
-def test_a_failed_check_is_shown_before_the_start_and_accepted_for_one(server, page):
+    # A failed check is shown, and accepted for one start.
     failed = {"name": "travel_no_angle", "text": "travel, if no angle comes: 2.50 rad"}
     beyond = {"name": "unknown_values", "text": "motor.peak_torque_nm: unknown"}
     rows = [failed | {"acceptable": True}, beyond | {"acceptable": False}]
     assert not page.is_visible("#failed-checks")
-    told = status()
-    told["daemon"]["failed_checks"] = rows
-    server.tell(told)
+    shown = status()
+    shown["daemon"]["failed_checks"] = rows
+    server.tell(shown)
     says(page, "#failed-rows", "travel_no_angle: travel, if no angle comes: 2.50 rad")
     says(page, "#failed-rows", "motor.peak_torque_nm")
     assert page.locator("#failed-rows input").count() == 1
     page.check("#failed-rows input")
-    server.tell(told)  # what is ticked stays
+    server.tell(shown)  # what is ticked stays
     server.replies["predict"] = {"plan": PLAN | {"failed_checks": rows}}
     page.click("#predict")
-    says(page, "#prediction", "Predicted peaks")
-    server.replies["start"] = {"series": 1, "plan": PLAN}
+    assert eventually(lambda: len(server.requests) == 3)
     page.click("#start-button")
     expect(page.locator("#failed-rows input")).not_to_be_checked()  # it is asked for again
-    assert [request["accept"] for request in server.requests] == [["travel_no_angle"]] * 2
-
-
-def test_a_required_operator_is_asked_for_in_its_own_field(server, page):
-    server.tell(hello(required_meta=["operator", "temperature_c"]))
-    expect(page.locator("#operator")).to_have_attribute("placeholder", "required")
-    assert page.evaluate("document.getElementById('operator').required")
-    assert not page.evaluate("document.getElementById('specimen').required")
-    assert page.input_value("#metadata-rows .pair input >> nth=0") == "temperature_c"
-    assert page.locator("#metadata-rows .pair").count() == 1
-    page.fill("#operator", "R. Igge")
-    page.fill("#metadata-rows input:nth-child(2)", "21.4")
-    server.replies["start"] = {"series": 1, "plan": PLAN}
-    page.click("#start-button")
-    says(page, "#prediction", "Predicted peaks")
-    notes = {"operator": "R. Igge", "meta": {"temperature_c": 21.4}}
-    assert server.requests[0]["notes"] == notes
+    assert [request["accept"] for request in server.requests[2:]] == [["travel_no_angle"]] * 2
 
 
 @pytest.mark.further
@@ -216,14 +208,6 @@ def test_a_value_that_is_no_number_is_told_and_not_sent(server, page):
     assert server.asked == []
 
 
-def test_a_refusal_is_told_in_the_daemon_s_words(server, page):
-    told = "The predicted peak angle of 0.6 rad exceeds 0.5 rad; lower the amplitude."
-    server.replies["start"] = {"ok": False, "error": told}
-    page.click("#start-button")
-    says(page, "#start-result", told)
-    page.wait_for_selector("#start-button:enabled")
-
-
 @pytest.mark.further
 def test_predict_shows_peaks_against_limits_and_offers_the_largest_amplitude(server, page):
     refused = "The predicted peak speed of 11 rad/s exceeds 10 rad/s."
@@ -280,7 +264,7 @@ def test_zero_tare_and_check_tell_their_results(server, page):
     says(page, "#calibration", "FT12345")
 
 
-def test_buttons_wait_for_their_state(server, page):
+def test_buttons_and_responses_are_those_of_the_state(server, page):
     enabled = "['zero', 'tare', 'check', 'reset', 'start-button'].filter(id => " \
         "!document.getElementById(id).disabled).join()"  # fmt: skip
     assert page.evaluate(enabled) == "zero,tare,check,start-button"
@@ -290,6 +274,13 @@ def test_buttons_wait_for_their_state(server, page):
     ):  # fmt: skip
         server.tell(told)
         page.wait_for_function(f"() => {enabled} === '{expected}'")
+    # Of the session before, nothing is shown when the next one of a series begins.
+    server.tell(status("running"), response("nominal"), response("last"), response())
+    says(page, "#response-keys", "measured")
+    server.tell(status("running"), response("nominal"))
+    expect(page.locator("#response-keys")).to_have_text("nominal model")
+    server.tell(response(reached_hz=5.0))
+    says(page, "#response-keys", "measured")
 
 
 # Live
@@ -339,15 +330,6 @@ def test_the_response_grows_over_model_and_last_session(server, page):
     page.hover("#response-plot", position={"x": 60, "y": 50})
     says(page, "#response-readout", "coherence")
     assert "Hz" in page.inner_text("#response-readout")
-
-
-def test_of_the_session_before_nothing_is_shown_when_the_next_of_a_series_begins(server, page):
-    server.tell(status("running"), response("nominal"), response("last"), response())
-    says(page, "#response-keys", "measured")
-    server.tell(status("running"), response("nominal"))
-    expect(page.locator("#response-keys")).to_have_text("nominal model")
-    server.tell(response(reached_hz=5.0))
-    says(page, "#response-keys", "measured")
 
 
 @pytest.mark.further
