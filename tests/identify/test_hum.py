@@ -42,7 +42,7 @@ def quiet(sessions):
 
 
 @pytest.mark.parametrize("offset_hz", [0.0, further(0.05), further(0.2)])
-@pytest.mark.parametrize("amplitude_nm", [2e-3, 5e-2])
+@pytest.mark.parametrize("amplitude_nm", [3e-3, further(5e-2)])
 def test_a_hum_on_a_mode_is_found_and_moves_nothing(sessions, quiet, offset_hz, amplitude_nm):
     hz = MODE_2_HZ + offset_hz
     analysis = analysed(humming(sessions("VI"), hz, amplitude_nm))
@@ -66,7 +66,7 @@ def test_the_hum_s_amplitude_counts_as_unknown(sessions, quiet):
 
 def test_a_hum_where_torque_was_lost(sessions):
     session = humming(sessions("VI"), MODE_2_HZ + 0.05, 0.02)
-    lost = (np.array([9000, 19_000, 50_000])[:, None] + np.arange(900)).ravel()
+    lost = (np.array([9000, 14_000, 25_000])[:, None] + np.arange(500)).ravel()
     (line,) = analysed(session, unknown_torque=lost).lines
     assert line.amplitude_nm == pytest.approx(0.02, abs=4e-4)
 
@@ -92,7 +92,7 @@ def test_a_mode_that_a_fit_has_beyond_the_band(sessions):
     assert find_hum_near_modes(comparison, plant, (pole,), noise, nothing) == ()
 
 
-@pytest.mark.parametrize("structure", ["II", "VI"])
+@pytest.mark.parametrize("structure", ["II", further("VI")])
 @pytest.mark.parametrize("plant", ["VI", further("III"), further("IV")])
 def test_what_a_model_leaves_of_a_multisine_is_no_hum(sessions, plant, structure):
     """The beam is driven all the time: what a wrong model leaves is as steady as a hum."""
@@ -102,7 +102,7 @@ def test_what_a_model_leaves_of_a_multisine_is_no_hum(sessions, plant, structure
 def test_a_burst_at_a_mode_is_no_hum(sessions):
     session = sessions("VI")
     t = np.arange(session.torque_nm.size) / 1000
-    burst = 0.02 * np.sin(2 * np.pi * MODE_2_HZ * t) * ((t > 45) & (t < 60))
+    burst = 0.02 * np.sin(2 * np.pi * MODE_2_HZ * t) * ((t > 20) & (t < 31))
     assert analysed(with_torque(session, burst)).comparison.hum == ()
 
 
