@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Comparison, Measurement, select
+from analysis.identify import Comparison, Measurement, fit_freest_alone, select
 from analysis.identify._channel_checks import (
     clipping_findings,
     sign_and_unit_findings,
@@ -161,15 +161,29 @@ def test_a_wrong_sign_comes_first():
     assert {each.flag for each in quantities} == {CONTRADICTED_FILE_REASON}
 
 
-def test_a_clipped_torque_leaves_no_number_without_a_flag():
+@pytest.fixture(scope="module")
+def slightly_clipped():
     """Even where so little is cut off that what remains is noise."""
     made = record()
     most = np.sort(np.abs(made.torque_nm))[-12]
-    clipped = replace(made, torque_nm=np.clip(made.torque_nm, -most, most))
-    found = select(clipped, band_hz=(0.0, 10.0))
-    assert "clipping" in {finding.kind for finding in found.verdict.findings}
-    assert all(each.flag for each in found.headline.parameters.values())
-    assert all(mode.damping_ratio.flag for mode in found.headline.modes)
+    return replace(made, torque_nm=np.clip(made.torque_nm, -most, most))
+
+
+def assert_flagged(headline, findings):
+    assert "clipping" in {finding.kind for finding in findings}
+    assert all(each.flag for each in headline.parameters.values())
+    assert all(mode.damping_ratio.flag for mode in headline.modes)
+
+
+def test_a_clipped_torque_leaves_no_number_without_a_flag(slightly_clipped):
+    headline, findings, _ = fit_freest_alone(slightly_clipped, (0.0, 10.0))
+    assert_flagged(headline, findings)
+
+
+@pytest.mark.further  # as the freest structure alone
+def test_a_clipped_torque_leaves_a_judgement_without_a_number(slightly_clipped):
+    found = select(slightly_clipped, band_hz=(0.0, 20.0))
+    assert_flagged(found.headline, found.verdict.findings)
     assert not any("no unmodelled effect" in sentence for sentence in found.verdict.sentences)
 
 

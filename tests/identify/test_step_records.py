@@ -36,12 +36,13 @@ def test_a_profile_looks_for_no_valley_where_there_is_none(without_delay):
     assert alpha.estimate == pytest.approx(field.best.fit.parameters["alpha"], abs=1e-4)
 
 
-def test_two_values_that_explain_a_record_equally_are_both_named(without_delay):
+def test_two_values_that_explain_a_record_equally_are_both_named(steps, freest_of):
+    candidates = freest_of(steps("IV", 0.1).measured(noise_nm=0.01, seed=8))
     found = LikelihoodProfile(
         "lambda", "VII", (0.5, 0.657, 0.9, 1.235, 1.4), (9.0, 0.0, 8.0, 0.8, 9.0), 0.657,
         (0.657, 1.235), (0.58, 1.3), False, False, 0.0,
     )  # fmt: skip
-    verdict = order_verdict(without_delay, found, (1,), doubt_reason=None)
+    verdict = order_verdict(candidates, found, (1,), doubt_reason=None)
     assert (verdict.status, verdict.value, verdict.interval) == ("not identifiable", None, None)
     said = order_sentence(verdict)
     assert "0.657 and 1.235 fit the record equally well" in said
