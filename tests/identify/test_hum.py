@@ -1,8 +1,8 @@
 """Hum on a sharp mode: told from the beam's own doing by lasting, and taken out of the fit.
 
-Over 12 other seeds, with 2 mN·m on the mode and 50 mN·m beside it, the largest errors were 5.1e-4
-Hz (2e-3 allowed), 0.13 mN·m (0.3), 0.51 standard deviations of a parameter (1), and 0.047 of the
-cost over its degrees of freedom (0.1).
+Over 12 other seeds, with 3 mN·m on the mode and 50 mN·m 0.1 Hz beside it, the largest errors were
+6.6e-4 Hz (2e-3 allowed), 0.26 mN·m (0.3), 0.63 standard deviations of a parameter (1), and 0.047 of
+the cost over its degrees of freedom (0.1).
 """
 
 import numpy as np
@@ -41,7 +41,7 @@ def quiet(sessions):
     return analysed(sessions("VI")).fits[0]
 
 
-@pytest.mark.parametrize("offset_hz", [0.0, further(0.05), further(0.2)])
+@pytest.mark.parametrize("offset_hz", [0.0, further(0.1), further(0.4)])
 @pytest.mark.parametrize("amplitude_nm", [3e-3, further(5e-2)])
 def test_a_hum_on_a_mode_is_found_and_moves_nothing(sessions, quiet, offset_hz, amplitude_nm):
     hz = MODE_2_HZ + offset_hz

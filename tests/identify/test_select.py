@@ -246,10 +246,10 @@ def test_what_cannot_be_told_apart_is_said(one_mode):
 
 @pytest.mark.further  # as each alone
 def test_hum_and_a_stiffness_that_rises_become_neither_mode_nor_order(sessions, stiffening):
-    made = sessions("III")
+    made = sessions("III", sweep_s=60)
     t = np.arange(made.torque_nm.size) / 1000
     hum = 0.03 * np.sin(2 * np.pi * 50.02 * t)  # beyond the band, and leaking into it
-    torque = made.torque_nm + stiffening("III", 0.02) + hum
+    torque = made.torque_nm + stiffening("III", 0.02, 60) + hum
     spoilt = type(made)(made.angle_rad, torque)
     selection = select(spoilt.measured(noise_nm=NOISE_NM, seed=45))
     verdict, told = selection.verdict, selection.headline
