@@ -86,7 +86,7 @@ def written(path, struck, *, marked=True, metadata=None, profile=PROFILE, length
 @pytest.fixture(scope="session")
 def touch_file(made_once):
     def make(folder):
-        (made,) = simulate([OBSTACLE], [Slew(1.0)], duration_s=0.95, steps=20, modes=20, seed=7)
+        (made,) = simulate([OBSTACLE], [Slew(1.0)], duration_s=0.95, steps=40, modes=24, seed=7)
         written(folder / "touch.mcap", made)
         (folder / "struck.pickle").write_bytes(pickle.dumps(made))
 
