@@ -53,6 +53,7 @@ def test_a_record_that_is_not_long_is_not_decimated(paper_file):
 
 
 @pytest.mark.fit
+@pytest.mark.further  # of a record that is equal, as tested above
 def test_the_modes_are_those_of_the_whole_record(paper_file, decimated):
     """Both fits are to the same time: 0.26 s at either end are inside no filter window."""
     ends_s = decimated.time_s[0], decimated.time_s[-1] + 1e-3

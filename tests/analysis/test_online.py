@@ -295,6 +295,7 @@ def test_a_blow_is_named_and_biases_nothing(session):
 
 
 @pytest.mark.parametrize(("density", "stiffness"), [(1.2, 0.8), further(0.8, 1.2)])
+@pytest.mark.further  # as in tests/identify/test_fit.py
 def test_a_beam_20_percent_off_its_data_is_found(session, density, stiffness):
     beam = Beam(0.98, density * 4.7e-3, stiffness * 0.090275)
     told = fed_with(scan(beam=beam), session).estimate().headline

@@ -139,6 +139,7 @@ def test_a_reference_that_does_not_explain_the_angle_is_not_believed(sessions, r
 
 
 @pytest.mark.fit
+@pytest.mark.further  # as a hum that moves the motor, and a multisine in test_hum.py
 def test_between_the_lines_of_a_multisine_there_is_noise_only(controlled, true_parameters):
     """It moves the motor there too: no response, no hum, and no other structure."""
     measured = controlled("VI", 7, multisine=True)

@@ -172,6 +172,7 @@ def test_a_hum_is_named_and_moves_nothing(sessions):
 
 @pytest.mark.parametrize(("hz", "amplitude_nm"), [further(49.0, 0.05), (16.7, 0.02)])
 @pytest.mark.parametrize("name", ["VI", further("III"), further("IV")])
+@pytest.mark.further  # as in test_hum.py, of a beam at rest and of one that rings
 def test_a_hum_is_no_ringing(sessions, name, hz, amplitude_nm):
     for shaken in (False, True):
         session = sessions(name, shaken=shaken)
@@ -192,7 +193,7 @@ def test_a_hum_is_no_ringing(sessions, name, hz, amplitude_nm):
 
 
 @pytest.mark.parametrize("seed", [further(4), 7, further(9)])
-@pytest.mark.further  # as a hum that is no ringing
+@pytest.mark.further  # as a hum on the mode
 def test_a_railway_s_hum_beside_the_second_mode(sessions, seed):
     """Its skirts reach over the resonance, which lies at 16.03 Hz and is compared all the same."""
     session = sessions("IV")

@@ -199,6 +199,7 @@ def test_a_record_that_does_not_grow_is_told_again(estimator, struck):
     assert {each.kind for each in told} == {"rigid"}
 
 
+@pytest.mark.further  # as the hard one
 def test_a_stiff_obstacle_near_the_tip_is_told_at_once(estimator):
     """Its contacts are the shortest; in steps of 0.1 ms their minimum is missed."""
     obstacle = Obstacle(x_m=0.93, stiffness_n_per_m=1e5)
