@@ -22,7 +22,6 @@ def test_a_step_without_a_delay_names_at_most_the_drag_that_it_hardly_shows(with
     assert {finding.kind for finding in findings} <= {"air drag"}
 
 
-@pytest.mark.further  # as in a sweep, in test_select.py
 def test_a_delay_that_is_there_is_named_in_a_step(steps):
     measured = steps("III", 0.3, delay_s=2e-3).measured(noise_nm=0.01, seed=5)
     (found,) = select(measured).verdict.findings
