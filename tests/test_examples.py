@@ -7,6 +7,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
+import warm_start
 
 from rigd.testing import DEVICE_CHECKS
 
@@ -24,14 +25,13 @@ def module_at(path):
     return module
 
 
-def run(example, folder, *arguments):
-    """Run an example in a folder; what it prints."""
-    done = subprocess.run(
-        [sys.executable, "-W", "error", EXAMPLES / f"{example}.py", *arguments],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
+def run(example, folder, *arguments, cold=False):
+    """Run an example in a folder; what it prints. A `cold` start makes errors of warnings, too."""
+    command = [EXAMPLES / f"{example}.py", *arguments]
+    if cold:
+        command = [sys.executable, "-W", "error", *command]
+    done = (subprocess if cold else warm_start).run(
+        command, cwd=folder, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -81,7 +81,7 @@ def test_peaks_of_the_response_are_found(session, tmp_path):
 
 @pytest.mark.further  # as in tests/identify
 def test_structures_are_fitted_and_one_is_selected(session, tmp_path):
-    printed = run("fit_and_select", tmp_path, session)
+    printed = run("fit_and_select", tmp_path, session, cold=True)
     fits = re.findall(r"^type (\w+), cost [\d.]+$", printed, re.MULTILINE)
     assert fits == ["III", "VI"]
     modes_hz = values(r"mode \d: ([\d.]+) Hz", printed)
@@ -91,7 +91,7 @@ def test_structures_are_fitted_and_one_is_selected(session, tmp_path):
 
 @pytest.mark.further  # as in tests/campaigns
 def test_sessions_are_pooled(made, tmp_path):
-    printed = run("campaign", tmp_path, *made[1])
+    printed = run("campaign", tmp_path, *made[1], cold=True)
     assert "2 sessions\n" in printed
     pooled = re.findall(r"^type (.+)$", printed, re.MULTILINE)
     assert {"III", "VI", "VII"} <= set(pooled)  # the freest is always among them
@@ -99,7 +99,7 @@ def test_sessions_are_pooled(made, tmp_path):
 
 
 def test_a_device_of_one_s_own_turns(tmp_path):
-    printed = run("own_device", tmp_path)
+    printed = run("own_device", tmp_path, cold=True)
     assert values(r"999 ms: ([\d.]+) rad", printed) == pytest.approx([0.1], abs=1e-3)
 
 

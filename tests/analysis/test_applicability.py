@@ -152,6 +152,7 @@ def slow(write_session, make_signals, tmp_path):
 
 @pytest.mark.fit
 @pytest.mark.usefixtures("slow")
+@pytest.mark.further  # the band that is fitted is tested above
 def test_a_record_of_100_hz_is_analysed(analyze_here, without_drawing, tmp_path):
     brief = ("--types", "I", "--weights", "const")
     with without_drawing():

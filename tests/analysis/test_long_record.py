@@ -53,6 +53,7 @@ def test_a_record_that_is_not_long_is_not_decimated(paper_file):
 
 
 @pytest.mark.fit
+@pytest.mark.further  # of a record that is equal, as tested above
 def test_the_modes_are_those_of_the_whole_record(paper_file, decimated):
     """Both fits are to the same time: 0.26 s at either end are inside no filter window."""
     ends_s = decimated.time_s[0], decimated.time_s[-1] + 1e-3
@@ -136,7 +137,7 @@ def test_a_torque_that_never_changes_is_no_data_of_a_sensor(paper_signals, write
 
 @pytest.mark.fit
 def test_a_fit_in_blocks_of_bins_finds_the_same(monkeypatch, write_session, tmp_path):
-    path = write_session(tmp_path / "a.mcap", chirp_signals(sweep_s=15.0))
+    path = write_session(tmp_path / "a.mcap", chirp_signals(sweep_s=8.0))
     measurement = Measurement.from_record(load_record(path))
     whole = fit_freest_alone(measurement, BAND_HZ)[0]
     for module, name, most in (

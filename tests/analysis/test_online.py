@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -73,6 +74,14 @@ def test_the_last_estimate_is_that_of_the_file(session):
     assert live.doubt is None
 
 
+def test_the_record_is_that_of_the_file(session):
+    live, record = fed(session).record(), load_record(session.path)
+    for name in ("time_s", "angle_rad", "torque_nm", "reference_rad", "torque_known"):
+        np.testing.assert_array_equal(getattr(live, name), getattr(record, name))
+    assert (live.rate_hz, live.beam, live.sweep) == (record.rate_hz, record.beam, record.sweep)
+
+
+@pytest.mark.further  # from the same record
 def test_the_quick_estimate_is_that_of_the_file(session):
     live = fed(session).estimate()
     record = load_record(session.path)
@@ -90,10 +99,10 @@ def of_four_seconds(session):
 def test_an_estimate_depends_on_what_was_before_its_tick_alone(session, of_four_seconds):
     early = OnlineEstimator(session.metadata, session.segments)
     early.feed(session.samples[:4000])
-    asked, early = of_four_seconds, early.estimate()
-    assert asked.headline.modes == early.headline.modes
-    assert asked.tick == early.tick == 4000
-    assert asked.duration_s == 4.0
+    asked, early = fed(session).record(4000), early.record()
+    np.testing.assert_array_equal(asked.angle_rad, early.angle_rad)
+    np.testing.assert_array_equal(asked.torque_nm, early.torque_nm)
+    assert (of_four_seconds.tick, of_four_seconds.duration_s) == (4000, 4.0)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +110,7 @@ def test_an_estimate_depends_on_what_was_before_its_tick_alone(session, of_four_
     [
         (0, "Nothing is excited yet"),
         further(500, "Nothing is excited yet"),
-        (1000, "are too short for the band"),
+        further(1000, "are too short for the band"),
         (1600, "No mode has been excited enough yet"),
     ],
 )
@@ -126,7 +135,7 @@ def test_a_fit_that_fails_is_a_problem_of_this_estimate_alone(session, monkeypat
         estimate = fit.estimate()
     assert estimate.problem.startswith("The record so far cannot be fitted")
     assert "Singular matrix" in estimate.problem
-    assert fit.estimate(4000).problem == ""
+    assert "are too short for the band" in fit.estimate(1000).problem
 
 
 def with_mass_at_tip(signals, tip_kg, damping=PAPER_DAMPING):
@@ -140,30 +149,30 @@ def with_mass_at_tip(signals, tip_kg, damping=PAPER_DAMPING):
     return replace(signals, torque_nm=torque_nm)
 
 
-def test_both_estimates_have_the_modes_of_a_beam_that_is_not_uniform(session):
+@pytest.mark.parametrize("whole", [False, further(True)])
+def test_an_estimate_has_the_modes_of_a_beam_that_is_not_uniform(session, whole):
     """Those of the modal model, without a flag; and the plant to excite next has them."""
     beam = Plant(PAPER_BEAM, PAPER_DAMPING, tip_mass_kg=1.8e-4)
     poles = beam.poles(clamped_free_eigenvalues(3))[:, 0]
     fit = fed_with(with_mass_at_tip(scan(), 1.8e-4), session)
-    for whole in (False, True):
-        estimate = fit.estimate(whole=whole)
-        assert estimate.doubt is None
-        told = estimate.headline
-        assert told.uniform_beam.status == "refused"
-        assert told.parameters["density_over_stiffness"].flag
-        for mode, pole in zip(told.modes, poles, strict=True):
-            assert (mode.source, mode.frequency_hz.flag, mode.damping_ratio.flag) == (
-                "modal", None, None,
-            )  # fmt: skip
-            frequency_hz = pole.imag / (2 * np.pi)
-            assert abs(mode.frequency_hz.value - frequency_hz) < 4 * mode.frequency_hz.std
-            ratio = -pole.real / abs(pole)
-            assert abs(mode.damping_ratio.value - ratio) < 4 * mode.damping_ratio.std
-        plant = estimate.plant
-        assert len(plant.stiffness_offsets) == 2
-        found = Plant(plant.beam, plant.damping, stiffness_offsets=plant.stiffness_offsets)
-        near = found.poles(clamped_free_eigenvalues(3))[:, 0]
-        np.testing.assert_allclose(near.imag, poles.imag, rtol=1e-3)
+    estimate = fit.estimate(whole=whole)
+    assert estimate.doubt is None
+    told = estimate.headline
+    assert told.uniform_beam.status == "refused"
+    assert told.parameters["density_over_stiffness"].flag
+    for mode, pole in zip(told.modes, poles, strict=True):
+        assert (mode.source, mode.frequency_hz.flag, mode.damping_ratio.flag) == (
+            "modal", None, None,
+        )  # fmt: skip
+        frequency_hz = pole.imag / (2 * np.pi)
+        assert abs(mode.frequency_hz.value - frequency_hz) < 4 * mode.frequency_hz.std
+        ratio = -pole.real / abs(pole)
+        assert abs(mode.damping_ratio.value - ratio) < 4 * mode.damping_ratio.std
+    plant = estimate.plant
+    assert len(plant.stiffness_offsets) == 2
+    found = Plant(plant.beam, plant.damping, stiffness_offsets=plant.stiffness_offsets)
+    near = found.poles(clamped_free_eigenvalues(3))[:, 0]
+    np.testing.assert_allclose(near.imag, poles.imag, rtol=1e-3)
 
 
 def quantities(estimate):
@@ -174,6 +183,26 @@ def quantities(estimate):
     return found
 
 
+def test_a_judgement_starts_from_the_last_if_asked_to(session, monkeypatch):
+    headline = SimpleNamespace(
+        visible_modes=(), fit=SimpleNamespace(plant=Plant(PAPER_BEAM, PAPER_DAMPING))
+    )
+    verdict = SimpleNamespace(findings=(), alpha=None, lambda_=None)
+    selected = SimpleNamespace(headline=headline, verdict=verdict, analysis=None)
+    started_from = []
+
+    def select(*_, band_hz, earlier):
+        started_from.append(earlier)
+        return selected
+
+    monkeypatch.setattr("analysis.identify.select", select)
+    fit = fed(session)
+    for from_last in (True, False, True):
+        fit.estimate(4000, whole=True, from_last=from_last)
+    assert started_from == [None, None, selected]
+
+
+@pytest.mark.further  # as the candidates in tests/identify/test_select.py
 def test_a_judgement_may_start_from_the_last(session, monkeypatch):
     """Without a search, and to the same minimum."""
     fit = fed_with(scan(noise_nm=5e-3), session)
@@ -198,6 +227,7 @@ def test_a_judgement_may_start_from_the_last(session, monkeypatch):
 
 
 @pytest.mark.fit
+@pytest.mark.further  # as the candidates in tests/identify/test_select.py
 def test_what_the_last_judgement_does_not_explain_is_searched_for(session):
     """Here in vain, for it hums within the width of mode 2: as if nothing had been known."""
     signals = scan(ring_down_s=2.0)
@@ -224,6 +254,7 @@ def test_what_still_runs_was_not_cut_short(of_nine_seconds):
     assert estimate.warnings == ()
     assert [mode.shown for mode in estimate.headline.modes][:2] == [True, True]
     assert estimate.doubt is None
+    assert estimate.as_json()["validity"]["uniform_beam"]["status"] == "passed"
 
 
 def test_one_mode_alone_tells_no_order(of_four_seconds):
@@ -233,13 +264,19 @@ def test_one_mode_alone_tells_no_order(of_four_seconds):
     assert told.modes[0].damping_ratio.flag is None
 
 
-def test_a_hum_and_a_blow_are_named_and_bias_nothing(session):
+def test_a_hum_is_named_and_no_doubt(session):
     signals = scan()
     time_s = np.arange(signals.torque_nm.size) / 1000
     hum = signals.torque_nm + 5e-3 * np.sin(2 * np.pi * 33 * time_s)
     estimate = fed_with(replace(signals, torque_nm=hum), session).estimate()
     assert [finding.kind for finding in estimate.findings] == ["hum"]
     assert estimate.doubt is None
+
+
+@pytest.mark.further  # as in tests/identify/test_impacts.py
+def test_a_blow_is_named_and_biases_nothing(session):
+    signals = scan()
+    time_s = np.arange(signals.torque_nm.size) / 1000
     since_s = np.maximum(time_s - 3.0, 0.0)
     ring = 0.2 * np.exp(-0.15 * since_s) * np.sin(2 * np.pi * 2.57 * since_s)
     struck = fed_with(replace(signals, torque_nm=signals.torque_nm + ring), session).estimate()
@@ -258,6 +295,7 @@ def test_a_hum_and_a_blow_are_named_and_bias_nothing(session):
 
 
 @pytest.mark.parametrize(("density", "stiffness"), [(1.2, 0.8), further(0.8, 1.2)])
+@pytest.mark.further  # as in tests/identify/test_fit.py
 def test_a_beam_20_percent_off_its_data_is_found(session, density, stiffness):
     beam = Beam(0.98, density * 4.7e-3, stiffness * 0.090275)
     told = fed_with(scan(beam=beam), session).estimate().headline
@@ -290,23 +328,22 @@ def next_estimate(thread):
     return eventually(thread.next_estimate)
 
 
-def test_a_thread_answers_to_requests(session, of_nine_seconds):
+def test_a_thread_answers_to_requests(session, of_four_seconds):
     thread = EstimatorThread()
-    thread.feed(session.samples[:9500])
+    thread.feed(session.samples[:4500])
     thread.begin(session.metadata, session.segments, None)
-    for number, (tick, whole) in enumerate([(300, False), (9000, False), (300, True)]):
+    for number, (tick, whole) in enumerate([(300, False), (4000, False), (300, True)]):
         thread.request(EstimateRequest(number, tick, whole))
     answers = [next_estimate(thread) for _ in range(3)]
     assert [(each["id"], each["tick"], each["whole"]) for each in answers] == [
-        (0, 300, False), (1, 9000, False), (2, 300, True),
+        (0, 300, False), (1, 4000, False), (2, 300, True),
     ]  # fmt: skip
-    expected = json.loads(json.dumps(of_nine_seconds.as_json()))
+    expected = json.loads(json.dumps(of_four_seconds.as_json()))
     took_s = answers[1].pop("took_s")
     assert 0 < took_s < 30
     assert answers[1] == {"id": 1} | {k: v for k, v in expected.items() if k != "took_s"}
     names = answers[1]["covariance"]["names"]
     assert np.array(answers[1]["covariance"]["matrix"]).shape == (len(names), len(names))
-    assert answers[1]["validity"]["uniform_beam"]["status"] == "passed"
     assert {mode["source"] for mode in answers[1]["modes"] if mode["shown"]} == {"modal"}
     assert set(answers[1]["plant"]["damping"]) == {"zeta", "alpha", "gamma", "lambda"}
     noise = answers[1]["noise"]

@@ -23,7 +23,22 @@ from rigd.session.quick_look import quick_look_path
 
 
 @pytest.fixture(scope="module")
-def chirps(short_chirps, tmp_path_factory):
+def judgements():
+    """Whole judgements by name of the file, each made once."""
+    made = {}
+
+    def once(record):
+        if record.path.name not in made:
+            made[record.path.name] = whole_record(record)
+        return made[record.path.name]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("analysis.results.whole_record", once)
+        yield made
+
+
+@pytest.fixture(scope="module")
+def chirps(short_chirps, judgements, tmp_path_factory):
     """Both chirps in their own folder, and the looks at them in turn."""
     folder = tmp_path_factory.mktemp("looks")
     paths = [Path(shutil.copy(path, folder)) for path in short_chirps]
@@ -35,8 +50,9 @@ def chirps(short_chirps, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def whole(short_chirps):
-    return whole_record(load_record(short_chirps[0]))
+def whole(chirps, judgements):
+    paths, _ = chirps
+    return judgements[paths[0].name]
 
 
 @pytest.fixture(scope="module")
@@ -221,6 +237,12 @@ def test_the_freest_structure_alone_flags_what_it_does_not_explain(short_chirps)
         "part of the record is unexplained"
     }
     assert found
+
+
+@pytest.mark.process
+@pytest.mark.further  # as the look at such a record
+def test_the_freest_structure_alone_flags_a_record_that_contradicts_its_file(short_chirps):
+    measurement = Measurement.from_record(load_record(short_chirps[0]))
     told, found, _ = fit_freest_alone(replace(measurement, torque_nm=-measurement.torque_nm))
     assert {mode.frequency_hz.flag for mode in told.modes} == {"the record contradicts its file"}
     assert [finding.kind for finding in found] == ["sign"]
@@ -291,8 +313,9 @@ def look(*arguments):
 
 
 @pytest.mark.process
-def test_the_program_writes_the_look_and_prints_it(short_chirps, tmp_path):
-    path = Path(shutil.copy(short_chirps[0], tmp_path))
+def test_the_program_writes_the_look_and_prints_it(write_session, short_signals, tmp_path):
+    held = replace(short_signals, metadata={"excitation": "hold"})  # of which little is computed
+    path = write_session(tmp_path / "held.mcap", held)
     done = look(path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == json.loads(quick_look_path(path).read_text())["text"]

@@ -5,6 +5,7 @@ from math import atan2
 
 import numpy as np
 import pytest
+from cases import further
 
 from analysis.record import RecordError
 from analysis.touch import TouchAnalysis
@@ -37,7 +38,7 @@ def test_the_map_shows_it_where_the_obstacle_stands(touched, touch_file):
     assert touch.antenna_m[0] == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
-@pytest.mark.parametrize("metadata", [{}, {"shear_projection": "0,0,0,0,0,0"}])
+@pytest.mark.parametrize("metadata", [{}, further({"shear_projection": "0,0,0,0,0,0"})])
 def test_one_that_is_not_marked_is_found(touch_file, touch_analysis, tmp_path, metadata):
     path = touch_file.write(tmp_path / "a.mcap", marked=False, metadata=metadata)
     session = touch_analysis.session(path)

@@ -116,7 +116,7 @@ def test_chunks_of_a_long_response_are_those_of_the_whole(loop_model):
     np.testing.assert_allclose(late[3000:], late[:1000], atol=1e-6)
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(
     actuation=st.integers(0, 20),
     angle=st.integers(0, 18),

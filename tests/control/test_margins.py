@@ -94,7 +94,9 @@ def test_the_command_carries_what_both_readings_carry(loop_model):
 
 
 @pytest.mark.parametrize("pole_rad_s", [further(40.0), 80.0, further(100.0)])
-@pytest.mark.parametrize("change", [lambda model: model, slower], ids=["sim", "slower"])
+@pytest.mark.parametrize(
+    "change", [further(lambda model: model, id="sim"), pytest.param(slower, id="slower")]
+)
 def test_a_gain_or_delay_beyond_its_margin_is_unstable(loop_model, change, pole_rad_s):
     model = change(loop_model)
     model = replace(model, settings=replace(model.settings, pole_rad_s=pole_rad_s))
@@ -128,14 +130,13 @@ def test_phase_margin_is_taken_either_way(loop_model):
 
 
 def test_no_frequency_of_a_fine_grid_is_nearer_to_minus_one(loop_model):
-    """Sharp resonances are not stepped over, not even those of a beam with no damping."""
+    """Sharp resonances are not stepped over: those of a beam with next to no damping."""
     light = replace(loop_model, plant=replace(loop_model.plant, damping=Damping(zeta=1e-5)))
     grid = 2 * np.pi * np.concatenate([np.linspace(2.5, 2.6, 801), np.linspace(15.8, 16.2, 801)])
-    for model in (loop_model, light):
-        loop = close_loop(model)
-        for opening, margins in zip(loop.openings, loop_margins(loop), strict=True):
-            distance = np.abs(1 + open_loop_gain(loop, opening, grid / model.rate_hz))
-            assert margins.modulus <= 1.001 * np.min(distance)
+    loop = close_loop(light)
+    for opening, margins in zip(loop.openings, loop_margins(loop), strict=True):
+        distance = np.abs(1 + open_loop_gain(loop, opening, grid / light.rate_hz))
+        assert margins.modulus <= 1.001 * np.min(distance)
 
 
 @pytest.mark.further  # and beyond them none

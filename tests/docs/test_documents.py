@@ -132,6 +132,14 @@ FILES = {
 """Files that an excitation reads: of docs/run_sessions.md, and of a first analysis."""
 
 
+IDENTIFICATIONS = {
+    (kind, repr(parameters)): (line, kind, parameters)
+    for line, kind, parameters, given in EVERY_SESSION
+    if kind not in ("move", "touch") and given["tip_slope_rad"] is None
+}
+"""Line, excitation and its parameters, each once."""
+
+
 def test_every_kind_of_identification_is_shown():
     kinds = {kind for _, kind, *_ in EVERY_SESSION}
     assert {"chirp", "step", "multisine", "hold", "file", "modes", "until"} <= kinds
@@ -142,8 +150,7 @@ def test_every_kind_of_identification_is_shown():
     ("kind", "parameters"),
     [
         pytest.param(kind, parameters, id=re.sub(r"[^\w .-]", "", line)[:60])
-        for line, kind, parameters, given in EVERY_SESSION
-        if kind not in ("move", "touch") and given["tip_slope_rad"] is None
+        for line, kind, parameters in IDENTIFICATIONS.values()
     ],
 )
 def test_identifications_keep_the_limit_of_the_tip_s_slope(kind, parameters, tmp_path):

@@ -236,6 +236,7 @@ def environment() -> dict[str, str]:
     return os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}", "CI": "1"}
 
 
+@pytest.mark.further  # that there is what the layout shows is tested above
 def test_the_commands_of_the_page_show_plots_in_rerun(session, look):
     (block,) = (block for block in blocks("sh") if "mcap convert" in block)
     *prepare, show = block.splitlines()
@@ -271,6 +272,7 @@ def test_the_python_of_the_page_puts_session_and_layout_into_one_file(session):
     assert count == 21_500
 
 
+@pytest.mark.further  # what another program does
 def test_a_session_file_opened_as_it_is_shows_the_events_at_most(look):
     """As the page says: should Rerun ever do better, the page is to say so.
 

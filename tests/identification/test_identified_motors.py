@@ -129,8 +129,8 @@ def windows_of(excitation, signals, session):
     ]
 
 
-def identify(nominal, motor, seed):
-    """Run the three sessions as the command does, and estimate."""
+def begin(nominal, motor, seed):
+    """Run the first session as the command does; its estimate, the timing, and how to go on."""
     rig = nominal.rig
     timing = Timing(rig.rate_hz, rig.encoder.delay_s, rig.sensor.delay_s, rig.actuation.delay_s)
 
@@ -141,6 +141,12 @@ def identify(nominal, motor, seed):
         return windows_of(excitation, signals, number)
 
     trial = estimate_motor(run(trial_session, with_cautious_controller(nominal), 0), timing)
+    return trial, timing, run
+
+
+def identify(nominal, motor, seed):
+    """Run the three sessions as the command does, and estimate."""
+    trial, timing, run = begin(nominal, motor, seed)
     fitted = with_tuned_controller(nominal, trial)
     windows = run(multisine_session, fitted, 1) + run(speeds_session, fitted, 2)
     return estimate_motor(windows, timing)
@@ -175,7 +181,16 @@ def random_case(number):
     return motor, replace(profile, rig=replace(profile.rig, motor=wrong))
 
 
-@pytest.mark.parametrize("count", [1, further(2), pytest.param(10, marks=pytest.mark.slow)])
+def test_a_trial_finds_a_motor_and_tunes_its_controller():
+    motor, nominal = random_case(0)
+    trial, *_ = begin(nominal, motor, seed=0)
+    errors = motor.normalised_errors(trial)
+    assert max(map(abs, errors.values())) < 3.0, errors
+    tuned = with_tuned_controller(nominal, trial).control_motor
+    assert tuned.inertia_kg_m2 * motor.torque_scale == pytest.approx(motor.inertia_kg_m2, rel=0.05)
+
+
+@pytest.mark.parametrize("count", [further(2), pytest.param(10, marks=pytest.mark.slow)])
 def test_random_motors_are_found_within_three_deviations(count):
     all_errors = []
     for number in range(count):

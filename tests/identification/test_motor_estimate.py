@@ -124,6 +124,9 @@ def errors_of(estimate, truth):
     }
 
 
+OLD_READINGS = Truth(angle_delay_s=0.6e-3, torque_delay_s=1.2e-3, actuation_delay_s=1.0e-3)
+
+
 @pytest.mark.parametrize(
     "truth",
     [
@@ -131,7 +134,7 @@ def errors_of(estimate, truth):
         further(
             Truth(actuation_delay_s=0.4e-3, torque_scale=1.2, inertia_kg_m2=4e-3, coulomb_nm=0.0)
         ),
-        Truth(angle_delay_s=0.6e-3, torque_delay_s=1.2e-3, actuation_delay_s=1.0e-3),
+        OLD_READINGS,
     ],
     ids=["light", "heavy", "old readings"],
 )
@@ -173,7 +176,7 @@ def test_a_rigid_load_does_not_tell_the_scale():
 
 
 def test_windows_with_a_standstill_are_left_out():
-    truth = Truth()
+    truth = OLD_READINGS
     windows = list(windows_for(truth))
     stuck = windows[0].angle_rad.copy()
     stuck[600:700] = stuck[600]
@@ -184,20 +187,20 @@ def test_windows_with_a_standstill_are_left_out():
 
 
 def test_too_few_passes_are_refused():
-    windows = windows_for(Truth())
+    windows = windows_for(OLD_READINGS)
     one_way = [window for window in windows if window.speed_rad_s > 0]
     for few in ((), one_way, windows[:3] + windows[8:11]):
         with pytest.raises(MotorEstimateError, match="Too few passes"):
-            estimate_motor(few, timing_for(Truth()))
+            estimate_motor(few, timing_for(OLD_READINGS))
 
 
 def test_a_record_without_torque_tells_nothing():
     still = [
         replace(window, torque_command_nm=np.zeros_like(window.torque_command_nm))
-        for window in windows_for(Truth())
+        for window in windows_for(OLD_READINGS)
     ]
     with pytest.raises(MotorEstimateError):
-        estimate_motor(still, timing_for(Truth()))
+        estimate_motor(still, timing_for(OLD_READINGS))
 
 
 @pytest.mark.parametrize("freedom", [5, 8, 15, 30, 100])

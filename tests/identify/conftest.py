@@ -18,6 +18,7 @@ from analysis.identify._candidates import CandidateSet
 from rigd.beam import Beam, Damping, clamped_free_eigenvalues, participation, transfer
 
 RATE_HZ = 1000.0
+SWEEP_S = 30
 BAND_HZ = (0.0, 50.0)
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 PLANTS = {
@@ -101,19 +102,19 @@ def response(reference, damping, beam, delay_s, tool_inertia_kg_m2, offsets, fol
     return Session(*(np.fft.irfft(x, padded)[:n] / decay for x in (angle, torque)))
 
 
-def sweep_rad(t):
-    phase = 2 * np.pi * (0.05 * t + (50 - 0.05) * t**2 / 120)
-    return np.where((t >= 0) & (t < 60), 0.025 * np.sin(phase), 0.0)
+def sweep_rad(t, sweep_s=SWEEP_S):
+    phase = 2 * np.pi * (0.05 * t + (50 - 0.05) * t**2 / (2 * sweep_s))
+    return np.where((t >= 0) & (t < sweep_s), 0.025 * np.sin(phase), 0.0)
 
 
 def multisine_rad(t):
-    """A period of 10 s, six times over."""
+    """A period of 10 s, three times over."""
     line_hz = np.arange(10, 401) / 10
     phases = np.random.default_rng(3).uniform(0, 2 * np.pi, line_hz.size)
-    during = (t >= 0) & (t < 60)
+    during = (t >= 0) & (t < SWEEP_S)
     period = np.cos(2 * np.pi * line_hz * t[during][:10_000, None] + phases).sum(axis=1)
     reference = np.zeros(t.size)
-    reference[during] = np.tile(0.01 / np.abs(period).max() * period, 6)
+    reference[during] = np.tile(0.01 / np.abs(period).max() * period, round(SWEEP_S / 10))
     return reference
 
 
@@ -126,14 +127,15 @@ def session(
     shaken: bool = False,
     offsets: tuple[float, ...] = (),
     multisine: bool = False,
+    sweep_s: int = SWEEP_S,
 ) -> Session:
-    """One second of rest, 0.05-50 Hz in 60 s, 10 s of ring-down; if shaken, 5 s of that before.
+    """One second of rest, 0.05-50 Hz, 10 s of ring-down; if shaken, 5 s of that before.
 
     With `multisine`, 391 lines from 1 to 40 Hz in place of the sweep.
     """
     before = 5.0 if shaken else 0.0
-    t = np.arange(round((before + 71) * RATE_HZ)) / RATE_HZ - before - 1
-    reference = multisine_rad(t) if multisine else sweep_rad(t)
+    t = np.arange(round((before + sweep_s + 11) * RATE_HZ)) / RATE_HZ - before - 1
+    reference = multisine_rad(t) if multisine else sweep_rad(t, sweep_s)
     reference[t < -2] += 0.01 * np.sin(2 * np.pi * 2.6 * (t[t < -2] + 1 + before))
     reference[t < -2] += 0.002 * np.sin(2 * np.pi * 16 * (t[t < -2] + 1 + before))
     return response(reference, PLANTS[name], beam, delay_s, tool_inertia_kg_m2, offsets)
@@ -221,7 +223,7 @@ def steps():
 
 
 @cache
-def extra_torque(name, rise):
+def extra_torque(name, rise, sweep_s=SWEEP_S):
     """What mode 1 of plant `name` (damping of order 1) adds when its stiffness rises by `rise`.
 
     Runge and Kutta's method on the mode's equation of motion, in y = r + angle:
@@ -229,7 +231,7 @@ def extra_torque(name, rise):
     """
     damping, beam, step = PLANTS[name], LINK, 1 / RATE_HZ
     assert damping.alpha == damping.lambda_ == 1
-    angle_rad = session(name).angle_rad
+    angle_rad = session(name, sweep_s=sweep_s).angle_rad
     n = angle_rad.size
     spectrum = np.fft.rfft(angle_rad, 2 * n)
     s = 2j * np.pi * np.fft.rfftfreq(2 * n, step)

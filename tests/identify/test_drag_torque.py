@@ -50,17 +50,18 @@ def deviation(one, other):
 
 @pytest.mark.parametrize("law", [further(DragLaw(2.3e-3)), WHITE])
 def test_the_torque_is_that_of_steps_in_time(brake, law):
-    angle_rad = swept(16.0, 20.0)
+    angle_rad = swept(8.0, 20.0)
     damping = Damping(zeta=5.4e-5, alpha=1.0, gamma=0.02, lambda_=1.0)
     comparison = compared(angle_rad)
     found = response(comparison, Plant(LINK, damping)).torque(law).torque_nm[comparison.retained]
     stepped = brake.drag_torque(angle_rad, RATE_HZ, LINK, damping, law.constant_m, law.slowing)
     truth = comparison.decimation.apply(stepped)[comparison.retained]
-    assert np.abs(truth).max() > 0.03
+    assert np.abs(truth).max() > 0.02
     spectra = comparison.spectrum(found), comparison.spectrum(truth)
     assert deviation(*spectra) < 2e-3
 
 
+@pytest.mark.further  # another law and record than above
 def test_a_rod_in_air_halves_the_peaks_of_the_papers_chirp():
     """The rod that stiffness and density say, without other external damping."""
     comparison = compared(swept(120.0, 50.0, after_s=15.0))
@@ -73,7 +74,7 @@ def test_a_rod_in_air_halves_the_peaks_of_the_papers_chirp():
 
 @pytest.fixture(scope="module")
 def short():
-    return compared(swept(16.0, 20.0))
+    return compared(swept(8.0, 20.0))
 
 
 def plant(zeta=5.4e-5, gamma=0.02, density=4.7e-3, delay_s=0.0, lambda_=1.0):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Comparison, Measurement, fit_record, select
+from analysis.identify import Comparison, Measurement, fit_freest_alone, fit_record
 from analysis.identify._instrument import reference_coherent_part
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, transfer
@@ -93,7 +93,7 @@ def test_noise_that_moves_the_motor_is_no_response(sessions, controlled):
         measured = controlled("III", seed)
         biased.append(deviates(fit(replace(measured, reference_rad=None), "III")) - by_chance)
         unbiased.append(deviates(fit(measured, "III")) - by_chance)
-    assert np.mean(biased) > 0.4
+    assert np.mean(biased) > 0.3
     assert abs(np.mean(unbiased)) < 0.1
 
 
@@ -118,7 +118,7 @@ def test_a_drift_does_not_keep_the_reference_from_being_followed(controlled):
 
 @pytest.mark.fit
 def test_unknown_torques_do_not_count_under_a_controller_either(controlled):
-    unknown = np.concatenate([np.arange(20_000, 20_050), np.arange(40_000, 60_000, 100)])
+    unknown = np.concatenate([np.arange(10_000, 10_050), np.arange(20_000, 30_000, 100)])
     every = fit(controlled("III", 5), "III")
     found = fit(controlled("III", 5, unknown_torque=unknown), "III")
     for name, std in every.std.items():
@@ -139,13 +139,14 @@ def test_a_reference_that_does_not_explain_the_angle_is_not_believed(sessions, r
 
 
 @pytest.mark.fit
+@pytest.mark.further  # as a hum that moves the motor, and a multisine in test_hum.py
 def test_between_the_lines_of_a_multisine_there_is_noise_only(controlled, true_parameters):
     """It moves the motor there too: no response, no hum, and no other structure."""
     measured = controlled("VI", 7, multisine=True)
     found = fit_record(measured, [STRUCTURES[name] for name in ("III", "VI", "VII")])
     third, sixth, seventh = found.fits
     assert found.lines == ()
-    assert seventh.cost < third.cost - 100
+    assert seventh.cost < third.cost - 50
     assert abs(sixth.cost - seventh.cost) < 10  # its alpha is all but 1
     for name, value in true_parameters("VI", tool_inertia_kg_m2=CLAMP).items():
         if seventh.std[name]:
@@ -195,18 +196,18 @@ def in_narrow_bands():
 @pytest.mark.fit
 def test_a_first_wrong_beam_does_not_decide_what_followed_no_reference(in_narrow_bands):
     """What rings turns the motor in far narrower bands than its following is smoothed over."""
-    found = select(in_narrow_bands)
-    assert found.verdict.adequate
+    headline, _, _ = fit_freest_alone(in_narrow_bands, (0.0, 50.0))
     poles = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4).poles(clamped_free_eigenvalues(3))[:, 0]
-    for mode, pole in zip(found.headline.modes, poles, strict=True):
+    for mode, pole in zip(headline.modes, poles, strict=True):
         frequency, ratio = mode.frequency_hz, mode.damping_ratio
+        assert frequency.flag is ratio.flag is None
         assert abs(frequency.value - pole.imag / (2 * np.pi)) < 4 * frequency.std
         assert abs(ratio.value + pole.real / abs(pole)) < 4 * ratio.std
 
 
 @pytest.mark.fit
 def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
-    unknown = np.arange(30_000, 30_050)
+    unknown = np.arange(15_000, 15_050)
     measured = controlled("III", 1, unknown_torque=unknown)
     comparison = Comparison.from_measurement(measured, (0.0, 50.0))
     found = fit_record(measured, [STRUCTURES["III"]])

@@ -1,8 +1,8 @@
 """Hum on a sharp mode: told from the beam's own doing by lasting, and taken out of the fit.
 
-Over 12 other seeds, with 2 mN·m on the mode and 50 mN·m beside it, the largest errors were 5.1e-4
-Hz (2e-3 allowed), 0.13 mN·m (0.3), 0.51 standard deviations of a parameter (1), and 0.047 of the
-cost over its degrees of freedom (0.1).
+Over 12 other seeds, with 3 mN·m on the mode and 50 mN·m 0.1 Hz beside it, the largest errors were
+6.6e-4 Hz (2e-3 allowed), 0.26 mN·m (0.3), 0.63 standard deviations of a parameter (1), and 0.047 of
+the cost over its degrees of freedom (0.1).
 """
 
 import numpy as np
@@ -41,8 +41,8 @@ def quiet(sessions):
     return analysed(sessions("VI")).fits[0]
 
 
-@pytest.mark.parametrize("offset_hz", [0.0, further(0.05), further(0.2)])
-@pytest.mark.parametrize("amplitude_nm", [2e-3, 5e-2])
+@pytest.mark.parametrize("offset_hz", [0.0, further(0.1), further(0.4)])
+@pytest.mark.parametrize("amplitude_nm", [3e-3, further(5e-2)])
 def test_a_hum_on_a_mode_is_found_and_moves_nothing(sessions, quiet, offset_hz, amplitude_nm):
     hz = MODE_2_HZ + offset_hz
     analysis = analysed(humming(sessions("VI"), hz, amplitude_nm))
@@ -66,7 +66,7 @@ def test_the_hum_s_amplitude_counts_as_unknown(sessions, quiet):
 
 def test_a_hum_where_torque_was_lost(sessions):
     session = humming(sessions("VI"), MODE_2_HZ + 0.05, 0.02)
-    lost = (np.array([9000, 19_000, 50_000])[:, None] + np.arange(900)).ravel()
+    lost = (np.array([9000, 14_000, 25_000])[:, None] + np.arange(500)).ravel()
     (line,) = analysed(session, unknown_torque=lost).lines
     assert line.amplitude_nm == pytest.approx(0.02, abs=4e-4)
 
@@ -92,7 +92,7 @@ def test_a_mode_that_a_fit_has_beyond_the_band(sessions):
     assert find_hum_near_modes(comparison, plant, (pole,), noise, nothing) == ()
 
 
-@pytest.mark.parametrize("structure", ["II", "VI"])
+@pytest.mark.parametrize("structure", ["II", further("VI")])
 @pytest.mark.parametrize("plant", ["VI", further("III"), further("IV")])
 def test_what_a_model_leaves_of_a_multisine_is_no_hum(sessions, plant, structure):
     """The beam is driven all the time: what a wrong model leaves is as steady as a hum."""
@@ -102,7 +102,7 @@ def test_what_a_model_leaves_of_a_multisine_is_no_hum(sessions, plant, structure
 def test_a_burst_at_a_mode_is_no_hum(sessions):
     session = sessions("VI")
     t = np.arange(session.torque_nm.size) / 1000
-    burst = 0.02 * np.sin(2 * np.pi * MODE_2_HZ * t) * ((t > 45) & (t < 60))
+    burst = 0.02 * np.sin(2 * np.pi * MODE_2_HZ * t) * ((t > 20) & (t < 31))
     assert analysed(with_torque(session, burst)).comparison.hum == ()
 
 

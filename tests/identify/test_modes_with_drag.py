@@ -59,6 +59,7 @@ def test_damping_ratios_are_those_without_air(bursts_of_modes, brake, plants, li
     assert "without air" in finding.sentence
 
 
+@pytest.mark.further  # that no drag is found is in test_drag.py
 def test_without_air_the_damping_ratios_are_as_uncertain_as_drag_makes_them(
     bursts_of_modes, plants, link
 ):

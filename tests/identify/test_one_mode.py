@@ -20,8 +20,8 @@ DELAY_S = 0.69e-3
 
 
 def blade(share):
-    """Two minutes of a sweep to 50 Hz, with 1 % of noise."""
-    n, padded = 60_000, 1 << 18
+    """One minute of a sweep to 50 Hz, with 1 % of noise."""
+    n, padded = 30_000, 1 << 17
     t = np.arange(n) / RATE_HZ
     angle = np.sin(2 * np.pi * (0.5 * t + (50 - 0.5) * t**2 / (2 * t[-1])))
     sigma = 5 * RATE_HZ / padded
@@ -39,12 +39,11 @@ def blade(share):
     return Measurement("blade", angle, torque, RATE_HZ, beam, known, known)
 
 
-@pytest.mark.parametrize(("share", "within"), [(0.05, 3e-6), further(-0.3, 3e-5)])
-def test_frequency_and_damping_ratio_do_not_go_with_the_band(share, within):
+@pytest.mark.parametrize("band_hz", [(2.0, 30.0), further((0.0, 50.0))])
+@pytest.mark.parametrize(("share", "within"), [(0.05, 6e-6), further(-0.3, 6e-5)])
+def test_frequency_and_damping_ratio_do_not_go_with_the_band(share, within, band_hz):
     """The second share asks for a negative tool inertia, which no rig has."""
-    record = blade(share)
-    for band_hz in ((0.0, 50.0), (2.0, 30.0)):
-        (fit,) = fit_record(record, [STRUCTURES["VI"]], band_hz=band_hz).fits
-        mode = fit.modes[0]
-        assert mode.frequency_hz == pytest.approx(FREQUENCY_HZ, abs=1e-3)
-        assert mode.damping_ratio == pytest.approx(DAMPING_RATIO, abs=within)
+    (fit,) = fit_record(blade(share), [STRUCTURES["VI"]], band_hz=band_hz).fits
+    mode = fit.modes[0]
+    assert mode.frequency_hz == pytest.approx(FREQUENCY_HZ, abs=1e-3)
+    assert mode.damping_ratio == pytest.approx(DAMPING_RATIO, abs=within)

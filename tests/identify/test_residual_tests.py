@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import further
 
 from analysis.identify.noise import smooth_power
 from analysis.identify.residual_tests import (
@@ -29,9 +30,10 @@ def test_noise_is_white_and_the_band_means_what_it_says():
     assert not any(test.loud for test in found)
 
 
-def test_noise_whose_spectrum_is_estimated_is_not_loud():
+@pytest.mark.parametrize("draws", [200, further(1000)])
+def test_noise_whose_spectrum_is_estimated_is_not_loud(draws):
     """The spectrum is estimated from the noise itself, as the modal fit does it."""
-    drawn = (noise(seed) for seed in range(1000))
+    drawn = (noise(seed) for seed in range(draws))
     found = [whiteness(each * np.sqrt(2 / smooth_power(each, finely=True)), HZ) for each in drawn]
     assert not any(test.loud for test in found)
 

@@ -5,6 +5,7 @@ import pytest
 from cases import further
 
 from analysis.identify import select
+from rigd.beam import modes
 
 pytestmark = pytest.mark.fit
 
@@ -19,13 +20,8 @@ def rubbed(made, friction_nm, sliding_rad_s):
     return type(made)(made.angle_rad, torque_nm)
 
 
-@pytest.fixture(scope="module")
-def plain(sessions):
-    return select(sessions("III").measured(NOISE_NM, 3))
-
-
 @pytest.mark.parametrize("sliding_rad_s", [0.003, further(0.03)])
-def test_dry_friction_is_named_and_leaves_the_modes_right(sessions, plain, sliding_rad_s):
+def test_dry_friction_is_named_and_leaves_the_modes_right(sessions, plants, link, sliding_rad_s):
     """A torque of known sign that grows with nothing: no harmonic, no order, no stiffness."""
     selection = select(rubbed(sessions("III"), 0.01, sliding_rad_s).measured(NOISE_NM, 3))
     (finding,) = selection.verdict.findings
@@ -34,15 +30,11 @@ def test_dry_friction_is_named_and_leaves_the_modes_right(sessions, plain, slidi
     headline = selection.headline
     assert headline.explained
     assert headline.uniform_beam.status == "passed"
-    for mode, same in zip(headline.modes, plain.headline.modes, strict=True):
+    for mode, true in zip(headline.modes, modes(link, plants["III"], 3), strict=True):
         for found, expected in (
-            (mode.frequency_hz, same.frequency_hz),
-            (mode.damping_ratio, same.damping_ratio),
+            (mode.frequency_hz, true.frequency_hz),
+            (mode.damping_ratio, true.damping_ratio),
         ):
             assert found.flag is None
-            assert abs(found.value - expected.value) < 2 * expected.std
+            assert abs(found.value - expected) < 4 * found.std
     assert selection.verdict.alpha.status == "compatible"
-
-
-def test_without_friction_none_is_named(plain):
-    assert "friction" not in {each.kind for each in plain.verdict.findings}

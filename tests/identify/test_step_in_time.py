@@ -13,7 +13,7 @@ from rigd.beam import clamped_free_eigenvalues
 pytestmark = pytest.mark.fit
 
 PERIOD_S = 1e-3
-AT_S, CHANGE = 21.0, -0.004
+AT_S, CHANGE = 11.0, -0.004
 
 
 def responding(force, omega, ratio):

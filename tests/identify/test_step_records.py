@@ -16,6 +16,7 @@ def without_delay(steps, candidates_of):
     return candidates_of(steps("IV", 0.1).measured(noise_nm=0.01, seed=8))
 
 
+@pytest.mark.further  # nothing else is named beside a delay either
 def test_a_step_without_a_delay_names_at_most_the_drag_that_it_hardly_shows(without_delay):
     findings = select(without_delay.comparison.measurement).verdict.findings
     assert {finding.kind for finding in findings} <= {"air drag"}
@@ -28,18 +29,20 @@ def test_a_delay_that_is_there_is_named_in_a_step(steps):
     assert found.value == pytest.approx(2e-3, abs=3e-4)
 
 
+@pytest.mark.further  # the profile's parts are in test_profile_valleys.py
 def test_a_profile_looks_for_no_valley_where_there_is_none(without_delay):
     field, alpha, _ = profile_both_orders(without_delay)
     assert len(alpha.local_minima) == 1
     assert alpha.estimate == pytest.approx(field.best.fit.parameters["alpha"], abs=1e-4)
 
 
-def test_two_values_that_explain_a_record_equally_are_both_named(without_delay):
+def test_two_values_that_explain_a_record_equally_are_both_named(steps, freest_of):
+    candidates = freest_of(steps("IV", 0.1).measured(noise_nm=0.01, seed=8))
     found = LikelihoodProfile(
         "lambda", "VII", (0.5, 0.657, 0.9, 1.235, 1.4), (9.0, 0.0, 8.0, 0.8, 9.0), 0.657,
         (0.657, 1.235), (0.58, 1.3), False, False, 0.0,
     )  # fmt: skip
-    verdict = order_verdict(without_delay, found, (1,), doubt_reason=None)
+    verdict = order_verdict(candidates, found, (1,), doubt_reason=None)
     assert (verdict.status, verdict.value, verdict.interval) == ("not identifiable", None, None)
     said = order_sentence(verdict)
     assert "0.657 and 1.235 fit the record equally well" in said

@@ -57,8 +57,8 @@ def test_whether_a_sweep_reached_the_second_mode(sessions, highest_hz, covered):
     made = sessions("III")
     n = made.angle_rad.size
     t = np.arange(n) / 1000 - 1
-    phase = 2 * np.pi * (0.05 * t + (highest_hz - 0.05) * t**2 / 120)
-    angle = np.where((t >= 0) & (t < 60), 0.025 * np.sin(phase), 0.0)
+    phase = 2 * np.pi * (0.05 * t + (highest_hz - 0.05) * t**2 / 60)
+    angle = np.where((t >= 0) & (t < 30), 0.025 * np.sin(phase), 0.0)
     measured = type(made)(angle, made.torque_nm).measured()
     assert is_excited(Comparison.from_measurement(measured, (0.0, 50.0)), 16.0, 2.55) is covered
 

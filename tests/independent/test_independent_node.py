@@ -88,7 +88,7 @@ def test_session_on_a_drive_that_lacks_objects(trial, eds_file, without, accepte
         # Each is refused of a drive by script as well, in tests/devices/cia402.
         pytest.param({"x6502": (7, "ro", 0x1A5)}, "6502", marks=pytest.mark.slow),
         pytest.param({"without": ("6071",)}, "6071", marks=pytest.mark.slow),
-        ({"without": ("1016", "1400:5")}, "1016"),
+        further({"without": ("1016", "1400:5")}, "1016"),
     ],
 )
 def test_a_drive_that_cannot_be_used_is_refused_by_the_object(trial, eds_file, changes, named):
@@ -109,6 +109,7 @@ def test_reset_switches_off_a_drive_that_a_killed_host_left_on(trial, eds_file, 
     assert result.startswith("ok: off"), result
 
 
+@pytest.mark.further  # by script in tests/devices/cia402/test_cia402_setup.py
 def test_reset_says_so_of_a_drive_that_does_not_switch_off(trial, eds_file):
     """A drive that takes no controlword by SDO: nothing but its STO is left."""
     path = eds_file(x6040=(6, "ro", 0))
@@ -122,6 +123,7 @@ def test_reset_says_so_of_a_drive_that_does_not_switch_off(trial, eds_file):
     assert "Traceback" not in done.said
 
 
+@pytest.mark.further  # a rule of this folder's own node
 def test_the_node_enforces_the_rules_of_pdos(trial, eds_file):
     """What a master that set PDOs up in the wrong order would be told."""
     import can

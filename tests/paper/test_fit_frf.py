@@ -17,8 +17,9 @@ from rigd.beam import Plant, ResponseGrid, TransferGrid, transfer
 pytestmark = pytest.mark.fit
 
 WEIGHTINGS = ("const", "omega")
-SOME = [name if name in ("I", "VI") else further(name) for name in STRUCTURES]
-"""Structures of tests that are run each time for the simplest and the freest."""
+SOME = [name if name == "VI" else further(name) for name in STRUCTURES]
+"""Structures of tests that are run each time for the freest."""
+SOME_WEIGHTINGS = [further("const"), "omega"]
 
 
 def assert_parameters(fit, damping, relative=1e-6):
@@ -33,7 +34,7 @@ def assert_parameters(fit, damping, relative=1e-6):
         assert fit.parameters[name] == pytest.approx(value, rel=relative)
 
 
-@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("weighting", SOME_WEIGHTINGS)
 def test_noise_free_fits_return_the_parameters_of_table_3(
     link, paper_grid_hz, paper_dampings, weighting
 ):
@@ -45,7 +46,7 @@ def test_noise_free_fits_return_the_parameters_of_table_3(
         assert fit.cost < 1e-15
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(
     name=st.sampled_from(list(STRUCTURES)),
     weighting=st.sampled_from([*WEIGHTINGS, "omega^-0.5"]),
@@ -107,7 +108,7 @@ def test_every_structure_with_every_weighting(fits, cost):
         assert fit.damping == STRUCTURES[name].damping(fit.parameters)
 
 
-@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("weighting", SOME_WEIGHTINGS)
 @pytest.mark.parametrize("name", SOME)
 def test_no_neighbour_is_lower(fits, cost, name, weighting):
     """A local grid from close by to far off, along the parameters and along their valleys."""
@@ -126,7 +127,7 @@ def test_no_neighbour_is_lower(fits, cost, name, weighting):
             assert cost(weighting, fit.structure.damping(moved)) >= fit.cost * (1 - 1e-9)
 
 
-@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("weighting", SOME_WEIGHTINGS)
 @pytest.mark.parametrize("name", SOME)
 def test_no_random_start_ends_lower(fits, cost, noisy_frf, link, name, weighting):
     """Twenty random starts of scipy's solver on every tenth point, the best carried to all."""
@@ -219,7 +220,7 @@ def test_standard_deviations_agree_with_scatter_where_errors_are_chance(link, pl
             STRUCTURES["VII"],
             "omega",
         )
-        for _ in range(20)
+        for _ in range(10)
     ]
     for name in ("zeta", "gamma", "lambda"):
         scatter = np.std([fit.parameters[name] for fit in repeats], ddof=1)

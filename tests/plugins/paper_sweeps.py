@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import further
 from numpy.typing import NDArray
 
 from analysis.models import STRUCTURES
@@ -126,7 +127,7 @@ def shipped_frf(paper_session) -> FrequencyResponse:
     return Sweep(samples["angle_rad"], samples["coupling_torque_nm"]).welch()
 
 
-@pytest.fixture(scope="session", params=["synthetic", "shipped"])
+@pytest.fixture(scope="session", params=["synthetic", further("shipped")])
 def noisy_frf(request) -> FrequencyResponse:
     """A response with noise: of the exact model, and of the shipped simulation."""
     frf: FrequencyResponse = request.getfixturevalue(f"{request.param}_frf")

@@ -16,10 +16,10 @@ from rigd.session.layout import encode_samples
 
 
 def test_damage_of_every_kind_gives_what_was_before_it_or_a_refusal(fuzz_recovery, original):
-    results = fuzz_recovery.fuzz(original, 25, seed=1)
+    results = fuzz_recovery.fuzz(original, 10, seed=1)
     for kind in fuzz_recovery.KINDS:
-        assert results[kind, "recovered"] > 12
-    assert results.total() == 25 * len(fuzz_recovery.KINDS)
+        assert results[kind, "recovered"] > 4
+    assert results.total() == 10 * len(fuzz_recovery.KINDS)
 
 
 def test_a_flipped_bit_in_the_head_of_a_record_invents_nothing(
@@ -31,8 +31,8 @@ def test_a_flipped_bit_in_the_head_of_a_record_invents_nothing(
         heads.append(position)
         position += 9 + struct.unpack_from("<Q", original.data, position + 1)[0]
     rng = random.Random(1)
-    cases = rng.sample([(head, bit) for head in heads for bit in range(8)], 40)
-    cases += [(rng.choice(heads) + rng.randrange(1, 9), rng.randrange(8)) for _ in range(15)]
+    cases = rng.sample([(head, bit) for head in heads for bit in range(8)], 20)
+    cases += [(rng.choice(heads) + rng.randrange(1, 9), rng.randrange(8)) for _ in range(8)]
     # An index of a single event that becomes a message has the length of an empty one.
     index = original.data.index(struct.pack("<BQHI", 7, 22, 4, 16))
     for at, bit in {*cases, (index, 1)}:

@@ -166,7 +166,7 @@ def test_numbers_beyond_all_floats_are_unknown(tmp_path):
                          "text", "flags", "specimen", "start_utc_ns", "interval_95", "std"]),
         inner,
     ),
-    max_leaves=30,
+    max_leaves=10,
 ))  # fmt: skip
 def test_anything_is_read_as_json_or_not_at_all(tmp_path_factory, found):
     folder = tmp_path_factory.getbasetemp()

@@ -78,7 +78,7 @@ def test_messages_that_contradict_their_schema(kit, tmp_path):
 def test_truncation_anywhere(kit, recorded, tmp_path):
     path = tmp_path / "a.mcap.part"
     size = len(recorded.data)
-    places = random.Random(1).sample(range(len(MAGIC), size), 100)
+    places = random.Random(1).sample(range(len(MAGIC), size), 30)
     for length in [*places, size - 1, size - 8, size - 9, size - 40]:
         path.write_bytes(recorded.data[:length])
         with pytest.raises(SessionError, match=r"is incomplete: it (ends|has no)") as error:
@@ -115,7 +115,7 @@ def test_a_tail_of_zeros_as_a_dead_host_leaves_it(recorded, tmp_path):
 def test_bit_flips_anywhere(recorded, tmp_path):
     """Every byte of such a file is under a checksum or compared, so none goes unnoticed."""
     path = tmp_path / "a.mcap"
-    for place in random.Random(2).sample(range(8 * len(recorded.data)), 100):
+    for place in random.Random(2).sample(range(8 * len(recorded.data)), 50):
         damaged = bytearray(recorded.data)
         damaged[place // 8] ^= 1 << place % 8
         path.write_bytes(damaged)
@@ -138,7 +138,7 @@ def test_bit_flips_in_files_with_fewer_checksums_never_give_wrong_samples(
     )
     data = path.read_bytes()
     refusals = 0
-    for place in random.Random(3).sample(range(8 * len(data)), 200):
+    for place in random.Random(3).sample(range(8 * len(data)), 80):
         damaged = bytearray(data)
         damaged[place // 8] ^= 1 << place % 8
         path.write_bytes(damaged)
@@ -148,7 +148,7 @@ def test_bit_flips_in_files_with_fewer_checksums_never_give_wrong_samples(
             refusals += 1
         else:  # a flip in what nobody needs
             np.testing.assert_array_equal(read, samples)
-    assert refusals > 100
+    assert refusals > 40
 
 
 def test_random_bytes_behind_the_magic(tmp_path):

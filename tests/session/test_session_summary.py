@@ -1,6 +1,7 @@
 """Metadata and counts without the samples: equal to what the whole file says, whoever wrote it."""
 
 import pytest
+from cases import further
 from mcap.writer import CompressionType, IndexType, Writer
 from session_schemas import schemas
 
@@ -74,17 +75,18 @@ def test_files_of_other_writers(tmp_path, options, by_index):
     assert bool(read_summary(with_unreadable_samples(path)).problem) is not by_index
 
 
-def test_every_cut_and_every_damaged_byte_at_the_end_is_borne(tmp_path, record_briefly):
+@pytest.mark.parametrize("every", [11, further(1)])
+def test_cuts_and_damaged_bytes_at_the_end_are_borne(tmp_path, record_briefly, every):
     whole = record_briefly("whole").read_bytes()
     stated = read_summary(tmp_path / "whole.mcap")
     path = tmp_path / "harmed.mcap"
-    for length in [*range(0, len(whole), 997), *range(len(whole) - 60, len(whole))]:
+    for length in [*range(0, len(whole), 997), *range(len(whole) - 60, len(whole), every)]:
         path.write_bytes(whole[:length])
         try:
             assert read_summary(path).problem
         except SessionError as error:
             assert length < 10, error
-    for place in range(len(whole) - 400, len(whole)):
+    for place in range(len(whole) - 400, len(whole), every):
         harmed = bytearray(whole)
         harmed[place] ^= 0x55
         path.write_bytes(harmed)

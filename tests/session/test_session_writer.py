@@ -11,6 +11,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from cases import further
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from session_schemas import message_class
@@ -154,7 +155,7 @@ CHILD = """
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("after", [100, 2600])
+@pytest.mark.parametrize("after", [further(100), 2600])
 def test_a_killed_recorder_loses_at_most_250_samples(kit, tmp_path, after):
     path = tmp_path / "a.mcap"
     command = [sys.executable, "-c", textwrap.dedent(CHILD), str(path), str(Path(__file__).parent)]
