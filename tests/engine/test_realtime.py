@@ -1,5 +1,6 @@
 """Real-time settings: tried one by one, and reported as granted or refused."""
 
+import functools
 import json
 import os
 import resource
@@ -211,6 +212,7 @@ os.sched_setscheduler = without_realtime
 ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="needs rights that only root is sure to have")
 
 
+@functools.cache
 def precedence_of_a_process(*, priority=20, cpu=-1, before="", root="/"):
     code = PRECEDENCE.format(priority=priority, cpu=cpu, before=before, root=root)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)

@@ -208,7 +208,7 @@ def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
 
     def plan():
         for piece_rad in pieces_rad:
-            time.sleep(0.3)
+            time.sleep(0.1)
             writer.append(piece_rad)
         session.shared_state[StateField.LAST_SEGMENT] = 1
 
@@ -241,7 +241,7 @@ def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_sign
         writer.append(np.zeros(100))
         session.shared_state[StateField.LAST_SEGMENT] = 1
 
-    planner = threading.Timer(1.0, plan)
+    planner = threading.Timer(0.3, plan)
     planner.start()
     session.obey(SessionJob(session.profile, spec))
     planner.join()
@@ -257,7 +257,7 @@ def test_a_stop_ends_the_wait_for_a_piece(make_session):
     session = make_session()
     spec = ReferenceSpec(write_reference(shared_memory_fd(), np.zeros(900)).fd, 900, 300)
     stopping = threading.Timer(
-        0.5, lambda: session.shared_state.__setitem__(StateField.STOP, StopReason.OPERATOR)
+        0.2, lambda: session.shared_state.__setitem__(StateField.STOP, StopReason.OPERATOR)
     )
     stopping.start()
     session.obey(SessionJob(session.profile, spec))

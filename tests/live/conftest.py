@@ -1,5 +1,6 @@
 """A fake control loop that fills a real ring, and the publisher as a real child process."""
 
+import contextlib
 import importlib.util
 import math
 import os
@@ -17,7 +18,7 @@ from rigd.beam import Beam, Damping
 from rigd.engine import Ring, shared_memory_fd
 from rigd.engine.channels import TOPICS, Channels, create_channels
 from rigd.engine.messages import MessageReader, ProcessFailed, encode
-from rigd.engine.shared_state import LogEvent, SharedState, StateField, write_event
+from rigd.engine.shared_state import LogEvent, Phase, SharedState, StateField, write_event
 from rigd.live.address import LiveAddress
 from rigd.live.messages import LiveJob, LiveSession, LiveSessionEnded, LiveSessionShown
 from rigd.session.layout import pack_sample_into, pack_timing_into
@@ -255,6 +256,14 @@ def rerun_program(rerun_runs):
     return program()
 
 
+def channels_running(channels) -> None:
+    """Have the torque on, until the publisher has shown that."""
+    shared_state = channels.shared_state
+    shared_state[StateField.PHASE] = Phase.RUNNING
+    beat = shared_state[StateField.LIVE_BEAT]
+    assert eventually(lambda: shared_state[StateField.LIVE_BEAT] > beat + 2)
+
+
 class Columns:
     """What Rerun received of a recording: by entity and component, times in ns and values."""
 
@@ -376,6 +385,39 @@ def receive(save):
         return end
 
     return begin
+
+
+@pytest.fixture(scope="session")
+def received(rerun_program, tmp_path_factory):
+    """What Rerun received of two sessions that one publisher showed, by the end of each.
+
+    One ended in a fault; of the other the supervisor was lost. With the number of ticks in them.
+    """
+    patience = "from rigd.live import publisher as p; p._MAX_QUEUED_S = 60.0"
+    with contextlib.ExitStack() as stack:
+        producer = Producer(capacity=64_000)
+        stack.callback(producer.close)
+        producer.start()
+        publisher = Publisher(producer, first=f"{patience}; p._MAX_ORPHANED_S = 0.5")
+        stack.callback(publisher.close)
+        publisher.begin()
+        path = tmp_path_factory.mktemp("received") / "sessions.rrd"
+        saver = Saver(rerun_program, publisher.address, path)
+        stack.callback(saver.close)
+        channels_running(producer.channels)
+        assert eventually(lambda: producer.tick > 1000 and saver.has_begun())
+        producer.stop()
+        publisher.finish("fault", "The drive was lost.")
+        assert eventually(saver.has_all)
+        publisher.show("lost", tuple(ring.written_count for ring in producer.channels.rings))
+        publisher.end()
+        assert (producer.dropped, producer.refused) == (0, 0)
+        recordings = saver.recordings()
+        return {
+            "ticks": producer.tick,
+            "fault": recordings["recording of chirp under test"],
+            "lost": recordings["recording of lost"],
+        }
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from math import tau
 import can
 import canopen
 import pytest
+from cases import further
 
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.cia402.requirements import (
@@ -377,7 +378,7 @@ class TestResettingADriveThatTurns:
         assert sdo
         assert turning.state == "switch-on disabled"
 
-    def test_nobody_answers(self, drive, turning):
+    def test_nobody_answers(self, impatient, drive, turning):
         turning.silent = True
         with pytest.raises(DeviceError, match=r"no answer on CAN bus can0 .* not shown that .*STO"):
             drive.reset_fault()
@@ -394,7 +395,7 @@ class TestResettingADriveThatTurns:
         assert (turning.state, turning.torque) == ("switch-on disabled", 0)
 
     def test_an_adapter_that_goes_on_failing_is_told_with_what_was_not_seen(
-        self, drive, turning, failing_bus
+        self, impatient, drive, turning, failing_bus
     ):
         failing_bus({can_id: [RuntimeError("a library's own")] * 1000 for can_id in (0x605, 0x000)})
         with pytest.raises(DeviceError, match=r"a library's own.*not shown that .*STO"):
@@ -417,7 +418,7 @@ def failing_bus(monkeypatch):
     return fail
 
 
-@pytest.mark.parametrize("late", [1, 2])
+@pytest.mark.parametrize("late", [1, further(2)])
 def test_replies_that_come_late_are_not_taken_for_the_next_ones(drive, scripted, late):
     """The first command is given up after 50 ms; its reply comes when another one is awaited."""
     answer, kept = scripted._sdo, []
@@ -492,20 +493,20 @@ def test_a_fault_whose_cause_stands(drive, scripted):
         drive.reset_fault()
 
 
-def test_no_drive_on_the_bus(drive, scripted):
+def test_no_drive_on_the_bus(impatient, drive, scripted):
     scripted.silent = True
     with pytest.raises(DeviceError, match=r"no answer on CAN bus can0.*cia402\.node_id"):
         drive.connect()
 
 
-def test_others_on_the_bus_are_named(make_drive, rig, settings, scripted):
+def test_others_on_the_bus_are_named(impatient, make_drive, rig, settings, scripted):
     drive = make_drive(replace(rig, cia402=replace(settings, node_id=6)))
     with pytest.raises(DeviceError, match=r"node 6.*frames came from node 5"):
-        threading.Timer(0.2, scripted.heartbeat).start()
+        threading.Timer(0.05, scripted.heartbeat).start()
         drive.connect()
 
 
-def test_a_bus_that_is_cut_in_the_middle(drive, scripted):
+def test_a_bus_that_is_cut_in_the_middle(impatient, drive, scripted):
     def cut(can_id, data, take=scripted._take):
         if can_id == 0x605 and data[1:3] == b"\x06\x10":
             scripted.cut()
