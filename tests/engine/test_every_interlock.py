@@ -141,7 +141,7 @@ def fill_disk(session):
 
 def miss(session, *late_ns):
     """Miss ticks from the middle on, so many ns a quarter of a second apart."""
-    late = {MIDDLE_NS + 500_000_000 * k: ns for k, ns in enumerate(late_ns)}
+    late = {MIDDLE_NS + 250_000_000 * k: ns for k, ns in enumerate(late_ns)}
     session.clock = Clock(late_ns=late, virtual=False)
 
 
@@ -161,7 +161,10 @@ class Case:
 CASES = {
     "angle": Case(
         # Beyond what the reference asks for, at which the session would not begin.
-        lambda s: (limit(s, angle_rad=0.03), sensor(s, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.5])),
+        lambda s: (
+            limit(s, angle_rad=0.03),
+            sensor(s, 2150, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.5]),
+        ),
         r"Angle -?0\.03\d* rad exceeds limit 0\.03 rad",
     ),
     "velocity": Case(
@@ -416,9 +419,10 @@ def test_an_angle_that_counts_the_other_way_round_is_told_from_too_much_amplitud
 @pytest.mark.parametrize("push_nm", [-0.5, 1.5])
 def test_a_push_on_the_beam_is_not_taken_for_a_wrong_sign(make_session, push_nm):
     """A loop that has the sign right turns with its torque, whatever the sensor is made to feel."""
-    session = make_session()
+    slow = chirp(rate_hz=1000.0, duration_s=4.0, rest_s=0.5, stop_hz=5.0)
+    session = make_session(excitation=slow)
     limit(session, velocity_rad_s=2.0, tracking_error_rad=0.02)
-    sensor(session, added=[0.0, 0.0, 0.0, 0.0, 0.0, push_nm])
+    sensor(session, wrong_from=3000, added=[0.0, 0.0, 0.0, 0.0, 0.0, push_nm])
     reason = session.run().finished.reason
     assert " exceeds limit " in reason
     assert "against the torque" not in reason
