@@ -2,12 +2,12 @@
 
 import os
 import socket
-import subprocess
 import sys
 import time
 from dataclasses import replace
 
 import pytest
+import warm_start
 from loopback_netft import UdpBox, serve_page
 from rigd_netft import protocol
 from rigd_netft.box import SimulatedBox
@@ -287,7 +287,7 @@ def test_a_profile_that_does_not_suit_the_box_is_refused(tmp_path, line, message
 
 
 def rigd(*arguments):
-    return subprocess.run(
+    return warm_start.run(
         [sys.executable, "-P", "-m", "rigd", *map(str, arguments)],
         capture_output=True, text=True, check=False, env=os.environ | {"RIGD_NO_LOOK": "1"},
     )  # fmt: skip
