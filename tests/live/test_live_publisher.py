@@ -9,6 +9,8 @@ import sys
 import time
 import urllib.request
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from rigd.engine.messages import ProcessFailed
 from rigd.engine.shared_state import StateField
 from rigd.live.address import LiveAddress, find
 from rigd.live.messages import LiveFit, LiveJob
+from rigd.live.publisher import RerunError, main
 
 pytestmark = pytest.mark.process
 
@@ -285,6 +288,7 @@ def assert_replaced_when_killed(publisher, receive):
     assert producer.refused == 0
 
 
+@pytest.mark.further  # as test_live_backlog.py
 def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer, start_publisher):
     producer = start_producer(capacity=1000, speed=8.0)
     publisher = start_publisher(producer)
@@ -319,11 +323,10 @@ def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, star
     ("script", "mode", "sentence"),
     [
         ("#!/bin/sh\necho no such option >&2\nexit 2\n", 0o755, "ended: no such option."),
-        pytest.param(
-            *("#!/bin/sh\n", 0o644, "cannot be run: Permission denied."), marks=pytest.mark.further
-        ),
+        ("#!/bin/sh\n", 0o644, "cannot be run: Permission denied."),
     ],
 )
+@pytest.mark.further  # as test_live_address.py
 def test_a_server_that_does_not_start_is_told_in_a_sentence(
     start_publisher, tmp_path, script, mode, sentence
 ):
@@ -336,6 +339,24 @@ def test_a_server_that_does_not_start_is_told_in_a_sentence(
     assert isinstance(publisher.answer, ProcessFailed)
     assert publisher.answer.reason.endswith(sentence)
     assert publisher.end() == (1, "", "")
+
+
+def test_the_supervisor_is_told_why_there_is_no_view(monkeypatch):
+    sent = []
+    job = SimpleNamespace(channels=None, rig="sim")
+    parent = SimpleNamespace(receive_job=lambda: job, send=sent.append)
+
+    def fail(_):
+        raise RerunError("The Rerun server ended.")
+
+    for name, stub in {
+        "signal": Mock(), "ignore_signals": Mock(), "prepare_sdk_environment": Mock(),
+        "attach_channels": Mock(), "SupervisorConnection": lambda: parent, "RerunServer": fail,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(f"rigd.live.publisher.{name}", stub)
+    with pytest.raises(SystemExit, match="1"):
+        main()
+    assert sent == [ProcessFailed("The Rerun server ended.")]
 
 
 def test_no_job_means_no_work():
