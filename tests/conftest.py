@@ -57,9 +57,9 @@ os.environ["XDG_CONFIG_HOME"] = f"{_RUNTIME}/config"
 os.environ["RIGD_NO_LOOK"] = "1"
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
-# The same examples each time, and however long they take: what fails is a change's fault. Others
-# are searched for by `make fuzz`.
-settings.register_profile("same", settings.get_profile("ci"))
+# The same examples each time, and however long they take: what fails is a change's fault. Others,
+# and more, are searched for by `make fuzz`.
+settings.register_profile("same", settings.get_profile("ci"), max_examples=40)
 settings.register_profile("others", settings.get_profile("ci"), derandomize=False)
 settings.load_profile("same")
 
