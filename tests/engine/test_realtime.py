@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 
 import pytest
+from cases import further
 
 from rigd.engine.realtime import (
     MAX_WAKE_UP_US,
@@ -253,7 +254,7 @@ def test_a_loop_on_a_core_of_its_own_is_kept_off_that_one():
     assert told["with"][2] == others
 
 
-@pytest.mark.parametrize("isolated", ["4000", ""])
+@pytest.mark.parametrize("isolated", [further("4000"), ""])
 def test_the_core_that_is_kept_off_is_the_one_that_the_loop_gets(machine, isolated):
     granted_realtime()
     first = str(min(os.sched_getaffinity(0)))
