@@ -30,7 +30,8 @@ def packages(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def session(tmp_path_factory, make_signals, write_session):
     path = tmp_path_factory.mktemp("structures") / "a.mcap"
-    return write_session(path, make_signals(sweep_s=20.0, ring_down_s=5.0))
+    signals = make_signals(sweep_s=15.0, ring_down_s=5.0, rate_hz=500.0, quantum_rad=0.0)
+    return write_session(path, signals)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """A fake control loop that fills a real ring, and the publisher as a real child process."""
 
 import contextlib
+import http.client
 import importlib.util
 import math
 import os
@@ -256,6 +257,22 @@ def rerun_program(rerun_runs):
     return program()
 
 
+def get_page(port: int, path: str, host: str | None = None):
+    """Ask the publisher's page server, as a browser does."""
+    link = http.client.HTTPConnection("127.0.0.1", port, timeout=30.0)
+    try:
+        link.request("GET", path, headers={} if host is None else {"Host": host})
+        answer = link.getresponse()
+        return answer, answer.read()
+    finally:
+        link.close()
+
+
+@pytest.fixture
+def get():
+    return get_page
+
+
 def channels_running(channels) -> None:
     """Have the torque on, until the publisher has shown that."""
     shared_state = channels.shared_state
@@ -391,7 +408,8 @@ def receive(save):
 def received(rerun_program, tmp_path_factory):
     """What Rerun received of two sessions that one publisher showed, by the end of each.
 
-    One ended in a fault; of the other the supervisor was lost. With the number of ticks in them.
+    One ended in a fault; of the other the supervisor was lost. With the number of ticks in them,
+    the address of the view, and what a browser got of its page.
     """
     patience = "from rigd.live import publisher as p; p._MAX_QUEUED_S = 60.0"
     with contextlib.ExitStack() as stack:
@@ -404,6 +422,11 @@ def received(rerun_program, tmp_path_factory):
         path = tmp_path_factory.mktemp("received") / "sessions.rrd"
         saver = Saver(rerun_program, publisher.address, path)
         stack.callback(saver.close)
+        address = publisher.address
+        place = f"/?{address.viewer_url.split('?')[1]}"
+        paths = ("/", place, "/re_viewer_bg.wasm", "/re_viewer.js", "/live.json")
+        absent = ("/etc/passwd", "/../x", "/version")
+        page = {path: get_page(address.page_port, path) for path in (*paths, *absent)}
         channels_running(producer.channels)
         assert eventually(lambda: producer.tick > 1000 and saver.has_begun())
         producer.stop()
@@ -414,6 +437,8 @@ def received(rerun_program, tmp_path_factory):
         assert (producer.dropped, producer.refused) == (0, 0)
         recordings = saver.recordings()
         return {
+            "address": address,
+            "page": page,
             "ticks": producer.tick,
             "fault": recordings["recording of chirp under test"],
             "lost": recordings["recording of lost"],
