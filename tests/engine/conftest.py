@@ -205,6 +205,14 @@ class Session:
         self.channels.close()
 
 
+@pytest.fixture(scope="session")
+def complete_session():
+    """A session without faults, and its samples; nobody changes them."""
+    session = Session().run()
+    yield session, session.samples
+    session.close()
+
+
 @pytest.fixture
 def make_session():
     made = []

@@ -356,8 +356,8 @@ def test_what_keeps_coming_near_its_limit_is_told_once_and_flagged_each_time(mak
     assert all(re.match(r"Angle .* rad above warning level", w.message) for w in warnings)
 
 
-def test_the_motor_stays_warm_through_the_sessions_of_a_connection(make_session):
-    commanded = make_session().run().samples["torque_command_nm"]
+def test_the_motor_stays_warm_through_the_sessions_of_a_connection(make_session, complete_session):
+    commanded = complete_session[1]["torque_command_nm"]
     heat_nm2 = float((commanded**2).sum()) / 1000 / 1e4  # over 10 000 s nothing cools down
     session = make_session()
     motor(session, continuous_torque_nm=(1.5 * heat_nm2) ** 0.5, thermal_time_constant_s=1e4)

@@ -29,9 +29,11 @@ def assert_books_balance(session, samples):
     assert counts["scheduled"] == len(samples) + counts["missed"] + counts["lost"]
 
 
-def test_a_complete_session_has_every_tick(make_session):
-    session = make_session().run()
-    samples = session.samples
+BRIEF = hold(rate_hz=1000.0, duration_s=0.2, rest_s=0.0, ring_down_s=0.0)
+
+
+def test_a_complete_session_has_every_tick(complete_session):
+    session, samples = complete_session
     assert session.finished.outcome == "complete"
     assert session.finished.reason == ""
     assert session.finished.counts == books(scheduled=3000)
@@ -43,23 +45,22 @@ def test_a_complete_session_has_every_tick(make_session):
     session.assert_safe()
 
 
-def test_the_reference_starts_where_the_motor_stands_and_follows_the_excitation(make_session):
-    session = make_session().run()
-    samples = session.samples
+def test_the_reference_starts_where_the_motor_stands_and_follows_the_excitation(complete_session):
+    session, samples = complete_session
     relative = samples["angle_reference_rad"] - samples["angle_reference_rad"][0]
     assert np.allclose(relative, session.excitation.reference_rad, atol=1e-15)
     assert abs(samples["angle_reference_rad"][0] - samples["angle_rad"][0]) < 3 * 7e-5
 
 
-def test_the_tare_takes_the_offset_away(make_session):
-    session = make_session().run()
+def test_the_tare_takes_the_offset_away(complete_session):
+    session, samples = complete_session
     ready = session.parent.said(ReadyToRecord)[0].tare
     offset = session.profile.rig.simulation.offset
     axes = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
     for axis, expected in zip(axes, offset, strict=True):
         spread = float(ready[f"tare_std_{axis}"])
         assert abs(float(ready[f"tare_mean_{axis}"]) - expected) < 0.2 * spread
-    rest = session.samples[: session.excitation.segments["rest"][1]]
+    rest = samples[: session.excitation.segments["rest"][1]]
     assert abs(rest["fz_n"].mean()) < 0.01
     assert abs(rest["coupling_torque_nm"].mean()) < 1e-3
     assert np.array_equal(rest["coupling_torque_nm"], rest["tz_nm"])
@@ -78,8 +79,7 @@ def test_without_friction_and_noise_the_rig_is_the_computed_closed_loop(
 
 
 def test_a_seed_gives_the_same_samples_again_and_without_one_it_is_fresh_and_stated(make_session):
-    brief = hold(rate_hz=1000.0, duration_s=0.2, rest_s=0.0, ring_down_s=0.0)
-    session = make_session(excitation=brief)
+    session = make_session(excitation=BRIEF)
     session.obey(session.order(seed=None), session.order(seed=None))
     first, second = (
         int(ready.tare["simulation_seed"]) for ready in session.parent.said(ReadyToRecord)
@@ -87,7 +87,7 @@ def test_a_seed_gives_the_same_samples_again_and_without_one_it_is_fresh_and_sta
     assert first != second
     here, there = np.split(session.samples, 2)
     assert not np.array_equal(here["coupling_torque_nm"], there["coupling_torque_nm"])
-    again = make_session(excitation=brief)
+    again = make_session(excitation=BRIEF)
     again.obey(again.order(seed=first))
     assert np.array_equal(here, again.samples)
 
@@ -522,7 +522,7 @@ def test_a_swinging_beam_is_not_taken_for_a_drift_of_the_sensor(make_session):
 
 
 def test_settings_that_were_not_granted_are_told_and_logged(make_session):
-    session = make_session()
+    session = make_session(excitation=BRIEF)
     session.obtained = {"clock": "real", "memory": "refused: no", "scheduling": "refused: never"}
     session.run()
     [warning] = [event for event in session.events if event.level == "warning"]
@@ -531,7 +531,7 @@ def test_settings_that_were_not_granted_are_told_and_logged(make_session):
 
 
 def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session):
-    session = make_session()
+    session = make_session(excitation=BRIEF)
     order = session.order()
     refused = {"supervisor_scheduling": "refused: not permitted"}
     session.obey(replace(order, refused=refused))
@@ -565,7 +565,7 @@ def test_the_drive_is_disabled_by_the_cycle_after_the_session_and_at_the_end(mak
 
 
 def test_a_drive_that_may_still_be_on_is_told(make_session):
-    session = make_session()
+    session = make_session(excitation=BRIEF)
     session.drive.doubt = "Drive: it does not show that it is off."
     finished = session.run().finished
     assert finished.outcome == "complete"  # the record is what it is
@@ -587,7 +587,7 @@ class StallOnTheWayBack(VirtualClock):
 
 def test_standing_still_on_the_way_back_has_its_limit_too(make_session):
     clock = StallOnTheWayBack()
-    session = make_session(clock=clock)
+    session = make_session(clock=clock, excitation=BRIEF)
     clock.shared_state = session.shared_state
     finished = session.run().finished
     assert "stalled for 60 ticks" in finished.reason

@@ -7,8 +7,9 @@ import pytest
 from rigd.beam import Beam
 from rigd.engine.channels import TOPICS
 from rigd.engine.shared_state import StateField
+from rigd.live import publisher
 from rigd.live.messages import LiveSession
-from rigd.live.publisher import POLL_S, Backlog, HealthReader, SessionRecordReader
+from rigd.live.publisher import POLL_S, Backlog, HealthReader
 from rigd.view import SessionDescription
 
 pytestmark = pytest.mark.process
@@ -67,11 +68,12 @@ def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer):
     beam = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
     description = SessionDescription("late", 1000.0, 10, (0, 10), beam, None)
     session = LiveSession(description, "id", (0,) * len(TOPICS))
-    reader = SessionRecordReader(session, producer.channels)
-    reader.read_new()
+    shown = publisher._ShownSession(session, producer.channels, None)
+    shown.queue_new_records()
     # An observer reads half of what a ring has.
-    assert reader.dropped == producer.tick - 500
-    assert reader.next_index == producer.tick
+    assert producer.dropped == producer.tick - 500
+    seen = producer.channels.shared_state[StateField.LIVE_SAMPLES_SEEN]
+    assert seen == producer.tick - 500  # as many wait to be sent
     assert producer.refused == 0
 
 
