@@ -264,15 +264,21 @@ def jump_between(session, n, counts=8000):
     session.parent.poll = poll
 
 
-@pytest.mark.parametrize("clock", [VirtualClock, FakeRealClock])
+SLIPS = [
+    ("zero", "session", 8000),
+    ("session", "zero", 80),
+    ("tare", "tare", -8000),
+    (None, "session", 80),
+]
+SLIP = ("session", "session", -80)
+
+
 @pytest.mark.parametrize(
-    ("first", "then", "counts"),
+    ("first", "then", "counts", "clock"),
     [
-        ("zero", "session", 8000),
-        ("session", "session", -80),
-        ("session", "zero", 80),
-        ("tare", "tare", -8000),
-        (None, "session", 80),
+        *((*slip, FakeRealClock) for slip in (SLIP, *SLIPS)),
+        (*SLIP, VirtualClock),
+        *(further(*slip, VirtualClock) for slip in SLIPS),
     ],
 )
 def test_an_encoder_that_slips_between_two_orders_is_noticed(
@@ -324,7 +330,7 @@ def test_an_encoder_that_slips_in_a_session_loses_the_connection_and_so_the_zero
     session.assert_safe()
 
 
-@pytest.mark.parametrize("speed_rad_s", [0.1, 1.0, 3.0])
+@pytest.mark.parametrize("speed_rad_s", [further(0.1), further(1.0), 3.0])
 def test_a_hand_may_turn_the_motor_between_sessions(make_session, speed_rad_s):
     """Up to a speed and back to rest within a tenth of a second each, and a quarter of a turn."""
     session = make_session(clock=FakeRealClock())

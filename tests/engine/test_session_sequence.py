@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
@@ -123,9 +124,20 @@ class StopAt(VirtualClock):
         (lambda s: s.stop.request(), "stopped", "operator"),
     ],
 )
-@pytest.mark.parametrize("at_s", [0.3, 1.2, 2.0])
+@pytest.mark.parametrize("at_s", [further(0.3), further(1.2), 2.0])
 def test_a_stop_leaves_the_torque_off(make_session, action, outcome, words, at_s):
-    session = make_session()
+    assert_stop_leaves_torque_off(make_session(), action, outcome, words, at_s)
+
+
+@pytest.mark.parametrize("at_s", [0.3, 0.8])
+def test_a_stop_before_the_record_leaves_the_torque_off(make_session, at_s):
+    def stop(session):
+        session.shared_state[StateField.STOP] = StopReason.OPERATOR
+
+    assert_stop_leaves_torque_off(make_session(), stop, "stopped", "operator", at_s)
+
+
+def assert_stop_leaves_torque_off(session, action, outcome, words, at_s):
     session.clock = StopAt(int(at_s * 1e9), lambda: action(session))
     session.run()
     session.assert_safe()
@@ -149,7 +161,7 @@ def test_a_stop_leaves_the_torque_off(make_session, action, outcome, words, at_s
         (lambda angle: float("inf"), "not a number"),
     ],
 )
-@pytest.mark.parametrize("read", [1200, 1501, 2000])
+@pytest.mark.parametrize("read", [1200, further(1501), further(2000)])
 def test_a_reading_beyond_its_limit_ends_in_a_fault_in_the_same_tick(
     make_session, fault, words, read
 ):
@@ -169,8 +181,14 @@ def test_a_reading_beyond_its_limit_ends_in_a_fault_in_the_same_tick(
         assert_books_balance(session, samples)
 
 
-@pytest.mark.parametrize("read", [3, 1200, 2000, 4200])
-@pytest.mark.parametrize("error", [DeviceError("The drive is gone."), ZeroDivisionError()])
+@pytest.mark.parametrize(
+    ("read", "error"),
+    [
+        *((read, DeviceError("The drive is gone.")) for read in (3, 1200, 2000, 4200)),
+        (2000, ZeroDivisionError()),
+        *(further(read, ZeroDivisionError()) for read in (3, 1200, 4200)),
+    ],
+)
 def test_a_device_that_fails_leaves_the_torque_off(make_session, read, error):
     def fail(angle_rad):
         raise error
