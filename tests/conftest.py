@@ -58,8 +58,8 @@ os.environ["RIGD_NO_LOOK"] = "1"
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
 # The same examples each time, and however long they take: what fails is a change's fault. Others,
-# and three times as many, are searched for by `make fuzz`.
-settings.register_profile("same", settings.get_profile("ci"), max_examples=30)
+# and more, are searched for by `make fuzz`.
+settings.register_profile("same", settings.get_profile("ci"), max_examples=40)
 settings.register_profile("others", settings.get_profile("ci"), derandomize=False)
 settings.load_profile("same")
 

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,10 @@ SOURCES = sorted(path for room in ("rigd", "analysis") for path in (ROOT / room)
 DOORS = sorted(path for room in ("rigd", "analysis") for path in (ROOT / room).rglob("*.pyi"))
 
 
+IMPORTS = re.compile(r"^\s*(?:from ([\w.]+) import (\([^)]*\)|.*)|import (.*))$", re.MULTILINE)
+"""Statement of an import: a module and what is taken from it, or modules."""
+
+
 def name_of(path):
     """Dotted name of a module or of a folder's door."""
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
@@ -18,12 +23,12 @@ def name_of(path):
 
 def imported_modules(path):
     """Modules of ours that a file names in its imports."""
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if isinstance(node, ast.ImportFrom):
-            yield node.module
-            yield from (f"{node.module}.{each.name}" for each in node.names)
-        elif isinstance(node, ast.Import):
-            yield from (each.name for each in node.names)
+    text = re.sub(r" as \w+", "", path.read_text("utf-8"))
+    for module, names, modules in IMPORTS.findall(text):
+        if module:
+            yield module
+        yield from re.findall(r"[\w.]+", modules)
+        yield from (f"{module}.{name}" for name in re.findall(r"\w+", names))
 
 
 def is_private(module):

@@ -5,6 +5,7 @@ import re
 import sys
 
 import pytest
+from cases import further
 from packages import DEVICES, install, rigd_with
 
 from rigd.devices import actuation_target, check_selection, open_devices
@@ -84,11 +85,11 @@ def test_a_sensor_that_needs_another_drive_is_refused_with_what_there_is(package
 
 
 @pytest.mark.process
-def test_commands_check_run_and_list_them(packages, tmp_path):
+def test_commands_check_run_and_list_them(packages, tmp_path, rigd_here):
     path, out = write_rig(tmp_path), tmp_path / "out"
-    code, output, _ = rigd_with(packages, "check", "--profile", path, "--json")
-    rows = {(row["group"], row["what"]): row for row in json.loads(output)["rows"]}
-    assert code == 0
+    done = rigd_here("check", "--profile", path, "--json")
+    rows = {(row["group"], row["what"]): row for row in json.loads(done.stdout)["rows"]}
+    assert done.returncode == 0
     assert rows["sensor", "gain"]["verdict"] == "ok"
     assert rows["devices", "twin"]["found"] == "lab-devices 1.2"
     # The processes of a session find the package, though the working folder is another.
@@ -100,27 +101,25 @@ def test_commands_check_run_and_list_them(packages, tmp_path):
     metadata = read_session(next(out.glob("*.mcap"))).metadata
     assert metadata["drive_package"] == metadata["sensor_package"] == "lab-devices 1.2"
     assert metadata["gain_mode"] == "fast"
-    code, output, _ = rigd_with(packages, "plugins")
-    assert code == 0
-    assert "twin: twin of the simulated drive (rigd.devices, lab-devices 1.2)" in output
-    code, output, _ = rigd_with(packages, "plugins", "show", "twin")
-    assert "# serial number on the case\n" in output
-    assert '# limit_nm = { value = 5.0, source = "assumed" }' in output
+    listed = rigd_here("plugins").stdout
+    assert "twin: twin of the simulated drive (rigd.devices, lab-devices 1.2)" in listed
+    shown = rigd_here("plugins", "show", "twin").stdout
+    assert "# serial number on the case\n" in shown
+    assert '# limit_nm = { value = 5.0, source = "assumed" }' in shown
 
 
-@pytest.mark.process
-def test_a_failed_row_of_theirs_refuses_a_session(packages, tmp_path):
+def test_a_failed_row_of_theirs_refuses_a_session(packages, tmp_path, rigd_here):
     path = write_rig(tmp_path, SECTIONS.replace("110.0", "300.0"))
-    code, _, errors = rigd_with(packages, "run", "hold", "--profile", path, "--fast")
-    assert code != 0
-    assert "device_settings" in errors
+    done = rigd_here("run", "hold", "--profile", path, "--fast")
+    assert done.returncode != 0
+    assert "device_settings" in done.stderr
 
 
 @pytest.mark.process
 @pytest.mark.parametrize(
     ("statement", "reason"),
     [
-        ("sensor.connect = lambda: {}[1]", "KeyError: 1"),
+        further("sensor.connect = lambda: {}[1]", "KeyError: 1"),
         ("gains, gain = [gain] * 2000, None", "IndexError: pop from empty list"),  # in a tick
     ],
 )
@@ -202,13 +201,12 @@ def test_code_of_a_package_that_fails_is_an_error_with_its_name(packages, tmp_pa
 @pytest.mark.process
 def test_nothing_comes_from_the_working_folder_and_help_does_not_search(packages, tmp_path):
     install(tmp_path / "here", "here-only", "1", "KIND = 1", "[rigd.devices]\nhere = here_only:K\n")
-    for program in (("-m", "rigd"), ("-P", "-m", "rigd")):
-        code, output, _ = rigd_with(
-            packages, "plugins", "--json", cwd=tmp_path / "here", program=program, cold=True
-        )
-        assert code == 0
-        assert {row["name"] for row in json.loads(output)["plugins"]} >= {"twin", "scaled"}
-        assert "here" not in output
+    code, output, _ = rigd_with(
+        packages, "plugins", "--json", cwd=tmp_path / "here", program=("-m", "rigd"), cold=True
+    )
+    assert code == 0
+    assert {row["name"] for row in json.loads(output)["plugins"]} >= {"twin", "scaled"}
+    assert "here" not in output
     code = (
         "import sys; sys.argv[1:] = ['--help']\n"
         "from rigd.__main__ import main\n"

@@ -144,13 +144,15 @@ def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
 
 
 @pytest.mark.process
-def test_commands_run_it_and_file_and_analysis_know_it(packages, tmp_path):
-    code, output, errors = rigd_with(packages, "run", "--help")
-    assert code == 0, errors
-    assert "triangle" in output
-    assert "lab-signals 0.4" in output
-    code, output, _ = rigd_with(packages, "run", "triangle", "--help")
-    assert "peak of the triangle (rad)." in output
+def test_commands_run_it_and_file_and_analysis_know_it(packages, tmp_path, rigd_here):
+    done = rigd_here("run", "--help")
+    assert done.returncode == 0, done.stderr
+    assert "triangle" in done.stdout
+    assert "lab-signals 0.4" in done.stdout
+    assert "peak of the triangle (rad)." in rigd_here("run", "triangle", "--help").stdout
+    done = rigd_here("run", "triangle", "--amplitude", "3", "--fast")
+    assert done.returncode == 2
+    assert "amplitude_rad = 3.0 rad" in done.stderr
     code, output, errors = rigd_with(
         packages, "run", "triangle", "--amplitude", "0.005", "--duration", "2", "--fast",
         "--seed", "1", "--output", tmp_path / "out", cwd=tmp_path,
@@ -164,6 +166,3 @@ def test_commands_run_it_and_file_and_analysis_know_it(packages, tmp_path):
     assert float(metadata["amplitude_rad"]) == 0.005
     # An analysis needs no package.
     assert welch_exclusion_reason(load_record(path)).startswith("a triangle excites")
-    code, _, errors = rigd_with(packages, "run", "triangle", "--amplitude", "3", "--fast")
-    assert code == 2
-    assert "amplitude_rad = 3.0 rad" in errors

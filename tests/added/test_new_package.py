@@ -25,7 +25,8 @@ def made(folder, name, *options):
     )
     assert code == 0, output + errors
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
-    metadata = folder / f"{project['name']}-{project['version']}.dist-info"
+    module = project["name"].replace("-", "_")
+    metadata = folder / f"{module}-{project['version']}.dist-info"
     metadata.mkdir()
     ((group, names),) = project["entry-points"].items()
     lines = [f"[{group}]", *(f"{name} = {reference}" for name, reference in names.items())]
@@ -34,27 +35,24 @@ def made(folder, name, *options):
 
 
 @pytest.mark.process
-@pytest.mark.parametrize(
-    ("options", "passed", "shown"),
-    [
-        ((), 10, '# address of the instrument\nhost = "…"\n'),
-        (("--kind", "controller"), 8, '# In [control]: controller = "mypart"\n[mypart]\n'),
-    ],
-    ids=["device", "controller"],
-)
-def test_a_new_package_passes_its_tests_and_joins(tmp_path, options, passed, shown):
-    folder = made(tmp_path / "own", "mypart", *options)
+def test_new_packages_pass_their_tests_and_join(tmp_path):
+    device = made(tmp_path / "device", "mypart")
+    law = made(tmp_path / "law", "mylaw", "--kind", "controller")
     done = subprocess.run(
         [sys.executable, "-P", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error",
-         folder / "tests"],
-        cwd=folder, env=os.environ | {"PYTHONPATH": str(folder)},
+         device / "tests", law / "tests"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": f"{device}:{law}"},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    assert f"{passed} passed" in done.stdout
-    code, output, _ = rigd_with(folder, "plugins", "show", "mypart", cwd=tmp_path)
-    assert code == 0
-    assert shown in output
+    assert "18 passed" in done.stdout
+    for folder, name, shown in (
+        (device, "mypart", '# address of the instrument\nhost = "…"\n'),
+        (law, "mylaw", '# In [control]: controller = "mylaw"\n[mylaw]\n'),
+    ):
+        code, output, _ = rigd_with(folder, "plugins", "show", name, cwd=tmp_path)
+        assert code == 0
+        assert shown in output
 
 
 @pytest.mark.process

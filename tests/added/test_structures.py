@@ -4,7 +4,7 @@ import json
 import sys
 
 import pytest
-from packages import STRUCTURE, install, rigd_with
+from packages import STRUCTURE, install
 
 from analysis.identify import Measurement, fit_structure, select
 from analysis.models import Structure
@@ -30,7 +30,8 @@ def packages(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def session(tmp_path_factory, make_signals, write_session):
     path = tmp_path_factory.mktemp("structures") / "a.mcap"
-    return write_session(path, make_signals(sweep_s=20.0, ring_down_s=5.0))
+    signals = make_signals(sweep_s=15.0, ring_down_s=5.0, rate_hz=500.0, quantum_rad=0.0)
+    return write_session(path, signals)
 
 
 @pytest.fixture(scope="module")
@@ -148,24 +149,25 @@ def test_two_packages_that_add_the_same_name_are_named(packages, tmp_path, monke
         added_structures(["zener"])
 
 
-@pytest.mark.process
 @pytest.mark.fit
-def test_analyze_offers_fits_and_reports_it(packages, session, tmp_path):
-    analyze = ("-P", "-m", "analysis")
+def test_analyze_offers_fits_and_reports_it(
+    packages, session, tmp_path, analyze_here, without_drawing
+):
     entry_points = f"[{GROUP}]\nbroken = lab_broken:BROKEN\n"
     install(packages, "lab-broken", "1", "raise SystemExit(3)", entry_points)
-    code, output, errors = rigd_with(packages, "--help", program=analyze)
-    assert code == 0, errors
-    assert "--structure" in output
-    assert "of lab-zener 0.1" in output
-    assert "of lab-broken 1" in output  # none is imported
+    done = analyze_here("--help")
+    assert done.returncode == 0, done.stderr
+    assert "--structure" in done.stdout
+    assert "of lab-zener 0.1" in done.stdout
+    assert "of lab-broken 1" in done.stdout  # none is imported
     report, results = tmp_path / "report", tmp_path / "a.json"
-    code, output, errors = rigd_with(
-        packages, session, "--method", "record", "--structure", "zener",
-        "--report", report, "--json", results, program=analyze,
-    )  # fmt: skip
-    assert code == 0, output + errors
-    text = " ".join(output.split())
+    with without_drawing():
+        done = analyze_here(
+            session, "--method", "record", "--structure", "zener", "--report", report,
+            "--json", results,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    text = " ".join(done.stdout.split())
     assert "Structure zener of lab-zener 0.1 (relaxation of the material, and viscous" in text
     assert "The reported numbers are those of types I to VII." in text
     (record,) = json.loads(results.read_text())["records"]
@@ -184,6 +186,6 @@ def test_analyze_offers_fits_and_reports_it(packages, session, tmp_path):
         (("--structure", "broken"), "Package lab-broken 1"),
         (("--structure", "zener", "--method", "welch"), "for whole-record fits"),
     ):
-        code, _, errors = rigd_with(packages, session, *arguments, program=analyze)
-        assert code == 2
-        assert reason in " ".join(errors.split())
+        done = analyze_here(session, *arguments)
+        assert done.returncode == 2
+        assert reason in " ".join(done.stderr.split())

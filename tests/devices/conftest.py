@@ -1,5 +1,6 @@
 """Every backend there is, opened but not connected."""
 
+import contextlib
 import os
 from dataclasses import replace
 
@@ -18,8 +19,8 @@ def _patient(patient_drives):
 
 
 @pytest.fixture(params=["direct", "can", further("serial"), further("previous_tick"), "hardware"])
-def devices(request, start_simulator, monkeypatch):
-    """Drive and sensor: simulated directly, through the wire in lock-step, or the real ones."""
+def open_backend(request, start_simulator, monkeypatch):
+    """Open drive and sensor: simulated directly, by wire in lock-step, or the real ones."""
     # How long a simulated drive takes to answer while it is set up is the machine's affair.
     if request.param != "hardware":
         for name in ("_SDO_TIMEOUT_S", "_HURRIED_TIMEOUT_S"):
@@ -37,7 +38,14 @@ def devices(request, start_simulator, monkeypatch):
         if request.param == "previous_tick":
             rig = replace(rig, acquisition=replace(rig.acquisition, mode="previous_tick"))
         start_simulator(name, "--lock-step")
-    opened = open_devices(rig)
-    yield opened
-    opened.drive.close()
-    opened.sensor.close()
+
+    @contextlib.contextmanager
+    def opened():
+        devices = open_devices(rig)
+        try:
+            yield devices
+        finally:
+            devices.drive.close()
+            devices.sensor.close()
+
+    return opened

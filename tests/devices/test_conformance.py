@@ -7,6 +7,7 @@ from rigd.testing import DEVICE_CHECKS
 pytestmark = pytest.mark.process
 
 
-@pytest.mark.parametrize("check", DEVICE_CHECKS, ids=lambda check: check.__name__.strip("_"))
-def test_a_backend_does_what_the_loop_relies_on(check, devices):
-    check(devices)
+def test_a_backend_does_what_the_loop_relies_on(open_backend):
+    for check in DEVICE_CHECKS:
+        with open_backend() as devices:
+            check(devices)

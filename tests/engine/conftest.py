@@ -140,7 +140,7 @@ class Session:
         self.profile = profile or strict(load_shipped("sim"))
         self.excitation = excitation or chirp(
             rate_hz=self.profile.rig.rate_hz,
-            duration_s=4.0,
+            duration_s=2.0,
             rest_s=0.5,
             ring_down_s=0.5,
             stop_hz=5.0,
@@ -203,6 +203,14 @@ class Session:
 
     def close(self):
         self.channels.close()
+
+
+@pytest.fixture(scope="session")
+def complete_session():
+    """A session without faults, and its samples; nobody changes them."""
+    session = Session().run()
+    yield session, session.samples
+    session.close()
 
 
 @pytest.fixture

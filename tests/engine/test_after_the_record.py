@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.control.damper import DamperSettings
 from rigd.engine.messages import PostRecordPlan, ReadyToRecord, SessionFinished
-from rigd.excitation import chirp, step
+from rigd.excitation import chirp, hold, step
 from rigd.runner.planning import plan_session
 
 RATE_HZ = 1000.0
@@ -30,12 +31,13 @@ def stepped():
 
 @pytest.fixture
 def two_sessions(make_session, struck):
-    """Run a session twice with an ending; returns it and the virtual time that passed (s)."""
+    """Run a session and a brief one with an ending; returns it and the virtual time (s)."""
 
     def run(ending, excitation=struck):
         session = make_session(excitation=excitation)
-        job = replace(session.order(), ending=ending)
-        session.obey(job, replace(session.order(), ending=ending))
+        brief = hold(rate_hz=RATE_HZ, duration_s=0.1, rest_s=0.0, ring_down_s=0.0)
+        orders = [session.order(), session.order(brief)]
+        session.obey(*(replace(order, ending=ending) for order in orders))
         outcomes = [finished.outcome for finished in session.parent.said(SessionFinished)]
         assert outcomes == ["complete", "complete"]
         session.assert_safe()
@@ -53,8 +55,8 @@ def test_the_next_session_need_not_wait_for_the_beam(two_sessions, struck):
     assert any("Waiting" in event.message for event in left.events)
     # The zero of the torque can be checked right after the record, which needs a beam at rest.
     for session, checked in ((damped, True), (left, False)):
-        for finished in session.parent.said(SessionFinished):
-            assert ("tare_drift_nm" in finished.results) == checked
+        finished = session.parent.said(SessionFinished)[0]
+        assert ("tare_drift_nm" in finished.results) == checked
 
 
 def plan_session_of(excitation):
@@ -95,8 +97,8 @@ def test_active_damping_stays_within_the_limit_of_the_angle(make_session):
 def test_a_damper_that_excites_the_beam_ends(two_sessions):
     """With the sign turned round it feeds the vibration: it ends after its time, and safely."""
     wrong = PostRecordPlan(damper=DamperSettings(-2.0, 0.025, 4.0, 320.0))
-    hold = step(rate_hz=RATE_HZ, amplitude_rad=0.005, duration_s=0.2, rest_s=0.2, ring_down_s=0.0)
-    session, _ = two_sessions(wrong, hold)
+    small = step(rate_hz=RATE_HZ, amplitude_rad=0.005, duration_s=0.2, rest_s=0.2, ring_down_s=0.0)
+    session, _ = two_sessions(wrong, small)
     assert np.abs(session.samples["coupling_torque_nm"]).max() < 1.0
 
 
@@ -110,11 +112,17 @@ def test_a_damper_that_excites_the_beam_ends(two_sessions):
                 p.rig, motor=replace(p.rig.motor, inertia_kg_m2=2 * p.rig.motor.inertia_kg_m2)
             ),
         ),
-        lambda p: replace(p, rig=replace(p.rig, motor=replace(p.rig.motor, coulomb_nm=0.08))),
-        lambda p: replace(p, rig=replace(p.rig, sensor=replace(p.rig.sensor, delay_s=5e-3))),
-        lambda p: replace(p, control=replace(p.control, feedforward_gain=0.8)),
-        lambda p: replace(
-            p, rig=replace(p.rig, beam=replace(p.rig.beam, bending_stiffness_n_m2=0.075))
+        further(
+            lambda p: replace(p, rig=replace(p.rig, motor=replace(p.rig.motor, coulomb_nm=0.08)))
+        ),
+        further(
+            lambda p: replace(p, rig=replace(p.rig, sensor=replace(p.rig.sensor, delay_s=5e-3)))
+        ),
+        further(lambda p: replace(p, control=replace(p.control, feedforward_gain=0.8))),
+        further(
+            lambda p: replace(
+                p, rig=replace(p.rig, beam=replace(p.rig.beam, bending_stiffness_n_m2=0.075))
+            )
         ),
     ],
     ids=["inertia", "friction", "delay", "feed-forward", "stiffness"],

@@ -1,5 +1,6 @@
 """Real-time settings: tried one by one, and reported as granted or refused."""
 
+import functools
 import json
 import os
 import resource
@@ -9,6 +10,7 @@ import sys
 from dataclasses import replace
 
 import pytest
+from cases import further
 
 from rigd.engine.realtime import (
     MAX_WAKE_UP_US,
@@ -189,7 +191,7 @@ thread.start()
 raised_priority.raise_new_threads()
 told["thread"] = state(thread.native_id)
 told["child"] = as_child()
-if os.access(sys.executable, os.X_OK):
+if {with_child}:
     rig_child = ChildProcess(RECORDER, cores=raised_priority.cores_before)
     told["cores of a process of the rig"] = sorted(os.sched_getaffinity(rig_child.pid))
     rig_child.stop()
@@ -211,14 +213,18 @@ os.sched_setscheduler = without_realtime
 ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="needs rights that only root is sure to have")
 
 
-def precedence_of_a_process(*, priority=20, cpu=-1, before="", root="/"):
-    code = PRECEDENCE.format(priority=priority, cpu=cpu, before=before, root=root)
+@functools.cache
+def precedence_of_a_process(*, priority=20, cpu=-1, before="", root="/", with_child=False):
+    """Return what a process, and a child of it, tell of their precedence before and after."""
+    code = PRECEDENCE.format(
+        priority=priority, cpu=cpu, before=before, root=root, with_child=with_child
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     return json.loads(done.stdout)
 
 
 def granted_realtime():
-    told = precedence_of_a_process()
+    told = precedence_of_a_process(with_child=True)
     if not told["obtained"]["scheduling"].startswith("SCHED_RR"):
         pytest.skip(f"no real-time priority here: {told['obtained']}")
     return told
@@ -239,7 +245,7 @@ def test_what_they_start_is_an_ordinary_process_on_every_core():
 
 
 def test_released_all_is_as_before():
-    told = precedence_of_a_process()
+    told = precedence_of_a_process(with_child=True)
     assert told["after"] == told["thread after"] == told["before"]
 
 
@@ -251,7 +257,7 @@ def test_a_loop_on_a_core_of_its_own_is_kept_off_that_one():
     assert told["with"][2] == others
 
 
-@pytest.mark.parametrize("isolated", ["4000", ""])
+@pytest.mark.parametrize("isolated", [further("4000"), ""])
 def test_the_core_that_is_kept_off_is_the_one_that_the_loop_gets(machine, isolated):
     granted_realtime()
     first = str(min(os.sched_getaffinity(0)))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import eventually
 
 from rigd.devices.contracts import LineHealth
 from rigd.engine import shared_memory_fd
@@ -197,6 +198,11 @@ def test_every_angle_of_a_piece_comes_in_its_order(pieces, missed):
         assert b - a <= then - first
 
 
+def wait_until_followed(session, ticks):
+    """Wait until a session has followed so many ticks of its reference."""
+    assert eventually(lambda: session.shared_state[StateField.SCHEDULED] >= ticks)
+
+
 def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
     """Under the virtual clock time stands still until the next piece is there."""
     session = make_session()
@@ -208,7 +214,7 @@ def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
 
     def plan():
         for piece_rad in pieces_rad:
-            time.sleep(0.3)
+            time.sleep(0.1)
             writer.append(piece_rad)
         session.shared_state[StateField.LAST_SEGMENT] = 1
 
@@ -238,10 +244,12 @@ def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_sign
     writer = ReferenceWriter(spec, session.shared_state)
 
     def plan():
+        wait_until_followed(session, 300)
+        time.sleep(0.3)
         writer.append(np.zeros(100))
         session.shared_state[StateField.LAST_SEGMENT] = 1
 
-    planner = threading.Timer(1.0, plan)
+    planner = threading.Thread(target=plan)
     planner.start()
     session.obey(SessionJob(session.profile, spec))
     planner.join()
@@ -256,11 +264,15 @@ def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_sign
 def test_a_stop_ends_the_wait_for_a_piece(make_session):
     session = make_session()
     spec = ReferenceSpec(write_reference(shared_memory_fd(), np.zeros(900)).fd, 900, 300)
-    stopping = threading.Timer(
-        0.5, lambda: session.shared_state.__setitem__(StateField.STOP, StopReason.OPERATOR)
-    )
+
+    def stop():
+        wait_until_followed(session, 300)
+        session.shared_state[StateField.STOP] = StopReason.OPERATOR
+
+    stopping = threading.Thread(target=stop)
     stopping.start()
     session.obey(SessionJob(session.profile, spec))
+    stopping.join()
     assert session.finished.outcome == "stopped"
     assert len(session.samples) == session.finished.counts["scheduled"] >= 300
     session.assert_safe()

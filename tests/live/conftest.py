@@ -1,5 +1,7 @@
 """A fake control loop that fills a real ring, and the publisher as a real child process."""
 
+import contextlib
+import http.client
 import importlib.util
 import math
 import os
@@ -17,7 +19,7 @@ from rigd.beam import Beam, Damping
 from rigd.engine import Ring, shared_memory_fd
 from rigd.engine.channels import TOPICS, Channels, create_channels
 from rigd.engine.messages import MessageReader, ProcessFailed, encode
-from rigd.engine.shared_state import LogEvent, SharedState, StateField, write_event
+from rigd.engine.shared_state import LogEvent, Phase, SharedState, StateField, write_event
 from rigd.live.address import LiveAddress
 from rigd.live.messages import LiveJob, LiveSession, LiveSessionEnded, LiveSessionShown
 from rigd.session.layout import pack_sample_into, pack_timing_into
@@ -255,6 +257,30 @@ def rerun_program(rerun_runs):
     return program()
 
 
+def get_page(port: int, path: str, host: str | None = None):
+    """Ask the publisher's page server, as a browser does."""
+    link = http.client.HTTPConnection("127.0.0.1", port, timeout=30.0)
+    try:
+        link.request("GET", path, headers={} if host is None else {"Host": host})
+        answer = link.getresponse()
+        return answer, answer.read()
+    finally:
+        link.close()
+
+
+@pytest.fixture
+def get():
+    return get_page
+
+
+def channels_running(channels) -> None:
+    """Have the torque on, until the publisher has shown that."""
+    shared_state = channels.shared_state
+    shared_state[StateField.PHASE] = Phase.RUNNING
+    beat = shared_state[StateField.LIVE_BEAT]
+    assert eventually(lambda: shared_state[StateField.LIVE_BEAT] > beat + 2)
+
+
 class Columns:
     """What Rerun received of a recording: by entity and component, times in ns and values."""
 
@@ -376,6 +402,47 @@ def receive(save):
         return end
 
     return begin
+
+
+@pytest.fixture(scope="session")
+def received(rerun_program, tmp_path_factory):
+    """What Rerun received of two sessions that one publisher showed, by the end of each.
+
+    One ended in a fault; of the other the supervisor was lost. With the number of ticks in them,
+    the address of the view, and what a browser got of its page.
+    """
+    patience = "from rigd.live import publisher as p; p._MAX_QUEUED_S = 60.0"
+    with contextlib.ExitStack() as stack:
+        producer = Producer(capacity=64_000)
+        stack.callback(producer.close)
+        producer.start()
+        publisher = Publisher(producer, first=f"{patience}; p._MAX_ORPHANED_S = 0.5")
+        stack.callback(publisher.close)
+        publisher.begin()
+        path = tmp_path_factory.mktemp("received") / "sessions.rrd"
+        saver = Saver(rerun_program, publisher.address, path)
+        stack.callback(saver.close)
+        address = publisher.address
+        place = f"/?{address.viewer_url.split('?')[1]}"
+        paths = ("/", place, "/re_viewer_bg.wasm", "/re_viewer.js", "/live.json")
+        absent = ("/etc/passwd", "/../x", "/version")
+        page = {path: get_page(address.page_port, path) for path in (*paths, *absent)}
+        channels_running(producer.channels)
+        assert eventually(lambda: producer.tick > 1000 and saver.has_begun())
+        producer.stop()
+        publisher.finish("fault", "The drive was lost.")
+        assert eventually(saver.has_all)
+        publisher.show("lost", tuple(ring.written_count for ring in producer.channels.rings))
+        publisher.end()
+        assert (producer.dropped, producer.refused) == (0, 0)
+        recordings = saver.recordings()
+        return {
+            "address": address,
+            "page": page,
+            "ticks": producer.tick,
+            "fault": recordings["recording of chirp under test"],
+            "lost": recordings["recording of lost"],
+        }
 
 
 @pytest.fixture

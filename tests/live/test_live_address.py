@@ -14,6 +14,7 @@ from processes import eventually
 
 from rigd.live._server import free_port
 from rigd.live.address import LiveAddress, announce, find, running, withdraw
+from rigd.live.publisher import RerunError, RerunServer
 from rigd.runtime.addresses import runtime_folder
 
 pytestmark = pytest.mark.process
@@ -94,6 +95,17 @@ def test_a_file_that_is_none_of_ours_is_passed_over(address, text):
     assert running() == []
     withdraw(address)
     assert file.exists()
+
+
+def test_a_server_that_does_not_start_is_told_in_a_sentence(runtime_folder, tmp_path, monkeypatch):
+    program = tmp_path / "rerun"
+    program.write_text("#!/bin/sh\necho no such option >&2\nexit 2\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("rigd.live._program._program_path", lambda: str(program))
+    server = RerunServer("antenna can")
+    with pytest.raises(RerunError, match=r"ended: no such option\.$"):
+        server.wait()
+    server.close()
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])

@@ -4,8 +4,13 @@ from functools import partial
 
 import pytest
 
+from rigd.beam import Beam
+from rigd.engine.channels import TOPICS
 from rigd.engine.shared_state import StateField
+from rigd.live import publisher
+from rigd.live.messages import LiveSession
 from rigd.live.publisher import POLL_S, Backlog, HealthReader
+from rigd.view import SessionDescription
 
 pytestmark = pytest.mark.process
 
@@ -54,6 +59,22 @@ def test_what_a_new_connection_is_given_anyway_is_not_sent_twice():
     backlog.put([drawing("a")], 1)
     backlog.drop_required()
     assert names(backlog.take()[0]) == ["a"]
+
+
+def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer):
+    producer = start_producer(capacity=1000)
+    producer.stop()
+    producer.go_on(3000)
+    beam = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
+    description = SessionDescription("late", 1000.0, 10, (0, 10), beam, None)
+    session = LiveSession(description, "id", (0,) * len(TOPICS))
+    shown = publisher._ShownSession(session, producer.channels, None)
+    shown.queue_new_records()
+    # An observer reads half of what a ring has.
+    assert producer.dropped == producer.tick - 500
+    seen = producer.channels.shared_state[StateField.LIVE_SAMPLES_SEEN]
+    assert seen == producer.tick - 500  # as many wait to be sent
+    assert producer.refused == 0
 
 
 def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):

@@ -1,6 +1,5 @@
 """The page for browsers: Rerun's own, but nothing of it is loaded from another computer."""
 
-import http.client
 import json
 import os
 import re
@@ -15,25 +14,14 @@ from rigd.live._page import ViewerPageServer, confine_to_loopback
 pytestmark = pytest.mark.process
 
 
-def get(port: int, path: str, host: str | None = None):
-    """Ask the publisher's page server, as a browser does."""
-    link = http.client.HTTPConnection("127.0.0.1", port, timeout=30.0)
-    try:
-        link.request("GET", path, headers={} if host is None else {"Host": host})
-        answer = link.getresponse()
-        return answer, answer.read()
-    finally:
-        link.close()
-
-
-def test_a_browser_gets_the_viewer_and_is_kept_on_this_computer(publisher):
-    port, viewer_url = publisher.address.page_port, publisher.address.viewer_url
-    answer, _ = get(port, "/")
+def test_a_browser_gets_the_viewer_and_is_kept_on_this_computer(received):
+    address, answers = received["address"], received["page"]
+    answer, _ = answers["/"]
     assert answer.status == 302
     # Relative, for those that come through a tunnel from another port.
-    assert answer.headers["Location"] == "/?" + viewer_url.split("?")[1]
+    assert answer.headers["Location"] == "/?" + address.viewer_url.split("?")[1]
 
-    answer, body = get(port, answer.headers["Location"])
+    answer, body = answers[answer.headers["Location"]]
     page = body.decode()
     assert answer.status == 200
     assert "the_canvas_id" in page, "it is the viewer"
@@ -45,19 +33,19 @@ def test_a_browser_gets_the_viewer_and_is_kept_on_this_computer(publisher):
     hosts = {word for sources in policy.values() for word in sources.split() if "/" in word}
     assert hosts == {"http://127.0.0.1:*", "http://localhost:*"}
 
-    answer, body = get(port, "/re_viewer_bg.wasm")
+    answer, body = answers["/re_viewer_bg.wasm"]
     assert answer.headers["Content-Type"] == "application/wasm"
     assert body[:4] == b"\0asm"
     assert len(body) == int(answer.headers["Content-Length"]) > 1_000_000
-    answer, body = get(port, "/re_viewer.js")
+    answer, body = answers["/re_viewer.js"]
     assert answer.status == 200
     assert b"WebHandle" in body
 
-    answer, body = get(port, "/live.json")
-    assert json.loads(body) == {"server": publisher.address.server}
+    answer, body = answers["/live.json"]
+    assert json.loads(body) == {"server": address.server}
     assert answer.headers["Cache-Control"] == "no-store"
     for path in ("/etc/passwd", "/../x", "/version"):
-        assert get(port, path)[0].status == 404
+        assert answers[path][0].status == 404
 
 
 def test_links_to_other_computers_are_left_out():
@@ -79,7 +67,7 @@ def page():
     server.close()
 
 
-def test_a_page_of_another_name_reads_nothing(page):
+def test_a_page_of_another_name_reads_nothing(page, get):
     """Whose name was made to lead to this computer."""
     assert get(page.port, "/live.json", "evil.example")[0].status == 403
     assert get(page.port, "/live.json", f"evil.example:{page.port}")[0].status == 403
@@ -87,16 +75,21 @@ def test_a_page_of_another_name_reads_nothing(page):
         assert get(page.port, "/live.json", host)[0].status == 503
 
 
-def test_who_only_connects_takes_but_the_room_there_is(page):
-    idle = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(60)]
+def test_who_only_connects_takes_but_the_room_there_is(monkeypatch):
+    monkeypatch.setattr("rigd.live._page._MAX_CONNECTIONS", 2)
+    before = threading.active_count()
+    page = ViewerPageServer(0, lambda: None, lambda: 0)
+    idle = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(6)]
     try:
-        for connection in idle[16:]:
+        for connection in idle[2:]:
             connection.settimeout(30.0)
             assert connection.recv(1) == b""
-        assert sum(t.name.startswith("Thread-") for t in threading.enumerate()) < 40
+        # Beside the server's own, one for each connection and one for its time.
+        assert threading.active_count() <= before + 1 + 2 * 2
     finally:
         for connection in idle:
             connection.close()
+        page.close()
 
 
 def test_a_connection_does_not_last_for_ever(monkeypatch, page):

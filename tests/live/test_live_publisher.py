@@ -9,9 +9,12 @@ import sys
 import time
 import urllib.request
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from cases import further
 from online_fits import online_fit
 from processes import eventually, has_ended, listeners, sockets
 
@@ -19,6 +22,7 @@ from rigd.engine.messages import ProcessFailed
 from rigd.engine.shared_state import StateField
 from rigd.live.address import LiveAddress, find
 from rigd.live.messages import LiveFit, LiveJob
+from rigd.live.publisher import RerunError, main
 
 pytestmark = pytest.mark.process
 
@@ -45,47 +49,13 @@ def accepts(port: int) -> bool:
     return True
 
 
-def test_the_view_is_on_loopback_where_the_first_line_says_and_ends_with_its_input(publisher):
-    assert isinstance(publisher.answer, LiveAddress)
-    address = publisher.address
-    assert (address.rig, address.pid) == ("rig under test", publisher.process.pid)
-    assert find("rig under test") == address
-    assert all(accepts(port) for port in publisher.ports)
-    # And nothing is open beyond loopback.
-    assert eventually(lambda: page(publisher))
-    pids = publisher.process.pid, publisher.server_pid
-    listening = {end.local for pid in pids for end in listeners(pid)}
-    assert {f"{LOOPBACK}:{port:04X}" for port in publisher.ports} <= listening
-    assert len(listening) == 3  # the third is where the server has the page's files
-    addresses = {address for pid in pids for end in sockets(pid) for address in end.addresses}
-    assert addresses == {LOOPBACK, "00000000"}  # the latter is the far end of a listening socket
-
-    # An interrupt is the supervisor's business.
-    server = publisher.server_pid
-    for number in (signal.SIGINT, signal.SIGTERM):
-        os.kill(publisher.process.pid, number)
-        os.kill(server, signal.SIGINT)
-        time.sleep(0.3)
-        assert publisher.process.poll() is None
-        assert not has_ended(server)
-    own = listeners(publisher.process.pid) | listeners(server)
-    assert len(own) == 3
-    assert publisher.end() == (0, "", "")
-    assert has_ended(server)
-    assert not own & listeners()
-
-
-def test_every_record_arrives_in_the_units_of_the_plots(unhurried, receive):
-    publisher, producer = unhurried, unhurried.producer
-    received = receive(publisher)
-    assert eventually(lambda: producer.tick > 1000)
-    ((recording_id, columns),) = received().items()
+def test_every_record_arrives_in_the_units_of_the_plots(received):
+    columns = received["fault"]
     assert columns.application_id == "rigd"
-    assert recording_id == "recording of chirp under test"
     time_ns, angle_mrad = columns("/signals", "angle_mrad")
     time_s = time_ns * 1e-9
     assert len(time_ns) > 500
-    assert time_ns[-1] == (producer.tick - 1) * 1_000_000  # up to the last that was made
+    assert time_ns[-1] == (received["ticks"] - 1) * 1_000_000  # up to the last that was made
     assert np.all(np.diff(time_ns) == 1_000_000)  # none missing, none twice
     reference = 0.025 * np.sin(2.0 * np.pi * (0.5 * time_s + 0.1 * time_s**2))
     assert angle_mrad[:, 0] == pytest.approx(1e3 * reference, abs=1e-9)
@@ -102,12 +72,10 @@ def test_every_record_arrives_in_the_units_of_the_plots(unhurried, receive):
     assert np.allclose(age_ms, [0.5, 1.5])
     _, lines = columns("/events", "TextLog:text")
     assert lines[0] == ["Record starts"]
-    assert lines[-1] == ["Outcome: stopped. The test is over."]
+    assert lines[-1] == ["Outcome: fault. The drive was lost."]
     health_ns, dropped = columns("/health", "backlog_samples")
     assert len(health_ns) >= 1
     assert dropped[-1, 1] == 0
-    assert publisher.dropped == 0
-    assert producer.refused == 0
 
 
 @pytest.mark.further  # as in tests/view
@@ -149,10 +117,11 @@ def test_the_quick_look_is_added_to_the_events(publisher, save, tmp_path):
     assert lines.tolist()[-2:] == [["Quick look at it"], ["  mode 1?[31m"]]
 
 
-@pytest.mark.parametrize("at_once", [pytest.param(False, marks=pytest.mark.further), True])
-def test_two_rigs_have_a_view_each_and_one_that_is_killed_leaves_no_server(
+@pytest.mark.parametrize("at_once", [further(False), True])
+def test_two_rigs_have_a_view_each_on_loopback_and_leave_no_server(
     publisher, start_producer, start_publisher, at_once
 ):
+    assert_on_loopback(publisher)
     own = publisher.ports
     # The port was free when it was looked at, and taken a moment later.
     race = f"outlet.free_port = lambda _: {publisher.address.grpc_port}" if at_once else "pass"
@@ -165,6 +134,37 @@ def test_two_rigs_have_a_view_each_and_one_that_is_killed_leaves_no_server(
     publisher.process.kill()
     assert eventually(lambda: has_ended(server))
     assert not has_ended(other.server_pid)
+    assert_ends_with_its_input(other)
+
+
+def assert_on_loopback(publisher):
+    """Assert that the view is where its first line says, and that nothing is open beyond."""
+    address = publisher.address
+    assert (address.rig, address.pid) == ("rig under test", publisher.process.pid)
+    assert find("rig under test") == address
+    assert eventually(lambda: page(publisher))
+    pids = publisher.process.pid, publisher.server_pid
+    listening = {end.local for pid in pids for end in listeners(pid)}
+    assert {f"{LOOPBACK}:{port:04X}" for port in publisher.ports} <= listening
+    assert len(listening) == 3  # the third is where the server has the page's files
+    addresses = {address for pid in pids for end in sockets(pid) for address in end.addresses}
+    assert addresses == {LOOPBACK, "00000000"}  # the latter is the far end of a listening socket
+
+
+def assert_ends_with_its_input(publisher):
+    """Assert that an interrupt, which is the supervisor's business, does not end a publisher."""
+    server = publisher.server_pid
+    for number in (signal.SIGINT, signal.SIGTERM):
+        os.kill(publisher.process.pid, number)
+        os.kill(server, signal.SIGINT)
+    time.sleep(0.3)
+    assert publisher.process.poll() is None
+    assert not has_ended(server)
+    own = listeners(publisher.process.pid) | listeners(server)
+    assert len(own) == 3
+    assert publisher.end() == (0, "", "")
+    assert has_ended(server)
+    assert not own & listeners()
 
 
 @pytest.mark.slow
@@ -249,20 +249,38 @@ def test_a_server_that_stays_frozen_is_replaced(start_producer, start_publisher,
     assert producer.refused == 0
 
 
-@pytest.mark.parametrize("frozen_first", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_killed_server_is_replaced_where_viewers_find_it(
-    start_producer, start_publisher, receive, own_port, frozen_first
+@pytest.mark.slow
+def test_a_frozen_server_that_is_killed_is_replaced(
+    start_producer, start_publisher, receive, own_port
 ):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(producer, first=f"{IMPATIENT}; {own_port}")
-    first, ports = publisher.server_pid, publisher.ports
-    if frozen_first:
-        os.kill(first, signal.SIGSTOP)
-        assert eventually(lambda: publisher.dropped > 0)
-    os.kill(first, signal.SIGKILL)
+    os.kill(publisher.server_pid, signal.SIGSTOP)
+    assert eventually(lambda: publisher.dropped > 0)
+    assert_replaced_when_killed(publisher, receive)
+
+
+def test_a_server_that_is_killed_or_has_seen_many_sessions_is_replaced(
+    start_publisher, receive, own_port
+):
+    publisher = start_publisher(first=f"{own_port}; outlet._MAX_SESSIONS = 2")
+    first = publisher.address
+    begins = tuple(ring.written_count for ring in publisher.producer.channels.rings)
+    for name in ("second", "third"):
+        publisher.show(name, begins)
+    address = publisher.next_address()
+    assert address.server != first.server
+    assert address.grpc_port == first.grpc_port
+    assert_replaced_when_killed(publisher, receive)
+
+
+def assert_replaced_when_killed(publisher, receive):
+    """Kill the server; viewers find another one, with all samples from then on."""
+    producer, server, ports = publisher.producer, publisher.server_pid, publisher.ports
+    os.kill(server, signal.SIGKILL)
     killed_ns = producer.tick * 1_000_000
     publisher.next_address()
-    assert publisher.server_pid != first
+    assert publisher.server_pid != server
     assert publisher.ports == ports
     assert all(accepts(port) for port in ports)
     (columns,) = receive(publisher)().values()
@@ -270,8 +288,9 @@ def test_a_killed_server_is_replaced_where_viewers_find_it(
     assert producer.refused == 0
 
 
+@pytest.mark.further  # as test_live_backlog.py
 def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer, start_publisher):
-    producer = start_producer(capacity=1000)
+    producer = start_producer(capacity=1000, speed=8.0)
     publisher = start_publisher(producer)
     os.kill(publisher.process.pid, signal.SIGSTOP)
     behind = producer.tick
@@ -304,11 +323,10 @@ def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, star
     ("script", "mode", "sentence"),
     [
         ("#!/bin/sh\necho no such option >&2\nexit 2\n", 0o755, "ended: no such option."),
-        pytest.param(
-            *("#!/bin/sh\n", 0o644, "cannot be run: Permission denied."), marks=pytest.mark.further
-        ),
+        ("#!/bin/sh\n", 0o644, "cannot be run: Permission denied."),
     ],
 )
+@pytest.mark.further  # as test_live_address.py
 def test_a_server_that_does_not_start_is_told_in_a_sentence(
     start_publisher, tmp_path, script, mode, sentence
 ):
@@ -321,6 +339,24 @@ def test_a_server_that_does_not_start_is_told_in_a_sentence(
     assert isinstance(publisher.answer, ProcessFailed)
     assert publisher.answer.reason.endswith(sentence)
     assert publisher.end() == (1, "", "")
+
+
+def test_the_supervisor_is_told_why_there_is_no_view(monkeypatch):
+    sent = []
+    job = SimpleNamespace(channels=None, rig="sim")
+    parent = SimpleNamespace(receive_job=lambda: job, send=sent.append)
+
+    def fail(_):
+        raise RerunError("The Rerun server ended.")
+
+    for name, stub in {
+        "signal": Mock(), "ignore_signals": Mock(), "prepare_sdk_environment": Mock(),
+        "attach_channels": Mock(), "SupervisorConnection": lambda: parent, "RerunServer": fail,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(f"rigd.live.publisher.{name}", stub)
+    with pytest.raises(SystemExit, match="1"):
+        main()
+    assert sent == [ProcessFailed("The Rerun server ended.")]
 
 
 def test_no_job_means_no_work():

@@ -3,8 +3,6 @@
 import os
 import resource
 import signal
-import threading
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,22 +24,26 @@ pytestmark = pytest.mark.process
 
 
 @pytest.fixture
-def rig(children_copied, write_profile, runtime_folder, monkeypatch):
+def profile(write_profile):
+    return load_profile(str(write_profile("sim")))
+
+
+@pytest.fixture
+def rig(children_copied, profile, runtime_folder, monkeypatch):
     # How long its start takes is the machine's affair: what is asked for is what it shows then.
     monkeypatch.setattr(live_view, "_ADDRESS_TIMEOUT_S", 60.0)
     monkeypatch.setattr(live_view, "_SHOW_TIMEOUT_S", 60.0)
-    rig = Rig(load_profile(str(write_profile("sim"))), fast=True, live=True)
+    rig = Rig(profile, fast=True, live=True)
     rig.connect()
     yield rig
     rig.disconnect()
 
 
 @pytest.fixture
-def order(rig, tmp_path):
+def order(profile, tmp_path):
     """Return the order for a session."""
 
     def order(name: str, duration_s: float = 1.0) -> SessionOrder:
-        profile = rig._profile
         excitation = make_excitation(
             "hold", {"duration_s": duration_s, "rest_s": 0.0}, profile.rig.rate_hz
         )
@@ -68,7 +70,7 @@ def run(rig, order):
     return run
 
 
-def test_a_series_has_one_view_which_gets_every_sample(rig, run, save):
+def test_a_series_has_one_view_which_gets_every_sample_and_is_replaced_when_it_dies(rig, run, save):
     first, (told, *_) = run("first")
     view = rig.status().live_view
     assert told == f"Live view: {view.viewer_url}"
@@ -79,6 +81,17 @@ def test_a_series_has_one_view_which_gets_every_sample(rig, run, save):
     assert rig.status().live_view == view, "the same process, and the same server"
     assert (first.live_dropped, second.live_dropped) == (0, 0)
     assert eventually(saver.has_all)
+    os.kill(view.pid, signal.SIGKILL)
+
+    def replaced() -> bool:
+        rig.watch()
+        return rig.status().live_view.pid != view.pid
+
+    assert eventually(replaced)
+    third, told = run("third", 0.1)
+    assert told[0].startswith("Live view: http://127.0.0.1:")
+    assert "The live process was killed by signal 9. It is restarted" in "\n".join(told)
+    assert (third.outcome, third.live_dropped) == ("complete", 0)
     rig.disconnect()
     assert find("sim") is None
     shown = [columns("/signals", "coupling_torque_nm") for columns in saver.recordings().values()]
@@ -90,18 +103,6 @@ def test_a_series_has_one_view_which_gets_every_sample(rig, run, save):
             and np.allclose(torque_nm[:, 0], samples["coupling_torque_nm"], rtol=0.0, atol=1e-12)
             for time_ns, torque_nm in shown
         )
-
-
-def test_a_view_that_does_not_begin_holds_no_stop_up(rig, order):
-    (pid,) = [process.pid for process in rig.status().processes if process.name == "live"]
-    os.kill(pid, signal.SIGSTOP)
-    stop = StopRequest()
-    threading.Timer(0.3, stop.request).start()
-    began_s = time.monotonic()
-    told = rig.show(order("held up"), stop)
-    assert stop.requested
-    assert time.monotonic() - began_s < live_view._ADDRESS_TIMEOUT_S
-    assert told.startswith("The live view is still starting")
 
 
 @pytest.mark.further  # as test_live_backlog.py
@@ -157,22 +158,6 @@ def test_a_full_disk_is_shown_as_a_fault_with_its_reason(rig, run, save):
     assert [text for text in said if text.startswith("# FAULT") and "cannot be written" in text]
 
 
-def test_a_view_that_dies_between_sessions_is_there_for_the_next(rig, run):
-    run("first")
-    before = rig.status().live_view
-    os.kill(before.pid, signal.SIGKILL)
-
-    def replaced() -> bool:
-        rig.watch()
-        return rig.status().live_view.pid != before.pid
-
-    assert eventually(replaced)
-    result, told = run("second")
-    assert told[0].startswith("Live view: http://127.0.0.1:")
-    assert "The live process was killed by signal 9. It is restarted" in "\n".join(told)
-    assert (result.outcome, result.live_dropped) == ("complete", 0)
-
-
 @pytest.mark.slow
 def test_a_view_that_dies_again_and_again_is_given_up_and_the_session_is_not(rig, run):
     killed = set()
@@ -207,13 +192,16 @@ class StillGroup:
         self.channels = SimpleNamespace(specs=None, rings=())
         self.started = 0
         self.silent_s = 0.0
+        self.asked = lambda: None
 
     def idle_process(self, process):
         self.started += 1
 
     def __getitem__(self, process):
         return SimpleNamespace(
-            messages=lambda timeout_s: [], kill=lambda: None, send=lambda message: None
+            messages=lambda timeout_s: self.asked() or [],
+            kill=lambda: None,
+            send=lambda message: None,
         )
 
     def stalled_s(self, process):
@@ -229,3 +217,17 @@ def test_one_that_is_only_starting_has_time_on_a_busy_computer(heard, patience_s
         group.silent_s += 0.1
         view.check()
     assert group.silent_s == pytest.approx(patience_s, abs=0.5)
+
+
+def test_a_view_that_does_not_begin_holds_no_stop_up(order):
+    group, stop, asked = StillGroup(), StopRequest(), []
+
+    def ask():
+        asked.append(1)
+        if len(asked) == 3:
+            stop.request()
+
+    group.asked = ask
+    view = live_view.LiveViewClient(group, "rig")
+    assert view.show(order("held up"), stop).startswith("The live view is still starting")
+    assert len(asked) == 4  # once more for what it shows

@@ -63,19 +63,6 @@ def test_sessions_leave_nothing_behind(publisher):
     assert resident_mb(pid) < before_mb + 10.0
 
 
-def test_a_server_that_has_seen_many_sessions_makes_room(start_publisher, receive, own_port):
-    publisher = start_publisher(first=f"{own_port}; outlet._MAX_SESSIONS = 2")
-    first = publisher.address
-    publisher.finish()
-    run_session(publisher, "second")
-    run_session(publisher, "third")
-    address = publisher.next_address()
-    assert address.server != first.server
-    assert address.grpc_port == first.grpc_port
-    columns = receive(publisher)()["recording of third"]
-    assert columns("/signals", "angle_mrad")[0].size > 100
-
-
 @pytest.mark.slow
 def test_a_session_that_begins_while_the_server_is_frozen_is_shown_when_it_goes_on(
     start_producer, start_publisher, receive

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cases import further
 from processes import eventually
 
 from rigd.beam import Beam
@@ -84,6 +83,7 @@ def first_sent_s(columns, word: str) -> float:
     return min(s for s, (text,) in zip(sent_s, texts, strict=True) if text.startswith(f"# {word}"))
 
 
+@pytest.mark.further  # as by the board, and in what is received
 def test_running_and_fault_are_shown_within_a_second(publisher, producer, receive):
     shared_state, told_s = producer.channels.shared_state, {"RUNNING": [], "FAULT": []}
     received = receive(publisher)
@@ -109,10 +109,27 @@ def test_running_and_fault_are_shown_within_a_second(publisher, producer, receiv
     assert "The drive was lost." in texts[-1][0]
 
 
-@pytest.mark.parametrize("off", [further(True), False])
-def test_a_lost_supervisor_is_named_and_whether_the_torque_is_off(
-    producer, start_publisher, save, off
-):
+def test_the_end_of_a_session_is_shown_with_its_reason(received):
+    shown = received["fault"]
+    assert words(shown)[-2:] == ["RUNNING", "FAULT"]
+    _, texts = shown.sent("/state", "TextDocument:text")
+    assert "The drive was lost." in texts[-1][0]
+
+
+def assert_supervisor_lost(columns, *, off):
+    assert words(columns)[-1] == "SUPERVISOR LOST"
+    _, texts = columns.sent("/state", "TextDocument:text")
+    assert ("the torque is off." in texts[-1][0]) is off
+    _, lines = columns("/events", "TextLog:text")
+    assert lines[-1][0].startswith("The supervising process ended")
+
+
+def test_a_lost_supervisor_is_named(received):
+    assert_supervisor_lost(received["lost"], off=False)
+
+
+@pytest.mark.further
+def test_a_lost_supervisor_is_named_with_the_torque_off(producer, start_publisher, save):
     publisher = start_publisher(
         first="from rigd.live import publisher as p; p._MAX_ORPHANED_S = 0.5"
     )
@@ -120,15 +137,10 @@ def test_a_lost_supervisor_is_named_and_whether_the_torque_is_off(
     shared_state[StateField.PHASE] = Phase.RUNNING
     saver = save(publisher.address)
     assert eventually(saver.has_begun)
-    if off:
-        shared_state[StateField.PHASE] = Phase.OFF
+    shared_state[StateField.PHASE] = Phase.OFF
     publisher.end()
     (columns,) = saver.recordings().values()
-    assert words(columns)[-1] == "SUPERVISOR LOST"
-    _, texts = columns.sent("/state", "TextDocument:text")
-    assert ("the torque is off." in texts[-1][0]) is off
-    _, lines = columns("/events", "TextLog:text")
-    assert lines[-1][0].startswith("The supervising process ended")
+    assert_supervisor_lost(columns, off=True)
 
 
 # Response of the last session

@@ -41,14 +41,31 @@ def shown_s(viewer):
     return ask
 
 
-def test_it_keeps_up_through_everything(publisher, viewer, shown_s):
-    def current() -> bool:
-        return shown_s() > publisher.producer.tick * 1e-3 - 1.5
+@pytest.fixture
+def current(publisher, shown_s):
+    """Whether it shows what has just come."""
+    return lambda: shown_s() > publisher.producer.tick * 1e-3 - 1.5
 
-    assert eventually(lambda: shown_s() > 1.0)
+
+def test_it_shows_the_newest_also_of_another_server(publisher, viewer, shown_s, current):
+    assert eventually(lambda: shown_s() > 0.5)
     assert eventually(current)
     addresses = {address for end in sockets(viewer.pid) for address in end.addresses}
     assert addresses == {"0100007F", "00000000"}, "127.0.0.1, and the far end of a listening socket"
+
+    # When the server is another one, it is brought back to the same session.
+    os.kill(publisher.server_pid, signal.SIGKILL)
+    address = publisher.next_address()
+    assert eventually(lambda: viewer.connect(address)), "while it is busy, it is asked again"
+    then_s = publisher.producer.tick * 1e-3
+    assert eventually(lambda: shown_s() > then_s)
+    assert eventually(current)
+    assert publisher.producer.refused == 0
+
+
+@pytest.mark.further  # as viewers that are no window, in test_live_publisher.py
+def test_it_keeps_up_when_it_stood_still_and_through_sessions(publisher, viewer, shown_s, current):
+    assert eventually(lambda: shown_s() > 1.0)
 
     # A window that stands still holds nobody up, and catches up.
     os.kill(viewer.pid, signal.SIGSTOP)
@@ -62,14 +79,6 @@ def test_it_keeps_up_through_everything(publisher, viewer, shown_s):
     begins = tuple(ring.written_count for ring in publisher.producer.channels.rings)
     publisher.show("second", begins)
     assert eventually(lambda: shown_s() > begins[-1] * 1e-3 + 0.2)
-
-    # When the server is another one, it is brought back to the same session.
-    os.kill(publisher.server_pid, signal.SIGKILL)
-    address = publisher.next_address()
-    assert eventually(lambda: viewer.connect(address)), "while it is busy, it is asked again"
-    then_s = publisher.producer.tick * 1e-3
-    assert eventually(lambda: shown_s() > then_s)
-    assert eventually(current)
     assert publisher.producer.refused == 0
 
 

@@ -13,8 +13,10 @@ import tomllib
 import urllib.request
 from pathlib import Path
 
+import check_jsonschema
 import pytest
 import yaml
+from click.testing import CliRunner
 
 PROJECT = Path(__file__).parents[2]
 WORKFLOW = PROJECT / ".github" / "workflows" / "tests.yml"
@@ -28,9 +30,9 @@ pytestmark = pytest.mark.process
     [("github-workflows", WORKFLOW), ("citation-file-format", PROJECT / "CITATION.cff")],
 )
 def test_a_file_has_the_form_that_its_reader_wants(schema, file):
-    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", f"vendor.{schema}"]
-    done = subprocess.run([*command, file], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    options = ["--builtin-schema", f"vendor.{schema}", str(file)]
+    done = CliRunner().invoke(check_jsonschema.main, options)
+    assert done.exit_code == 0, done.output
 
 
 def test_the_workflow_calls_what_there_is():
@@ -88,8 +90,19 @@ def free_port():
         return probe.getsockname()[1]
 
 
+COMMAND = re.findall(r"^CMD (\[.*\])$", DOCKERFILE, re.MULTILINE)
+
+
+def test_the_container_s_command_is_one(rigd_here):
+    ((program, *arguments),) = map(json.loads, COMMAND)
+    assert program == "rigd"
+    done = rigd_here(*arguments, "--help")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.further  # as tests/daemon and tests/web have it of such a command
 def test_the_container_s_command_serves_the_page(tmp_path):
-    (text,) = re.findall(r"^CMD (\[.*\])$", DOCKERFILE, re.MULTILINE)
+    (text,) = COMMAND
     port = str(free_port())
     command = json.loads(text.replace("8720", port).replace("/data", str(tmp_path / "data")))
     command[0] = shutil.which(command[0], path=str(Path(sys.executable).parent))

@@ -1,7 +1,7 @@
 """The analyser on systems without POSIX: its modules and its whole command line.
 
 On Windows and macOS the commands run as they are. On Linux `windows_like/sitecustomize.py` takes
-from `rigd` and `analysis` what Windows does not have.
+from `rigd` and `analysis` what Windows does not have, and all packages that they do not require.
 """
 
 import ast
@@ -10,12 +10,14 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import distribution, packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from packages import normalized, required_distributions
 
 from rigd.session import read_session
 from rigd.testing import PAPER_BEAM, chirp_signals, write_session
@@ -59,12 +61,23 @@ def missing_on_windows():
     return missing
 
 
+def not_required():
+    """Return the modules that are installed here, but not with `rigd` alone."""
+    required = required_distributions([distribution("rigd")]).keys() | {"rigd"}
+    return {
+        module
+        for module, names in packages_distributions().items()
+        if not {normalized(name) for name in names} & required
+    }
+
+
 @pytest.fixture(scope="module")
 def variables():
     if sys.platform != "linux":
         return os.environ | {"PYTHONIOENCODING": "cp1252"}
     return os.environ | {
         "MISSING_ON_WINDOWS": json.dumps(missing_on_windows()),
+        "MISSING_PACKAGES": json.dumps(sorted(not_required())),
         "PYTHONPATH": str(WINDOWS_LIKE),
         "PYTHONIOENCODING": "cp1252",  # what a pipe has there
     }
@@ -98,6 +111,41 @@ def python(variables, tmp_path):
     return run
 
 
+ALL_MODULES = """
+import importlib, pkgutil, analysis
+names = [each.name for each in pkgutil.walk_packages(analysis.__path__, "analysis.")]
+for name in names:
+    importlib.import_module(name)
+    module = importlib.import_module(name)
+    for public in getattr(module, "__all__", ()):
+        getattr(module, public)
+assert len(names) > 100
+"""
+
+
+ONE_AFTER_THE_OTHER = """
+import json, runpy, sys
+for program, *arguments in json.loads(sys.argv[1]):
+    sys.argv = [program, *arguments]
+    try:
+        runpy.run_module(program, run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        if end.code:
+            raise
+"""
+
+
+@pytest.fixture
+def run_commands(python):
+    """Run commands in one process, once it has imported every module of the analyser."""
+
+    def run(*commands):
+        texts = [list(map(str, command)) for command in commands]
+        return python("-c", ALL_MODULES + ONE_AFTER_THE_OTHER, json.dumps(texts))
+
+    return run
+
+
 @pytest.fixture
 def analyze(python):
     return lambda *arguments: python("-m", "analysis", *arguments)
@@ -115,6 +163,7 @@ def analyze(python):
         ("open('/proc/self/stat')", "No such file"),
         ("open('12:30.mcap', 'w')", "filename"),
         ("f = open('a', 'w'); import os; os.remove('a')", "used by another process"),
+        ("import canopen", "canopen"),
     ],
 )
 def test_the_simulation_refuses_what_windows_does_not_have(variables, tmp_path, code, words):
@@ -126,52 +175,32 @@ def test_the_simulation_refuses_what_windows_does_not_have(variables, tmp_path, 
     assert words in done.stderr.splitlines()[-1]
 
 
-ALL_MODULES = """
-import importlib, pkgutil, analysis
-names = [each.name for each in pkgutil.walk_packages(analysis.__path__, "analysis.")]
-for name in names:
-    importlib.import_module(name)
-    module = importlib.import_module(name)
-    for public in getattr(module, "__all__", ()):
-        getattr(module, public)
-print(len(names))
-"""
-
-
-def test_every_module_of_the_analyser_can_be_imported(python):
-    assert int(python("-c", ALL_MODULES)) > 100
-
-
-def test_a_session_is_analysed_and_reported(analyze, sessions, tmp_path):
+def test_every_module_can_be_imported_and_the_commands_run(run_commands, sessions, tmp_path):
     (tmp_path / "report").mkdir()  # an empty folder is taken
-    analyze(
-        sessions / "0.mcap", "--method", "welch", "--types", "I", "--weights", "const",
-        "--report", "report", "--json", "fits.json", "--figures", "svg",
+    said = run_commands(
+        ("rigd", "list", sessions),
+        ("rigd", "info", sessions / "0.mcap"),
+        ("analysis", sessions / "0.mcap", "--method", "welch", "--types", "I", "--weights", "const",
+         "--report", "report", "--json", "fits.json", "--figures", "svg"),
+        ("analysis", "export", "record", sessions / "0.mcap", "record.csv"),
+        ("analysis", "import", "record.csv", "imported.mcap",
+         "--profile", PROJECT / "hw_profiles" / "sim.toml", "--time", "time_s:s",
+         "--angle", "angle_rad:rad", "--torque", "coupling_torque_nm:N.m", "--sweep", "1,31"),
+        ("analysis", "export", "frf", "imported.mcap", "frf.mat"),
     )  # fmt: skip
+    assert "2.mcap" in said
+    assert "rate" in said
     assert (tmp_path / "report" / "figures" / "welch_frf.svg").stat().st_size > 10_000
     assert json.loads((tmp_path / "fits.json").read_text("utf-8"))["fits"]
     assert not list(tmp_path.glob(".*"))  # nothing temporary remains
-
-
-def test_records_are_exported_and_imported(analyze, sessions, tmp_path):
-    analyze("export", "record", sessions / "0.mcap", "record.csv")
-    analyze(
-        "import", "record.csv", "imported.mcap", "--profile", PROJECT / "hw_profiles" / "sim.toml",
-        "--time", "time_s:s", "--angle", "angle_rad:rad", "--torque", "coupling_torque_nm:N.m",
-        "--sweep", "1,31",
-    )  # fmt: skip
     imported, original = read_session(tmp_path / "imported.mcap"), read_session(sessions / "0.mcap")
     for field in ("angle_rad", "coupling_torque_nm"):
         assert np.array_equal(imported.samples[field], original.samples[field])
-    analyze("export", "frf", "imported.mcap", "frf.mat")
     assert (tmp_path / "frf.mat").stat().st_size > 1000
 
 
-def test_of_rigd_the_file_tools_work(python, sessions, variables):
-    assert "2.mcap" in python("-m", "rigd", "list", sessions)
-    assert "rate" in python("-m", "rigd", "info", sessions / "0.mcap")
-    if sys.platform == "darwin":
-        return
+@pytest.mark.skipif(sys.platform == "darwin", reason="it runs there")
+def test_a_session_needs_linux(sessions, variables):
     done = subprocess.run(
         [sys.executable, "-m", "rigd", "run", "chirp", "--fast"],
         cwd=sessions, env=variables, capture_output=True, text=True, check=False,

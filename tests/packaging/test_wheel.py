@@ -1,7 +1,6 @@
 """The wheel, installed apart from the checkout: what it holds is enough to run and to analyse."""
 
 import os
-import re
 import subprocess
 import sys
 import venv
@@ -10,8 +9,7 @@ from importlib.metadata import Distribution, distribution
 from pathlib import Path
 
 import pytest
-from cases import further
-from packaging.requirements import Requirement
+from packages import required_distributions
 
 from rigd.testing import chirp_signals, write_session
 
@@ -69,21 +67,6 @@ def installed(wheel, tmp_path_factory):
     return folder
 
 
-def required(distributions):
-    """Return the distributions that some require, without extras, and those that these require."""
-    found = {}
-    waiting = list(distributions)
-    while waiting:
-        for text in waiting.pop().requires or ():
-            requirement = Requirement(text)
-            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
-                name = re.sub(r"[-_.]+", "-", requirement.name.lower())
-                if name not in found:
-                    found[name] = distribution(requirement.name)
-                    waiting.append(found[name])
-    return found
-
-
 @pytest.fixture(scope="module")
 def bare(wheel, made_once):
     """An environment with the wheel and what it requires, without any extra."""
@@ -97,7 +80,7 @@ def bare(wheel, made_once):
             folder=folder,
         )
         (metadata,) = packages.glob("rigd-*.dist-info")
-        for each in required([Distribution.at(metadata)]).values():
+        for each in required_distributions([Distribution.at(metadata)]).values():
             for name in {file.parts[0] for file in each.files} - {".."}:
                 if not (packages / name).exists():
                     (packages / name).symlink_to(each.locate_file(name))
@@ -105,6 +88,7 @@ def bare(wheel, made_once):
     return made_once("bare", make)
 
 
+@pytest.mark.further  # as in test_other_systems.py
 def test_the_analyser_needs_no_extra(bare, tmp_path):
     signals = chirp_signals(sweep_s=30.0, ring_down_s=5.0, rate_hz=250.0, start_hz=0.5)
     session = write_session(tmp_path / "session.mcap", signals)
@@ -124,37 +108,59 @@ def test_the_analyser_needs_no_extra(bare, tmp_path):
     assert "antenna_can" in here("rigd", "profiles")
 
 
-def test_the_analyser_is_small(bare):
+def test_the_analyser_is_small(wheel):
     """Without what Python compiles: docs/platforms.md."""
-    (metadata,) = bare.glob("lib/python3*/site-packages/rigd-*.dist-info")
-    installed = Distribution.at(metadata)
-    files = [
-        Path(each.locate_file(file))
-        for each in (installed, *required([installed]).values())
-        for file in each.files
-        if file.suffix != ".pyc"
-    ]
-    assert 100e6 < sum(file.stat().st_size for file in files if file.exists()) < 350e6
+    others = required_distributions([distribution("rigd")]).values()
+    files = [Path(each.locate_file(file)) for each in others for file in each.files]
+    sizes = [file.stat().st_size for file in files if file.suffix != ".pyc" and file.exists()]
+    own = sum(each.file_size for each in zipfile.ZipFile(wheel).infolist())
+    assert 100e6 < sum(sizes) + own < 350e6
 
 
-@pytest.mark.parametrize(
-    ("command", "subject", "extra"),
-    [
-        (("rigd", "run", "chirp", "--fast", "--live"), "--live", "live"),
-        further(("rigd", "serve", "--profile", "sim", "--web"), "The page", "rig"),
-        (("rigd", "check", "--profile", "sim"), "This command", "rig"),
-        (("rigd", "run", "chirp", "--profile", "antenna_can"), "The rig antenna_can", "rig"),
-        (("analyze", "session.mcap", "--rerun", "session.rrd"), "--rerun", "live"),
-    ],
-)
-def test_a_missing_extra_is_named(bare, tmp_path, command, subject, extra):
+EXTRAS_OF_COMMANDS = [
+    (("rigd", "run", "chirp", "--fast", "--live"), "--live", "live"),
+    (("rigd", "serve", "--profile", "sim", "--web"), "The page", "rig"),
+    (("rigd", "run", "chirp", "--profile", "antenna_can"), "The rig antenna_can", "rig"),
+    (("analyze", "session.mcap", "--rerun", "session.rrd"), "--rerun", "live"),
+]
+CHECK = (("rigd", "check", "--profile", "sim"), "This command", "rig")
+
+
+def assert_extra_named(done, subject, extra):
+    assert done.returncode == 1, done.stdout + done.stderr
+    message = f"Error: {subject} needs optional packages: pip install 'rigd[{extra}]'."
+    assert done.stderr.splitlines()[-1] == message
+
+
+@pytest.mark.parametrize(("command", "subject", "extra"), EXTRAS_OF_COMMANDS)
+def test_a_missing_extra_is_named(
+    rigd_here, analyze_here, tmp_path, monkeypatch, command, subject, extra
+):
+    write_session(tmp_path / "session.mcap", chirp_signals(sweep_s=2.0, ring_down_s=0.5))
+    monkeypatch.setattr("rigd.extras.find_spec", lambda _: None)
+    program, *options = command
+    run_command = rigd_here if program == "rigd" else analyze_here
+    assert_extra_named(run_command(*options), subject, extra)
+    assert not list(tmp_path.rglob("*.mcap*"))[1:]  # nothing has run
+
+
+def test_a_module_that_is_missed_on_import_is_named(tmp_path):
+    command, *named = CHECK
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(('can', 'canopen', 'serial', 'aiohttp')))\n"
+        f"sys.argv[:] = {list(command)}; from rigd.__main__ import main; main()"
+    )
+    assert_extra_named(completed(sys.executable, "-c", code, folder=tmp_path), *named)
+
+
+@pytest.mark.further
+@pytest.mark.parametrize(("command", "subject", "extra"), [*EXTRAS_OF_COMMANDS, CHECK])
+def test_an_extra_that_is_not_installed_is_named(bare, tmp_path, command, subject, extra):
     write_session(tmp_path / "session.mcap", chirp_signals(sweep_s=2.0, ring_down_s=0.5))
     runtime = {"XDG_RUNTIME_DIR": str(tmp_path)}
     program, *options = command
     done = completed(bare / "bin" / program, *options, folder=tmp_path, **runtime)
-    assert done.returncode == 1, done.stdout + done.stderr
-    message = f"Error: {subject} needs optional packages: pip install 'rigd[{extra}]'."
-    assert done.stderr.splitlines()[-1] == message
+    assert_extra_named(done, subject, extra)
     assert not list(tmp_path.rglob("*.mcap*"))[1:]  # nothing has run
 
 

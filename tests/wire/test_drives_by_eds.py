@@ -32,6 +32,7 @@ def test_a_drive_with_torque_mode_runs_fails_is_reset_and_runs_again(
     assert again.is_successful, again.reason
 
 
+@pytest.mark.further  # as tests/devices/cia402/test_cia402_setup.py has it
 def test_a_drive_without_torque_mode_is_refused_by_name(quiet_profile, start_simulator, load):
     path = quiet_profile("antenna_can")
     start_simulator(path, "--lock-step", "--eds", eds_path("pilz_prbt"))

@@ -146,7 +146,7 @@ def test_every_row_has_its_message():
     [pytest.param(row, marks=marks(row), id=named(row)) for row in rows(FATAL)],
 )
 def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
-    row, quiet_profile, start_simulator, run_order, load, drive_log, tmp_path
+    row, quiet_profile, start_simulator, run_order, load, drive_log, tmp_path, monkeypatch
 ):
     shortened = MESSAGES[row.name].endswith(f"{STALE} ticks")
     values = {"limits.stale_ticks_in_a_row": str(STALE)} if shortened else {}
@@ -170,8 +170,11 @@ def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
 
     rig = load(profile).rig
     if row.name in UNTIL_MENDED:
-        with pytest.raises(DeviceError, match=UNTIL_MENDED[row.name]) as refused:
-            reset_drive(rig)
+        with monkeypatch.context() as brief:
+            brief.setattr("rigd.devices.cia402._sdo._SDO_TIMEOUT_S", 0.1)
+            brief.setattr("rigd.devices.cia402._switch_off._FIRST_ANSWER_TIMEOUT_S", 0.2)
+            with pytest.raises(DeviceError, match=UNTIL_MENDED[row.name]) as refused:
+                reset_drive(rig)
         assert READY not in str(refused.value)
     inject(rig.name, ["end"])
     if "`rigd reset`" in row.back:
@@ -182,7 +185,7 @@ def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
         assert READY in told
     else:
         assert "start again" in row.back
-    following = run_order(load(profile), "next", fast=True, **CHIRP | {"duration_s": 0.5})
+    following = run_order(load(profile), "next", fast=True, **CHIRP | {"duration_s": 0.1})
     assert following.is_successful, following.reason
     assert following.recorded == following.scheduled
     simulator.terminate()

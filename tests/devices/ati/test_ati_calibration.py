@@ -157,7 +157,7 @@ entries = st.floats(-1e4, 1e4, width=32)
 gauges = st.integers(-32768, 32767)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     matrix=st.lists(st.lists(entries, min_size=6, max_size=6), min_size=6, max_size=6),
     counts=st.tuples(st.integers(10**5, 2**31 - 1), st.integers(10**5, 2**31 - 1)),
@@ -192,7 +192,7 @@ def test_text():
     assert printable_text(b"A\xb0B") == "41 b0 42"
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.binary(max_size=32))
 def test_text_is_always_printable(raw):
     assert printable_text(raw).isprintable()
@@ -223,7 +223,7 @@ def test_an_empty_calibration_block_is_refused(fill):
         parse_block([fill] * 133)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.lists(st.integers(0, 0xFFFF), min_size=133, max_size=133), st.booleans())
 def test_any_calibration_block_is_read_or_refused_in_words(registers, sound_units):
     if sound_units:

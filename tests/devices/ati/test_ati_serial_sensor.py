@@ -416,7 +416,13 @@ def test_measuring(open_sensor, digital_ft, fakes):
     assert sensor.measure(0.02)["checksum_errors"] == 1
 
 
-def test_a_silent_sensor(open_sensor, digital_ft, monkeypatch):
+@pytest.fixture
+def impatient(monkeypatch):
+    """Have late replies awaited for no longer than a fake sensor takes."""
+    monkeypatch.setattr("rigd.devices.ati._serial_setup._LATE_REPLY_S", 0.05)
+
+
+def test_a_silent_sensor(impatient, open_sensor, digital_ft, monkeypatch):
     monkeypatch.setattr("rigd.devices.ati._serial_setup._REPLY_TIMEOUT_S", 0.02)
     digital_ft.silent = True
     message = refusal(open_sensor())
@@ -425,13 +431,13 @@ def test_a_silent_sensor(open_sensor, digital_ft, monkeypatch):
     assert "ati_serial.baud" in message
 
 
-def test_a_disturbed_reply_is_asked_for_again(open_sensor, digital_ft):
+def test_a_disturbed_reply_is_asked_for_again(impatient, open_sensor, digital_ft):
     digital_ft.damage_next = 2
     open_sensor().connect()
     assert digital_ft.log.count("0a 03 00 1d 00 01 15 77") == 4
 
 
-def test_replies_that_stay_disturbed(open_sensor, digital_ft):
+def test_replies_that_stay_disturbed(impatient, open_sensor, digital_ft):
     digital_ft.damage_next = 9
     assert "checksum of the reply is wrong" in refusal(open_sensor())
 

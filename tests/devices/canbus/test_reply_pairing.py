@@ -58,7 +58,7 @@ class Line:
         return self.inbox.number == self.number
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(
     st.lists(
         st.tuples(st.sampled_from(["whole"] * 3 + ["held", "lost"]), st.booleans()), max_size=60
@@ -71,7 +71,7 @@ def test_no_old_reading_counts_as_fresh_while_late_replies_catch_up(events):
             assert line.right()
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(
     late=st.integers(1, 8),
     before=st.lists(st.sampled_from(["whole"] * 5 + ["lost"]), max_size=20),
@@ -82,7 +82,7 @@ def test_replies_that_are_late_for_good_never_count(late, before):
     for event in before:
         if line.tick(event):
             assert line.right()
-    for _ in range(100):
+    for _ in range(30):
         assert not line.tick(late=late)
 
 

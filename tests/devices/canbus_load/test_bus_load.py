@@ -51,7 +51,7 @@ def bits_per_second(frames, data_of):
     return sum(each.rate_hz * bits_on_the_wire(each.can_id, data_of(each)) for each in frames)
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(st.data())
 def test_the_load_of_any_data_lies_between_plain_and_worst(can_rig, data):
     load = bus_load(can_rig)

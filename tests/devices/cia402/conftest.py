@@ -407,3 +407,10 @@ def make_drive(scripted, link_to):
 @pytest.fixture
 def drive(make_drive, rig):
     return make_drive(rig)
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """Have a reply that does not come awaited for no longer than where there is no time."""
+    monkeypatch.setattr("rigd.devices.cia402._sdo._SDO_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("rigd.devices.cia402._switch_off._FIRST_ANSWER_TIMEOUT_S", 0.1)

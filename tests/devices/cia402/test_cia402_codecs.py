@@ -161,7 +161,7 @@ def test_every_error_code_has_words_of_its_class():
         "Additional Functions": "additional function",
         "Device Specific": "see its manual",
     }
-    for code in range(0x10000):
+    for code in range(0, 0x10000, 0x11):  # of each class, with every low byte
         theirs = EmcyError(code, 0, b"", 0).get_desc()
         words = protocol.describe_error(code)
         assert f"0x{code:04X}" in words

@@ -120,7 +120,7 @@ def test_heartbeats_go_out_by_the_ticks_time(ticks, scripted):
 
 
 def test_a_lost_reply_makes_ticks_stale_until_it_cannot_be_late_any_more(make_drive, rig, scripted):
-    quick = replace(rig, acquisition=Acquisition("same_tick", 2e5))
+    quick = replace(rig, acquisition=Acquisition("same_tick", 1e5))
     drive = make_drive(quick)
     drive.connect()
     ticks = Ticks(drive)
@@ -136,7 +136,7 @@ def test_a_lost_reply_makes_ticks_stale_until_it_cannot_be_late_any_more(make_dr
 
 
 def test_a_late_reply_is_never_taken_for_the_next_ticks(make_drive, rig, scripted):
-    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e5)))
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e5)))
     drive.connect()
     ticks = Ticks(drive)
     scripted.hold = 1
@@ -231,7 +231,7 @@ def test_in_lock_step_a_lost_reply_leaves_a_doubt(make_drive, rig, scripted):
 
 
 def test_a_reply_that_comes_between_the_ticks_does_not_count(make_drive, rig, scripted):
-    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e5)))
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e5)))
     drive.connect()
     ticks = Ticks(drive)
     scripted.hold = 1
@@ -275,7 +275,7 @@ def test_a_lost_reply_in_the_mode_of_the_tick_before(make_drive, rig, scripted):
 
 @pytest.mark.parametrize("garbage", ["", "50", "5002E8030000", "5002E80300000000" + "00"])
 def test_a_reply_of_the_wrong_length_has_no_angle(make_drive, rig, scripted, garbage):
-    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e5)))
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e5)))
     drive.connect()
     ticks = Ticks(drive)
     ticks(2)
@@ -372,7 +372,7 @@ def falls_silent(scripted):
     ],
 )
 def test_what_ends_a_session(make_drive, rig, scripted, happens, words):
-    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e5)))
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e5)))
     drive.connect()
     ticks = Ticks(drive)
     ticks(5)
@@ -413,7 +413,7 @@ def test_silence_is_told_as_soon_as_it_is_too_long(ticks, drive, scripted):
 
 
 def test_without_its_supply_a_drive_says_nothing_for_a_command(make_drive, rig, scripted):
-    ticks = Ticks(make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e5))))
+    ticks = Ticks(make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e5))))
     ticks.drive.connect()
     ticks.drive.enable()
     ticks(5, torque_nm=0.1)

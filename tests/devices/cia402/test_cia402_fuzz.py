@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from cases import further
 
 from rigd.devices.canbus import CanExchange
 from rigd.devices.parameters import Acquisition
@@ -20,7 +21,7 @@ def load():
     return module
 
 
-@pytest.mark.parametrize("mode", ["same_tick", "previous_tick"])
+@pytest.mark.parametrize("mode", ["same_tick", further("previous_tick")])
 def test_only_device_errors_leave_the_driver(rig, settings, mode):
     fuzzer = load()
     quick = replace(

@@ -9,6 +9,7 @@ from math import tau
 import can
 import canopen
 import pytest
+from cases import further
 
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.cia402.requirements import (
@@ -240,12 +241,20 @@ def test_zero_in_the_profile_accepts_any_drive(make_drive, rig, settings, script
     assert drive.identity()["rated_torque_counts"] is None
 
 
+PLACES = [
+    (0x1006, 0), (0x1A00, 0), (0x60C2, 1), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x1029, 1),
+    (0x6072, 0), (0x6060, 0), (0x1400, 1), (0x1800, 2), (0x1801, 1),
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "place",
-    [(0x1006, 0), (0x60C2, 1), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x1029, 1), (0x6072, 0),
-     (0x6060, 0), (0x1400, 1), (0x1800, 2), (0x1A00, 0), (0x1801, 1)],
-)  # fmt: skip
-@pytest.mark.parametrize("how", ["refuses", "keeps"])
+    ("place", "how"),
+    [
+        *((place, "keeps") for place in PLACES),
+        *((place, "refuses") for place in PLACES[:2]),
+        *(further(place, "refuses") for place in PLACES[2:]),
+    ],
+)
 def test_an_object_that_does_not_take_its_value(drive, scripted, place, how):
     scripted.objects |= {(0x1029, 1): 2, (0x60C2, 2): 0, (0x1006, 0): 4000}
     index, sub = place
@@ -377,7 +386,7 @@ class TestResettingADriveThatTurns:
         assert sdo
         assert turning.state == "switch-on disabled"
 
-    def test_nobody_answers(self, drive, turning):
+    def test_nobody_answers(self, impatient, drive, turning):
         turning.silent = True
         with pytest.raises(DeviceError, match=r"no answer on CAN bus can0 .* not shown that .*STO"):
             drive.reset_fault()
@@ -394,7 +403,7 @@ class TestResettingADriveThatTurns:
         assert (turning.state, turning.torque) == ("switch-on disabled", 0)
 
     def test_an_adapter_that_goes_on_failing_is_told_with_what_was_not_seen(
-        self, drive, turning, failing_bus
+        self, impatient, drive, turning, failing_bus
     ):
         failing_bus({can_id: [RuntimeError("a library's own")] * 1000 for can_id in (0x605, 0x000)})
         with pytest.raises(DeviceError, match=r"a library's own.*not shown that .*STO"):
@@ -417,7 +426,7 @@ def failing_bus(monkeypatch):
     return fail
 
 
-@pytest.mark.parametrize("late", [1, 2])
+@pytest.mark.parametrize("late", [1, further(2)])
 def test_replies_that_come_late_are_not_taken_for_the_next_ones(drive, scripted, late):
     """The first command is given up after 50 ms; its reply comes when another one is awaited."""
     answer, kept = scripted._sdo, []
@@ -442,7 +451,7 @@ def test_a_drive_that_answers_slowly_after_a_reply_that_came_late(drive, scripte
 
     def slow(data):
         heard.append(data)
-        time.sleep(0.12 if len(heard) == 1 else 0.01)  # the first is given up after 50 ms
+        time.sleep(0.12 if len(heard) == 1 else 0.004)  # the first is given up after 50 ms
         answer(data)
 
     scripted._sdo = slow
@@ -492,20 +501,20 @@ def test_a_fault_whose_cause_stands(drive, scripted):
         drive.reset_fault()
 
 
-def test_no_drive_on_the_bus(drive, scripted):
+def test_no_drive_on_the_bus(impatient, drive, scripted):
     scripted.silent = True
     with pytest.raises(DeviceError, match=r"no answer on CAN bus can0.*cia402\.node_id"):
         drive.connect()
 
 
-def test_others_on_the_bus_are_named(make_drive, rig, settings, scripted):
+def test_others_on_the_bus_are_named(impatient, make_drive, rig, settings, scripted):
     drive = make_drive(replace(rig, cia402=replace(settings, node_id=6)))
     with pytest.raises(DeviceError, match=r"node 6.*frames came from node 5"):
-        threading.Timer(0.2, scripted.heartbeat).start()
+        threading.Timer(0.05, scripted.heartbeat).start()
         drive.connect()
 
 
-def test_a_bus_that_is_cut_in_the_middle(drive, scripted):
+def test_a_bus_that_is_cut_in_the_middle(impatient, drive, scripted):
     def cut(can_id, data, take=scripted._take):
         if can_id == 0x605 and data[1:3] == b"\x06\x10":
             scripted.cut()

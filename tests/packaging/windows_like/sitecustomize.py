@@ -1,5 +1,7 @@
 """Make the interpreter resemble Python on Windows to `rigd` and `analysis`.
 
+Packages of MISSING_PACKAGES are not installed.
+
 Python imports this module at its start if its folder is in PYTHONPATH, so worker processes have it
 as well. Other packages exist for Windows, and see the real system. What remains of this system:
 `sys.platform`, separators of paths, and start of processes.
@@ -82,6 +84,7 @@ def refuse(event, arguments):
 
 
 modules = {}
+sys.modules.update(dict.fromkeys(json.loads(os.environ["MISSING_PACKAGES"])))
 builtins.__import__ = windows_import
 os.rename = windows_rename
 sys.addaudithook(refuse)
