@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from cases import further
 from typer.testing import CliRunner
 
 from rigd.cli.app import app
@@ -69,10 +70,11 @@ def test_a_dead_device_fails_with_its_message(rigd, stand_ins, silent):
 @pytest.mark.parametrize(
     ("old", "new", "word"),
     [
-        ("base_id = { value = 0x68", "base_id = { value = 0x20", "RPDO1"),
-        ("value = 1_000_000, source", "value = 500_000, source", "% at worst"),
+        pytest.param(
+            "base_id = { value = 0x68", "base_id = { value = 0x20", "RPDO1", id="identifiers"
+        ),
+        further("value = 1_000_000, source", "value = 500_000, source", "% at worst", id="load"),
     ],
-    ids=["identifiers", "load"],
 )
 def test_a_bus_that_cannot_be_right_is_left_alone(
     rigd, stand_ins, can_profile, tmp_path, old, new, word
