@@ -32,7 +32,7 @@ def bands_of(made):
 @pytest.fixture(scope="module")
 def make(document_of_modes, rig):
     return partial(
-        excitation.modes, rate_hz=1000.0, path=document_of_modes, duration_s=61.234, rest_s=2.0,
+        excitation.modes, rate_hz=1000.0, path=document_of_modes, duration_s=31.234, rest_s=2.0,
         ring_down_s=7.5, rig=rig,
     )  # fmt: skip
 
@@ -45,11 +45,11 @@ def made(make):
 def test_it_takes_the_time_asked_for_to_the_tick(made):
     assert made.segments == {
         "rest": (0, 2000),
-        "sweep": (2000, 63_234),
-        "ring_down": (63_234, 70_734),
+        "sweep": (2000, 33_234),
+        "ring_down": (33_234, 40_734),
     }
-    assert made.reference_rad.shape == (70_734,)
-    assert sum(row[3] for row in bands_of(made)) == pytest.approx(61.234, abs=1e-3)
+    assert made.reference_rad.shape == (40_734,)
+    assert sum(row[3] for row in bands_of(made)) == pytest.approx(31.234, abs=1e-3)
     assert not made.reference_rad[:2001].any()
     assert abs(made.reference_rad[-1]) < 1e-6
 
@@ -104,7 +104,7 @@ def test_what_rings_longest_comes_first_and_modes_above_are_left_out(document):
 
 @pytest.mark.parametrize("amplitude_rad", [further(0.025), 0.3])
 def test_the_planning_lets_the_amplitudes_through(document, profile, amplitude_rad):
-    options = {"path": document(), "amplitude_rad": amplitude_rad, "duration_s": 60.0}
+    options = {"path": document(), "amplitude_rad": amplitude_rad, "duration_s": 24.0}
     made = excitation_for(profile, "modes", options)
     plan = plan_session(profile, made)
     assert plan.warnings == ()
@@ -120,7 +120,7 @@ def test_a_tighter_limit_lowers_the_amplitude_of_the_band_that_reaches_it(docume
     limits = replace(profile.limits, tracking_error_rad=0.02)
     profile, tight = (with_tip_slope(replace(profile, limits=each), 10.0) for each in
                       (profile.limits, limits))  # fmt: skip
-    options = {"path": document(), "duration_s": 60.0}
+    options = {"path": document(), "duration_s": 24.0}
     free, held = (bands_of(excitation_for(p, "modes", options)) for p in (profile, tight))
     assert [row[2] for row in free] == pytest.approx([0.025] * 3, rel=0.05)
     assert held[2][2] < 0.018
@@ -132,7 +132,7 @@ def test_a_tighter_limit_lowers_the_amplitude_of_the_band_that_reaches_it(docume
 def test_the_amplitudes_keep_the_limit_of_the_tip_s_slope(document, profile, limit_rad):
     """Each of the three sweeps comes as near to it as it may."""
     rig = with_tip_slope(profile, limit_rad)
-    options = {"path": document(), "duration_s": 60.0}
+    options = {"path": document(), "duration_s": 24.0}
     made = excitation_for(rig, "modes", options)
     plan = plan_session(rig, made)
     limit_rad = limit_rad or SMALL_SLOPE_RAD

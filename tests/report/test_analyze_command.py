@@ -58,11 +58,28 @@ def long_session(paper_file, tmp_path):
     return shutil.copy(paper_file, tmp_path / "session.mcap")
 
 
-@pytest.mark.process
-def test_a_session_becomes_a_report(session, tmp_path):
-    result = run(session.name, "--json", "fits.json", "--segment", "5000", cwd=tmp_path)
+@pytest.mark.fit
+def test_a_part_of_a_session_becomes_a_report_that_states_it(
+    session, tmp_path, analyze_here, without_drawing
+):
+    with without_drawing():
+        result = analyze_here(
+            session.name, "--to", "20", "--json", "fits.json", "--segment", "5000"
+        )
     content = assert_whole(result, tmp_path)
-    assert [mode["mode"] for mode in content["modes"] if mode["estimator"] == "record"] == [1, 2, 3]
+    part = {"from_s": 0.0, "to_s": 20.0}
+    (headline,), (file,), (from_record,) = (
+        content[key] for key in ("headlines", "files", "records")
+    )
+    assert (headline["part"], file["part"]) == (part, part)
+    assert from_record["verdict"][0] == "All results are of 0 to 20 s of the session."
+    assert result.stdout.startswith(from_record["verdict"][0])
+    page = (tmp_path / "session.report" / "report.html").read_text()
+    assert "0 to 20 s of the session" in page
+    # The sweep is at 48.75 Hz then, and no fit uses what lies beyond.
+    assert any("48.75" in warning for warning in file["warnings"])
+    frequencies_hz = [mode["frequency_hz"]["value"] for mode in headline["modes"]]
+    assert frequencies_hz == pytest.approx([2.57, 16.01, 44.83], abs=0.02)
 
 
 @pytest.mark.process
@@ -73,6 +90,8 @@ def test_one_session_from_end_to_end(long_session, tmp_path):
         cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     content = assert_whole(result, tmp_path)
+    for picture in (tmp_path / "session.report" / "figures").iterdir():
+        assert ET.parse(picture).getroot().findall(".//{*}path")
     assert len(result.stdout.splitlines()) <= 30
     of_paper = [fit for fit in content["fits"] if fit["estimator"] == "welch"]
     best = min(of_paper, key=lambda fit: fit["indices"]["wmse"])
@@ -95,10 +114,7 @@ def assert_whole(result, folder):
     assert sorted(path.name for path in report.iterdir()) == [
         "SHA256SUMS", "analysis.json", "figures", "report.html", "tables", "tables.txt",
     ]  # fmt: skip
-    pictures = list((report / "figures").iterdir())
-    assert len(pictures) == 6
-    for picture in pictures:
-        assert ET.parse(picture).getroot().findall(".//{*}path")
+    assert len(list((report / "figures").iterdir())) == 6
     content = json.loads((folder / "fits.json").read_text())
     assert content == json.loads((report / "analysis.json").read_text())
     of_paper = [fit for fit in content["fits"] if fit["estimator"] == "welch"]
@@ -116,31 +132,6 @@ def assert_whole(result, folder):
     ]  # fmt: skip
     assert "Resonant peaks" not in result.stdout
     return content
-
-
-@pytest.mark.fit
-def test_the_numbers_of_a_part_state_it(session, tmp_path, analyze_here, without_drawing):
-    with without_drawing():
-        result = analyze_here(
-            session.name, "--to", "20", "--json", "fits.json", "--report", "out",
-            "--types", "VI", "--weights", "omega", "--segment", "5000",
-        )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    part = {"from_s": 0.0, "to_s": 20.0}
-    content = json.loads((tmp_path / "fits.json").read_text())
-    (headline,), (file,), (from_record,) = (
-        content["headlines"],
-        content["files"],
-        content["records"],
-    )
-    assert (headline["part"], file["part"]) == (part, part)
-    assert from_record["verdict"][0] == "All results are of 0 to 20 s of the session."
-    assert result.stdout.startswith(from_record["verdict"][0])
-    assert "0 to 20 s of the session" in (tmp_path / "out" / "report.html").read_text()
-    # The sweep is at 48.75 Hz then, and no fit uses what lies beyond.
-    assert any("48.75" in warning for warning in file["warnings"])
-    frequencies_hz = [mode["frequency_hz"]["value"] for mode in headline["modes"][:2]]
-    assert frequencies_hz == pytest.approx([2.57, 16.01], abs=0.01)
 
 
 @pytest.mark.parametrize(

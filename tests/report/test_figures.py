@@ -43,7 +43,7 @@ def count(image, colour):
     [
         (paper_signals_figure, (style.ORANGE, style.BLUE, style.GREEN)),
         further(frf_figure, (style.BLUE, style.VERMILION, style.GREY)),
-        (torque_figure, (style.BLUE, style.VERMILION, style.GREY)),
+        further(torque_figure, (style.BLUE, style.VERMILION, style.GREY)),
     ],
 )
 def test_a_figure_shows_its_lines(paper_analysis, tmp_path, draw, colours):
@@ -127,7 +127,9 @@ def test_the_torque_of_the_true_structure_is_followed(paper_analysis):
 
 
 @pytest.mark.fit
-@pytest.mark.parametrize("draw", [paper_signals_figure, frf_figure, torque_figure])
+@pytest.mark.parametrize(
+    "draw", [further(paper_signals_figure), frf_figure, further(torque_figure)]
+)
 def test_no_figure_has_the_name_of_a_file(paper_analysis, draw):
     with style.figure_style():
         figure = draw(paper_analysis)
@@ -326,7 +328,7 @@ def test_each_mode_has_a_stretch_round_the_moment_the_chirp_passes_it(paper_anal
 
 
 @pytest.mark.fit
-@pytest.mark.parametrize("draw", [paper_signals_figure, torque_figure])
+@pytest.mark.parametrize("draw", [further(paper_signals_figure), torque_figure])
 def test_marks_have_the_numbers_and_the_extent_of_the_enlargements(paper_analysis, draw):
     with style.figure_style():
         figure = draw(paper_analysis)

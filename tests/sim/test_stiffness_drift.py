@@ -65,10 +65,10 @@ OVER_DAMPED = (Damping(zeta=1.075e-3), {})
 @pytest.mark.parametrize(
     ("damping", "more", "rate"),
     [
-        *((*rig, FASTEST) for rig in (TIP_MASS, CLAMP, FILTER, DAMPED)),
-        *((*rig, -FASTEST) for rig in (BARE, OVER_DAMPED)),
-        *(further(*rig, -FASTEST) for rig in (TIP_MASS, CLAMP, FILTER, DAMPED)),
-        *(further(*rig, FASTEST) for rig in (BARE, OVER_DAMPED)),
+        *((*rig, FASTEST) for rig in (TIP_MASS, CLAMP, FILTER)),
+        (*OVER_DAMPED, -FASTEST),
+        *(further(*rig, FASTEST) for rig in (BARE, DAMPED, OVER_DAMPED)),
+        *(further(*rig, -FASTEST) for rig in (BARE, TIP_MASS, CLAMP, FILTER, DAMPED)),
     ],
 )
 def test_poles_are_those_of_the_stiffness_at_each_time(rig, damping, more, rate):

@@ -161,7 +161,7 @@ def test_a_recorded_session_shows_its_touches(touch_file, drawn, make_timings):
         {"sweep": (1000, 1000)},
         further({"sweep": (1000, 1003)}),
         further({"rate_hz": 100.0, "ticks": 3000, "sweep": (0, 3000)}),
-        {"damping": None},
+        further({"damping": None}),
         further({"ticks": 0, "sweep": (0, 0)}),
     ],
 )
