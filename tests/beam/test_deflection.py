@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.beam import (
     Beam,
@@ -94,7 +95,9 @@ def test_the_truth_of_these_tests_is_eq_25(frequency_hz):
 
 
 @pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
-@pytest.mark.parametrize("frequency_hz", [0.3, 1.0, 2.5537, 9.0, 16.002, 30.0, 44.81, 49.0])
+@pytest.mark.parametrize(
+    "frequency_hz", [2.5537, 30.0, *map(further, (0.3, 1.0, 9.0, 16.002, 44.81, 49.0))]
+)
 def test_shape_is_that_of_the_boundary_value_problem(damping, frequency_hz):
     shape = response(frequency_hz, damping)
     truth = exact(frequency_hz, damping, x_m())

@@ -5,6 +5,7 @@ from math import pi
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.beam import Beam, Damping, Plant, PointForceGrid, mode_mean, mode_shape, realise_force
 from rigd.beam.realisation import RealisationError, realise, state_output
@@ -28,8 +29,8 @@ def response(realised, s):
     return (driven / (s[:, None] - poles)) @ (realised.rows @ vectors).T + realised.direct
 
 
-@pytest.mark.parametrize("highest_rad_s", [1e4, 1e5])
-@pytest.mark.parametrize("at_m", [0.1, 0.62, 0.97])
+@pytest.mark.parametrize("highest_rad_s", [further(1e4), 1e5])
+@pytest.mark.parametrize("at_m", [0.1, further(0.62), 0.97])
 @pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
 def test_response_to_a_force_is_the_exact_one(damping, at_m, highest_rad_s):
     s = 1j * np.geomspace(0.1, 0.5 * highest_rad_s, 700)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rigd.bench import Results, as_json, report_lines
@@ -89,6 +89,7 @@ def loop_of(delays_us, name="loop"):
     return LoopMeasurement(name, 1000.0, delays_us, np.full(1, 20.0), delays_us.size, 0)
 
 
+@settings(max_examples=25)
 @given(st.lists(st.floats(0.0, 1e7), min_size=1, max_size=50))
 def test_every_delay_is_in_one_bin(delays_us):
     document = as_json(results_of(loop_of(delays_us)))

@@ -146,6 +146,7 @@ def test_a_record_is_judged_from_the_document_alone():
     assert Scored.from_line(its.line()) == its
 
 
+@pytest.mark.further  # as test_independent_records.py has noise by its seed
 def test_each_record_of_a_cell_has_noise_of_its_own(tmp_path: Path):
     first, other = (CELLS[NAME].record(seed, tmp_path).torque_nm for seed in (1, 2))
     assert not np.array_equal(first, other)

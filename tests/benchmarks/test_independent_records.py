@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import further
 from independent_records import (
     DENSITY_KG_PER_M,
     LENGTH_M,
@@ -81,7 +82,7 @@ def still() -> Exact:
 
 
 @pytest.mark.fit
-@pytest.mark.parametrize("declared", [True, False])
+@pytest.mark.parametrize("declared", [further(True), False])
 def test_an_estimator_finds_the_truth(still: Exact, declared: bool):
     made = still if declared else exact(Truth(**PAPER, **UNDECLARED))
     truth = made.truth

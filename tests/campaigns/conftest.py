@@ -1,6 +1,5 @@
 """Short sessions of a beam with a little damping of both kinds, at 250 Hz to spare time."""
 
-import sys
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +19,11 @@ from analysis.identify import ModeEstimate, RecordFit, Ringing
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper import FrfFit
 from analysis.paper.welch_analysis import FitIndices, FittedModel, Peak
+from analysis.record import load_record
 from rigd.beam import Beam, Damping, Plant
 from rigd.testing import PAPER_BEAM, chirp_signals, write_session
 
+CAMPAIGN = "analysis.campaigns._campaign"
 RATE_HZ = 250.0
 LINK = PAPER_BEAM
 PLANT = Damping(zeta=3e-4, alpha=1.0, gamma=0.2, lambda_=1.0)
@@ -50,17 +51,22 @@ def make_file():
 
 
 @pytest.fixture(scope="session")
-def short_sessions(tmp_path_factory):
+def short_sessions(made_once):
     """Four that agree."""
-    folder = tmp_path_factory.mktemp("campaign")
-    return [short_session(folder / f"{seed}.mcap", seed) for seed in range(4)]
+
+    def make(folder):
+        for seed in range(4):
+            short_session(folder / f"{seed}.mcap", seed)
+
+    return sorted(made_once("campaign_sessions", make).iterdir())
 
 
 @pytest.fixture(scope="session")
-def other_beam(tmp_path_factory):
-    return short_session(
-        tmp_path_factory.mktemp("other") / "longer.mcap", 9, replace(LINK, length_m=1.0)
-    )
+def other_beam(made_once):
+    def make(folder):
+        short_session(folder / "longer.mcap", 9, replace(LINK, length_m=1.0))
+
+    return made_once("campaign_other_beam", make) / "longer.mcap"
 
 
 @pytest.fixture(scope="session")
@@ -74,17 +80,34 @@ def truth():
 
 
 @pytest.fixture(scope="session")
-def done(short_sessions, other_beam, settings, tmp_path_factory):
+def done(short_sessions, other_beam, settings, tmp_path_factory, computed_once):
     """The campaign of four that agree and two files that do not belong to it; its progress."""
-    torn = tmp_path_factory.mktemp("torn") / "torn.mcap"
-    torn.write_bytes(short_sessions[0].read_bytes()[:5000])
-    paths = [short_sessions[0], torn, *short_sessions[1:], other_beam]
-    progress = []
-    found = campaign(
-        paths, settings, structures=("I", "III"), jobs=2,
-        on_progress=lambda *step: progress.append(step),
-    )  # fmt: skip
-    return found, progress
+
+    class Workers(Here):
+        """Workers that need not analyse the other beam: what is found of it is excluded."""
+
+        def run(self, function, tasks, on_done):
+            if function is not analyse_session:
+                return super().run(function, tasks, on_done)
+            *to_analyse, (path, _) = tasks
+            assert path == other_beam
+            found = super().run(function, to_analyse, on_done)
+            on_done(len(to_analyse))
+            experiment = Experiment.from_record(load_record(path))
+            return [*found, replace(found[0], path=path, experiment=experiment)]
+
+    def compute():
+        torn = tmp_path_factory.mktemp("torn") / "torn.mcap"
+        torn.write_bytes(short_sessions[0].read_bytes()[:5000])
+        paths = [short_sessions[0], torn, *short_sessions[1:], other_beam]
+        progress = []
+        found = campaign(
+            paths, settings, structures=("I", "III"), workers=Workers(),
+            on_progress=lambda *step: progress.append(step),
+        )  # fmt: skip
+        return found, progress
+
+    return computed_once("campaign", compute)
 
 
 class Here:
@@ -113,7 +136,14 @@ class Prepared(Here):
 @pytest.fixture(scope="session")
 def campaign_of():
     """Make the campaign of results that a test made up, of which there are no files to predict."""
-    return lambda results: campaign([each.path for each in results], workers=Prepared(results))
+
+    def made(results, *, validated=False, **options):
+        with pytest.MonkeyPatch.context() as patch:
+            if not validated:
+                patch.setattr(f"{CAMPAIGN}.validate", lambda *_: ((), ()))
+            return campaign([each.path for each in results], workers=Prepared(results), **options)
+
+    return made
 
 
 @pytest.fixture(scope="session")
@@ -140,7 +170,7 @@ def in_this_process():
     @contextmanager
     def entered():
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys.modules["analysis.campaigns._campaign"], "process_pool", pool)
+            patch.setattr(f"{CAMPAIGN}.process_pool", pool)
             yield
 
     return entered

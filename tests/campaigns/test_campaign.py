@@ -10,13 +10,14 @@ from PIL import Image
 
 from analysis.campaigns import CampaignError, SessionTask, analyse_session, campaign
 from analysis.campaigns._validation import leave_one_out_results, models_without_session
-from analysis.identify import BAND_HZ
+from analysis.campaigns.workers import process_pool
+from analysis.identify import BAND_HZ, Measurement, fit_record
+from analysis.models import STRUCTURES
 from analysis.record import load_record
 from analysis.report import campaign_document
 from analysis.report._campaign_tables import session_list_table, sessions_table, validation_summary
 from analysis.report.campaign_report import campaign_tables, campaign_text, write_campaign
 from analysis.report.table import json_rows
-from analysis.results import whole_record
 from rigd.beam import Plant, modes, transfer
 
 pytestmark = pytest.mark.fit
@@ -34,11 +35,13 @@ def test_sessions_keep_their_order_and_failures_are_told(done, short_sessions, o
     assert {step[2] for step in progress} >= {path.name for path in short_sessions}
 
 
+@pytest.mark.process
+@pytest.mark.further  # as test_validation.py, where workers predict sessions
 def test_workers_find_what_this_process_finds(done, short_sessions, settings):
-    found, _ = done
     task = SessionTask(settings, ("I", "III"), (), None)
-    here = analyse_session(short_sessions[2], task)
-    there = found.sessions[2]
+    with process_pool(1) as pool:
+        (there,) = pool.run(analyse_session, [(short_sessions[2], task)])
+    here = done[0].sessions[2]
     assert np.array_equal(here.response, there.response)
     for one, two in zip(here.welch_models, there.welch_models, strict=True):
         assert one.fit.parameters == pytest.approx(two.fit.parameters, rel=1e-9)
@@ -103,16 +106,29 @@ def test_error_of_a_forecast_is_that_of_the_torque(done, short_sessions, truth):
     assert nothing.error == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_folder_holds_every_figure_and_table(done, tmp_path):
+FIGURES = (
+    "figure5_signals", "figure6_nominal", "figure7_indices", "figure8_best", "pooled",
+    "validation", "damping", "pooled_response",
+)  # fmt: skip
+
+
+@pytest.mark.further  # as figures of a report
+def test_every_figure_is_filled(done, tmp_path):
+    found, _ = done
+    write_campaign(found, tmp_path, with_paper=True, formats=("png",))
+    for figure in FIGURES:
+        image = Image.open(tmp_path / "figures" / f"{figure}.png")
+        assert np.asarray(image.convert("L")).std() > 5
+
+
+def test_the_folder_holds_every_figure_and_table(done, tmp_path, without_drawing):
     found, _ = done
     steps = []
-    write_campaign(found, tmp_path, with_paper=True, on_step=steps.append, formats=("png",))
+    with without_drawing():
+        write_campaign(found, tmp_path, with_paper=True, on_step=steps.append, formats=("png",))
     figures, tables = tmp_path / "figures", tmp_path / "tables"
-    for figure in (
-        "figure5_signals", "figure6_nominal", "figure7_indices", "figure8_best", "pooled",
-        "validation", "damping", "pooled_response",
-    ):  # fmt: skip
-        assert np.asarray(Image.open(figures / f"{figure}.png").convert("L")).std() > 5
+    for figure in FIGURES:
+        assert (figures / f"{figure}.png").exists()
         assert f"figure {figure}" in steps
     with (tables / "table3.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -151,7 +167,7 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
         < page.index('id="table3"')
     )
     assert "torn.mcap" in page
-    assert "http" not in page.replace("http://www.w3.org", "")
+    assert "://" not in page.replace("http://www.w3.org", "")
     text = (tmp_path / "tables.txt").read_text()
     # No number without its validity: that of the worst session.
     slope_rad = max(each.validity.predicted_peak_tip_slope_rad for each in found.sessions)
@@ -297,14 +313,15 @@ def test_fit_and_leave_one_out_error_stand_beside_each_other(done):
 def test_the_fit_is_that_of_a_single_report(done, short_sessions):
     """But for hum and free decay, which a report counts as explained: here are none."""
     found, _ = done
-    whole = whole_record(load_record(short_sessions[0]))
+    measured = Measurement.from_record(load_record(short_sessions[0]))
+    analysis = fit_record(measured, [STRUCTURES["III"]])
     (trial,) = (
         each
         for each in found.validation
         if (each.path, each.method, each.name) == (short_sessions[0], "record", "III")
     )
-    (fit,) = (fit for name, fit in whole.fits.items() if name == "III")
-    assert 100 * (1 - trial.own_error) == pytest.approx(whole.analysis.fit_percent(fit), abs=0.2)
+    (fit,) = analysis.fits
+    assert 100 * (1 - trial.own_error) == pytest.approx(analysis.fit_percent(fit), abs=0.2)
 
 
 def test_added_metadata_stand_in_the_table_of_sessions(done):
@@ -329,8 +346,9 @@ def test_the_paper_s_numbers_stand_beside_only_on_request(done):
     assert "(1.33)" in campaign_text(found, with_paper=True)
 
 
-def test_no_session_left(tmp_path, settings):
-    with pytest.raises(CampaignError, match=r"(?s)No session could be analysed.*none\.mcap"):
-        campaign([tmp_path / "none.mcap"], settings, jobs=1)
+def test_no_session_left(tmp_path, settings, in_this_process):
+    no_session = pytest.raises(CampaignError, match=r"(?s)No session could be.*none\.mcap")
+    with in_this_process(), no_session:
+        campaign([tmp_path / "none.mcap"], settings)
     with pytest.raises(CampaignError, match="none was given"):
         campaign([], settings)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cases import further
 from cauchy_residues import modal_constants
 
 from analysis.identify import MODE_CONSTANT_NAMES, ModalEstimate, ModalModel
@@ -146,7 +147,7 @@ def test_a_falling_sweep_is_the_same_experiment(make_experiment):
     assert make_experiment(**UP, there_and_back=1.0).rising is None
 
 
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("count", [further(1), 3])
 def test_opposite_sweeps_that_agree_say_that_nothing_changed(sessions_of, verdict_of, count):
     found = verdict_of([*sessions_of(count, **UP), *sessions_of(count, first=50, **DOWN)])
     sweeps = found.sweeps
@@ -161,7 +162,7 @@ def test_sweeps_of_one_direction_say_nothing_of_changes(sessions_of, verdict_of)
     assert not any("changed along" in each for each in found.sentences)
 
 
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("count", [further(1), 3])
 def test_opposite_sweeps_name_the_mode_that_changed(sessions_of, verdict_of, count):
     """The stiffness of mode 2 falls by 0.4 % after the rising sweep has passed it."""
     later = TRUE.copy()

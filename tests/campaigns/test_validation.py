@@ -1,14 +1,16 @@
 """Every trial of the validation is accounted for: done, or lost and why."""
 
-import os
 import xml.etree.ElementTree as ET
+from contextlib import nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from cases import further
+from ended_workers import call_unless_one
 
 from analysis.campaigns import CampaignError, analyse_session, campaign
-from analysis.campaigns.workers import process_pool
+from analysis.campaigns.workers import FailedTask, process_pool
 from analysis.cli.campaign import campaign_command
 from analysis.cli.sessions import Outputs
 from analysis.report import campaign_document
@@ -16,16 +18,23 @@ from analysis.report.campaign_report import campaign_page, campaign_text, write_
 
 pytestmark = pytest.mark.fit
 
+REASON = "its worker process ended by itself twice"
 
-def ends_at_one(function, path, *arguments):
-    """Call a function, but end the process that is given 1.mcap, as lack of memory does."""
-    if path.name == "1.mcap":
-        os._exit(9)
-    return function(path, *arguments)
+
+class OneLost:
+    """Workers of this process that report one of them as killed."""
+
+    def run(self, _function, tasks, on_done):
+        found = []
+        for number, (function, path, *arguments) in enumerate(tasks):
+            lost = path.name == "1.mcap"
+            found.append(FailedTask(REASON) if lost else function(path, *arguments))
+            on_done(number)
+        return found
 
 
 class Shaken:
-    """Two processes, of which one is killed; sessions are analysed already."""
+    """A process that is killed; sessions are analysed already."""
 
     def __init__(self, pool, results):
         self._pool, self._results = pool, results
@@ -35,15 +44,15 @@ class Shaken:
             for number, _ in enumerate(tasks):
                 on_done(number)
             return [self._results[path] for path, _ in tasks]
-        return self._pool.run(ends_at_one, [(function, *task) for task in tasks], on_done)
+        return self._pool.run(call_unless_one, [(function, *task) for task in tasks], on_done)
 
 
-@pytest.fixture(scope="module")
-def shaken(short_sessions, settings, done):
+@pytest.fixture(scope="module", params=["reported", further("killed")])
+def shaken(request, short_sessions, settings, done):
     """A campaign of four whose worker is killed in the middle of the validation."""
     results = {each.path: each for each in done[0].sessions}
     progress = []
-    with process_pool(2) as pool:
+    with process_pool(1) if request.param == "killed" else nullcontext(OneLost()) as pool:
         found = campaign(
             short_sessions, settings, structures=("III",), workers=Shaken(pool, results),
             on_progress=lambda *step: progress.append(step),
@@ -57,7 +66,7 @@ def test_a_trial_whose_worker_is_killed_is_lost_and_the_others_are_done(shaken):
     assert shaken.failures == ()
     (lost,) = shaken.failed_predictions
     assert (lost.path.name, shaken.trials) == ("1.mcap", 4)
-    assert "worker process ended by itself twice" in lost.reason
+    assert lost.reason.startswith(REASON)
     assert {each.path.name for each in shaken.validation} == {"0.mcap", "2.mcap", "3.mcap"}
 
 
@@ -108,7 +117,7 @@ def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tm
 
 
 def test_sessions_that_cannot_be_read_any_more_are_lost_with_the_reason(make_session, campaign_of):
-    found = campaign_of([make_session(f"gone{number}.mcap") for number in range(3)])
+    found = campaign_of([make_session(f"gone{number}.mcap") for number in range(3)], validated=True)
     assert found.validation == ()
     for number, lost in enumerate(found.failed_predictions):
         assert f"gone{number}.mcap" in lost.reason
@@ -129,7 +138,7 @@ def test_what_was_found_is_kept_though_all_workers_go(make_session):
     assert {each.reason for each in found.failed_predictions} == {"The Dask scheduler went away."}
 
 
-def test_nothing_is_said_where_nothing_was_asked(short_sessions, settings):
-    found = campaign(short_sessions[:2], settings, structures=(), jobs=1)
+def test_nothing_is_said_where_nothing_was_asked(done, campaign_of):
+    found = campaign_of(done[0].sessions[:2], structures=())
     assert (found.trials, found.validation, found.failed_predictions) == (0, (), ())
     assert "predicted" not in campaign_text(found)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from analysis.campaigns import SessionFailure, SessionTask, analyse_session, campaign
+from analysis.campaigns import SessionFailure, SessionTask, analyse_session
 from analysis.models import WelchSettings
 from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 
@@ -16,18 +16,18 @@ pytestmark = pytest.mark.fit
 
 
 @pytest.fixture(scope="module")
-def found(make_file, tmp_path_factory, in_this_process):
-    """Two sessions whose files say that their excitation is a multisine."""
-    folder = tmp_path_factory.mktemp("multisine")
-    paths = [
-        make_file(
-            folder / f"{seed}.mcap", seed, excitation="multisine", specimen="A", operator="Eve",
-            note="[clamp] <b>new</b>",
-        )
-        for seed in range(2)
-    ]  # fmt: skip
-    with in_this_process():
-        return campaign(paths, WelchSettings(types=("I",)), structures=("III",))
+def found(make_file, tmp_path_factory, campaign_of):
+    """Two sessions of a file that says that its excitation is a multisine."""
+    path = make_file(
+        tmp_path_factory.mktemp("multisine") / "0.mcap", 0, excitation="multisine", specimen="A",
+        operator="Eve", note="[clamp] <b>new</b>",
+    )  # fmt: skip
+    first = analyse_session(path, SessionTask(WelchSettings(types=("I",)), ("III",), (), None))
+    experiment = replace(first.experiment, identity=("1.mcap",))
+    other = replace(
+        first, path=path.with_name("1.mcap"), experiment=experiment, digests=frozenset()
+    )
+    return campaign_of([first, other], structures=("III",))
 
 
 def test_the_whole_records_are_pooled_and_nothing_else(found, truth):

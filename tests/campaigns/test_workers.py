@@ -4,6 +4,7 @@ import time
 
 import pytest
 from cases import further
+from ended_workers import end_at_zero
 
 from analysis.campaigns import CampaignError
 from analysis.campaigns.workers import FailedTask, process_pool
@@ -32,25 +33,19 @@ def test_a_worker_that_dies_is_told():
     assert "--jobs" in str(it.value)
 
 
-def ends_at_zero(number):
-    """Kill the process that is given a 0."""
-    if number == 0:
-        os._exit(3)
-    return number
-
-
 def test_one_task_whose_worker_dies_is_told_and_the_others_are_done():
     with process_pool(2) as pool:
-        found = pool.run(ends_at_zero, [(n,) for n in (5, 4, 3, 0, 2, 1)])
+        found = pool.run(end_at_zero, [(n,) for n in (5, 4, 3, 0, 2, 1)])
     (lost,) = (each for each in found if isinstance(each, FailedTask))
     assert found == [5, 4, 3, lost, 2, 1]
+    assert lost.reason.startswith("its worker process ended by itself twice")
     assert "memory" in lost.reason
 
 
-@pytest.mark.parametrize("jobs", [further(1), 2])
+@pytest.mark.parametrize("jobs", [1, further(2)])
 def test_the_first_task_of_all_may_be_the_one(jobs):
     with process_pool(jobs) as pool:
-        lost, *others = pool.run(ends_at_zero, [(n,) for n in (0, 1, 2)])
+        lost, *others = pool.run(end_at_zero, [(n,) for n in (0, 1, 2)])
     assert isinstance(lost, FailedTask)
     assert others == [1, 2]
 
@@ -58,7 +53,7 @@ def test_the_first_task_of_all_may_be_the_one(jobs):
 @pytest.mark.further  # as one that dies after others are done
 def test_a_second_worker_that_dies_before_anything_is_done_ends_all():
     with process_pool(1) as pool, pytest.raises(CampaignError, match="worker processes ended"):
-        pool.run(ends_at_zero, [(0,), (0,), (1,)])
+        pool.run(end_at_zero, [(0,), (0,), (1,)])
 
 
 def test_a_worker_that_ends_with_nothing_to_do_is_replaced():

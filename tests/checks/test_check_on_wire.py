@@ -38,16 +38,17 @@ def profile(request, can_profile, serial_profile):
 
 
 @pytest.mark.process
-def test_a_fault_is_found_and_only_the_operator_resets_it(profile):
+def test_a_fault_is_found_and_only_the_operator_resets_it(profile, monkeypatch):
     from rigd.sim.wire import inject
 
+    monkeypatch.setattr("rigd.checks.devices.EXCHANGE_TICKS", 100)
     rows = inspect_devices(profile)
     assert overall(rows) == "ok", rows
     found = {(row.group, row.what): row.found for row in rows}
     assert "rigd simulate, in lock-step" in found["link", "what moves"]
     assert found["drive", "supported modes"] == "0x200"
-    assert found["exchange", "angles missing"] == "0 of 500 ticks"
-    assert found["exchange", "wrenches missing"] == "0 of 500 ticks"
+    assert found["exchange", "angles missing"] == "0 of 100 ticks"
+    assert found["exchange", "wrenches missing"] == "0 of 100 ticks"
 
     inject(profile.name, ["emcy,code=0x2310"])
     for _ in range(2):  # looking at it does not reset it

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from cases import further
 
 from rigd.beam import Damping
 from rigd.check_rows import CheckResult, overall
@@ -23,7 +24,7 @@ def with_control(profile, **changes):
     return replace(profile, control=replace(profile.control, **changes))
 
 
-@pytest.mark.parametrize("name", ["sim", "antenna_can", "antenna_serial"])
+@pytest.mark.parametrize("name", ["sim", further("antenna_can"), further("antenna_serial")])
 def test_the_shipped_loops_are_fine(name):
     rows = list(loop_rows(load_profile(name)))
     assert overall(rows) == "ok"

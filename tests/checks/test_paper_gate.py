@@ -39,8 +39,7 @@ FACTORS = {
 }
 LIES = [(key, factor) for key, factors in FACTORS.items() for factor in factors]
 AT_ONCE = {
-    ("motor.inertia_kg_m2", 5), ("limits.velocity_rad_s", 0.3), ("actuation.delay_s", 20),
-    ("limits.missed_ticks_in_a_row", 16), ("cia402.gear_ratio", 5),
+    ("limits.velocity_rad_s", 0.3), ("actuation.delay_s", 20), ("limits.missed_ticks_in_a_row", 16),
 }  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import further
 
 from analysis.exchange import (
     ExchangeError,
@@ -256,8 +257,8 @@ def motion():
     [
         ({}, ()),
         ({"angle": "angle:deg"}, ("57", "check the units")),
-        ({"torque": "torque:mN.m"}, ("0.00", "check the units")),
-        ({"torque": "torque:lbf.in"}, ("0.11", "check the units")),
+        further({"torque": "torque:mN.m"}, ("0.00", "check the units")),
+        further({"torque": "torque:lbf.in"}, ("0.11", "check the units")),
         ({"reverse_torque": True}, ("opposite sign", "--reverse-torque")),
     ],
 )

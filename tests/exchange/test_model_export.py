@@ -171,9 +171,9 @@ def response(model, frequency_hz):
 @pytest.mark.parametrize(
     ("seed", "given"),
     [
-        *((seed, "acceleration") for seed in range(2)),
+        (0, "acceleration"),
         (4, "angle"),
-        *(further(seed, "acceleration") for seed in range(2, 7)),
+        *(further(seed, "acceleration") for seed in range(1, 7)),
         *(further(seed, "angle") for seed in range(3)),
         *(slow(seed, "acceleration") for seed in range(7, 20)),
         *(slow(seed, "angle") for seed in range(3, 20) if seed != 4),
@@ -282,7 +282,7 @@ def test_every_format_has_the_same_variables(exported, export, tmp_path):
     np.testing.assert_array_equal(npz["background"], MODAL.background)
 
 
-@pytest.mark.parametrize("given", ["acceleration", "angle"])
+@pytest.mark.parametrize("given", ["acceleration", further("angle")])
 def test_the_modal_model_is_exported_where_the_beam_was_refused(exported, given):
     model = exported(document(gate="refused"), "--input", given)
     assert model["model"] == "modal"
@@ -427,8 +427,15 @@ def test_unusual_beams_are_accurate_too(exported, values):
     assert np.abs(response(model, frequency_hz) / true - 1).max() < 1e-3
 
 
+@pytest.fixture(scope="module")
+def identified(simulated):
+    return identify_session(simulated)
+
+
 @pytest.mark.process
-def test_a_session_is_analysed_on_the_spot(simulated, analyze, tmp_path):
+def test_a_session_is_analysed_on_the_spot(simulated, identified, analyze, tmp_path, monkeypatch):
+    found = {simulated: identified}
+    monkeypatch.setattr("analysis.linear_model.identify_session", found.__getitem__)
     result = analyze("export", "model", simulated, tmp_path / "a.npz", "--samples", 2)
     assert result.exit_code == 0, result.output
     assert f"exact beam of {simulated}" in result.stdout
@@ -442,8 +449,8 @@ def test_a_session_is_analysed_on_the_spot(simulated, analyze, tmp_path):
 
 
 @pytest.mark.process
-def test_beam_and_modal_model_of_a_session_agree_within_what_the_record_knows(simulated):
-    found = identify_session(simulated)
+def test_beam_and_modal_model_of_a_session_agree_within_what_the_record_knows(identified):
+    found = identified
     assert found.uniform_beam_test.status == "passed"
     beam = linear_model(found, ModelOptions(order=20, samples=0))
     unreadable = found.headline | {"validity": {"uniform_beam": {"status": "refused"}}}

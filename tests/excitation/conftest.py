@@ -1,4 +1,5 @@
 import json
+from functools import partial
 
 import pytest
 
@@ -22,13 +23,19 @@ def rig(profile):
     return RigPreview(profile)
 
 
+def written(folder, modes=MODES, **more):
+    path = folder / "fits.json"
+    path.write_text(json.dumps({"modes": modes, **more}), encoding="utf-8")
+    return path
+
+
 @pytest.fixture
 def document(tmp_path):
     """Write a document with some modes, or with anything else."""
+    return partial(written, tmp_path)
 
-    def write(modes=MODES, **more):
-        path = tmp_path / "fits.json"
-        path.write_text(json.dumps({"modes": modes, **more}), encoding="utf-8")
-        return path
 
-    return write
+@pytest.fixture(scope="session")
+def document_of_modes(tmp_path_factory):
+    """A document with three modes."""
+    return written(tmp_path_factory.mktemp("modes"))

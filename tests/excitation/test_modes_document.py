@@ -155,10 +155,8 @@ def test_a_session_is_run_and_says_what_it_did(document, tmp_path):
     assert metadata["duration_s"] == "14.0"
 
 
-@pytest.mark.process
-def test_the_command_refuses_in_one_sentence(tmp_path):
-    command = [sys.executable, "-m", "rigd", "run", "modes", str(tmp_path / "no.json"), "--fast"]
-    done = warm_start.run(command, capture_output=True, text=True, timeout=300, check=False)
+def test_the_command_refuses_in_one_sentence(rigd_here, tmp_path):
+    done = rigd_here("run", "modes", tmp_path / "no.json", "--fast")
     assert done.returncode == 2
     assert "no.json: cannot be read" in done.stderr
     assert "Traceback" not in done.stderr

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.beam import clamped_free_eigenvalues
 from rigd.excitation import KINDS, ExcitationError, move
@@ -81,12 +82,13 @@ def test_a_move_knows_where_it_starts(profile):
 
 
 def test_a_move_is_run_once(profile, tmp_path):
-    made = excitation_for(profile, "move", {"by_rad": 0.1})
+    made = excitation_for(profile, "move", {"by_rad": -0.4}, start_rad=1.2)
     with pytest.raises(RefusedError, match="--repeat 2"):
         Series(profile, made, tmp_path, repeat=2)
 
 
 @pytest.mark.process
+@pytest.mark.further  # as with an identified tip mass
 def test_a_move_through_the_engine_leaves_nothing_that_rings(rigd, tmp_path):
     """Friction, noise and quantisation included, against the quintic of the same time."""
     options = ("--fast", "--seed", "1", "--json", "--ring-down", "3", "--output", tmp_path)
@@ -133,6 +135,8 @@ def test_a_move_with_an_identified_tip_mass_leaves_what_its_plan_states(rigd, an
     first, end = session.segments["sweep"]
     # The first mode is at 2.29 Hz; that of the profile would be at 2.57 Hz.
     assert amplitude_nm(session.samples, end + 150, 2.286) < min(floor_nm, 0.01 * quintic_nm)
+    torque_nm = session.samples["torque_command_nm"]
+    assert np.abs(torque_nm).max() < 0.95 * load_profile("sim").rig.motor.peak_torque_nm
     away = np.flatnonzero(np.abs(session.samples["angle_rad"] - 0.5) > 1e-3)[-1] + 1 - first
     assert stated["arrival_s"] == pytest.approx(away / 1000.0, abs=0.01)
     assert (end - first) / 1000.0 == pytest.approx(stated["arrival_s"] - 0.08, abs=0.02)
@@ -156,19 +160,22 @@ def test_a_model_with_an_effect_that_its_use_does_not_take_is_refused(
     assert f"headlines[0].parameters.{effect}.value = 0.0001" in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    "effect",
-    [
-        {"tip_mass_kg": {"value": 1e-3}},
-        {"root_compliance_rad_per_nm": {"value": 0.5}},
-        {"stiffness_offset_2": {"value": -0.1}, "stiffness_offset_3": {"value": 0.2}},
-    ],
-)
+TIP_MASS = {"tip_mass_kg": {"value": 1e-3}}
+COMPLIANCE = {"root_compliance_rad_per_nm": {"value": 0.5}}
+OFFSETS = {"stiffness_offset_2": {"value": -0.1}, "stiffness_offset_3": {"value": 0.2}}
+
+
+@pytest.mark.parametrize("effect", [TIP_MASS, COMPLIANCE, OFFSETS])
 def test_the_poles_of_a_move_are_those_of_the_beam_as_identified(profile, analysed, effect):
     plant = RigPreview(profile).move_plant(analysed(**effect), MOVE)
     assert plant.model is not None
     locked = plant.model.plant.poles(clamped_free_eigenvalues(3))[:, 0]
     assert plant.poles_rad_s[:3] == pytest.approx(locked, rel=5e-3)
+
+
+@pytest.mark.parametrize("effect", [further(TIP_MASS), further(COMPLIANCE), OFFSETS])
+def test_a_move_of_the_beam_as_identified_leaves_nothing(profile, analysed, effect):
+    plant = RigPreview(profile).move_plant(analysed(**effect), MOVE)
     made = excitation_for(profile, "move", {"by_rad": 0.1, "path": analysed(**effect)})
     path = made.reference_rad[slice(made.segments["sweep"][0] - 1, made.segments["sweep"][1])]
     left = np.abs(modal_state(path, 1000.0, plant.poles_rad_s)) @ plant.torque_per_state_nm_s

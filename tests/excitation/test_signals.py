@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rigd.excitation import (
@@ -100,6 +100,7 @@ def test_taper_fades_both_ends_and_leaves_the_middle():
     np.testing.assert_allclose(faded[2000], 0.5 * plain[2000])
 
 
+@settings(max_examples=30)
 @given(
     rest=st.integers(0, 3000),
     duration=st.integers(2, 5000),

@@ -34,14 +34,18 @@ def make_signals():
 
 
 @pytest.fixture(scope="session")
-def paper_file(paper_signals, tmp_path_factory):
-    return write_session(tmp_path_factory.mktemp("sessions") / "paper.mcap", paper_signals)
+def paper_file(made_once):
+    def make(folder):
+        write_session(folder / "paper.mcap", chirp_signals())
+
+    return made_once("paper_file", make) / "paper.mcap"
 
 
 @pytest.fixture(scope="session")
-def paper_analysis(paper_file):
+def paper_analysis(paper_file, computed_once):
     """Three types of the paper's session, enough to show every kind of cell."""
-    return analyse(load_record(paper_file), WelchSettings(types=("I", "III", "VI")))
+    settings = WelchSettings(types=("I", "III", "VI"))
+    return computed_once("paper_analysis", lambda: analyse(load_record(paper_file), settings))
 
 
 CHIRP = {"excitation": "chirp", "start_hz": "0.05", "stop_hz": "50.0"}

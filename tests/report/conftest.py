@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from analysis.identify import Candidate, Measurement, Selection, fit_record
+from analysis.identify import Candidate, Measurement, Selection, fit_record, select
 from analysis.identify.headline import headline_of_fit
 from analysis.identify.verdict import OrderVerdict, Verdict
 from analysis.models import STRUCTURES, WelchSettings
@@ -13,6 +13,7 @@ from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from analysis.report.record_report import write_report
 from analysis.results import RecordResult, WholeRecord
+from rigd.testing import chirp_signals, write_session
 
 TYPES = ("I", "III", "VI", "VII")
 HOSTILE = "<script>alert('note')</script> & \"quotes\" $x^2$"
@@ -38,10 +39,14 @@ def verdict(*sentences, experiments=()):
 
 
 @pytest.fixture(scope="session")
-def record_result(make_signals, write_session, tmp_path_factory):
-    signals = make_signals(sweep_s=60.0, ring_down_s=10.0, tool_inertia_kg_m2=1e-5)
+def record_result(computed_once, tmp_path_factory):
+    return computed_once("record_result", lambda: fitted(tmp_path_factory.mktemp("html")))
+
+
+def fitted(folder):
+    signals = chirp_signals(sweep_s=60.0, ring_down_s=10.0, tool_inertia_kg_m2=1e-5)
     path = write_session(
-        tmp_path_factory.mktemp("html") / "a <b> & $c$.mcap",
+        folder / "a <b> & $c$.mcap",
         signals,
         metadata={"note": HOSTILE, "operator": "<i>Rossi</i>", "specimen": "</td>"},
     )
@@ -63,6 +68,14 @@ def record_result(make_signals, write_session, tmp_path_factory):
         WholeRecord(record, selection, (0.0, 50.0)),
         analyse(record, WelchSettings(types=("III", "VI"))),
     )
+
+
+@pytest.fixture(scope="session")
+def modal_result(record_result, computed_once):
+    """Result of a record whose modes are those of the modal model."""
+    record = record_result.record
+    selection = computed_once("modal_result", lambda: select(Measurement.from_record(record)))
+    return RecordResult(record, WholeRecord(record, selection, (0.0, 50.0)))
 
 
 @pytest.fixture(scope="session")
@@ -90,9 +103,6 @@ def as_text():
 
 
 @pytest.fixture(scope="session")
-def report(record_result, tmp_path_factory):
+def report(record_result, made_once):
     """Folder of the written page with its figures and tables."""
-    folder = tmp_path_factory.mktemp("reports") / "report"
-    folder.mkdir()
-    write_report(record_result, folder)
-    return folder
+    return made_once("report", lambda folder: write_report(record_result, folder))

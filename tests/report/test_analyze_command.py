@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warm_start
+from cases import further
 from typer.testing import CliRunner
 
 from analysis.cli.app import app
@@ -42,9 +43,9 @@ def refused(result, code, *words):
 
 @pytest.fixture(scope="module")
 def short_file(make_signals, write_session, tmp_path_factory):
-    """Session of a minute, in place of two."""
-    folder = tmp_path_factory.mktemp("command")
-    return write_session(folder / "a.mcap", make_signals(sweep_s=60.0, ring_down_s=10.0))
+    """Session of a third of a minute, in place of two."""
+    signals = make_signals(rest_s=0.5, sweep_s=20.0, ring_down_s=1.0)
+    return write_session(tmp_path_factory.mktemp("command") / "a.mcap", signals)
 
 
 @pytest.fixture
@@ -57,30 +58,68 @@ def long_session(paper_file, tmp_path):
     return shutil.copy(paper_file, tmp_path / "session.mcap")
 
 
+@pytest.mark.fit
+def test_a_part_of_a_session_becomes_a_report_that_states_it(
+    session, tmp_path, analyze_here, without_drawing
+):
+    with without_drawing():
+        result = analyze_here(
+            session.name, "--to", "20", "--json", "fits.json", "--segment", "5000"
+        )
+    content = assert_whole(result, tmp_path)
+    part = {"from_s": 0.0, "to_s": 20.0}
+    (headline,), (file,), (from_record,) = (
+        content[key] for key in ("headlines", "files", "records")
+    )
+    assert (headline["part"], file["part"]) == (part, part)
+    assert from_record["verdict"][0] == "All results are of 0 to 20 s of the session."
+    assert result.stdout.startswith(from_record["verdict"][0])
+    page = (tmp_path / "session.report" / "report.html").read_text()
+    assert "0 to 20 s of the session" in page
+    # The sweep is at 48.75 Hz then, and no fit uses what lies beyond.
+    assert any("48.75" in warning for warning in file["warnings"])
+    frequencies_hz = [mode["frequency_hz"]["value"] for mode in headline["modes"]]
+    assert frequencies_hz == pytest.approx([2.57, 16.01, 44.83], abs=0.02)
+
+
 @pytest.mark.process
+@pytest.mark.further  # as a shorter one
 def test_one_session_from_end_to_end(long_session, tmp_path):
     result = subprocess.run(
         [sys.executable, "-m", "analysis", long_session.name, "--json", "fits.json"],
         cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
+    content = assert_whole(result, tmp_path)
+    for picture in (tmp_path / "session.report" / "figures").iterdir():
+        assert ET.parse(picture).getroot().findall(".//{*}path")
+    assert len(result.stdout.splitlines()) <= 30
+    of_paper = [fit for fit in content["fits"] if fit["estimator"] == "welch"]
+    best = min(of_paper, key=lambda fit: fit["indices"]["wmse"])
+    assert (best["type"], best["weighting"]) == ("VI", "omega")
+    # Welch's windows bias the damping by a third; the whole record tells the plant's.
+    (from_record,) = content["records"]
+    (selected,) = (
+        fit for fit in content["fits"] if fit.get("candidate") == from_record["selected"]
+    )  # fmt: skip
+    for name, true in (("gamma", 5.5e-2), ("lambda", 0.594)):
+        assert abs(selected["parameters"][name] - true) < 5 * selected["std"][name]
+    assert len([m for m in content["modes"] if m["estimator"] == "record"]) == 3
+
+
+def assert_whole(result, folder):
+    """Check that all is written and printed of a session; return its document."""
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
-    report = tmp_path / "session.report"
+    report = folder / "session.report"
     assert sorted(path.name for path in report.iterdir()) == [
         "SHA256SUMS", "analysis.json", "figures", "report.html", "tables", "tables.txt",
     ]  # fmt: skip
-    pictures = list((report / "figures").iterdir())
-    assert len(pictures) == 6
-    for picture in pictures:
-        assert ET.parse(picture).getroot().findall(".//{*}path")
-    content = json.loads((tmp_path / "fits.json").read_text())
+    assert len(list((report / "figures").iterdir())) == 6
+    content = json.loads((folder / "fits.json").read_text())
     assert content == json.loads((report / "analysis.json").read_text())
     of_paper = [fit for fit in content["fits"] if fit["estimator"] == "welch"]
     assert len(of_paper) == 12
-    best = min(of_paper, key=lambda fit: fit["indices"]["wmse"])
-    assert (best["type"], best["weighting"]) == ("VI", "omega")
     lines = result.stdout.splitlines()
-    assert len(lines) <= 30
     (from_record,) = content["records"]
     assert lines[0] in from_record["verdict"][0]
     modes = [line.split() for line in lines if line[:4].strip().isdigit()]
@@ -92,40 +131,7 @@ def test_one_session_from_end_to_end(long_session, tmp_path):
         "All results as JSON: fits.json", "Report of session.mcap: session.report/report.html",
     ]  # fmt: skip
     assert "Resonant peaks" not in result.stdout
-    # Welch's windows bias the damping by a third; the whole record tells the plant's.
-    (selected,) = (
-        fit for fit in content["fits"] if fit.get("candidate") == from_record["selected"]
-    )  # fmt: skip
-    for name, true in (("gamma", 5.5e-2), ("lambda", 0.594)):
-        assert abs(selected["parameters"][name] - true) < 5 * selected["std"][name]
-    assert len([m for m in content["modes"] if m["estimator"] == "record"]) == 3
-
-
-@pytest.mark.fit
-def test_the_numbers_of_a_part_state_it(session, tmp_path, analyze_here, without_drawing):
-    with without_drawing():
-        result = analyze_here(
-            session.name, "--to", "30", "--json", "fits.json", "--report", "out",
-            "--types", "VI", "--weights", "omega",
-        )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    part = {"from_s": 0.0, "to_s": 30.0}
-    content = json.loads((tmp_path / "fits.json").read_text())
-    (headline,), (file,), (from_record,) = (
-        content["headlines"],
-        content["files"],
-        content["records"],
-    )
-    assert (headline["part"], file["part"]) == (part, part)
-    assert from_record["verdict"][0] == "All results are of 0 to 30 s of the session."
-    assert result.stdout.startswith(from_record["verdict"][0])
-    assert "0 to 30 s of the session" in (tmp_path / "out" / "report.html").read_text()
-    # The sweep is at 24.19 Hz then, and no fit uses what lies beyond.
-    assert any("24.19" in warning for warning in file["warnings"])
-    assert [round(mode["frequency_hz"]["value"], 2) for mode in headline["modes"][:2]] == [
-        2.57,
-        16.01,
-    ]
+    return content
 
 
 @pytest.mark.parametrize(
@@ -144,14 +150,15 @@ def test_times_that_select_no_part_are_wrong_use(tmp_path, analyze_here, options
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.process
-def test_json_on_standard_output_is_alone_there(session, tmp_path):
+@pytest.mark.fit
+def test_json_on_standard_output_is_alone_there(session, tmp_path, analyze_here, without_drawing):
     named = session.rename(tmp_path / "ζ.mcap")
-    result = run(
-        named.name, "--json", "-", "--types", "vi,III", "--weights", "omega,omega^-0.5",
-        "--frf", "hv", "--band", "1,49", "--report", "out", "--method", "welch",
-        cwd=tmp_path,
-    )  # fmt: skip
+    with without_drawing():
+        result = analyze_here(
+            named.name, "--json", "-", "--types", "vi,III", "--weights", "omega,omega^-0.5",
+            "--frf", "hv", "--band", "1,49", "--report", "out", "--method", "welch",
+            "--segment", "5000",
+        )  # fmt: skip
     assert result.returncode == 0, result.stderr
     assert result.stdout.isascii()  # whatever the stream's encoding is
     content = json.loads(result.stdout)
@@ -216,9 +223,9 @@ def broken_file(kind, path, good):
 @pytest.mark.parametrize(
     "kind", ["missing", "empty", "no container", "truncated", "magic only", "foreign", "a folder"]
 )
-def test_a_file_that_is_no_session_is_refused(paper_file, tmp_path, analyze_here, kind):
+def test_a_file_that_is_no_session_is_refused(short_file, tmp_path, analyze_here, kind):
     path = tmp_path / "bad.mcap"
-    broken_file(kind, path, paper_file)
+    broken_file(kind, path, short_file)
     before = sorted(tmp_path.iterdir())
     refused(analyze_here("bad.mcap", "--json", "fits.json"), 1, "bad.mcap")
     assert sorted(tmp_path.iterdir()) == before
@@ -364,14 +371,16 @@ def run_as_is(module, cwd):
 @pytest.mark.parametrize(
     "body",
     [
-        f"    exec('{CTRL_C.format(30)}')",
+        further(f"    exec('{CTRL_C.format(30)}')", id="code made from text"),
         # What is raised at the end of an object's life is dropped.
-        "    class Ending:\n"
-        f"        def __del__(self): {CTRL_C.format(0)}\n"
-        "    Ending()\n"
-        "    time.sleep(30)",
+        pytest.param(
+            "    class Ending:\n"
+            f"        def __del__(self): {CTRL_C.format(0)}\n"
+            "    Ending()\n"
+            "    time.sleep(30)",
+            id="an object that ends",
+        ),
     ],
-    ids=["code made from text", "an object that ends"],
 )
 def test_ctrl_c_inside_what_python_does_itself_ends_with_130_too(tmp_path, body):
     (tmp_path / "stopped.py").write_text("import time\n" + STOPPED.format(body=body))

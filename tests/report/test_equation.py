@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from cases import further
 from matplotlib.mathtext import MathTextParser
 
 from analysis.models import STRUCTURES
@@ -70,7 +71,7 @@ def test_what_was_fitted_beside_the_beam_stands_in_it(told, extra, tex, words):
     assert words not in definitions(told("VI"))
 
 
-@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize("name", [further(name) if name != "VI" else name for name in STRUCTURES])
 def test_both_languages_can_be_read(told, name):
     extras = dict.fromkeys(
         ("filter_time_constant_s", "second_order_filter_time_constant_s", "tip_mass_kg"), 1e-3

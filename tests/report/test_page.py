@@ -125,11 +125,15 @@ def test_it_is_readable_without_sight_and_on_paper(source, read_page):
     assert read_page.tags.count("figcaption") == read_page.tags.count("figure")
     assert read_page.tags.count("table") == read_page.tags.count("caption") > 10
     assert all(a.get("scope") in ("row", "col") for tag, a in read_page.attributes if tag == "th")
-    assert "@media print" in source
+    printed = source.partition("@media print")[2].partition("</style>")[0]
+    assert set(re.findall(r"break-\w+: (\w+)", printed)) == {"avoid"}
+    (undivided,) = re.findall(r"([^{}]+)\{ break-inside: avoid", printed)
+    assert ".table" not in undivided  # a long one would leave half a page empty
     assert "prefers-color-scheme: dark" in source
 
 
 @pytest.mark.process
+@pytest.mark.further  # nothing begins a page
 @pytest.mark.skipif(not shutil.which("chromium"), reason="no browser to print with")
 def test_on_paper_no_page_is_half_empty(report, tmp_path):
     """All of it fits on six pages; with a break before every part it takes nine."""
@@ -323,9 +327,9 @@ def test_figures_are_svg_files_with_text(report):
         assert "<text" in svg
 
 
-def test_a_taken_name_is_told_and_left_alone(report, record_result):
+def test_a_taken_name_is_told_and_left_alone(report, record_result, without_drawing):
     before = (report / "report.html").stat().st_mtime_ns
-    with pytest.raises(OutputExistsError, match=r"welch_frf\.svg exists"):
+    with without_drawing(), pytest.raises(OutputExistsError, match=r"welch_frf\.svg exists"):
         write_report(record_result, report)
     assert (report / "report.html").stat().st_mtime_ns == before
 

@@ -33,8 +33,24 @@ def value(batches: list, name: str):
     return found
 
 
+SAMPLES = 10_000
+
+
 @pytest.fixture(scope="module")
-def written(paper_analysis, tmp_path_factory):
+def brief_sessions():
+    """Have ten seconds of each session drawn, in place of two minutes."""
+
+    def read(path):
+        session = read_session(path)
+        return replace(session, samples=session.samples[:SAMPLES])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("analysis.report._rerun_file.read_session", read)
+        yield
+
+
+@pytest.fixture(scope="module")
+def written(paper_analysis, tmp_path_factory, brief_sessions):
     path = tmp_path_factory.mktemp("rerun") / "paper.rrd"
     write_rerun_file(RecordResult(paper_analysis.record, welch=paper_analysis), path)
     return batches(path), path
@@ -153,9 +169,9 @@ def test_the_estimate_of_the_fits_is_shown_with_its_coherence(paper_analysis, wr
     )  # fmt: skip
 
 
-def test_it_has_the_session_the_numbers_and_a_tab_for_each(paper_analysis, paper_file, written):
+def test_it_has_the_session_the_numbers_and_a_tab_for_each(paper_analysis, written):
     chunks, path = written
-    assert sum(b.num_rows for b in chunks["/signals"]) == len(read_session(paper_file).samples)
+    assert sum(b.num_rows for b in chunks["/signals"]) == SAMPLES
     text = value(chunks["/fits/tables"], "TextDocument:text")[0]
     best = next(
         m
@@ -169,7 +185,7 @@ def test_it_has_the_session_the_numbers_and_a_tab_for_each(paper_analysis, paper
 
 
 @pytest.fixture(scope="module")
-def from_record(record_result, tmp_path_factory):
+def from_record(record_result, tmp_path_factory, brief_sessions):
     path = tmp_path_factory.mktemp("rerun") / "record.rrd"
     write_rerun_file(replace(record_result, welch=None), path)
     return batches(path), path
@@ -267,7 +283,7 @@ def session(write_session, short_signals, tmp_path):
     return write_session(tmp_path / "session.mcap", short_signals)
 
 
-def test_a_file_that_cannot_be_written_is_told(paper_analysis):
+def test_a_file_that_cannot_be_written_is_told(paper_analysis, brief_sessions):
     with pytest.raises(OutputError, match=r"^/proc/fits.rrd cannot be written: [A-Z][^:]*\.$"):
         write_rerun_file(
             RecordResult(paper_analysis.record, welch=paper_analysis), Path("/proc/fits.rrd")

@@ -30,9 +30,10 @@ def cut(write_session, make_signals, tmp_path_factory):
 
 
 @pytest.mark.fit
-def test_what_there_is_is_reported(cut, analyze_here, tmp_path):
+def test_what_there_is_is_reported(cut, analyze_here, tmp_path, without_drawing):
     """A record with fewer bins than tests have neighbours, figures stretches; none at a mode."""
-    result = analyze_here(cut(1700), *ONE_FIT, "--report", "r", "--json", "r.json")
+    with without_drawing():
+        result = analyze_here(cut(1700), *ONE_FIT, "--report", "r", "--json", "r.json")
     assert (result.returncode, result.stderr) == (0, "")
     content = json.loads((tmp_path / "r.json").read_text())
     assert {fit["estimator"] for fit in content["fits"]} == {"welch", "record"}

@@ -15,10 +15,17 @@ from analysis.report.touch_report import touches_document, touches_table, write_
 
 
 @pytest.fixture
-def analyze(monkeypatch, touch_analysis):
-    """Run the command; the model is prepared once for all tests."""
+def analyze(monkeypatch, touch_analysis, touch_file, touched):
+    """Run the command; the file is analysed once for all tests."""
+
+    class Analysed:
+        def session(self, path, *options):
+            if path == touch_file.path:
+                return touched
+            return touch_analysis.session(path, *options)
+
     monkeypatch.setattr(
-        "analysis.touch.TouchAnalysis", lambda model: touch_analysis if model is None else None
+        "analysis.touch.TouchAnalysis", lambda model: Analysed() if model is None else None
     )
     return lambda *arguments: CliRunner().invoke(app, ["touch", *map(str, arguments)])
 
@@ -74,8 +81,9 @@ def test_a_session_may_be_called_touch(touch_file, tmp_path):
     assert "is empty, nothing was recorded to it" in result.stderr
 
 
-def test_the_report_has_a_map_and_the_evidence(touched, tmp_path):
-    write_touch_report([touched, touched], {"b.mcap": "b.mcap is damaged."}, tmp_path)
+def test_the_report_has_a_map_and_the_evidence(touched, tmp_path, without_drawing):
+    with without_drawing():
+        write_touch_report([touched, touched], {"b.mcap": "b.mcap is damaged."}, tmp_path)
     page = (tmp_path / "report.html").read_text()
     assert "<title>2 sessions: touches</title>" in page
     assert "Left out: b.mcap is damaged." in page

@@ -9,25 +9,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify import MODE_CONSTANT_NAMES, Measurement, ModalModel, select
+from analysis.identify import MODE_CONSTANT_NAMES, ModalModel
 from analysis.report import FIGURES, ShownModel, document, illustrations, result_text
-from analysis.report import _style as style
 from analysis.report.bands import loss_estimate, modal_response_band
 from analysis.report.record_report import record_page, report_tables, uniformity_tables
-from analysis.results import RecordResult, WholeRecord
 
 pytestmark = pytest.mark.fit
 
 EXACT = "if the beam is uniform to 1e-5"
 TOLERANT = "if each mode lies where that of a uniform beam does, to 0.1 %"
-
-
-@pytest.fixture(scope="module")
-def modal_result(record_result):
-    """Result of a record whose modes are those of the modal model."""
-    record = record_result.record
-    selection = select(Measurement.from_record(record))
-    return RecordResult(record, WholeRecord(record, selection, (0.0, 50.0)))
 
 
 @pytest.fixture(scope="module")
@@ -142,26 +132,6 @@ def page(modal_result):
     ]
     modes, tables, _ = report_tables(modal_result)
     return record_page(modal_result, pictures, modes, tables, datetime(2026, 1, 1, tzinfo=UTC))
-
-
-@pytest.mark.parametrize("factor", [1.0, 0.01])
-def test_labels_of_the_uniformity_figure_are_whole(modal_result, retold, factor):
-    """A frequency that is known to a ten thousandth of a per cent has long numbers at its axis."""
-    told = modal_result.whole.headline
-    test = told.uniform_beam
-    predicted = test.measured + factor * (test.predicted - test.measured)
-    test = replace(test, predicted=predicted, std=factor * test.std)
-    result = retold(modal_result, headline=replace(told, uniform_beam=test))
-    with style.figure_style():
-        figure = drawn(result)["uniform_beam"].draw()
-        figure.canvas.draw()
-        for axes in figure.axes:
-            for label in (axes.xaxis.label, axes.yaxis.label, axes.title):
-                box = label.get_window_extent()
-                assert box.x0 >= 0
-                assert box.y0 >= 0
-                assert box.x1 <= figure.bbox.x1
-                assert box.y1 <= figure.bbox.y1
 
 
 def test_the_page_has_a_section_on_the_uniformity(modal_result, page):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import further
 from shipped_profile import load_shipped
 
 from analysis.identify import Comparison, Measurement
@@ -79,11 +80,12 @@ def unexplained(parameters, drag_m):
 @pytest.mark.parametrize(
     ("damping", "coulomb_nm", "delay_s"),
     [
-        (Damping(5.4e-5, 1.0, 0.02, 1.0), 0.0, 0.0),
-        (Damping(7.1e-5, 0.996, 0.055, 0.594), 0.03, 0.0),
-        (Damping(7.1e-5, 0.996, 0.055, 0.594), 0.0, 0.4e-3),
+        further(Damping(5.4e-5, 1.0, 0.02, 1.0), 0.0, 0.0, id="integer orders"),
+        further(Damping(7.1e-5, 0.996, 0.055, 0.594), 0.03, 0.0, id="fractional, with friction"),
+        pytest.param(
+            Damping(7.1e-5, 0.996, 0.055, 0.594), 0.0, 0.4e-3, id="a sensor between two ticks"
+        ),
     ],
-    ids=["integer orders", "fractional, with friction", "a sensor between two ticks"],
 )
 def test_the_simulated_drag_is_that_of_the_exact_beam(damping, coulomb_nm, delay_s):
     left, by_drag = unexplained(rig(DRAG_M, damping, coulomb_nm, delay_s), DRAG_M)

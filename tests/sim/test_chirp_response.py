@@ -186,7 +186,9 @@ def simulate(damping, tool_inertia=0.0, substeps=1):
     return angle, torque
 
 
-@pytest.mark.parametrize("name", TABLE_3)
+@pytest.mark.parametrize(
+    "name", [name if name in ("I-const", "VI-omega") else further(name) for name in TABLE_3]
+)
 def test_table_3(name):
     angle, torque = simulate(TABLE_3[name])
     exact = exact_torque(angle, 1000, TABLE_3[name])
@@ -196,8 +198,8 @@ def test_table_3(name):
 @pytest.mark.parametrize(
     "seed",
     [
-        *range(3),
-        *map(further, range(3, 12)),
+        0,
+        *map(further, range(1, 12)),
         *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(12, 50)),
     ],
 )

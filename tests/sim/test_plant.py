@@ -88,7 +88,7 @@ def noise(n, level=0.1, seed=0):
 
 @pytest.mark.parametrize("delay", [further(0.0), 0.3e-3, further(1e-3), 2.7e-3])
 @pytest.mark.parametrize("angle_delay", [0.0, further(0.4e-3), 2e-3, further(3.3e-3)])
-@pytest.mark.parametrize("torque_delay", [0.1e-3, 0.8e-3, 2.2e-3])
+@pytest.mark.parametrize("torque_delay", [further(0.1e-3), 0.8e-3, 2.2e-3])
 def test_delays(delay, angle_delay, torque_delay):
     torques = noise(300)
     slow = enabled(rig(delay=delay, angle_delay=angle_delay, torque_delay=torque_delay))
@@ -260,7 +260,7 @@ def test_friction_converges_with_the_rate():
 # Energy
 
 
-@pytest.mark.parametrize("coulomb", [0.0, 0.03])
+@pytest.mark.parametrize("coulomb", [further(0.0), 0.03])
 @pytest.mark.parametrize(
     "damping",
     [

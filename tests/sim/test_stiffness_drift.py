@@ -65,16 +65,16 @@ OVER_DAMPED = (Damping(zeta=1.075e-3), {})
 @pytest.mark.parametrize(
     ("damping", "more", "rate"),
     [
-        *((*rig, FASTEST) for rig in (TIP_MASS, CLAMP, FILTER, DAMPED)),
-        *((*rig, -FASTEST) for rig in (BARE, OVER_DAMPED)),
-        *(further(*rig, -FASTEST) for rig in (TIP_MASS, CLAMP, FILTER, DAMPED)),
-        *(further(*rig, FASTEST) for rig in (BARE, OVER_DAMPED)),
+        *((*rig, FASTEST) for rig in (TIP_MASS, CLAMP, FILTER)),
+        (*OVER_DAMPED, -FASTEST),
+        *(further(*rig, FASTEST) for rig in (BARE, DAMPED, OVER_DAMPED)),
+        *(further(*rig, -FASTEST) for rig in (BARE, TIP_MASS, CLAMP, FILTER, DAMPED)),
     ],
 )
 def test_poles_are_those_of_the_stiffness_at_each_time(rig, damping, more, rate):
     rig = rig if damping is None else replace(rig, damping=damping)
     plant = plant_of(rig, **more, stiffness_drift_per_s=rate)
-    for time_s in (0.0, 3.0, 11.0, 29.0, 44.0, 49.98, 50.0, 60.0):
+    for time_s in (0.0, 11.0, 44.0, 50.0, 60.0):
         periods = round(time_s * RATE_HZ)
         changed = plant._drift.refresh_if_due(periods)
         assert changed == (time_s < 60)
@@ -93,19 +93,19 @@ def test_poles_are_those_of_the_stiffness_at_each_time(rig, damping, more, rate)
             assert found.imag == pytest.approx(expected.imag, rel=1e-4)
 
 
-def test_after_the_drift_it_is_a_beam_of_that_stiffness(rig):
+@pytest.mark.parametrize("sign", [further(1), -1])
+def test_after_the_drift_it_is_a_beam_of_that_stiffness(rig, sign):
     rig = replace(rig, motor=replace(rig.motor, coulomb_nm=0.03))
-    torques = noise(3000, 0.2)
-    for sign in (1, -1):
-        drifted = plant_of(rig, stiffness_drift_per_s=sign * FASTEST)
-        drifted.enable()
-        drifted.advance(60_000)
-        exact = plant_of(rig, stiffness_ratio=1 + sign * LARGEST_DRIFT)
-        exact.enable()
-        found, expected = run(drifted, torques), run(exact, torques)
-        assert np.abs(found - expected).max(axis=0) == pytest.approx(
-            0.0, abs=1e-7 * np.abs(expected).max()
-        )
+    torques = noise(2000, 0.2)
+    drifted = plant_of(rig, stiffness_drift_per_s=sign * FASTEST)
+    drifted.enable()
+    drifted.advance(60_000)
+    exact = plant_of(rig, stiffness_ratio=1 + sign * LARGEST_DRIFT)
+    exact.enable()
+    found, expected = run(drifted, torques), run(exact, torques)
+    assert np.abs(found - expected).max(axis=0) == pytest.approx(
+        0.0, abs=1e-7 * np.abs(expected).max()
+    )
 
 
 def test_it_counts_from_the_first_enabling(rig):
@@ -184,9 +184,9 @@ def test_it_moves_as_its_modal_equations(rig, rate):
     rig = replace(rig, actuation=replace(rig.actuation, delay_s=0.0))
     plant = plant_of(rig, stiffness_drift_per_s=rate)
     plant.enable()
-    ticks = 2000
+    ticks = 1000
     t = np.arange(ticks) / RATE_HZ
-    torques = 0.1 * np.hanning(ticks) * np.sin(2 * np.pi * (1.0 + 4.5 * t) * t)
+    torques = 0.1 * np.hanning(ticks) * np.sin(2 * np.pi * (1.0 + 9.0 * t) * t)
     found = run(plant, torques)
 
     motor, tool = rig.motor, rig.sensor.tool_inertia_kg_m2
@@ -226,9 +226,9 @@ def test_a_beam_on_a_locked_shaft_rings_as_its_modal_equations(rig, rate):
     plant = plant_of(rig, stiffness_drift_per_s=rate)
     plant.enable()
     run(plant, [0.3] * 60 + [-0.3] * 30)
-    record = run(plant, [0.0] * 9000)
+    record = run(plant, [0.0] * 4500)
     first = np.flatnonzero(record[:, 1])[-1] + 2000  # the higher modes have decayed
-    assert first < 5000
+    assert first < 3000
     torque = record[first:, STATE.index("coupling_torque_nm")]
     assert np.abs(torque).max() > 1e-3
     start_s = (90 + first) / RATE_HZ

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.beam import DeflectionFilter
 from rigd.view import Scene
@@ -100,7 +101,7 @@ def last_label(batches):
     return time_ns, text
 
 
-@pytest.mark.parametrize("excitation", ["move", "touch"])
+@pytest.mark.parametrize("excitation", ["move", further("touch")])
 def test_where_the_motor_goes_far_all_is_drawn_to_scale(description, samples, drawn, excitation):
     scene = Scene(dataclasses.replace(description, excitation=excitation))
     turned = samples.copy()
@@ -119,8 +120,9 @@ def test_where_the_motor_goes_far_all_is_drawn_to_scale(description, samples, dr
             assert last_label(sent[LABEL])[1].endswith(" mm, drawn to scale")
 
 
-@pytest.mark.parametrize("amplitude", [0.0, 0.01, 0.1, 1.0])
+@pytest.mark.parametrize("amplitude", [further(0.0), 0.01, further(0.1), 1.0])
 def test_the_label_tells_the_largest_deflection_of_late(description, samples, follow, amplitude):
+    samples = samples[:1500]
     samples["angle_rad"] = amplitude * (samples["angle_rad"] - 0.3)
     last_ns, last = last_label(follow(blocks(samples, 50))[LABEL])
     bends = DeflectionFilter(description.beam, description.damping, description.rate_hz)
@@ -138,7 +140,7 @@ def test_the_trail_is_what_the_beam_has_been(samples, follow):
         np.testing.assert_array_equal(past, lines[1])
 
 
-@pytest.mark.parametrize("size", [1, 7, 64, 3000])
+@pytest.mark.parametrize("size", [further(1), 7, further(64), 3000])
 def test_blocks_make_no_difference(size, samples, follow):
     expected = moments(follow(blocks(samples, 50))[BEAM])
     found = moments(follow(blocks(samples, size))[BEAM])
@@ -168,16 +170,16 @@ def test_after_a_gap_of_hours_it_goes_on_at_once(make_samples, follow):
     assert beams[-1][0] > 30_000 * 10**9
 
 
-@pytest.mark.parametrize("rate_hz", [10.0, 250.0, 4000.0])
+@pytest.mark.parametrize("rate_hz", [10.0, further(250.0), 4000.0])
 def test_other_rates_are_drawn_at_most_20_times_a_second(
     rate_hz, description, make_samples, follow
 ):
-    n = int(10 * rate_hz)
+    n = int(4 * rate_hz)
     samples = make_samples(n, angle_rad=0.02 * np.sin(np.arange(n) / rate_hz))
     samples["t_ns"] = np.arange(n) * round(1e9 / rate_hz)
     of = dataclasses.replace(description, rate_hz=rate_hz)
     beams = moments(follow(blocks(samples, 500), of)[BEAM])
-    assert 0.85 <= len(beams) / (10 * min(rate_hz, DRAWN_HZ)) <= 1.0
+    assert 0.85 <= len(beams) / (4 * min(rate_hz, DRAWN_HZ)) <= 1.0
     assert all(np.isfinite(lines).all() for _, lines in beams)
 
 

@@ -103,7 +103,7 @@ def test_what_is_written_is_understood_and_written_back(question, random):
     assert (again.kind, dict(again.values), again.after_s) == (kind, dict(fault.values), after_s)
 
 
-@settings(max_examples=200)
+@settings(max_examples=50)
 @given(st.text(max_size=40) | st.text(alphabet="dropfmes=,@0x1.-", max_size=20))
 def test_anything_else_is_refused_with_a_sentence(text):
     try:

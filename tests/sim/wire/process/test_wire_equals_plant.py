@@ -170,7 +170,7 @@ def bare(rig, ticks):
         ),
         further("antenna_serial", {"filter": '"triangle"', "sensor:delay_s": "1.0e-3"}),
         ("antenna_serial", {}),
-        ("antenna_can", {"force_noise_n": AND_AN_OBSTACLE}),
+        further("antenna_can", {"force_noise_n": AND_AN_OBSTACLE}),  # as test_world.py
         further("antenna_serial", {"force_noise_n": AND_AN_OBSTACLE}),
         further("antenna_can", {"force_noise_n": AND_A_DRIFT}),
         further("antenna_serial", {"force_noise_n": AND_A_DRIFT}),
