@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from analysis.identify.profile_likelihood import (
+from analysis.identify.deviance_curve import (
     CHI_SQUARE_95,
-    LikelihoodProfile,
     admitted_interval,
     coarse_minima_values,
     limit_crossing,
     local_minima,
     values_outside_known,
 )
+from analysis.identify.profile_likelihood import LikelihoodProfile
 
 VALUES = np.linspace(0.1, 1.9, 361)
 

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify.profile_likelihood import OrderProfiler, admitted_interval, local_minima
+from analysis.identify.deviance_curve import admitted_interval, local_minima
+from analysis.identify.profile_likelihood import OrderProfiler
 from analysis.models import STRUCTURES
 from analysis.optimizer import NormalEquations
 

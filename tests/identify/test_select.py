@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.identify import fit_record, headline_json, select
-from analysis.identify.profile_likelihood import CHI_SQUARE_95
+from analysis.identify.deviance_curve import CHI_SQUARE_95
 from analysis.identify.verdict import SECOND_DAMPING_REASON, too_few_modes
 from analysis.models import STRUCTURES
 from analysis.statistics import BIC_TIE
