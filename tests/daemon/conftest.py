@@ -8,7 +8,6 @@ from operated_daemons import Operated, run_processes_as_threads
 
 from rigd.daemon import _stop as stop_module
 from rigd.daemon import background
-from rigd.engine.workers import PREDICTION
 from rigd.profile import load_profile
 from rigd.runtime.processes import read_processes
 
@@ -31,9 +30,8 @@ def operate(profile, tmp_path, monkeypatch, children_copied):
     """
     run_processes_as_threads(monkeypatch)
     monkeypatch.setattr("rigd.engine._session_sequence._SETTLING_S", 0.1)
-    copied = replace(PREDICTION, memory=None, niceness=0)
-    for job in (background.PredictionJob, background.CheckJob):
-        monkeypatch.setattr(job, "worker", copied)
+    for job in (background.PredictionJob, background.PlanJob, background.CheckJob):
+        monkeypatch.setattr(job, "worker", replace(job.worker, memory=None, niceness=0))
     made = []
 
     def make():
