@@ -16,7 +16,7 @@ demo: $(VENV)/ready
 	$(BIN)/analyze demo/*.mcap --report demo/report
 	@echo "The operator's page on the simulated rig: $(BIN)/rigd serve --profile sim --web --output demo"
 
-# Five minutes on two processors: every behaviour once.
+# Seven minutes on two processors: every behaviour once.
 test: $(VENV)/ready
 	$(PYTEST) -m "not further and not slow"
 
