@@ -182,6 +182,8 @@ def test_earlier_results_are_replaced_and_nothing_else(tmp_path):
     path = tmp_path / "a.json"
     write_new(path, '{"versions": {}, "headlines": [], "fits": []}', overwrite=True)
     write_new(path, '{"versions": {}, "headlines": [], "fits": [1]}', overwrite=True)
+    with pytest.raises(OutputExistsError, match="nothing is overwritten"):
+        write_new(path, "2")
     assert "[1]" in path.read_text()
     for text in ('{"fits": []}', "[]", "not JSON"):
         path.write_text(text)
