@@ -8,12 +8,14 @@ each result (`analysis.campaigns.SessionAnalysis`) and combines these in an
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from analysis.identify import RecordAnalysis, RecordFit, Selection, Setting, StructureFit
@@ -381,11 +383,15 @@ def record_result(
     if not routes.whole_record:
         on_step("Welch fits")
         return RecordResult(record, None, fit_welch()[0])
+    on_step("Welch fits and whole record")
+    computation: AbstractContextManager[Callable[[], tuple[WelchAnalysis | None, str | None]]]
+    if routes.settings.are_from_paper:
+        computation = computed_meanwhile(fit_welch)
+    else:  # chosen settings may not suit the record, which is reported before the other fits
+        welch_of_settings = fit_welch()
+        computation = nullcontext(lambda: welch_of_settings)
     whole_fits, measurement_error = None, None
-    with computed_meanwhile(fit_welch) as welch_fits:
-        on_step("Welch fits and whole record")
-        if not routes.settings.are_from_paper:
-            welch_fits()  # settings that do not suit the record are reported first
+    with computation as welch_fits:
         try:
             whole_fits = _fit_whole_record(record, routes, warn)
         except MeasurementError as error:

@@ -12,7 +12,7 @@ import base64
 import io
 import logging
 import warnings
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, Final
@@ -330,9 +330,12 @@ def _draw_by_two(
     """Return the image files of figures by their names, half of them drawn by a copy."""
     own, others = illustrations[::2], illustrations[1::2]
     images: dict[str, Images] = {}
-    with computed_meanwhile(
-        lambda: {each.name: _images(each, formats) for each in others}
-    ) as other_images:
+    computation = (
+        computed_meanwhile(lambda: {each.name: _images(each, formats) for each in others})
+        if others
+        else nullcontext(dict)
+    )
+    with computation as other_images:
         for illustration in own:
             images[illustration.name] = _images(illustration, formats)
             on_step(f"figure {illustration.name}")

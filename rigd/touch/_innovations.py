@@ -177,31 +177,37 @@ class InnovationFilter:
 
     __slots__ = (
         "_angle_rad",
+        "_following_zeros",
         "_gain",
-        "_held_zeros",
+        "_holding_zeros",
         "_multiply",
         "_previous_angle_rad",
         "_start_rad",
         "_states",
         "_unwhitening",
         "_vectors",
-        "_zero_states",
         "predicted",
         "whitened",
     )
 
     def __init__(self, model: ObservedBeam) -> None:
         n = self._states = model.states
-        self._gain = model.gain
         self._unwhitening = (0.0, 0.0)
         if model.channels == 2:
             torque_coefficient, shear_coefficient = np.linalg.inv(model.whitening)[1].tolist()
             self._unwhitening = torque_coefficient, shear_coefficient
-        self._multiply = np.asfortranarray(model.matrix).dot
+        # The zeros are the last states: without a gain they stay what they are.
+        zeros = np.arange(n - model.channels, n)
+        holding_matrix, holding_gain = model.matrix.copy(), model.gain.copy()
+        holding_matrix[zeros] = np.eye(n + 3)[zeros]
+        holding_gain[zeros] = 0.0
+        self._following_zeros, self._holding_zeros = (
+            (np.asfortranarray(matrix).dot, gain)
+            for matrix, gain in ((model.matrix, model.gain), (holding_matrix, holding_gain))
+        )
+        self._multiply, self._gain = self._following_zeros
         # In turn input [state, angle, torque, shear] and output [state, whitened, predicted].
         self._vectors = tuple(np.zeros((2, n + 4)))
-        self._zero_states = slice(n - model.channels, n)
-        self._held_zeros: Real | None = None
         self._start_rad: float | None = None
         self._angle_rad = self._previous_angle_rad = 0.0
         self.whitened = (0.0, 0.0)
@@ -249,11 +255,11 @@ class InnovationFilter:
 
     def hold_zeros(self) -> None:
         """Hold the zeros of torque and shear, which a contact force would shift for seconds."""
-        self._held_zeros = self._vectors[0][self._zero_states].copy()
+        self._multiply, self._gain = self._holding_zeros
 
     def follow_zeros(self) -> None:
         """Follow the zeros of torque and shear again."""
-        self._held_zeros = None
+        self._multiply, self._gain = self._following_zeros
 
     @property
     def predicted_shear_n(self) -> float:
@@ -272,8 +278,6 @@ class InnovationFilter:
         input_vector[n + 1] = torque_nm
         input_vector[n + 2] = shear_n
         self._multiply(input_vector[: n + 3], output_vector)
-        if self._held_zeros is not None:
-            output_vector[self._zero_states] = self._held_zeros
         self._vectors = output_vector, input_vector
         torque_innovation, shear_innovation, predicted_torque, predicted_shear = output_vector[
             n:
@@ -288,8 +292,6 @@ class InnovationFilter:
         """Process one tick without a valid wrench, whose effect on the filter's state is undone."""
         self._step_with_wrench(relative_angle_rad, torque_nm, shear_n)
         self._vectors[0][: self._states] -= self._gain @ np.array(self.whitened)
-        if self._held_zeros is not None:
-            self._vectors[0][self._zero_states] = self._held_zeros
         self.whitened = 0.0, 0.0
 
 

@@ -10,14 +10,15 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from importlib.metadata import distribution, packages_distributions
+from importlib.metadata import packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from packages import normalized, required_distributions
+from packages import required_distributions
+from packaging.utils import canonicalize_name
 
 from rigd.session import read_session
 from rigd.testing import PAPER_BEAM, chirp_signals, write_session
@@ -63,11 +64,11 @@ def missing_on_windows():
 
 def not_required():
     """Return the modules that are installed here, but not with `rigd` alone."""
-    required = required_distributions([distribution("rigd")]).keys() | {"rigd"}
+    required = required_distributions(["rigd"]).keys()
     return {
         module
         for module, names in packages_distributions().items()
-        if not {normalized(name) for name in names} & required
+        if not {canonicalize_name(name) for name in names} & required
     }
 
 

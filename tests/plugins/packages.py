@@ -1,14 +1,12 @@
 """Packages of one file that add parts by entry points, as pip leaves them in a folder."""
 
 import os
-import re
+import runpy
 import subprocess
 import sys
-from importlib.metadata import distribution
 from pathlib import Path
 
 import warm_start
-from packaging.requirements import Requirement
 
 
 def install(folder, package, version, code, entry_points):
@@ -37,24 +35,10 @@ def rigd_with(folder, *arguments, cwd=None, program=("-P", "-m", "rigd"), cold=F
     return done.returncode, done.stdout, done.stderr
 
 
-def required_distributions(distributions):
-    """Return the distributions that some require, without extras, and those that these require."""
-    found = {}
-    waiting = list(distributions)
-    while waiting:
-        for text in waiting.pop().requires or ():
-            requirement = Requirement(text)
-            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
-                name = normalized(requirement.name)
-                if name not in found:
-                    found[name] = distribution(requirement.name)
-                    waiting.append(found[name])
-    return found
-
-
-def normalized(name):
-    """Return the name of a distribution as indexes write it."""
-    return re.sub(r"[-_.]+", "-", name.lower())
+def required_distributions(requirements):
+    """Return the distributions that requirements name, and those that these require, by name."""
+    program = runpy.run_path(str(Path(__file__).parents[2] / ".ci" / "dependencies.py"))
+    return program["installed_requirements"](requirements)
 
 
 DEVICES = Path(__file__).with_name("outside_devices.txt").read_text()
