@@ -2,7 +2,7 @@
 
 
 def batches(path):
-    """Record batches by entity, in order of time."""
+    """Record batches by entity, in the order in which they were written."""
     from rerun.chunk import RrdReader
 
     found = {}

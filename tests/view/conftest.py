@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from rerun_files import batches
 
 from rigd.beam import Beam, Damping
 from rigd.session.layout import TIMING_SIZE, decode_timings, pack_timing_into
@@ -28,7 +29,6 @@ def drawn(tmp_path):
 
     def draw(drawings) -> dict[str, list]:
         import rerun as rr
-        from rerun.chunk import RrdReader
 
         path = tmp_path / "drawn.rrd"
         path.unlink(missing_ok=True)
@@ -38,10 +38,7 @@ def drawn(tmp_path):
             drawing(stream)
         stream.flush(timeout_sec=60.0)
         stream.disconnect()
-        found: dict[str, list] = {}
-        for chunk in RrdReader(path).stream():
-            found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
-        return found
+        return batches(path)
 
     return draw
 
@@ -68,7 +65,8 @@ class Shown:
                 self._add(entry.name, [row for row in rows if row[1] is not None])
 
     def _add(self, name: str, rows: list) -> None:
-        rows += zip(self.times_ns.get(name, []), self.values.get(name, []), strict=True)
+        # Of one time the earlier batch comes first: Rerun may split what is sent at any row.
+        rows = [*zip(self.times_ns.get(name, []), self.values.get(name, []), strict=True), *rows]
         rows.sort(key=lambda row: -1 if row[0] is None else row[0])
         self.times_ns[name] = [time_ns for time_ns, _ in rows]
         self.values[name] = [value for _, value in rows]
@@ -85,9 +83,9 @@ def shown(drawn):
 
     def draw(drawings) -> dict[str, Shown]:
         found = {}
-        for entity, batches in drawn(drawings).items():
+        for entity, written in drawn(drawings).items():
             found[entity] = Shown()
-            for batch in batches:
+            for batch in written:
                 found[entity].add(batch)
         return found
 
