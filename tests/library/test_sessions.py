@@ -168,6 +168,7 @@ def test_dates_are_local_and_the_last_day_is_included(record_briefly, tmp_path, 
             return [row.id for row in list_sessions(tmp_path, **filters)]
 
         assert ids(since="2023-11-15", until="2023-11-15") == ["a"]
+        assert ids(since="2023-11-15T07:13:20") == ["b", "a"]
         assert ids(since="2023-11-15T07:14") == ["b"]
         assert ids(until="2023-11-15T07:14") == ["a"]
         assert ids(until="2023-11-14T22:14+00:00") == ["a"]
