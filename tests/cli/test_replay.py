@@ -32,7 +32,7 @@ from rigd.session.layout import SAMPLE_SIZE, TIMING_SIZE, Status, pack_sample_in
 from rigd.view import draw_session
 from rigd.view._recorded import describe_recorded_session
 from rigd.view.frequency_charts import MAGNITUDE_ENTITY, ResponseCharts
-from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
+from rigd.view.plots import AGES, GREEN, GREY, ORANGE, SKY_BLUE
 
 pytestmark = pytest.mark.process
 
@@ -243,6 +243,17 @@ def test_it_is_played_from_its_start_in_the_layout_of_the_live_view(chirp):
         if "RecordingInfo:start_time" in batch.schema.names
     ]
     assert starts_ns[-1][-1] == session.start_utc_ns
+
+
+def test_ages_are_a_plot_if_a_real_rig_states_them(write):
+    path = write("ages.mcap", np.arange(10))
+    session, timings = read_session(path), read_timings(path)
+    samples = session.samples.copy()
+    samples["work_ns"] = 1000  # in simulated time there is none
+    of_a_rig = replace(session, samples=samples)
+    assert AGES.component not in describe_recorded_session(of_a_rig, timings).absent
+    for without in (None, timings[:0]):
+        assert AGES.component in describe_recorded_session(of_a_rig, without).absent
 
 
 LEAST = {
