@@ -423,13 +423,16 @@ def test_a_full_disk_is_told_and_leaves_nothing_behind(short, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_progress_appears_when_it_takes_long(rigd_here, write, monkeypatch, tmp_path):
-    monkeypatch.setattr("rigd.cli.options._PROGRESS_DELAY_S", -1.0)
+@pytest.mark.parametrize(("delay_s", "appears"), [(-1.0, True), (600.0, False)])
+def test_progress_appears_when_it_takes_long(
+    rigd_here, write, monkeypatch, tmp_path, delay_s, appears
+):
+    monkeypatch.setattr("rigd.cli.options._PROGRESS_DELAY_S", delay_s)
     monkeypatch.setenv("FORCE_COLOR", "1")
     path = write("brief.mcap", np.arange(700))
     done = rigd_here("replay", path, "--save", tmp_path / "out.rrd")
     assert done.returncode == 0, done.stderr
-    assert path.name in done.stderr.partition("open it with")[0]
+    assert (path.name in done.stderr.partition("open it with")[0]) == appears
 
 
 def test_without_a_screen_it_says_what_else_there_is(rigd_here, write, monkeypatch):
