@@ -283,7 +283,7 @@ def histogram_lines(histogram_columns: Sequence[tuple[str, npt.NDArray[np.float6
 def _histogram_bar(bin_count: int, longest: int) -> str:
     """Return the bar of a bin; `longest` is the count of the longest bar."""
     bar_length = round((_BAR_WIDTH - 1) * log10(1 + bin_count) / log10(1 + longest))
-    return f"{_BAR_CHARACTER * max(bar_length, int(bin_count > 0)):<{_BAR_WIDTH}}"
+    return f"{_BAR_CHARACTER * bar_length:<{_BAR_WIDTH}}"
 
 
 def _bin_label(bin_index: int) -> str:

@@ -103,7 +103,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         unusable_count += pass_count - len(usable_passes)
     if first_data is None:
         raise MotorEstimateError("No session file is given.")
-    if all(pass_window.top_hz == HIGHEST_FREQUENCY_HZ[SPEEDS] for pass_window in pass_readings):
+    if {pass_window.top_hz for pass_window in pass_readings} == {HIGHEST_FREQUENCY_HZ[SPEEDS]}:
         raise MotorEstimateError(
             "Constant speeds alone do not determine inertia, delay and torque scale; give the "
             f"session {MULTISINE} of the same rig, too."

@@ -264,6 +264,7 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, an
     [
         (("--types", "VIII"), ("VIII", "I, II, III, IV, V, VI, VII")),
         (("--types", ","), ("--types", "I, II, III")),
+        (("--weights", ","), ("--weights", "no weighting was named; choose from const, omega")),
         (("--weights", "log"), ("log", "const, omega")),
         (("--weights", "omega^nan"), ("omega^nan", "omega^K")),
         (("--weights", "omega^1e308"), ("omega^1e308",)),

@@ -327,11 +327,6 @@ class Pdo:
             objects.add(mapping, Entry("I", mapping_value, check=self._check_slot), sub)
             for sub, mapping_value in enumerate((default_mapping + (0,) * slots)[:slots], 1)
         ]
-        self.can_id = -1
-        self.size = 0
-        self.entries: list[Entry] = []
-        self._struct = Struct("<")
-        self.reset_exchange()
 
     def compile(self) -> None:
         """Rebuild the PDO's mapping from the object dictionary."""
