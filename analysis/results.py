@@ -39,7 +39,7 @@ FigureFormat = Literal["png", "svg", "pdf"]
 FIGURE_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg", "pdf")
 """File formats in which figures can be written."""
 DEFAULT_FORMATS: Final[tuple[FigureFormat, ...]] = ("svg",)
-"""Default file formats of the figures: that of the page. PNG and PDF take as long again each."""
+"""Default file formats of figures: that of the page. PNG and PDF would each double the time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +140,8 @@ class WholeRecord:
     def verdict(self) -> Verdict:
         """Verdict on the record, in sentences for the operator.
 
-        The second sentence states the validity of the estimates. If the record is a part of the
-        session, a sentence before them states it.
+        The second sentence states the validity of the estimates. If only a part of the session was
+        analysed, an additional first sentence states which part.
         """
         verdict = self.selection.verdict
         first_sentence, other_sentences = verdict.sentences[:1], verdict.sentences[1:]
@@ -173,7 +173,7 @@ class WholeRecord:
 
     @property
     def withheld_orders(self) -> frozenset[str]:
-        """Orders of the reported fit that are not to be reported: their estimate has a flag."""
+        """Orders of the damping whose estimate must not be reported, because it has a flag."""
         return frozenset(_ORDER_NAMES & self.headline.flags.keys())
 
     @property
@@ -214,9 +214,9 @@ class WholeRecord:
         }
 
     def _covariance_json(self) -> dict[str, Any]:
-        """Return the parameter names of the fit and their covariance matrix, as JSON values.
+        """Return the covariance matrix of the fit's parameters, and their names, for JSON.
 
-        The prefix ``ln_`` of a name states that the covariance is that of the logarithm.
+        A name with the prefix ``ln_`` denotes the logarithm of a parameter.
         """
         from rigd.beam import LOGARITHMIC_PARAMETERS
 
@@ -230,9 +230,9 @@ class WholeRecord:
 
     @property
     def unsupported_orders(self) -> frozenset[str]:
-        """Orders that the record does not support.
+        """Orders of damping that the record does not support.
 
-        These have a flag for an exactly uniform beam, or belong to absent damping.
+        Their estimate for an exactly uniform beam has a flag, or their damping was not found.
         """
         exact_parameters = (self.headline.exact or self.headline).parameters
         flagged_orders = {
@@ -289,12 +289,12 @@ class RecordResult:
 
     @property
     def unsupported_orders(self) -> frozenset[str]:
-        """Orders that the whole record does not support; empty without whole-record fits."""
+        """Orders of damping that the record does not support; empty without whole-record fits."""
         return frozenset() if self.whole is None else self.whole.unsupported_orders
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences on weaknesses of the record and, if there are Welch fits, of these."""
+        """Sentences on weaknesses of the record, and of the Welch fits if there are any."""
         return self.record.warnings if self.welch is None else self.welch.warnings
 
 
@@ -348,7 +348,7 @@ def record_result(
     routes : AnalysisOptions
         Selected analyses and their settings.
     on_step : callable, optional
-        Called with the name of each step after it.
+        Called after each step with the step's name.
     warn : callable, optional
         Called with a sentence on each omitted analysis.
 
@@ -414,7 +414,7 @@ def record_result(
 def _fit_whole_record(
     record: Record, routes: AnalysisOptions, warn: Callable[[str], None]
 ) -> WholeRecord:
-    """Run the fits to a whole record, with those of packages' structures."""
+    """Fit all structures to a whole record, including the selected ones of installed packages."""
     whole_fits = whole_record(record, routes.fixed, routes.band_hz)
     return _with_structures(whole_fits, routes.structures, warn)
 
@@ -424,7 +424,7 @@ def _with_structures(
     structures: tuple[AddedStructure, ...],
     warn: Callable[[str], None],
 ) -> WholeRecord:
-    """Return the fits with those of packages' structures; warn of each that cannot be fitted."""
+    """Return the fits with those of added structures; warn of each that cannot be fitted."""
     if not structures:
         return whole_fits
     from analysis.identify import fit_structure
@@ -448,7 +448,7 @@ def _with_structures(
 
 
 def with_uniformity(record: Record, uniformity: float | None) -> Record:
-    """Return a record with another uniformity of the beam.
+    """Return a record whose stated uniformity of the beam is replaced.
 
     Parameters
     ----------

@@ -173,10 +173,10 @@ def map_figure(session_touches: Sequence[SessionTouches]) -> Figure:
         _draw_map(detail_axes, session_touches, with_numbers=True)
         interval_ends_m = np.concatenate(
             [
-                t.ends_m
+                t.interval_ends_m
                 for session in session_touches
                 for t in session.touches
-                if t.ends_m is not None
+                if t.interval_ends_m is not None
             ]
         )
         map_centre_m = (interval_ends_m.min(axis=0) + interval_ends_m.max(axis=0)) / 2
@@ -202,9 +202,11 @@ def _draw_map(axes: Axes, sessions: Sequence[SessionTouches], *, with_numbers: b
         for touch in session.touches:
             if touch.antenna_m is not None:
                 axes.plot(*touch.antenna_m.T, color=style.FAINT, linewidth=1.0, zorder=1)
-            if touch.point_m is None or touch.ends_m is None:
+            if touch.point_m is None or touch.interval_ends_m is None:
                 continue
-            axes.plot(*touch.ends_m.T, color=session_color, linewidth=2.4, alpha=0.5, zorder=2)
+            axes.plot(
+                *touch.interval_ends_m.T, color=session_color, linewidth=2.4, alpha=0.5, zorder=2
+            )
             kind_is_known = touch.estimate is not None and touch.estimate.kind != "unknown"
             axes.plot(
                 *touch.point_m, "o", color=session_color, markersize=4, zorder=3,
