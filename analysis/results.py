@@ -334,7 +334,7 @@ def whole_record(
 
 def record_result(
     path: Path,
-    routes: AnalysisOptions,
+    options: AnalysisOptions,
     *,
     on_step: Callable[[str], None] = lambda _done: None,
     warn: Callable[[str], None] = lambda _text: None,
@@ -345,7 +345,7 @@ def record_result(
     ----------
     path : Path
         Session file.
-    routes : AnalysisOptions
+    options : AnalysisOptions
         Selected analyses and their settings.
     on_step : callable, optional
         Called after each step with the step's name.
@@ -369,23 +369,23 @@ def record_result(
     from analysis.record import load_record
     from rigd.runtime.computations import computed_meanwhile
 
-    record = load_record(path, routes.part_s, highest_hz=highest_frequency_hz(routes.band_hz))
-    record = with_uniformity(record, routes.uniformity)
-    record = _add_warnings(record, remarks(record, routes.band_hz))
+    record = load_record(path, options.part_s, highest_hz=highest_frequency_hz(options.band_hz))
+    record = with_uniformity(record, options.uniformity)
+    record = _add_warnings(record, remarks(record, options.band_hz))
     on_step("read")
-    if not routes.paper:
-        check_record_band(record, routes.band_hz)
+    if not options.paper:
+        check_record_band(record, options.band_hz)
         on_step("whole record")
-        return RecordResult(record, _fit_whole_record(record, routes, warn))
+        return RecordResult(record, _fit_whole_record(record, options, warn))
     fit_welch = partial(
-        welch_analysis, record, routes.settings, routes.band_hz, optional=routes.whole_record
+        welch_analysis, record, options.settings, options.band_hz, optional=options.whole_record
     )
-    if not routes.whole_record:
+    if not options.whole_record:
         on_step("Welch fits")
         return RecordResult(record, None, fit_welch()[0])
     on_step("Welch fits and whole record")
     computation: AbstractContextManager[Callable[[], tuple[WelchAnalysis | None, str | None]]]
-    if routes.settings.are_from_paper:
+    if options.settings.are_from_paper:
         computation = computed_meanwhile(fit_welch)
     else:  # chosen settings may not suit the record, which is reported before the other fits
         welch_of_settings = fit_welch()
@@ -393,7 +393,7 @@ def record_result(
     whole_fits, measurement_error = None, None
     with computation as welch_fits:
         try:
-            whole_fits = _fit_whole_record(record, routes, warn)
+            whole_fits = _fit_whole_record(record, options, warn)
         except MeasurementError as error:
             measurement_error = error
         welch_results, omission_remark = welch_fits()
@@ -412,11 +412,11 @@ def record_result(
 
 
 def _fit_whole_record(
-    record: Record, routes: AnalysisOptions, warn: Callable[[str], None]
+    record: Record, options: AnalysisOptions, warn: Callable[[str], None]
 ) -> WholeRecord:
     """Fit all structures to a whole record, including the selected ones of installed packages."""
-    whole_fits = whole_record(record, routes.fixed, routes.band_hz)
-    return _with_structures(whole_fits, routes.structures, warn)
+    whole_fits = whole_record(record, options.fixed, options.band_hz)
+    return _with_structures(whole_fits, options.structures, warn)
 
 
 def _with_structures(
