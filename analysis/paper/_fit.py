@@ -99,7 +99,7 @@ class FrfFit:
 
     @property
     def std_of_free_parameters(self) -> dict[str, float | None] | None:
-        """Return the standard deviations, with None for each fixed parameter; None without `std`."""
+        """Return the standard deviations, with None for fixed parameters; None if `std` is None."""
         if self.std is None:
             return None
         free_parameters = self.structure.free
