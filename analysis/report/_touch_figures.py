@@ -1,4 +1,4 @@
-"""Figures of touches: the evidence of each touch, and a map of all contact points from above."""
+"""Figures of touches: a map of all contact points from above, and the evidence of each touch."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _SHOWN_AFTER_MS: Final = 100.0
 _MIN_LOG_LIKELIHOOD_RANGE: Final = 40.0
 """Least range of the log-likelihood's axis."""
 _LINEAR_RANGE_STD: Final = 5.0
-"""Number of standard deviations up to which the axis of innovations is linear."""
+"""Number of standard deviations up to which the axis of innovations is linear, not logarithmic."""
 _MAX_DETAIL_FRACTION: Final = 0.25
-"""Largest extent of the contact points, relative to the antenna, for an enlarged map of them."""
+"""Largest extent of all contact points, relative to the antenna, for which a detail is drawn."""
 _SESSION_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE)
 """Colours of the sessions in the map."""
 
@@ -201,7 +201,7 @@ def _draw_map(axes: Axes, sessions: Sequence[SessionTouches], *, with_numbers: b
         session_label: str | None = session.path.stem
         for touch in session.touches:
             if touch.antenna_m is not None:
-                axes.plot(*touch.antenna_m.T, color=style.FAINT, linewidth=1.0, zorder=1)
+                axes.plot(*touch.antenna_m.T, color=style.LIGHT_GREY, linewidth=1.0, zorder=1)
             if touch.point_m is None or touch.interval_ends_m is None:
                 continue
             axes.plot(
