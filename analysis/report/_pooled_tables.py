@@ -410,7 +410,7 @@ def modes_table(campaign: CampaignResult) -> Table:
 
 
 def specimens_table(campaign: CampaignResult) -> Table:
-    """Return the table of the specimens that the files state, the campaign's own in the first row."""
+    """Return the table of the specimens that the files state, the campaign's own as first row."""
     stated_specimens = campaign.homogeneity.specimens
     return Table(
         "specimens",
