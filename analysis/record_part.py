@@ -31,7 +31,7 @@ def part_of_session(
 ) -> tuple[Session, tuple[float, float]]:
     """Return the part of a session between two times, and these times.
 
-    The segments of the result end where the part does, and those outside it are left out.
+    Segments are cut at the limits of the part, and segments outside the part are omitted.
 
     Parameters
     ----------

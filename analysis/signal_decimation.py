@@ -6,8 +6,8 @@ Each block overlaps its neighbours by the length of the filter, so that the resu
 on where a block ends. Reference, angle and torque pass the same filter, which leaves the response
 from angle to torque unchanged.
 
-Values in short gaps are interpolated before the filter. A longer gap makes those samples unknown
-whose filter window contains it.
+Values in short gaps are interpolated before the filter. A decimated sample is marked as unknown if
+its filter window contains a longer gap.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class SignalDecimation:
         Parameters
         ----------
         samples : ndarray of `rigd.session.layout.SAMPLE_DTYPE`, shape (n,)
-            Samples in the order of their ticks; others than those of the grid are ignored.
+            Samples in the order of their ticks. Samples outside the grid are ignored.
 
         Raises
         ------
@@ -166,7 +166,7 @@ class SignalDecimation:
         Raises
         ------
         RecordError
-            The torque is constant, or the file has fewer samples than before.
+            The torque is constant, or the file was changed while it was read.
         """
         path = self.grid.session.path
         check_sensor(path, np.array(self._torque_range_nm))

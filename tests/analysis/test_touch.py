@@ -33,7 +33,7 @@ def test_the_map_shows_it_where_the_obstacle_stands(touched, touch_file):
     # The obstacle is met by the straight antenna at this angle; the bent one is ahead or behind.
     assert atan2(*touch.point_m[::-1]) == pytest.approx(touch_file.obstacle.angle_rad, abs=3e-3)
     assert np.hypot(*touch.point_m) == pytest.approx(touch_file.obstacle.x_m, abs=4e-3)
-    inner, outer = np.hypot(*touch.ends_m.T)
+    inner, outer = np.hypot(*touch.interval_ends_m.T)
     assert inner < np.hypot(*touch.point_m) < outer
     assert touch.antenna_m[0] == pytest.approx([0.0, 0.0], abs=1e-9)
 
