@@ -1,4 +1,4 @@
-"""Sentences on modes and damping estimated from all sessions with a tolerance of the geometry."""
+"""Sentences on modes and damping estimated from all sessions for a beam that may be uneven."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OTHER_BASES: Final = {
     "losses": "damping ratios and residue phases alone",
     "none": "no beam with one order of each damping, which do not explain the losses",
 }
-"""Descriptions of the estimates that do not rely on the frequencies of a uniform beam."""
+"""What estimates are based on that do not use the frequencies of a uniform beam, as sentences."""
 
 
 def p_value_text(p_value: float) -> str:
@@ -37,7 +37,7 @@ def p_value_text(p_value: float) -> str:
 
 
 def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate) -> str:
-    """Describe the basis of the parameters and the tolerated deviation from a uniform beam."""
+    """Describe from what the parameters are estimated, and the tolerated unevenness of the beam."""
     largest_stated = modal_model.stated[-1]
     tolerance_text = f"{100 * largest_stated:g} % as the files state it"
     if len(modal_model.stated) > 1:
@@ -65,12 +65,12 @@ def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate
 
 
 def describe_slope(pooled_order: PooledOrder, modal_model: PooledModalModel) -> str:
-    """Describe an order of the damping as the slope of a loss over the visible modes.
+    """Describe an order of the damping as the slope of a loss against frequency.
 
     Parameters
     ----------
     pooled_order : PooledOrder
-        Order estimated with a tolerance of the geometry.
+        Order estimated for a beam that may be uneven.
     modal_model : PooledModalModel
         Modal model of all sessions, with the estimate `tolerant`.
     """
@@ -86,12 +86,12 @@ def describe_slope(pooled_order: PooledOrder, modal_model: PooledModalModel) -> 
             "identifiable: "
             f"{pooled_order.reason}. {sessions_sentence}"
         )
-    shown_hz = [mode.frequency_hz for mode in modal_model.modes]
+    mode_frequencies_hz = [mode.frequency_hz for mode in modal_model.modes]
     slope_sentence = loss_slope_sentence(
         pooled_order.order,
         pooled_order.value,
         pooled_order.interval,
-        shown_hz,
+        mode_frequencies_hz,
         estimate,
         pooled_order.status,
         pooled_order.reason,
@@ -169,7 +169,7 @@ def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
 
 
 def _describe_mode_change(mode_change: ModeInSweeps) -> str:
-    """Describe how one mode differs in falling sweeps from rising ones."""
+    """Describe how one mode differs between falling and rising sweeps."""
 
     def change_text(value: float, std: float) -> str:
         """Format a relative change in per cent, with its 95 % interval and direction."""

@@ -39,7 +39,7 @@ _NO_RESPONSE: Final = FrequencyResponse(
 _PAPER_SETTINGS: Final = WelchSettings()
 """Welch settings of the paper."""
 _NO_INDICES: Final = FitIndices(math.nan, math.nan, math.nan)
-"""Fit indices of a model without a measured response."""
+"""Fit indices (NaN) of a model that there is no measured response to compare with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +63,11 @@ class SessionAnalysis:
     peaks : tuple of Peak or None
         Measured resonant peaks, one for each mode.
     welch_models : tuple of FittedModel
-        Welch fits by type, then by weighting, without their responses, which would take most of
-        the memory of a campaign; empty if Welch's method is not applicable.
+        Welch fits by damping structure, then by weighting, without their responses, which would
+        take most of the memory of a campaign; empty if Welch's method is not applicable.
     record_estimates : tuple of RecordEstimate
-        Whole-record fits by type; empty if none was requested, or the record could not be used.
+        Whole-record fits by damping structure; empty if none was requested, or the record could
+        not be used.
     verdict : Verdict or None
         Verdict on the whole record of this session alone; None without estimates.
     warnings : tuple of str
@@ -233,7 +234,7 @@ def _session_result(
     experiment: Experiment,
     warnings: tuple[str, ...],
 ) -> SessionAnalysis:
-    """Return the results of a session that a campaign retains."""
+    """Return the part of a session's results that a campaign stores."""
     from analysis.applicability import record_band_hz, welch_settings
 
     record, whole_fits, welch_results = (

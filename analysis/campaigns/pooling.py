@@ -1,10 +1,11 @@
 """Pooled whole-record estimates of all sessions, by a random-effects model.
 
 The estimates y_k of session k follow ``y_k ~ N(mu, S_k + diag(tau²))``. S_k is the covariance that
-session k states for its estimates. tau is the scatter of each parameter between sessions, by the
-moments of DerSimonian and Laird [1]_. A full matrix instead of ``diag(tau²)`` would have more
-elements than a campaign has sessions. By maximum likelihood, it would show a scatter of two thirds
-of the standard deviation in each of eight parameters for five sessions without any scatter.
+session k states for its estimates. tau is the scatter of each parameter between sessions, estimated
+by the method of moments of DerSimonian and Laird [1]_. A full matrix instead of ``diag(tau²)``
+would have more elements than a campaign has sessions; estimated by maximum likelihood, it would
+show a scatter of two thirds of the standard deviation in each of eight parameters for five sessions
+without any scatter.
 
 References
 ----------
@@ -171,7 +172,7 @@ class PooledMode:
 
 
 def pool_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
-    """Pool frequency and damping ratio, separately, of each mode that all sessions have."""
+    """Pool the frequency and, separately, the damping ratio of each mode that all sessions have."""
     pooled_list = []
     for session_modes in zip(*(estimate.fit.modes for estimate in estimates), strict=False):
         pooled_frequency = _pool_quantity(
@@ -188,7 +189,7 @@ def pool_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
 
 
 def _pool_quantity(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, float] | None:
-    """Return the mean of a quantity, its standard deviation, and its scatter between sessions.
+    """Return the mean of a quantity, the mean's standard deviation, and the scatter of sessions.
 
     Return None if a session has no standard deviation.
     """
@@ -507,8 +508,8 @@ def _pooled_plant(estimate: RecordEstimate, parameter_values: dict[str, float]) 
 # intervals of the freest structure are valid for any simpler structure, too.
 
 _DETERMINING_FRACTION: Final = 0.9
-"""Fraction of the sessions determining the structure of the lowest BIC that must determine a freer
-structure for it to be reported."""
+"""Smallest number of sessions that must determine the reported structure, as a fraction of those
+that determine the structure of the lowest BIC."""
 
 
 def freest_estimate(pooled_estimates: Sequence[PooledEstimate]) -> PooledEstimate | None:

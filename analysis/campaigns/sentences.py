@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 _DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
-"""Name of the damping whose order each parameter is."""
+"""Name of the damping that has each order."""
 _ORDER_NAMES: Final[tuple[OrderName, ...]] = ("alpha", "lambda")
 """Names of the orders of internal and of external damping."""
 _CLASSICAL_STRUCTURE: Final = "III"
@@ -107,7 +107,7 @@ def _order_clause(pooled_order: PooledOrder) -> str:
 
 
 def _value_and_half_width(pooled_order: PooledOrder) -> str | None:
-    """Return an order as "value ± half width of its interval", or None if not established."""
+    """Return "value ± half width of the interval" of an order, or None if the order is doubtful."""
     value, interval = pooled_order.value, pooled_order.interval
     if value is None or interval is None or pooled_order.reason is not None:
         return None
@@ -116,7 +116,7 @@ def _value_and_half_width(pooled_order: PooledOrder) -> str | None:
 
 
 def _slope_clause(pooled_order: PooledOrder) -> str:
-    """Describe how one loss grows with frequency over the visible modes, as a clause."""
+    """Describe how fast one loss grows with frequency, as a clause of a sentence."""
     loss_name = LOSS_NAMES[pooled_order.order]
     slope_text = _value_and_half_width(pooled_order)
     if slope_text is None:
@@ -280,8 +280,8 @@ def describe_modes(pooled_modes: Sequence[PooledMode], sessions: int, *, mixed: 
         return []
     t = student_t_quantile(0.95, sessions - 1)
     mode_clauses = "; ".join(_mode_clause(mode, t) for mode in pooled_modes)
-    of = "the sessions, a mixture" if mixed else "the sessions"
-    return [f"Modes: {mode_clauses} (± 95 % of the mean over {of})."]
+    sessions_text = "the sessions, a mixture" if mixed else "the sessions"
+    return [f"Modes: {mode_clauses} (± 95 % of the mean over {sessions_text})."]
 
 
 def describe_order(pooled_order: PooledOrder) -> str:
@@ -314,8 +314,8 @@ def describe_order(pooled_order: PooledOrder) -> str:
         f"(95 %: {low} to {high_text}, between-session variance included)"
     )
     if pooled_order.reason is not None:
-        would_be = order_statement.replace(" is ", " would be ", 1)
-        return f"{would_be}, but {pooled_order.reason}; do not interpret it.{sessions_text}"
+        conditional_text = order_statement.replace(" is ", " would be ", 1)
+        return f"{conditional_text}, but {pooled_order.reason}; do not interpret it.{sessions_text}"
     conclusion = {
         "compatible": "consistent with 1",
         "fractional": "1 is excluded",
@@ -342,8 +342,8 @@ def describe_welch_bias(
     withheld_orders : collection of str
         Orders that are not reported; their coefficients are not reported either.
     comparable : bool
-        Whether the sessions are of one specimen and a uniform beam predicts its modes. If not,
-        there is no reference for the Welch fits.
+        Whether the sessions are of one specimen whose modes a uniform beam predicts. If not, there
+        is no reference for the Welch fits.
     """
     if not comparable:
         return []
@@ -355,7 +355,9 @@ def describe_welch_bias(
     sentences = []
     for bias in best_model_biases or type_biases[:1]:
         significant_parameters = [
-            one for one in bias.significant_parameters if one.parameter not in omitted_parameters
+            parameter_bias
+            for parameter_bias in bias.significant_parameters
+            if parameter_bias.parameter not in omitted_parameters
         ]
         if not significant_parameters:
             continue

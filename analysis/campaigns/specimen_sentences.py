@@ -26,8 +26,8 @@ MIXTURE_NOTE: Final = (
 )
 """Footnote that explains `MIXTURE_MARK`."""
 _SLIGHT_FREQUENCY_SCATTER: Final = 2e-3
-"""Relative scatter of a frequency that one beam may show: ten kelvin change the stiffness of steel
-by 0.3 %."""
+"""Largest relative scatter of a frequency that a single beam may show: ten kelvin change the
+stiffness of steel by 0.3 %."""
 
 
 def specimens(homogeneity: Homogeneity) -> list[str]:
@@ -49,7 +49,7 @@ def title(text: str, homogeneity: Homogeneity) -> str:
     Parameters
     ----------
     text : str
-        Title without the mark.
+        Title without the addition.
     homogeneity : Homogeneity
         Whether the sessions are of one specimen.
     """
