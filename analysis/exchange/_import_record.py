@@ -61,7 +61,7 @@ class ImportedRecord:
 
 
 _REPORTED_JITTER: Final = 0.01
-"""Distance of a time stamp from its tick, in sample periods, above which it is reported."""
+"""Distance of a time stamp from its tick, in sample periods, above which the user is warned."""
 
 
 def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecord:
@@ -189,7 +189,7 @@ def _check_duration(path: Path, plan: ImportPlan, timebase: Timebase) -> list[st
 def _si_columns(
     plan: ImportPlan, channels: Mapping[str, SourceChannel]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the channels of the record in SI units, including values that are not finite."""
+    """Return the values of each field in SI units, including those that are not finite."""
     si_columns = {}
     with np.errstate(over="ignore"):
         for field_name, choice in plan.channels.items():
@@ -203,7 +203,7 @@ def _si_columns(
 def _segment_ticks(
     path: Path, segments_s: Mapping[str, tuple[float, float]], rate_hz: float, ticks: int
 ) -> dict[str, tuple[int, int]]:
-    """Return first and end tick of each segment; raise if one is not inside the record."""
+    """Return first and end tick of each segment; raise if a segment is not inside the record."""
     ticks_by_name = {}
     for segment_name, (start_s, end_s) in segments_s.items():
         first_tick, end = round(start_s * rate_hz), round(end_s * rate_hz)
@@ -252,7 +252,7 @@ def _describe_missing_samples(
 def _interpolate_gaps(
     ticks: NDArray[np.int64], known_values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values at all ticks, interpolated in gaps."""
+    """Return values at all ticks from the values at known ticks, by interpolation in gaps."""
     if ticks[-1] - ticks[0] + 1 == len(ticks):
         return known_values
     return np.interp(np.arange(ticks[0], ticks[-1] + 1), ticks, known_values)
@@ -261,7 +261,7 @@ def _interpolate_gaps(
 def _session_metadata(
     source: Path, target: Path, file_format: str, plan: ImportPlan, rate_hz: float
 ) -> dict[str, str]:
-    """Return the metadata of the new session, including those of its source file."""
+    """Return the metadata of the new session, with name and checksum of its source file."""
     beam = plan.specimen.beam
     rig_numbers = {
         "rate_hz": rate_hz,
@@ -274,9 +274,9 @@ def _session_metadata(
         **{f"uncertainty_{k}_percent": v for k, v in plan.specimen.uncertainty_percent.items()},
     }
     for key in ("uniformity_percent", "tip_mass_kg", "axis_tilt_deg"):
-        stated_texts = getattr(plan.specimen, key)
-        if stated_texts is not None:
-            rig_numbers[key] = stated_texts
+        stated_number = getattr(plan.specimen, key)
+        if stated_number is not None:
+            rig_numbers[key] = stated_number
     with source.open("rb") as stream:
         file_digest = hashlib.file_digest(stream, "sha256").hexdigest()
     channel_texts = {
@@ -314,7 +314,7 @@ _STALE_FLAGS: Final = {
     "angle_rad": Status.ANGLE_STALE,
     "coupling_torque_nm": Status.WRENCH_STALE,
 }
-"""Flag that marks a held value, by the field of a sample."""
+"""Status flag of a sample in which the last finite value is held, by the field of the value."""
 
 
 def hold_last_values(
@@ -322,15 +322,15 @@ def hold_last_values(
 ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.uint32], int]:
     """Replace values that are not finite by the last finite value, and flag them as stale.
 
-    `channel_names` are the names of the fields' channels in the file. Return the fields, shape
-    (n - first_sample,), the bits of `rigd.session.layout.Status`, and the number
+    `channel_names` has the channel in the file of each field, for messages. Return the fields,
+    shape (n - first_sample,), the bits of `rigd.session.layout.Status`, and the number
     `first_sample` of initial samples that are left out because no finite value precedes them. Raise
     ExchangeError if too many values are not finite, or if the field of such a value has no flag.
     """
-    bad = {
+    bad_by_field = {
         field_name: ~np.isfinite(field_values) for field_name, field_values in si_columns.items()
     }
-    for field_name, is_bad in bad.items():
+    for field_name, is_bad in bad_by_field.items():
         bad_count = int(is_bad.sum())
         if bad_count and field_name not in _STALE_FLAGS:
             raise ExchangeError(
@@ -347,15 +347,15 @@ def hold_last_values(
                 f"{path}: {bad_message} Or choose another channel, or cut the session out of the "
                 "file."
             )
-    first_sample = max(int(np.argmin(is_bad)) for is_bad in bad.values())
+    first_sample = max(int(np.argmin(is_bad)) for is_bad in bad_by_field.values())
     filled_columns = {
-        field_name: _hold_last(field_values, bad[field_name])[first_sample:]
+        field_name: _hold_last(field_values, bad_by_field[field_name])[first_sample:]
         for field_name, field_values in si_columns.items()
     }
     status_bits = np.zeros(len(next(iter(filled_columns.values()))), dtype=np.uint32)
     for field_name, stale_flag in _STALE_FLAGS.items():
-        if field_name in bad:
-            status_bits[bad[field_name][first_sample:]] |= np.uint32(stale_flag)
+        if field_name in bad_by_field:
+            status_bits[bad_by_field[field_name][first_sample:]] |= np.uint32(stale_flag)
     return filled_columns, status_bits, first_sample
 
 
@@ -370,22 +370,22 @@ def _hold_last(samples: NDArray[np.float64], is_bad: NDArray[np.bool_]) -> NDArr
 # Plausibility of the torque
 
 _CHECK_BANDS: Final = ((0.25, 0.6), (1.5, 3.5))
-"""Frequency bands of the torque check, as multiples of the first natural frequency. They lie on
-either side of the first resonance, far enough from it and from the first antiresonance (at 4.4) for
-damping not to matter, and above the frequencies at which the paper's external damping exceeds the
-inertia."""
+"""Frequency bands of the torque check, as multiples of the first natural frequency. They are on
+both sides of the first resonance, far enough from it and from the first antiresonance (at 4.4) for
+damping not to matter, and above the frequencies at which the paper's external damping torque
+exceeds the inertial torque."""
 
 _SIGNIFICANT_STDS: Final = 6.0
-"""Smallest significant ratio of torque to model, in standard deviations. A motion that does not
-excite the bands gives no significant ratio."""
+"""Smallest significant ratio of measured to modelled torque, in standard deviations. The ratio is
+not significant if the motion does not excite the bands."""
 
 _TAPER_FRACTION: Final = 0.05
-"""Fraction of the record that is tapered at either end: a record may begin and end in motion, and
-the paper's chirp passes the bands early."""
+"""Fraction of the record that is tapered at each end, as a record may begin and end in motion. It
+is short, because the paper's chirp passes the bands early."""
 
 _LARGEST_RATIO: Final = 3.0
-"""Largest ratio of torque to model that damping and a wrong mass may explain. Units that are easily
-confused differ by more than ten."""
+"""Largest ratio of measured to modelled torque that damping and a wrong mass may explain. Units
+that are easily confused differ by a factor of more than ten."""
 
 
 def torque_anomaly(
@@ -396,7 +396,7 @@ def torque_anomaly(
 ) -> str | None:
     """Check sign and size of the torque against the undamped beam near its first resonance.
 
-    `angle_rad` and `torque_nm` are the whole record with finite values. Return a sentence with
+    `angle_rad` and `torque_nm` are the whole record, all values finite. Return a sentence with
     anomaly and remedy, or None if the torque is plausible or the motion too small for the check.
     """
     frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
@@ -459,8 +459,8 @@ def write_session(
 ) -> None:
     """Write a record of another program as a session file.
 
-    The reason for the end of the record is not known, so the outcome only has the numbers of
-    samples. If writing fails, no file remains.
+    The outcome in the file has only the numbers of samples, because it is not known why the record
+    ended. If writing fails, no file remains.
 
     Parameters
     ----------
