@@ -1,4 +1,4 @@
-"""Reader of recorded sessions whose windows of motion are the input of the motor's estimate."""
+"""Reader of the recorded windows of motion from which a motor is estimated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ _UNUSABLE_STATUS = int(
 )
 """Status bits of samples that cannot be used.
 
-Their readings are old or clipped, or the torque was off, so that they do not belong to the torque
-that was commanded."""
+Such a sample has old or clipped readings, or the torque was off, so that its readings are not the
+response to the commanded torque."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Recording:
     tool_inertia_kg_m2: float
     """Inertia between sensor and beam."""
     unusable: int
-    """Number of passes with missing samples, or with old or clipped readings."""
+    """Number of passes that were left out for missing, old or clipped readings."""
 
 
 def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording:
@@ -48,7 +48,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     paths
         Session files of one rig, in any order.
     actuation_delay_s
-        Start value of the search for the command's delay.
+        Start value in s of the search for the delay from a command to its torque.
 
     Returns
     -------
@@ -114,7 +114,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
 def _read_passes(
     session: Session, session_number: int, rate_hz: float
 ) -> tuple[list[PassReadings], int]:
-    """Return the usable windows of a session, and the number of its passes."""
+    """Return the usable windows of a session, and the number of all its passes."""
     schedule = read_schedule(session.metadata)
     if schedule is None:
         raise MotorEstimateError(
