@@ -148,7 +148,7 @@ def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
     """Describe whether rising and falling sweeps show the same modes."""
     if sweeps is None:
         return []
-    sweep_counts = f"{sweeps.rising} rising and {sweeps.falling} falling sweeps"
+    sweeps_text = f"{sweeps.rising} rising and {sweeps.falling} falling sweeps"
     if not sweeps.changed:
         lowest_p_value = min(mode_change.chance for mode_change in sweeps.modes)
         largest_change = max(
@@ -156,15 +156,15 @@ def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
             for mode_change in sweeps.modes
         )
         return [
-            f"Nothing changed along the records: {sweep_counts} have the same modal constants "
+            f"Nothing changed along the records: {sweeps_text} have the same modal constants "
             "(lowest "
             f"{p_value_text(lowest_p_value)}; frequencies to {100 * largest_change:.1g} %)."
         ]
-    mode_change = "; ".join(map(_describe_mode_change, sweeps.changed))
+    changes_text = "; ".join(map(_describe_mode_change, sweeps.changed))
     return [
-        f"Something changes along the records, or with the direction of the sweep: {sweep_counts} "
+        f"Something changes along the records, or with the direction of the sweep: {sweeps_text} "
         "differ "
-        f"in {mode_change}. Each mode is as it was when the sweep passed it."
+        f"in {changes_text}. Each mode is as it was when the sweep passed it."
     ]
 
 
@@ -191,10 +191,10 @@ def recommend_sweeps(
 ) -> list[str]:
     """Recommend further sweeps that show whether the specimen changes during the records."""
     if sweeps is not None and sweeps.changed:
-        mode_numbers = listed([str(mode_change.mode) for mode_change in sweeps.changed])
+        modes_text = listed([str(mode_change.mode) for mode_change in sweeps.changed])
         return [
             "To tell a change in time from one with amplitude, repeat both sweeps with half the "
-            f"amplitude: a difference in mode {mode_numbers} that stays is a change in time. "
+            f"amplitude: a difference in mode {modes_text} that stays is a change in time. "
             "Then check clamp and temperature."
         ]
     sweep_directions = {session.experiment.rising for session in sessions}

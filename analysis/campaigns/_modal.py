@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _MIN_SESSIONS: Final = 2
 """Smallest number of sessions that can be pooled."""
 _COMMON_MODE_FRACTION: Final = 0.9
-"""Fraction of the sessions that must show a mode for it to be pooled."""
+"""Smallest fraction of the sessions that must show a mode for the mode to be pooled."""
 
 _SIGNIFICANCE_LEVEL: Final = 0.01
 """Level, for all modes together, at which rising and falling sweeps differ significantly."""

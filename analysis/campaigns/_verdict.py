@@ -242,7 +242,7 @@ def campaign_verdict(
     adequate_count = sum(verdict.adequate for verdict in verdicts)
     dissenting_sessions = _dissenting_sessions(sessions, lowest_bic_estimate)
     advice_counts = Counter(
-        common_advice for verdict in verdicts for common_advice in verdict.experiments
+        experiment for verdict in verdicts for experiment in verdict.experiments
     )
     common_advice = [
         experiment

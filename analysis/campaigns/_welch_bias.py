@@ -114,9 +114,9 @@ def welch_biases(
     """
     biases = []
     pooled_by_name = {
-        record_estimate.name: record_estimate
-        for record_estimate in pooled
-        if record_estimate.misfit <= LARGEST_MISFIT
+        pooled_estimate.name: pooled_estimate
+        for pooled_estimate in pooled
+        if pooled_estimate.misfit <= LARGEST_MISFIT
     }
     for (structure, weighting), welch_models in fits_by_model(sessions).items():
         pooled_estimate = pooled_by_name.get(structure)

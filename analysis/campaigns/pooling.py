@@ -303,12 +303,10 @@ class PooledEstimate:
                 coefficient, order, plant_values, parameter_names, self.covariance, first_rad_s
             )
             if loss_factor is not None:
-                factor = math.exp(t * loss_factor.std / loss_factor.value)
-                interval = loss_factor.value / factor, loss_factor.value * factor
-                order_name = Estimate(loss_factor.value, loss_factor.std, interval)
-                loss_factors.append(
-                    ReportedLossFactor(damping, loss_factor.omega_rad_s, order_name)
-                )
+                interval_factor = math.exp(t * loss_factor.std / loss_factor.value)
+                interval = loss_factor.value / interval_factor, loss_factor.value * interval_factor
+                estimate = Estimate(loss_factor.value, loss_factor.std, interval)
+                loss_factors.append(ReportedLossFactor(damping, loss_factor.omega_rad_s, estimate))
         return tuple(loss_factors)
 
     @property
@@ -375,8 +373,8 @@ def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None
     p_values = chi_square_p_value(pooled_effects.cochran_q, len(used_estimates) - 1)
     pooled_statistics = (pooled_effects.mean, std, within_std, pooled_effects.between_std, p_values)
     parameters = tuple(
-        _pooled_parameter(parameter_name, t, *row)
-        for parameter_name, row in zip(
+        _pooled_parameter(parameter_name, t, *statistics)
+        for parameter_name, statistics in zip(
             determined_names, np.transpose(pooled_statistics).tolist(), strict=True
         )
     )

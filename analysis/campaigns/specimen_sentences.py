@@ -137,7 +137,7 @@ def _describe_heterogeneity(scatter: Heterogeneity) -> str:
 
 
 def _describe_groups(scatter: Heterogeneity) -> str:
-    """Describe the groups of sessions, or the sessions of lowest and highest value."""
+    """Describe the groups of sessions or, if there are none, the sessions with extreme values."""
     quantity_label, _, _ = label(scatter.quantity)
     values_by_file = {
         file_name: (session_value, std) for file_name, session_value, std in scatter.values

@@ -337,7 +337,7 @@ def dask_cluster(address: str) -> Iterator[Workers]:
 
 @contextmanager
 def _suppress_dask_messages() -> Iterator[None]:
-    """Suppress Dask's own messages on failures and different versions, which are reported here."""
+    """Suppress Dask's messages on failures and different versions, as this module reports them."""
     log = logging.getLogger("distributed.client")
     log_level = log.level
     log.setLevel(logging.CRITICAL)

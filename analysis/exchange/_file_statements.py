@@ -228,8 +228,7 @@ class FileStatements:
             float(np.median(time_steps[time_steps > 0.0])) if (time_steps > 0.0).any() else 0.0
         )
         if (time_steps == 0.0).any() and any(
-            abs(rate_hz * typical_step * best_unit_s - 1) < _COARSE_TOLERANCE
-            for best_unit_s in units_s
+            abs(rate_hz * typical_step * unit_s - 1) < _COARSE_TOLERANCE for unit_s in units_s
         ):
             self.report_contradiction(
                 f"the time {times_name} of sample {int(np.argmax(time_steps == 0.0)) + 2} is that "

@@ -104,7 +104,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     )
     si_columns = _si_columns(plan, channels)
     del channels  # frees up to a quarter of a gigabyte
-    channel_titles = {column_name: choice.channel for column_name, choice in plan.channels.items()}
+    channel_titles = {field_name: choice.channel for field_name, choice in plan.channels.items()}
     si_columns, status_bits, first_sample = hold_last_values(source, channel_titles, si_columns)
     ticks = timebase.ticks[first_sample:]
     is_after_gap = np.diff(ticks, prepend=-1) > 1
@@ -229,14 +229,14 @@ def _describe_missing_samples(
             f"The first {omitted_samples} samples were left out: angle or torque is not finite "
             "there."
         )
-    for stale_flag, field_name in (
+    for stale_flag, channel in (
         (Status.ANGLE_STALE, channel_titles["angle_rad"]),
         (Status.WRENCH_STALE, channel_titles["coupling_torque_nm"]),
     ):
         flagged_count = int(np.count_nonzero(status_bits & stale_flag))
         if flagged_count:
             sentences.append(
-                f"{flagged_count} samples of '{field_name}' are not finite; they were flagged as "
+                f"{flagged_count} samples of '{channel}' are not finite; they were flagged as "
                 "stale."
             )
     tick_steps = np.diff(ticks)
@@ -286,10 +286,7 @@ def _session_metadata(
         channel_texts["import_coupling_torque_nm"] += ", reversed"
     return {
         "id": target.stem,
-        **{
-            field_name: repr(float(number_value))
-            for field_name, number_value in rig_numbers.items()
-        },
+        **{key: repr(float(number_value)) for key, number_value in rig_numbers.items()},
         **{
             key: stated_text
             for key, stated_text in (
@@ -376,8 +373,8 @@ damping not to matter, and above the frequencies at which the paper's external d
 exceeds the inertial torque."""
 
 _SIGNIFICANT_STDS: Final = 6.0
-"""Smallest significant ratio of measured to modelled torque, in standard deviations. The ratio is
-not significant if the motion does not excite the bands."""
+"""Smallest ratio of measured to modelled torque that is significant, in standard deviations of the
+ratio. It is not significant if the motion does not excite the bands."""
 
 _TAPER_FRACTION: Final = 0.05
 """Fraction of the record that is tapered at each end, as a record may begin and end in motion. It
@@ -487,15 +484,15 @@ def write_session(
         for first_row in range(0, len(ticks), _BLOCK_SAMPLES):
             row_slice = slice(first_row, first_row + _BLOCK_SAMPLES)
             sample_block = {
-                segment_name: column_values[row_slice]
-                for segment_name, column_values in samples.items()
+                field_name: column_values[row_slice]
+                for field_name, column_values in samples.items()
             }
             sample_block["t_ns"] = np.rint(np.multiply(sample_block["tick"], 1e9 / rate_hz))
             writer.write_samples(encode_samples(sample_block))
         scheduled_ticks = int(ticks[-1]) + 1
         counts = {"scheduled": scheduled_ticks, "recorded": len(ticks), "missed": 0}
         counts["lost"] = scheduled_ticks - len(ticks)
-        writer.close({segment_name: str(row_count) for segment_name, row_count in counts.items()})
+        writer.close({count_name: str(row_count) for count_name, row_count in counts.items()})
     except BaseException:
         # The source still exists, so an incomplete copy of it is useless.
         try:

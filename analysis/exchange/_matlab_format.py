@@ -81,13 +81,13 @@ def _read_channels(
 ) -> dict[str, SourceChannel]:
     """Load the requested variables after checking their listed sizes, and return the channels."""
     shape_by_name = {
-        channel_name: variable_shape for channel_name, variable_shape, _ in variable_list
+        variable_name: variable_shape for variable_name, variable_shape, _ in variable_list
     }
-    variables = {
+    variable_names = {
         channel_name: _split_element(_split_name(channel_name, shape_by_name)[0])[0]
         for channel_name in channel_names
     }
-    for channel_name, variable_name in variables.items():
+    for channel_name, variable_name in variable_names.items():
         if variable_name not in shape_by_name:
             raise no_such_channel_error(path, channel_name, shape_by_name)
         check_samples(
@@ -99,12 +99,12 @@ def _read_channels(
         if states_time(n) and max(shape_by_name[n], default=0) <= MAX_SAMPLES
     }
     file_variables = load_variables(
-        path, variable_names=sorted(time_variables | set(variables.values()))
+        path, variable_names=sorted(time_variables | set(variable_names.values()))
     )
     loaded_variables = {
-        channel_name: file_variables[channel_name]
-        for channel_name in shape_by_name
-        if channel_name in file_variables
+        variable_name: file_variables[variable_name]
+        for variable_name in shape_by_name
+        if variable_name in file_variables
     }
 
     def names_in(parent: str) -> Sequence[str]:

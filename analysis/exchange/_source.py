@@ -384,13 +384,13 @@ def channel_index(
             f"{path}: {title_count} {duplicates_text} '{channel_name}'; give the number, such as "
             f"#{titles.index(channel_name) + 1} for the first of them."
         )
-    channel_number = channel_name.removeprefix("#")
+    number_text = channel_name.removeprefix("#")
     if (
-        channel_name != channel_number
-        and channel_number.isdecimal()
-        and 0 < int(channel_number) <= len(titles)
+        channel_name != number_text
+        and number_text.isdecimal()
+        and 0 < int(number_text) <= len(titles)
     ):
-        return int(channel_number) - 1
+        return int(number_text) - 1
     listed_titles = (
         [f"#{channel_number} {title}" for channel_number, title in enumerate(titles, 1)]
         if numbered

@@ -77,10 +77,10 @@ def read_specimen(path: Path) -> SpecimenFile:
     except DocumentError as error:
         raise ExchangeError(f"{path}: {error}.") from error
     rig_section, beam_section, sensor_section, uncertainty_section = (
-        _read_section(path, file_content, quantity)
-        for quantity in ("rig", "beam", "sensor", "uncertainty")
+        _read_section(path, file_content, section_name)
+        for section_name in ("rig", "beam", "sensor", "uncertainty")
     )
-    percent_number = partial(_number_in_range, path, "uncertainty", uncertainty_section, low=0.0)
+    read_percent = partial(_number_in_range, path, "uncertainty", uncertainty_section, low=0.0)
     tool_inertia_kg_m2 = 0.0
     if "tool_inertia_kg_m2" in sensor_section:
         tool_inertia_kg_m2 = _required_number(path, "sensor", sensor_section, "tool_inertia_kg_m2")
@@ -99,12 +99,10 @@ def read_specimen(path: Path) -> SpecimenFile:
         {
             quantity: percent_value
             for quantity in UNCERTAIN_QUANTITIES
-            if (
-                percent_value := percent_number(f"{quantity}_percent", high=MAX_UNCERTAINTY_PERCENT)
-            )
+            if (percent_value := read_percent(f"{quantity}_percent", high=MAX_UNCERTAINTY_PERCENT))
             is not None
         },
-        percent_number("uniformity_percent", high=MAX_UNIFORMITY_PERCENT),
+        read_percent("uniformity_percent", high=MAX_UNIFORMITY_PERCENT),
         _number_in_range(path, "beam", beam_section, "tip_mass_kg", low=0.0, high=MAX_TIP_MASS_KG),
         _number_in_range(
             path,

@@ -149,8 +149,8 @@ def frf_table(
             "estimator": response.estimator,
             "segments": str(response.segments),
             **{
-                f"{column_name}_samples": str(column_values)
-                for column_name, column_values in welch_lengths.items()
+                f"{length_name}_samples": str(sample_count)
+                for length_name, sample_count in welch_lengths.items()
             },
             "rate_hz": repr(record.rate_hz),
             "angle_delay_removed_s": repr(record.angle_delay_s),

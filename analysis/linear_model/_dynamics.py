@@ -164,7 +164,7 @@ def beam_dynamics(plant: Plant) -> Dynamics:
     LinearModelError
         If the beam has too many modes in the band, or their poles are not found.
     """
-    pole_pairs_rad_s, mode_indices, real_poles = _beam_poles(plant)
+    pole_pairs_rad_s, mode_numbers, real_poles = _beam_poles(plant)
     pole_hz = np.abs(pole_pairs_rad_s) / (2 * np.pi)
     plant_without_channel = replace(
         plant, delay_s=0.0, filter_time_constant_s=0.0, second_order_filter_time_constant_s=0.0
@@ -176,7 +176,7 @@ def beam_dynamics(plant: Plant) -> Dynamics:
     return Dynamics(
         response=lambda s: ResponseGrid(s).evaluate(plant_without_channel)[0],
         pairs=pole_pairs_rad_s,
-        names=tuple(f"mode_{mode_index}" for mode_index in mode_indices),
+        names=tuple(f"mode_{mode_number}" for mode_number in mode_numbers),
         in_band=int((pole_hz < BEAM_BAND_HZ[1]).sum()),
         band_hz=BEAM_BAND_HZ,
         real_poles=real_poles,

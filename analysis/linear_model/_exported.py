@@ -373,12 +373,12 @@ def _draw_posterior(
     Samples whose model needs other states than the nominal one are rejected. Raise
     `LinearModelError` if too few remain.
     """
-    drawn_count = options.samples
+    requested_count = options.samples
     accepted_values: list[NDArray[np.float64]] = []
     sample_systems: list[StateSpace] = []
     random_generator = np.random.default_rng(_RANDOM_SEED)
-    for _ in range(drawn_count * _MAX_DRAWS_PER_SAMPLE):
-        if len(accepted_values) == drawn_count:
+    for _ in range(requested_count * _MAX_DRAWS_PER_SAMPLE):
+        if len(accepted_values) == requested_count:
             break
         drawn_values = random_generator.multivariate_normal(
             uncertain_dynamics.values,
@@ -398,14 +398,14 @@ def _draw_posterior(
             sample_systems.append(
                 sampled_fit.system(pole_structure, fit_coefficients, options.given)
             )
-    if len(accepted_values) < drawn_count:
+    if len(accepted_values) < requested_count:
         raise LinearModelError(
-            f"Only {len(accepted_values)} of {drawn_count} samples of the posterior have the "
+            f"Only {len(accepted_values)} of {requested_count} samples of the posterior have the "
             "states of the model: its parameters are too uncertain; record more, or add "
             "--samples 0."
         )
     return PosteriorSamples(
-        np.array(accepted_values).reshape(drawn_count, uncertain_dynamics.values.size),
+        np.array(accepted_values).reshape(requested_count, uncertain_dynamics.values.size),
         tuple(sample_systems),
     )
 

@@ -272,16 +272,14 @@ def histogram_lines(histogram_columns: Sequence[tuple[str, npt.NDArray[np.float6
     header_line = " " * (_LABEL_WIDTH + 3) + "".join(
         f"{column_title:<{_BAR_WIDTH + 9}}" for column_title, _ in histogram_columns
     )
-    histogram_text = [header_line.rstrip()]
+    text_lines = [header_line.rstrip()]
     for bin_no in range(used_bins[0], used_bins[-1] + 1):
         bars_text = (
             f"{_histogram_bar(bin_totals[bin_no], longest_count)}{bin_totals[bin_no]:>7}  "
             for bin_totals in bin_counts
         )
-        histogram_text.append(
-            f"{_bin_label(bin_no):>{_LABEL_WIDTH}}   {''.join(bars_text)}".rstrip()
-        )
-    return histogram_text
+        text_lines.append(f"{_bin_label(bin_no):>{_LABEL_WIDTH}}   {''.join(bars_text)}".rstrip())
+    return text_lines
 
 
 def _histogram_bar(bin_count: int, longest_count: int) -> str:

@@ -268,8 +268,12 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
     torque_at_sync = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
     smallest_values = {"actuation.delay_s": 1 / rig.rate_hz} if torque_at_sync else {}
     proposal_rows = tuple(
-        ProposalRow(*row, profile.sources.get(row[0], "assumed"), smallest_values.get(row[0], 0.0))
-        for row in compared_numbers
+        ProposalRow(
+            *compared_number,
+            profile.sources.get(compared_number[0], "assumed"),
+            smallest_values.get(compared_number[0], 0.0),
+        )
+        for compared_number in compared_numbers
     )
     operator_notes = _notes(estimate, profile, unusable_count)
     if any(row.is_below_least for row in proposal_rows if row.key in smallest_values):

@@ -122,11 +122,13 @@ def passes_of_schedule(schedule: PassSchedule, rate_hz: float) -> list[SpeedPass
     start_tick = round(schedule.rest_s * rate_hz) + round(schedule.approach_s * rate_hz)
     speed_passes = []
     for cycle_number in range(schedule.cycles):
-        for relative_speed in schedule.speeds_rad_s:
-            for signed_speed in (relative_speed, -relative_speed):
+        for speed_rad_s in schedule.speeds_rad_s:
+            for signed_speed_rad_s in (speed_rad_s, -speed_rad_s):
                 start_tick += turn_ticks + settle_ticks
                 speed_passes.append(
-                    SpeedPass(start_tick, start_tick + window_ticks, signed_speed, cycle_number)
+                    SpeedPass(
+                        start_tick, start_tick + window_ticks, signed_speed_rad_s, cycle_number
+                    )
                 )
                 start_tick += window_ticks
     return speed_passes

@@ -462,8 +462,8 @@ def welch_response(
     if estimator not in ("h1", "h2", "hv"):
         raise SpectralError(f"There is no estimator {estimator!r}; choose one of h1, h2, hv.")
     segment_weights = WINDOW.weights(segment_length)
-    segment_number = segment_count(x.size, segment_length, overlap)
-    if segment_number == 0:
+    segment_total = segment_count(x.size, segment_length, overlap)
+    if segment_total == 0:
         raise SpectralError(
             f"The record has {x.size} samples ({x.size / rate_hz:g} s), fewer than one Welch "
             f"segment of {segment_length} ({segment_length / rate_hz:g} s); "
@@ -474,7 +474,7 @@ def welch_response(
     # Allocated once, because allocating this much memory again is slow.
     fx, fy = np.empty((2, bin_count), dtype=np.complex128)
     # One segment at a time stays in the cache, unlike a whole batch.
-    for k in range(segment_number):
+    for k in range(segment_total):
         segment = slice(
             segment_start := k * (segment_length - overlap), segment_start + segment_length
         )

@@ -187,7 +187,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
     TableError
         If the file contains no table with these columns.
     """
-    if not any(line_number.strip() for line_number in lines):
+    if not any(line_text.strip() for line_text in lines):
         raise TableError("is empty; export the record again.")
     separator_in_file = stated_separator(lines[0])
     if separator_in_file:
@@ -198,7 +198,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
     present_separators = [
         separator_character
         for separator_character in _SEPARATORS
-        if any(separator_character in line_number for line_number in lines)
+        if any(separator_character in line_text for line_text in lines)
     ]
     candidate_separators = (
         [separator_in_file] if separator_in_file else [*present_separators, BLANK_SEPARATOR]
@@ -223,9 +223,9 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
             possible_layout = _layout_with_separator(
                 nonempty_rows, separator, requested_names, labview_head
             )
-        except _NotThisTableError as unlikely:
-            unlikely.separator = separator
-            failed_attempts.append(unlikely)
+        except _NotThisTableError as failure:
+            failure.separator = separator
+            failed_attempts.append(failure)
             continue
         if separator == ",":
             _check_split_decimals(text_rows[possible_layout.rows_before_numbers :], possible_layout)
