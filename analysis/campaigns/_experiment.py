@@ -285,10 +285,10 @@ def stated_specimens(
 
 
 def complete_labels(experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Return the experiments, each with a specimen label if they state several labels.
+    """Return the experiments, with an empty specimen label if one states none and others differ.
 
-    An experiment without a label is of the same specimen as the others if these have one label.
-    If they have several, its specimen is unknown, and it gets an empty label, which differs.
+    If the labels differ, the specimen of an experiment without a label is unknown, and the empty
+    label differs from all others. Otherwise it is taken to be the specimen of the others.
     """
     if len({experiment.label for experiment in experiments if experiment.label}) < 2:
         return list(experiments)

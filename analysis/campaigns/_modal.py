@@ -190,9 +190,9 @@ def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
 
 
 def _pooled_constants(estimates: Sequence[ModalEstimate], modes: Sequence[int]) -> RandomEffects:
-    """Pool the `MODE_CONSTANT_NAMES` of some modes, and the background, over estimates.
+    """Pool the constants of some modes, and the background, over the estimates of all sessions.
 
-    Whole turns are removed from the phase differences to the first estimate.
+    Residue phases are first shifted by whole turns to be nearest to those of the first estimate.
     """
     session_values, session_covariances = map(
         np.array, zip(*(_constants_and_background(e, modes) for e in estimates), strict=True)

@@ -295,7 +295,7 @@ def _record_estimates(
     response_grid = ResponseGrid(1j * omega)
 
     def estimate_of(candidate: Candidate) -> RecordEstimate:
-        """Return the retained results of a fit, with its fit indices."""
+        """Return the results of a fit that the campaign stores, with their fit indices."""
         # The delay stated in the file is removed from the measured response.
         plant = candidate.fit.plant
         plant = replace(plant, delay_s=plant.delay_s - delay_s)

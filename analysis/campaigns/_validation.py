@@ -136,7 +136,7 @@ def leave_one_out_results(
 ) -> tuple[LeaveOneOutResult, ...] | FailedPrediction:
     """Return the error of each model in predicting a session's torque from its angle.
 
-    If the session cannot be predicted, that is returned, not raised: the others are still usable.
+    A session that cannot be predicted raises no error, because the others are still usable.
     """
     from analysis.applicability import highest_frequency_hz, record_band_hz
     from analysis.identify import Comparison

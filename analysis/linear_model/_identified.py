@@ -198,7 +198,7 @@ class IdentifiedModel:
                 raise self._error("covariance.names", f"{key_name!r} has no such parameter")
 
         def all_values(determined_values: Mapping[str, float]) -> Mapping[str, float]:
-            """Return all beam parameters by name. Given values replace fitted ones.
+            """Return all beam parameters by name, of which `determined_values` replaces some.
 
             A value whose name begins with "ln_" is a logarithm, and is converted.
             """
@@ -346,7 +346,7 @@ def read_identified_model(path: Path) -> IdentifiedModel:
         )
 
     def entries(list_key: str) -> list[dict[str, Any]]:
-        """Return the entries of a list in the document that belong to the analysed file."""
+        """Return the entries of a list in the document that belong to the file of the headline."""
         stated_list = document.get(list_key)
         entry_dicts = (
             [document_entry for document_entry in stated_list if isinstance(document_entry, dict)]

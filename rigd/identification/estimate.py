@@ -37,7 +37,7 @@ SCALE_INDEX, INERTIA_INDEX, VISCOUS_INDEX, COULOMB_INDEX, DELAY_INDEX, ZERO_INDE
 From `ZERO_INDEX` on, there is one torque offset (zero of the sensor) for each session."""
 
 _RISE_FRACTION = 0.15
-"""Fraction of a window in which the test functions rise, and equally that in which they fall."""
+"""Duration of the rise, and of the fall, of the test functions as a fraction of the window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,7 +406,7 @@ class MotorQuantity:
     """Estimated quantity of a motor with its standard deviation."""
 
     value: float
-    """Estimate of the quantity, or its assumed value."""
+    """Estimate of the quantity; its assumed value if it was not estimated."""
     std: float | None
     """Standard deviation of the estimate, or None if the quantity was not estimated."""
 

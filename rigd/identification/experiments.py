@@ -339,7 +339,7 @@ def _passes_reference(schedule: PassSchedule, profile: Profile) -> Real:
 
 
 def _add_offsets(reference_rad: Real, schedule: PassSchedule, profile: Profile) -> None:
-    """Add to each cycle of a reference angle its own offset of some encoder steps, in place.
+    """Add a different offset of some encoder steps to each cycle of a reference angle, in place.
 
     The offset changes in the turn before the cycle.
     """

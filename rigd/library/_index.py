@@ -61,9 +61,9 @@ _SQL_TYPES: Final = {
     "meta": "TEXT",
     "problem": "TEXT",
 }
-"""SQL types of the columns, without ``file`` and ``stamp``.
+"""SQL type of each column except ``file`` and ``stamp``.
 
-Modes, validity and meta are JSON. Times are UTC in ISO 8601."""
+Modes, validity and meta are JSON; ``start_utc`` is in ISO 8601."""
 _PYTHON_TYPES: Final = {"TEXT": str, "INTEGER": int | None, "REAL": float | None}
 """Python type that a value read from a column must have, by the SQL type of the column."""
 _COLUMNS_TO_READ: Final = tuple(name for name in _SQL_TYPES if name != "start_utc")
