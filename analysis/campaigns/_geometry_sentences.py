@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify.tolerant_estimate import TolerantEstimate
 
-_OTHER_BASES: Final = {
+_FREQUENCY_FREE_BASES: Final = {
     "losses": "damping ratios and residue phases alone",
     "none": "no beam with one order of each damping, which do not explain the losses",
 }
@@ -51,7 +51,7 @@ def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate
     )
     if estimate.basis != "geometry":
         return (
-            f"{basis_sentence}, by {_OTHER_BASES[estimate.basis]}: the frequencies are "
+            f"{basis_sentence}, by {_FREQUENCY_FREE_BASES[estimate.basis]}: the frequencies are "
             f"not those of a uniform beam to {tolerance_text}, nor with a wider tolerance."
         )
     used_text = tolerance_text
@@ -119,7 +119,7 @@ def describe_orders_if_exact(
         ):
             continue
         half_width = (exact_order.interval[1] - exact_order.interval[0]) / 2
-        value_text, low, high_text = to_uncertainty(
+        value_text, low_text, high_text = to_uncertainty(
             (exact_order.value, *exact_order.interval), exact_order.std or half_width
         )
         conclusions = {
@@ -128,7 +128,7 @@ def describe_orders_if_exact(
             "open": "1 would be doubtful",
         }
         orders_shown.append(
-            f"{order.order} {value_text} (95 %: {low} to {high_text}; "
+            f"{order.order} {value_text} (95 %: {low_text} to {high_text}; "
             f"{conclusions[exact_order.status]})"
         )
     return (

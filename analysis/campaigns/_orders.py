@@ -238,8 +238,8 @@ def _status_and_reason(
         for estimate in (ranked_estimates[0], *rival_estimates(ranked_estimates, BIC_DECISIVE))
         if _has_order_one(estimate, order)
     ]
-    low, upper_limit = parameter.interval
-    if low <= 1 <= upper_limit:
+    lower_limit, upper_limit = parameter.interval
+    if lower_limit <= 1 <= upper_limit:
         return "compatible", None
     is_one_excluded = not integer_rivals and _excludes_one(parameter, freest_fit.sessions)
     return ("fractional" if is_one_excluded else "open"), None
@@ -250,9 +250,11 @@ def _has_order_one(estimate: PooledEstimate, order: OrderName) -> bool:
     return STRUCTURES[estimate.structure].fixed.get(order) == 1.0
 
 
-def _excludes_one(order: PooledParameter, sessions: int) -> bool:
+def _excludes_one(order: PooledParameter, session_count: int) -> bool:
     """Return whether an order differs from 1 at the level `_EXCLUSION_LEVEL`."""
-    return abs(order.value - 1) > student_t_quantile(_EXCLUSION_LEVEL, sessions - 1) * order.std
+    return (
+        abs(order.value - 1) > student_t_quantile(_EXCLUSION_LEVEL, session_count - 1) * order.std
+    )
 
 
 def _relative_width(order_interval: tuple[float, float]) -> float:

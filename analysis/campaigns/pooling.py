@@ -445,7 +445,7 @@ def _stack_estimates(
 
 def _pooled_parameter(
     parameter_name: str,
-    t: float,
+    t_quantile: float,
     mean: float,
     std: float,
     within_std: float,
@@ -459,11 +459,13 @@ def _pooled_parameter(
         name=parameter_name,
         value=pooled_value,
         std=std_factor * std,
-        interval=_parameter_interval(parameter_name, mean, t * std),
+        interval=_parameter_interval(parameter_name, mean, t_quantile * std),
         within_std=std_factor * within_std,
         between_std=std_factor * between_std,
         chance=p_value,
-        next_interval=_parameter_interval(parameter_name, mean, t * math.hypot(std, between_std)),
+        next_interval=_parameter_interval(
+            parameter_name, mean, t_quantile * math.hypot(std, between_std)
+        ),
     )
 
 

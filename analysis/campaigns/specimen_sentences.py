@@ -149,11 +149,11 @@ def _describe_groups(scatter: Heterogeneity) -> str:
             for group in scatter.groups
         )
         return f"By the {quantity_label} they are {len(scatter.groups)} groups: {groups_text}."
-    low, high = _extreme_sessions(scatter.values)
+    lowest_session, highest_session = _extreme_sessions(scatter.values)
     return (
         f"There are no clear groups: the {quantity_label} goes from "
-        f"{_mean_text([low[1]], scatter)} in {low[0]} "
-        f"to {_mean_text([high[1]], scatter)} in {high[0]}."
+        f"{_mean_text([lowest_session[1]], scatter)} in {lowest_session[0]} "
+        f"to {_mean_text([highest_session[1]], scatter)} in {highest_session[0]}."
     )
 
 

@@ -150,10 +150,10 @@ _LATEST_START_NS: Final = 2**63 - 1
 
 def _session_start(source: Path, duration_s: float) -> tuple[int, str]:
     """Return the file's modification time in ns, or the present time with a warning."""
-    changed_ns = source.stat().st_mtime_ns
-    if changed_ns >= 0 and changed_ns + duration_s * 1e9 < _LATEST_START_NS:
-        return changed_ns, ""
-    modification_year = 1970 + changed_ns / (365.2425 * 86_400e9)
+    modification_ns = source.stat().st_mtime_ns
+    if modification_ns >= 0 and modification_ns + duration_s * 1e9 < _LATEST_START_NS:
+        return modification_ns, ""
+    modification_year = 1970 + modification_ns / (365.2425 * 86_400e9)
     return time.time_ns(), (
         f"By its time stamp the file was changed about the year {modification_year:.0f}, which a "
         "session cannot state; the time of this import is used as the session's start."
@@ -206,13 +206,13 @@ def _segment_ticks(
     """Return first and end tick of each segment; raise if a segment is not inside the record."""
     ticks_by_name = {}
     for segment_name, (start_s, end_s) in segments_s.items():
-        first_tick, end = round(start_s * rate_hz), round(end_s * rate_hz)
-        if not 0 <= first_tick < end <= ticks:
+        first_tick, end_tick = round(start_s * rate_hz), round(end_s * rate_hz)
+        if not 0 <= first_tick < end_tick <= ticks:
             raise ExchangeError(
                 f"{path}: the segment {segment_name} from {start_s:g} to {end_s:g} s is not inside "
                 f"the record, which lasts {ticks / rate_hz:g} s; count from the first sample."
             )
-        ticks_by_name[segment_name] = (first_tick, end)
+        ticks_by_name[segment_name] = (first_tick, end_tick)
     return ticks_by_name
 
 
@@ -399,8 +399,8 @@ def torque_anomaly(
     frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
     first_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)
     in_band = np.zeros(frequency_hz.shape, dtype=np.bool_)
-    for low, high_ratio in _CHECK_BANDS:
-        in_band |= (frequency_hz >= low * first_hz) & (frequency_hz <= high_ratio * first_hz)
+    for low_ratio, high_ratio in _CHECK_BANDS:
+        in_band |= (frequency_hz >= low_ratio * first_hz) & (frequency_hz <= high_ratio * first_hz)
     s = 2j * np.pi * frequency_hz[in_band]
     centre_distance = np.abs(
         np.linspace(-1.0, 1.0, len(angle_rad))

@@ -39,7 +39,7 @@ _HDF5_OFFSETS: Final = (0, 512)  # MATLAB writes its own header of 512 bytes bef
 """Offsets at which an HDF5 file may begin."""
 
 
-def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read vectors from a MATLAB file (see `analysis.exchange.read_source`).
 
     A channel is a variable ``angle``, a field of a struct ``log.angle``, a field of an element of a
@@ -51,8 +51,8 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
         first_bytes[magic_offset : magic_offset + len(_HDF5_MAGIC)] == _HDF5_MAGIC
         for magic_offset in _HDF5_OFFSETS
     ):
-        return _read_hdf5(path, names)
-    return _read_mat(path, names)
+        return _read_hdf5(path, channel_names)
+    return _read_mat(path, channel_names)
 
 
 def _read_mat(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:

@@ -115,8 +115,8 @@ def _shipped(name: str, module: str, max_bytes: int) -> ImportFormat:
     """Return a format of this package; its module is imported when the first file is read."""
 
     def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
-        read_format: ReadChannels = import_module(f"analysis.exchange.{module}").read
-        return read_format(path, channel_names)
+        read_channels: ReadChannels = import_module(f"analysis.exchange.{module}").read
+        return read_channels(path, channel_names)
 
     return ImportFormat(name, read, max_bytes)
 

@@ -42,7 +42,7 @@ _HAS_METADATA, _NEW_LIST, _BIG_ENDIAN = 1 << 1, 1 << 2, 1 << 6
 """Bits in the lead-in: the segment has metadata, a new list of channels, big-endian numbers."""
 
 
-def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read channels ``Group/Channel`` from a TDMS file (see `analysis.exchange.read_source`).
 
     Scales in the file are applied. If npTDMS does not know a scale, the values are raw and
@@ -67,9 +67,9 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
                 is_cut_off = tdms_file.file_status.incomplete_final_segment
                 source_channels = {
                     channel_name: _read_channel(path, channel_name, channels_by_name, is_cut_off)
-                    for channel_name in names
+                    for channel_name in channel_names
                 }
-                for channel_name in names:
+                for channel_name in channel_names:
                     property_levels = (
                         channels_by_name[channel_name],
                         tdms_file[channels_by_name[channel_name].group_name],
@@ -78,7 +78,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
                     unapplied_scale = _unapplied_scale(
                         [property_level.properties for property_level in property_levels]
                     )
-                    group_times = _group_times(path, channel_name, names, channels_by_name)
+                    group_times = _group_times(path, channel_name, channel_names, channels_by_name)
                     source_channels[channel_name] = replace(
                         source_channels[channel_name],
                         unapplied_scale=unapplied_scale,
@@ -216,13 +216,13 @@ def _unapplied_scale(property_levels: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _group_times(
-    path: Path, channel_name: str, names: Sequence[str], channels: Mapping[str, Any]
+    path: Path, channel_name: str, channel_names: Sequence[str], channels: Mapping[str, Any]
 ) -> FileTimes | None:
     """Return the times in a channel of the same group that was not requested, or None."""
     channel = channels[channel_name]
     for other_name, other_channel in channels.items():
         if (
-            other_name in names
+            other_name in channel_names
             or other_channel.group_name != channel.group_name
             or not is_title_of_times(other_channel.name)
             or len(other_channel) != len(channel)

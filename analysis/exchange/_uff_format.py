@@ -51,7 +51,7 @@ _STEP_TOLERANCE: Final = 1e-3
 """Largest difference between the time steps of two data sets, relative to the step."""
 
 
-def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read functions of time from a universal file (see `analysis.exchange.read_source`).
 
     A channel is named ``#2`` (the second data set of type 58) or by its first identification line,
@@ -63,7 +63,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
         raise missing_library_error(path, "pyuff") from error
     try:
         with bounded_memory():
-            return _read_channels(path, names, pyuff.UFF)
+            return _read_channels(path, channel_names, pyuff.UFF)
     except (ExchangeError, OSError, MemoryError):
         raise
     except Exception as error:  # pyuff raises many types
@@ -73,7 +73,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 
 
 def _read_channels(
-    path: Path, names: Sequence[str], open_file: Callable[[str], Any]
+    path: Path, channel_names: Sequence[str], open_file: Callable[[str], Any]
 ) -> dict[str, SourceChannel]:
     """Return the requested channels from their data sets."""
     _check_set_count(path)
@@ -88,7 +88,7 @@ def _read_channels(
         channel_name: channel_index(
             path, channel_name, set_titles, "data sets have the title", numbered=True
         )
-        for channel_name in names
+        for channel_name in channel_names
         if channel_name != ABSCISSA
     }
     if not number_by_name:
@@ -98,11 +98,11 @@ def _read_channels(
         data_set = uff_file.read_sets(set_numbers[set_number])
         set_abscissae = np.asarray(data_set["x"], dtype=np.float64)
         channels[channel_name] = _source_channel(
-            path, channel_name, data_set, set_abscissae, timed=ABSCISSA in names
+            path, channel_name, data_set, set_abscissae, timed=ABSCISSA in channel_names
         )
         abscissae.append(set_abscissae)
         abscissa_units.append(_abscissa_unit(data_set))
-    if ABSCISSA in names:
+    if ABSCISSA in channel_names:
         first_channel = next(iter(channels.values()))
         channels[ABSCISSA] = SourceChannel(
             _common_times(path, channels, abscissae),
@@ -206,9 +206,9 @@ def _check_time_response(path: Path, name: str, data_set: Mapping[str, Any], uni
         )
 
 
-def _code_name(code: int, names: Mapping[int, str]) -> str:
+def _code_name(code: int, code_names: Mapping[int, str]) -> str:
     """Return the name of a code in parentheses, or an empty text if it has no name."""
-    return f" ({names[code]})" if code in names else ""
+    return f" ({code_names[code]})" if code in code_names else ""
 
 
 _FUNCTION_TYPES: Final = {

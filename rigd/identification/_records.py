@@ -128,15 +128,15 @@ def _read_passes(
     speed_passes = passes_of_schedule(schedule, rate_hz)
     pass_readings = []
     for speed_pass in speed_passes:
-        first_index, end = np.searchsorted(
+        first_index, end_index = np.searchsorted(
             tick_numbers, (speed_pass.first, speed_pass.end)
         ).tolist()
         if (
-            end - first_index < speed_pass.end - speed_pass.first
-            or is_unusable[first_index:end].any()
+            end_index - first_index < speed_pass.end - speed_pass.first
+            or is_unusable[first_index:end_index].any()
         ):
             continue
-        window_samples = sample_records[first_index:end]
+        window_samples = sample_records[first_index:end_index]
         pass_readings.append(
             PassReadings(
                 angle_rad=window_samples["angle_rad"],

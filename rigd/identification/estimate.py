@@ -320,7 +320,7 @@ def _finish_fit(
     # Each stack's part in the variance, from the scatter of its repeats' effects on the solution.
     variance_parts, stack_degrees_of_freedom = [], []
     weighted_squares, term_count = 0.0, 0
-    departure_nm = 0.0
+    friction_departure_nm = 0.0
     for equations, bin_weight, bin_residuals in zip(
         stack_equations, weights, residuals, strict=True
     ):
@@ -336,7 +336,9 @@ def _finish_fit(
         weighted_squares += float(np.sum(bin_weight * np.abs(mean_residual) ** 2))
         term_count += mean_residual.size
         constant_column = abs(equations.x[0, 0, COULOMB_INDEX])
-        departure_nm = max(departure_nm, abs(float(mean_residual[0].real)) / float(constant_column))
+        friction_departure_nm = max(
+            friction_departure_nm, abs(float(mean_residual[0].real)) / float(constant_column)
+        )
     stack_variances = np.array(variance_parts)
     unknown_variances = stack_variances.sum(axis=0)
     degrees_of_freedom = unknown_variances**2 / np.sum(
@@ -349,7 +351,7 @@ def _finish_fit(
     unbiased_values[free_indices] -= inverse_matrix @ noise_bias
     unbiased_values[DELAY_INDEX] += delay_s
     stds[free_indices] = widening * np.sqrt(unknown_variances)
-    return _MotorFit(unbiased_values, stds, misfit, departure_nm)
+    return _MotorFit(unbiased_values, stds, misfit, friction_departure_nm)
 
 
 def _student_factor(degrees_of_freedom: Real) -> Real:

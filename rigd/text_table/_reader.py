@@ -234,7 +234,7 @@ class _NumberRows:
     """Reader of rows of numbers that checks each row against the layout of the table."""
 
     layout: TableLayout
-    names: Sequence[str]
+    requested_names: Sequence[str]
     decimal_sign: str
     """Decimal sign of the numbers."""
     columns_to_read: Sequence[int]
@@ -266,7 +266,7 @@ class _NumberRows:
     def title(self, column_index: int) -> str:
         """Return the name of a requested column for messages; its number if it has no name."""
         if column_index in self.layout.columns:
-            return self.names[self.layout.columns.index(column_index)]
+            return self.requested_names[self.layout.columns.index(column_index)]
         return f"#{column_index + 1}"
 
     def fit(self, row: Sequence[str], line_number: int) -> list[str]:
