@@ -111,7 +111,7 @@ class CampaignResult:
 
     @property
     def headline(self) -> PooledEstimate | None:
-        """Pooled estimate whose parameters are reported (`freest_estimate`); None if none is."""
+        """Pooled estimate whose parameters are reported (`freest_estimate`), or None."""
         return freest_estimate(self.pooled)
 
     @property
@@ -409,8 +409,8 @@ def _exclusion_reason(
     """Return why a session does not belong to the campaign, or None if it does.
 
     `common_session` is a session of the most common experiment, `accepted` are the sessions
-    accepted so far. `majority_text` is inserted into the reason; it states how many sessions agree
-    with `common_session`.
+    accepted so far. The reason contains `majority_text`, which says so if most sessions agree with
+    `common_session`.
     """
     experiment = session_result.experiment
     difference = experiment and common_session.experiment.difference(experiment)

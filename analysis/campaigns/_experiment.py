@@ -66,7 +66,7 @@ _SPECIMEN_KEYS: Final = (LABEL_KEY, "beam_length_m", "beam_density_kg_per_m",
                          "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
 """Keys of the specimen in a session file that must agree over a campaign."""
 _SWEEP_END_KEYS: Final = ("start_hz", "stop_hz")
-"""Keys of the start and stop frequency of a sweep, which opposite sweeps may exchange."""
+"""Keys of a sweep's start and stop frequency; sweeps that differ in their order count as equal."""
 
 _SWEEP_NAME: Final = "chirp"
 """Name of the excitation by a sweep."""
@@ -185,7 +185,7 @@ class Experiment:
 
     @property
     def rising(self) -> bool | None:
-        """Whether the frequency of the sweep rises; None if there is no sweep, or both ways."""
+        """Whether the frequency of the sweep rises; None if it also falls, or without a sweep."""
         if self.facts.get("excitation") != _SWEEP_NAME or "there_and_back" in self.facts:
             return None
         start_hz, stop_hz = (self.facts.get(key) for key in _SWEEP_END_KEYS)
@@ -285,10 +285,10 @@ def stated_specimens(
 
 
 def complete_labels(experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Return the experiments, with an empty specimen label if one states none and others differ.
+    """Return the experiments; if their specimen labels differ, add an empty one to those without.
 
-    If the labels differ, the specimen of an experiment without a label is unknown, and the empty
-    label differs from all others. Otherwise it is taken to be the specimen of the others.
+    The specimen of an experiment without a label is then unknown, and the empty label differs from
+    every other. If all stated labels are equal, it is taken to be the same specimen.
     """
     if len({experiment.label for experiment in experiments if experiment.label}) < 2:
         return list(experiments)

@@ -25,7 +25,7 @@ _FREQUENCY_FREE_BASES: Final = {
     "losses": "damping ratios and residue phases alone",
     "none": "no beam with one order of each damping, which do not explain the losses",
 }
-"""What estimates are based on that do not use the frequencies of a uniform beam, as sentences."""
+"""Phrases for the bases of estimates that do not use the frequencies of a uniform beam."""
 
 
 def p_value_text(p_value: float) -> str:

@@ -207,7 +207,7 @@ def _pooled_constants(estimates: Sequence[ModalEstimate], modes: Sequence[int]) 
 def _constants_and_background(
     estimate: ModalEstimate, modes: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return modal constants and background of a session as one vector, and its covariance."""
+    """Return the modal constants and the background of a session in one vector, with covariance."""
     constant_indices = estimate.rows(modes)
     indices = np.concatenate(
         [constant_indices, np.arange(estimate.constants.size, len(estimate.joint_covariance))]
@@ -269,7 +269,7 @@ class OppositeSweeps:
 
 
 def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | None:
-    """Compare the modes of rising and falling sweeps; None if either or a common mode is missing.
+    """Compare rising with falling sweeps by the modes of both; None if they have none in common.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ _NO_RESPONSE: Final = FrequencyResponse(
 _PAPER_SETTINGS: Final = WelchSettings()
 """Welch settings of the paper."""
 _NO_INDICES: Final = FitIndices(math.nan, math.nan, math.nan)
-"""Fit indices (NaN) of a model that there is no measured response to compare with."""
+"""Fit indices (NaN) of a model if there is no measured response to compare it with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ class SessionAnalysis:
 
     @property
     def selected(self) -> str | None:
-        """Name of the damping structure that this session selects; None without a verdict."""
+        """Name of the damping structure that this session selects; None if it has no verdict."""
         if self.verdict is None:
             return None
         return min(self.record_estimates, key=lambda estimate: estimate.bic).name

@@ -300,7 +300,7 @@ def campaign_verdict(
 def _final_order(
     exact_order: PooledOrder, verdicts: Sequence[Verdict], modal_model: PooledModalModel | None
 ) -> PooledOrder:
-    """Return an order estimated from the modal constants; without them, for a uniform beam."""
+    """Return an order estimated from the modal constants or, without them, for a uniform beam."""
     if modal_model is None:
         return exact_order
     if modal_model.tolerant is not None:
@@ -366,7 +366,7 @@ def _withheld_orders(*orders: PooledOrder) -> frozenset[str]:
 def _dissenting_sessions(
     sessions: Sequence[SessionAnalysis], lowest_bic_estimate: PooledEstimate
 ) -> tuple[DissentingSession, ...]:
-    """Return the sessions that alone exclude the structure that has the lowest BIC over all."""
+    """Return the sessions that alone exclude the structure of the lowest BIC over all sessions."""
     dissents = []
     for session in sessions:
         estimates_by_name = {estimate.name: estimate for estimate in session.record_estimates}

@@ -39,8 +39,8 @@ _RATE_TOLERANCE: Final = 2e-5
 UFF58 files state six digits."""
 
 _COARSE_TOLERANCE: Final = 1e-3
-"""Largest such difference for a rate that follows from times with too few digits for a time base.
-"""
+"""Largest relative difference that is no contradiction between the user's rate and that of times
+with too few digits for a time base."""
 
 _DEFAULT_RATE_HZ: Final = 1.0
 """Sampling rate that LabVIEW and other programs write if the user has given them none."""
@@ -129,7 +129,7 @@ class FileStatements:
                 )
 
     def check_scales(self, channels: Mapping[str, SourceChannel]) -> None:
-        """Report as contradiction a scale that the file states but that could not be applied."""
+        """Report a contradiction if the file states a scale that could not be applied."""
         for name, channel in channels.items():
             if channel.unapplied_scale:
                 self.report_contradiction(

@@ -265,8 +265,8 @@ def _common_times(
 # Writing
 
 _TEXT_TOLERANCE, _BINARY_TOLERANCE = 1e-2, 1e-6
-"""Largest error of an abscissa, in increments, at which first value and increment (six digits
-each) are written instead of all abscissae. A binary file would have these without an error."""
+"""Largest error of an abscissa, in increments, at which a text file or a binary file states first
+value and increment, with six digits each, instead of all abscissae."""
 
 _INCREMENT_TOLERANCE: Final = 1e-10
 """Largest relative error of an increment of six digits at which a binary file states the increment

@@ -38,7 +38,7 @@ _ANALYZE_AGAIN_ADVICE: Final = "analyze the session again"
 """Advice at the end of error messages on documents."""
 
 _LOGARITHM_PREFIX: Final = "ln_"
-"""Prefix of a parameter's name in a covariance that is that of the parameter's logarithm."""
+"""Prefix of a parameter's name in a covariance if this is the covariance of its logarithm."""
 
 _MAX_OFFSET_MODE: Final = 50
 """Largest number of a mode for which a document may state a stiffness offset."""
@@ -198,7 +198,7 @@ class IdentifiedModel:
                 raise self._error("covariance.names", f"{key_name!r} has no such parameter")
 
         def all_values(determined_values: Mapping[str, float]) -> Mapping[str, float]:
-            """Return all beam parameters by name, of which `determined_values` replaces some.
+            """Return all beam parameters by name, some of them replaced by `determined_values`.
 
             A value whose name begins with "ln_" is a logarithm, and is converted.
             """

@@ -48,7 +48,7 @@ class LoopError(FailureError):
 
 
 def simulated_profile(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
-    """Return a profile of a simulated rig with the rate and the spin time to be measured.
+    """Return a profile of a simulated rig with the given loop rate and spin time.
 
     Everything is simulated in the control process. Late ticks are measured and do not end the
     session. Only the real-time settings of the given profile are used.

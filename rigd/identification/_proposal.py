@@ -89,7 +89,7 @@ def _is_stable(profile: Profile) -> bool:
 # Proposal
 
 _SIGNIFICANT_STDS = 3.0
-"""Number of standard deviations from which an estimate differs from a value significantly."""
+"""Smallest significant deviation of an estimate from a value, in standard deviations."""
 _MAX_UNREMARKED_MISFIT = 1.5
 """Largest misfit of an estimate that is not mentioned to the operator."""
 
@@ -285,7 +285,7 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
 
 
 def _scaled(factor: float, quantity: MotorQuantity) -> MotorQuantity:
-    """Return a quantity multiplied by a factor, as is its standard deviation."""
+    """Return a quantity whose value and standard deviation are multiplied by a factor."""
     std = None if quantity.std is None else factor * quantity.std
     return MotorQuantity(factor * quantity.value, std)
 

@@ -33,7 +33,7 @@ Real = NDArray[np.float64]
 """Array of real numbers."""
 
 MIN_SEGMENT_FRACTION: Final = 0.25
-"""Smallest length of the first samples from which a response is estimated, in segments.
+"""Smallest number of samples from which a response is estimated, as a fraction of a segment.
 
 Fewer samples have too little resolution."""
 
