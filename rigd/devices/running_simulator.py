@@ -34,8 +34,8 @@ class SimulatorAddress:
     control_socket: str
     """Unix socket that accepts faults to inject; while it answers, the simulator runs."""
     can_socket: str = ""
-    """Unix socket that carries CAN frames; empty if the simulator is on a real (virtual) CAN
-    bus."""
+    """Unix socket that carries CAN frames; empty if the simulator uses a CAN interface of the
+    kernel."""
     serial_port: str = ""
     """Pseudo-terminal of the simulated serial sensor; empty if there is none."""
     lock_step: bool = False

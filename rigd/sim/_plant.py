@@ -604,7 +604,7 @@ def _step_vectors(
 
 
 class GrowingDelayLine:
-    """Delay line of readings whose delay grows, for a sensor with a slower clock than the loop.
+    """Delay line of readings whose delay grows, for a sensor whose clock differs from the loop's.
 
     Between ticks the reading is interpolated by a cubic through the four nearest readings.
 
