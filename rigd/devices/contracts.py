@@ -33,7 +33,7 @@ def wired_stop_dropped(device: str, explanation: str = "") -> DeviceError:
     device
         Name of the drive.
     explanation
-        How the drive reports it, as the rest of a sentence.
+        How the drive reports the dropped stop, as the rest of a sentence.
     """
     return DeviceError(
         f"{device}: the wired stop (STO) was dropped{explanation}. Find out who pressed it and "
@@ -56,10 +56,10 @@ class LineHealth:
     status
         Status word of the device; 0 means no error.
     doubt
-        Reason why readings may be older than reported, for the operator; the same text while the
-        reason is the same. Empty if there is no such doubt.
+        Reason why readings may be older than reported, for the operator. The text changes only if
+        the reason changes; it is empty if there is no such doubt.
     doubt_count
-        Sentence that states the number of readings concerned so far; empty if `doubt` is empty.
+        Sentence with the number of readings so far that may be older; empty if `doubt` is empty.
     cause
         Probable cause of missing readings, with its remedy; empty if unknown.
     """

@@ -286,7 +286,7 @@ def describe_obstacle(disturbance: Disturbance) -> str:
 
 
 def _default_side(angle_rad: float) -> int:
-    """Return the default side of an obstacle: that from which a beam at angle zero approaches."""
+    """Return the default side of an obstacle, reached by a beam that moves away from angle zero."""
     return -1 if angle_rad < 0 else 1
 
 
@@ -299,5 +299,5 @@ def _parse_finite(text: str) -> float:
 
 
 def _obstacle_error(text: str, reason: str) -> ObstacleError:
-    """Return the error for a wrong text of an obstacle or impact; it states text and reason."""
+    """Return the error for a text that describes no valid obstacle or impact, with the reason."""
     return ObstacleError(f"Obstacle '{text}': {reason}.")

@@ -19,7 +19,7 @@ from rigd.runtime.processes import listening_sockets
 if TYPE_CHECKING:  # it imports numpy, which takes longer than a stop may take
     from rigd.devices.parameters import RigParameters
 
-_LONGEST_REPLY = 65_536
+_MAX_REPLY_BYTES = 65_536
 """Largest length in bytes of a simulator's reply."""
 _REPLY_TIMEOUT_S = 2.0
 """Time in seconds to wait for a simulator's reply."""
@@ -34,8 +34,8 @@ class SimulatorAddress:
     control_socket: str
     """Unix socket that accepts faults to inject; while it answers, the simulator runs."""
     can_socket: str = ""
-    """Unix socket that carries CAN frames; empty if the simulator is on a real (virtual) CAN
-    bus."""
+    """Unix socket that carries CAN frames; empty if the simulator uses a CAN interface of the
+    kernel."""
     serial_port: str = ""
     """Pseudo-terminal of the simulated serial sensor; empty if there is none."""
     lock_step: bool = False
@@ -125,7 +125,7 @@ def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[st
             control_link.connect(address.control_socket)
             control_link.sendall(json.dumps(request).encode() + b"\n")
             with control_link.makefile("rb") as reply_lines:
-                reply = json.loads(reply_lines.readline(_LONGEST_REPLY))
+                reply = json.loads(reply_lines.readline(_MAX_REPLY_BYTES))
     except (OSError, ValueError) as error:
         raise DeviceError(
             f"The simulated rig (process {address.pid}) does not answer ({error}); start it again."

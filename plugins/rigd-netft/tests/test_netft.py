@@ -218,7 +218,7 @@ def test_a_second_client_takes_the_stream_and_the_cause_is_stated(distant, strea
     assert not distant.health().cause
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
         thief.connect(("127.0.0.1", streaming_box.port))
-        thief.send(protocol.STREAM)
+        thief.send(protocol.STREAM_REQUEST)
         assert thief.recv(64)
         distant.read_wrench()
         time.sleep(0.05)
@@ -231,7 +231,7 @@ def test_packets_from_elsewhere_are_ignored(distant):
     port = distant._line._socket.getsockname()[1]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for sequence in range(50):
-            record = protocol.RECORD.pack(sequence, sequence, 0xFFFFFFFF, *(6 * [10**9]))
+            record = protocol.RECORD_LAYOUT.pack(sequence, sequence, 0xFFFFFFFF, *(6 * [10**9]))
             stranger.sendto(record, ("127.0.0.1", port))
     time.sleep(0.01)
     assert distant.read_wrench() == pytest.approx(WRENCH)
@@ -239,8 +239,8 @@ def test_packets_from_elsewhere_are_ignored(distant):
 
 
 def test_counters_may_wrap_around():
-    assert protocol.difference(3, 0xFFFFFFFE) == 5
-    assert protocol.difference(0xFFFFFFFE, 3) == -5
+    assert protocol.counter_difference(3, 0xFFFFFFFE) == 5
+    assert protocol.counter_difference(0xFFFFFFFE, 3) == -5
     assert protocol.NETFT.status_texts(0x80010000) == ["a monitor condition is latched"]
 
 
@@ -256,8 +256,8 @@ def test_a_box_that_streams_by_the_clock_is_read_without_a_growing_delay(distant
     measured = distant.measure(0.3)
     assert measured["records_hz"] > 0
     assert measured["lost"] == 0
-    sequence, _ = distant._last
-    assert sequence == distant._records  # all came, and none waits
+    sequence, _ = distant._last_numbers
+    assert sequence == distant._record_count  # all came, and none waits
 
 
 @pytest.mark.parametrize("port", ["port", "http_port"])

@@ -42,7 +42,7 @@ _SATURATED_COUNTS = 32767
 
 
 class AtiGauges:
-    """Six strain gauges under a wrench, with the calibration matrix that inverts them.
+    """Six strain gauges that a wrench loads, and the matrix that computes it from their counts.
 
     The counts are ``round(M⁻¹ · (wrench · counts per unit)) + bias``, with the calibration matrix M
     in single precision, as it is transmitted. They saturate at 16 bits.
@@ -66,8 +66,8 @@ class AtiGauges:
         Largest error of each axis by the rounding of the gauges, in N and N·m. With the range and
         resolution of the Mini40 SI-20-1 it is less than half the resolution on every axis, and so
         is the effect of one count of one gauge.
-    stuck : tuple of int and Stuck, or None
-        Number of a gauge that has failed, and replacement for its readings.
+    stuck : tuple of int and StuckReadings, or None
+        Number of a gauge that has failed, and replacement for its readings; None if none has.
     """
 
     def __init__(

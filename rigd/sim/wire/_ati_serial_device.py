@@ -2,13 +2,12 @@
 
 The following behaviour, which is not documented for the sensor, is defined here:
 
-* frames for another address, with a wrong checksum, or of other bytes get no answer; * a request is
-complete as soon as its length is reached and its checksum is right; a request that is
-  still incomplete after 50 ms of silence is discarded (a real sensor discards it after 3.5
+* frames for another address, with a wrong checksum, or of other bytes get no answer;
+* a request is complete as soon as its length is reached and its checksum is right; a request that
+  is still incomplete after 50 ms of silence is discarded (a real sensor discards it after 3.5
   characters, which a pseudo-terminal cannot reproduce);
 * a request to start the stream or to lock, with an undocumented parameter, is answered with 0
-instead
-  of 1;
+  instead of 1;
 * polled gauges (input registers 0 to 5) are in their natural order;
 * gains and offsets are zero after power-up; writing them while locked is an illegal address.
 
@@ -87,7 +86,7 @@ _STOP_BYTE_COUNT = 14
 """Number of received bytes that end the stream."""
 _SILENCE_S = 0.05
 """Silence in seconds after which an incomplete request is discarded."""
-_LONGEST_FRAME = 256
+_MAX_FRAME_BYTES = 256
 """Longest Modbus frame in bytes."""
 _RECORD_SIZE = 13
 """Size of a record of the stream in bytes."""
@@ -110,8 +109,8 @@ class AtiSerialDevice:
         number of the filled calibration block (the fifteen others read 0xFFFF), and the baud
         register after power-up.
     simulated_rig
-        Simulated rig, whose sensor measures. The stream sends the newest readings that the sensor
-        has taken in a period, without new ones.
+        Simulated rig, whose sensor measures. The stream sends the readings that the sensor has
+        taken in a period, and takes none itself.
     write
         Function that sends the bytes of an answer, or the records of one period.
     log
@@ -416,7 +415,7 @@ def _next_request(received: bytes) -> tuple[bytes | None, bytes]:
                 return received[request_start : request_start + request_length], received[
                     request_start + request_length :
                 ]
-        elif available_bytes < _LONGEST_FRAME:
+        elif available_bytes < _MAX_FRAME_BYTES:
             possible_start = min(possible_start, request_start)
         request_start = received.find(_ADDRESS, request_start + 1)
     return None, received[possible_start:]
@@ -441,7 +440,7 @@ def _request_length(received: bytes, start: int) -> int:
     # A request with an unknown function ends where its checksum holds.
     return (
         unknown_length
-        if available_bytes > _LONGEST_FRAME or _checksum(received[start:])
+        if available_bytes > _MAX_FRAME_BYTES or _checksum(received[start:])
         else available_bytes
     )
 

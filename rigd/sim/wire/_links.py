@@ -23,15 +23,15 @@ from rigd.devices.parameters import RigParameters
 
 
 def without_transport_delay(rig: RigParameters) -> RigParameters:
-    """Return the rig with the delays that remain to be simulated in addition to the exchange.
+    """Return a rig's parameters without the part of its delays that the exchange itself causes.
 
-    If replies are used one tick later, the exchange itself causes one period of the delays in the
-    profile. :class:`rigd.sim._devices.SimulatedRig` subtracts the decimating filter's delay.
+    If replies are used one tick later, this part is one period; otherwise it is zero.
+    :class:`rigd.sim._devices.SimulatedRig` subtracts the decimating filter's delay.
 
     Raises
     ------
     DeviceError
-        If a delay in the profile is shorter than the exchange takes.
+        If a delay in the profile is shorter than the part that the exchange causes.
     """
     if rig.acquisition is None or rig.acquisition.mode == "same_tick":
         return rig
