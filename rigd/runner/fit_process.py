@@ -205,7 +205,7 @@ class _SessionFit:
         self._parent = parent
         self._estimator = EstimatorThread()
         self._shared_state = channels.shared_state
-        self._reader = Observer(channels.samples, job.first)
+        self._reader = Observer(channels.samples, job.first_index)
         self._job = job
         self._search: ExcitationPlanner | None = None
         self._pending: EstimateRequest | None = None  # request without an estimate so far

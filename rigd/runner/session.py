@@ -522,7 +522,7 @@ class SessionSupervisor:
             )
         if isinstance(recorder_message, ProcessFailed):
             self._saved_path = recorder_message.saved_path
-            raise (_FileExistsError if recorder_message.taken else SessionFailedError)(
+            raise (_FileExistsError if recorder_message.is_name_taken else SessionFailedError)(
                 recorder_message.reason
             )
         if not isinstance(recorder_message, reply_type):
