@@ -61,7 +61,7 @@ def _fixed_layout_file(schema_name: str, field_types: dict[str, str]) -> "FileDe
 def _event_file() -> "FileDescriptorProto":
     """Return the protobuf file descriptor of the log message ``foxglove.Log``.
 
-    It contains the fields used here of https://github.com/foxglove/foxglove-sdk.
+    It contains only the fields used here; https://github.com/foxglove/foxglove-sdk defines all.
     """
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
@@ -167,8 +167,8 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
 def metadata_for_channel(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
     """Return the records ``session`` and ``segments`` as metadata of the samples' channel.
 
-    A checksum covers the channel. MCAP has no checksum for a metadata record, and the checksum of
-    the whole file is at its end.
+    The copy in the channel is protected by the checksum of its chunk. A metadata record of MCAP has
+    no checksum, and the checksum of the whole file is missing if the file is truncated.
     """
     return {
         **{f"session.{key}": metadata_value for key, metadata_value in session.items()},
@@ -179,7 +179,7 @@ def metadata_for_channel(session: Mapping[str, str], segments: Mapping[str, str]
 def metadata_from_channel(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
     """Return the records ``session`` and ``segments`` from the metadata of the samples' channel.
 
-    This is the inverse of `metadata_for_channel`. The result lacks a record without any key.
+    This is the inverse of `metadata_for_channel`, except that empty records are missing.
     """
     records: dict[str, dict[str, str]] = {}
     for key, metadata_value in channel.items():
