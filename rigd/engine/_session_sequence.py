@@ -228,11 +228,11 @@ class SessionSequence:
         if sensor_violation is not None:
             raise SessionEnd("fault", str(sensor_violation))
         self._rest_spread_nm = rest_readings.torque_spread_nm
-        self._compare_with_tare_before(float(rest_readings.torques_nm.mean()))
+        self._compare_with_previous_tare(float(rest_readings.torques_nm.mean()))
         self._cycle.tare = rest_readings.mean
         return rest_readings.as_metadata() | {"start_angle_rad": repr(self._start_angle_rad)}
 
-    def _compare_with_tare_before(self, zero_nm: float) -> None:
+    def _compare_with_previous_tare(self, zero_nm: float) -> None:
         """Raise `SessionEnd` if the torque at rest differs too much from the previous tare.
 
         `zero_nm` is the coupling torque at rest in N·m, which is stored for the next comparison.
@@ -626,7 +626,7 @@ class SessionSequence:
         )
 
     def _stop_reason(self) -> SessionEnd | None:
-        """Return the error that ends the session if a stop is requested or a process died."""
+        """Return the error for the end after a stop request or a dead process, otherwise None."""
         stop_reason = self._shared_state[StateField.STOP]
         if self._stop.requested or stop_reason == StopReason.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")

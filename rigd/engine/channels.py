@@ -21,7 +21,7 @@ VIRTUAL_BUFFERED_S = 160.0
 It is longer than `RECORDER_BUFFER_S`, because under the virtual clock a session takes about a
 second, and observers lag behind."""
 _EVENT_CAPACITY = 256
-"""Number of log events that their ring holds."""
+"""Number of records that the ring of log events holds."""
 
 
 @dataclass(frozen=True, slots=True)

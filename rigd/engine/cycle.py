@@ -124,7 +124,7 @@ class StandstillMonitor:
         last_movements_rad, self._last_movements_rad = self._last_movements_rad, None
         if elapsed_ticks > 1:
             max_jump_rad = self._max_movement_rad * elapsed_ticks + self._angle_tolerance_rad
-            jump_rad, key = movement_rad, "limits.velocity_rad_s"
+            jump_rad, limit_key = movement_rad, "limits.velocity_rad_s"
         else:
             # The movement before the first is unknown.
             last_movement_rad, earlier_movement_rad = last_movements_rad or (
@@ -138,13 +138,14 @@ class StandstillMonitor:
                 + abs(last_movement_rad)
                 + abs(earlier_movement_rad)
             )
-            jump_rad, key = movement_rad - last_movement_rad, "limits.acceleration_rad_s2"
+            jump_rad, limit_key = movement_rad - last_movement_rad, "limits.acceleration_rad_s2"
             self._last_movements_rad = movement_rad, last_movement_rad
         if not abs(jump_rad) <= max_jump_rad:
             elapsed_text = f"{elapsed_ticks} ticks" if elapsed_ticks > 1 else "one tick"
             raise DeviceError(
                 f"The encoder jumped by {jump_rad:.4g} rad within {elapsed_text} while the torque "
-                f"was off; at most {max_jump_rad:.2g} rad is possible ({key}). {ENCODER_REMEDY}"
+                f"was off; at most {max_jump_rad:.2g} rad is possible ({limit_key}). "
+                f"{ENCODER_REMEDY}"
             )
 
 
@@ -313,7 +314,7 @@ class Cycle:
         self._recent_ticks.clear()
 
     def skip(self, missed_ticks: int) -> None:
-        """Report ticks that were missed with unchanged torque to the limit and encoder monitors."""
+        """Report missed ticks, in which the torque was unchanged, to limit and encoder monitors."""
         if missed_ticks:
             self.limit_monitor.skip(missed_ticks)
             self.skip_encoder(missed_ticks)
@@ -329,8 +330,8 @@ class Cycle:
         """Return whether the shaft has just accelerated against the torque on it.
 
         The torque on the motor is the commanded torque less the measured coupling torque, which
-        includes every load on the beam. If the measured acceleration is about minus this torque
-        divided by the inertia, the sign of angle or torque is wrong, or somebody turns the shaft.
+        includes every load on the beam. If the measured acceleration is about
+        −torque / inertia, the sign of angle or torque is wrong, or somebody turns the shaft.
         Call this after a tick that violated a limit.
 
         Parameters

@@ -190,6 +190,6 @@ def gauge_limits(profile: Profile) -> dict[str, float]:
         "i2t": motor_parameters.continuous_torque_nm,
         "missed": limits.missed_percent,
     } | {
-        wrench_axis: limits.sensor_range_percent / 100.0 * end
-        for wrench_axis, end in zip(wrench_axes, sensor_parameters.range, strict=True)
+        wrench_axis: limits.sensor_range_percent / 100.0 * axis_range
+        for wrench_axis, axis_range in zip(wrench_axes, sensor_parameters.range, strict=True)
     }

@@ -160,7 +160,7 @@ class RigPreview:
             Path of a document of ``analyze --json`` with an identified beam; empty for the beam of
             the profile.
         use
-            Purpose of the model. The identified beam may only have effects that it allows for.
+            Purpose of the model, which determines the effects that the identified beam may have.
 
         Raises
         ------
@@ -441,7 +441,9 @@ def plan_document(profile: Profile, excitation: Excitation, plan: SessionPlan) -
         "sweep": excitation.motion,
         "profile": profile.name,
         "parameters": dict(excitation.parameters),
-        "segments": {name: list(end_text) for name, end_text in excitation.segments.items()},
+        "segments": {
+            name: list(segment_ticks) for name, segment_ticks in excitation.segments.items()
+        },
         "record_s": excitation.reference_rad.size / profile.rig.rate_hz,
         "ends_itself": excitation.ends_itself,
         **asdict(plan.prediction),

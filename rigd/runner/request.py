@@ -415,8 +415,8 @@ def _session_metadata(
         "uniformity_percent": repr(order.profile.uncertainty.uniformity_percent),
         # The parameters of a session may override the uniformity.
         **{
-            metadata_name: _parameter_text(metadata_value)
-            for metadata_name, metadata_value in order.excitation.parameters.items()
+            parameter_name: _parameter_text(parameter_value)
+            for parameter_name, parameter_value in order.excitation.parameters.items()
         },
         "beam_length_m": repr(rig.beam.length_m),
         "beam_density_kg_per_m": repr(rig.beam.density_kg_per_m),
@@ -435,8 +435,8 @@ def _session_metadata(
         **software_commit(),
         "host": platform.node(),
         **{
-            f"realtime_{metadata_name}": metadata_value
-            for metadata_name, metadata_value in connection.realtime.items()
+            f"realtime_{setting_name}": setting_text
+            for setting_name, setting_text in connection.realtime.items()
         },
         **connection.drive,
         **tare,

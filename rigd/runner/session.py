@@ -328,8 +328,8 @@ class SessionSupervisor:
             touch_order,
             session_order.seed,
             tuple(
-                f"{metadata_item.name}: {metadata_item.text}"
-                for metadata_item in session_order.accepted
+                f"{accepted_check.name}: {accepted_check.text}"
+                for accepted_check in session_order.accepted
             ),
         )
         process_group.control.send(job)

@@ -291,8 +291,8 @@ class MessageDecoder:
                 if is_long
                 else len(joined_records)
             )
-            for first_message in range(0, len(joined_records), part_bytes):
-                record_part = joined_records[first_message : first_message + part_bytes]
+            for part_start in range(0, len(joined_records), part_bytes):
+                record_part = joined_records[part_start : part_start + part_bytes]
                 out = self._sink.array_for(len(record_part) // message_size)
                 self._decode_group(channel, message_size, record_part, out)
                 self._sink.store(out)
@@ -430,7 +430,7 @@ class MessageDecoder:
                     position - value_start,
                     array_conversion,
                 )
-        field_names = self.dtype.field_names or ()
+        field_names = self.dtype.names or ()
         absent_fields = {
             field_name: getattr(empty_message, field_name, 0)
             for field_name in field_names
@@ -499,8 +499,8 @@ class MessageDecoder:
         try:
             out[indices] = np.array(
                 [
-                    tuple([getattr(each, field_name, 0) for field_name in field_names])
-                    for each in decoded_messages
+                    tuple([getattr(single_message, field_name, 0) for field_name in field_names])
+                    for single_message in decoded_messages
                 ],
                 self.dtype,
             )

@@ -43,14 +43,14 @@ def _fixed_layout_file(schema_name: str, field_types: dict[str, str]) -> "FileDe
     """Return the protobuf file descriptor of a message with the given field names and types."""
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
-    package_name, field_name = schema_name.split(".")
+    package_name, message_name = schema_name.split(".")
     file_descriptor = FileDescriptorProto(
-        name=f"{package_name}/{field_name.lower()}.proto", package=package_name, syntax="proto3"
+        name=f"{package_name}/{message_name.lower()}.proto", package=package_name, syntax="proto3"
     )
-    message_descriptor = file_descriptor.message_type.add(name=field_name)
-    for field_number, (field, protobuf_type) in enumerate(field_types.items(), start=1):
+    message_descriptor = file_descriptor.message_type.add(name=message_name)
+    for field_number, (field_name, protobuf_type) in enumerate(field_types.items(), start=1):
         message_descriptor.field.add(
-            name=field,
+            name=field_name,
             number=field_number,
             label=FieldDescriptorProto.LABEL_OPTIONAL,
             type=FieldDescriptorProto.Type.Value(f"TYPE_{protobuf_type.upper()}"),
@@ -73,8 +73,8 @@ def _event_file() -> "FileDescriptorProto":
     )
     log_descriptor = file_descriptor.message_type.add(name="Log")
     level_enum = log_descriptor.enum_type.add(name="Level")
-    for level_number, field_name in enumerate(EVENT_LEVELS):
-        level_enum.value.add(name=field_name.upper(), number=level_number)
+    for level_number, level_name in enumerate(EVENT_LEVELS):
+        level_enum.value.add(name=level_name.upper(), number=level_number)
     log_fields = (
         ("timestamp", FieldDescriptorProto.TYPE_MESSAGE, ".google.protobuf.Timestamp"),
         ("level", FieldDescriptorProto.TYPE_ENUM, ".foxglove.Log.Level"),
