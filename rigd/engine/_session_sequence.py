@@ -626,7 +626,7 @@ class SessionSequence:
         )
 
     def _stop_reason(self) -> SessionEnd | None:
-        """Return the error for the end after a stop request or a dead process, otherwise None."""
+        """Return the error that ends the session if a stop is requested or a process died."""
         stop_reason = self._shared_state[StateField.STOP]
         if self._stop.requested or stop_reason == StopReason.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")

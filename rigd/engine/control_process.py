@@ -293,7 +293,7 @@ class _ControlServer:
         ):
             shared_state[state_field] = 0
         self._warn_of_refusals(session_job)
-        self._log_accepted(session_job)
+        self._log_accepted_checks(session_job)
         cycle = self._cycle = self._make_cycle(session_job.profile)
         reference_rad = map_reference(session_job.reference)
         touch_monitor = None
@@ -535,7 +535,7 @@ class _ControlServer:
         for refused_settings, consequence_text in (
             (own_refusals, "more ticks will be late"),
             (
-                session_job.refused,
+                session_job.refused_settings,
                 "a computer that is busy with other programs may end the session",
             ),
         ):
@@ -547,10 +547,10 @@ class _ControlServer:
                 warning_message = f"The system did not grant {setting_names}: {consequence_text}."
                 write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
-    def _log_accepted(self, session_job: SessionJob) -> None:
+    def _log_accepted_checks(self, session_job: SessionJob) -> None:
         """Log a warning for each failed check of ``rigd check`` that the operator accepted."""
-        for check_row in session_job.accepted:
-            warning_message = f"Accepted by the operator, though rigd check fails: {check_row}"
+        for check_text in session_job.accepted_check_texts:
+            warning_message = f"Accepted by the operator, though rigd check fails: {check_text}"
             write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
 

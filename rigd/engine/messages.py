@@ -98,7 +98,7 @@ class SessionJob:
     """Profile of the rig, possibly with another controller and other limits."""
     reference: "ReferenceSpec"
     """Reference angles in shared memory, relative to the angle at the start."""
-    refused: Mapping[str, str] = field(default_factory=dict)
+    refused_settings: Mapping[str, str] = field(default_factory=dict)
     """Real-time setting of supervisor or recorder → reason why the system refused it."""
     ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Steps after the record."""
@@ -106,7 +106,7 @@ class SessionJob:
     """Search for an obstacle; None: no search."""
     seed: int | None = None
     """Seed of a simulated rig's noise; None: the rig chooses a seed."""
-    accepted: tuple[str, ...] = ()
+    accepted_check_texts: tuple[str, ...] = ()
     """Texts for the log, one for each failed row of `rigd check` that the operator accepted."""
 
 

@@ -383,7 +383,7 @@ class Heartbeat:
 
     def __init__(self) -> None:
         self._beat = -1
-        self._polled_s = 0.0
+        self._last_poll_s = 0.0
         self.still_s = 0.0
 
     def stalled_for(self, beat_count: int, now_s: float) -> float:
@@ -396,7 +396,7 @@ class Heartbeat:
         now_s
             Time of a monotonic clock.
         """
-        passed_s = min(now_s - self._polled_s, self._MAX_STEP_S)
+        passed_s = min(now_s - self._last_poll_s, self._MAX_STEP_S)
         self.still_s = self.still_s + passed_s if beat_count == self._beat else 0.0
-        self._beat, self._polled_s = beat_count, now_s
+        self._beat, self._last_poll_s = beat_count, now_s
         return self.still_s

@@ -199,11 +199,11 @@ class _TerminalProgress:
     """Listener of a series of sessions that prints progress and results to the terminal."""
 
     def __init__(self, record_ticks: int, session_count: int, print_line: _PrintLine) -> None:
-        self._ticks = record_ticks
-        self._repeat = session_count
+        self._record_ticks = record_ticks
+        self._session_count = session_count
         self._print = print_line
         self._progress_line: ProgressLine | None = None
-        self._number = ""
+        self._session_number_text = ""
         self._last_view_text = ""
 
     def __enter__(self) -> Self:
@@ -213,7 +213,9 @@ class _TerminalProgress:
         self._close()
 
     def on_start(self, number: int, path: Path) -> None:  # noqa: ARG002 - printed when it exists
-        self._number = f"{number}/{self._repeat}" if self._repeat > 1 else ""
+        self._session_number_text = (
+            f"{number}/{self._session_count}" if self._session_count > 1 else ""
+        )
         self._progress_line = ProgressLine()
 
     def on_message(self, level: str, text: str) -> None:
@@ -234,10 +236,10 @@ class _TerminalProgress:
         self._progress_line.update(
             progress.phase,
             progress.tick,
-            self._ticks,
+            self._record_ticks,
             missed=progress.missed,
             late=progress.late,
-            session_number_text=self._number,
+            session_number_text=self._session_number_text,
         )
 
     def on_result(self, result: SessionResult, *, look_follows: bool) -> None:  # noqa: ARG002

@@ -42,11 +42,11 @@ class LiveViewClient(WorkerClient):
 
     worker = LIVE
 
-    def __init__(self, group: ProcessGroup, rig: str, *, fast: bool = False) -> None:
+    def __init__(self, group: ProcessGroup, rig_name: str, *, fast: bool = False) -> None:
         super().__init__(group)
         self._fast = fast
         self.address: LiveAddress | None = None
-        self._job = LiveJob(rig, group.channels.specs)
+        self._job = LiveJob(rig_name, group.channels.specs)
         self._session: LiveSession | None = None
         self._is_session_shown = False
         self._restart()
