@@ -650,7 +650,7 @@ def _largest_fraction(limited_peaks: tuple[_LimitedPeak, ...]) -> float:
 def _sensor_limit_nm(profile: Profile) -> float:
     """Return the coupling torque in N·m at which a sensor axis reaches its limit.
 
-    Of all wrenches with the same coupling torque, the smallest one is assumed.
+    The smallest of all wrenches with the same coupling torque is assumed.
     """
     sensor = profile.rig.sensor
     projection_norm_squared = sum(p * p for p in sensor.projection)
