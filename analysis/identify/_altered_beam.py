@@ -7,9 +7,9 @@ turns with the clamp. Relative to the stiffness of the beam, mode k then solves 
 
 The coefficients K (stiffness), C (clamp), M (mass), I (external damping) and T (tension by gravity)
 follow from the mode shape. The residue of the torque includes the arms of these forces about the
-motor axis. The plain beam has ``K = k⁴``, ``M = I = 1``, ``C = T = 0``. The effect of damping on a
-mode shape is of the order of the damping times the alteration. It changes poles by the square of
-that, and the arms to first order.
+motor axis. The uniform beam has ``K = k⁴``, ``M = I = 1``, ``C = T = 0``. Damping changes a mode
+shape by about the product of the damping and the deviation from a uniform beam. The arms change in
+proportion to this product, the poles in proportion to its square.
 
 A local compliance adds to the flexibility of the beam, not to its stiffness. The moment along a
 clamped-free beam follows from its loads alone, so few modes suffice.
@@ -59,7 +59,7 @@ Terms = NDArray[np.inexact[Any]]
 """Array of real or complex Galerkin coefficients."""
 
 Profile = Literal["taper", "outer half", "wave"]
-"""Course of a relative deviation along the beam.
+"""Shape of a relative deviation along the beam.
 
 "taper" rises from -1/2 to 1/2, "outer half" is 0 in the inner and 1 in the outer half, and "wave"
 is a cosine of one period."""
@@ -103,15 +103,15 @@ class Alteration:
 
     @classmethod
     def stated(cls, nominal: Plant, tilt_deg: float | None = None) -> Alteration:
-        """Return the alteration that the session file states: tip mass and gravity by inclination.
+        """Return the alteration of the beam that the session file states: tip mass and tilt.
 
         Parameters
         ----------
         nominal : Plant
             Rig and specimen as the file states them.
         tilt_deg : float, optional
-            Inclination of the plane of motion along the beam at rest, positive where the tip is
-            lower than the motor's axis.
+            Angle between the beam at rest and the horizontal, positive if the tip is lower than
+            the root.
         """
         mass_kg = nominal.tip_mass_kg
         return cls(
@@ -120,9 +120,10 @@ class Alteration:
         )
 
     def has_same_shapes(self, other_alteration: Alteration) -> bool:
-        """Return whether two alterations differ at most in what leaves the mode shapes unchanged.
+        """Return whether two alterations of the beam result in the same mode shapes.
 
-        This is the relaxation of the material, and the lags of the torque channel.
+        They then differ at most in the relaxation of the material and in the lags of the torque
+        channel, which do not affect the mode shapes.
         """
         return self == replace(
             other_alteration, relaxation=self.relaxation, sensor=self.sensor, lag_s=self.lag_s
@@ -130,7 +131,7 @@ class Alteration:
 
     @property
     def lags(self) -> tuple[tuple[float, float], ...]:
-        """Coefficients of s and s² in the denominators of the torque channel's lags."""
+        """Return the coefficients of s and s² in the denominator of each lag of the torque."""
         time_s, inverse_quality = self.sensor
         lags = ((inverse_quality * time_s, time_s**2), (self.lag_s, 0.0))
         return tuple(lag for lag in lags if any(lag))
@@ -145,17 +146,17 @@ class ModeTerms:
     Attributes
     ----------
     stiffness, clamp, mass, lump, tension : ndarray, shape (n,)
-        Coefficients of D: K and C divided by the length to the fourth power, M without and of the
-        point masses, and g T divided by the length. The point masses' part is relative to the
-        density `density_kg_per_m`; if that is None, the point masses are proportional to the
-        density.
+        Coefficients of D: ``K / L⁴``, ``C / L⁴``, M without the point masses, M of the point
+        masses, and ``g T / L``, with the length L of the beam.
     mass_arm, lump_arm, medium_arm, tension_arm : ndarray, shape (n,)
-        Arms about the motor's axis, divided by the length; complex if the clamp has a loss.
+        Arms of the forces of mass, point masses, external damping and tension about the motor's
+        axis, divided by the length; complex if the clamp has a loss.
     turn_by_medium, turn_by_internal : ndarray, shape (n,)
-        Changes of the mass's arm by ``gamma s^lambda`` and ``zeta s^alpha``, which alter the mode
-        shape.
+        Change of the arm of the mass per ``gamma s^lambda`` and per ``zeta s^alpha``, since damping
+        changes the mode shape.
     density_kg_per_m : float or None
-        Mass per length for which `lump` is valid.
+        Mass per length for which `lump` is valid. None if the point masses are constant fractions
+        of the mass of the beam.
     alteration : Alteration
         Alteration of the beam.
     """
@@ -175,22 +176,22 @@ class ModeTerms:
     alteration: Alteration
 
     def by_mode(self) -> Iterable[tuple[complex, ...]]:
-        """Return the coefficients of each mode, in the order of the attributes."""
+        """Return one tuple of coefficients for each mode, in the order of the attributes."""
         return zip(*(terms.tolist() for terms in _coefficients(self)), strict=True)
 
 
 _coefficients: Final = attrgetter(*(field.name for field in fields(ModeTerms)[:-2]))
-"""Function that returns the attributes of `ModeTerms` that are arrays."""
+"""Function that returns the coefficients of `ModeTerms`: all attributes that are arrays."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Basis:
-    """First modes of the uniform beam at the points of a quadrature, and their integrals.
+    """First N modes of the uniform beam at quadrature points, and integrals over their shapes.
 
-    `z` are the eigenvalues k L, and `x` the relative positions with `weights`. `shapes`, `slopes`
-    and `curvatures` have the shape (N, points). `arms` and `arms_of_tension`, (N,), are integrals
-    of shape times position and of slope times 1 - x, and `tension`, (N, N), those of products of
-    slopes.
+    `z` are the eigenvalues k L, and `x` the quadrature points, as positions relative to the length,
+    with their `weights`. `shapes`, `slopes` and `curvatures` have the shape (N, points). `arms` are
+    the integrals of ``shape x`` and `arms_of_tension` those of ``slope (1 - x)``, both of shape
+    (N,). `tension` are the integrals of ``slope_i slope_j (1 - x)``, shape (N, N).
     """
 
     z: NDArray[np.float64]
@@ -206,19 +207,19 @@ class _Basis:
     def weighted_products(
         self, rows: NDArray[np.float64], profile: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the integrals over the beam of products of two functions, shape (N, N).
+        """Return the integrals over the beam of all products of two of N functions, shape (N, N).
 
-        The N functions are given as `rows` of values at the quadrature points. Each product is
-        weighted by a `profile`, the values of another function at these points.
+        `rows` are the values of the N functions at the quadrature points. Each product is weighted
+        by `profile`, the values of another function at these points.
         """
         integrals: NDArray[np.float64] = (rows * (self.weights * profile)) @ rows.T
         return integrals
 
     def deviation(self, deviations: Sequence[tuple[Profile, float]]) -> NDArray[np.float64]:
-        """Return the sum of relative deviations of density or stiffness, shape (points,).
+        """Return the total relative deviation of density or stiffness at the quadrature points.
 
-        Each deviation is a profile along the beam and its size. The sum is evaluated at the
-        quadrature points.
+        It is the sum of `deviations`, each given by its profile along the beam and its size. The
+        shape is (points,).
         """
         total_deviation = np.zeros(self.x.size)
         for profile, size in deviations:
@@ -235,7 +236,7 @@ _PROFILE_FUNCTIONS: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[
 
 
 def _basis_shapes(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the N shapes of the basis modes at positions relative to the length, (N, …)."""
+    """Return the shapes of the N basis modes at positions relative to the length, (N, …)."""
     return np.array([mode_shape(mode_number, x) for mode_number in range(1, _BASIS_MODE_COUNT + 1)])
 
 
@@ -278,8 +279,8 @@ def _basis() -> _Basis:
 def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> ModeTerms:
     """Return the Galerkin coefficients of the given modes of an altered beam.
 
-    `modes` are mode numbers, from 1. The basis is extended by one mode for each point mass, which
-    represents all modes beyond the basis.
+    `modes` are mode numbers, from 1. For each point mass one mode is added to the basis. It
+    represents all higher modes.
     """
     basis = _basis()
     length_m, mode_indices = beam.length_m, np.array(modes) - 1
@@ -389,8 +390,8 @@ def _complex_shapes(
 ) -> NDArray[np.complex128]:
     """Return the mode shapes of a beam in a lossy clamp, as coefficients of the basis, (N, n).
 
-    The result is complex. It follows by inverse iteration from `lossless_shapes`, those of a
-    clamp without loss.
+    They are complex, and computed by inverse iteration from `lossless_shapes`, the mode shapes for
+    a clamp without loss.
     """
     complex_shapes = lossless_shapes.astype(np.complex128)
     for mode_index in complex_shapes.T:

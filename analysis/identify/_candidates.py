@@ -144,10 +144,10 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet | None:
-        """Refit the candidates for the beginning of a record to the record as it is now, longer.
+        """Refit candidates that were fitted to the beginning of a record to the longer record.
 
-        Each descent starts from the last estimate of the candidate. Return None if the residual of
-        the first candidate exceeds the noise: then a full search is needed.
+        Each descent starts from the earlier estimate of the candidate. Return None if the residual
+        of the first candidate exceeds the noise: then a full search is needed.
 
         Parameters
         ----------
@@ -235,9 +235,9 @@ class CandidateSet:
 
     @property
     def best(self) -> Candidate:
-        """Return the first candidate, which is reported.
+        """Return the first candidate, whose numbers are reported.
 
-        It is that of the lowest BIC unless `with_leading_candidate` moved another one to the front.
+        It has the lowest BIC unless `with_leading_candidate` moved another one to the front.
         """
         return self.candidates[0]
 
@@ -316,9 +316,9 @@ class CandidateSet:
         )
 
     def _update_reference_following(self) -> CandidateSet:
-        """Return the set refitted with a new estimate of the reference-following motor angle.
+        """Re-estimate the part of the motor angle that follows the reference, and refit the set.
 
-        Return `self` if the reference-following part of the angle has converged.
+        Return `self` if this part has converged.
         """
         candidate_set = self
         for _ in range(MAX_ANGLE_REESTIMATES):
@@ -376,9 +376,9 @@ class CandidateSet:
         ).candidate()
 
     def cross_check(self) -> CandidateSet:
-        """Restart each candidate from the plant of the best candidate, until the best one is final.
+        """Refit each candidate from the plant of the best one, until the best one stays the best.
 
-        An earlier search of a candidate may have missed a flat minimum.
+        The earlier search for a candidate may have missed a flat minimum.
         """
         candidate_set = self
         for _ in range(_MAX_CROSS_CHECK_ROUNDS):
@@ -438,19 +438,20 @@ class CandidateSet:
         return candidate_set.with_leading_candidate(candidate_set.freest)
 
     def fit_with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
-        """Return a candidate's fit with the damping it lacks, and whether that damping was added.
+        """Return a candidate refitted with both internal and external damping.
 
-        An insignificant damping may still exist, and the damping ratio of a mode is the sum of both
-        dampings. If the mode was excited for less time than it rings, this dominates its
-        uncertainty. So the other damping is estimated as well, with order 1. A damping whose order
-        is at the limit of its range acts as an inertia or a stiffness, and also counts as absent.
+        A damping that is missing because it is insignificant may still exist, and adds to the
+        damping ratio of each mode. For a mode that was excited for less time than it rings, it is
+        the main uncertainty of the damping ratio. So the missing damping is estimated with order 1.
+        A damping whose order is at the limit of its range acts as an inertia or a stiffness. It
+        counts as missing, too.
 
         Returns
         -------
         fit : RecordFit
-            The candidate's own fit if it lacks no damping.
+            Fit with both dampings; the candidate's own fit if no damping or both are missing.
         bounded : bool
-            Whether the best coefficient of the other damping is negative. The coefficient is then
+            Whether the best coefficient of the added damping is negative. The coefficient is then
             set to one standard deviation, and the fit is not a minimum.
         """
         structure, own_fit = candidate.structure, candidate.fit
@@ -492,7 +493,7 @@ class CandidateSet:
         return self.descent(unknowns, x, 1).fit(), True
 
     def fit_with_free_orders(self) -> CandidateSet:
-        """Return the set with fits of the structures with free damping orders, if it lacks them."""
+        """Return the set with the structures of free damping orders fitted, if they are missing."""
         best_candidate = self.best
         by_structure = {c.structure.name: c.fit for c in self.candidates}
         refits: list[Refit] = []
@@ -549,7 +550,7 @@ class CandidateSet:
 
 
 def _one_damping_structures(fit: RecordFit) -> list[Structure]:
-    """Return the damping structures that leave out an insignificant damping of a fit."""
+    """Return the structures that lack one damping which is insignificant in a fit."""
     structures_and_missing = zip(_ONE_DAMPING_STRUCTURES, (fit.external, fit.internal), strict=True)
     return [
         structure

@@ -37,8 +37,8 @@ _MIN_BINS: Final = 50
 """Minimum number of frequency bins in the compared band."""
 
 _MAX_REMOVED_TORQUE_CHANGE: Final = 0.1
-"""Change of the torque caused by the incoherent angle, as a sum of whitened squares, up to which
-this torque is not recomputed."""
+"""Change of the torque caused by the part of the angle that is incoherent with the reference, as a
+sum of whitened squares, up to which this torque is not recomputed."""
 
 _FEEDBACK_ITERATIONS: Final = 3
 """Number of iterations between the torque of the ringing beam and the part of the angle that
@@ -89,8 +89,8 @@ class Comparison:
     incoherent_rad : ndarray, shape (m,), or float
         Part of the angle that is incoherent with the reference; 0 if the whole angle is used.
     incoherent_nm, incoherent_in_gaps_nm : ndarray or float
-        Torque caused by that part of the angle, which was removed, at the retained samples and at
-        the ticks with unknown torque.
+        Torque caused by `incoherent_rad`, which was removed: at the retained samples, and at the
+        ticks with unknown torque.
     drag : DragExpansion, optional
         Removed torque by drag, and its derivatives with respect to the beam.
     impact_spectra : ndarray of complex, shape (k, K), or None
@@ -98,8 +98,8 @@ class Comparison:
     last_poles_rad_s : list of complex
         Poles of the last plant, from which the search for the poles of the next plant starts.
     shared_values : RecentValues
-        Cache of one result for all objectives of a long record, of which one for each would take
-        too much memory.
+        Cache of one result, common to all objectives of a long record: one result for each
+        objective would take too much memory.
     """
 
     measurement: Measurement
@@ -571,10 +571,10 @@ class Comparison:
     def decay_gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        """Return the derivatives of the free-decay spectra by the parameters that move the poles.
+        """Return the derivatives of the free decays' spectrum by the parameters of the poles.
 
-        These are the free decays in ``amplitudes @ nuisance_spectra(poles)``. The amplitudes are
-        held constant.
+        The spectrum is the part of ``amplitudes @ nuisance_spectra(poles)`` that belongs to free
+        decays. The amplitudes are held constant.
 
         Parameters
         ----------

@@ -118,9 +118,9 @@ def setting_findings(candidate_set: CandidateSet, headline: Headline) -> Iterato
 def _significant_deviation(
     candidate_set: CandidateSet, headline: Headline, setting_name: Setting
 ) -> tuple[float, float, float] | None:
-    """Return the estimate of a setting minus the file's value, with its 95 % interval.
+    """Return the deviation of a setting from the file's value, and the ends of its 95 % interval.
 
-    Return None if the deviation is not significant, or if the value carries a flag.
+    Return None if the deviation is not significant, or if the estimate carries a flag.
     """
     reported_value, stated_value = (
         headline.parameters.get(setting_name),
@@ -297,9 +297,9 @@ excitation."""
 
 
 def mains_harmonic_text(frequency_hz: float) -> str:
-    """Return the words for the mains harmonic that a frequency is near, or an empty string.
+    """Return words that name the mains harmonic near a frequency as source of a disturbance.
 
-    The text describes the possible source of a disturbance with this frequency.
+    Return an empty string if there is no mains harmonic near it.
     """
     for mains_hz in (50, 60):
         for n in range(1, 9):

@@ -1,8 +1,8 @@
-"""Air drag on the beam: whether it is significant, its size C_D d, and the damping by amplitude.
+"""Air drag on the beam: its significance, its size C_D d, and damping ratios at several amplitudes.
 
-Drag along the whole beam is described by one number, or by two where the coefficient falls with the
-speed. A fit without drag yields a fractional order, a delay, deviating mode frequencies and a wrong
-density instead, because drag damps each mode in proportion to its speed.
+The drag law of the whole beam has one coefficient, or two if C_D falls with the speed. A fit
+without drag yields a fractional order, a delay, deviating mode frequencies and a wrong density
+instead, because drag damps each mode in proportion to its speed.
 
 In free vibration of one mode, with the tip moving by ``A sin(omega t)``, a force per metre
 ``rho_air/2 C v^p`` dissipates in each cycle as much energy as linear damping of the ratio::
@@ -79,10 +79,10 @@ _ROUGH_COST_TOLERANCE: Final = 500.0
 """Predicted reduction of the cost below which the drag torque is not recomputed in the first, rough
 fit.
 
-The last step is still taken by all fits at this drag (`_fit_all_structures`). The two numbers of a
-law and external damping can compensate each other along a flat direction. There each recomputation
-predicted a step of half a standard deviation in the same direction, for ten rounds and more: away
-from the true value, at a second a round."""
+The fits of all structures still take the last step (`_fit_all_structures`). The two coefficients of
+a drag law and external damping can compensate each other along a flat direction. With a smaller
+tolerance, each recomputation then predicted another step of half a standard deviation, away from
+the true value, for ten rounds and more of a second each."""
 
 _STAGNATION_COST_REDUCTION: Final = 20.0
 """Predicted reduction of the cost below which a fit with drag may end if it stagnates: if the step
@@ -98,12 +98,12 @@ _FREEST_STRUCTURE: Final = "VI"
 """Structure with both dampings and free orders."""
 
 _ONE_NUMBER_LAW_STD: Final = 0.1
-"""Relative standard deviation of the drag coefficient above which the drag law has one number.
+"""Relative standard deviation of C_D d above which the drag law is a constant.
 
-The drag coefficient of a cylinder falls with the speed. A constant coefficient is wrong by up to 7
-% on rods and wires between 0.2 and 2 mm, and external damping compensates for the rest. A more
-certain coefficient gets a second number, whether or not that differs from 0, since its interval
-would be too narrow otherwise."""
+The drag coefficient of a cylinder falls with the speed. A constant is wrong by up to 7 % on rods
+and wires between 0.2 and 2 mm, and external damping compensates for the error. If C_D d is more
+certain, the law gets its second coefficient, even if that is not significant: otherwise the
+interval would be too narrow."""
 
 _LOWEST_RELATIVE_SPEED: Final = 0.02
 """Lowest speed at which C_D d is reported, relative to the highest speed: below it the record
@@ -179,7 +179,7 @@ def _bic_under_own_noise(refit: Refit) -> float:
 class _DragFitStart:
     """Start values of a fit with air drag: plant, damping structure, drag law and noise.
 
-    `has_two_numbers` states whether both numbers of the drag law are estimated.
+    `has_two_numbers` states whether both coefficients of the drag law are estimated.
     """
 
     plant: Plant
@@ -228,11 +228,9 @@ def small_drag_spectrum(
 
 
 def _first_order_drag(refit: Refit) -> tuple[float, float]:
-    """Return the air drag C_D d in metres that a fit lacks, and by how much it reduces the cost.
+    """Return C_D d in metres of the air drag missing from a fit, and by how much it cuts the cost.
 
-    Both are estimated to first order.
-
-    All other parameters of the fit stay free.
+    Both are first-order estimates, with all other parameters of the fit free.
     """
     (drag_spectrum,), residual = refit.unexplained_columns(
         small_drag_spectrum(refit.objective.comparison, refit.plant)
@@ -271,11 +269,9 @@ def _converged_drag_fit(
 ) -> Refit | None:
     """Return a refit of one damping structure with air drag whose torque has converged.
 
-    The fit starts from `fit_start`.
-
-    `tolerance` is the largest cost reduction by a further step. `start_comparison` is the
-    comparison with the drag of the start, if it has been computed. Return None if the drag is
-    negative, is unstable or does not converge.
+    The fit starts from `fit_start`, and has converged if a further step would reduce the cost by
+    less than `tolerance`. `start_comparison` is the comparison with the drag of the start, if it
+    has been computed. Return None if the drag is negative, is unstable or does not converge.
     """
     unknowns = candidate_set.unknowns(structure)
     x = unknowns.vector(fit_start.plant)
@@ -328,7 +324,7 @@ def _converged_drag_fit(
 
 
 def _relative_drag_std(refit: Refit) -> float:
-    """Return the relative standard deviation of C_D d in a refit whose drag law has one number."""
+    """Return the relative standard deviation of C_D d in a refit whose drag law is a constant."""
     law, (_, std) = _law_at_minimum(refit), refit.amplitudes()
     return float(std[0]) / max(float(law.constant_m), float(np.finfo(float).tiny))
 
@@ -422,7 +418,7 @@ _RELATIVE_TIP_AMPLITUDES: Final = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
 up to the limit of small slopes."""
 
 _SPEED_EXPONENTS: Final = (2.0, 4 / 3)
-"""Exponents of the speed in the drag force, for the two numbers of a `DragLaw`."""
+"""Exponents of the speed in the drag force, for the two coefficients of a `DragLaw`."""
 
 _QUADRATURE_POINTS: Final = 64
 """Number of points of the Gauss quadrature along the beam."""
@@ -491,9 +487,9 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAtAmplit
 def damping_ratio_by_drag_law(
     mode: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
 ) -> NDArray[np.float64]:
-    """Return a mode's damping ratio by air drag, per unit of each number of a `DragLaw`, (2,).
+    """Return the damping ratio due to air drag per unit of each coefficient of a `DragLaw`, (2,).
 
-    The mode vibrates freely with a given amplitude of the tip in metres.
+    It is that of one mode in free vibration, with a given amplitude of the tip in metres.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     relative_shape = np.abs(mode_shape(mode, 0.5 * (nodes + 1)) / mode_shape(mode, 1.0))

@@ -1,8 +1,8 @@
-"""Change of the torque by air drag with beam and drag, to first order.
+"""First-order change of the torque by air drag if the beam or the drag law changes.
 
 The torque by drag is not linear in the motion, so no frequency response function describes it. In a
-fit it is computed at one beam and drag and removed from the measured torque. Its change with beam
-or drag is linear (`DragExpansion`) in
+fit it is computed for one beam and drag law and removed from the measured torque. If beam or drag
+law change, the torque changes linearly (`DragExpansion`) with
 
 * the poles of the modes, on which the motion near a resonance depends,
 * the external damping ``gamma s^lambda`` at these poles, since it also drives the modes,
@@ -10,12 +10,12 @@ or drag is linear (`DragExpansion`) in
 * the delay between the channels,
 * the drag itself.
 
-The first four follow from a fit's unknowns. The drag is free: its columns are projected out as
-those of a free decay are. A fit with drag repeats both steps until they agree.
+The first four follow from a fit's unknowns. The drag is free: its spectra are projected out like
+those of a free decay. Fits and computations of the drag torque alternate until they agree.
 
-Without drag a resonance peak grows without limit as the damping falls. With drag it hardly grows.
-Where the linear torque curves with a pole, the torque by drag curves against it. So only the first
-order in the poles of the linear torque counts, and its remainder is subtracted.
+Without drag a resonance peak grows without limit as the damping falls. With drag it hardly grows:
+to second order in a pole, the changes of the linear torque and of the torque by drag cancel. So the
+linear torque counts to first order in the poles only, and its change beyond that is subtracted.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class DragExpansion:
             Poles of the other beam, differentiated by the unknowns.
         parameter_names : sequence of str
             Names of the parameters, as in `Unknowns`.
-        parameter_slopes : ndarray, shape (len(names), k)
+        parameter_slopes : ndarray, shape (len(parameter_names), k)
             Derivatives of the parameters by the unknowns, with density over stiffness and stiffness
             as logarithms.
 
@@ -139,9 +139,10 @@ class DragExpansion:
         return torque_change + change_by_poles, torque_jacobian + jacobian_by_poles
 
     def change_by_poles(self, poles: Sequence[Pole], unknown_count: int) -> tuple[Complex, Complex]:
-        """Return the change of the drag torque with the poles alone, and its derivatives.
+        """Return the change of the drag torque due to the poles of another beam.
 
-        The spectra have the shapes (K,) and (unknown_count, K).
+        The spectrum of the change, shape (K,), is returned with its derivatives by the unknowns,
+        shape (unknown_count, K).
 
         Parameters
         ----------
@@ -170,15 +171,15 @@ class DragExpansion:
     def _external_damping_change(self, plant: Plant) -> list[Real]:
         """Return the external damping of another beam minus that of this beam, for two modes.
 
-        The difference is taken at the pole of each mode: with another order ``gamma s^lambda`` is
-        not linear in gamma and lambda, and a fit with insignificant external damping may reach any
-        order.
+        The difference is taken at the pole of each mode, without an expansion in the order:
+        ``gamma s^lambda`` is not linear in lambda, and a fit with insignificant external damping
+        may reach any order.
 
         Returns
         -------
         list of ndarray, shape (2, 3)
-            For each mode c_0 and c_1 of ``c_0 + c_1 s``, each with its derivatives by gamma and
-            lambda.
+            For each mode the difference as ``c_0 + c_1 s``. The rows are c_0 and c_1, each with its
+            derivatives by gamma and lambda.
         """
         own_damping, other_damping = self.plant.damping, plant.damping
         linear_terms = []
@@ -236,9 +237,10 @@ class DragExpansion:
 def _parameter_rows(
     derivatives: Real, derivative_names: Sequence[str], wanted_names: Sequence[str]
 ) -> Real:
-    """Return the derivatives of the wanted parameters by the unknowns, shape (n, k).
+    """Return the rows of `derivatives` for the wanted parameters, shape (n, k).
 
-    `derivative_names` are the parameters of the given rows. A missing parameter gets zeros.
+    `derivative_names` are the parameters of all rows. A parameter that is not among them gets
+    zeros.
     """
     zero_row = np.zeros(derivatives.shape[1])
     return np.array(

@@ -1,8 +1,8 @@
 """Simple causes of modes that deviate from a uniform beam; they are hypotheses, not facts.
 
-Each cause is fitted to the modal constants together with the seven parameters of the beam, at exact
-geometry. About twelve constants are compatible with several causes, so a cause that explains them
-is not established.
+Each cause is fitted to the modal constants together with the seven parameters of the beam, without
+a tolerance of the geometry. About twelve constants are compatible with several causes, so a cause
+that explains them is not established.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ Frequencies are known so precisely that a descent without tolerance would conver
 long and narrow curve."""
 
 _GIVE_UP_CHI_SQUARE: Final = 6.0
-"""Chi-square per degree of freedom, with a tolerance, above which a cause is given up."""
+"""Chi-square per degree of freedom above which a cause is given up after a descent with tolerance.
+"""
 
 _DERIVATIVE_STEP: Final = 1e-6
 """Step of an unknown for numerical derivatives. Steps of the unknowns of a cause are relative to
@@ -235,7 +236,7 @@ class _CauseSearch:
 
     Parameters
     ----------
-    problem : ConstantsProblem
+    problem : UniformBeamProblem
         Modal constants of the record and the beam to compare with them.
     cause : Cause
         Cause that is added to the beam.
@@ -262,9 +263,9 @@ class _CauseSearch:
         self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def best_start(self) -> tuple[float, NDArray[np.float64]]:
-        """Return the best start of a cause, after one step of the beam's unknowns from each start.
+        """Return chi-square and unknowns of beam and cause at the best start of the cause.
 
-        The result is its chi-square, and its unknowns of beam and cause.
+        The unknowns of the beam have taken one step from each start before they are compared.
         """
         x, derivatives = self._beam_x, None
         lowest_step, highest_step = (limits[: x.size] - x for limits in (self._lower, self._upper))
@@ -332,23 +333,23 @@ class _CauseSearch:
     def _deviations(
         self, x: NDArray[np.float64], mode_terms: ModeTerms
     ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
-        """Return the whitened deviations of the modal constants, and a function for derivatives.
+        """Return predicted minus measured modal constants, whitened, and a function for slopes.
 
         `x` are the unknowns of the beam, shape (7,), and `mode_terms` describe the beam with the
-        cause. The derivatives are those by the unknowns of the beam at constant mode shapes.
+        cause. The slopes are the derivatives by `x` at constant mode shapes.
         """
         return self._problem.deviations(x, self._whitener, mode_terms)
 
     def _deviations_at(
         self, y: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
-        """Return `_deviations` for the unknowns of beam and cause."""
+        """Return `_deviations` for the unknowns `y` of beam and cause."""
         return self._deviations(y[: self._beam_x.size], self._mode_terms(y))
 
     def _slopes_by_cause(
         self, y: NDArray[np.float64], deviations: NDArray[np.float64]
     ) -> list[NDArray[np.float64]]:
-        """Return the derivatives of the whitened deviations by the unknowns of the cause."""
+        """Return the derivatives of the `deviations` at `y` by the unknowns of the cause."""
         return [
             (self._deviations_at(y + cause_step)[0] - deviations) / cause_step.sum()
             for cause_step in _DERIVATIVE_STEP * np.diag(self._scale)[self._beam_x.size :]
@@ -363,8 +364,8 @@ def _limited_step(
 ) -> tuple[NDArray[np.float64], float]:
     """Return the Gauss-Newton step within limits, and the chi-square predicted after it.
 
-    The deviations themselves are solved by least squares. Frequencies are known a thousand times
-    more precisely than residues, and normal equations would square that ratio.
+    The least-squares problem is solved without normal equations. They would square the ratio of the
+    precisions of frequencies and residues, which is a thousand.
     """
     step, free_unknowns = np.zeros(len(derivative_rows)), np.arange(len(derivative_rows))
     while free_unknowns.size:
@@ -400,7 +401,7 @@ def finding(
         Test that refused the plain uniform beam.
     causes : sequence of CauseFit
         Causes from `explanations`.
-    stiffness_step : Step, optional
+    stiffness_step : StiffnessStep, optional
         Step of the stiffness during the record, from `best_stiffness_step`.
     """
     cause_phrases = [cause_fit.phrase for cause_fit in causes]

@@ -206,9 +206,9 @@ def _descend_with_noise(
     """Fit all structures under the noise estimated from the residual of the closest structure.
 
     `searches` holds one search for each structure; `closest_index` is the index of the closest
-    structure, and `reference_descent` its descent. `earlier_descents` are the descents before the
-    part that follows the reference was re-estimated; it is empty the first time. A structure that
-    was far behind in them is not searched for again.
+    structure, and `reference_descent` its descent. `earlier_descents` are the results of the last
+    call, with an earlier estimate of the input; empty at the first call. A structure whose cost was
+    far above that of the closest one is not searched for again.
     """
     # Lines are searched for once, in the residual of a fit to every bin.
     noise_spectrum = reference_descent.noise(with_lines=True)
@@ -261,7 +261,7 @@ def _descent_if_still_worse(
 
 
 def _update_reference_following(descent: Descent, whole_angle: Comparison) -> Descent:
-    """Return a descent with the reference-following angle estimated again, without the hum.
+    """Return a descent whose input, the angle that follows the reference, is estimated without hum.
 
     The first estimate was biased by the hum.
     """

@@ -264,11 +264,9 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
 def _likeliest_start(refit: Refit) -> int | None:
     """Return the index of the sample at which an impact most likely begins.
 
-    Free decays of all modes from this sample on explain most of the residual.
-
-    Return None if chance may explain as much, or if the residual does not rise abruptly. The search
-    takes one correlation per decay: the sums for a decay from the first sample on, reversed in
-    time, give those for all samples at once.
+    Free decays of all modes from this sample on explain most of the residual. Return None if chance
+    may explain as much, or if the residual does not rise abruptly. One correlation per decay, by
+    fast Fourier transforms, gives the sums for all possible start samples.
     """
     comparison, weight = refit.objective.comparison, refit.noise.weight
     poles = comparison.poles(refit.plant)
@@ -310,11 +308,9 @@ def _likeliest_start(refit: Refit) -> int | None:
 
 
 def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refit:
-    """Return a refit whose plant and noise were estimated with an impact in the model.
+    """Return a refit whose plant and noise were estimated with an impact between two samples.
 
-    The impact lies between two samples.
-
-    The refit itself is without the impact.
+    The model of the refit itself does not contain the impact.
     """
     comparison, columns_before = refit.objective.comparison, refit.columns
     for _ in range(_IMPACT_FIT_ROUNDS):
@@ -381,15 +377,16 @@ def _successive_cost_reductions(
 
 
 _DEPENDENT_LENGTH: Final = 1e-6
-"""Length of a torque of length 1, after its projection on earlier torques is removed, below which
-it is a linear combination of these."""
+"""Length of the part of a torque of length 1 that is orthogonal to the earlier torques, below which
+the torque is a linear combination of them."""
 
 
 def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[int, int] | None:
     """Return first sample and end sample of an impact within a window of samples, or None.
 
-    Each sample of unknown torque has to reduce the cost by the BIC penalty of a parameter. If the
-    samples suffice without the decays there is no impact: the sensor was disturbed.
+    Each sample of unknown torque has to reduce the cost by the BIC penalty of a parameter. Return
+    None also if such samples explain the residual without free decays: then the sensor was
+    disturbed, and there was no impact.
     """
     bic_penalty = math.log(2 * np.count_nonzero(refit.noise.counts))
     comparison = refit.objective.comparison

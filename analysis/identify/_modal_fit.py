@@ -187,7 +187,8 @@ class ModalFit(ModalEstimate):
     ) -> NDArray[np.float64]:
         """Return how much less certain damping ratios are with an additional effect, shape (n,).
 
-        Each is the standard deviation with a free size of the effect, over that without it.
+        Each value is the standard deviation with the effect, whose size is free, divided by that
+        without the effect.
 
         Parameters
         ----------
@@ -402,8 +403,8 @@ class _ModalSearch:
     def is_near_mode(self, *, within_resonance: bool = False) -> NDArray[np.bool_]:
         """Return a mask of the bins in which the residual may belong to a mode, shape (K,).
 
-        The bins `within_resonance` are those up to half of this distance from a mode. A peak of the
-        noise does not begin nearer to a mode than the whole distance, and ends there.
+        They are the bins within a distance from a mode; with `within_resonance`, within half of it.
+        A peak of the noise begins outside of the whole distance, and ends at half of it.
         """
         hz = self.comparison.frequency_hz[:, None]
         mode_hz, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
@@ -456,11 +457,10 @@ class _ModalSearch:
         return bool(np.any(np.abs(mode_rad_s[:-1] - mode_rad_s[-1]) < least_distances))
 
     def remove_unexcited_modes(self) -> _ModalSearch:
-        """Return the search without modes that the record does not excite.
+        """Return the search without modes that are not excited in the record.
 
-        They hardly reduce the cost at first, and lose their damping in a descent.
-
-        Such a mode would fit a narrow line of the noise.
+        Such modes hardly reduce the cost at the start, and lose their damping in a descent. They
+        would be fitted to a narrow line of the noise.
         """
         cost_increases = self.evidence()
         if cost_increases.min() >= _MIN_DEVIANCE_REDUCTION:
@@ -474,7 +474,7 @@ class _ModalSearch:
         return search
 
     def _remove_mode(self, mode_index: int) -> _ModalSearch:
-        """Return the search without the mode at `mode_index` in `remaining_numbers`."""
+        """Return the search without the mode at `mode_index` in `numbers`."""
         remaining_numbers = self.numbers[:mode_index] + self.numbers[mode_index + 1 :]
         return replace(
             self,
@@ -555,7 +555,8 @@ class _ModalSearch:
 class _DerivativeSpan:
     """Orthonormal rows that span all derivatives of the whitened residual of a modal fit.
 
-    Those of a long record take too much memory to be stored with each fit.
+    The rows of a long record are computed again when needed: they take too much memory to be stored
+    with each fit.
     """
 
     def __init__(self, search: _ModalSearch, rows: NDArray[np.float64]) -> None:

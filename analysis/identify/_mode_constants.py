@@ -1,9 +1,10 @@
 """Modal constants of a uniform or altered beam, and their derivatives by its parameters.
 
 The pole of a mode is the root of its dynamic stiffness D(s) (`analysis.identify._altered_beam`).
-The residue of the torque is ``j L³ EI F² / D'(s)``, with the modal force F of a turn of the motor.
+The residue of the torque is ``j L³ EI F² / D'(s)``, with the modal force F per rotation of the
+motor.
 
-The numbers of each mode are Python's: arrays of so few numbers would take five times as long.
+Each mode is computed with Python numbers: arrays of so few numbers would take five times as long.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class BeamVibration:
     def slopes(self) -> NDArray[np.float64]:
         """Return the derivatives of the constants by the parameters, shape (4 n, 7).
 
-        All modes have a pole.
+        Every mode must have a pole.
         """
         return np.array([row for mode in self._modes if mode for row in mode.slopes()])
 
@@ -151,9 +152,9 @@ class _Mode:
     def _stiffness_at(
         self, s: complex
     ) -> tuple[complex, complex, tuple[complex, complex], complex]:
-        """Return the dynamic stiffness and its derivative by s, and the parts of the stiffness.
+        """Return the dynamic stiffness D, its derivative by s, and terms of D.
 
-        The parts are those of both dampings, and rho/EI s².
+        The terms are those of internal and external damping, as a pair, and ``rho/EI s²``.
         """
         log_s, (alpha, lambda_) = cmath.log(s), self._orders
         internal = cmath.exp(self._ln_coefficients[0] + alpha * log_s) * self._stiffness
@@ -170,7 +171,7 @@ class _Mode:
         return stiffness, slope, (internal, external), inertia
 
     def slopes(self) -> Iterator[list[float]]:
-        """Return the derivatives of the four constants by the seven parameters."""
+        """Yield the derivatives by the seven parameters of each of the four constants."""
         s, dstiffness, force, inertia = self._pole, self._slope, self._force, self._inertia
         log_s, mass = cmath.log(s), inertia * self._mass
         # Derivatives of dynamic stiffness, its slope and the force by the parameters at constant s

@@ -40,11 +40,11 @@ _SMALLEST_DRAG_M: Final = 3e-4
 """Smallest C_D d of a beam in air: that of a wire of about 0.2 mm."""
 
 _LARGEST_DRAG_M: Final = 1e-2
-"""C_D d that a thick beam may have: the standard deviation of C_D d before the record."""
+"""C_D d of a thick beam, which is the standard deviation assumed for C_D d before the fit."""
 
 _MIN_DRAG_STDS: Final = 5.0
-"""Smallest drag over its standard deviation, above which a record without drag excludes any drag.
-"""
+"""Ratio of `_SMALLEST_DRAG_M` to the standard deviation of C_D d above which a record without drag
+excludes all drag."""
 
 _MIN_STD_RATIO: Final = 1.1
 """Ratio of the standard deviation of a damping ratio with drag of unknown size to that without
@@ -61,8 +61,8 @@ _LEAST_DRAG_M: Final = 1e-6
 """C_D d that hardly brakes a beam, for which the torque is computed if the estimate is less."""
 
 _CHANGED_STDS: Final = 3.0
-"""Change of a damping ratio by drag, in its standard deviations without drag, from which the value
-without drag is doubtful although drag does not explain the record as well."""
+"""Change of a damping ratio if drag is fitted, in its standard deviations without drag, from which
+the value without drag is doubtful even if the fit with drag explains the record less well."""
 
 _TOLERANCE_STDS: Final = 0.2
 """Remaining change of the drag, in standard deviations, below which its computation has converged.
@@ -207,9 +207,9 @@ def fit_modes_with_drag(
 
 
 def _remaining_change_m(estimates_m: Sequence[float]) -> float:
-    """Return the change of the drag in m that another computation of its torque would cause.
+    """Return the change of C_D d in m that another computation of the drag torque would cause.
 
-    Each change is the same fraction of the one before.
+    It is extrapolated from the last changes: each is the same fraction of the one before.
     """
     changes_m = np.abs(np.diff(estimates_m))[-2:]
     largest_m = float(changes_m.max())
@@ -217,7 +217,7 @@ def _remaining_change_m(estimates_m: Sequence[float]) -> float:
 
 
 def modes_that_drag_changes(modal_fit: ModalFit, with_drag: ModalFit) -> tuple[int, ...]:
-    """Return the modes whose damping ratio drag changes by more than chance, by number.
+    """Return the numbers of the modes whose damping ratio drag changes by more than chance would.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def modes_that_drag_changes(modal_fit: ModalFit, with_drag: ModalFit) -> tuple[i
 
 
 def _mode_starts(modal_fit: ModalFit) -> list[tuple[int, float, float]]:
-    """Return number, frequency in hertz and damping ratio at which the search for modes starts."""
+    """Return number, frequency in hertz and damping ratio of each mode, as starts of a search."""
     return [
         (mode_number, pole.imag / (2 * math.pi), -pole.real / abs(pole))
         for mode_number, pole in modal_fit.poles_rad_s.items()

@@ -1,4 +1,4 @@
-"""Nonlinear stiffness and damping (dependent on the deflection): torque, and a search for them.
+"""Nonlinear stiffness and damping: torque, and search for their forces in a record.
 
 The angle drives the motion r of mode i relative to its root. A further restoring force n acts on
 it::
@@ -64,7 +64,8 @@ _PADDING_RATIO: Final = 1.5
 """Length of the transforms over that of the record."""
 
 _DECAY_EXPONENT: Final = 9.0
-"""Exponent of the transforms' damping: substitution repeats what wraps round."""
+"""Decay exponent of the `CausalTransform`. It is large because repeated substitution accumulates
+what wraps round from the end of a transform to its beginning."""
 
 _MAX_SUBSTITUTIONS: Final = 12
 """Maximum number of substitutions that compute the motion of a mode with its nonlinear force."""
@@ -90,7 +91,7 @@ class NonlinearTerm:
 
 
 class NonlinearForceSpectra:
-    """Computes the torque spectra of nonlinear restoring forces of unit size on single modes.
+    """Computation of the torque spectra of nonlinear restoring forces of unit size on single modes.
 
     Parameters
     ----------
@@ -183,9 +184,10 @@ class NonlinearForceSpectra:
     def _force_scale(
         self, force_kind: ForceKind, linear_motion_transform: NDArray[np.complex128]
     ) -> float:
-        """Return the factor of a power of deflection or speed in a nonlinear force of unit size.
+        """Return the constant factor of a nonlinear force of unit size, such as ``1 / R²``.
 
-        The linear motion determines the largest deflection R and the largest speed V of the mode.
+        It depends on the largest deflection R and the largest speed V of the mode, which are those
+        of its linear motion.
         """
         largest_deflection = np.abs(self._oversampled_values(linear_motion_transform)).max()
         if force_kind == "quadratic drag":
@@ -199,9 +201,9 @@ class NonlinearForceSpectra:
         motion_transform: NDArray[np.complex128],
         force_scale: float,
     ) -> NDArray[np.complex128]:
-        """Return the transform of the nonlinear force of a mode's motion, shape (length // 2 + 1,).
+        """Return the transform of a nonlinear force of unit size, shape (length // 2 + 1,).
 
-        The force is relative to its size.
+        The motion of the mode determines the force.
         """
         if force_kind == "quadratic drag":
             speed = self._oversampled_values(motion_transform * self._s)
@@ -212,7 +214,7 @@ class NonlinearForceSpectra:
         return force_scale * self._transform.forward(n, oversampling=_OVERSAMPLING)
 
     def _oversampled_values(self, motion_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the oversampled time series, over the record, of a mode's Laplace transform."""
+        """Return the inverse of a mode's Laplace transform as an oversampled time series."""
         return self._transform.inverse(
             motion_transform, _OVERSAMPLING * self._samples, oversampling=_OVERSAMPLING
         )
@@ -252,7 +254,7 @@ class NonlinearForce:
 
     Attributes
     ----------
-    term : Term
+    term : NonlinearTerm
         Kind and mode of the force.
     size : float
         Change of the stiffness at the largest deflection, as a fraction, or change of the damping
@@ -269,15 +271,15 @@ class NonlinearForce:
 def add_nonlinear_forces(
     candidate_set: CandidateSet, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
-    """Return the candidate set refitted with significant nonlinear forces, and these forces.
+    """Return the candidate set refitted with significant nonlinear forces, and the forces.
 
-    They are added one by one.
+    The forces are added one by one to the visible `modes`. Return the given candidates and no
+    forces if none is significant.
 
     A mode whose stiffness rises resembles a mode of another frequency, or a fractional order. If
     the best candidate has a fractional order, the search also starts from candidates without one.
-    Even then such a force leaves a trace in the residual of the best candidate, and without that
-    trace nothing is tested. `modes` are the visible modes. Return the candidates with the forces,
-    or the given candidates and no forces.
+    Even then such a force leaves a trace in the residual of the best candidate. Without that trace
+    nothing is tested.
     """
     best_candidate = candidate_set.best
     best_refit = candidate_set.refit(best_candidate)
@@ -304,7 +306,7 @@ def add_nonlinear_forces(
 def _start_candidates(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
     """Return the candidates from which the search for nonlinear forces starts.
 
-    This is the best one. If its internal order is free, it comes after those with the order 1.
+    They are the best one and, if its internal order is free, before it those with the order 1.
     """
     best_candidate = candidate_set.best
     if "alpha" not in best_candidate.structure.free:
@@ -318,7 +320,7 @@ def _start_candidates(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
 def _add_forces(
     candidate_set: CandidateSet, start_candidate: Candidate, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
-    """Return the candidate set refitted with the nonlinear forces of one candidate, and these.
+    """Return the candidate set refitted with the nonlinear forces of one candidate, and the forces.
 
     Significant forces are added to that candidate one by one.
     """
@@ -373,9 +375,8 @@ def _best_first_order_force(
 ) -> tuple[NonlinearTerm | None, float]:
     """Return the nonlinear force that reduces the cost most, and the cost with it.
 
-    Both are predicted to first order. The force is None if there is none left.
-
-    Forces in `excluded_terms` are not considered.
+    Both are predicted to first order. Forces in `excluded_terms` are not considered. The force is
+    None if there is no other.
     """
     force_spectra = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
     # If drag on the whole beam is significant, drag on a single mode is not tested.

@@ -52,9 +52,9 @@ class ResidualTests:
     Attributes
     ----------
     whiteness : Whiteness
-        Whether the residual is white.
+        Test of whether the residual is white.
     input_relation : InputRelation
-        Whether the residual follows the angle.
+        Test of whether the residual follows the angle.
     harmonics : tuple of Harmonic
         Residual at multiples of the sweep's frequency.
     """
@@ -65,7 +65,7 @@ class ResidualTests:
 
     @property
     def is_noise(self) -> bool:
-        """Whether the residual is white and does not follow the angle."""
+        """Return whether the residual is white and does not follow the angle."""
         return self.whiteness.is_white and not self.input_relation.related
 
 
@@ -74,7 +74,7 @@ def test_residual(
 ) -> ResidualTests:
     """Test whether the residual is white, follows the angle, or has harmonics of the sweep.
 
-    This is the residual of the modal model, or that of the first candidate without such a model.
+    The residual is that of the modal model or, if that is None, of the first candidate.
     """
     comparison, compared_bins = candidate_set.comparison, candidate_set.noise.counts
     modal_residual = candidate_set.best.fit.residual if modal_fit is None else modal_fit.residual
@@ -136,7 +136,7 @@ class RecordModel:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on the effects that are fitted with the modes."""
+        """Return the findings on the effects that are fitted with the modes."""
         effects = (self.small_effect, self.modes_with_drag)
         return tuple(effect.finding() for effect in effects if effect is not None)
 
@@ -183,7 +183,7 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
 
 
 def add_further_effects(model: RecordModel, band_hz: tuple[float, float]) -> RecordModel:
-    """Add the effects that the small ones leave unexplained, and fit the candidates with all.
+    """Add large effects if small ones do not explain the record, and fit the candidates with them.
 
     Parameters
     ----------
@@ -261,7 +261,10 @@ def _accepted_drag(
     modes_with_drag: ModesWithDrag | None,
     explains_record: Callable[[ModalFit], bool],
 ) -> tuple[ModesWithDrag | None, tuple[int, ...]]:
-    """Return modes with drag if they explain the record, else None and the modes in doubt."""
+    """Return the modes with drag if they explain the record, else None and the modes in doubt.
+
+    The modes in doubt are the numbers of those whose damping ratio depends on the drag.
+    """
     if modes_with_drag is None:
         return None, ()
     if modes_with_drag.converged and explains_record(modes_with_drag.modal_fit):
@@ -289,7 +292,7 @@ def fit_modal_model(
 
 
 def _mode_starts(modes: Iterable[ModeEstimate]) -> list[tuple[int, float, float]]:
-    """Return number, frequency in hertz and damping ratio at which the search for a mode starts.
+    """Return number, frequency in hertz and damping ratio of each mode, as starts of a search.
 
     A beam that fits badly may have an overdamped mode below one that oscillates. The search for the
     overdamped mode starts at the frequency ratio of a uniform beam.
@@ -331,7 +334,7 @@ def _explains_record(
 
 
 def _small_drag(candidate_set: CandidateSet, modal_fit: ModalFit) -> NDArray[np.complex128]:
-    """Return the torque spectrum of a small drag on a beam with these modes, shape (K,)."""
+    """Return the torque spectrum of a small drag on a beam with the fitted modes, shape (K,)."""
     plant = modal_fit.uniform_plant(candidate_set.comparison.measurement.nominal)
     drag_spectra = small_drag_spectrum(candidate_set.comparison, plant, modal_fit)
     return np.asarray(drag_spectra[0])
@@ -356,7 +359,7 @@ def _with_small_effect(
 
 
 def _with_fitted_candidates(model: RecordModel) -> RecordModel:
-    """Fit the candidates with drag or a distinct small effect, which may change their numbers."""
+    """Refit the candidates with the drag or the large small effect of the model, if it has one."""
     linear_candidates, modes_with_drag = model.linear_candidates, model.modes_with_drag
     if modes_with_drag is not None:
         with_drag = replace(linear_candidates, comparison=modes_with_drag.comparison)

@@ -1,8 +1,7 @@
 """Refit from the end of a fit: another structure, other noise, a fixed order, or added torques.
 
 A nonlinear effect (for example a stiffness that depends on the deflection) adds to the torque a
-spectrum of known shape and unknown size, called a column. It is projected out like the free
-decay.
+spectrum of known shape and unknown size. It is projected out like the free decay.
 """
 
 from __future__ import annotations
@@ -119,7 +118,7 @@ class Refit:
 
     @property
     def columns(self) -> NDArray[np.complex128]:
-        """Return the torque spectra that are projected out besides the free decay, (c, K)."""
+        """Return the torque spectra of effects, projected out like those of free decays, (c, K)."""
         return self.objective.columns
 
     @property
@@ -168,7 +167,7 @@ class Refit:
         return torque_amplitudes, np.sqrt(np.diag(covariance))
 
     def amplitude_covariance(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the fitted factors of the added torque spectra, (c,), and their covariance."""
+        """Return the sizes of the added torque spectra, shape (c,), and the covariance, (c, c)."""
         linearisation = self.objective.linearise(self.x)
         projected_objective = self.objective.project(linearisation, self.noise.weight)
         whitened_spectra = self.objective.unknown_torques(linearisation) * self.noise.weight
@@ -193,11 +192,11 @@ class Refit:
     def unexplained_columns(
         self, torque_spectra: NDArray[np.complex128], *, beam_free: bool = True
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Whiten torque spectra and remove the part that other free terms explain, shape (c, K).
+        """Return the part of whitened torque spectra that other free terms do not explain, (c, K).
 
-        The whitened residual (prediction minus measurement), shape (K,), is returned as well. With
-        `beam_free` the unknowns may explain a part of the spectra, too. Otherwise only the terms
-        that are projected out may.
+        The free terms are the disturbances of unknown amplitude and, with `beam_free`, the unknowns
+        of the beam. The whitened residual (prediction minus measurement), shape (K,), is returned
+        as well.
         """
         noise_weight, linearisation = self.noise.weight, self.objective.linearise(self.x)
         projected_objective = self.objective.project(linearisation, noise_weight)
@@ -211,9 +210,7 @@ class Refit:
     def cost_reduction_by_spectrum(
         self, torque_spectra: NDArray[np.complex128]
     ) -> NDArray[np.float64]:
-        """Return the first-order reduction of the sum of squares by each torque spectrum alone.
-
-        Its shape is (c,).
+        """Return the first-order reduction of the cost by each torque spectrum alone, shape (c,).
 
         Parameters
         ----------
@@ -257,7 +254,7 @@ class Refit:
         )
 
     def candidate(self) -> Candidate:
-        """Return this minimum as a candidate for the best fit of the record, with its structure."""
+        """Return the fit at this minimum, with its structure, as a candidate."""
         unknowns = self.objective.unknowns
         return Candidate(unknowns.structure, self.fit(), len(self.columns))
 

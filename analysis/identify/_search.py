@@ -41,7 +41,7 @@ _LN_RATIO_SHIFTS: Final = np.linspace(-0.5, 0.5, 101)
 """Shifts of ln(rho/EI) at which the resonances are compared with the record."""
 
 _SCAN_DAMPING: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
-"""Damping for the scan of these shifts, as `Unknowns.start` accepts it."""
+"""Damping at which the shifts are compared, as `Unknowns.start` accepts it."""
 
 
 def resonance_shift(coarse_response: CoarseResponse, unknowns: Unknowns) -> NDArray[np.float64]:
@@ -150,7 +150,7 @@ class CoarseResponse:
         return self._responses[plant]
 
     def best_ln_ratio_shift(self, plant: Plant) -> float:
-        """Return the shift of ln(rho/EI) of a plant, with constant losses, of the lowest cost."""
+        """Return the shift of ln(rho/EI), at constant losses, for which a plant fits best."""
         # Cached: structures that differ only in what is free begin at the same plant.
         if plant not in self._shifts:
             ratio, gamma = plant.beam.density_over_stiffness, plant.damping.gamma
@@ -172,13 +172,13 @@ class CoarseResponse:
         return self._mean_square(self._predicted(first_plant) - self._predicted(second_plant))
 
     def alike(self, first_plant: Plant, second_plant: Plant) -> bool:
-        """Return whether the responses of two plants are so similar that they are one minimum."""
+        """Return whether two plants respond so similarly that they count as the same minimum."""
         return self.distance(first_plant, second_plant) <= _SAME_MINIMUM_FRACTION * min(
             self.cost(first_plant), self.cost(second_plant)
         )
 
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
-        """Return `cost` with its gradient and Gauss-Newton matrix by the unknowns."""
+        """Return the cost at `x` with its gradient and Gauss-Newton matrix by the unknowns."""
         plant, unknown_slopes = unknowns.plant_and_gradient(x)
         spectra = self._response.evaluate(plant, unknowns.gradient_names)
         response_deviation = spectra[0] - self._measured
@@ -191,7 +191,7 @@ class CoarseResponse:
         )
 
     def _mean_square(self, response_deviation: NDArray[np.complex128]) -> float:
-        """Return the weighted mean square of differences of the response, in (N·m/rad)²."""
+        """Return the weighted mean square of a deviation of the response, in (N·m/rad)²."""
         return float(self._weights @ (response_deviation.real**2 + response_deviation.imag**2))
 
 

@@ -83,7 +83,7 @@ session repeats."""
 _TILTED_AXIS_REASON: Final = (
     "the axis is tilted, and fits to the whole record are of one that is plumb"
 )
-"""Reason against the estimates on an exactly uniform beam if the axis is tilted."""
+"""Reason to doubt the estimates for an exactly uniform beam if the axis is tilted."""
 
 ORDER_ONE_STRUCTURE: Final = STRUCTURES["III"]
 """Structure with internal and external damping of order 1. It is fitted from every start: it has no
@@ -387,7 +387,7 @@ def _explain_deviations(
 ) -> tuple[tuple[CauseFit, ...], tuple[Finding, ...]]:
     """Return simple causes of the deviations from a uniform beam, and the finding that names them.
 
-    Return none with only two modes, which leave no degree of freedom for this test.
+    Both are empty with only two modes, which leave no degree of freedom for a test of causes.
     """
     if len(modal_fit.visible) <= MODES_WITHOUT_REDUNDANCY:
         return (), ()
@@ -406,7 +406,7 @@ def _add_modal_model(
     beam_test: UniformBeamTest | None,
     check: ModelCheck,
 ) -> Headline:
-    """Add the modal model and the estimates with tolerance to the headline of a uniform beam.
+    """Add the modal model and the estimates with tolerance to the headline for a uniform beam.
 
     Return `exact_headline` if there is no modal model.
     """
@@ -523,9 +523,9 @@ def _fit_freest_with_known_impacts(
 def _unidentifiable_orders(
     candidate_set: CandidateSet, visible_numbers: tuple[int, ...]
 ) -> dict[str, str]:
-    """Return why an order is not determined, for each order that the record does not determine.
+    """Return the reason why each undetermined damping order is not determined, by order name.
 
-    The fit is that of the structure with most free parameters.
+    The orders are those of the fit with most free parameters.
     """
     freest_candidate, *other_candidates = candidate_set.candidates
     common_reason = not_reported_reason(candidate_set, visible_numbers)

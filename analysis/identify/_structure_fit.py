@@ -1,8 +1,8 @@
 """Fit of a damping structure of an installed package to a whole record.
 
-Data and noise spectrum are those of the structures of the analyser, so that the costs are
-comparable. The poles of the free decay at the start of the record are those of the closest of these
-structures: nearly all records begin at rest.
+Data and noise spectrum are those of the fits of types I to VII, so that the costs are comparable.
+The poles of the free decay at the start of the record are those of the type with the lowest BIC.
+They hardly matter: nearly all records begin at rest.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _ROUGH_TOLERANCE: Final = 1e-3
 _TOLERANCE: Final = 1e-8
 """Relative tolerance of the cost at the minimum."""
 _DESCENTS: Final = 3
-"""Number of starts, those of the lowest cost, from which descents begin."""
+"""Maximum number of starts, those of the lowest cost, from which descents begin."""
 _MAX_EVALUATIONS: Final = 60
 """Largest number of evaluations of a descent."""
 
@@ -69,7 +69,7 @@ class StructureFit:
     degrees_of_freedom : int
         Cost that is expected if the residual is noise only.
     delta_bic : float
-        Bayesian information criterion (BIC) above the lowest of types I to VII.
+        Bayesian information criterion (BIC) minus the lowest one of types I to VII.
     compared_with : str
         Name of the type with the lowest BIC.
     residual : ndarray of complex, shape (K,)
@@ -90,7 +90,7 @@ class StructureFit:
 
     @property
     def sentence(self) -> str:
-        """Return the sentence of the verdict on this structure, which is none of its candidates."""
+        """Return the sentence that compares this structure with types I to VII by BIC."""
         above = self.delta_bic > 0
         difference = (
             f"its BIC is {abs(self.delta_bic):.3g} {'above' if above else 'below'} that of type "

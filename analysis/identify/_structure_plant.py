@@ -84,7 +84,10 @@ class StructurePlant(Plant):
     def _factor_slopes(
         self, s: NDArray[np.complex128], parameter: Parameter
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return the derivatives of the factors c and e by a parameter, by central differences."""
+        """Return the derivatives of elastic factor and external damping by a parameter, (n,) each.
+
+        They are central differences.
+        """
         value = self.values[parameter.name]
         step = _PARAMETER_STEP * (
             value if parameter.logarithmic else parameter.upper - parameter.lower
@@ -128,7 +131,7 @@ class StructureUnknowns(Unknowns):
 
     @cached_property
     def settings(self) -> Unknowns:
-        """Return the unknowns of beam and rig alone."""
+        """Return the unknowns of beam and rig alone, which come after those of the structure."""
         return Unknowns(UNDAMPED, self.nominal, self.free, self.omega_rad_s)
 
     @property
@@ -146,7 +149,7 @@ class StructureUnknowns(Unknowns):
         )
 
     def vector_near(self, values: Mapping[str, float], closest: Plant) -> NDArray[np.float64]:
-        """Return the unknowns for values of the structure's parameters on the closest plant."""
+        """Return the unknowns for values of the structure's parameters, with `closest` as beam."""
         own_unknowns = [_unknown(each, values[each.name]) for each in self._free]
         return np.array([*own_unknowns, *self.settings.vector(closest)])
 

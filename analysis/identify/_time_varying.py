@@ -1,6 +1,6 @@
 """Changes along the record (damping, stiffness, gain), clocks of different rates, and backlash.
 
-Each effect adds to the torque a spectrum of known shape and unknown size, called a column as in
+Each effect adds to the torque a spectrum of known shape and unknown size, as in
 `analysis.identify._refit`: the change of the torque if damping, stiffness or gain rise in
 proportion to time, and the effect of a hub that follows the shaft with backlash. In one sweep time
 and frequency increase together, so a drifting damping competes with an order of the damping, and a
@@ -64,12 +64,13 @@ _MIN_DEVIANCE_REDUCTION: Final = SIGNIFICANT_STD**2 + 2 * math.log(20)
 candidates."""
 
 _RIVAL_BIC_FRACTION: Final = 0.75
-"""Fraction of the BIC advantage of another explanation that an effect must be predicted to reach.
-The first order predicts this advantage to a tenth."""
+"""Fraction of the BIC advantage of another explanation that an effect must reach as well, by
+first-order prediction. The prediction is accurate to a tenth."""
 
 _PREDICTED_BIC_FRACTION: Final = 0.5
-"""Fraction of the BIC advantage with which an effect would rival the best fitted one that it must
-be predicted to reach. The first order predicts at least this fraction of the advantage of a fit."""
+"""An effect is fitted if its predicted BIC advantage reaches this fraction of the advantage that it
+needs to rival the best fitted effect. The first order predicts at least this fraction of the
+advantage that a fit shows."""
 
 UNIT_BACKLASH_RAD: Final = 1e-4
 """Backlash that corresponds to 1 of the fitted size, in rad."""
@@ -218,9 +219,9 @@ def _promising_changes(
     backlash_angle: NDArray[np.float64],
     highest_bic: float,
 ) -> Iterator[tuple[Effect, float]]:
-    """Yield the changes that would make a candidate the best one, by rising predicted BIC.
+    """Yield the changes with which a candidate may become the best one, with their predicted BIC.
 
-    The BIC comes with each. A change must reduce the deviance significantly, and its BIC must be
+    The lowest BIC is first. A change must reduce the deviance significantly, and its BIC must be
     below `highest_bic`.
     """
     candidate_refit = candidate_set.refit(candidate, 1)
@@ -394,7 +395,7 @@ _PADDING_RATIO: Final = 1.5
 """Length of the transforms over that of the record."""
 
 _DECAY_EXPONENT: Final = 9.0
-"""Exponent of the transforms' damping, as in `analysis.identify._nonlinear`."""
+"""Decay exponent of the `CausalTransform`, as in `analysis.identify._nonlinear`."""
 
 _MAX_SIZE_ORDER: Final = 12
 """Highest order in the size of the change to which the torque is computed."""
@@ -412,10 +413,9 @@ def memory_torque(
 ) -> NDArray[np.float64]:
     """Return the torque change by past values of a changing property, per unit size, (samples,).
 
-    This is the torque beyond the instantaneous derivative. `relative_change`, shape (samples,), is
-    w at the retained samples, constant before and after. For `changing_property` of "stiffness" the
-    mass is constant.
-    `change_size` is e.
+    It is the part of the torque change that the derivative by the present value does not contain.
+    `relative_change`, shape (samples,), is w of the module's equations at the retained samples,
+    constant before and after; `change_size` is e. If the stiffness changes, the mass is constant.
     """
     n = comparison.angle_rad.size
     transform = CausalTransform.for_record(

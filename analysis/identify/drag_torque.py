@@ -1,4 +1,4 @@
-"""Torque by air drag along the beam, and its derivatives by beam and drag.
+"""Torque by air drag along the beam, and its derivatives by the parameters of beam and drag law.
 
 A force f per metre on a beam that moves relative to its root acts on mode i with
 ``F_i = ∫ phi_i f dx / L``. With p, c and k of `analysis.identify._predictor`,
@@ -64,15 +64,15 @@ _OVERSAMPLING: Final = 3
 aliased into it."""
 
 _PAST_FORCES: Final = 3
-"""Number of earlier forces, besides the present one, that the interpolation polynomial passes
-through."""
+"""Number of earlier forces that the interpolation polynomial passes through, in addition to the
+present force."""
 
 HALF_AIR_DENSITY_KG_PER_M3: Final = 0.5 * AIR_DENSITY_KG_PER_M3
 """Half the density of air, in kg/m³."""
 
 LOWEST_MODE_INDICES: Final = [0, 1]
-"""Indices of the modes that external damping drives noticeably: it falls off against the
-inertia."""
+"""Indices of the modes on which external damping acts noticeably: relative to inertia, its force
+decreases with frequency."""
 
 _DIVERGED_SPEED_RATIO: Final = 10.0
 """Speed, relative to the highest one without drag, that no beam with drag can reach."""
@@ -373,9 +373,9 @@ class DragResponse:
         return point_speed_m_s
 
     def _add_drag_to_speeds(self, speed_m_s: Real, law: DragLaw) -> None:
-        """Replace the speeds of the beam points without drag, in m/s, by those with drag.
+        """Add the effect of drag to the speeds of the beam points in m/s, shape (3 m, points).
 
-        The array is changed itself.
+        The array is changed in place.
         """
         speed_by_state, by_state, by_force = self._time_step_matrices()
         step_matrix = np.concatenate([self._grid.shapes.T @ speed_by_state, by_state])
@@ -410,13 +410,13 @@ class DragResponse:
     def _modal_force_changes(
         self, speed_m_s: Real, law: DragLaw, speed_sources: list[tuple[int, Real]]
     ) -> list[Real]:
-        """Return the first-order change of the modal forces by added speeds and by the drag law.
+        """Return the first-order changes of the modal forces, each of shape (modes + 1, 3 m).
 
-        To first order the force on a mode is a sum over the modal speeds, with one factor for each
-        pair of modes at each time step. `speed_m_s`, shape (3 m, points), includes the effect of
-        drag. Each element of `speed_sources` holds the index of a mode, and the speed, shape
-        (3 m,), that is added to this mode. The changes by the two coefficients of the drag law come
-        last.
+        First come the changes due to each of `speed_sources`: the index of a mode, and a speed,
+        shape (3 m,), that is added to this mode. The last two are those per unit of each
+        coefficient of the drag law. To first order the force on a mode is a sum over the modal
+        speeds, with one factor for each pair of modes at each time step. `speed_m_s`, shape
+        (3 m, points), includes the effect of drag.
         """
         speed_by_state, by_state, by_force = self._time_step_matrices()
         step_matrix = np.concatenate([speed_by_state, by_state])
@@ -465,8 +465,8 @@ class DragResponse:
     def _time_step_matrices(self) -> tuple[Real, Real, Real]:
         """Return the matrices of one time step of the modes under drag.
 
-        The first gives the modal speeds from the state, the second the next state from the state,
-        and the third the next state from the modal forces. The state holds two numbers for each
+        They multiply the state to give the modal speeds, the state to give its part of the next
+        state, and the modal forces to give the other part. The state holds two numbers for each
         mode, then the modal forces of the last three steps.
         """
         n, step_s = DRAG_MODES, 1 / (_OVERSAMPLING * self._rate_hz)
@@ -585,8 +585,8 @@ class DragResponse:
     def _phase_factor(self, pole: complex, residue: complex) -> Complex:
         """Return the factor that gives the torque of a mode its measured phase, shape (bins,).
 
-        Drag on a mode moves its pole to the left, whatever turns the phase of its residue: external
-        damping, delay or clamp. Torque of another phase would move the frequency.
+        Drag adds damping to a mode, whatever changes the phase of its residue: external damping,
+        delay or clamp. A drag torque without this phase would change the frequency instead.
         """
         # The residue of -s⁴ / Z, through the torque channel, is j times a multiple of this.
         turn = residue / (1j * pole**4 * self.plant.channel_response(pole))
@@ -595,9 +595,9 @@ class DragResponse:
         return factor
 
     def _oversampled_values(self, laplace_transform: Complex) -> Real:
-        """Convert a Laplace transform to values over time, at three times the sampling rate.
+        """Convert a Laplace transform to a time series at three times the sampling rate.
 
-        Their shape is (..., 3 m).
+        The shape is (..., 3 m).
         """
         return self._transform.inverse(
             laplace_transform, _OVERSAMPLING * self._samples, oversampling=_OVERSAMPLING
@@ -605,7 +605,7 @@ class DragResponse:
 
 
 def _drag_force(speed_m_s: Real, law: DragLaw) -> Real:
-    """Return the drag force per length of the beam in N/m, at speeds in m/s of the same shape."""
+    """Return the drag force per length of the beam in N/m, of the shape of the speeds in m/s."""
     speed_magnitude = np.abs(speed_m_s)
     force_per_speed = law.constant_m * speed_magnitude
     if law.slowing:
@@ -640,8 +640,8 @@ def _impedance_slopes(pole_pairs: Complex, plant: Plant) -> Complex:
 def _force_weights_of_step(poles_per_s: Complex, step_s: float) -> Complex:
     """Return the weights of the last forces F in one time step of the equation ``z' = p z + F``.
 
-    p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCES`), with the newest
-    force first. Between the instants the force is the polynomial through all of these forces.
+    p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCES`), with that of the
+    newest force first. Between the time steps F is the polynomial through the last forces.
     """
     quadrature_node, quadrature_weight = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     step_fraction = 0.5 * (quadrature_node + 1)

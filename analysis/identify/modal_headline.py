@@ -62,11 +62,11 @@ def uniform_beam_refusal_reason(test: UniformBeamTest) -> str | None:
 
 
 _CHANGED_BY_DRAG: Final = "air drag of unknown size would change it"
-"""Reason against a damping ratio that is not known apart from the drag."""
+"""Reason to doubt a damping ratio that depends on a drag of unknown size."""
 
 _CONTRADICTION_STDS: Final = 3.0
-"""Distance of a number with a cause from the reported one, in standard deviations by the side of
-the 95 % interval that faces it, from which the cause makes the reported number doubtful."""
+"""Distance between the reported value and the value under a possible cause from which the reported
+value is doubtful, in standard deviations derived from the side of the 95 % interval towards it."""
 
 _EstimatesT = TypeVar("_EstimatesT", bound=Estimates)
 """Type variable for `Estimates` or a subclass, which `replace_by_modal_model` takes and returns."""
@@ -140,9 +140,9 @@ def replace_by_modal_model(
 
 
 def flag_contradicted_damping(headline: Headline, causes: Sequence[CauseFit]) -> Headline:
-    """Return the headline with flags on internal damping that differs with a cause of the modes.
+    """Return the headline with flags on values of internal damping that a cause contradicts.
 
-    The reported numbers are those of a nearly uniform beam. A cause that explains the modes as well
+    The reported numbers are those of a nearly uniform beam. A cause that also explains the modes
     may need another damping. External damping has a flag anyway if the beam is not uniform.
 
     Parameters
@@ -198,7 +198,7 @@ def flag_modes_changed_by_drag(headline: Headline, mode_numbers: Sequence[int]) 
 
 
 def _flag_contradicted(estimate: Estimate, rivals: Sequence[tuple[float, str]]) -> Estimate:
-    """Return an estimate with a flag if a cause, given by value and phrase, has another value."""
+    """Return an estimate, with a flag if a value of `rivals` (value and phrase) contradicts it."""
     if estimate.interval_95 is None:
         return estimate
     low, high = estimate.interval_95
@@ -259,9 +259,10 @@ def _reported_parameters(
 ) -> dict[str, Estimate]:
     """Return the parameters of the beam with a tolerance of the geometry, flagged if undetermined.
 
-    `doubt` is the reason against every number. With `refused`, stiffness, density, delay and
+    `doubt` is the reason to doubt every number. With `refused`, stiffness, density, delay and
     external damping are effective values: a tip mass or a compliant clamp changes all modes alike,
-    by far more than the tolerance. So is internal damping if an order makes up for the frequencies.
+    by far more than the tolerance. Internal damping is an effective value if its order was fitted
+    to the frequencies.
     """
     return {
         parameter_name: Estimate(

@@ -234,7 +234,7 @@ def noise_power_with_peaks(
 
 
 def _continued(is_start: NDArray[np.bool_], may_continue: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the bins that are connected with a start by bins to which it may continue."""
+    """Return a mask of the start bins and all bins connected to them by `may_continue`, (K,)."""
     is_connected = is_start | may_continue
     run_numbers = np.cumsum(np.diff(is_connected, prepend=False) & is_connected)
     has_start = np.bincount(run_numbers[is_start], minlength=run_numbers[-1] + 1) > 0
@@ -291,11 +291,10 @@ def _find_line_groups(
 
 
 def _lasts_through_record(residual: NDArray[np.complex128], line_bins: slice) -> bool:
-    """Return whether a narrow-band disturbance lasts through the whole record.
+    """Return whether the disturbance in the bins `line_bins` lasts through the whole record.
 
-    `line_bins` is the range of its bins.
-
-    The residual of a wrong model at a mode begins when the sweep passes the mode, and decays.
+    The residual of a wrong model at a mode does not: it begins when the sweep passes the mode, and
+    decays.
     """
     bins_around = residual[
         max(line_bins.start - _DURATION_BINS, 0) : line_bins.stop + _DURATION_BINS

@@ -146,7 +146,7 @@ class Unknowns:
         Parameters
         ----------
         damping_sizes : ndarray, shape (len(structure.free),)
-            Those of ``ln z``, ``alpha``, ``ln g`` and ``lambda`` that are free.
+            Values of ``ln z``, ``alpha``, ``ln g`` and ``lambda``, as far as they are free.
         """
         unknown_values: dict[str, float] = {
             **dict(self.structure.fixed.items()),
@@ -253,7 +253,7 @@ class Unknowns:
 
     @cached_property
     def units(self) -> Mapping[str, float]:
-        """Return the value of delay and tool inertia for which the unknown is 1, by name.
+        """Return the delay and the tool inertia for which their unknowns are 1, by name.
 
         The tool inertia is that between torque sensor and beam.
         """
@@ -410,7 +410,7 @@ _MAX_GROWTH_EXPONENT: Final = 50.0
 
 @dataclass(frozen=True, slots=True)
 class StepRule:
-    """Rule of the steps of a descent: their curve in the space of the unknowns, and limits.
+    """Rule of the steps of a descent: their limits, and curve in the space of the unknowns.
 
     Attributes
     ----------
@@ -422,9 +422,9 @@ class StepRule:
     losses : tuple of int
         Indices of the losses of dampings with a fixed order.
     linear_below : float
-        Loss below which a step changes the loss itself, to which the effect of the damping is
-        proportional. A step of its logarithm would lead from a negligible value to the upper bound,
-        and most of a descent would be spent on the way back.
+        Loss below which a step changes the loss itself instead of its logarithm. The effect of the
+        damping is proportional to the loss: a step of the logarithm would lead from a negligible
+        value to the upper bound, and most of a descent would be spent on the way back.
     """
 
     lower: NDArray[np.float64]
@@ -442,7 +442,7 @@ class StepRule:
         unknowns : Unknowns
             Unknowns of the structure.
         linear_below : float
-            Loss below which a step changes the loss itself.
+            Loss below which a step changes the loss itself instead of its logarithm.
         """
         unknown_names = unknowns.names
         damping_indices = tuple(

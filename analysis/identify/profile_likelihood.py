@@ -90,7 +90,7 @@ class LikelihoodProfile:
 
     @classmethod
     def undetermined(cls, candidate: Candidate, order: OrderName) -> LikelihoodProfile:
-        """Return the profile of an order that was not profiled: one value, the whole range 0 to 2.
+        """Return the profile of an order that was not varied: one value, and interval 0 to 2.
 
         Parameters
         ----------
@@ -390,9 +390,10 @@ class OrderProfiler:
             self._extend(direction)
 
     def extend_from_candidates(self) -> None:
-        """Extend the profile from candidates that fit as well, outside of the 95 % interval.
+        """Extend the profile from candidates that fit about as well with an order outside of it.
 
-        Most of them fix the order at 1. A barrier may separate them from the minimum.
+        The order is outside of the 95 % interval; for most of these candidates it is fixed at 1. A
+        barrier may separate it from the minimum.
         """
         damping_coefficient, free_parameters = COEFFICIENT_OF[self.order], set(self.structure.free)
         for candidate in self._candidate_set.candidates:
@@ -572,7 +573,7 @@ class OrderProfiler:
 
     @cached_property
     def _without_damping(self) -> Refit:
-        """Return the fit with the smallest damping. Its cost does not depend on the order."""
+        """Return the fit with the smallest damping, for which the cost is the same at any order."""
         damping_coefficient = COEFFICIENT_OF[self.order]
         start_unknowns = self._minimum.x.copy()
         coefficient_index = self._unknowns.names.index(damping_coefficient)

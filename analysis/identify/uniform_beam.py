@@ -76,7 +76,7 @@ INTEGRAL_TOLERANCE_RATIO: Final = 3
 the frequencies. They are integrals over a mode's shape, which vary more than its frequency."""
 
 _IDLE_CURVATURE: Final = 1e-4
-"""Second derivative of chi-square below which an unknown counts as without effect."""
+"""Second derivative of chi-square by an unknown below which the unknown has no effect."""
 
 
 class UniformBeamProblem:
@@ -98,8 +98,8 @@ class UniformBeamProblem:
     uniformity : float
         Relative standard deviation of each frequency, in addition to the noise.
     tilt_deg : float, optional
-        Inclination of the plane of motion along the resting beam, as the file states it, in
-        degrees.
+        Angle in degrees between the beam at rest and the horizontal, as the file states it;
+        positive if the tip is lower than the root.
     loss_tolerance : float
         Relative standard deviation of each damping ratio, in addition to the noise.
     """
