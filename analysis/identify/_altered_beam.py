@@ -55,7 +55,7 @@ _INVERSE_ITERATIONS: Final = 2
 _RELATIVE_SHIFT: Final = 1e-7
 """Shift of an inverse iteration relative to the eigenvalue: the matrix is not singular."""
 
-Terms = NDArray[np.inexact[Any]]
+CoefficientArray = NDArray[np.inexact[Any]]
 """Array of real or complex Galerkin coefficients."""
 
 Profile = Literal["taper", "outer half", "wave"]
@@ -84,7 +84,7 @@ class Alteration:
     relaxation : tuple of (float, float)
         Strength and time constant (s) of a relaxation of the material: the stiffness gains
         ``strength s t / (1 + s t)``.
-    sensor : tuple of (float, float)
+    sensor_lag : tuple of (float, float)
         Second-order lag in the torque channel: reciprocal of its undamped frequency (s), and of its
         quality factor.
     lag_s : float
@@ -98,7 +98,7 @@ class Alteration:
     clamp_compliance: float = 0.0
     clamp_loss: float = 0.0
     relaxation: tuple[float, float] = (0.0, 1.0)
-    sensor: tuple[float, float] = (0.0, 0.0)
+    sensor_lag: tuple[float, float] = (0.0, 0.0)
     lag_s: float = 0.0
 
     @classmethod
@@ -126,13 +126,16 @@ class Alteration:
         channel, which do not affect the mode shapes.
         """
         return self == replace(
-            other_alteration, relaxation=self.relaxation, sensor=self.sensor, lag_s=self.lag_s
+            other_alteration,
+            relaxation=self.relaxation,
+            sensor_lag=self.sensor_lag,
+            lag_s=self.lag_s,
         )
 
     @property
     def lags(self) -> tuple[tuple[float, float], ...]:
         """Return the coefficients of s and s² in the denominator of each lag of the torque."""
-        time_s, inverse_quality = self.sensor
+        time_s, inverse_quality = self.sensor_lag
         lags = ((inverse_quality * time_s, time_s**2), (self.lag_s, 0.0))
         return tuple(lag for lag in lags if any(lag))
 
@@ -151,7 +154,7 @@ class ModeTerms:
     mass_arm, lump_arm, medium_arm, tension_arm : ndarray, shape (n,)
         Arms of the forces of mass, point masses, external damping and tension about the motor's
         axis, divided by the length; complex if the clamp has a loss.
-    turn_by_medium, turn_by_internal : ndarray, shape (n,)
+    arm_change_by_external, arm_change_by_internal : ndarray, shape (n,)
         Change of the arm of the mass per ``gamma s^lambda`` and per ``zeta s^alpha``, since damping
         changes the mode shape.
     density_kg_per_m : float or None
@@ -161,26 +164,26 @@ class ModeTerms:
         Alteration of the beam.
     """
 
-    stiffness: Terms
-    clamp: Terms
-    mass: Terms
-    lump: Terms
-    tension: Terms
-    mass_arm: Terms
-    lump_arm: Terms
-    medium_arm: Terms
-    tension_arm: Terms
-    turn_by_medium: Terms
-    turn_by_internal: Terms
+    stiffness: CoefficientArray
+    clamp: CoefficientArray
+    mass: CoefficientArray
+    lump: CoefficientArray
+    tension: CoefficientArray
+    mass_arm: CoefficientArray
+    lump_arm: CoefficientArray
+    medium_arm: CoefficientArray
+    tension_arm: CoefficientArray
+    arm_change_by_external: CoefficientArray
+    arm_change_by_internal: CoefficientArray
     density_kg_per_m: float | None
     alteration: Alteration
 
-    def by_mode(self) -> Iterable[tuple[complex, ...]]:
+    def coefficients_by_mode(self) -> Iterable[tuple[complex, ...]]:
         """Return one tuple of coefficients for each mode, in the order of the attributes."""
-        return zip(*(terms.tolist() for terms in _coefficients(self)), strict=True)
+        return zip(*(terms.tolist() for terms in _coefficient_arrays(self)), strict=True)
 
 
-_coefficients: Final = attrgetter(*(field.name for field in fields(ModeTerms)[:-2]))
+_coefficient_arrays: Final = attrgetter(*(field.name for field in fields(ModeTerms)[:-2]))
 """Function that returns the coefficients of `ModeTerms`: all attributes that are arrays."""
 
 
@@ -331,8 +334,10 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
         basis.weighted_products(moments, relative_flexibility), _NEXT_EIGENVALUE**-4.0
     )
     root_moments = with_lump_modes(2 * (-1.0) ** np.arange(_BASIS_MODE_COUNT) / basis.z**2)
-    clamp_flexibility: Terms = alteration.clamp_compliance * np.outer(root_moments, root_moments)
-    elastic_stiffness: Terms = np.linalg.inv(beam_flexibility + clamp_flexibility)
+    clamp_flexibility: CoefficientArray = alteration.clamp_compliance * np.outer(
+        root_moments, root_moments
+    )
+    elastic_stiffness: CoefficientArray = np.linalg.inv(beam_flexibility + clamp_flexibility)
     gravity_factor = alteration.gravity_m_s2 * beam.density_over_stiffness * length_m**3
     # Eigenvalues are 1 / omega²: the largest ones, of the lowest modes, are the most exact.
     inverse_factor = np.linalg.inv(np.linalg.cholesky(elastic_stiffness + gravity_factor * tension))
@@ -341,7 +346,7 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
     )
     inverse_squares, eigenvectors = inverse_squares[::-1], eigenvectors[:, ::-1]
     all_shapes = inverse_factor.T @ eigenvectors / np.sqrt(inverse_squares)  # of modal mass 1
-    shapes: Terms = all_shapes[:, mode_indices]
+    shapes: CoefficientArray = all_shapes[:, mode_indices]
     if alteration.clamp_loss:
         clamp_flexibility = clamp_flexibility / (1 + 1j * alteration.clamp_loss)
         elastic_stiffness = np.linalg.inv(beam_flexibility + clamp_flexibility)
@@ -352,14 +357,16 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
     eigenvalue_differences = 1 / inverse_squares[mode_indices] - 1 / inverse_squares[:, None]
     eigenvalue_differences[mode_indices, np.arange(mode_indices.size)] = np.inf
     mass_arms = (mass_arm + lump_arm) @ all_shapes
-    turn_by_medium = mass_arms @ ((all_shapes.T @ shapes) / eigenvalue_differences)
-    turn_by_internal = mass_arms @ (
+    arm_change_by_external = mass_arms @ ((all_shapes.T @ shapes) / eigenvalue_differences)
+    arm_change_by_internal = mass_arms @ (
         ((elastic_stiffness @ all_shapes).T @ beam_flexibility @ modal_loads)
         / eigenvalue_differences
     )
 
-    def modal_coefficients(coefficient_matrix: NDArray[np.float64]) -> Terms:
-        coefficients: Terms = np.sum(shapes * (coefficient_matrix @ shapes), axis=0) / modal_masses
+    def modal_coefficients(coefficient_matrix: NDArray[np.float64]) -> CoefficientArray:
+        coefficients: CoefficientArray = (
+            np.sum(shapes * (coefficient_matrix @ shapes), axis=0) / modal_masses
+        )
         return coefficients
 
     root_modal_masses = np.sqrt(modal_masses)
@@ -378,15 +385,17 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
         lump_arm=lump_arm @ shapes / root_modal_masses,
         medium_arm=with_lump_modes(basis.arms) @ shapes / root_modal_masses,
         tension_arm=gravity_per_length * (tension_arm @ shapes) / root_modal_masses,
-        turn_by_medium=turn_by_medium / root_modal_masses * length_m**4,
-        turn_by_internal=turn_by_internal / root_modal_masses,
+        arm_change_by_external=arm_change_by_external / root_modal_masses * length_m**4,
+        arm_change_by_internal=arm_change_by_internal / root_modal_masses,
         density_kg_per_m=beam.density_kg_per_m,
         alteration=alteration,
     )
 
 
 def _complex_shapes(
-    stiffness_matrix: Terms, mass_matrix: NDArray[np.float64], lossless_shapes: Terms
+    stiffness_matrix: CoefficientArray,
+    mass_matrix: NDArray[np.float64],
+    lossless_shapes: CoefficientArray,
 ) -> NDArray[np.complex128]:
     """Return the mode shapes of a beam in a lossy clamp, as coefficients of the basis, (N, n).
 
@@ -394,14 +403,12 @@ def _complex_shapes(
     a clamp without loss.
     """
     complex_shapes = lossless_shapes.astype(np.complex128)
-    for mode_index in complex_shapes.T:
+    for shape in complex_shapes.T:
         for _ in range(_INVERSE_ITERATIONS):
-            eigenvalue = (mode_index @ stiffness_matrix @ mode_index) / (
-                mode_index @ mass_matrix @ mode_index
-            )
+            eigenvalue = (shape @ stiffness_matrix @ shape) / (shape @ mass_matrix @ shape)
             next_shape = np.linalg.solve(
                 stiffness_matrix - eigenvalue * (1 + _RELATIVE_SHIFT) * mass_matrix,
-                mass_matrix @ mode_index,
+                mass_matrix @ shape,
             )
-            mode_index[:] = next_shape / np.sqrt(next_shape @ mass_matrix @ next_shape)
+            shape[:] = next_shape / np.sqrt(next_shape @ mass_matrix @ next_shape)
     return complex_shapes

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from rigd.beam import Plant
 
 
-INTEGER_INTERNAL_ORDER: Final = (STRUCTURES["III"], STRUCTURES["VII"])
+INTERNAL_ORDER_ONE_STRUCTURES: Final = (STRUCTURES["III"], STRUCTURES["VII"])
 """Structures with internal and external damping whose internal damping has order 1."""
 
 _MIN_BIC_REDUCTION_FOR_NEW_NOISE: Final = 10.0
@@ -89,26 +89,26 @@ class CandidateSet:
         Record, reduced to the band.
     noise : NoiseSpectrum
         Noise under which all candidates were fitted.
-    free : tuple of str
+    free_settings : tuple of str
         Settings that are estimated.
     candidates : tuple of Candidate
         Candidates by rising BIC.
-    columns : ndarray of complex, shape (c, K)
+    effect_spectra : ndarray of complex, shape (c, K)
         Torque spectra, with free amplitudes, that all candidates include in addition to the linear
         beam.
     drag : DragEstimate, optional
         Air drag, if it is significant; all candidates then include it.
-    misread : tuple of Finding
+    misread_findings : tuple of Finding
         Findings of a wrong sign or unit, which invalidates every number; usually empty.
     """
 
     comparison: Comparison
     noise: NoiseSpectrum
-    free: tuple[Setting, ...]
+    free_settings: tuple[Setting, ...]
     candidates: tuple[Candidate, ...]
-    columns: NDArray[np.complex128]
+    effect_spectra: NDArray[np.complex128]
     drag: DragEstimate | None = None
-    misread: tuple[Finding, ...] = ()
+    misread_findings: tuple[Finding, ...] = ()
 
     @classmethod
     def from_measurement(
@@ -130,7 +130,9 @@ class CandidateSet:
             sign_and_unit_findings(Comparison.from_measurement(measurement, band_hz))
         ):
             # No beam explains such a record, so all structures leave much the same residual.
-            return replace(cls.fit_freest_structure(measurement, fixed, band_hz), misread=misread)
+            return replace(
+                cls.fit_freest_structure(measurement, fixed, band_hz), misread_findings=misread
+            )
         candidate_set = cls._from_uniform_beam(
             fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed
         )
@@ -139,7 +141,7 @@ class CandidateSet:
     @classmethod
     def refit_from_earlier(
         cls,
-        earlier: Sequence[Candidate],
+        earlier_candidates: Sequence[Candidate],
         measurement: Measurement,
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
@@ -151,7 +153,7 @@ class CandidateSet:
 
         Parameters
         ----------
-        earlier : sequence of Candidate
+        earlier_candidates : sequence of Candidate
             Earlier candidates by rising BIC.
         measurement : Measurement
             Longer record.
@@ -165,7 +167,7 @@ class CandidateSet:
         MeasurementError
             The record cannot be used.
         """
-        first_candidate, *other_candidates = earlier
+        first_candidate, *other_candidates = earlier_candidates
         unknowns = Unknowns.for_structure(
             first_candidate.structure, measurement.nominal, free_settings(fixed)
         )
@@ -175,7 +177,7 @@ class CandidateSet:
         candidate_set = cls._from_analysis(
             analysis, fixed, (replace(first_candidate, fit=analysis.fits[0]),)
         )
-        earlier_set = replace(candidate_set, candidates=tuple(earlier))
+        earlier_set = replace(candidate_set, candidates=tuple(earlier_candidates))
         refitted = (
             earlier_set._refit_in(candidate_set, c, DESCENT_EVALUATIONS) for c in other_candidates
         )
@@ -184,7 +186,7 @@ class CandidateSet:
             ._exclude_leakage()
             .cross_check()
         )
-        return candidate_set._update_reference_following()
+        return candidate_set._update_coherent_angle()
 
     @classmethod
     def fit_freest_structure(
@@ -228,9 +230,9 @@ class CandidateSet:
         return cls(
             comparison=comparison,
             noise=analysis.noise,
-            free=free_settings(fixed),
+            free_settings=free_settings(fixed),
             candidates=_by_rising_bic(candidates),
-            columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
+            effect_spectra=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
         )
 
     @property
@@ -271,7 +273,7 @@ class CandidateSet:
         return replace(self, candidates=(candidate, *other_candidates))
 
     @property
-    def likeliest(self) -> RecordFit:
+    def likeliest_fit(self) -> RecordFit:
         """Return the candidates' fit with the lowest cost, a sum of squared whitened residuals."""
         return min((candidate.fit for candidate in self.candidates), key=lambda fit: fit.cost)
 
@@ -282,11 +284,13 @@ class CandidateSet:
         It includes the level of the noise, and so is comparable between candidate sets with
         different noise.
         """
-        return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
+        return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.is_compared])))
 
     def unknowns(self, structure: Structure) -> Unknowns:
         """Return the unknown parameters that a fit of a damping structure to this record varies."""
-        return Unknowns.for_structure(structure, self.comparison.measurement.nominal, self.free)
+        return Unknowns.for_structure(
+            structure, self.comparison.measurement.nominal, self.free_settings
+        )
 
     def refit(self, candidate: Candidate, max_evaluations: int = DESCENT_EVALUATIONS) -> Refit:
         """Return the minimum of the cost that a descent reaches from a candidate's estimate."""
@@ -311,11 +315,11 @@ class CandidateSet:
             unknowns,
             start_point,
             self.noise,
-            self.columns,
+            self.effect_spectra,
             max_evaluations=max_evaluations,
         )
 
-    def _update_reference_following(self) -> CandidateSet:
+    def _update_coherent_angle(self) -> CandidateSet:
         """Re-estimate the part of the motor angle that follows the reference, and refit the set.
 
         Return `self` if this part has converged.
@@ -348,7 +352,7 @@ class CandidateSet:
 
     def _exclude_leakage(self) -> CandidateSet:
         """Refit all candidates without the bins into which a disturbance outside the band leaks."""
-        noise = without_leakage(self.noise, self.comparison, self.likeliest)
+        noise = without_leakage(self.noise, self.comparison, self.likeliest_fit)
         return self.refit_under_noise(noise) if noise is not self.noise else self
 
     def refit_under_noise(self, noise: NoiseSpectrum) -> CandidateSet:
@@ -409,10 +413,10 @@ class CandidateSet:
         cost_to_beat = candidate.fit.cost * (1 - MISSED_COST_FRACTION)
         if start_refit.predicted_cost > cost_to_beat:
             return candidate
-        first_descent = start_refit.further(REFIT_EVALUATIONS)
+        first_descent = start_refit.continue_descent(REFIT_EVALUATIONS)
         if first_descent.cost > candidate.fit.cost * (1 + _CONTINUATION_COST_TOLERANCE):
             return candidate
-        new_minimum = first_descent.further(DESCENT_EVALUATIONS)
+        new_minimum = first_descent.continue_descent(DESCENT_EVALUATIONS)
         return candidate if new_minimum.cost > cost_to_beat else new_minimum.candidate()
 
     def fit_special_cases(self) -> CandidateSet:
@@ -520,19 +524,19 @@ class CandidateSet:
 
         The noise is estimated again from the residual of the best candidate with these spectra.
         """
-        all_columns = np.concatenate([self.columns, effect_spectra])
-        best_refit = replace(self, columns=all_columns).refit(self.best)
-        return self.refit_with_effect_spectra(all_columns, best_refit.residual_noise())
+        all_spectra = np.concatenate([self.effect_spectra, effect_spectra])
+        best_refit = replace(self, effect_spectra=all_spectra).refit(self.best)
+        return self.refit_with_effect_spectra(all_spectra, best_refit.residual_noise())
 
     def refit_with_effect_spectra(
         self, effect_spectra: NDArray[np.complex128], noise: NoiseSpectrum
     ) -> CandidateSet:
         """Refit all candidates with given torque spectra of free amplitude, under a given noise.
 
-        The spectra represent effects in addition to the linear beam. They replace the `columns` of
-        the set.
+        The spectra are those of effects in addition to the linear beam. They replace the
+        `effect_spectra` of the set.
         """
-        new_set = replace(self, columns=effect_spectra, noise=noise)
+        new_set = replace(self, effect_spectra=effect_spectra, noise=noise)
         return new_set.with_candidates(
             new_set.refit(c).candidate() for c in self.candidates
         ).cross_check()
@@ -543,14 +547,14 @@ class CandidateSet:
 
     def is_nearly_white(self, fit: RecordFit) -> bool:
         """Return whether the torque residual of a fit is white noise at the 1 % level."""
-        used_bins = self.noise.counts
+        used_bins = self.noise.is_compared
         return whiteness(
             fit.residual[used_bins], self.comparison.frequency_hz[used_bins]
         ).is_nearly_white
 
 
 def _one_damping_structures(fit: RecordFit) -> list[Structure]:
-    """Return the structures that lack one damping which is insignificant in a fit."""
+    """Return the structures of one damping, if the other damping is insignificant in a fit."""
     structures_and_missing = zip(_ONE_DAMPING_STRUCTURES, (fit.external, fit.internal), strict=True)
     return [
         structure

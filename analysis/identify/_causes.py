@@ -322,7 +322,7 @@ CAUSES: Final = (
         (0.0,),
         (10.0,),
         lambda stated_alteration, unknowns, _: replace(
-            stated_alteration, sensor=(1e-3 * unknowns[0], _BUTTERWORTH_LOSS)
+            stated_alteration, sensor_lag=(1e-3 * unknowns[0], _BUTTERWORTH_LOSS)
         ),
         _describe_second_order_filter,
         _plant_with_second_order_filter,
@@ -333,7 +333,7 @@ CAUSES: Final = (
         (0.0, 0.0),
         (3.0, 2.0),
         lambda stated_alteration, unknowns, _: replace(
-            stated_alteration, sensor=(1e-3 * unknowns[0], unknowns[1])
+            stated_alteration, sensor_lag=(1e-3 * unknowns[0], unknowns[1])
         ),
         _describe_resonance,
         special_cases=("torque filter of second order",),

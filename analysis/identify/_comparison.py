@@ -224,7 +224,7 @@ class Comparison:
             for time_s in (sample_times_s, unknown_times_s)
         )
         impact_torques = np.concatenate(
-            [impact.columns(sample_times_s, rate_hz) for impact in impacts]
+            [impact.unit_torques(sample_times_s, rate_hz) for impact in impacts]
         )
         return replace(self, impact_spectra=self.spectrum(impact_torques))._remove_torque(
             impact_nm, impact_at_unknown_nm
@@ -525,14 +525,14 @@ class Comparison:
                 law=law,
                 response=drag_response,
                 band=band,
-                by_pole={
+                pole_derivatives={
                     mode_number: band(derivative_rows)
-                    for mode_number, derivative_rows in drag_torque.by_pole.items()
+                    for mode_number, derivative_rows in drag_torque.pole_derivatives.items()
                 },
-                by_external=band(drag_torque.by_external),
-                by_ln_density=band(drag_torque.by_ln_density),
-                by_delay=band(drag_torque.by_delay),
-                by_law=band(drag_torque.by_law),
+                external_derivatives=band(drag_torque.external_derivatives),
+                ln_density_derivative=band(drag_torque.ln_density_derivative),
+                delay_derivative=band(drag_torque.delay_derivative),
+                law_derivatives=band(drag_torque.law_derivatives),
                 speed_m_s=drag_torque.speed_m_s,
                 top_speed_m_s=drag_torque.top_speed_m_s,
             ),
@@ -562,7 +562,7 @@ class Comparison:
         drift_spectrum = _drift_spectrum(self.samples)[None, self.bins]
         impact_spectra = drift_spectrum[:0] if self.impact_spectra is None else self.impact_spectra
         decay_columns = [
-            decay_spectra.columns(poles) for decay_spectra in (self.decays, *self.later_decays)
+            decay_spectra.spectra(poles) for decay_spectra in (self.decays, *self.later_decays)
         ]
         return np.concatenate(
             [*decay_columns, hum_spectra, impact_spectra, drift_spectrum, effect_spectra]

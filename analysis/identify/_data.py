@@ -65,7 +65,7 @@ class RecordedImpact:
     poles_rad_s : tuple of complex
         Poles of the ringing modes: the upper pole of a conjugate pair, or a real pole.
     sizes : tuple of float
-        Estimated amplitude of each row of `columns`; empty before they are estimated.
+        Estimated amplitude of each row of `unit_torques`; empty before they are estimated.
     largest_nm : float
         Largest torque within one second from the beginning.
     """
@@ -100,7 +100,7 @@ class RecordedImpact:
                 decay_rows += [real_decay, real_decay * since_s]
         return np.array(decay_rows).reshape(len(decay_rows), time_s.size)
 
-    def columns(self, time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
+    def unit_torques(self, time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
         """Return the time series by which the unknown amplitudes of the impact are multiplied.
 
         The sum of the products is the torque of the impact. The rows are the free decays, then a
@@ -144,7 +144,7 @@ class RecordedImpact:
             return np.zeros(time_s.size)
         decays = self.decays(time_s)
         amplitudes = np.array(self.sizes)
-        contact_nm = amplitudes[len(decays) :] @ self.columns(grid_s, rate_hz)[len(decays) :]
+        contact_nm = amplitudes[len(decays) :] @ self.unit_torques(grid_s, rate_hz)[len(decays) :]
         decay_nm: NDArray[np.float64] = amplitudes[: len(decays)] @ decays
         return decay_nm + np.interp(time_s, grid_s, contact_nm)
 

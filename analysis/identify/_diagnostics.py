@@ -50,11 +50,11 @@ def findings(
     """
     measurement = candidate_set.comparison.measurement
     model_independent = (
-        *candidate_set.misread,
+        *candidate_set.misread_findings,
         *clipping_findings(measurement),
         *standstill_findings(measurement),
     )
-    if candidate_set.misread:
+    if candidate_set.misread_findings:
         return model_independent
     all_findings = (
         *model_independent,

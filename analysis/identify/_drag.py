@@ -97,7 +97,7 @@ _FIRST_STRUCTURE: Final = "III"
 _FREEST_STRUCTURE: Final = "VI"
 """Structure with both dampings and free orders."""
 
-_ONE_NUMBER_LAW_STD: Final = 0.1
+_MIN_STD_OF_CONSTANT_LAW: Final = 0.1
 """Relative standard deviation of C_D d above which the drag law is a constant.
 
 The drag coefficient of a cylinder falls with the speed. A constant is wrong by up to 7 % on rods
@@ -170,8 +170,8 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
 
 def _bic_under_own_noise(refit: Refit) -> float:
     """Return the BIC of a refit under the noise of its residual, comparable to that of a set."""
-    noise_power = refit.residual_noise().power[refit.noise.counts]
-    parameter_count = refit.x.size + len(refit.columns)
+    noise_power = refit.residual_noise().power[refit.noise.is_compared]
+    parameter_count = refit.x.size + len(refit.effect_spectra)
     return float(parameter_count * math.log(2 * noise_power.size) + 2 * np.sum(np.log(noise_power)))
 
 
@@ -179,21 +179,23 @@ def _bic_under_own_noise(refit: Refit) -> float:
 class _DragFitStart:
     """Start values of a fit with air drag: plant, damping structure, drag law and noise.
 
-    `has_two_numbers` states whether both coefficients of the drag law are estimated.
+    `has_two_coefficients` states whether both coefficients of the drag law are estimated.
     """
 
     plant: Plant
     structure: Structure
     law: DragLaw
     noise: NoiseSpectrum
-    has_two_numbers: bool = False
+    has_two_coefficients: bool = False
 
     @classmethod
     def of(cls, refit: Refit) -> _DragFitStart:
         """Return the minimum of a refit as the start of the next fit with drag."""
         structure = refit.objective.unknowns.structure
-        has_two_numbers = len(refit.columns) > 1
-        return cls(refit.plant, structure, _law_at_minimum(refit), refit.noise, has_two_numbers)
+        has_two_coefficients = len(refit.effect_spectra) > 1
+        return cls(
+            refit.plant, structure, _law_at_minimum(refit), refit.noise, has_two_coefficients
+        )
 
 
 def _drag_may_improve_fit(candidate_set: CandidateSet) -> bool:
@@ -224,7 +226,7 @@ def small_drag_spectrum(
     `measured_modes` replace those of the plant, as for `DragResponse`.
     """
     drag_response = comparison.drag_response(plant, measured_modes)
-    return comparison.spectrum(drag_response.first_order()[None, comparison.retained])
+    return comparison.spectrum(drag_response.first_order_torque()[None, comparison.retained])
 
 
 def _first_order_drag(refit: Refit) -> tuple[float, float]:
@@ -232,7 +234,7 @@ def _first_order_drag(refit: Refit) -> tuple[float, float]:
 
     Both are first-order estimates, with all other parameters of the fit free.
     """
-    (drag_spectrum,), residual = refit.unexplained_columns(
+    (drag_spectrum,), residual = refit.unexplained_spectra(
         small_drag_spectrum(refit.objective.comparison, refit.plant)
     )
     squared_length = float(np.vdot(drag_spectrum, drag_spectrum).real)
@@ -248,7 +250,7 @@ def _first_order_start(candidate_set: CandidateSet, candidate: Candidate) -> _Dr
     Return None if the drag would be negative.
     """
     drag_spectrum = small_drag_spectrum(candidate_set.comparison, candidate.fit.plant)
-    refit = replace(candidate_set, columns=drag_spectrum).refit(
+    refit = replace(candidate_set, effect_spectra=drag_spectrum).refit(
         candidate, _SHORT_DESCENT_EVALUATIONS
     )
     drag_m = float(refit.amplitudes()[0][0])
@@ -275,7 +277,11 @@ def _converged_drag_fit(
     """
     unknowns = candidate_set.unknowns(structure)
     x = unknowns.vector(fit_start.plant)
-    law, noise, has_two_numbers = fit_start.law, fit_start.noise, fit_start.has_two_numbers
+    law, noise, has_two_coefficients = (
+        fit_start.law,
+        fit_start.noise,
+        fit_start.has_two_coefficients,
+    )
     comparison, is_rough_fit, cost_reduction = (
         start_comparison,
         tolerance > _COST_TOLERANCE,
@@ -295,10 +301,16 @@ def _converged_drag_fit(
         assert drag_expansion is not None
         descent = partial(Refit.descend, comparison, unknowns, noise=noise)
         start_refit = descent(
-            x, torque_spectra=drag_expansion.by_law[: 1 + has_two_numbers], max_evaluations=1
+            x,
+            torque_spectra=drag_expansion.law_derivatives[: 1 + has_two_coefficients],
+            max_evaluations=1,
         )
-        refit = start_refit.further(_SHORT_DESCENT_EVALUATIONS)
-        if has_two_numbers or is_rough_fit or _relative_drag_std(refit) > _ONE_NUMBER_LAW_STD:
+        refit = start_refit.continue_descent(_SHORT_DESCENT_EVALUATIONS)
+        if (
+            has_two_coefficients
+            or is_rough_fit
+            or _relative_drag_std(refit) > _MIN_STD_OF_CONSTANT_LAW
+        ):
             last_reduction, cost_reduction = (
                 cost_reduction,
                 start_refit.cost - max(start_refit.predicted_cost, refit.cost),
@@ -310,10 +322,10 @@ def _converged_drag_fit(
                 return start_refit
         else:
             # Not before: a second number would compensate for wrong damping of the beam.
-            has_two_numbers = True
+            has_two_coefficients = True
             refit = descent(
                 refit.x,
-                torque_spectra=drag_expansion.by_law,
+                torque_spectra=drag_expansion.law_derivatives,
                 max_evaluations=_SHORT_DESCENT_EVALUATIONS,
             )
         x, law, noise = refit.x, _law_at_minimum(refit), refit.residual_noise()
@@ -337,8 +349,10 @@ def _law_at_minimum(refit: Refit) -> DragLaw:
     expansion = refit.objective.comparison.drag
     assert expansion is not None
     law_change = refit.amplitudes()[0].tolist()
-    slowing_m = expansion.law.slowing + (law_change[1] if len(law_change) > 1 else 0.0)
-    return DragLaw(expansion.law.constant_m + law_change[0], slowing_m)
+    decreasing_part = expansion.law.decreasing_part + (
+        law_change[1] if len(law_change) > 1 else 0.0
+    )
+    return DragLaw(expansion.law.constant_m + law_change[0], decreasing_part)
 
 
 def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> CandidateSet:
@@ -346,7 +360,7 @@ def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> Ca
     set_with_drag = replace(
         candidate_set,
         comparison=converged_fit.objective.comparison,
-        columns=converged_fit.columns,
+        effect_spectra=converged_fit.effect_spectra,
         noise=converged_fit.residual_noise(),
     )
     converged_cost = set_with_drag.descent(
@@ -361,14 +375,14 @@ def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> Ca
             unknowns,
             unknowns.vector(converged_fit.plant),
             set_with_drag.noise,
-            set_with_drag.columns,
+            set_with_drag.effect_spectra,
             max_evaluations=_SHORT_DESCENT_EVALUATIONS,
             relative_tolerance=MISSED_COST_FRACTION,
             hopeless=(_EARLY_EVALUATIONS, cost_limit),
         )
         short_descents.append((refit.candidate(), refit))
     candidates = [
-        refit.further(_LONG_DESCENT_EVALUATIONS).candidate()
+        refit.continue_descent(_LONG_DESCENT_EVALUATIONS).candidate()
         if refit.predicted_cost < cost_limit
         else candidate
         for candidate, refit in short_descents
@@ -454,30 +468,31 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAtAmplit
     if drag_estimate is None:
         return ()
     fit = candidate_set.best.fit
-    law_numbers = np.array([drag_estimate.law.constant_m, drag_estimate.law.slowing])[
+    law_coefficients = np.array([drag_estimate.law.constant_m, drag_estimate.law.decreasing_part])[
         : len(drag_estimate.covariance)
     ]
     covariance = np.array(drag_estimate.covariance)
     estimates = []
-    for mode_number in fit.modes:
-        if mode_number.number not in _REPORTED_MODE_NUMBERS or mode_number.frequency_hz <= 0:
+    for mode_estimate in fit.modes:
+        if mode_estimate.number not in _REPORTED_MODE_NUMBERS or mode_estimate.frequency_hz <= 0:
             continue
         for relative_amplitude in _RELATIVE_TIP_AMPLITUDES:
             tip_amplitude_m = relative_amplitude * fit.plant.beam.length_m
             ratio_by_law = damping_ratio_by_drag_law(
-                mode_number.number,
-                2 * math.pi * mode_number.frequency_hz,
+                mode_estimate.number,
+                2 * math.pi * mode_estimate.frequency_hz,
                 tip_amplitude_m,
                 fit.plant.beam.density_kg_per_m,
-            )[: law_numbers.size]
-            ratio_variance = mode_number.damping_ratio_std**2 + float(
+            )[: law_coefficients.size]
+            ratio_variance = mode_estimate.damping_ratio_std**2 + float(
                 ratio_by_law @ covariance @ ratio_by_law
             )
             estimates.append(
                 DampingAtAmplitude(
-                    mode=mode_number.number,
+                    mode=mode_estimate.number,
                     tip_amplitude_m=tip_amplitude_m,
-                    damping_ratio=mode_number.damping_ratio + float(ratio_by_law @ law_numbers),
+                    damping_ratio=mode_estimate.damping_ratio
+                    + float(ratio_by_law @ law_coefficients),
                     std=math.sqrt(ratio_variance),
                 )
             )

@@ -57,15 +57,15 @@ class DragExpansion:
         Response of this beam to drag.
     band : callable
         Function from torque samples, at the times of the angle, to their spectrum in the band.
-    by_pole : dict of int to ndarray of complex, shape (2, K)
+    pole_derivatives : dict of int to ndarray of complex, shape (2, K)
         Derivatives by the real and the imaginary part of the upper pole of each mode.
-    by_external : ndarray of complex, shape (2, 2, K)
+    external_derivatives : ndarray of complex, shape (2, 2, K)
         Derivatives by the external damping that drives each of the two lowest modes, as in
         `DragTorque`.
-    by_ln_density, by_delay : ndarray of complex, shape (K,)
+    ln_density_derivative, delay_derivative : ndarray of complex, shape (K,)
         Derivatives by ln(mass per length) and by the delay of the torque.
-    by_law : ndarray of complex, shape (2, K)
-        Derivatives by `DragLaw.constant_m` and `DragLaw.slowing`.
+    law_derivatives : ndarray of complex, shape (2, K)
+        Derivatives by `DragLaw.constant_m` and `DragLaw.decreasing_part`.
     speed_m_s, top_speed_m_s : float
         Mean and highest speed of the beam, as in `DragTorque`.
     """
@@ -74,11 +74,11 @@ class DragExpansion:
     law: DragLaw
     response: DragResponse
     band: Callable[[Real], Complex]
-    by_pole: dict[int, Complex]
-    by_external: Complex
-    by_ln_density: Complex
-    by_delay: Complex
-    by_law: Complex
+    pole_derivatives: dict[int, Complex]
+    external_derivatives: Complex
+    ln_density_derivative: Complex
+    delay_derivative: Complex
+    law_derivatives: Complex
     speed_m_s: float
     top_speed_m_s: float
 
@@ -112,23 +112,23 @@ class DragExpansion:
         torque_jacobian : ndarray of complex, shape (k, K)
             Derivatives of the change by the unknowns.
         """
-        derivative_spectra = [self.by_ln_density]
+        derivative_spectra = [self.ln_density_derivative]
         own_density, other_density = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
         parameter_steps = [np.log(other_density / own_density)]
         # ln(mass per length) is the sum of ln(rho/EI) and ln(EI).
         step_slopes = [
             _parameter_rows(parameter_slopes, parameter_names, BEAM_PARAMETERS).sum(axis=0)
         ]
-        for by_external, damping_change in zip(
-            self.by_external, self._external_damping_change(plant), strict=True
+        for external_derivative, damping_change in zip(
+            self.external_derivatives, self._external_damping_change(plant), strict=True
         ):
-            derivative_spectra += list(by_external)
+            derivative_spectra += list(external_derivative)
             parameter_steps += damping_change[:, 0].tolist()
             step_slopes += list(
                 damping_change[:, 1:]
                 @ _parameter_rows(parameter_slopes, parameter_names, _EXTERNAL_PARAMETERS)
             )
-        derivative_spectra.append(self.by_delay)
+        derivative_spectra.append(self.delay_derivative)
         parameter_steps.append(plant.delay_s - self.plant.delay_s)
         step_slopes += list(_parameter_rows(parameter_slopes, parameter_names, ("delay_s",)))
         # A real view suffices, since the spectra are multiplied by real numbers only.
@@ -151,19 +151,21 @@ class DragExpansion:
         unknown_count : int
             Number of unknowns.
         """
-        change = np.zeros(self.by_delay.size, dtype=np.complex128)
+        change = np.zeros(self.delay_derivative.size, dtype=np.complex128)
         jacobian = np.zeros((unknown_count, change.size), dtype=np.complex128)
         for pole in poles:
-            if pole.mode not in self.by_pole or not pole.oscillates:
+            if pole.mode not in self.pole_derivatives or not pole.oscillates:
                 continue
             own_pole = complex(self.response.poles[pole.mode - 1])
             pole_step = pole.at_rad_s - own_pole
             remainder, remainder_slopes = self._torque_beyond_first_order(
                 pole.mode, own_pole, pole.at_rad_s
             )
-            by_real, by_imaginary = self.by_pole[pole.mode]
+            by_real, by_imaginary = self.pole_derivatives[pole.mode]
             change += pole_step.real * by_real + pole_step.imag * by_imaginary - remainder
-            by_real_at_pole, by_imaginary_at_pole = self.by_pole[pole.mode] - remainder_slopes
+            by_real_at_pole, by_imaginary_at_pole = (
+                self.pole_derivatives[pole.mode] - remainder_slopes
+            )
             jacobian += np.outer(pole.derivative.real, by_real_at_pole)
             jacobian += np.outer(pole.derivative.imag, by_imaginary_at_pole)
         return change, jacobian

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _MIN_CHANGES: Final = 4
 """Minimum number of alternating changes between two counts that show a motor at rest."""
 
-_STEP_TOLERANCE: Final = 1.5
+_MAX_COUNT_RATIO: Final = 1.5
 """Largest change of the reading that is a single count, relative to the smallest change of the
 record."""
 
@@ -49,7 +49,7 @@ def angle_without_alternating_counts(
     reference_moves = np.cumsum(np.diff(reference_rad) != 0)[change_indices]
     returns = (
         (changes_rad[1:] == -changes_rad[:-1])
-        & (np.abs(changes_rad[1:]) <= _STEP_TOLERANCE * np.abs(changes_rad).min())
+        & (np.abs(changes_rad[1:]) <= _MAX_COUNT_RATIO * np.abs(changes_rad).min())
         & (reference_moves[1:] == reference_moves[:-1])
     )
     settled_rad = angle_rad.copy()

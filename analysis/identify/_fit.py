@@ -122,7 +122,7 @@ def fit_record(
     reference_descent = Descent(searches[closest_index].objective, reference_descent.x)
     remove_hum = reference_descent.remove_hum(_ROUGH_COST_TOLERANCE)
     if remove_hum is not reference_descent:
-        reference_descent = _update_reference_following(remove_hum, whole_angle)
+        reference_descent = _update_coherent_angle(remove_hum, whole_angle)
         comparison = reference_descent.objective.comparison
         coarse_response = CoarseResponse(comparison)
         searches = [
@@ -222,7 +222,7 @@ def _descend_with_noise(
         .descend_to_minimum(noise_spectrum, _COST_TOLERANCE)
     )
     far_behind_ratio = math.exp(
-        FAR_BEHIND_BIC_DIFFERENCE / (2 * np.count_nonzero(noise_spectrum.counts))
+        FAR_BEHIND_BIC_DIFFERENCE / (2 * np.count_nonzero(noise_spectrum.is_compared))
     )
     cost_limit = far_behind_ratio * closest_descent.cost(noise_spectrum)
     structure_descents = []
@@ -242,7 +242,7 @@ def _descend_with_noise(
 
 def _residual_is_noise(descent: Descent, noise: NoiseSpectrum) -> bool:
     """Return whether the residual at the end of a descent is white at the 1 % level."""
-    objective, used_bins = descent.objective, noise.counts
+    objective, used_bins = descent.objective, noise.is_compared
     residual = objective.project(objective.linearise(descent.x), noise.weight).residual
     hz = objective.comparison.frequency_hz
     return whiteness(residual[used_bins], hz[used_bins]).is_nearly_white
@@ -260,7 +260,7 @@ def _descent_if_still_worse(
     return short_descent if short_descent.cost(noise) > cost_limit else None
 
 
-def _update_reference_following(descent: Descent, whole_angle: Comparison) -> Descent:
+def _update_coherent_angle(descent: Descent, whole_angle: Comparison) -> Descent:
     """Return a descent whose input, the angle that follows the reference, is estimated without hum.
 
     The first estimate was biased by the hum.
@@ -293,7 +293,9 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
     linearisation = objective.linearise(x)
     projected = objective.project(linearisation, noise.weight)
     # Where the torque is unknown the residual is 0 and adds nothing to the cost.
-    compared_values = round(2 * np.sum(noise.counts) * comparison.measurement.known_torque_fraction)
+    compared_values = round(
+        2 * np.sum(noise.is_compared) * comparison.measurement.known_torque_fraction
+    )
     degrees_of_freedom = compared_values - x.size - projected.amplitudes.size
     residual_variance = projected.cost / degrees_of_freedom
     lower_bounds, upper_bounds = unknowns.bounds

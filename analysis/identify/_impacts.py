@@ -128,7 +128,10 @@ def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Itera
     also uses the residual of fits to either half. With `obvious` it is limited to obvious
     impacts.
     """
-    if candidate_set.misread or len(candidate_set.comparison.measurement.impacts) == MAX_IMPACTS:
+    if (
+        candidate_set.misread_findings
+        or len(candidate_set.comparison.measurement.impacts) == MAX_IMPACTS
+    ):
         return
     found_in_whole = find_impact(candidate_set)
     if found_in_whole is not None and found_in_whole.is_obvious:
@@ -204,14 +207,14 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
             analysis = fit_record(half_measurement, (_FREEST_STRUCTURE,), band_hz=band_hz)
         except MeasurementError:
             continue
-        fit, used_bins = analysis.fits[0], analysis.noise.counts
+        fit, used_bins = analysis.fits[0], analysis.noise.is_compared
         if not whiteness(
             fit.residual[used_bins], analysis.comparison.frequency_hz[used_bins]
         ).is_white:
             continue
         comparison_with_hum = comparison.remove_hum(()).recompute_incoherent_torque(fit.plant)
         unknowns = Unknowns.for_structure(
-            _FREEST_STRUCTURE, measurement.nominal, candidate_set.free
+            _FREEST_STRUCTURE, measurement.nominal, candidate_set.free_settings
         )
         refit_at_start = partial(
             Refit.descend,
@@ -222,7 +225,7 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         )
         first_refit = refit_at_start(noise=candidate_set.noise)
         noise_of_all_bins = replace(
-            first_refit.residual_noise(), counts=np.ones(hz.size, dtype=bool), lines=()
+            first_refit.residual_noise(), is_compared=np.ones(hz.size, dtype=bool), lines=()
         )
         yield refit_at_start(noise=noise_of_all_bins)
 
@@ -273,7 +276,7 @@ def _likeliest_start(refit: Refit) -> int | None:
     if not poles:
         return None
     residual = refit.objective.project(refit.objective.linearise(refit.x), weight).residual
-    decays = comparison.decays.columns(poles) * weight
+    decays = comparison.decays.spectra(poles) * weight
     projections = np.array([comparison.in_time(decay.conj() * residual) for decay in decays])
     projections *= comparison.samples / 2
     decay_lengths = np.sqrt(np.sum(np.abs(decays) ** 2, axis=1))
@@ -312,14 +315,14 @@ def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refi
 
     The model of the refit itself does not contain the impact.
     """
-    comparison, columns_before = refit.objective.comparison, refit.columns
+    comparison, spectra_before = refit.objective.comparison, refit.effect_spectra
     for _ in range(_IMPACT_FIT_ROUNDS):
         assumed_impact = _impact_between(refit, first_sample, end_sample)
-        all_columns = np.concatenate(
-            [columns_before, comparison.spectrum(_impact_torques(comparison, assumed_impact))]
+        all_spectra = np.concatenate(
+            [spectra_before, comparison.spectrum(_impact_torques(comparison, assumed_impact))]
         )
         refit = Refit.descend(
-            comparison, refit.objective.unknowns, refit.x, refit.noise, all_columns,
+            comparison, refit.objective.unknowns, refit.x, refit.noise, all_spectra,
             max_evaluations=REFIT_EVALUATIONS,
         )  # fmt: skip
         refit = replace(refit, noise=refit.residual_noise())
@@ -328,7 +331,7 @@ def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refi
         refit.objective.unknowns,
         refit.x,
         refit.noise,
-        columns_before,
+        spectra_before,
         max_evaluations=1,
     )
 
@@ -349,7 +352,7 @@ def _impact_between(refit: Refit, first_sample: int, end_sample: int) -> Recorde
 
 def _impact_torques(comparison: Comparison, impact: RecordedImpact) -> NDArray[np.float64]:
     """Return the torques of an impact of unit amplitudes at the compared samples, (c, samples)."""
-    return impact.columns(comparison.times_s(), comparison.decimation.rate_hz)
+    return impact.unit_torques(comparison.times_s(), comparison.decimation.rate_hz)
 
 
 def _successive_cost_reductions(
@@ -360,7 +363,7 @@ def _successive_cost_reductions(
     `unit_torques` are torques of unit amplitude at the compared samples, shape (c, samples). All
     free parameters of the fit stay free, to first order.
     """
-    unexplained_spectra, residual = refit.unexplained_columns(
+    unexplained_spectra, residual = refit.unexplained_spectra(
         refit.objective.comparison.spectrum(unit_torques)
     )
     unexplained_spectra /= np.maximum(
@@ -388,7 +391,7 @@ def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[in
     None also if such samples explain the residual without free decays: then the sensor was
     disturbed, and there was no impact.
     """
-    bic_penalty = math.log(2 * np.count_nonzero(refit.noise.counts))
+    bic_penalty = math.log(2 * np.count_nonzero(refit.noise.is_compared))
     comparison = refit.objective.comparison
     # Beginning: decays from the window's end on, then single samples backwards from there.
     impact = _impact_between(refit, window_end, window_end)
@@ -432,7 +435,7 @@ def _impact_with_amplitudes(refit: Refit, first_sample: int, end_sample: int) ->
     unit_torques = _impact_torques(comparison, impact)
     cost_before, expected_cost = refit.cost, refit.expected_cost
     is_beam_free = bool(cost_before < _OVERWHELMING_COST_RATIO * expected_cost)
-    unexplained_spectra, residual = refit.unexplained_columns(
+    unexplained_spectra, residual = refit.unexplained_spectra(
         comparison.spectrum(unit_torques), beam_free=is_beam_free
     )
     unexplained_parts = unexplained_spectra.view(np.float64)

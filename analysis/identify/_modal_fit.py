@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from analysis.identify.residual_tests import InputRelation, Whiteness
     from rigd.beam import Plant
 
-_RELATIVE_TOLERANCE: Final = 1e-8
+_COST_TOLERANCE: Final = 1e-8
 """Relative tolerance of the sum of squares at which a descent has converged."""
 
 _MIN_LOSS_FACTOR: Final = 1e-5
@@ -226,9 +226,9 @@ class ModalFit(ModalEstimate):
     def plant_with_modal_frequencies(self, plant: Plant) -> Plant:
         """Return the plant with stiffnesses adjusted to the frequencies of the visible modes.
 
-        The given plant is returned unchanged if there is no such plant, if the visible modes are
-        not modes 1 to n without a gap, or if the plant has a tip mass, a compliant clamp or a
-        filter.
+        The given plant is returned unchanged if no stiffnesses give these frequencies, if the
+        visible modes are not modes 1 to n without a gap, or if the plant has a tip mass, a
+        compliant clamp or a filter.
 
         Parameters
         ----------
@@ -255,7 +255,7 @@ def fit_modes(
     comparison: Comparison,
     noise: NoiseSpectrum,
     starts: Sequence[tuple[int, float, float]],
-    columns: NDArray[np.complex128] | None = None,
+    torque_spectra: NDArray[np.complex128] | None = None,
 ) -> ModalFit | None:
     """Return the modal model fitted to a record; None if no mode is in the band or significant.
 
@@ -267,10 +267,10 @@ def fit_modes(
         First estimate; bins that it excludes stay excluded.
     starts : sequence of (int, float, float)
         Mode number, approximate frequency (Hz) and approximate damping ratio of each mode.
-    columns : ndarray of complex, shape (c, K), optional
+    torque_spectra : ndarray of complex, shape (c, K), optional
         Torque spectra of known form and unknown amplitude, as for `Objective`.
     """
-    search = _ModalSearch.starting_at(comparison, noise, starts, columns)
+    search = _ModalSearch.starting_at(comparison, noise, starts, torque_spectra)
     if search is None:
         return None
     return search.remove_unexcited_modes().converge_with_noise().add_resonances().fit()
@@ -313,7 +313,7 @@ class _ModalSearch:
         comparison: Comparison,
         noise: NoiseSpectrum,
         starts: Sequence[tuple[int, float, float]],
-        columns: NDArray[np.complex128] | None = None,
+        torque_spectra: NDArray[np.complex128] | None = None,
     ) -> _ModalSearch | None:
         """Return the search that starts at the modes in the band, or None if there is none."""
         starts_in_band = [
@@ -322,12 +322,12 @@ class _ModalSearch:
         if not starts_in_band:
             return None
         effect_spectra = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
-        effect_spectra = effect_spectra if columns is None else columns
+        effect_spectra = effect_spectra if torque_spectra is None else torque_spectra
         lowest_hz = _LOWEST_RELATIVE_FREQUENCY * min(hz for _, hz, _ in starts_in_band)
-        used_bins = noise.counts & (comparison.frequency_hz >= lowest_hz)
+        used_bins = noise.is_compared & (comparison.frequency_hz >= lowest_hz)
         return cls(
             comparison,
-            replace(noise, counts=used_bins),
+            replace(noise, is_compared=used_bins),
             effect_spectra,
             tuple(mode_number for mode_number, _, _ in starts_in_band),
             np.array(
@@ -358,7 +358,7 @@ class _ModalSearch:
             problem.normal_equations,
             self.x,
             ConstantBounds(lower_bounds.ravel(), upper_bounds.ravel()),
-            relative_tolerance=_RELATIVE_TOLERANCE,
+            relative_tolerance=_COST_TOLERANCE,
             max_evaluations=60,
         )
         return replace(self, x=minimum.x)
@@ -385,7 +385,7 @@ class _ModalSearch:
                 ~search.is_near_mode(within_resonance=True),
             )
             noise_power /= comparison.measurement.known_torque_fraction
-            used_bins = search.noise.counts
+            used_bins = search.noise.is_compared
             mean_log_change = np.abs(np.log(noise_power / search.noise.power)[used_bins]).mean()
             search = replace(
                 search, comparison=comparison, noise=replace(search.noise, power=noise_power)
@@ -497,7 +497,7 @@ class _ModalSearch:
         angle_spectrum = self.comparison.spectrum(
             self.comparison.angle_rad[self.comparison.retained]
         )
-        used_bins = self.noise.counts
+        used_bins = self.noise.is_compared
         first_used_bin = int(np.argmax(used_bins))
         return input_relation(
             residual[first_used_bin:],
@@ -529,7 +529,7 @@ class _ModalSearch:
         joint_covariance = uncertainty.covariance
         constants, covariance = problem.constants(linear_parameters, x, joint_covariance)
         residual_spectrum = residual.view(np.complex128)
-        used_bins = search.noise.counts
+        used_bins = search.noise.is_compared
         effect_count = len(search.effect_spectra)
         effect_variances = np.diag(joint_covariance)[joint_covariance.shape[0] - effect_count :]
         return ModalFit(

@@ -63,7 +63,7 @@ class BeamVibration:
         near_rad_s: Sequence[complex],
     ) -> None:
         self._modes: list[_Mode | None] = []
-        for coefficients, near in zip(terms.by_mode(), near_rad_s, strict=True):
+        for coefficients, near in zip(terms.coefficients_by_mode(), near_rad_s, strict=True):
             try:
                 mode = _Mode(parameters, terms, coefficients, length_m, lags, near)
             except (ArithmeticError, ValueError):  # the iterations end at no pole
@@ -101,7 +101,7 @@ class _Mode:
         self._ln_coefficients, self._orders = (ln_zeta, ln_gamma), (alpha, lambda_)
         (
             self._stiffness, clamp, mass, lump, tension, mass_arm, lump_arm,
-            self._medium_arm, tension_arm, turn_by_medium, turn_by_internal,
+            self._medium_arm, tension_arm, arm_change_by_external, arm_change_by_internal,
         ) = coefficients  # fmt: skip
         self._relaxation, self._lags = terms.alteration.relaxation, lags
         self._ratio = math.exp(ln_ratio)
@@ -117,8 +117,8 @@ class _Mode:
         _, self._slope, self._dampings, self._inertia = self._stiffness_at(s)
         # Damping turns the mode shape, and with it the arm of the mass.
         self._arms = (
-            self._inertia * turn_by_internal / self._stiffness,
-            self._inertia * turn_by_medium + self._medium_arm,
+            self._inertia * arm_change_by_internal / self._stiffness,
+            self._inertia * arm_change_by_external + self._medium_arm,
         )
         self._force = (
             self._inertia * (mass_arm + lump_arm)

@@ -60,11 +60,11 @@ MAX_DRAG_COMPUTATIONS: Final = 8
 _LEAST_DRAG_M: Final = 1e-6
 """C_D d that hardly brakes a beam, for which the torque is computed if the estimate is less."""
 
-_CHANGED_STDS: Final = 3.0
+_CHANGED_DAMPING_STDS: Final = 3.0
 """Change of a damping ratio if drag is fitted, in its standard deviations without drag, from which
 the value without drag is doubtful even if the fit with drag explains the record less well."""
 
-_TOLERANCE_STDS: Final = 0.2
+_DRAG_TOLERANCE_STDS: Final = 0.2
 """Remaining change of the drag, in standard deviations, below which its computation has converged.
 """
 
@@ -175,7 +175,7 @@ def fit_modes_with_drag(
         law = DragLaw(current.law.constant_m + change_m)
         estimates_m.append(law.constant_m)
         is_first_order = len(estimates_m) == 2  # which misses that drag limits the amplitude
-        has_converged = _remaining_change_m(estimates_m) < _TOLERANCE_STDS * std_m
+        has_converged = _remaining_change_m(estimates_m) < _DRAG_TOLERANCE_STDS * std_m
         current = replace(
             current,
             modal_fit=fit_with_drag,
@@ -201,7 +201,7 @@ def fit_modes_with_drag(
             current,
             law=assumed_law,
             comparison=comparison,
-            drag_spectra=comparison.drag.by_law[:1],
+            drag_spectra=comparison.drag.law_derivatives[:1],
         )
     return current
 
@@ -228,7 +228,7 @@ def modes_that_drag_changes(modal_fit: ModalFit, with_drag: ModalFit) -> tuple[i
     for mode_number in set(modal_fit.visible) & set(with_drag.visible):
         without = modal_fit.mode(mode_number)
         change = without.damping_ratio - with_drag.mode(mode_number).damping_ratio
-        if abs(change) > _CHANGED_STDS * without.damping_ratio_std:
+        if abs(change) > _CHANGED_DAMPING_STDS * without.damping_ratio_std:
             changed.append(mode_number)
     return tuple(sorted(changed))
 

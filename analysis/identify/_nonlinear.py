@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify._candidates import INTEGER_INTERNAL_ORDER
+from analysis.identify._candidates import INTERNAL_ORDER_ONE_STRUCTURES
 from analysis.identify._refit import Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.statistics import BIC_DECISIVE
@@ -115,7 +115,9 @@ class NonlinearForceSpectra:
             density_over_stiffness * self._s**2 + damping.gamma * self._s**damping.lambda_
         )
 
-    def column(self, term: NonlinearTerm, force_size: float = 0.0) -> NDArray[np.complex128]:
+    def torque_spectrum(
+        self, term: NonlinearTerm, force_size: float = 0.0
+    ) -> NDArray[np.complex128]:
         """Return the torque spectrum of a nonlinear force per unit of its size, in N·m, shape (K,).
 
         It is not finite if the repeated substitution diverges: the force is then too large.
@@ -312,7 +314,7 @@ def _start_candidates(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
     if "alpha" not in best_candidate.structure.free:
         return (best_candidate,)
     return (
-        *(c for c in candidate_set.candidates if c.structure in INTEGER_INTERNAL_ORDER),
+        *(c for c in candidate_set.candidates if c.structure in INTERNAL_ORDER_ONE_STRUCTURES),
         best_candidate,
     )
 
@@ -355,7 +357,9 @@ def _add_forces(
         refit, force_sizes, std = fit_with_term
     if not found_terms:
         return candidate_set, ()
-    with_forces = candidate_set.refit_with_effect_spectra(refit.columns, refit.residual_noise())
+    with_forces = candidate_set.refit_with_effect_spectra(
+        refit.effect_spectra, refit.residual_noise()
+    )
     forces = zip(found_terms, force_sizes.tolist(), std.tolist(), strict=True)
     return with_forces, tuple(
         NonlinearForce(best_term, force_size, s) for best_term, force_size, s in forces
@@ -394,7 +398,7 @@ def _best_first_order_force(
     if not tested_terms:
         return None, refit.cost
     cost_reductions = refit.cost_reduction_by_spectrum(
-        np.array([force_spectra.column(force_term) for force_term in tested_terms])
+        np.array([force_spectra.torque_spectrum(force_term) for force_term in tested_terms])
     )
     best_index = int(np.argmax(cost_reductions))
     return tested_terms[best_index], max(
@@ -417,22 +421,22 @@ def _fit_with_forces(
     for _ in range(_MAX_SIZE_ITERATIONS):
         force_spectra = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
         spectra = [
-            force_spectra.column(force_term, e)
+            force_spectra.torque_spectrum(force_term, e)
             for force_term, e in zip(force_terms, force_sizes.tolist(), strict=True)
         ]
         if not np.isfinite(spectra).all():
             return None
-        columns = np.concatenate([candidate_set.columns, spectra])
+        torque_spectra = np.concatenate([candidate_set.effect_spectra, spectra])
         refit = Refit.descend(
             candidate_set.comparison,
             refit.objective.unknowns,
             refit.x,
             candidate_set.noise,
-            columns,
+            torque_spectra,
         )
         last_force_sizes = force_sizes
         force_sizes, std = (
-            force_values[len(candidate_set.columns) :] for force_values in refit.amplitudes()
+            force_values[len(candidate_set.effect_spectra) :] for force_values in refit.amplitudes()
         )
         if np.all(
             np.abs(force_sizes - last_force_sizes)

@@ -116,7 +116,8 @@ class TorquePredictor:
     ) -> Iterator[tuple[slice, NDArray[np.float64]]]:
         """Yield the predicted torque in N·m at the retained samples and its derivatives, in blocks.
 
-        Each block, shape (b, m), comes with its rows among the torque and its k derivatives.
+        Each block, shape (b, m), comes with the range of its rows. Row 0 is the torque, and rows 1
+        to k are its derivatives.
 
         Parameters
         ----------

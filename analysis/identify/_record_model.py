@@ -76,7 +76,7 @@ def test_residual(
 
     The residual is that of the modal model or, if that is None, of the first candidate.
     """
-    comparison, compared_bins = candidate_set.comparison, candidate_set.noise.counts
+    comparison, compared_bins = candidate_set.comparison, candidate_set.noise.is_compared
     modal_residual = candidate_set.best.fit.residual if modal_fit is None else modal_fit.residual
     angle_rad = comparison.angle_rad[comparison.retained]
     unit_variance_residual = comparison.in_time(modal_residual) * math.sqrt(comparison.samples / 2)
@@ -154,7 +154,7 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
     effect = small_effect(
         linear_candidates.comparison,
         linear_fit,
-        linear_fit.plant_with_modal_frequencies(linear_candidates.likeliest.plant),
+        linear_fit.plant_with_modal_frequencies(linear_candidates.likeliest_fit.plant),
         drag_spectrum,
     )
     modes_with_drag, changed_by_drag = None, tuple[int, ...]()
@@ -171,7 +171,7 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
     else:
         modal_fit, explains_record = modes_with_drag.modal_fit, True
         if effect is not None and (
-            effect.kind == "air drag" or not effect.significant_with(modal_fit)
+            effect.kind == "air drag" or not effect.is_significant_with(modal_fit)
         ):
             effect = None
     model = RecordModel(
@@ -280,14 +280,14 @@ def fit_modal_model(
     `added_spectra`, shape (c, K), are torque spectra of unknown size in addition to those of the
     candidates.
     """
-    if candidate_set.misread:
+    if candidate_set.misread_findings:
         return None
-    mode_starts = _mode_starts(candidate_set.likeliest.modes)
-    torque_spectra, drag_expansion = candidate_set.columns, candidate_set.comparison.drag
+    mode_starts = _mode_starts(candidate_set.likeliest_fit.modes)
+    torque_spectra, drag_expansion = candidate_set.effect_spectra, candidate_set.comparison.drag
     if added_spectra is not None:
         torque_spectra = np.concatenate([torque_spectra, added_spectra])
     if drag_expansion is not None:  # the size of the drag is not known exactly
-        torque_spectra = np.concatenate([torque_spectra, drag_expansion.by_law])
+        torque_spectra = np.concatenate([torque_spectra, drag_expansion.law_derivatives])
     return fit_modes(candidate_set.comparison, candidate_set.noise, mode_starts, torque_spectra)
 
 
@@ -345,9 +345,9 @@ def _with_small_effect(
 ) -> RecordModel:
     """Fit a small effect together with the modes, and with the drag if there is any."""
     modal_fit = (
-        fit_modal_model(model.linear_candidates, effect.column[None])
+        fit_modal_model(model.linear_candidates, effect.torque_spectrum[None])
         if model.modes_with_drag is None
-        else model.modes_with_drag.fit_with_effect(model.linear_candidates, effect.column)
+        else model.modes_with_drag.fit_with_effect(model.linear_candidates, effect.torque_spectrum)
     )
     return replace(
         model,
@@ -370,7 +370,7 @@ def _with_fitted_candidates(model: RecordModel) -> RecordModel:
     effect = model.small_effect
     if effect is None or effect.deviance_reduction <= LARGE_DEVIANCE_REDUCTION:
         return model
-    candidate_set = linear_candidates.refit_with_additional_effect(effect.column[None])
+    candidate_set = linear_candidates.refit_with_additional_effect(effect.torque_spectrum[None])
     return replace(model, candidate_set=candidate_set, modal_fit=fit_modal_model(candidate_set))
 
 
@@ -388,14 +388,16 @@ def _fit_further_effects(
         )
         return candidate_set, (), temporal_changes
     candidate_set = (
-        linear_candidates if linear_candidates.misread else refit_with_air_drag(linear_candidates)
+        linear_candidates
+        if linear_candidates.misread_findings
+        else refit_with_air_drag(linear_candidates)
     )
     visible_numbers = visible_modes(
         linear_candidates.comparison, linear_candidates.noise, linear_candidates.best.fit
     )
     candidate_set, nonlinear_forces = (
         (candidate_set, ())
-        if candidate_set.misread
+        if candidate_set.misread_findings
         else add_nonlinear_forces(candidate_set, visible_numbers)
     )
     if nonlinear_forces and candidate_set.drag is not None:

@@ -77,21 +77,21 @@ class Refit:
         *,
         max_evaluations: int = 60,
         relative_tolerance: float = _COST_TOLERANCE,
-        hold: Sequence[str] = (),
+        held_unknowns: Sequence[str] = (),
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
         """Descend from a start vector, after unknown torques are filled with the prediction there.
 
         `torque_spectra`, shape (c, K), are torque spectra of unknown size that are projected out in
-        addition to the free decay. `hold` names unknowns that keep their start values.
+        addition to the free decay. `held_unknowns` names unknowns that keep their start values.
         `relative_tolerance` and `hopeless` are those of `analysis.optimizer.descend`. With
         `max_evaluations` of 1 the start is only evaluated.
         """
         descent_steps = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
         x = np.clip(start, descent_steps.lower, descent_steps.upper)
-        for fixed_name in hold:
-            fixed_index = unknowns.names.index(fixed_name)
-            descent_steps.lower[fixed_index] = descent_steps.upper[fixed_index] = x[fixed_index]
+        for held_name in held_unknowns:
+            held_index = unknowns.names.index(held_name)
+            descent_steps.lower[held_index] = descent_steps.upper[held_index] = x[held_index]
         objective, minimum = Objective(comparison, unknowns, torque_spectra).minimum(
             x,
             noise.weight,
@@ -102,7 +102,7 @@ class Refit:
         )
         return cls(objective, minimum.x, minimum.equations, noise)
 
-    def further(self, max_evaluations: int) -> Refit:
+    def continue_descent(self, max_evaluations: int) -> Refit:
         """Continue the descent with no unknown fixed, as `descend` from the same point would.
 
         The evaluation at this point counts, but is not repeated unless torques are unknown.
@@ -117,9 +117,9 @@ class Refit:
         return Refit(objective, minimum.x, minimum.equations, self.noise)
 
     @property
-    def columns(self) -> NDArray[np.complex128]:
+    def effect_spectra(self) -> NDArray[np.complex128]:
         """Return the torque spectra of effects, projected out like those of free decays, (c, K)."""
-        return self.objective.columns
+        return self.objective.effect_spectra
 
     @property
     def cost(self) -> float:
@@ -130,7 +130,7 @@ class Refit:
     def expected_cost(self) -> float:
         """Return the sum of squares that is expected if the residual is noise only."""
         known_fraction = self.objective.comparison.measurement.known_torque_fraction
-        return float(2 * np.count_nonzero(self.noise.counts) * known_fraction)
+        return float(2 * np.count_nonzero(self.noise.is_compared) * known_fraction)
 
     @property
     def predicted_cost(self) -> float:
@@ -171,7 +171,7 @@ class Refit:
         linearisation = self.objective.linearise(self.x)
         projected_objective = self.objective.project(linearisation, self.noise.weight)
         whitened_spectra = self.objective.unknown_torques(linearisation) * self.noise.weight
-        # The Jacobian before the projection is needed: after it the columns are orthogonal to the
+        # The Jacobian before the projection is needed: after it the spectra are orthogonal to the
         # Jacobian, so their amplitudes would seem independent of the unknowns.
         derivatives = np.concatenate([linearisation.jacobian * self.noise.weight, whitened_spectra])
         derivative_norms = np.sqrt(np.sum(np.abs(derivatives) ** 2, axis=1))
@@ -180,16 +180,16 @@ class Refit:
         gram_matrix = (derivatives.conj() @ derivatives.T).real + 1e-12 * np.eye(
             derivative_norms.size
         )
-        first_column = derivative_norms.size - len(self.columns)
+        first_column = derivative_norms.size - len(self.effect_spectra)
         column_scale = derivative_norms[first_column:]
         covariance = np.linalg.inv(gram_matrix)[first_column:, first_column:] / np.outer(
             column_scale, column_scale
         )
         return projected_objective.amplitudes[
-            projected_objective.amplitudes.size - len(self.columns) :
+            projected_objective.amplitudes.size - len(self.effect_spectra) :
         ], covariance
 
-    def unexplained_columns(
+    def unexplained_spectra(
         self, torque_spectra: NDArray[np.complex128], *, beam_free: bool = True
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Return the part of whitened torque spectra that other free terms do not explain, (c, K).
@@ -217,7 +217,7 @@ class Refit:
         torque_spectra : ndarray of complex, shape (c, K)
             Torque spectra of unknown size.
         """
-        unexplained_spectra, residual = self.unexplained_columns(torque_spectra)
+        unexplained_spectra, residual = self.unexplained_spectra(torque_spectra)
         correlation = (unexplained_spectra.conj() @ residual).real
         unexplained_squares = np.maximum(
             np.sum(np.abs(unexplained_spectra) ** 2, axis=1), np.finfo(float).tiny
@@ -228,9 +228,9 @@ class Refit:
     def fit(self) -> RecordFit:
         """Return the fit at this minimum with parameters, modes and uncertainties."""
         fit = summary(self.objective, self.x, self.noise)
-        if not len(self.columns):
+        if not len(self.effect_spectra):
             return fit
-        # `summary` does not know that the amplitudes of other columns are free as well.
+        # `summary` does not know that the amplitudes of the effects are free as well.
         projected_objective = self.objective.project(
             self.objective.linearise(self.x), self.noise.weight
         )
@@ -245,7 +245,7 @@ class Refit:
             gram_matrix[:decay_count, decay_count:],
             gram_matrix[decay_count:, decay_count:],
         )
-        # Inverse covariance of the decays alone, the other columns free (Schur complement).
+        # Inverse covariance of the decays alone, the other amplitudes free (Schur complement).
         decay_precision = decay_gram - cross_gram @ np.linalg.solve(column_gram, cross_gram.T)
         a = (projected_objective.amplitudes * gram_scale)[:decay_count]
         chi_square = float(a @ decay_precision @ a) * fit.degrees_of_freedom / fit.cost
@@ -256,7 +256,7 @@ class Refit:
     def candidate(self) -> Candidate:
         """Return the fit at this minimum, with its structure, as a candidate."""
         unknowns = self.objective.unknowns
-        return Candidate(unknowns.structure, self.fit(), len(self.columns))
+        return Candidate(unknowns.structure, self.fit(), len(self.effect_spectra))
 
     def residual_noise(self) -> NoiseSpectrum:
         """Return the noise of the residual at this minimum. Lines stay excluded."""

@@ -72,7 +72,7 @@ def resonance_shift(coarse_response: CoarseResponse, unknowns: Unknowns) -> NDAr
 _COARSE_POINTS: Final = 400
 """Number of points of the coarse response."""
 
-_COARSE_TOLERANCE: Final = 1e-2
+_COARSE_COST_TOLERANCE: Final = 1e-2
 """Relative tolerance of the cost in a descent on the coarse response."""
 
 _SAME_MINIMUM_FRACTION: Final = 0.05
@@ -171,7 +171,7 @@ class CoarseResponse:
         """Return the weighted mean square of the difference between two plants' responses."""
         return self._mean_square(self._predicted(first_plant) - self._predicted(second_plant))
 
-    def alike(self, first_plant: Plant, second_plant: Plant) -> bool:
+    def are_alike(self, first_plant: Plant, second_plant: Plant) -> bool:
         """Return whether two plants respond so similarly that they count as the same minimum."""
         return self.distance(first_plant, second_plant) <= _SAME_MINIMUM_FRACTION * min(
             self.cost(first_plant), self.cost(second_plant)
@@ -239,7 +239,7 @@ def coarse_minima(
             lambda x: coarse_response.normal_equations(unknowns, x),
             start_vector,
             descent_steps,
-            relative_tolerance=_COARSE_TOLERANCE,
+            relative_tolerance=_COARSE_COST_TOLERANCE,
             max_evaluations=_MAX_COARSE_EVALUATIONS,
         )
         for start_vector in start_vectors
@@ -248,7 +248,7 @@ def coarse_minima(
     for minimum in sorted(minima, key=lambda m: m.cost):
         plant = unknowns.plant(minimum.x)
         if not any(
-            coarse_response.alike(plant, unknowns.plant(known_minimum.x))
+            coarse_response.are_alike(plant, unknowns.plant(known_minimum.x))
             for known_minimum in distinct_minima
         ):
             distinct_minima.append(minimum)
@@ -257,7 +257,7 @@ def coarse_minima(
 
 # Descents on the whole record
 
-_RIVAL_TOLERANCE: Final = 1e-2
+_RIVAL_COST_TOLERANCE: Final = 1e-2
 """Relative tolerance of the descents that decide which of several minima is lower."""
 
 _MAX_RIVALS: Final = 2
@@ -393,17 +393,17 @@ class StructureSearch:
     ----------
     objective : Objective
         Sum of squares of the whole record.
-    coarse : CoarseResponse
+    coarse_response : CoarseResponse
         Some points of the frequency response of the record.
-    first : ndarray, shape (k,)
+    order_one_start : ndarray, shape (k,)
         Unknowns of the best start with all orders 1.
     minima : list of Minimum
         Minima of the coarse response under white noise, the lowest first.
     """
 
     objective: Objective
-    coarse: CoarseResponse
-    first: NDArray[np.float64]
+    coarse_response: CoarseResponse
+    order_one_start: NDArray[np.float64]
     minima: list[Minimum]
 
     @classmethod
@@ -446,10 +446,12 @@ class StructureSearch:
         known_descent : Descent, optional
             Descent at a known minimum.
         """
-        whitened_response = self.coarse.whitened(noise, self.objective.comparison.frequency_hz)
+        whitened_response = self.coarse_response.whitened(
+            noise, self.objective.comparison.frequency_hz
+        )
         start_vectors = [minimum.x for minimum in self.minima[:_MAX_STORED_MINIMA]]
         minima_under_noise = coarse_minima(
-            whitened_response, self.unknowns, [*start_vectors, self.first]
+            whitened_response, self.unknowns, [*start_vectors, self.order_one_start]
         )
         rival_descents = [
             Descent(self.objective, minimum.x)
@@ -461,14 +463,16 @@ class StructureSearch:
             rival_descents = [known_descent] + [
                 rival_descent
                 for rival_descent in rival_descents
-                if not whitened_response.alike(known_plant, self.unknowns.plant(rival_descent.x))
+                if not whitened_response.are_alike(
+                    known_plant, self.unknowns.plant(rival_descent.x)
+                )
                 and whitened_response.cost(self.unknowns.plant(rival_descent.x))
                 < _BETTER_COST_RATIO * whitened_response.cost(known_plant)
             ]
         if len(rival_descents) == 1:
             return rival_descents[0]
         final_descents = [
-            rival_descent.descend_to_minimum(noise, _RIVAL_TOLERANCE)
+            rival_descent.descend_to_minimum(noise, _RIVAL_COST_TOLERANCE)
             for rival_descent in rival_descents
         ]
         return min(final_descents, key=lambda end: end.cost(noise))

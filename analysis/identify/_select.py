@@ -479,7 +479,7 @@ def _fit_freest_with_known_impacts(
     additional_structures = () if misread_findings else (ORDER_ONE_STRUCTURE,)
     candidate_set = replace(
         CandidateSet.fit_freest_structure(measurement, (), band_hz, additional_structures),
-        misread=misread_findings,
+        misread_findings=misread_findings,
     )
     if not misread_findings:
         candidate_set = candidate_set.fit_special_cases()

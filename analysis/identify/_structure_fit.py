@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from analysis.models import Structure
     from analysis.structures import AddedStructure
 
-_ROUGH_TOLERANCE: Final = 1e-3
+_ROUGH_COST_TOLERANCE: Final = 1e-3
 """Relative tolerance of the cost in the descents from several starts."""
-_TOLERANCE: Final = 1e-8
+_COST_TOLERANCE: Final = 1e-8
 """Relative tolerance of the cost at the minimum."""
-_DESCENTS: Final = 3
+_MAX_DESCENTS: Final = 3
 """Maximum number of starts, those of the lowest cost, from which descents begin."""
 _MAX_EVALUATIONS: Final = 60
 """Largest number of evaluations of a descent."""
@@ -134,14 +134,14 @@ def fit_structure(
         return None
     noise = selection.analysis.noise
     comparison = selection.analysis.comparison
-    settings = Unknowns.for_structure(
+    undamped_unknowns = Unknowns.for_structure(
         UNDAMPED, comparison.measurement.nominal, free_settings(fixed)
     )
     unknowns = StructureUnknowns(
         structure,
-        settings.nominal,
-        settings.free,
-        settings.omega_rad_s,
+        undamped_unknowns.nominal,
+        undamped_unknowns.free_settings,
+        undamped_unknowns.omega_rad_s,
         comparison.poles(best.fit.plant),
     )
     region = ConstantBounds(*unknowns.bounds)
@@ -149,21 +149,21 @@ def fit_structure(
         try:
             objective = Objective(comparison, unknowns)
             starts = [unknowns.vector_near(v, best.fit.plant) for v in structure.start_values()]
-            if len(starts) > _DESCENTS:
+            if len(starts) > _MAX_DESCENTS:
                 starts.sort(key=lambda x: objective.normal_equations(x, noise.weight).cost)
             descents = [
                 objective.minimum(
                     start,
                     noise.weight,
                     region,
-                    relative_tolerance=_ROUGH_TOLERANCE,
+                    relative_tolerance=_ROUGH_COST_TOLERANCE,
                     max_evaluations=_MAX_EVALUATIONS,
                 )
-                for start in starts[:_DESCENTS]
+                for start in starts[:_MAX_DESCENTS]
             ]
             objective, rough_minimum = min(descents, key=lambda each: each[1].cost)
             objective, minimum = objective.minimum(
-                rough_minimum.x, noise.weight, region, relative_tolerance=_TOLERANCE
+                rough_minimum.x, noise.weight, region, relative_tolerance=_COST_TOLERANCE
             )
             x = minimum.x
             projected = objective.project(objective.linearise(x), noise.weight)

@@ -328,7 +328,7 @@ def ringing(
     poles: Sequence[Pole],
     projected: ProjectedResidual,
     residual_variance: float,
-    projected_spectra: NDArray[np.complex128],
+    nuisance_spectra: NDArray[np.complex128],
     hum_spectra: NDArray[np.complex128],
 ) -> Ringing:
     """Return the amplitude of the free decay in each mode, with its chi-square.
@@ -336,22 +336,22 @@ def ringing(
     The bins of a hum are excluded. But a hum starts and ends with the record and so leaks into all
     other bins, where free decays would explain a part of it. So chi-square is the reduction of the
     sum of squares by free decays and hum together, minus that by the hum alone.
-    `projected_spectra`, shape (m, K), are the whitened spectra of the free decays and of the other
+    `nuisance_spectra`, shape (m, K), are the whitened spectra of the free decays and of the other
     terms that are projected out. `hum_spectra`, shape (h, K), are those of the hum.
     `residual_variance` is the variance of real and imaginary parts of the residual.
     """
     decay_count = count_decay_spectra(poles)
-    projected_spectra, decay_amplitudes = (
-        projected_spectra[:decay_count],
+    nuisance_spectra, decay_amplitudes = (
+        nuisance_spectra[:decay_count],
         projected.amplitudes[:decay_count],
     )
     explained_squares = float(
         decay_amplitudes @ projected.amplitude_gram[:decay_count, :decay_count] @ decay_amplitudes
     )
     if len(hum_spectra) and decay_amplitudes.size:
-        decay_free_residual = projected.residual - decay_amplitudes @ projected_spectra
+        decay_free_residual = projected.residual - decay_amplitudes @ nuisance_spectra
         best_factors, remaining_squares = _best_combination(
-            decay_free_residual, np.concatenate([projected_spectra, hum_spectra])
+            decay_free_residual, np.concatenate([nuisance_spectra, hum_spectra])
         )
         explained_squares = (
             _best_combination(decay_free_residual, hum_spectra)[1] - remaining_squares

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from analysis.identify._result import RecordFit
     from analysis.identify.noise import NoiseSpectrum
 
-_MIN_EVIDENCE: Final = 400.0
+_MIN_RESONANCE_DEVIANCE: Final = 400.0
 """Deviance by which a response with a resonance must be better than a smooth one. The resonance is
 then known to a twentieth of its height, and its damping to about a tenth."""
 
@@ -59,7 +59,7 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
         reach_hz = _window_half_width_hz(
             comparison, mode_estimate.frequency_hz, mode_estimate.damping_ratio
         )
-        in_window = (np.abs(offset_hz) < reach_hz) & noise.counts
+        in_window = (np.abs(offset_hz) < reach_hz) & noise.is_compared
         degrees_of_freedom = 2 * (int(np.count_nonzero(in_window)) - _SMOOTH_DEGREE - 1)
         if degrees_of_freedom < _MIN_BINS_PER_SIDE:
             continue
@@ -71,12 +71,12 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
         )
         # Chance does neither: together they are nearly eight standard deviations, or more.
         has_evidence = (
-            smooth_chi_square - degrees_of_freedom > _MIN_EVIDENCE
+            smooth_chi_square - degrees_of_freedom > _MIN_RESONANCE_DEVIANCE
             and smooth_chi_square > _MIN_RESIDUAL_OVER_NOISE * degrees_of_freedom
         )
         # With many bins a resonance may be below the noise of each and still be significant.
         fit_chi_square = float(np.vdot(fit.residual[in_window], fit.residual[in_window]).real)
-        if has_evidence or smooth_chi_square - fit_chi_square > _MIN_EVIDENCE:
+        if has_evidence or smooth_chi_square - fit_chi_square > _MIN_RESONANCE_DEVIANCE:
             visible_numbers.append(mode_estimate.number)
     return tuple(visible_numbers)
 

@@ -25,7 +25,7 @@ _HUM_DECAY_EXPONENT: Final = 1e-6
 
 
 def count_decay_spectra(poles: Sequence[Pole]) -> int:
-    """Return the number of decay spectra of poles: two for each that oscillates, else one."""
+    """Return the number of decay spectra: two for each oscillating pole, one for a real pole."""
     return sum(1 + pole.oscillates for pole in poles)
 
 
@@ -49,7 +49,7 @@ class DecaySpectra:
         self._duration_s = sample_count / rate_hz
         self._sample_rotation = np.exp(-1j * omega_rad_s * self._period_s)
 
-    def columns(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+    def spectra(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
         """Return the spectra of the decay ``exp(p t)`` of each pole p, shape (m, K).
 
         An oscillating decay has two rows: the spectra of its real and of its imaginary part.
@@ -59,7 +59,7 @@ class DecaySpectra:
     def gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        """Return the derivatives of ``amplitudes @ columns(poles)`` by the unknowns, shape (k, K).
+        """Return the derivatives of ``amplitudes @ spectra(poles)`` by the unknowns, shape (k, K).
 
         Parameters
         ----------
@@ -82,13 +82,13 @@ class DecaySpectra:
             else:
                 weighted_derivatives.append(amplitudes[amplitude_index] * pole.derivative.real)
                 amplitude_index += 1
-        real_parts: NDArray[np.float64] = np.array(weighted_derivatives).T @ self.growing(
+        real_parts: NDArray[np.float64] = np.array(weighted_derivatives).T @ self.growing_spectra(
             poles
         ).view(np.float64)
         spectrum_slopes: NDArray[np.complex128] = real_parts.view(np.complex128)
         return spectrum_slopes
 
-    def growing(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+    def growing_spectra(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
         """Return the spectra of ``t exp(p t)`` of each pole p, shape (m, K).
 
         The time t begins at the first sample.
@@ -108,7 +108,7 @@ class DecaySpectra:
         poles = [
             Pole(0, complex(-decay_rate, 2 * np.pi * hz), no_derivatives) for hz in frequency_hz
         ]
-        return np.concatenate([self.columns(poles), self.growing(poles)])
+        return np.concatenate([self.spectra(poles), self.growing_spectra(poles)])
 
     def _real_spectra(
         self, poles: Sequence[Pole], spectrum_of_pole: Callable[[complex], NDArray[np.complex128]]

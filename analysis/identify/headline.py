@@ -264,7 +264,11 @@ class Headline(Estimates):
         status : str
             "selected", "compatible" or "excluded".
         """
-        return tuple(structure_name for structure_name, its in self.structures if its == status)
+        return tuple(
+            structure_name
+            for structure_name, structure_status in self.structures
+            if structure_status == status
+        )
 
 
 def headline(
@@ -420,10 +424,10 @@ def structures(
 ) -> tuple[tuple[str, StructureStatus], ...]:
     """Return name and status of every structure: which ones the record excludes.
 
-    A special case of the freest structure is excluded by the likelihood ratio. Any other structure
-    is excluded if its likelihood is lower by as much and its BIC exceeds the lowest BIC by 10. A
-    structure that explains the record with unnecessary parameters is not excluded. A structure that
-    fixes an order at 1 is excluded if the order is in `fractional_orders`.
+    A special case of the freest structure is excluded if its deviance exceeds that of the freest
+    one by `EXCLUSION_DEVIANCES`, or if it fixes an order of `fractional_orders` at 1. Any other
+    structure is excluded if its deviance exceeds the first of these limits and its BIC exceeds the
+    lowest BIC by 10. So a structure with unnecessary parameters is not excluded.
 
     Parameters
     ----------

@@ -41,12 +41,12 @@ if TYPE_CHECKING:
     from analysis.identify.profile_likelihood import LikelihoodProfile, OrderName
     from analysis.identify.tolerant_estimate import TolerantEstimate
 
-NOT_UNIFORM: Final = (
+NOT_UNIFORM_REASON: Final = (
     "the modes are not those of a uniform beam, and what makes them differ may change this value"
 )
 """Reason for a flag on parameters that a deviation from a uniform beam may change."""
 
-NO_ORDER: Final = "no beam with one internal and one external order explains the losses"
+NO_ORDER_REASON: Final = "no beam with one internal and one external order explains the losses"
 """Reason for a flag on damping parameters: no beam with fractional orders explains the losses."""
 
 _EFFECTIVE_PARAMETERS: Final = (*BEAM_PARAMETERS, "delay_s", "gamma", "lambda")
@@ -61,7 +61,7 @@ def uniform_beam_refusal_reason(test: UniformBeamTest) -> str | None:
     return f"a uniform beam does not predict the modal constants ({test.summary.chance})"
 
 
-_CHANGED_BY_DRAG: Final = "air drag of unknown size would change it"
+_CHANGED_BY_DRAG_REASON: Final = "air drag of unknown size would change it"
 """Reason to doubt a damping ratio that depends on a drag of unknown size."""
 
 _CONTRADICTION_STDS: Final = 3.0
@@ -189,7 +189,7 @@ def flag_modes_changed_by_drag(headline: Headline, mode_numbers: Sequence[int]) 
         Modes whose damping ratio depends on air drag of unknown size.
     """
     modes = tuple(
-        replace(mode, damping_ratio=mode.damping_ratio.with_flag(_CHANGED_BY_DRAG))
+        replace(mode, damping_ratio=mode.damping_ratio.with_flag(_CHANGED_BY_DRAG_REASON))
         if mode.number in mode_numbers
         else mode
         for mode in headline.modes
@@ -280,7 +280,7 @@ def _reported_parameters(
 def _reason_undetermined(estimate: TolerantEstimate, parameter_name: str) -> str | None:
     """Return the reason why the modes do not determine a beam or damping parameter, or None."""
     if estimate.basis == "none":
-        return NO_ORDER
+        return NO_ORDER_REASON
     for order_name, coefficient_name in COEFFICIENT_OF.items():
         if parameter_name in (order_name, coefficient_name) and not is_order_identifiable(
             estimate, order_name
@@ -361,7 +361,7 @@ def loss_factors_with_geometry_tolerance(
         )
         if loss_factor is None:
             continue
-        flag_reason = NO_ORDER if estimate.basis == "none" else None
+        flag_reason = NO_ORDER_REASON if estimate.basis == "none" else None
         flag_reason = flag_reason or effective_reason(
             estimate, coefficient_name, refused=test.status == "refused"
         )
@@ -384,7 +384,7 @@ def effective_reason(
         Whether the test refused a uniform beam.
     """
     is_effective = parameter_name in _EFFECTIVE_PARAMETERS or estimate.rests_on_frequencies
-    return NOT_UNIFORM if refused and is_effective else None
+    return NOT_UNIFORM_REASON if refused and is_effective else None
 
 
 def order_verdict_with_geometry_tolerance(
@@ -436,7 +436,7 @@ def order_status_with_geometry_tolerance(
         Whether the test refused a uniform beam.
     """
     if estimate.basis == "none":
-        return "not identifiable", NO_ORDER
+        return "not identifiable", NO_ORDER_REASON
     if not is_order_identifiable(estimate, order):
         return "not identifiable", ORDER_NOT_DETERMINED_REASON
     order_low, order_high = estimate.interval[order]

@@ -96,14 +96,14 @@ class NoiseSpectrum:
     ----------
     power : ndarray, shape (K,)
         Expected ``|residual|²`` of each bin.
-    counts : ndarray of bool, shape (K,)
+    is_compared : ndarray of bool, shape (K,)
         True for bins that are compared, False at the lines.
     lines : tuple of NoiseLine
         Narrow-band disturbances, which are not part of `power`.
     """
 
     power: NDArray[np.float64]
-    counts: NDArray[np.bool_]
+    is_compared: NDArray[np.bool_]
     lines: tuple[NoiseLine, ...]
 
     @property
@@ -112,7 +112,7 @@ class NoiseSpectrum:
 
         Real and imaginary parts of the whitened noise have variance 1.
         """
-        whitening_factor: NDArray[np.float64] = np.sqrt(2 / self.power) * self.counts
+        whitening_factor: NDArray[np.float64] = np.sqrt(2 / self.power) * self.is_compared
         return whitening_factor
 
 
@@ -223,7 +223,7 @@ def noise_power_with_peaks(
         np.convolve(local_ratio > _PEAK_POWER_RATIO, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
     )
     if may_continue is not None:
-        is_peak_allowed = is_peak_allowed | _continued(
+        is_peak_allowed = is_peak_allowed | _connected_bins(
             is_peak & is_peak_allowed, is_peak & may_continue
         )
     return np.where(
@@ -233,7 +233,9 @@ def noise_power_with_peaks(
     )
 
 
-def _continued(is_start: NDArray[np.bool_], may_continue: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _connected_bins(
+    is_start: NDArray[np.bool_], may_continue: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Return a mask of the start bins and all bins connected to them by `may_continue`, (K,)."""
     is_connected = is_start | may_continue
     run_numbers = np.cumsum(np.diff(is_connected, prepend=False) & is_connected)

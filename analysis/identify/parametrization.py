@@ -73,7 +73,7 @@ class Unknowns:
         Damping structure.
     nominal : Plant
         Source of the values that are not free. Its damping is not used.
-    free : tuple of str
+    free_settings : tuple of str
         Free settings, in the order of `SETTINGS`.
     omega_rad_s : tuple of float
         Undamped first and second natural frequency of the nominal beam.
@@ -81,7 +81,7 @@ class Unknowns:
 
     structure: Structure
     nominal: Plant
-    free: tuple[Setting, ...]
+    free_settings: tuple[Setting, ...]
     omega_rad_s: tuple[float, float]
 
     @classmethod
@@ -110,7 +110,7 @@ class Unknowns:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Return the names of the free parameters, in the order of the vector."""
-        return (*self.structure.free, *self.free)
+        return (*self.structure.free, *self.free_settings)
 
     @cached_property
     def gradient_names(self) -> tuple[str, ...]:
@@ -416,12 +416,12 @@ class StepRule:
     ----------
     lower, upper : ndarray, shape (k,)
         Bounds of the unknowns.
-    dampings : tuple of (int, int, bool)
+    damping_indices : tuple of (int, int, bool)
         Index of the loss and index of the order of each damping with a free order, and whether the
         damping adds to the stiffness. If not, it reduces the inertia.
-    losses : tuple of int
+    loss_indices : tuple of int
         Indices of the losses of dampings with a fixed order.
-    linear_below : float
+    linear_loss_limit : float
         Loss below which a step changes the loss itself instead of its logarithm. The effect of the
         damping is proportional to the loss: a step of the logarithm would lead from a negligible
         value to the upper bound, and most of a descent would be spent on the way back.
@@ -429,19 +429,19 @@ class StepRule:
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
-    dampings: tuple[tuple[int, int, bool], ...]
-    losses: tuple[int, ...] = ()
-    linear_below: float = 0.0
+    damping_indices: tuple[tuple[int, int, bool], ...]
+    loss_indices: tuple[int, ...] = ()
+    linear_loss_limit: float = 0.0
 
     @classmethod
-    def for_unknowns(cls, unknowns: Unknowns, linear_below: float = 0.0) -> StepRule:
+    def for_unknowns(cls, unknowns: Unknowns, linear_loss_limit: float = 0.0) -> StepRule:
         """Return the rule of the steps for the unknowns of a structure.
 
         Parameters
         ----------
         unknowns : Unknowns
             Unknowns of the structure.
-        linear_below : float
+        linear_loss_limit : float
             Loss below which a step changes the loss itself instead of its logarithm.
         """
         unknown_names = unknowns.names
@@ -459,7 +459,7 @@ class StepRule:
             for coefficient_name, order_name in (("zeta", "alpha"), ("gamma", "lambda"))
             if coefficient_name in unknown_names and order_name not in unknown_names
         )
-        return cls(*unknowns.bounds, damping_indices, loss_indices, linear_below)
+        return cls(*unknowns.bounds, damping_indices, loss_indices, linear_loss_limit)
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the smallest and largest admissible step of each unknown, each of shape (k,).
@@ -468,7 +468,7 @@ class StepRule:
         depends on the logarithm of that distance. The order of a vanished damping is constant.
         """
         smallest_steps, largest_steps = self.lower - x, self.upper - x
-        for loss_index, order_index, _ in self.dampings:
+        for loss_index, order_index, _ in self.damping_indices:
             step_fraction = (
                 _MAX_ORDER_STEP_FRACTION if x[loss_index] > self.lower[loss_index] else 0.0
             )
@@ -491,10 +491,10 @@ class StepRule:
             Step within the `limits`, tangent to the curve at `x`.
         """
         end = np.clip(x + unknown_step, self.lower, self.upper)
-        for i in self.losses:
-            if unknown_step[i] > 0 and math.exp(x[i]) < self.linear_below:
+        for i in self.loss_indices:
+            if unknown_step[i] > 0 and math.exp(x[i]) < self.linear_loss_limit:
                 end[i] = min(x[i] + math.log1p(unknown_step[i]), self.upper[i])
-        for i, j, adds_stiffness in self.dampings:
+        for i, j, adds_stiffness in self.damping_indices:
             if unknown_step[i] != 0:
                 phase_before, phase_after = (
                     _phase_of_order(x[j], adds_stiffness),
@@ -502,7 +502,7 @@ class StepRule:
                 )
                 largest_loss = math.exp(self.upper[i])
                 loss_factor = math.exp(x[i])
-                is_linear = loss_factor < self.linear_below
+                is_linear = loss_factor < self.linear_loss_limit
                 loss_factor, phase_rad = _loss_and_phase_after_step(
                     loss_factor,
                     float(unknown_step[i]),

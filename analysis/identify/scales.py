@@ -106,7 +106,7 @@ def with_scale_uncertainty(
 def _relative_scale_uncertainty(
     scale_exponents: Mapping[str, int], scale_uncertainty: Mapping[str, float]
 ) -> float:
-    """Return the relative standard uncertainty of a parameter by those of the scales.
+    """Return the relative standard uncertainty of a parameter due to uncertain scales.
 
     `scale_exponents` are the powers of the scales, such as length, to which the parameter is
     proportional.

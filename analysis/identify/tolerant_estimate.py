@@ -42,10 +42,10 @@ the fit compensate a part of the deviations of a beam that exceeds the tolerance
 _PLAUSIBLE_P_VALUE_WIDER: Final = 0.1
 """p-value from which the wider tolerance suffices."""
 
-_WIDER_TOLERANCE: Final = 3e-3
+_WIDER_FREQUENCY_TOLERANCE: Final = 3e-3
 """Relative frequency tolerance that is tried if the stated one does not suffice."""
 
-_LOOSE_TOLERANCE: Final = 0.05
+_LOOSE_FREQUENCY_TOLERANCE: Final = 0.05
 """Relative frequency tolerance at which frequencies and residues have almost no weight."""
 
 _LOSS_TOLERANCE: Final = 0.01
@@ -179,11 +179,11 @@ def tolerant_estimate(
     mode_numbers = fit.visible
     if len(mode_numbers) < _MIN_VISIBLE_MODES:
         return None
-    wider_tolerance = max(_WIDER_TOLERANCE, uniformity)
+    wider_frequency_tolerance = max(_WIDER_FREQUENCY_TOLERANCE, uniformity)
     tolerance_attempts: tuple[tuple[EstimateBasis, float, float], ...] = (
         ("geometry", uniformity, _PLAUSIBLE_P_VALUE),
-        ("geometry", wider_tolerance, _PLAUSIBLE_P_VALUE_WIDER),
-        ("losses", _LOOSE_TOLERANCE, MIN_P_VALUE_OF_UNIFORM_BEAM),
+        ("geometry", wider_frequency_tolerance, _PLAUSIBLE_P_VALUE_WIDER),
+        ("losses", _LOOSE_FREQUENCY_TOLERANCE, MIN_P_VALUE_OF_UNIFORM_BEAM),
     )
     for estimate_basis, frequency_tolerance, min_p_value in tolerance_attempts:
         loss_tolerance = (
@@ -198,7 +198,7 @@ def tolerant_estimate(
         )
         minima = problem.minima()
         # With the loose tolerance frequencies and residues do not count as data.
-        constant_count = problem.compared // (2 if estimate_basis == "losses" else 1)
+        constant_count = problem.constant_count // (2 if estimate_basis == "losses" else 1)
         degrees_of_freedom = constant_count - (
             len(PARAMETERS) if estimate_basis == "geometry" else len(PARAMETERS) - 2
         )
@@ -221,7 +221,7 @@ def tolerant_estimate(
         return beam_estimate
     if estimate_basis == "geometry":
         problem = UniformBeamProblem(
-            fit, mode_numbers, nominal, _LOOSE_TOLERANCE, tilt_deg, loss_tolerance
+            fit, mode_numbers, nominal, _LOOSE_FREQUENCY_TOLERANCE, tilt_deg, loss_tolerance
         )
         minima = problem.minima()
     best_minimum = minima[0]

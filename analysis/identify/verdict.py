@@ -170,7 +170,7 @@ def _order_status(
     *,
     doubt_reason: str | None,
 ) -> tuple[Status, str | None]:
-    """Return the status of a damping order, and why it is doubtful or None."""
+    """Return the status of a damping order, and the reason if it is doubtful, else None."""
     freest_candidate, order_name = candidate_set.freest, order_profile.order
     reason_against = not_reported_reason(candidate_set, visible_numbers)
     if reason_against is not None:
