@@ -102,7 +102,7 @@ class Alteration:
     lag_s: float = 0.0
 
     @classmethod
-    def stated(cls, nominal: Plant, tilt_deg: float | None = None) -> Alteration:
+    def from_nominal(cls, nominal: Plant, tilt_deg: float | None = None) -> Alteration:
         """Return the alteration of the beam that the session file states: tip mass and tilt.
 
         Parameters

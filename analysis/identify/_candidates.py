@@ -194,9 +194,9 @@ class CandidateSet:
         measurement: Measurement,
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
-        additional: tuple[Structure, ...] = (),
+        additional_structures: tuple[Structure, ...] = (),
     ) -> CandidateSet:
-        """Fit the damping structure with free orders, and the `additional` structures, to a record.
+        """Fit the damping structure with free orders, and the `additional_structures`, to a record.
 
         The beam is uniform.
 
@@ -205,7 +205,7 @@ class CandidateSet:
         MeasurementError
             The record cannot be used.
         """
-        structures = (_FREEST_STRUCTURE, *additional)
+        structures = (_FREEST_STRUCTURE, *additional_structures)
         return cls._from_uniform_beam(
             fit_record(measurement, structures, fixed=fixed, band_hz=band_hz), fixed
         )

@@ -1,8 +1,8 @@
 """Checks of the recorded channels: clipping, stopped motor, wrong sign or unit.
 
-Sign and unit are checked by the ratio of torque and angle to the response of the beam that the file
-states, as a median over the band. The median depends neither on the exact mode frequencies nor on
-the damping.
+Sign and unit are checked by the ratio of the measured response, torque over angle, to the response
+of the beam that the file states. The median of this ratio over the band depends neither on the
+exact mode frequencies nor on the damping.
 """
 
 from __future__ import annotations

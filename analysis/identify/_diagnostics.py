@@ -381,7 +381,7 @@ def unexplained_residual_finding(
     )
 
 
-_DRIFT_SEGMENTS: Final = 16
+_DRIFT_SEGMENT_COUNT: Final = 16
 """Number of segments of a record whose mean residual torques are compared."""
 
 _MIN_SCATTER_RATIO: Final = 10.0
@@ -397,10 +397,10 @@ def _torque_zero_drift_nm(candidate_set: CandidateSet) -> float:
     comparison = candidate_set.comparison
     predicted_nm, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
     residual_nm = comparison.torque_nm[comparison.retained] - predicted_nm
-    segment_length = residual_nm.size // _DRIFT_SEGMENTS
+    segment_length = residual_nm.size // _DRIFT_SEGMENT_COUNT
     segment_means_nm = (
-        residual_nm[: _DRIFT_SEGMENTS * segment_length]
-        .reshape(_DRIFT_SEGMENTS, segment_length)
+        residual_nm[: _DRIFT_SEGMENT_COUNT * segment_length]
+        .reshape(_DRIFT_SEGMENT_COUNT, segment_length)
         .mean(axis=1)
     )
     # Expected scatter for white noise with the power of the band's upper half.

@@ -147,7 +147,10 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
     if rough_fit is None:
         return candidate_set
     # The freest structure starts from this fit: its fit without drag may be far off.
-    start_comparison, next_start = rough_fit.objective.comparison, _DragFitStart.of(rough_fit)
+    start_comparison, next_start = (
+        rough_fit.objective.comparison,
+        _DragFitStart.from_refit(rough_fit),
+    )
     for structure_name in (_FREEST_STRUCTURE, _FIRST_STRUCTURE):
         drag_fit = _converged_drag_fit(
             candidate_set, next_start, STRUCTURES[structure_name], start_comparison=start_comparison
@@ -189,7 +192,7 @@ class _DragFitStart:
     has_two_coefficients: bool = False
 
     @classmethod
-    def of(cls, refit: Refit) -> _DragFitStart:
+    def from_refit(cls, refit: Refit) -> _DragFitStart:
         """Return the minimum of a refit as the start of the next fit with drag."""
         structure = refit.objective.unknowns.structure
         has_two_coefficients = len(refit.effect_spectra) > 1

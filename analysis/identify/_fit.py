@@ -291,16 +291,16 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
     """
     unknowns, comparison = objective.unknowns, objective.comparison
     linearisation = objective.linearise(x)
-    projected = objective.project(linearisation, noise.weight)
+    projected_residual = objective.project(linearisation, noise.weight)
     # Where the torque is unknown the residual is 0 and adds nothing to the cost.
     compared_values = round(
         2 * np.sum(noise.is_compared) * comparison.measurement.known_torque_fraction
     )
-    degrees_of_freedom = compared_values - x.size - projected.amplitudes.size
-    residual_variance = projected.cost / degrees_of_freedom
+    degrees_of_freedom = compared_values - x.size - projected_residual.amplitudes.size
+    residual_variance = projected_residual.cost / degrees_of_freedom
     lower_bounds, upper_bounds = unknowns.bounds
     at_bound = (x <= lower_bounds) | (x >= upper_bounds)
-    jacobian = _compared_jacobian(objective, x, projected, noise)
+    jacobian = _compared_jacobian(objective, x, projected_residual, noise)
     covariance, determined_mask = covariance_of_unknowns(jacobian, residual_variance, at_bound)
     unknown_names, plant = unknowns.names, unknowns.plant(x)
     parameter_values = unknowns.parameters(x)
@@ -341,21 +341,21 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
         modes=mode_table(linearisation.poles, covariance),
         ringing=ringing(
             linearisation.poles,
-            projected,
+            projected_residual,
             residual_variance,
             objective.unknown_torques(linearisation) * noise.weight,
             hum_spectra,
         ),
-        cost=projected.cost,
+        cost=projected_residual.cost,
         degrees_of_freedom=degrees_of_freedom,
-        residual=projected.residual,
+        residual=projected_residual.residual,
     )
 
 
 def _compared_jacobian(
     objective: Objective,
     x: NDArray[np.float64],
-    projected: ProjectedResidual,
+    projected_residual: ProjectedResidual,
     noise: NoiseSpectrum,
 ) -> NDArray[np.complex128]:
     """Return the whitened derivatives of the measured torque's spectrum by the unknowns, (k, K).
@@ -364,8 +364,8 @@ def _compared_jacobian(
     """
     comparison, unknowns = objective.comparison, objective.unknowns
     if comparison.measurement.torque_known.all():
-        return projected.jacobian
+        return projected_residual.jacobian
     plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
     unknown_gradient = comparison.gradient_at_unknown_torque(plant, unknowns.gradient_names)
     unknown_jacobian = noise.weight * (parameters_by_unknowns.T @ unknown_gradient)
-    return projected.jacobian - unknown_jacobian
+    return projected_residual.jacobian - unknown_jacobian

@@ -358,7 +358,7 @@ def _impact_torques(comparison: Comparison, impact: RecordedImpact) -> NDArray[n
 def _successive_cost_reductions(
     refit: Refit, unit_torques: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the cost reduction by each torque after the torques in the rows before it, (c,).
+    """Return the cost reduction by each torque in addition to the torques of earlier rows, (c,).
 
     `unit_torques` are torques of unit amplitude at the compared samples, shape (c, samples). All
     free parameters of the fit stay free, to first order.

@@ -138,16 +138,16 @@ class ModalFit(ModalEstimate):
         torque_spectra = list(torque_spectra)
         span, residual = self.derivatives.rows(), self.residual.view(np.float64)
 
-        def whitened(columns: slice) -> NDArray[np.float64]:
+        def whitened_spectra(columns: slice) -> NDArray[np.float64]:
             bins = slice(columns.start // 2, columns.stop // 2)
             spectra = np.array([spectrum[bins] for spectrum in torque_spectra])
             return np.ascontiguousarray(spectra * self.noise.weight[bins]).view(np.float64)
 
         blocks = list(column_blocks(residual.size))
-        coefficients = sum(whitened(columns) @ span[:, columns].T for columns in blocks)
+        coefficients = sum(whitened_spectra(columns) @ span[:, columns].T for columns in blocks)
         projections, squares = np.zeros((2, len(torque_spectra)))
         for columns in blocks:
-            outside_span = whitened(columns) - coefficients @ span[:, columns]
+            outside_span = whitened_spectra(columns) - coefficients @ span[:, columns]
             projections += outside_span @ residual[columns]
             squares += np.einsum("ij,ij->i", outside_span, outside_span)
         cost_reductions: NDArray[np.float64] = projections**2 / np.maximum(
@@ -159,16 +159,16 @@ class ModalFit(ModalEstimate):
         """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
         return np.ascontiguousarray(torque_spectra * self.noise.weight).view(np.float64)
 
-    def outside_span(self, whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+    def outside_span(self, whitened_spectra: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the part of whitened spectra that no parameter of the fit can imitate.
 
         Parameters
         ----------
-        whitened : ndarray, shape (..., 2 K)
+        whitened_spectra : ndarray, shape (..., 2 K)
             Whitened spectra with real and imaginary parts interleaved.
         """
         span = self.derivatives.rows()
-        outside_span: NDArray[np.float64] = whitened - (whitened @ span.T) @ span
+        outside_span: NDArray[np.float64] = whitened_spectra - (whitened_spectra @ span.T) @ span
         return outside_span
 
     def effect_std(self, torque_spectrum: NDArray[np.complex128]) -> float:
@@ -197,12 +197,12 @@ class ModalFit(ModalEstimate):
         prior_std : float
             Standard deviation of the size before the record.
         """
-        whitened = self._whiten(torque_spectrum)
+        whitened_spectrum = self._whiten(torque_spectrum)
         size_variance = 1 / (self.effect_std(torque_spectrum) ** -2 + prior_std**-2)
         damping_variance = np.diag(self.covariance)[
             MODE_CONSTANT_NAMES.index("ln_damping_ratio") :: len(MODE_CONSTANT_NAMES)
         ]
-        added_variance = (self.ln_damping_by_torque @ whitened) ** 2 * size_variance
+        added_variance = (self.ln_damping_by_torque @ whitened_spectrum) ** 2 * size_variance
         std_ratios: NDArray[np.float64] = np.sqrt(1 + added_variance / damping_variance)
         return std_ratios
 
@@ -364,7 +364,7 @@ class _ModalSearch:
         return replace(self, x=minimum.x)
 
     def converge_with_noise(self) -> _ModalSearch:
-        """Return the search after descents, noise and unknown torque have converged together."""
+        """Alternate descents with estimates of noise and unknown torque until all converge."""
         search = self
         for _ in range(_MAX_NOISE_ESTIMATES):
             problem = search.problem()
@@ -491,9 +491,9 @@ class _ModalSearch:
             [problem.for_modes(each.numbers).cost(each.x) - full_cost for each in without_mode]
         )
 
-    def residual_dependence_on_angle(self, whitened: NDArray[np.float64]) -> InputRelation:
+    def residual_dependence_on_angle(self, whitened_residual: NDArray[np.float64]) -> InputRelation:
         """Return the result of a test whether a residual depends linearly on the motor angle."""
-        residual = whitened.view(np.complex128)
+        residual = whitened_residual.view(np.complex128)
         angle_spectrum = self.comparison.spectrum(
             self.comparison.angle_rad[self.comparison.retained]
         )

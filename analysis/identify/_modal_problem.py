@@ -128,7 +128,7 @@ def _ln_damping_by_torque(
 
 
 def _relative_pole(eta: float) -> complex:
-    """Return the pole of a mode over its undamped frequency in rad/s, for the loss factor eta.
+    """Return the pole of a mode with loss factor eta, divided by its undamped frequency in rad/s.
 
     It is the root of ``1 + eta q + q²`` with positive imaginary part.
     """

@@ -126,10 +126,10 @@ class _Mode:
             + self._dampings[1] * self._arms[1]
             + self._tension_arm
         )
-        channel = cmath.exp(-self._delay_s * s)
+        channel_response = cmath.exp(-self._delay_s * s)
         for first, second in lags:
-            channel /= 1 + s * (first + s * second)
-        ln_residue = cmath.log(1j * length_m**3 * self._force**2 / self._slope * channel)
+            channel_response /= 1 + s * (first + s * second)
+        ln_residue = cmath.log(1j * length_m**3 * self._force**2 / self._slope * channel_response)
         self.constants = (
             math.log(s.imag / (2 * math.pi)),
             math.log(-s.real / abs(s)),
@@ -165,9 +165,9 @@ class _Mode:
         slope = (alpha * internal + lambda_ * external + 2 * mass) / s
         strength, time_s = self._relaxation
         if strength:
-            relaxed = strength * time_s / (1 + time_s * s) * self._stiffness
-            stiffness += relaxed * s
-            slope += relaxed / (1 + time_s * s)
+            relaxation_term = strength * time_s / (1 + time_s * s) * self._stiffness
+            stiffness += relaxation_term * s
+            slope += relaxation_term / (1 + time_s * s)
         return stiffness, slope, (internal, external), inertia
 
     def slopes(self) -> Iterator[list[float]]:

@@ -150,7 +150,7 @@ class ModelCheck:
         """
         if self.contradicts_file:
             return tuple(finding for finding in self.findings if finding.kind in _CHANNEL_KINDS)
-        marked = mark_doubtful_findings(
+        marked_findings = mark_doubtful_findings(
             (*self.findings, *self._setting_findings(headline), *effect_findings),
             change_findings,
             self.model_reason,
@@ -163,19 +163,19 @@ class ModelCheck:
             explained=self.residual_tests.is_noise,
         )
         if self.residual_tests.is_noise:
-            return (*impacts, *marked)
+            return (*impacts, *marked_findings)
         residual_finding = unexplained_residual_finding(
             self.residual_tests.whiteness,
             self.residual_tests.input_relation,
             self.candidate_set.best.fit.modes,
             stiffness_step,
         )
-        return (*impacts, *marked, residual_finding)
+        return (*impacts, *marked_findings, residual_finding)
 
     def _setting_findings(self, headline: Headline) -> tuple[Finding, ...]:
         """Return findings on fitted settings, such as the delay, that differ from the file's.
 
-        Return none if the record cannot show such a difference.
+        The result is empty if the record cannot show such a difference.
         """
         if (
             "implausible" in self.finding_kinds

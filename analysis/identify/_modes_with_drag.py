@@ -224,13 +224,13 @@ def modes_that_drag_changes(modal_fit: ModalFit, with_drag: ModalFit) -> tuple[i
     modal_fit, with_drag : ModalFit
         Modes of the same record without and with drag.
     """
-    changed = []
+    changed_numbers = []
     for mode_number in set(modal_fit.visible) & set(with_drag.visible):
-        without = modal_fit.mode(mode_number)
-        change = without.damping_ratio - with_drag.mode(mode_number).damping_ratio
-        if abs(change) > _CHANGED_DAMPING_STDS * without.damping_ratio_std:
-            changed.append(mode_number)
-    return tuple(sorted(changed))
+        mode_without_drag = modal_fit.mode(mode_number)
+        change = mode_without_drag.damping_ratio - with_drag.mode(mode_number).damping_ratio
+        if abs(change) > _CHANGED_DAMPING_STDS * mode_without_drag.damping_ratio_std:
+            changed_numbers.append(mode_number)
+    return tuple(sorted(changed_numbers))
 
 
 def _mode_starts(modal_fit: ModalFit) -> list[tuple[int, float, float]]:

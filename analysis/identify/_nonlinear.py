@@ -205,7 +205,7 @@ class NonlinearForceSpectra:
     ) -> NDArray[np.complex128]:
         """Return the transform of a nonlinear force of unit size, shape (length // 2 + 1,).
 
-        The motion of the mode determines the force.
+        `motion_transform` is the transform of the motion of the mode, which determines the force.
         """
         if force_kind == "quadratic drag":
             speed = self._oversampled_values(motion_transform * self._s)
@@ -308,7 +308,7 @@ def add_nonlinear_forces(
 def _start_candidates(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
     """Return the candidates from which the search for nonlinear forces starts.
 
-    They are the best one and, if its internal order is free, before it those with the order 1.
+    The best candidate is the last. If its internal order is free, those with order 1 come first.
     """
     best_candidate = candidate_set.best
     if "alpha" not in best_candidate.structure.free:

@@ -270,8 +270,8 @@ def unexplained_part(
 ) -> NDArray[np.complex128]:
     """Return the part of whitened spectra that other free terms do not explain, shape (c, K).
 
-    `explaining_spectra`, shape (k, K), are the whitened derivatives by all free parameters and
-    amplitudes.
+    `explaining_spectra`, shape (k, K), are those of the other free terms: whitened derivatives by
+    all free parameters and amplitudes.
     """
     spectrum_norms = np.sqrt(np.sum(np.abs(explaining_spectra) ** 2, axis=1))
     normalized_spectra = (

@@ -342,12 +342,12 @@ class Descent:
     def hum(self) -> tuple[Hum, ...]:
         """Search for hum, a narrow-band disturbance, near the modes of the current beam."""
         comparison = self.objective.comparison
-        at, noise = self.objective.linearise(self.x), self.noise()
-        torque_amplitudes = self.objective.project(at, noise.weight).amplitudes
-        decay_count = count_decay_spectra(at.poles) * (1 + len(comparison.later_decays))
-        decay_spectra = self.objective.unknown_torques(at)[:decay_count]
+        linearisation, noise = self.objective.linearise(self.x), self.noise()
+        torque_amplitudes = self.objective.project(linearisation, noise.weight).amplitudes
+        decay_count = count_decay_spectra(linearisation.poles) * (1 + len(comparison.later_decays))
+        decay_spectra = self.objective.unknown_torques(linearisation)[:decay_count]
         decaying_nm = comparison.in_time(torque_amplitudes[:decay_count] @ decay_spectra)
-        return find_hum_near_modes(comparison, self.plant, at.poles, noise, decaying_nm)
+        return find_hum_near_modes(comparison, self.plant, linearisation.poles, noise, decaying_nm)
 
     def remove_hum(self, tolerance: float) -> Descent:
         """Remove the hum near modes from the data, and fit again. Return `self` without hum."""
@@ -366,18 +366,18 @@ class Descent:
     def noise(self, *, with_lines: bool = False) -> NoiseSpectrum:
         """Return the noise spectrum of the current residual, without the free decay."""
         objective, comparison = self.objective, self.objective.comparison
-        at = objective.linearise(self.x)
+        linearisation = objective.linearise(self.x)
         is_near_mode = None
         if with_lines:
             hz = comparison.frequency_hz
             is_near_mode = np.zeros(hz.size, dtype=bool)
-            for mode_pole in at.poles:
+            for mode_pole in linearisation.poles:
                 mode_width_hz = resonance_half_width_hz(mode_pole, float(hz[1] - hz[0]))
                 is_near_mode |= (
                     np.abs(hz - abs(mode_pole.at_rad_s.imag) / (2 * np.pi)) < mode_width_hz
                 )
         return estimate_noise(
-            objective.project(at, 1.0).residual,
+            objective.project(linearisation, 1.0).residual,
             comparison.frequency_hz,
             comparison.samples,
             comparison.measurement.known_torque_fraction,

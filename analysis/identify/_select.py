@@ -120,7 +120,7 @@ class Selection:
 
     @property
     def fit(self) -> RecordFit:
-        """Return the fit of a beam to the record whose parameter values are reported."""
+        """Return the whole-record fit whose parameter values are reported."""
         return self.headline.fit
 
     @property
@@ -499,7 +499,9 @@ def _fit_freest_with_known_impacts(
         visible_numbers,
         {} if misread_findings else _unidentifiable_orders(candidate_set, visible_numbers),
         unexplained_reason=check.model_reason,
-        both=None if misread_findings else candidate_set.fit_with_both_dampings(candidate_set.best),
+        fit_with_both_dampings=None
+        if misread_findings
+        else candidate_set.fit_with_both_dampings(candidate_set.best),
     )
     beam_test = _uniform_beam_test(measurement, modal_fit)
     reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)

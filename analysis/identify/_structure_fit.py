@@ -107,7 +107,7 @@ class StructureFit:
 
 
 def fit_structure(
-    added: AddedStructure, selection: Selection, fixed: tuple[Setting, ...] = ()
+    added_structure: AddedStructure, selection: Selection, fixed: tuple[Setting, ...] = ()
 ) -> StructureFit | None:
     """Fit the damping structure of a package to the record of a selection.
 
@@ -116,7 +116,7 @@ def fit_structure(
 
     Parameters
     ----------
-    added : AddedStructure
+    added_structure : AddedStructure
         Structure and its package.
     selection : Selection
         Selection among types I to VII, with data and noise spectrum of the record.
@@ -128,7 +128,7 @@ def fit_structure(
     PluginError
         If the code of the package fails, or its damping is not finite somewhere in its range.
     """
-    structure, plugin = added.structure, added.plugin
+    structure, plugin = added_structure.structure, added_structure.plugin
     best = selection.candidates[0]
     if best.effect_count or selection.analysis.comparison.drag is not None:
         return None
@@ -166,7 +166,7 @@ def fit_structure(
                 rough_minimum.x, noise.weight, region, relative_tolerance=_COST_TOLERANCE
             )
             x = minimum.x
-            projected = objective.project(objective.linearise(x), noise.weight)
+            projected_residual = objective.project(objective.linearise(x), noise.weight)
             plant, slopes = unknowns.plant_and_gradient(x)
             loss_factors = tuple(
                 (pole.frequency_hz, plant.loss_factor(abs(pole.at_rad_s)))
@@ -178,7 +178,7 @@ def fit_structure(
     degrees_of_freedom = best.values - x.size - best.fit.ringing.degrees_of_freedom
     at_bound = (x <= region.lower) | (x >= region.upper)
     covariance, determined = covariance_of_unknowns(
-        projected.jacobian, projected.cost / degrees_of_freedom, at_bound
+        projected_residual.jacobian, projected_residual.cost / degrees_of_freedom, at_bound
     )
     stds = np.sqrt(np.diag(slopes @ covariance @ slopes.T))
     parameters = unknowns.parameters(x)
@@ -193,11 +193,13 @@ def fit_structure(
             else None
             for name, std, is_determined in zip(names, stds, determined, strict=True)
         },
-        at_bounds=tuple(name for name, held in zip(names, at_bound, strict=True) if held),
+        at_bounds=tuple(
+            name for name, is_at_bound in zip(names, at_bound, strict=True) if is_at_bound
+        ),
         loss_factors=loss_factors,
         cost=minimum.cost,
         degrees_of_freedom=degrees_of_freedom,
         delta_bic=bic(minimum.cost, best.values, x.size) - best.bic,
         compared_with=best.name,
-        residual=projected.residual,
+        residual=projected_residual.residual,
     )

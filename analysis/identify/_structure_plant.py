@@ -121,9 +121,10 @@ class StructurePlant(Plant):
 class StructureUnknowns(Unknowns):
     """Vector of unknowns of a package's structure: its free parameters, then the settings.
 
-    A logarithmic parameter is its logarithm, another one is relative to its range. Density over
-    stiffness and stiffness are the effective ones, with the real part of the damping at the first
-    two modes, so that a step of a parameter does not move the modes.
+    The unknown of a logarithmic parameter is its logarithm, that of another parameter is its value
+    relative to the range. Density over stiffness and stiffness are effective values, which include
+    the real part of the damping at the first two modes: a step of a parameter then does not move
+    the modes.
     """
 
     decay_poles: tuple[Pole, ...] = ()

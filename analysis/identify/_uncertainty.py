@@ -326,7 +326,7 @@ def _propagated_std(derivatives: NDArray[np.float64], covariance: NDArray[np.flo
 
 def ringing(
     poles: Sequence[Pole],
-    projected: ProjectedResidual,
+    projected_residual: ProjectedResidual,
     residual_variance: float,
     nuisance_spectra: NDArray[np.complex128],
     hum_spectra: NDArray[np.complex128],
@@ -343,13 +343,15 @@ def ringing(
     decay_count = count_decay_spectra(poles)
     nuisance_spectra, decay_amplitudes = (
         nuisance_spectra[:decay_count],
-        projected.amplitudes[:decay_count],
+        projected_residual.amplitudes[:decay_count],
     )
     explained_squares = float(
-        decay_amplitudes @ projected.amplitude_gram[:decay_count, :decay_count] @ decay_amplitudes
+        decay_amplitudes
+        @ projected_residual.amplitude_gram[:decay_count, :decay_count]
+        @ decay_amplitudes
     )
     if len(hum_spectra) and decay_amplitudes.size:
-        decay_free_residual = projected.residual - decay_amplitudes @ nuisance_spectra
+        decay_free_residual = projected_residual.residual - decay_amplitudes @ nuisance_spectra
         best_factors, remaining_squares = _best_combination(
             decay_free_residual, np.concatenate([nuisance_spectra, hum_spectra])
         )

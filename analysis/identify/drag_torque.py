@@ -605,9 +605,9 @@ class DragResponse:
         delay or clamp. A drag torque without this phase would change the frequency instead.
         """
         # The residue of -s⁴ / Z, through the torque channel, is j times a multiple of this.
-        turn = residue / (1j * pole**4 * self.plant.channel_response(pole))
-        turn /= abs(turn)
-        factor: Complex = turn.real + turn.imag * (self.s - pole.real) / pole.imag
+        phasor = residue / (1j * pole**4 * self.plant.channel_response(pole))
+        phasor /= abs(phasor)
+        factor: Complex = phasor.real + phasor.imag * (self.s - pole.real) / pole.imag
         return factor
 
     def _oversampled_values(self, laplace_transform: Complex) -> Real:

@@ -344,7 +344,7 @@ def headline_of_fit(
     order_reasons: Mapping[str, str] = _EMPTY_MAPPING,
     order_intervals: Mapping[str, tuple[float, float]] = _EMPTY_MAPPING,
     unexplained_reason: str | None = None,
-    both: tuple[RecordFit, bool] | None = None,
+    fit_with_both_dampings: tuple[RecordFit, bool] | None = None,
 ) -> Headline:
     """Return the headline of one fit, with flags on the numbers that are not valid.
 
@@ -362,10 +362,10 @@ def headline_of_fit(
         95 % intervals of orders, used instead of those of the fit.
     unexplained_reason : str, optional
         Reason against all numbers.
-    both : tuple of (RecordFit, bool), optional
+    fit_with_both_dampings : tuple of (RecordFit, bool), optional
         Result of `CandidateSet.fit_with_both_dampings`: the fit with both dampings, for the modes.
     """
-    with_both, uses_both = both or (fit, False)
+    with_both, uses_both = fit_with_both_dampings or (fit, False)
     damping_reason = ONE_MODE_REASON if len(visible_numbers) < _MODES_TO_SEPARATE_DAMPINGS else None
     if SECOND_DAMPING_REASON in order_reasons.values():
         damping_reason = SECOND_DAMPING_REASON

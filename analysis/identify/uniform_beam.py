@@ -83,7 +83,7 @@ class UniformBeamProblem:
     """Least-squares fit of a uniform beam's parameters to the measured modal constants.
 
     Unknowns are the contribution of internal damping to the stiffness at the highest visible mode
-    (``ln zeta omega^alpha``) and external damping to the inertia at the lowest
+    (``ln zeta omega^alpha``) and that of external damping to the inertia at the lowest
     (``ln gamma omega^lambda / (rho/EI omega²)``), which depend little on the orders; alpha and
     lambda; the logarithms of rho/EI and EI; and the delay.
 
@@ -132,7 +132,7 @@ class UniformBeamProblem:
         self._whitener = np.linalg.inv(np.linalg.cholesky(self.covariance))
         length_m = nominal.beam.length_m
         z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
-        self.stated_alteration = Alteration.stated(nominal, tilt_deg)
+        self.stated_alteration = Alteration.from_nominal(nominal, tilt_deg)
         self.terms = galerkin_mode_terms(self.stated_alteration, nominal.beam, self.modes)
         constants_by_mode = self.measured.reshape(-1, len(MODE_CONSTANT_NAMES))
         self._omega_rad_s = 2 * np.pi * np.exp(constants_by_mode[:, 0])
