@@ -395,11 +395,11 @@ class Comparison:
         ).recompute_incoherent_torque(plant)
 
     def recompute_incoherent_torque(self, plant: Plant | ModalModel) -> Comparison:
-        """Return the comparison with the torque of the incoherent angle predicted again.
+        """Return the comparison with the torque of the incoherent angle predicted by `plant`.
 
-        That torque, predicted with `plant`, is subtracted from the measured torque. The incoherent
-        angle is the part that does not follow the reference of the motor's controller. Return
-        `self` if the whole angle is coherent with the reference.
+        This torque is subtracted from the measured torque, instead of an earlier prediction. The
+        incoherent angle is the part that does not follow the reference of the motor's controller.
+        Return `self` if the whole angle is coherent with the reference.
         """
         if not isinstance(self.incoherent_rad, np.ndarray):
             return self
@@ -598,10 +598,8 @@ class Comparison:
     def fill_unknown_torque(self, plant: Plant | ModalModel) -> Comparison:
         """Return the comparison with unmeasured torque filled by a plant's prediction.
 
-        The residual at these ticks then is 0.
-
-        After convergence of the fit, the cost has the same minimum as the cost of the known samples
-        alone.
+        The residual at the filled ticks then is 0. After convergence of the fit, the cost has the
+        same minimum as the cost of the known samples alone.
         """
         known_mask = self.measurement.torque_known
         if known_mask.all():

@@ -370,8 +370,8 @@ class Measurement:
     def angle_from_rest(self, highest_hz: float) -> NDArray[np.float64]:
         """Return the motor angle in rad relative to its rest position, gaps interpolated, (n,).
 
-        `highest_hz` is the highest frequency that the angle contains. Where the rest position is
-        unknown, it is the first angle.
+        `highest_hz` is the highest frequency that the angle contains. If the rest position is
+        unknown, the first angle is used.
         """
         filled_angle_rad = interpolate_gaps(
             self.angle_rad, self.angle_known, highest_hz / self.rate_hz

@@ -172,7 +172,7 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
 
 
 def _bic_under_own_noise(refit: Refit) -> float:
-    """Return the BIC of a refit under the noise of its residual, comparable to that of a set."""
+    """Return the BIC of a refit under the noise of its residual, as in `CandidateSet.bic`."""
     noise_power = refit.residual_noise().power[refit.noise.is_compared]
     parameter_count = refit.x.size + len(refit.effect_spectra)
     return float(parameter_count * math.log(2 * noise_power.size) + 2 * np.sum(np.log(noise_power)))

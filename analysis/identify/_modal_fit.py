@@ -403,8 +403,9 @@ class _ModalSearch:
     def is_near_mode(self, *, within_resonance: bool = False) -> NDArray[np.bool_]:
         """Return a mask of the bins in which the residual may belong to a mode, shape (K,).
 
-        They are the bins within a distance from a mode; with `within_resonance`, within half of it.
-        A peak of the noise begins outside of the whole distance, and ends at half of it.
+        They are the bins within a distance that depends on the width of the resonance; with
+        `within_resonance`, within half of this distance. A peak of the noise begins outside of the
+        whole distance, and ends at half of it.
         """
         hz = self.comparison.frequency_hz[:, None]
         mode_hz, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]

@@ -103,8 +103,8 @@ class _LinearSolution:
 class _Uncertainty:
     """Uncertainty of the modal model at a minimum.
 
-    `covariance` is the joint one of frequencies, damping and linear parameters, `span` are
-    orthonormal rows that span all derivatives of the residual, and `ln_damping_by_torque`, shape
+    `covariance` is that of frequencies, damping and linear parameters together. `span` are
+    orthonormal rows that span all derivatives of the residual. `ln_damping_by_torque`, shape
     (n, 2 K), is the derivative of the logarithm of each eta by the whitened torque.
     """
 
@@ -260,7 +260,7 @@ class ModalProblem:
         """Return the whitened spectra that the linear parameters multiply, shape (m, 2 K).
 
         They are those of the numerators of the modes, of the background and of the nuisances, in
-        this order. `further_rows` is the number of rows that are added without values.
+        this order. `further_rows` is the number of rows without values that are appended.
         """
         nuisance_spectra = self._nuisance_spectra(self._poles(x))
         nuisance_start = x.size + BACKGROUND_COEFFICIENTS
@@ -347,7 +347,7 @@ class ModalProblem:
     def residual(
         self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64], model: ModalModel
     ) -> NDArray[np.complex128]:
-        """Return the residual spectrum of a model at a point in N·m, not whitened, shape (K,)."""
+        """Return the residual spectrum of a model in N·m, not whitened, shape (K,)."""
         nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
         poles = self._poles(x)
         comparison = self._comparison

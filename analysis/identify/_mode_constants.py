@@ -171,7 +171,7 @@ class _Mode:
         return stiffness, slope, (internal, external), inertia
 
     def slopes(self) -> Iterator[list[float]]:
-        """Yield the derivatives by the seven parameters of each of the four constants."""
+        """Yield, for each of the four constants, its derivatives by the seven parameters."""
         s, dstiffness, force, inertia = self._pole, self._slope, self._force, self._inertia
         log_s, mass = cmath.log(s), inertia * self._mass
         # Derivatives of dynamic stiffness, its slope and the force by the parameters at constant s

@@ -157,7 +157,7 @@ class TorquePredictor:
         fine_indices: NDArray[np.intp],
         wrt: Sequence[str] = (),
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the torque in N·m predicted at fine samples of a higher rate, and derivatives.
+        """Return the torque in N·m at samples of a higher rate, and its derivatives.
 
         Parameters
         ----------

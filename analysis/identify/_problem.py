@@ -219,7 +219,7 @@ class Objective:
     ) -> tuple[Objective, Minimum]:
         """Return the minimum of the cost reached by descents from `start_unknowns`.
 
-        The descent is repeated while filling unknown torques moves the minimum.
+        The descent is repeated until filling the unknown torques no longer moves the minimum.
 
         Parameters
         ----------
@@ -268,7 +268,7 @@ class Objective:
 
 
 def _as_real_rows(complex_rows: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return a real view of complex rows, parts interleaved, with the shape (..., 2 K).
+    """Return complex rows as real ones, real and imaginary parts interleaved, shape (..., 2 K).
 
     Products of such rows are the real parts of complex products, at half the cost.
     """

@@ -142,7 +142,7 @@ class RecordModel:
 
 
 def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, float]) -> RecordModel:
-    """Fit the modal model of a record, with the small effects and the drag that it suggests.
+    """Fit the modal model of a record, with a small effect and drag if the record suggests them.
 
     The candidates remain those without effects.
     """
@@ -359,7 +359,7 @@ def _with_small_effect(
 
 
 def _with_fitted_candidates(model: RecordModel) -> RecordModel:
-    """Refit the candidates with the drag or the large small effect of the model, if it has one."""
+    """Refit the candidates with the drag of the model, or with its small effect if it is large."""
     linear_candidates, modes_with_drag = model.linear_candidates, model.modes_with_drag
     if modes_with_drag is not None:
         with_drag = replace(linear_candidates, comparison=modes_with_drag.comparison)

@@ -27,7 +27,7 @@ class FitWithResidual(Protocol):
 
     @property
     def residual(self) -> NDArray[np.complex128]:
-        """Whitened spectrum of the residual, shape (K,)."""
+        """Return the whitened spectrum of the residual, shape (K,)."""
 
 
 @dataclass(frozen=True, slots=True)

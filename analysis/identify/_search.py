@@ -325,9 +325,9 @@ class Descent:
         return self.objective.normal_equations(self.x, noise.weight).cost
 
     def with_reestimated_angle(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
-        """Re-estimate the motor angle from the reference angle, and descend until it converges.
+        """Re-estimate the part of the angle that follows the reference, and descend; repeat both.
 
-        Return `self` if it has converged already.
+        Return `self` if this part of the angle has converged already.
         """
         descent = self
         for _ in range(MAX_ANGLE_REESTIMATES):
@@ -340,7 +340,7 @@ class Descent:
         return descent
 
     def hum(self) -> tuple[Hum, ...]:
-        """Search for hum, a narrow-band disturbance, near the modes of the current beam."""
+        """Return the hum (narrow-band disturbance) that is found near modes of the current beam."""
         comparison = self.objective.comparison
         linearisation, noise = self.objective.linearise(self.x), self.noise()
         torque_amplitudes = self.objective.project(linearisation, noise.weight).amplitudes
@@ -350,7 +350,7 @@ class Descent:
         return find_hum_near_modes(comparison, self.plant, linearisation.poles, noise, decaying_nm)
 
     def remove_hum(self, tolerance: float) -> Descent:
-        """Remove the hum near modes from the data, and fit again. Return `self` without hum."""
+        """Remove the hum near modes from the data, and fit again; return `self` if none exists."""
         descent = self
         for _ in range(_MAX_HUM_SEARCHES):
             hum = descent.hum()

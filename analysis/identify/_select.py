@@ -373,7 +373,7 @@ def _select_with_known_impacts(
 def _uniform_beam_test(
     measurement: Measurement, modal_fit: ModalFit | None
 ) -> UniformBeamTest | None:
-    """Test whether a uniform beam predicts the measured modes. Return None without modal model."""
+    """Test whether a uniform beam predicts the measured modes; None if there is no modal model."""
     if modal_fit is None:
         return None
     return uniform_beam_test(modal_fit, measurement.nominal, measurement.axis_tilt_deg)

@@ -50,7 +50,7 @@ class StructurePlant(Plant):
     def torque_spectra(
         self, s: NDArray[np.complex128], wrt: Sequence[str], angle_spectrum: NDArray[np.complex128]
     ) -> NDArray[np.complex128]:
-        """Return the transforms of the torque and its derivatives, as `ResponseGrid.evaluate`.
+        """Return the transforms of the torque and its derivatives, like `ResponseGrid.evaluate`.
 
         Parameters
         ----------

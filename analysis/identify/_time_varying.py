@@ -371,8 +371,8 @@ def _hub_angle(
 ) -> NDArray[np.float64]:
     """Return the angle of a hub that starts at 0 and follows a shaft with backlash, shape (n,).
 
-    At each sample the shaft limits the last angle of the hub to a range about its own. The limits
-    of successive samples are combined until a single angle remains.
+    At each sample the last angle of the hub is limited to a range about the angle of the shaft. The
+    limits of successive samples are combined until a single angle remains.
     """
     lowest_rad, highest_rad = (
         shaft_angle_rad - half_backlash_rad,

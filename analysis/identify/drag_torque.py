@@ -95,7 +95,7 @@ _DECREASING_EXPONENT: Final = 1 / 3
 
 
 class DragError(ArithmeticError):
-    """The drag is too large, or the beam too light, for a stable simulation in time steps."""
+    """Error if drag is too large, or the beam too light, for a stable simulation in time steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +158,7 @@ class DragTorque:
     def ln_density_derivative(self) -> Real:
         """Return the derivative of the drag torque by ln(mass per length), in N·m, shape (m,).
 
-        Poles and drag law are constant.
+        Poles and drag law are held constant.
         """
         law_coefficients = np.array([self.law.constant_m, self.law.decreasing_part])
         torque_derivative: Real = self.torque_nm - law_coefficients @ self.law_derivatives
@@ -233,7 +233,7 @@ class DragResponse:
         self._speed_transform = s * angle_transform
 
     def first_order_torque(self) -> Real:
-        """Return drag torque over C_D d in the limit of small drag, in N, shape (m,).
+        """Return the drag torque divided by C_D d in the limit of small drag, in N, shape (m,).
 
         C_D d is drag coefficient times diameter.
         """

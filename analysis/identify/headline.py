@@ -232,7 +232,7 @@ class Headline(Estimates):
 
     @property
     def flags(self) -> dict[str, str]:
-        """Return the reason why a parameter is not valid, for each flagged parameter, by name."""
+        """Return the reasons why flagged parameters are not valid, by parameter name."""
         return {name: each.flag for name, each in self.parameters.items() if each.flag}
 
     @property

@@ -292,7 +292,7 @@ def _reason_undetermined(estimate: TolerantEstimate, parameter_name: str) -> str
 def is_order_identifiable(estimate: TolerantEstimate, order_name: str) -> bool:
     """Return whether the modes determine a damping order.
 
-    Its 95 % interval must be narrower than a quarter of its range, and its damping significant.
+    Its 95 % interval must be narrower than a quarter of its range, and the damping significant.
 
     Parameters
     ----------

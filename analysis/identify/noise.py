@@ -82,7 +82,7 @@ class Hum:
         return NoiseLine(self.frequency_hz, float(abs(self.phasor_nm)))
 
     def torque(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the torque of the hum in N·m at times since the first compared sample."""
+        """Return the torque of the hum in N·m at given times since the first compared sample."""
         phase_rotation = np.exp(2j * np.pi * self.frequency_hz * time_s)
         torque_nm: NDArray[np.float64] = (self.phasor_nm * phase_rotation).real
         return torque_nm

@@ -389,7 +389,7 @@ class Unknowns:
 
 
 def _ln_damping_size(ln_loss: float, order: float) -> tuple[float, float]:
-    """Return ``ln size`` of a damping with a given loss, and its derivative by the order."""
+    """Return ``ln z`` or ``ln g`` of a damping with a given loss, and its slope over the order."""
     order_phase_rad = _QUARTER_TURN_RAD * order
     return ln_loss - math.log(math.sin(order_phase_rad)), -_QUARTER_TURN_RAD / math.tan(
         order_phase_rad

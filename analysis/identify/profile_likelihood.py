@@ -390,10 +390,10 @@ class OrderProfiler:
             self._extend(direction)
 
     def extend_from_candidates(self) -> None:
-        """Extend the profile from candidates that fit about as well with an order outside of it.
+        """Extend the profile from candidates that fit about as well with a very different order.
 
-        The order is outside of the 95 % interval; for most of these candidates it is fixed at 1. A
-        barrier may separate it from the minimum.
+        The order is outside of the 95 % interval; most of these candidates fix it at 1. A barrier
+        may separate it from the minimum.
         """
         damping_coefficient, free_parameters = COEFFICIENT_OF[self.order], set(self.structure.free)
         for candidate in self._candidate_set.candidates:

@@ -151,7 +151,7 @@ def too_few_modes(structure: Structure, mode_count: int) -> str | None:
 
 
 def deviance_of_order_one(order_profile: LikelihoodProfile) -> float:
-    """Return the deviance of order 1 above the lowest, or infinity outside of the profile.
+    """Return the deviance at order 1 minus the lowest one; infinity if the profile ends before 1.
 
     Parameters
     ----------
