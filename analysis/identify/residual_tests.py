@@ -321,7 +321,7 @@ def harmonics(
     rate_hz: float,
     band_hz: tuple[float, float],
 ) -> tuple[Harmonic, ...]:
-    """Test a residual for harmonics of a sweep. Return no test if the angle is no sweep.
+    """Test a residual for harmonics of a sweep; return an empty tuple if the angle is no sweep.
 
     Parameters
     ----------
