@@ -286,7 +286,8 @@ def split_groups(
 ) -> tuple[tuple[int, ...], ...]:
     """Split estimates at clear gaps into groups of session indices, the lowest values first.
 
-    There are at most half as many groups as sessions, so that at least one group has two members.
+    There are at most half as many groups as sessions, rounded up, so that one group or more has two
+    members.
     A gap is clear if it exceeds `_CLEAR_GAP_STDS` times the standard deviation within the groups,
     or the standard deviation of a single session if this is larger. Without clear gaps, there are
     no groups.
