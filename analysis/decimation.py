@@ -104,8 +104,8 @@ def _interpolation_weights(
 
 def runs_of_true(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the start index of each run of True in a mask, and the index after its end."""
-    outside = np.zeros(1, np.int8)  # of the mask's own size: a long record has many values
-    run_edges = np.diff(np.concatenate((outside, mask.astype(np.int8), outside)))
+    edge_value = np.zeros(1, np.int8)  # of the mask's own size: a long record has many values
+    run_edges = np.diff(np.concatenate((edge_value, mask.astype(np.int8), edge_value)))
     return np.flatnonzero(run_edges == 1), np.flatnonzero(run_edges == -1)
 
 
@@ -115,7 +115,7 @@ _STOP_BAND_ATTENUATION_DB: Final = 100.0
 """Attenuation of the decimation filter in its stop band, in decibels."""
 
 _FACTOR_TOLERANCE: Final = 1e-9
-"""Tolerance for the rounding of a ratio of rates."""
+"""Tolerance for the rounding error of the ratio of two sampling rates."""
 
 _MIN_RATE_OVER_BAND: Final = 2.4
 """Minimum decimated sampling rate relative to the highest frequency: at lower rates the decimation

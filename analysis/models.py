@@ -164,11 +164,11 @@ class Structure:
                 for factor in self.factors(s, values)
             )
         if not (np.isfinite(elastic).all() and np.isfinite(external).all()):
-            raise ValueError(f"its damping is not finite at {described(values)}.")
+            raise ValueError(f"its damping is not finite at {parameters_text(values)}.")
         return elastic, external
 
 
-def described(values: Mapping[str, float]) -> str:
+def parameters_text(values: Mapping[str, float]) -> str:
     """Return parameters as a text, such as ``zeta = 7e-05, alpha = 1``."""
     return ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
 
@@ -181,7 +181,7 @@ def _fractional_factors(s: NDArray[np.complex128], values: Mapping[str, float]) 
     )
 
 
-def _fractional(name: str, description: str, fixed_values: dict[str, float]) -> Structure:
+def _fractional_structure(name: str, description: str, fixed_values: dict[str, float]) -> Structure:
     """Return a structure of fractional damping with given fixed parameters."""
     return Structure(
         name,
@@ -192,25 +192,33 @@ def _fractional(name: str, description: str, fixed_values: dict[str, float]) -> 
     )
 
 
-_NO_INTERNAL: Final = {"zeta": 0.0, "alpha": 0.0}
-"""Parameter values of a structure without internal damping."""
-_NO_EXTERNAL: Final = {"gamma": 0.0, "lambda": 0.0}
-"""Parameter values of a structure without external damping."""
+_NO_INTERNAL_DAMPING: Final = {"zeta": 0.0, "alpha": 0.0}
+"""Parameter values that mean no internal damping."""
+_NO_EXTERNAL_DAMPING: Final = {"gamma": 0.0, "lambda": 0.0}
+"""Parameter values that mean no external damping."""
 
-UNDAMPED: Final = _fractional("undamped", "No damping", _NO_INTERNAL | _NO_EXTERNAL)
+UNDAMPED: Final = _fractional_structure(
+    "undamped", "No damping", _NO_INTERNAL_DAMPING | _NO_EXTERNAL_DAMPING
+)
 """Structure without damping: only the parameters of beam and rig are fitted."""
 
 STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
     {
         structure.name: structure
         for structure in (
-            _fractional("I", "Internal damping only", {"alpha": 1.0, **_NO_EXTERNAL}),
-            _fractional("II", "External damping only", {**_NO_INTERNAL, "lambda": 1.0}),
-            _fractional("III", "Internal and external damping", {"alpha": 1.0, "lambda": 1.0}),
-            _fractional("IV", "Internal damping only", _NO_EXTERNAL),
-            _fractional("V", "External damping only", _NO_INTERNAL),
-            _fractional("VI", "Internal and external damping", {}),
-            _fractional("VII", "Internal and external damping", {"alpha": 1.0}),
+            _fractional_structure(
+                "I", "Internal damping only", {"alpha": 1.0, **_NO_EXTERNAL_DAMPING}
+            ),
+            _fractional_structure(
+                "II", "External damping only", {**_NO_INTERNAL_DAMPING, "lambda": 1.0}
+            ),
+            _fractional_structure(
+                "III", "Internal and external damping", {"alpha": 1.0, "lambda": 1.0}
+            ),
+            _fractional_structure("IV", "Internal damping only", _NO_EXTERNAL_DAMPING),
+            _fractional_structure("V", "External damping only", _NO_INTERNAL_DAMPING),
+            _fractional_structure("VI", "Internal and external damping", {}),
+            _fractional_structure("VII", "Internal and external damping", {"alpha": 1.0}),
         )
     }
 )
@@ -271,7 +279,7 @@ def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[n
                 f"{omega_rad_s.shape} frequencies; it must give one value for each."
             )
     else:
-        p = omega_rad_s ** _exponent(weighting)
+        p = omega_rad_s ** _weighting_exponent(weighting)
     weight_sum = float(p.sum())
     if not (math.isfinite(weight_sum) and weight_sum > 0 and float(p.min()) >= 0):
         raise WeightingError(
@@ -297,11 +305,11 @@ def weighting_name(weighting: Weighting) -> str:
     """
     if callable(weighting):
         return str(getattr(weighting, "__name__", type(weighting).__name__))
-    _exponent(weighting)
+    _weighting_exponent(weighting)
     return weighting
 
 
-def _exponent(weighting: str) -> float:
+def _weighting_exponent(weighting: str) -> float:
     """Return the exponent K of a named weighting omega^K; raise if the name is not valid."""
     if weighting == "const":
         return 0.0

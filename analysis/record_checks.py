@@ -49,7 +49,7 @@ MAX_AXIS_TILT_DEG: Final = 90.0
 MAX_UNCERTAINTY_PERCENT: Final = 50.0
 """Largest relative standard uncertainty that a file may state."""
 MAX_UNIFORMITY_PERCENT: Final = 10.0
-"""Largest deviation of mode frequencies that a model of a uniform beam allows."""
+"""Largest deviation of mode frequencies from a uniform beam's for which its model is used."""
 _DEFAULT_UNIFORMITY_PERCENT: Final = 0.1
 """Deviation of mode frequencies of a carefully made antenna."""
 _FIRST_EIGENVALUE: Final = 1.8751040687119611
@@ -265,7 +265,7 @@ def stated_uncertainty(session: Session) -> dict[str, float]:
 
 
 def stated_uniformity(session: Session) -> float:
-    """Return the relative standard deviation of mode frequencies from those of a uniform beam.
+    """Return the standard deviation of mode frequencies from a uniform beam's, relative to these.
 
     If not stated, it is 0.001, which is typical of a carefully made antenna.
 
@@ -449,7 +449,7 @@ def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
 
 
 def check_fillable(
-    path: Path, channel: str, unknown: NDArray[np.bool_], first_tick: int, rate_hz: float
+    path: Path, channel: str, is_unknown: NDArray[np.bool_], first_tick: int, rate_hz: float
 ) -> None:
     """Raise if too many samples of a channel in the sweep would have to be interpolated.
 
@@ -461,19 +461,19 @@ def check_fillable(
         File that messages name.
     channel : str
         Name of the channel in messages.
-    unknown : ndarray of bool, shape (n,)
-        Samples of the sweep without a new value.
+    is_unknown : ndarray of bool, shape (n,)
+        Whether each sample of the sweep has no new value.
     first_tick : int
         First tick of the sweep.
     rate_hz : float
         Sampling rate.
     """
     fraction_message = unknown_fraction_message(
-        f"the {channel} in the sweep", int(unknown.sum()), len(unknown)
+        f"the {channel} in the sweep", int(is_unknown.sum()), len(is_unknown)
     )
     if fraction_message:
         raise RecordError(f"{path}: {fraction_message}")
-    gap_ticks, gap_start = longest_run(unknown)
+    gap_ticks, gap_start = longest_run(is_unknown)
     if gap_ticks > MAX_GAP_S * rate_hz:
         raise RecordError(
             f"{path}: {gap_ticks} ticks of the {channel} in a row are missing or stale from tick "

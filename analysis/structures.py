@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from analysis.models import STRUCTURES, Structure, described
+from analysis.models import STRUCTURES, Structure, parameters_text
 from rigd.beam import PARAMETERS, Parameter
 from rigd.plugins import Plugin, Registry, load_declaration, plugin_errors
 from rigd.printable import listed, printable
@@ -73,13 +73,13 @@ def _check_damping(structure: Structure, values: Mapping[str, float]) -> None:
         if gains.size:
             raise ValueError(
                 f"its {name} gains energy at {_CHECKED_OMEGA_RAD_S[gains[0]]:.3g} rad/s with "
-                f"{described(values)}: the imaginary part is negative."
+                f"{parameters_text(values)}: the imaginary part is negative."
             )
-    mirrored = structure.finite_factors(s.conj(), values)
-    for factor, at_conjugate in zip(factors, mirrored, strict=True):
+    conjugate_factors = structure.finite_factors(s.conj(), values)
+    for factor, at_conjugate in zip(factors, conjugate_factors, strict=True):
         if not np.allclose(at_conjugate, factor.conj(), rtol=1e-9, atol=0.0):
             raise ValueError(
-                f"its damping is not real in time with {described(values)}: at the conjugate "
+                f"its damping is not real in time with {parameters_text(values)}: at the conjugate "
                 "of s it must be the conjugate, which no causal force violates."
             )
 

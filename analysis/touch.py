@@ -147,7 +147,7 @@ class SessionTouches:
         Session file.
     touches
         Touches in the order of time.
-    found
+    detection_source
         Where touches were detected: in the control ``loop``, or in the ``record`` by this analysis.
     model
         Model of the beam used for the estimates.
@@ -163,7 +163,7 @@ class SessionTouches:
 
     path: Path
     touches: tuple[Touch, ...]
-    found: str
+    detection_source: str
     model: TouchModel
     rate_hz: float
     has_shear: bool
@@ -353,7 +353,7 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
     angle_delay_s = stated_delay_s(session, "angle_delay_s")
-    stated = Plant(
+    undamped_plant = Plant(
         beam,
         Damping(),
         delay_s=stated_delay_s(session, "torque_delay_s") - angle_delay_s,
@@ -361,7 +361,7 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
     )
     sensor_filter = _sensor_filter(session, rate_hz)
     if model_path is not None:
-        return TouchModel.from_analysis(model_path, stated, angle_delay_s, sensor_filter)
+        return TouchModel.from_analysis(model_path, undamped_plant, angle_delay_s, sensor_filter)
     attached_files = (
         session.attachments.get(attachment_name, b"") for attachment_name in _DAMPING_ATTACHMENTS
     )
@@ -371,7 +371,9 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
             f"{session.path}: no profile.toml with [beam.damping] is attached, so the damping is "
             "not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
         )
-    return TouchModel.assumed(replace(stated, damping=damping), angle_delay_s, sensor_filter)
+    return TouchModel.assumed(
+        replace(undamped_plant, damping=damping), angle_delay_s, sensor_filter
+    )
 
 
 def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:

@@ -180,7 +180,7 @@ def session_command(
         # The file is written before any output, because the streams may be closed.
         write_new(outputs.json, document_text(results_document), overwrite=outputs.overwrite)
     console = outputs.console()
-    _print_tables(console, record_results, single=len(files) == 1, verbose=outputs.verbose)
+    _print_tables(console, record_results, is_single_file=len(files) == 1, verbose=outputs.verbose)
     if outputs.json_to_stdout:
         typer.echo(document_text(results_document, ascii_only=True), nl=False)
     elif outputs.json is not None:
@@ -198,7 +198,7 @@ def session_command(
 
 
 def _print_tables(
-    console: Console, record_results: Sequence[RecordResult], *, single: bool, verbose: bool
+    console: Console, record_results: Sequence[RecordResult], *, is_single_file: bool, verbose: bool
 ) -> None:
     """Print the tables of a single file, or a summary of several files."""
     from analysis.report import result_text, shown_warnings, summary_table, warning_lines
@@ -206,7 +206,7 @@ def _print_tables(
     welch_results = [
         record_result for record_result in record_results if record_result.welch is not None
     ]
-    if single:
+    if is_single_file:
         for record_result in record_results:
             console.print(result_text(record_result, verbose=verbose))
     elif not welch_results:

@@ -54,9 +54,9 @@ _FEW_POINTS: Final = 800
 _REFINED_MINIMA: Final = 3
 """Number of minima that are refined with all points."""
 _ROUGH_TOLERANCE: Final = 1e-5
-"""Relative tolerance of the first descents."""
+"""Relative cost reduction in a step below which the first descents end."""
 _REFINED_TOLERANCE: Final = 1e-12
-"""Relative tolerance of the refined minima."""
+"""Relative cost reduction in a step below which the refinement of a minimum ends."""
 _SAME_MINIMUM_DISTANCE: Final = 0.02
 """Difference in an unknown above which two descents count as ended at different minima."""
 

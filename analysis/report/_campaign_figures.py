@@ -154,7 +154,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
             estimate.name,
             parameter,
             panel_axes,
-            reported=parameter.name not in not_reported,
+            is_reported=parameter.name not in not_reported,
         )
         if panel_number + _PANELS_PER_ROW >= len(estimate.parameters):
             panel_axes.set_xlabel("Session", labelpad=1)
@@ -175,12 +175,12 @@ def _draw_parameter_panel(
     parameter: PooledParameter,
     panel_axes: Axes,
     *,
-    reported: bool,
+    is_reported: bool,
 ) -> None:
     """Draw the sessions' estimates of one parameter, and the pooled value.
 
     In the background are the interval of the pooled value and the interval in which the next
-    session's estimate is expected. `reported`: whether the parameter is a reported result.
+    session's estimate is expected. `is_reported`: whether the parameter is a reported result.
     """
     parameter_symbol, display_factor, _ = label(parameter.name)
     session_positions, session_values, half_widths = [], [], []
@@ -198,10 +198,12 @@ def _draw_parameter_panel(
     )
     panel_axes.axhspan(
         *(display_factor * end for end in parameter.interval),
-        color=INTERVAL_COLOR if reported else style.LIGHT_GREY,
+        color=INTERVAL_COLOR if is_reported else style.LIGHT_GREY,
         zorder=0.6,
     )
-    session_color, pooled_color = (style.INK, style.BLUE) if reported else (style.GREY, style.GREY)
+    session_color, pooled_color = (
+        (style.INK, style.BLUE) if is_reported else (style.GREY, style.GREY)
+    )
     panel_axes.axhline(display_factor * parameter.value, color=pooled_color)
     panel_axes.errorbar(
         session_positions,
@@ -212,7 +214,7 @@ def _draw_parameter_panel(
         color=session_color,
         linewidth=0.8,
     )
-    mark_text = "" if reported else NOT_REPORTED_MARK
+    mark_text = "" if is_reported else NOT_REPORTED_MARK
     mark_text += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
     p_value_text = f"p = {probability(parameter.chance)}".replace("= <", "<")
     panel_axes.set_title(f"{parameter_symbol}{mark_text}   {p_value_text}")

@@ -164,11 +164,11 @@ def sessions_welch_table(campaign: CampaignResult) -> Table:
             "at_bounds": " ".join(model.fit.at_bounds),
             **{
                 f"nominal_{index_name}": index_value
-                for index_name, index_value in asdict(nominal.indices[session_index]).items()
+                for index_name, index_value in asdict(nominal_model.indices[session_index]).items()
             },
         }
         for session_index, session in enumerate(campaign.sessions)
-        for model, nominal in zip(session.welch_models, campaign.nominal, strict=True)
+        for model, nominal_model in zip(session.welch_models, campaign.nominal, strict=True)
     ]
     return _file_only_table("sessions_welch", table_rows)
 

@@ -309,14 +309,19 @@ def save_pictures(
     images = _draw_in_two_processes(illustrations, formats, on_step)
     pictures = []
     for illustration in illustrations:
-        rendered = images[illustration.name]
+        rendered_images = images[illustration.name]
         for file_format in formats:
             # The suffix is appended, because a name may contain dots.
-            write_new(folder / f"{illustration.name}.{file_format}", rendered[file_format])
-        has_small_svg = "svg" in rendered and len(rendered["svg"]) <= _MAX_SVG_BYTES
+            write_new(folder / f"{illustration.name}.{file_format}", rendered_images[file_format])
+        has_small_svg = "svg" in rendered_images and len(rendered_images["svg"]) <= _MAX_SVG_BYTES
         page_format: FigureFormat = "svg" if has_small_svg else "png"
         pictures.append(
-            Picture(illustration.name, illustration.description, rendered[page_format], page_format)
+            Picture(
+                illustration.name,
+                illustration.description,
+                rendered_images[page_format],
+                page_format,
+            )
         )
     return pictures
 
@@ -350,14 +355,14 @@ def _images(illustration: Illustration, formats: Collection[FigureFormat]) -> Im
     """Return a figure's images by file format: the requested ones, and one for the page."""
     with figure_style():
         figure = illustration.draw()
-        rendered: Images = {
+        rendered_images: Images = {
             file_format: render_figure(figure, file_format) for file_format in formats
         }
-        if not {"svg", "png"} & rendered.keys():
-            rendered["svg"] = render_figure(figure, "svg")
-        if len(rendered.get("svg", b"")) > _MAX_SVG_BYTES and "png" not in rendered:
-            rendered["png"] = render_figure(figure, "png")
-    return rendered
+        if not {"svg", "png"} & rendered_images.keys():
+            rendered_images["svg"] = render_figure(figure, "svg")
+        if len(rendered_images.get("svg", b"")) > _MAX_SVG_BYTES and "png" not in rendered_images:
+            rendered_images["png"] = render_figure(figure, "png")
+    return rendered_images
 
 
 # Lines

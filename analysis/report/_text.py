@@ -320,7 +320,7 @@ def _loss_text(loss_factor: ReportedLossFactor) -> str:
 
 
 def _coefficient_is_flagged(headline: Headline, loss_factor: ReportedLossFactor) -> bool:
-    """Return whether the coefficient of a damping has a flag: it describes only this fit."""
+    """Return whether a damping's coefficient is flagged as not a property of the antenna."""
     return headline.parameters[_DAMPING_SYMBOLS[loss_factor.damping][2]].flag is not None
 
 

@@ -132,7 +132,9 @@ def session_lines(session: SessionTouches) -> list[str]:
         if touch_count == 1
         else f"{touch_count} touches"
     )
-    detection_phrase = "during the session" if session.found == "loop" else "in the record"
+    detection_phrase = (
+        "during the session" if session.detection_source == "loop" else "in the record"
+    )
     detection_text = f", detected {detection_phrase}" if touch_count else ""
     validity_text = f" {session.validity.sentence}" if touch_count else ""
     return [
@@ -171,7 +173,7 @@ def touches_document(
             "touches": [
                 {
                     "file": str(session.path),
-                    "detected": session.found,
+                    "detected": session.detection_source,
                     "validity": session.validity.as_json(),
                     **touch.as_dict(),
                 }
