@@ -197,7 +197,7 @@ class Comparison:
             decays=DecaySpectra(samples, decimation.rate_hz, omega_rad_s),
         )
         gap_end_s = [
-            gap_end / measurement.rate_hz - comparison.first_s for _, gap_end in angle_gaps
+            gap_end / measurement.rate_hz - comparison.first_sample_s for _, gap_end in angle_gaps
         ]
         later_decays = tuple(
             LaterDecaySpectra(
@@ -249,10 +249,10 @@ class Comparison:
 
     def times_s(self) -> NDArray[np.float64]:
         """Return the times of the compared samples since the record's first tick, (samples,)."""
-        return self.first_s + np.arange(self.samples) / self.decimation.rate_hz
+        return self.first_sample_s + np.arange(self.samples) / self.decimation.rate_hz
 
     @property
-    def first_s(self) -> float:
+    def first_sample_s(self) -> float:
         """Return the time in seconds from the record's first tick to the first compared sample."""
         return float(self.retained.start - self.decimation.reach) / self.decimation.rate_hz
 
@@ -462,8 +462,8 @@ class Comparison:
         """
         with_new_hum = replace(self, hum=hum)
         unknown_indices = self._decimated_indices(~self.measurement.torque_known)
-        first_s = self.retained.start / self.decimation.rate_hz
-        unknown_times_s = unknown_indices / self.measurement.rate_hz - first_s
+        first_sample_s = self.retained.start / self.decimation.rate_hz
+        unknown_times_s = unknown_indices / self.measurement.rate_hz - first_sample_s
         return with_new_hum._remove_torque(
             with_new_hum.hum_nm - self.hum_nm,
             with_new_hum._hum_torque_at(unknown_times_s) - self._hum_torque_at(unknown_times_s),

@@ -58,7 +58,7 @@ class RecordedImpact:
 
     Attributes
     ----------
-    first_s, last_s : float
+    start_s, end_s : float
         Beginning and end of the contact, since the record's first tick.
     start_uncertainty_s : float
         Uncertainty of the beginning.
@@ -70,8 +70,8 @@ class RecordedImpact:
         Largest torque within one second from the beginning.
     """
 
-    first_s: float
-    last_s: float
+    start_s: float
+    end_s: float
     start_uncertainty_s: float
     poles_rad_s: tuple[complex, ...]
     sizes: tuple[float, ...] = ()
@@ -88,7 +88,7 @@ class RecordedImpact:
         time_s : ndarray, shape (n,)
             Times since the record's first tick.
         """
-        since_s = time_s - self.first_s
+        since_s = time_s - self.start_s
         has_begun = since_s > -_START_TOLERANCE_S
         since_s = np.where(has_begun, since_s, 0.0)
         decay_rows = []
@@ -118,9 +118,7 @@ class RecordedImpact:
         ndarray, shape (c, n)
         """
         half_period_s = 0.5 / rate_hz
-        in_contact = (time_s > self.first_s - half_period_s) & (
-            time_s < self.last_s - half_period_s
-        )
+        in_contact = (time_s > self.start_s - half_period_s) & (time_s < self.end_s - half_period_s)
         contact_indices = np.flatnonzero(in_contact)
         single_samples = np.zeros((contact_indices.size, time_s.size))
         single_samples[np.arange(contact_indices.size), contact_indices] = 1.0

@@ -14,8 +14,8 @@ The first four follow from a fit's unknowns. The drag is free: its spectra are p
 those of a free decay. Fits and computations of the drag torque alternate until they agree.
 
 Without drag a resonance peak grows without limit as the damping falls. With drag it hardly grows:
-to second order in a pole, the changes of the linear torque and of the torque by drag cancel. So the
-linear torque counts to first order in the poles only, and its change beyond that is subtracted.
+to second order in a pole, the changes of the linear torque and of the torque by drag nearly cancel.
+So the linear torque counts to first order in the poles only. Its change beyond that is subtracted.
 """
 
 from __future__ import annotations

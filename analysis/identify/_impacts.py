@@ -245,7 +245,7 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
         yield Finding(
             kind="knock",
             sentence=(
-                f"The beam was struck at {impact.first_s:.2f} s (to within "
+                f"The beam was struck at {impact.start_s:.2f} s (to within "
                 f"{start_uncertainty_s:.2g} s): {1e3 * impact.largest_nm:.3g} mN·m in the torque, "
                 "and from then on the free decay of its modes. "
                 + (
@@ -254,8 +254,8 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
                     else "It was fitted too, but is not all that is in the record."
                 )
             ),
-            value=impact.first_s,
-            interval=(impact.first_s - start_uncertainty_s, impact.first_s + start_uncertainty_s),
+            value=impact.start_s,
+            interval=(impact.start_s - start_uncertainty_s, impact.start_s + start_uncertainty_s),
             unit="s",
             remedy="Keep clear of the beam while it is recorded.",
         )
@@ -342,8 +342,8 @@ def _impact_between(refit: Refit, first_sample: int, end_sample: int) -> Recorde
     rate_hz = comparison.decimation.rate_hz
     poles = comparison.poles(refit.plant)
     return RecordedImpact(
-        first_s=comparison.first_s + first_sample / rate_hz,
-        last_s=comparison.first_s + end_sample / rate_hz,
+        start_s=comparison.first_sample_s + first_sample / rate_hz,
+        end_s=comparison.first_sample_s + end_sample / rate_hz,
         # The soft beginning of a touch is not visible before the torque has grown.
         start_uncertainty_s=max(2, end_sample - first_sample) / rate_hz,
         poles_rad_s=tuple(pole.at_rad_s for pole in poles),

@@ -109,7 +109,8 @@ class ModelCheck:
     def mode_doubt_reason(self) -> str | None:
         """Return the reason to doubt every mode; None if there is none.
 
-        A fitted change along the record is none: the modes are those at the middle of the record.
+        A change along the record is such a reason only if it is part of the model: the modes then
+        are those at the middle of the record.
         """
         if self.temporal_changes and self.temporal_changes[0].is_certain:
             return self.doubt_reason

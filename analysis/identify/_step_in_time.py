@@ -98,7 +98,7 @@ def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
         if deviance_reductions[best_index] > best_step.score:
             best_step = StiffnessStep(
                 score=float(deviance_reductions[best_index]),
-                instant_s=comparison.first_s
+                instant_s=comparison.first_sample_s
                 + float(sample_indices[best_index]) / comparison.decimation.rate_hz,
                 relative_change=float(correlation[best_index] / spectrum_squares[best_index]),
             )

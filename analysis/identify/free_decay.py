@@ -164,7 +164,7 @@ class LaterDecaySpectra(DecaySpectra):
         Rate of the compared samples.
     omega_rad_s : ndarray, shape (K,)
         Frequencies of the bins.
-    first_s : float
+    decay_start_s : float
         Time from the first sample to the tick at which the decays begin, with full amplitude.
     tick_s : float
         Time between ticks.
@@ -177,14 +177,16 @@ class LaterDecaySpectra(DecaySpectra):
         sample_count: int,
         rate_hz: float,
         omega_rad_s: NDArray[np.float64],
-        first_s: float,
+        decay_start_s: float,
         tick_s: float,
     ) -> None:
         super().__init__(sample_count, rate_hz, omega_rad_s)
-        self._duration_s -= first_s
+        self._duration_s -= decay_start_s
         self._tick_s = tick_s
         self._tick_rotation = np.exp(-1j * omega_rad_s * tick_s)
-        self._first_tick_factor = tick_s / self._period_s * np.exp(-1j * omega_rad_s * first_s)
+        self._first_tick_factor = (
+            tick_s / self._period_s * np.exp(-1j * omega_rad_s * decay_start_s)
+        )
 
     def _transform_of_decay(self, pole: complex) -> NDArray[np.complex128]:
         """Return the transform of ``exp(p t)`` from the first tick to the last sample, (K,)."""

@@ -240,8 +240,8 @@ def _connected_bins(
     is_connected = is_start | may_continue
     run_numbers = np.cumsum(np.diff(is_connected, prepend=False) & is_connected)
     has_start = np.bincount(run_numbers[is_start], minlength=run_numbers[-1] + 1) > 0
-    connected: NDArray[np.bool_] = is_connected & has_start[run_numbers]
-    return connected
+    connected_mask: NDArray[np.bool_] = is_connected & has_start[run_numbers]
+    return connected_mask
 
 
 def _block_borders(bin_count: int) -> NDArray[np.intp]:

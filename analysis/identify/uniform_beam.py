@@ -62,8 +62,8 @@ _SHAPE_UPDATES: Final = 4
 """Number of times that the mode shapes of a loaded or tilted beam are recomputed for the fitted
 beam."""
 
-_DEVIATION_WITHOUT_POLE: Final = 1e6
-"""Whitened deviation of every constant if a mode has no pole."""
+_RESIDUAL_WITHOUT_POLE: Final = 1e6
+"""Whitened residual of every constant if a mode has no pole."""
 
 _COST_TOLERANCE: Final = 1e-4
 """Relative tolerance of chi-square at which a descent ends."""
@@ -266,7 +266,7 @@ class UniformBeamProblem:
         differences = vibration.constants() - self.measured
         if np.isnan(differences).any():
             return (
-                np.full(self.constant_count, _DEVIATION_WITHOUT_POLE),
+                np.full(self.constant_count, _RESIDUAL_WITHOUT_POLE),
                 lambda: np.zeros((x.size, self.constant_count)),
             )
         phase_differences = differences[
