@@ -9,7 +9,7 @@ from rigd.devices._unknown import describe_unknown_values
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.kinds import DEVICES, fits, known_selections
 from rigd.devices.parameters import DeviceSelection, RigParameters
-from rigd.devices.running_simulator import differences, find_simulator
+from rigd.devices.running_simulator import find_simulator, profile_differences
 from rigd.errors import UserError
 from rigd.plugins import PluginError, plugin_errors
 
@@ -114,7 +114,7 @@ def simulated_differently(rig: RigParameters) -> list[str]:
     The list is empty if no simulator runs.
     """
     running_simulator = None if is_simulated_here(rig) else find_simulator(rig.name)
-    return [] if running_simulator is None else differences(rig, running_simulator)
+    return [] if running_simulator is None else profile_differences(rig, running_simulator)
 
 
 def simulator() -> ModuleType:
@@ -130,7 +130,7 @@ def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> D
     rig
         Parameters of a profile.
     target
-        What the operator has confirmed to move, or None if nothing was confirmed.
+        What the operator has confirmed will move, or None if nothing was confirmed.
 
     Raises
     ------

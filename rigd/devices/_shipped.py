@@ -11,7 +11,7 @@ from rigd.devices.parameters import AtiCan, AtiSerial, RigParameters, ServoDrive
 
 _MAX_TORQUE_RATIO = 32.767
 """Largest ratio of torque to rated torque that the 16 bits of object 6071 can hold."""
-_ROUNDING_S = 1e-9
+_DELAY_ROUNDING_S = 1e-9
 """Largest rounding error in seconds of a delay in a profile."""
 
 
@@ -55,7 +55,7 @@ def _open_can_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
 
 
 def _open_serial_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
-    """Create the ATI sensor on a serial line, of the rig or of the simulator of the drive."""
+    """Create the ATI sensor on the rig's serial line, or on that of the drive's simulator."""
     from rigd.devices.ati import AtiSerialSensor
 
     return AtiSerialSensor(rig, opened.line.simulator)
@@ -177,7 +177,7 @@ def _serial_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     )
     delay_s = profile_values["sensor.delay_s"]
     min_delay_s = settings.filter_delay_s(profile_values["rig.rate_hz"])
-    if delay_s < min_delay_s - _ROUNDING_S:
+    if delay_s < min_delay_s - _DELAY_ROUNDING_S:
         yield (
             f"sensor.delay_s = {delay_s:g} s is less than the filter of the sensor's records "
             f"alone: at least {min_delay_s:.6g} s."

@@ -22,7 +22,7 @@ _NETWORK_INTERFACES_FOLDER = Path("/sys/class/net")
 
 
 @dataclass(frozen=True, slots=True)
-class WiredLine:
+class WiredConnection:
     """CAN bus of a CiA 402 drive, and the simulator that replaces the hardware, if one runs."""
 
     can_link: CanLink
@@ -60,7 +60,7 @@ def open_wired_drive(rig: RigParameters) -> OpenedDrive:
         renew_noise=None
         if running_simulator is None
         else partial(_restart_simulator_noise, running_simulator),
-        line=WiredLine(can_link, running_simulator),
+        line=WiredConnection(can_link, running_simulator),
     )
 
 

@@ -183,10 +183,10 @@ class Acquisition:
     """Settings of the acquisition: which replies of the devices a tick uses."""
 
     mode: Literal["same_tick", "previous_tick"]
-    """Whether a tick waits for the replies to its own requests or uses those to the previous
-    tick's."""
+    """Whether a tick waits for the replies to its own requests, or uses the replies to the requests
+    of the previous tick."""
     deadline_us: Annotated[float, Gt(0)]
-    """Time in microseconds after its start until which a tick waits for its own replies.
+    """Time in microseconds from the start of a tick until which the tick waits for its own replies.
 
     After that the last values are used."""
 

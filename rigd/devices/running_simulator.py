@@ -49,7 +49,7 @@ def described(rig: "RigParameters") -> dict[str, object]:
     return json.loads(json.dumps(dict(_flatten(asdict(rig), ""))))  # type: ignore[no-any-return]
 
 
-def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
+def profile_differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
     """Return the differences between a profile and the simulated rig, one phrase per key.
 
     A different seed of the noise does not count, since each session has its own.
@@ -87,7 +87,7 @@ def announce(rig_name: str, address: SimulatorAddress) -> Path:
     return address_path
 
 
-def forget(rig_name: str) -> None:
+def remove_address_file(rig_name: str) -> None:
     """Remove the address file of a simulator, also the file of a simulator that was killed."""
     _address_file(rig_name).unlink(missing_ok=True)
 

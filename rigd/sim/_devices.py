@@ -268,7 +268,7 @@ class SimulatedDrive:
         self._rig.stuck_encoder = stuck
 
     def connect(self) -> None:
-        """Do nothing: a drive simulated in this process has no line to open."""
+        """Do nothing: a drive simulated in this process needs no connection."""
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:  # noqa: ARG002
         """Switch the simulated drive on, or raise if the wired stop is dropped."""
@@ -287,7 +287,7 @@ class SimulatedDrive:
         return self._plant.command(torque_nm)
 
     def health(self) -> LineHealth:
-        """Return an empty line health, since there is no line."""
+        """Return a line health without values, since there is no communication line."""
         return LineHealth()
 
     def disable(self) -> None:
@@ -377,7 +377,7 @@ class SimulatedSensor:
         self.wrench_saturated = False
 
     def connect(self) -> None:
-        """Do nothing: a sensor simulated in this process has no line to open."""
+        """Do nothing: a sensor simulated in this process needs no connection."""
 
     def calibration(self) -> dict[str, object]:
         """Return the calibration as a real sensor would report it."""
@@ -405,7 +405,7 @@ class SimulatedSensor:
         return fx, fy, fz, tx, ty, tz
 
     def health(self) -> LineHealth:
-        """Return the line health of a sensor without errors and without line."""
+        """Return a line health with status 0 (no error), since there is no communication line."""
         return LineHealth(status=0)
 
     def renew_noise(self, seed: int) -> None:
@@ -458,7 +458,7 @@ class SimulatedSensor:
         return wrench if self.stuck is None else self.stuck(wrench)
 
     def close(self) -> None:
-        """Do nothing: a sensor simulated in this process has no line to release."""
+        """Do nothing: a sensor simulated in this process has no connection to close."""
 
     def _noise(self, seed: int | None) -> Iterator[list[list[float]]]:
         """Yield blocks of unloaded readings, that is noise and offset in N and N·m.

@@ -26,11 +26,11 @@ _REPLY_TIMEOUT_S = 0.2
 """Time in seconds to wait for the reply to one request during set-up."""
 _REQUEST_ATTEMPTS = 3
 """Number of attempts of one request during set-up."""
-_LATE_REPLY_S = 0.5
+_LATE_REPLY_WAIT_S = 0.5
 """Time in seconds in which late replies are discarded after a repeated request.
 
 A repeated request may be answered twice, and no reply states which row of the matrix it holds."""
-_LOST_POLL_S = 0.02
+_POLL_TIMEOUT_S = 0.02
 """Time in seconds after which a poll of `measure` counts as lost."""
 _MIN_RESTART_S = 0.005
 """Time in seconds without reply after which a box may have restarted; no box starts faster."""
@@ -141,7 +141,7 @@ class AtiCanSensor:
             self._calibration = self._read_scale(serial_number, calibration_matrix)
             self._wrench_from_counts = wrench_function(self._calibration.wrench_per_wire_count())
             self._evaluate(self._first_reading())
-            self.polls.forget()
+            self.polls.reset_pairing()
             self._previous_reply = None
             self._unanswered_ticks = 0
             self._calibration_in_doubt = False
@@ -227,7 +227,7 @@ class AtiCanSensor:
         return self._evaluate(poll_reply)
 
     def health(self) -> LineHealth:
-        """Return the number of errors on the line to the sensor, and the sensor's status word."""
+        """Return the number of errors on the bus to the sensor, and the sensor's status word."""
         error_count = self.polls.lost + self.bus_errors
         return LineHealth(errors=error_count, status=self._status_word)
 
@@ -250,14 +250,14 @@ class AtiCanSensor:
         begin_ns = time.monotonic_ns()
         end_ns = begin_ns + int(duration_s * 1e9)
         while time.monotonic_ns() < end_ns:
-            poll_reply = self._poll(_LOST_POLL_S)
+            poll_reply = self._poll(_POLL_TIMEOUT_S)
             if poll_reply is None:
                 lost_polls += 1
                 continue
             self._evaluate(poll_reply)
             turnarounds_ns.append(self.polls.turnaround_ns)
         elapsed_s = (time.monotonic_ns() - begin_ns) * 1e-9
-        self.polls.forget()
+        self.polls.reset_pairing()
         turnarounds_ns.sort()
         return {
             "polls_hz": len(turnarounds_ns) / elapsed_s,
@@ -362,7 +362,7 @@ class AtiCanSensor:
         """Poll the sensor once outside the control loop; return the reply, or None on timeout."""
         gauge_polls = self.polls
         gauge_polls.drain()
-        gauge_polls.forget()
+        gauge_polls.reset_pairing()
         gauge_polls.send()
         return gauge_polls.wait(gauge_polls.sent_ns + int(timeout_s * 1e9))
 
@@ -391,7 +391,8 @@ class AtiCanSensor:
             ):
                 reply_frames = [inbox[reply_opcode] for reply_opcode in reply_opcodes]
                 if attempt:
-                    exchange.wait_until(lambda: False, _ns_after(_LATE_REPLY_S))  # all is dropped
+                    # All frames that arrive are dropped.
+                    exchange.wait_until(lambda: False, _ns_after(_LATE_REPLY_WAIT_S))
                 break
         else:
             raise self._no_reply_error(requested_item)

@@ -160,12 +160,12 @@ class GaugePolls:
     def open(self, exchange: CanExchange) -> None:
         """Start polling on an open CAN exchange; replies to earlier polls are not expected."""
         self._exchange = exchange
-        self.forget()
+        self.reset_pairing()
 
     def close(self) -> None:
         """Stop using the CAN exchange."""
         self._exchange = None
-        self.forget()
+        self.reset_pairing()
 
     @property
     def exchange(self) -> CanExchange:
@@ -234,7 +234,7 @@ class GaugePolls:
                 self.turnaround_ns = time.monotonic_ns() - self.sent_ns
         return self.answer
 
-    def forget(self) -> None:
+    def reset_pairing(self) -> None:
         """Reset the pairing of polls and replies; from then on no reply is outstanding."""
         self._first_pairing.start()
         self._second_pairing.start()

@@ -19,7 +19,7 @@ from rigd.devices.ati._calibration import (
 )
 from rigd.devices.ati._serial_protocol import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
 from rigd.devices.ati._serial_setup import (
-    SILENCE_S,
+    FRAME_SILENCE_S,
     SerialLine,
     SerialSetup,
     describe_adapter_delay,
@@ -34,11 +34,11 @@ _MAX_ERROR_RECORDS = 7
 """Number of consecutive records with the error bit set that end a session.
 
 It is above 1 because the checksum does not protect this bit against errors of the line."""
-_IDLE_NS = 20_000_000
+_MAX_IDLE_NS = 20_000_000
 """Time in nanoseconds without reading after which received bytes are discarded.
 
 After a longer time the kernel's buffer of 4 kB may overflow at 91 kB/s, and its content is old."""
-_GAP_PERIODS = 2.5
+_MIN_GAP_PERIODS = 2.5
 """Number of periods without a byte that count as a gap; the stream has several records per
 period."""
 _STORED_GAPS, _MIN_EVALUATED_GAPS = 8, 4
@@ -194,7 +194,7 @@ class AtiSerialSensor:
             elapsed_periods = max(1, round((due_ns - self._tick_ns) / self._period_ns))
         self._tick_ns = due_ns
         self._due_bytes += elapsed_periods * self._bytes_per_tick
-        if now_ns - self._last_read_ns > _IDLE_NS and not self._lock_step:
+        if now_ns - self._last_read_ns > _MAX_IDLE_NS and not self._lock_step:
             # Queued bytes are old and may have gaps: only bytes that arrive from now on count.
             self._split_records(self._open_line().read())
             self._history = b""
@@ -378,7 +378,7 @@ class AtiSerialSensor:
             return received_bytes
         now_ns = time.monotonic_ns()
         gap_ns = now_ns - self._arrived_ns
-        if self._arrived_ns and gap_ns > _GAP_PERIODS * self._period_ns:
+        if self._arrived_ns and gap_ns > _MIN_GAP_PERIODS * self._period_ns:
             self._latest_gaps.append((now_ns, gap_ns))
         self._arrived_bytes += len(received_bytes)
         self._arrived_ns = now_ns
@@ -465,7 +465,7 @@ class AtiSerialSensor:
                     f"{_FIRST_RECORDS_TIMEOUT_S} s only {self.stream.records - records_before} "
                     "were sound records. Check cable, ati_serial.baud and ati_serial.stream_hz."
                 )
-            serial_line.wait(SILENCE_S)
+            serial_line.wait(FRAME_SILENCE_S)
             self._split_records(serial_line.read())
         if self._history:
             # Value that is used if the first tick finds no new records.

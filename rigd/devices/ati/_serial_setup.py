@@ -223,7 +223,7 @@ def _opening_remedy(error: Exception) -> str:
 
 # Set-up over Modbus
 
-SILENCE_S = 0.002
+FRAME_SILENCE_S = 0.002
 """Silence in seconds that ends a Modbus frame."""
 
 _STOP_BYTES = bytes(range(1, 15))
@@ -238,7 +238,7 @@ _REPLY_TIMEOUT_S = 0.3
 """Time in seconds to wait for the reply to one request."""
 _REQUEST_ATTEMPTS = 3
 """Number of attempts of one request."""
-_LATE_REPLY_S = 0.5
+_LATE_REPLY_WAIT_S = 0.5
 """Silence in seconds to wait for after a repeated request.
 
 A repeated request may be answered twice, and no reply states which registers it holds."""
@@ -253,7 +253,7 @@ class SerialSetup:
     Parameters
     ----------
     line
-        Open line.
+        Open serial line to the sensor.
     settings
         Settings of the sensor.
     name
@@ -333,7 +333,7 @@ class SerialSetup:
     def start_streaming(self) -> bytes:
         """Start the sensor's stream of records; return the bytes received after the reply."""
         request = modbus.START_STREAM_REQUEST
-        time.sleep(SILENCE_S)
+        time.sleep(FRAME_SILENCE_S)
         reply_size = modbus.reply_length(request)
         reply = self._line.transact(request, reply_size, _REPLY_TIMEOUT_S)
         try:
@@ -346,11 +346,11 @@ class SerialSetup:
         """Send a request and return the content of its reply; repeat a request that failed."""
         last_error = ""
         for attempt_number in range(_REQUEST_ATTEMPTS):
-            time.sleep(SILENCE_S)
+            time.sleep(FRAME_SILENCE_S)
             reply_size = modbus.reply_length(request)
             reply = self._line.transact(request, reply_size, _REPLY_TIMEOUT_S)
             if attempt_number:
-                self._line.drain(_LATE_REPLY_S, 2 * _LATE_REPLY_S)
+                self._line.drain(_LATE_REPLY_WAIT_S, 2 * _LATE_REPLY_WAIT_S)
             try:
                 return modbus.reply_content(request, reply)
             except modbus.ModbusExceptionError as error:

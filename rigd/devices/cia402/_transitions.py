@@ -22,7 +22,7 @@ from rigd.devices.cia402._protocol import (
 from rigd.devices.cia402.objects import CONTROLWORD, CYCLIC_TORQUE_MODE
 from rigd.devices.contracts import DeviceError, wired_stop_dropped
 
-_OTHER_SENDER: Final = (
+_OTHER_SENDER_HINT: Final = (
     "a command came over the bus that this computer did not give (a corrupt frame, a second master)"
 )
 """Part of a message: another sender on the bus may have commanded the drive."""
@@ -56,17 +56,17 @@ def operation_left_error(drive_name: str, statusword: int) -> DeviceError:
         )
         sto_error = wired_stop_dropped(
             drive_name,
-            f", or the motor's supply failed, or {_OTHER_SENDER}: {transition_text}"
+            f", or the motor's supply failed, or {_OTHER_SENDER_HINT}: {transition_text}"
             f"{supply_hint if is_supplied else ''}",
         )
         return DeviceError(f"{sto_error} If nobody pressed it, {_CHECK_BUS_ADVICE}.")
     if present_state in (DriveState.READY, DriveState.SWITCHED_ON):
         return DeviceError(
-            f"{drive_name}: {transition_text}: {_OTHER_SENDER}; {_CHECK_BUS_ADVICE}."
+            f"{drive_name}: {transition_text}: {_OTHER_SENDER_HINT}; {_CHECK_BUS_ADVICE}."
         )
     return DeviceError(
-        f"{drive_name}: {transition_text}, by itself or because {_OTHER_SENDER}; check STO, supply "
-        f"and its own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
+        f"{drive_name}: {transition_text}, by itself or because {_OTHER_SENDER_HINT}; check STO, "
+        f"supply and its own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
     )
 
 

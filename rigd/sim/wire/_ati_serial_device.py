@@ -84,7 +84,7 @@ _CALIBRATION_LAYOUT = Struct(">8s32s4s20s36f2B6f2i6H6H")
 
 _STOP_BYTE_COUNT = 14
 """Number of received bytes that end the stream."""
-_SILENCE_S = 0.05
+_REQUEST_TIMEOUT_S = 0.05
 """Silence in seconds after which an incomplete request is discarded."""
 _MAX_FRAME_BYTES = 256
 """Longest Modbus frame in bytes."""
@@ -209,7 +209,7 @@ class AtiSerialDevice:
         if self._has_received:
             self._has_received = False
             self._silent_since_s = now_s
-        elif now_s - self._silent_since_s > _SILENCE_S:
+        elif now_s - self._silent_since_s > _REQUEST_TIMEOUT_S:
             self._incomplete_request = b""
 
     def emit(self) -> None:

@@ -29,7 +29,7 @@ from rigd.devices.running_simulator import (
     ask_simulator,
     described,
     find_simulator,
-    forget,
+    remove_address_file,
 )
 from rigd.runtime.addresses import runtime_folder
 from rigd.sim import SimulatedRig
@@ -92,7 +92,7 @@ def reserve_rig_name(rig_name: str) -> Iterator[None]:
                 "it first, or use that one."
             ) from None
         # Remove the address file of a dead simulator first: it names the sockets to be created.
-        forget(rig_name)
+        remove_address_file(rig_name)
         yield
 
 
@@ -409,7 +409,7 @@ class _SimulatorProcess:
         for start_line in self._start_messages():
             self._log.print_line(start_line)
         announce(self._rig.name, self._address)
-        self._exit_stack.callback(forget, self._rig.name)
+        self._exit_stack.callback(remove_address_file, self._rig.name)
         # Set-up leaves objects that are never freed: exclude them from garbage collection.
         gc.collect()
         gc.freeze()
