@@ -278,7 +278,7 @@ class ExcitationPlanner:
             self._doubtful_count = self._doubtful_count + 1 if doubt_text else 0
         if self._doubtful_count >= _MAX_DOUBTFUL_FITS:
             findings_text = " ".join(document["findings"])
-            end_reason = f"The record is doubtful: {doubt_text}. {findings_text} Take a chirp."
+            end_reason = f"The record is doubtful: {doubt_text}. {findings_text} Record a chirp instead: rigd run chirp."
             yield self._end_message(end_reason.replace("  ", " "), reached=False)
             return
         try:

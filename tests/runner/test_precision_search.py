@@ -185,7 +185,7 @@ def test_a_record_that_stays_doubtful_is_given_up_with_its_findings(bench):
     assert not ends[0].reached
     assert ends[0].reason == (
         "The record is doubtful: part of the record is unexplained. Something struck the beam. "
-        "Take a chirp."
+        "Record a chirp instead: rigd run chirp."
     )
     assert told[0].document["text"][-1].count("doubtful") == 3
 
