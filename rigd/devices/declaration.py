@@ -20,7 +20,7 @@ class OpenedDrive:
     rig: RigParameters
     """Parameters of the rig with which the drive was created."""
     drive: Drive
-    """The drive."""
+    """Drive of the rig, not yet connected."""
     simulated: bool
     """Whether the drive is simulated, so that no motor moves."""
     renew_noise: Callable[[int | None], int] | None = None

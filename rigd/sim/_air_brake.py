@@ -29,7 +29,8 @@ Complex = NDArray[np.complex128]
 _DRAG_MODES = 5
 """Number of modes of the beam on which the drag acts.
 
-The fifth mode of the paper's link is at 145 Hz: three times the end of its sweep."""
+The fifth mode of the reference paper's beam is at 145 Hz, three times the highest frequency of its
+sweep."""
 _DRAG_POINTS = 16
 """Number of points along the beam at which the drag force is computed."""
 _EXTRAPOLATION_WEIGHTS = (23 / 12, -16 / 12, 5 / 12)

@@ -320,8 +320,8 @@ class SimulatedSensor:
     """Simulated six-axis sensor with white noise, hum, offset, limited resolution and range.
 
     The wrench is the smallest one whose projections are the coupling torque (with hum) and the base
-    shear; crosstalk is added to it. If the sensor streams, the wrench read is the last readings
-    after the decimating filter.
+    shear; crosstalk is added to it. If the sensor streams, the wrench read is the output of the
+    decimating filter for the last readings.
 
     Parameters
     ----------

@@ -148,7 +148,7 @@ class PythonCanPort:
         self._to_message, self._from_message = to_message, from_message
         self._error = can.CanError
         self._next_frame: bytes | None = None
-        self._damaged_in_a_row = 0
+        self._consecutive_damaged_frames = 0
         self.name = name
 
     def send(self, frame: bytes) -> None:
@@ -201,17 +201,17 @@ class PythonCanPort:
                 "adapter."
             ) from None
         except Exception as error:
-            self._damaged_in_a_row += 1
-            if self._damaged_in_a_row < _MAX_DAMAGED_FRAMES:
+            self._consecutive_damaged_frames += 1
+            if self._consecutive_damaged_frames < _MAX_DAMAGED_FRAMES:
                 return DAMAGED_FRAME
-            self._damaged_in_a_row = 0
+            self._consecutive_damaged_frames = 0
             raise DeviceError(
                 f"CAN bus {self.name}: the adapter sends what is no CAN frame, "
                 f"{_MAX_DAMAGED_FRAMES} times in a row ({_error_text(error)}); check the adapter, "
                 "its cable and its firmware."
             ) from None
         if raw_frame is not None and not unpack_header(raw_frame)[0] & ERROR_FLAG:
-            self._damaged_in_a_row = 0
+            self._consecutive_damaged_frames = 0
         return raw_frame
 
 

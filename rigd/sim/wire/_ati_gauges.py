@@ -74,18 +74,18 @@ class AtiGauges:
         self, sensor: WrenchSensorSettings, counts_per_unit: tuple[int, int] = COUNTS_PER_UNIT
     ) -> None:
         self.counts_per_unit = counts_per_unit
-        counts_by_axis = np.repeat(np.array(counts_per_unit, dtype=np.float64), 3)
-        range_counts = counts_by_axis * np.array(sensor.range)
+        axis_counts_per_unit = np.repeat(np.array(counts_per_unit, dtype=np.float64), 3)
+        range_counts = axis_counts_per_unit * np.array(sensor.range)
         self.matrix = np.linalg.inv(np.array(_COUNTS_AT_FULL_RANGE) / range_counts).astype(
             np.float32
         )
         calibration_matrix = self.matrix.astype(np.float64)
         self.quantisation: NDArray[np.float64] = (
-            0.5 * np.abs(calibration_matrix).sum(axis=1) / counts_by_axis
+            0.5 * np.abs(calibration_matrix).sum(axis=1) / axis_counts_per_unit
         )
         # For wrenches in rows.
         self._counts_per_wrench = np.ascontiguousarray(
-            (np.linalg.inv(calibration_matrix) * counts_by_axis).T
+            (np.linalg.inv(calibration_matrix) * axis_counts_per_unit).T
         )
         self.stuck: tuple[int, StuckReadings] | None = None
         self._bias = np.array(_BIAS_COUNTS, dtype=np.float64)

@@ -301,7 +301,7 @@ def add_drive_objects(
     rate_hz: float,
     resolution_rad: float,
 ) -> DriveObjects:
-    """Add the drive's objects with their values at power-on; return those that the drive uses."""
+    """Add the drive's objects to a dictionary; return the entries that the simulation uses."""
 
     def add(object_index: int, entry: Entry) -> Entry:
         return objects.add(object_index, entry)

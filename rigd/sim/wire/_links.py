@@ -307,7 +307,7 @@ def listen(path: Path) -> socket.socket:
 
 
 def is_virtual(interface_name: str) -> bool:
-    """Return whether a network interface is a CAN bus without hardware.
+    """Return whether a network interface is a virtual CAN bus; False if it does not exist.
 
     Raises
     ------
