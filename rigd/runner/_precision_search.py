@@ -34,6 +34,9 @@ _MIN_FORECAST_ESTIMATES: Final = 4
 """Minimum number of estimates from which the remaining time is forecast."""
 _UNREACHABLE_TIME_RATIO: Final = 2.0
 """Ratio of forecast to available time above which the requested precision is unreachable."""
+_MAX_FORECAST_S: Final = 86_400.0
+"""Longest time in s that is forecast: the information grows too little for a number if it takes
+more than a day."""
 _MAX_UNREACHABLE_FORECASTS: Final = 3
 """Number of consecutive forecasts of an unreachable precision that end the session."""
 _NOT_VISIBLE: Final = "not visible yet"
@@ -278,7 +281,10 @@ class ExcitationPlanner:
             self._doubtful_count = self._doubtful_count + 1 if doubt_text else 0
         if self._doubtful_count >= _MAX_DOUBTFUL_FITS:
             findings_text = " ".join(document["findings"])
-            end_reason = f"The record is doubtful: {doubt_text}. {findings_text} Record a chirp instead: rigd run chirp."
+            end_reason = (
+                f"The record is doubtful: {doubt_text}. {findings_text} Record a chirp instead: "
+                "rigd run chirp."
+            )
             yield self._end_message(end_reason.replace("  ", " "), reached=False)
             return
         try:
@@ -596,8 +602,13 @@ class _TimeForecast:
     def remaining_s(self) -> float | None:
         """Forecast of the time in s until the ratio is 1, from the last half of the estimates.
 
-        It is None if there are too few estimates, or if the information does not grow.
+        It is None if there are too few estimates, or if the information hardly grows.
         """
+        required_s = self._required_s()
+        return None if required_s is None or required_s > _MAX_FORECAST_S else required_s
+
+    def _required_s(self) -> float | None:
+        """Return the time in s until the ratio is 1, however long; None if there is no forecast."""
         if len(self._information_at_times) < _MIN_FORECAST_ESTIMATES:
             return None
         (now_s, present_information), (earlier_s, earlier_information) = (
@@ -619,17 +630,22 @@ class _TimeForecast:
 
         The text is empty if the time may suffice.
         """
-        required_s = self.remaining_s
+        required_s = self._required_s()
         if required_s is None or required_s <= _UNREACHABLE_TIME_RATIO * available_s:
             return ""
         now_s, present_information = self._information_at_times[-1]
         reachable_ratio = (
             present_information + (1.0 - present_information) * available_s / required_s
         ) ** -0.5
+        if required_s > _MAX_FORECAST_S:
+            time_text, longer_text = "more than a day", ""
+        else:
+            time_text = f"about {required_s:.0f} s more"
+            longer_text = f", or give --at-most {1.2 * (now_s + required_s):.0f}"
         return (
-            f"it would take about {required_s:.0f} s more, and the {available_s:.0f} s that are "
-            f"left will do for {reachable_ratio:.2g} times the deviation asked for. Ask for "
-            f"that, or give --at-most {1.2 * (now_s + required_s):.0f}."
+            f"it would take {time_text}, and the remaining {available_s:.0f} s suffice for "
+            f"{reachable_ratio:.2g} times the requested standard deviation. Request that"
+            f"{longer_text}."
         )
 
 
