@@ -61,6 +61,11 @@ _COUNTER_FIELDS = {
 }
 """Name of a tick count in the result → field of the shared state with the counter."""
 _ZERO_COUNTS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTER_FIELDS, 0))
+_WITHOUT_HEARTBEAT_TEXT: Final = (
+    "Without its heartbeat the watchdog of the drive switches the torque off; check that it is "
+    "off, and press the wired stop (STO) if it is not."
+)
+"""Sentence for the operator after the control process has ended and left the drive enabled."""
 
 
 class SessionFailedError(FailureError):
@@ -401,7 +406,7 @@ class SessionSupervisor:
             try:
                 control_message = self._group.control.poll(0.0 if has_waited else _POLL_S)
             except ChildError as error:
-                return self._control_died(str(error))
+                return self._control_died(f"{error} {_WITHOUT_HEARTBEAT_TEXT}")
             self._report()
             now_s = time.monotonic()
             # In lock-step with a simulated rig, a tick may wait for missing replies.
@@ -458,8 +463,7 @@ class SessionSupervisor:
         """
         self._group.control.kill()
         return self._control_died(
-            f"The control process {failure_predicate} and was killed: without its heartbeat the "
-            "drive switches itself off. Check that it is off."
+            f"The control process {failure_predicate} and was killed. {_WITHOUT_HEARTBEAT_TEXT}"
         )
 
     def _control_died(self, reason: str) -> SessionFinished:

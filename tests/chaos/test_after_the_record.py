@@ -77,7 +77,10 @@ def test_a_control_process_that_dies_on_the_way_back_leaves_a_whole_record(tmp_p
     finally:
         rig.disconnect()
     assert result.outcome == "complete"
-    assert result.reason == "After the record: The control process was killed by signal 9."
+    assert result.reason.startswith(
+        "After the record: The control process was killed by signal 9. Without its heartbeat"
+    )
+    assert "check that it is off" in result.reason
     assert not result.is_successful
     assert result.scheduled == 400 == result.recorded
     assert read_session(result.path).outcome["outcome"] == "complete"
