@@ -124,6 +124,7 @@ TOUCH: Final = Worker(
     loss="warning",
     consequence="Touches are detected but not estimated; the session continues.",
     beat=StateField.TOUCH_BEAT,
+    start_timeout_s=60.0,  # it computes the responses of the beam first
     # An estimate may take long; a missing estimate is reported as such.
     max_silence_s=None,
     end_timeout_s=1.0,
@@ -138,7 +139,7 @@ FIT: Final = Worker(
     consequence="The session continues without fits.",
     beat=StateField.FIT_BEAT,
     # A decision may take long on a busy computer; the loop holds the angle meanwhile.
-    max_silence_s=15.0,
+    max_silence_s=30.0,
     end_timeout_s=1.0,
     is_per_session=True,
     niceness=5,  # a third of a processor in competition with another program
