@@ -15,6 +15,7 @@ from analysis.report._frf_figure import line_styles
 from analysis.report._paper_tables import welch_method_text
 from analysis.report._pooled_tables import exact_condition_text, session_count_text
 from analysis.report.table import NOT_REPORTED_MARK, unreported_parameters
+from analysis.statistics import NORMAL_95
 from rigd.spectral import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
@@ -190,7 +191,7 @@ def _draw_parameter_panel(
             if estimate.name == structure_name and std is not None:
                 session_positions.append(session_number)
                 session_values.append(display_factor * estimate.fit.parameters[parameter.name])
-                half_widths.append(1.96 * display_factor * std)
+                half_widths.append(NORMAL_95 * display_factor * std)
     panel_axes.axhspan(
         *(display_factor * end for end in parameter.next_interval),
         color=style.SHADE_COLOR,
