@@ -312,11 +312,11 @@ def parse_block(registers: Sequence[int]) -> CalibrationBlock:
 
 # Status words
 
-CAN_WATCHDOG_RESET = 0x0001
+CAN_WATCHDOG_RESET_BIT = 0x0001
 """Status bit of a NETCANOEM box: its watchdog has reset it."""
-CAN_BAD_CALIBRATION = 0x0040
+CAN_BAD_CALIBRATION_BIT = 0x0040
 """Status bit of a NETCANOEM box: the active calibration is bad."""
-CAN_BUS_ERROR = 0x4000
+CAN_BUS_ERROR_BIT = 0x4000
 """Status bit of a NETCANOEM box: it has seen errors on the CAN bus."""
 
 _COMMON_STATUS_BITS = {

@@ -7,9 +7,9 @@ from math import ceil
 
 from rigd.devices.ati import _netcanoem as netcanoem
 from rigd.devices.ati._calibration import (
-    CAN_BAD_CALIBRATION,
-    CAN_BUS_ERROR,
-    CAN_WATCHDOG_RESET,
+    CAN_BAD_CALIBRATION_BIT,
+    CAN_BUS_ERROR_BIT,
+    CAN_WATCHDOG_RESET_BIT,
     CRITICAL_CAN_STATUS_BITS,
     Calibration,
     MatrixRows,
@@ -307,14 +307,14 @@ class AtiCanSensor:
 
     def _check_status(self, status_word: int, previous_word: int) -> None:
         """Count bus errors in a status word, and raise on a restart or a critical status bit."""
-        if status_word & CAN_BUS_ERROR:
+        if status_word & CAN_BUS_ERROR_BIT:
             self.bus_errors += 1
-        if status_word & ~previous_word & CAN_WATCHDOG_RESET:
+        if status_word & ~previous_word & CAN_WATCHDOG_RESET_BIT:
             raise self._restart_error(f"its watchdog has reset it (status word {status_word:#06x})")
         if status_word & CRITICAL_CAN_STATUS_BITS:
             remedy = (
                 "choose another (ati_can.calibration)"
-                if status_word & CAN_BAD_CALIBRATION
+                if status_word & CAN_BAD_CALIBRATION_BIT
                 else "it does not measure properly: check sensor, cable and supply"
             )
             raise DeviceError(
@@ -446,7 +446,7 @@ class AtiCanSensor:
             )
         # The status shows whether the selected calibration is valid.
         status_word = self._status_word = netcanoem.read_gauges(self._first_reading()[0])[0]
-        if status_word & CAN_BAD_CALIBRATION:
+        if status_word & CAN_BAD_CALIBRATION_BIT:
             self._check_status(status_word, status_word)
 
     def _read_matrix(self) -> MatrixRows:

@@ -201,7 +201,7 @@ def _check_identity(
     A drive without cyclic synchronous torque mode is refused as well.
     """
     eds_vendor, eds_product = eds_identity
-    for key, value_source, required_number in (
+    for key, requirement_source, required_number in (
         ("vendor_id", "cia402.vendor_id", settings.vendor_id),
         ("product_code", "cia402.product_code", settings.product_code),
         ("vendor_id", f"VendorNumber in {settings.eds}", eds_vendor),
@@ -211,9 +211,9 @@ def _check_identity(
         if required_number and reported_number != required_number:
             reported_text = "nothing" if reported_number is None else f"0x{reported_number:08X}"
             raise DeviceError(
-                f"{drive_name}: it is another drive: {value_source} is 0x{required_number:08X}, it "
-                f"says {reported_text}. Check cia402.node_id, or write into the profile what is "
-                "really there."
+                f"{drive_name}: it is another drive: {requirement_source} is "
+                f"0x{required_number:08X}, it says {reported_text}. Check cia402.node_id, or write "
+                "into the profile what is really there."
             )
     mode_bits = identity["supported_modes"]
     if not (isinstance(mode_bits, int) and mode_bits & objects.CYCLIC_TORQUE_MODE_BIT):

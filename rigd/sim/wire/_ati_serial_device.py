@@ -393,7 +393,7 @@ def _answer_with_registers(
     )
 
 
-def _next_request(received: bytes) -> tuple[bytes | None, bytes]:
+def _next_request(received_bytes: bytes) -> tuple[bytes | None, bytes]:
     """Return the first complete request in received bytes, and the remaining bytes.
 
     Every byte that could be the address is tried. So noise before a request is skipped without
@@ -405,42 +405,42 @@ def _next_request(received: bytes) -> tuple[bytes | None, bytes]:
         Request with its checksum, or None if there is none. Bytes after the request, or from the
         first position at which a request may have begun.
     """
-    possible_start = len(received)
-    request_start = received.find(_ADDRESS)
+    possible_start = len(received_bytes)
+    request_start = received_bytes.find(_ADDRESS)
     while request_start >= 0:
-        available_bytes = len(received) - request_start
-        request_length = _request_length(received, request_start)
+        available_bytes = len(received_bytes) - request_start
+        request_length = _request_length(received_bytes, request_start)
         if request_length <= available_bytes:
-            if _checksum(received[request_start : request_start + request_length]) == 0:
-                return received[request_start : request_start + request_length], received[
-                    request_start + request_length :
-                ]
+            if _checksum(received_bytes[request_start : request_start + request_length]) == 0:
+                return received_bytes[
+                    request_start : request_start + request_length
+                ], received_bytes[request_start + request_length :]
         elif available_bytes < _MAX_FRAME_BYTES:
             possible_start = min(possible_start, request_start)
-        request_start = received.find(_ADDRESS, request_start + 1)
-    return None, received[possible_start:]
+        request_start = received_bytes.find(_ADDRESS, request_start + 1)
+    return None, received_bytes[possible_start:]
 
 
-def _request_length(received: bytes, start: int) -> int:
+def _request_length(received_bytes: bytes, start: int) -> int:
     """Return the length in bytes of the request at `start`.
 
     If the length is unknown, a length is returned that exceeds the data.
     """
-    available_bytes = len(received) - start
+    available_bytes = len(received_bytes) - start
     unknown_length = available_bytes + 1
     if available_bytes < 4:
         return unknown_length
-    function_code = received[start + 1]
+    function_code = received_bytes[start + 1]
     if function_code in (_READ_HOLDING_FUNCTION, _READ_INPUT_FUNCTION):
         return 8
     if function_code in (_STREAM_FUNCTION, _LOCK_FUNCTION):
         return 5
     if function_code == _WRITE_FUNCTION:
-        return 9 + received[start + 6] if available_bytes > 6 else unknown_length
+        return 9 + received_bytes[start + 6] if available_bytes > 6 else unknown_length
     # A request with an unknown function ends where its checksum holds.
     return (
         unknown_length
-        if available_bytes > _MAX_FRAME_BYTES or _checksum(received[start:])
+        if available_bytes > _MAX_FRAME_BYTES or _checksum(received_bytes[start:])
         else available_bytes
     )
 

@@ -19,7 +19,7 @@ _EMERGENCY_LAYOUT = Struct("<HB5s")
 """Layout of an emergency message: error code, error register, vendor's bytes."""
 _GENERIC_ERROR_BIT = 0x01
 """Generic bit of the error register."""
-_HISTORY_LENGTH = 8
+_ERROR_HISTORY_LENGTH = 8
 """Number of error codes in the error history."""
 
 
@@ -52,7 +52,7 @@ class EmergencyMessages:
             "B", read_value=lambda: len(self._history), high=0, after_write=self._history.clear
         )
         objects.add(0x1003, count_entry)
-        for sub in range(1, _HISTORY_LENGTH + 1):
+        for sub in range(1, _ERROR_HISTORY_LENGTH + 1):
             objects.add(0x1003, Entry("I", access="ro", read_value=self._history_reader(sub)), sub)
         self._cob_id = objects.add(0x1014, Entry("I", 0x80 + node_id, check=self._check_cob_id))
 
@@ -82,7 +82,7 @@ class EmergencyMessages:
             return False
         self.active_errors[error_code] = register_bits | _GENERIC_ERROR_BIT
         self._history.insert(0, error_code)
-        del self._history[_HISTORY_LENGTH:]
+        del self._history[_ERROR_HISTORY_LENGTH:]
         self._transmit(error_code, vendor_bytes)
         return True
 
@@ -98,7 +98,7 @@ class EmergencyMessages:
 
     def _transmit(self, error_code: int, vendor_bytes: bytes) -> None:
         """Send an emergency message of the node, unless object 1014 disables such messages."""
-        if not self._cob_id.value & COB_ID_DISABLED:
+        if not self._cob_id.value & COB_ID_DISABLED_BIT:
             message_bytes = _EMERGENCY_LAYOUT.pack(
                 error_code, self._error_register(), vendor_bytes[:5]
             )
@@ -127,7 +127,7 @@ class EmergencyMessages:
         if new_cob_id & 0x7FFF_F800 or not is_free_id(new_cob_id & 0x7FF):
             raise Abort(AbortCode.INVALID_VALUE)
         if (
-            not (present_value | new_cob_id) & COB_ID_DISABLED
+            not (present_value | new_cob_id) & COB_ID_DISABLED_BIT
             and (present_value ^ new_cob_id) & 0x7FF
         ):
             raise Abort(AbortCode.WRONG_STATE)
@@ -249,15 +249,15 @@ def add_heartbeat_monitors(
 
 # PDOs
 
-COB_ID_DISABLED = 0x8000_0000
+COB_ID_DISABLED_BIT = 0x8000_0000
 """Bit in the COB-ID of a PDO or emergency message that disables it."""
 MAX_MAPPING_ENTRIES = 8
 """Largest number of objects in a PDO."""
 _MAX_PDO_BITS = 64
 """Largest length of a PDO in bits."""
-_LAST_SYNC_TYPE = 240
+_MAX_SYNCHRONOUS_TYPE = 240
 """Largest transmission type of a synchronous PDO."""
-_EVENT_TYPES = (254, 255)
+_EVENT_DRIVEN_TYPES = (254, 255)
 """Transmission types of event-driven PDOs."""
 
 
@@ -286,7 +286,7 @@ class Pdo:
         "r" (received) or "t" (transmitted), which the `Entry.mapping` of mapped objects must
         contain.
     cob_id
-        COB-ID at power-on, with or without `COB_ID_DISABLED`.
+        COB-ID at power-on, with or without `COB_ID_DISABLED_BIT`.
     default_mapping
         Mapping at power-on; each entry is index << 16 | sub-index << 8 | bits.
     slots
@@ -344,7 +344,7 @@ class Pdo:
             self.entries = []
         self._struct = Struct("<" + "".join(entry.kind for entry in self.entries))
         self.size = self._struct.size
-        is_enabled = self.entries and not self._cob_id.value & COB_ID_DISABLED
+        is_enabled = self.entries and not self._cob_id.value & COB_ID_DISABLED_BIT
         self.can_id = self._cob_id.value & 0x7FF if is_enabled else -1
         self.reset_exchange()
 
@@ -355,7 +355,7 @@ class Pdo:
     @property
     def is_synchronous(self) -> bool:
         """Whether the PDO is synchronous with SYNC."""
-        return self._type.value <= _LAST_SYNC_TYPE
+        return self._type.value <= _MAX_SYNCHRONOUS_TYPE
 
     def _rebuild(self) -> None:
         """Rebuild the mapping after a parameter was written, and report the change."""
@@ -377,31 +377,31 @@ class Pdo:
 
     def _check_cob_id(self, new_cob_id: int) -> None:
         """Raise `Abort` if the PDO's COB-ID may not be set to a value now."""
-        was_enabled = not self._cob_id.value & COB_ID_DISABLED
+        was_enabled = not self._cob_id.value & COB_ID_DISABLED_BIT
         if new_cob_id & 0x3FFF_F800 or not is_free_id(new_cob_id & 0x7FF):
             raise Abort(AbortCode.INVALID_VALUE)
         if (
             was_enabled
-            and not new_cob_id & COB_ID_DISABLED
+            and not new_cob_id & COB_ID_DISABLED_BIT
             and (new_cob_id ^ self._cob_id.value) & 0x7FF
         ):
             raise Abort(AbortCode.WRONG_STATE)
 
     def _check_inhibit(self, new_time: int) -> None:  # noqa: ARG002
         """Raise `Abort` if the PDO's inhibit time may not be set to a value now."""
-        if not self._cob_id.value & COB_ID_DISABLED:
+        if not self._cob_id.value & COB_ID_DISABLED_BIT:
             raise Abort(AbortCode.WRONG_STATE)
 
     def _check_slot(self, new_entry: int) -> None:
         """Raise `Abort` if a mapping entry of the PDO may not be set to a value now."""
-        if not self._cob_id.value & COB_ID_DISABLED or self._count.value:
+        if not self._cob_id.value & COB_ID_DISABLED_BIT or self._count.value:
             raise Abort(AbortCode.WRONG_STATE)
         if new_entry:
             self._mapped_entry(new_entry)
 
     def _check_count(self, new_count: int) -> None:
         """Raise `Abort` if the number of mapped objects may not be set to a value now."""
-        if not self._cob_id.value & COB_ID_DISABLED:
+        if not self._cob_id.value & COB_ID_DISABLED_BIT:
             raise Abort(AbortCode.WRONG_STATE)
         if new_count > len(self._slots):
             raise Abort(AbortCode.PDO_TOO_LONG)
@@ -526,5 +526,5 @@ class TransmitPdo(Pdo):
 
 def _check_transmission_type(new_type: int) -> None:
     """Raise `Abort` if a value is not a supported transmission type of a PDO."""
-    if new_type > _LAST_SYNC_TYPE and new_type not in _EVENT_TYPES:
+    if new_type > _MAX_SYNCHRONOUS_TYPE and new_type not in _EVENT_DRIVEN_TYPES:
         raise Abort(AbortCode.INVALID_VALUE)

@@ -15,7 +15,7 @@ from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 from rigd.sim import SimulatedRig
 from rigd.sim.wire._canopen_services import (
-    COB_ID_DISABLED,
+    COB_ID_DISABLED_BIT,
     DEFAULT_MONITOR_COUNT,
     MAX_MAPPING_ENTRIES,
     EmergencyMessages,
@@ -741,7 +741,7 @@ def _pdo_parameters(
         yield (
             communication + pdo_number,
             mapping_index,
-            default_cob_id | (COB_ID_DISABLED if pdo_number else 0),
+            default_cob_id | (COB_ID_DISABLED_BIT if pdo_number else 0),
             default_mapping,
             slot_count,
         )
