@@ -285,9 +285,9 @@ def _metadata_number(record: Record, key: str) -> float | None:
 
 
 def _limit_band(band_hz: Band, record: Record) -> Band:
-    """Return the part of a band that a record supports: by its rate and its part of a sweep.
+    """Restrict a band to frequencies below the limit of the rate and within the recorded sweep.
 
-    The whole band is returned if that part is empty.
+    The whole band is returned if nothing remains.
     """
     first_hz, last_hz = band_hz
     limit_hz = min(last_hz, LARGEST_FRACTION_OF_RATE * record.rate_hz)

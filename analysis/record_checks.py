@@ -160,7 +160,7 @@ def stated_tip_mass_kg(session: Session) -> float | None:
     Raises
     ------
     RecordError
-        The mass is negative, or implausibly large.
+        If the mass is negative, or implausibly large.
     """
     return _stated_in_range(session, "tip_mass_kg", 0.0, MAX_TIP_MASS_KG)
 

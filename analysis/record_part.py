@@ -123,9 +123,9 @@ def check_part_length(path: object, part_s: tuple[float, float], beam: Beam) -> 
 def swept_frequencies_hz(
     session: Session, first_tick: int, end_tick: int
 ) -> tuple[float, float] | None:
-    """Return the lowest and highest frequency that a linear sweep has between two ticks.
+    """Return the lowest and highest frequency that a linear sweep covers between two ticks.
 
-    Return None if the session states no linear sweep there.
+    Return None if the session has no linear sweep there.
 
     Parameters
     ----------

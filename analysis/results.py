@@ -474,7 +474,7 @@ def finite(json_value: Any) -> Any:  # noqa: ANN401 - any JSON value
     from numpy import generic
 
     def copy_value(json_value: Any) -> Any:  # noqa: ANN401
-        """Return a copy of one value, recursively."""
+        """Return a deep copy of a JSON value."""
         if isinstance(json_value, dict):
             return {
                 str(key).rstrip("_"): copy_value(json_item) for key, json_item in json_value.items()

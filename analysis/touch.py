@@ -496,9 +496,9 @@ def _white_noise_std(signal_values: Real) -> float:
 
 def _angle_noise_std(angle_rad: Real, is_at_rest: NDArray[np.bool_]) -> float:
     """Return the standard deviation of the angle's noise, from rest or from its resolution."""
-    angle_steps_rad = np.abs(np.diff(angle_rad))
-    angle_steps_rad = angle_steps_rad[angle_steps_rad > _MIN_NOISE_STD]
-    resolution_rad = float(angle_steps_rad.min()) if angle_steps_rad.size else 0.0
+    angle_increments_rad = np.abs(np.diff(angle_rad))
+    angle_increments_rad = angle_increments_rad[angle_increments_rad > _MIN_NOISE_STD]
+    resolution_rad = float(angle_increments_rad.min()) if angle_increments_rad.size else 0.0
     return max(_white_noise_std(angle_rad[is_at_rest]), resolution_rad / sqrt(12))
 
 

@@ -256,7 +256,7 @@ class StatedSpecimen:
 def stated_specimens(
     stated_experiments: Iterable[tuple[str, Experiment | None]], campaign_experiment: Experiment
 ) -> tuple[StatedSpecimen, ...]:
-    """Group files by the specimen that they state, the specimen of the campaign first.
+    """Group files by the specimen named in them; the specimen of the campaign comes first.
 
     Parameters
     ----------

@@ -134,7 +134,7 @@ class Alteration:
 
     @property
     def lags(self) -> tuple[tuple[float, float], ...]:
-        """Return the coefficients of s and s² in the denominator of each lag of the torque."""
+        """Return the coefficients of s and s² in the denominator of each low-pass of the torque."""
         time_s, inverse_quality = self.sensor_lag
         lags = ((inverse_quality * time_s, time_s**2), (self.lag_s, 0.0))
         return tuple(lag for lag in lags if any(lag))
@@ -210,7 +210,7 @@ class _Basis:
     def weighted_products(
         self, rows: NDArray[np.float64], profile: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the integrals over the beam of all products of two of N functions, shape (N, N).
+        """Return the integrals over the beam of all pairwise products of N functions, shape (N, N).
 
         `rows` are the values of the N functions at the quadrature points. Each product is weighted
         by `profile`, the values of another function at these points.

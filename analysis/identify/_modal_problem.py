@@ -286,7 +286,10 @@ class ModalProblem:
     def _solve(
         self, x: NDArray[np.float64], spectra: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return residual and best linear parameters; make `spectra` orthonormal in place."""
+        """Return residual and best linear parameters at the nonlinear parameters `x`.
+
+        The `spectra` of the linear parameters are made orthonormal in place.
+        """
         triangular_factor = _orthonormalise(spectra)
         measured_torque = self._measured_torque
         if (drag := self._comparison.drag) is not None:

@@ -423,7 +423,9 @@ def published_table3() -> Mapping[tuple[str, str, str], PaperStatistics]:
 
 @cache
 def published_table4() -> Mapping[tuple[str, str, str, int], float]:
-    """Return the mean deviations in the paper's Table 4 by type, weighting, quantity and mode.
+    """Return the mean deviations of the peaks in the paper's Table 4.
+
+    The key is (name of the model type, weighting, quantity, number of the mode).
 
     The names of the quantities are those of `MeanPeakDeviation`.
     """

@@ -44,7 +44,7 @@ OnPoll = Callable[[], None]
 
 
 class LoopError(FailureError):
-    """Error if a session fails in which the loop is measured; the message states the reason."""
+    """Raised with the reason if a session that measures the timing of the loop fails."""
 
 
 def simulated_profile(profile: Profile, rate_hz: float, spin_us: float) -> Profile:

@@ -84,7 +84,7 @@ _LATEST_TIME_S = 1e6
 
 
 def _is_time_allowed(time_s: float) -> bool:
-    """Return whether a value in seconds is allowed as a time."""
+    """Return whether the start or end time of an obstacle is finite and within its limits."""
     return 0 <= time_s <= _LATEST_TIME_S
 
 

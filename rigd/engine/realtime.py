@@ -152,9 +152,9 @@ class RaisedPriority:
         return {"scheduling": scheduling_result}
 
     def raise_new_threads(self) -> None:
-        """Raise the priority of all threads, because they compete for one interpreter lock.
+        """Give the threads that were started since `request` the priority of the process.
 
-        Call this after `request` when new threads were started.
+        All threads need it, because they compete for one interpreter lock.
         """
         if self._apply_priority is None:
             return

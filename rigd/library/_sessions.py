@@ -1,4 +1,4 @@
-"""List of the sessions in a folder: search, comparison with the index, reading and filters."""
+"""List of the sessions in a folder: its files are found, read if new or changed, and filtered."""
 
 import os
 from collections.abc import Callable

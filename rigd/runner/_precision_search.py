@@ -472,7 +472,10 @@ class ExcitationPlanner:
         yield PlannedSegment("the scan once more", {"why": reason})
 
     def _append_scan(self, name: str, held_ticks: int) -> bool:
-        """Append the first chirp again as segment `name`; return False if time is too short."""
+        """Append the first chirp again as segment `name`; return False if too little time remains.
+
+        The motor has been held for `held_ticks` so far, which the record contains in addition.
+        """
         scan_rad = self._intervals[0].reference_rad
         if self._max_ticks - self._writer.ticks - held_ticks < scan_rad.size:
             return False

@@ -1,7 +1,7 @@
 """Probing move before the first session, which verifies the scales of motor and sensors.
 
 The result is stored in the user's runtime folder. It is valid until the computer is restarted, as
-long as the verified values, the drive, the sensor and a simulated rig do not change.
+long as verified values, drive, sensor and, if the rig is simulated, the simulation do not change.
 """
 
 import contextlib

@@ -328,7 +328,7 @@ class Rig:
             self.disconnect()
             raise RigError(str(error)) from None
         finally:
-            stop.on_request = _ignore_stop_request
+            stop.on_request = _do_nothing_on_stop
             _reset_session_fields(shared_state)
         if isinstance(probe_reply, MeasurementRefused):
             raise RigError(probe_reply.reason)
@@ -500,7 +500,7 @@ class Rig:
         self.disconnect()
 
 
-def _ignore_stop_request() -> None:
+def _do_nothing_on_stop() -> None:
     """Do nothing when a stop is requested, because its flag is read later."""
 
 

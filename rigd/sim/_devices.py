@@ -179,8 +179,8 @@ class SimulatedRig:
         disturbance
             Obstacle or impact, whose times count from the first enabling of the drive.
         wait
-            Whether the disturbance is present before the next period; the caller then waits a tenth
-            of a second. Otherwise another process prepares it while the rig continues.
+            If True, block for about 0.1 s until the disturbance acts. If False, return at once;
+            another process prepares it while the rig continues.
         """
         self._added_disturbances.append(disturbance)
         if wait:
