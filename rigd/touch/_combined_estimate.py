@@ -92,6 +92,7 @@ def estimate_from_explanations(
             _position_estimate(explanation_search, likely_explanations),
             _common_parameter(likely_explanations, 1, begin_s),
         )
+        x_m = _including(x_m, explained_record.first_of_two_m)
         if is_poor_fit or explained_record.other_kinds_untried:
             x_m = _with_wide_interval(explanation_search, x_m)
         force_history_n, force_times_s, force_n = _force_estimate(
@@ -157,6 +158,19 @@ def _with_wide_interval(
     *_, low_m, high_m = explanation_search.any_force.interval()
     low_m, high_m = min(low_m, estimate.interval_95[0]), max(high_m, estimate.interval_95[1])
     return TouchQuantity(estimate.value, max(estimate.std, (high_m - low_m) / 4), (low_m, high_m))
+
+
+def _including(estimate: TouchQuantity, positions_m: Real) -> TouchQuantity:
+    """Return a touch position in m, with an interval that includes other possible positions."""
+    low_m, high_m = (
+        float(limit([*estimate.interval_95, *positions_m])) for limit in (np.min, np.max)
+    )
+    if (low_m, high_m) == estimate.interval_95:
+        return estimate
+    farthest_m = max(high_m - estimate.value, estimate.value - low_m)
+    return TouchQuantity(
+        estimate.value, max(estimate.std, farthest_m / _NORMAL_QUANTILE_95), (low_m, high_m)
+    )
 
 
 def _position_estimate(

@@ -70,6 +70,12 @@ is that large by chance."""
 _MIN_TWO_OBSTACLES_GAIN = 5.0
 """Reduction of the sum of squared residuals by two obstacles from which they are possible, so that
 the position is less certain."""
+_FIRST_OF_TWO = np.array([[0.85, 1.3], [0.7, 1.5], [0.55, 1.75], [1.3, 0.85], [1.6, 0.65]])
+"""Positions of two obstacles, over that of a single one, which are compared with it. That of the
+first stays, the search adapts the other parameters."""
+_MAX_EQUIVALENT_LOSS = 50.0
+"""Increase of the sum of squared residuals by the nearest such pair beyond which none is likely, as
+for all but soft obstacles near the axis."""
 _MIN_EARLY_GAIN = 0.8
 """Reduction of the sum of squared residuals after a few iterations, from which the search for two
 obstacles continues."""
@@ -118,6 +124,8 @@ class ExplainedRecord:
     """Whether the later samples, which are left out, contradict an obstacle at rest."""
     other_kinds_untried: bool
     """Whether another kind of obstacle may be likelier, but was not tried."""
+    first_of_two_m: Real
+    """Positions of the first of two obstacles that explain the record as well as one does."""
 
 
 class ExplanationSearch:
@@ -205,6 +213,7 @@ class ExplanationSearch:
         )
         explanations = [resting_explanation]
         other_kinds_untried = False
+        first_of_two_m: Real = np.zeros(0)
         if two_obstacles is None:
             needs_other_kinds = not self.fits(
                 resting_explanation, sample_window, POOR_FIT_STDS
@@ -214,7 +223,15 @@ class ExplanationSearch:
             elif needs_other_kinds:
                 explanations += self._explain_by_other_kinds(sample_window)
             if self.fits(resting_explanation, sample_window):
-                two_obstacles = self._explain_by_two(resting_explanation, sample_window)
+                two_obstacles, first_of_two_m = self._explain_by_two(
+                    resting_explanation, sample_window
+                )
+                # What one obstacle explains much worse than two, another kind may explain as well.
+                other_kinds_untried |= (
+                    first
+                    and two_obstacles is not None
+                    and two_obstacles.chi2 < resting_explanation.chi2 - DECISIVE_CHI2_DIFFERENCE
+                )
         if two_obstacles is not None:
             explanations.append(two_obstacles)
         return ExplainedRecord(
@@ -222,6 +239,7 @@ class ExplanationSearch:
             sample_window,
             later_samples_contradict=later_samples_contradict,
             other_kinds_untried=other_kinds_untried,
+            first_of_two_m=first_of_two_m,
         )
 
     def _explain_in_stages(self) -> tuple[Explanation, WhitenedWindow, Explanation | None, bool]:
@@ -269,7 +287,7 @@ class ExplanationSearch:
             if previous_stage is not None and self._later_samples_fit_worse(
                 at_rest, stage_window, *previous_stage
             ):
-                two_obstacles = self._explain_by_two(at_rest, stage_window)
+                two_obstacles, _ = self._explain_by_two(at_rest, stage_window)
                 if two_obstacles is not None and self.fits(
                     two_obstacles, stage_window, POOR_FIT_STDS
                 ):
@@ -639,8 +657,12 @@ class ExplanationSearch:
 
     def _explain_by_two(
         self, resting_explanation: Explanation, sample_window: WhitenedWindow
-    ) -> Explanation | None:
-        """Return the explanation by two obstacles, or None if one obstacle explains as much."""
+    ) -> tuple[Explanation | None, Real]:
+        """Return the explanation by two obstacles, and possible positions of the first of two.
+
+        The explanation is None if one obstacle explains about as much. At the positions, two
+        obstacles explain the first samples at least as well as one.
+        """
         two_contacts = self.pairing()
         parameter_ranges = two_contacts.space(self.space(3))
         # The first samples show in less time whether more iterations are worthwhile.
@@ -656,22 +678,25 @@ class ExplanationSearch:
             two_contacts.predict_channels, early_window, start_pairs, parameter_ranges, rounds=4
         )
         single_obstacle = resting_explanation.parameters[None]
-        if (
-            minima.chi2.min()
-            > chi2_of(self.predictor(single_obstacle), early_window, single_obstacle)[0]
-            - _MIN_EARLY_GAIN
-        ):
-            return None
-        likeliest = minima.parameters[np.argsort(minima.chi2)[:3]]
+        [single_chi2] = chi2_of(self.predictor(single_obstacle), early_window, single_obstacle)
+        equivalent_pairs, equivalent_chi2 = self._equivalent_pairs(
+            two_contacts, resting_explanation, early_window, single_chi2
+        )
+        first_of_two_m = equivalent_pairs[equivalent_chi2 <= single_chi2, 0]
+        start_candidates = np.vstack([minima.parameters, equivalent_pairs])
+        start_chi2 = np.concatenate([minima.chi2, equivalent_chi2])
+        if start_chi2.min() > single_chi2 - _MIN_EARLY_GAIN:
+            return None, first_of_two_m
+        likeliest = start_candidates[np.argsort(start_chi2)[:3]]
         start_pairs = np.vstack([likeliest, two_contacts.in_reverse_order(likeliest[:1])])
         minima = find_minima(
             two_contacts.predict_channels, sample_window, start_pairs, parameter_ranges, rounds=8
         )
         chi2_gain = resting_explanation.chi2 - minima.chi2.min()
         if chi2_gain < _MIN_TWO_OBSTACLES_GAIN:
-            return None
+            return None, first_of_two_m
         variance_factor = _TWO_OBSTACLES_VARIANCE if chi2_gain > DECISIVE_CHI2_DIFFERENCE else 1.0
-        return self._explain_from_minima(
+        two_obstacles = self._explain_from_minima(
             "two",
             two_contacts.predict_channels,
             sample_window,
@@ -679,6 +704,35 @@ class ExplanationSearch:
             parameter_ranges,
             variance_factor,
         )
+        return two_obstacles, first_of_two_m
+
+    def _equivalent_pairs(
+        self,
+        two_contacts: TwoObstacleContact,
+        resting_explanation: Explanation,
+        sample_window: WhitenedWindow,
+        single_chi2: float,
+    ) -> tuple[Real, Real]:
+        """Return the likeliest pairs for some positions of the first, and their squared residuals.
+
+        The pairs are (k, 6) parameters, without any if their effect is not that of one obstacle.
+        """
+        parameter_ranges = two_contacts.space(self.space(3))
+        pairs = two_contacts.equivalent_pairs(resting_explanation.parameters, _FIRST_OF_TWO)
+        pairs = pairs[(pairs[:, [0, 3]] <= parameter_ranges.high[0]).all(axis=1)]
+        predict_effect = two_contacts.predict_channels
+        if (
+            not pairs.size
+            or chi2_of(predict_effect, sample_window, pairs[:1])[0]
+            > single_chi2 + _MAX_EQUIVALENT_LOSS
+        ):
+            return np.empty((0, 6)), np.empty(0)
+        is_free = np.ones(pairs.shape, dtype=bool)
+        is_free[:, 0] = False
+        minima = find_minima(
+            predict_effect, sample_window, pairs, parameter_ranges, rounds=8, free=is_free
+        )
+        return minima.parameters, minima.chi2
 
     def pressing_direction(self) -> float:
         """Return the direction in which the beam presses on the obstacle, 1 or -1.

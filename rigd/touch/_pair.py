@@ -139,20 +139,33 @@ class TwoObstacleContact:
             Number of positions of a second obstacle: those with the largest reduction of the
             residuals, by first-order effects.
         """
-        equivalent_pairs = np.tile(
-            np.concatenate([single_obstacle, single_obstacle]), (len(_EQUIVALENT_POSITIONS), 1)
-        )
-        equivalent_pairs[:, [0, 3]] *= _EQUIVALENT_POSITIONS
-        equivalent_pairs[:, [2, 5]] -= np.log(2 * _EQUIVALENT_POSITIONS**2)
-        equivalent_pairs[:, 4] = 0.0
         return np.vstack(
             [
-                equivalent_pairs,
+                self.equivalent_pairs(single_obstacle, _EQUIVALENT_POSITIONS),
                 self._with_second_obstacle(
                     single_obstacle, sample_window, parameter_ranges, pair_count
                 ),
             ]
         )
+
+    @staticmethod
+    def equivalent_pairs(single_obstacle: Real, relative_positions: Real) -> Real:
+        """Return pairs of obstacles with about the effect of a single one, shape (k, 6).
+
+        Parameters
+        ----------
+        single_obstacle
+            Position, instant and logarithm of the stiffness of the single obstacle.
+        relative_positions
+            Positions of the two obstacles over that of the single one, shape (k, 2).
+        """
+        pairs: Real = np.tile(
+            np.concatenate([single_obstacle, single_obstacle]), (len(relative_positions), 1)
+        )
+        pairs[:, [0, 3]] *= relative_positions
+        pairs[:, [2, 5]] -= np.log(2 * relative_positions**2)
+        pairs[:, 4] = 0.0
+        return pairs
 
     def _with_second_obstacle(
         self,

@@ -139,6 +139,17 @@ def test_two_soft_obstacles_are_not_one_between_them(estimator, mistaken):
     assert 0 < estimate.force_n.value < 2 * two.peak_n
 
 
+@pytest.mark.fit
+def test_what_two_explain_as_well_as_one_is_in_the_first_interval(estimator):
+    """With this noise two obstacles explain the first 50 ms only a little better than one."""
+    (first, second), slew = ALIKE["two alike"]
+    [two] = simulate([(first, second)], [slew], duration_s=0.62, steps=20, modes=20, seed=7)
+    estimate = estimator.follow().update(cut(two, 50), scan=False, first=True)
+    low, high = estimate.x_m.interval_95
+    assert low < first.x_m < high < second.x_m
+    assert abs(estimate.x_m.value - first.x_m) < 4 * estimate.x_m.std
+
+
 @pytest.mark.parametrize("after", [further(50), 190])
 def test_one_that_is_like_two_is_one(estimator, mistaken, after):
     estimate = estimator.estimate(cut(mistaken["one alike"], after), scan=False)
