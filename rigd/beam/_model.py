@@ -111,10 +111,10 @@ _SERIES = np.array(
     ]
 )
 """Power series coefficients of the numerator N(q) and the denominator D(q), lowest power first."""
-_SERIES_WITH_SLOPES = np.concatenate(
+_SERIES_AND_DERIVATIVES = np.concatenate(
     [_SERIES, np.pad(_SERIES[:, 1:] * np.arange(1.0, 10.0), ((0, 0), (0, 1)))]
 )
-"""The same, followed by those of their derivatives."""
+"""Power series coefficients of N(q) and D(q), then of dN/dq and dD/dq, lowest power first."""
 
 
 class TransferGrid:
@@ -163,7 +163,7 @@ class TransferGrid:
     def evaluate_with_gradient(
         self, beam: Beam, damping: Damping, wrt: Sequence[str] = GRADIENT_NAMES[:4]
     ) -> tuple[Complex, Complex]:
-        """Return the coupling torque per motor angle and its derivatives by parameters.
+        """Return the coupling torque per motor angle and its derivatives for the parameters `wrt`.
 
         Parameters
         ----------
@@ -277,7 +277,7 @@ def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
 def transfer_and_gradient(
     s: ArrayLike, beam: Beam, damping: Damping, wrt: Sequence[str] = GRADIENT_NAMES[:4]
 ) -> tuple[Complex, Complex]:
-    """Return the coupling torque per motor angle at `s`, and its derivatives by parameters.
+    """Return the coupling torque per motor angle at `s` and its derivatives for parameters `wrt`.
 
     Parameters
     ----------
@@ -387,7 +387,7 @@ def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
     is_small = np.abs(q) < _SERIES_LIMIT
     if is_small.any():
         small_q = q[is_small]
-        n, d, n_slope, d_slope = _polynomials(_SERIES_WITH_SLOPES, small_q)
+        n, d, n_slope, d_slope = _polynomials(_SERIES_AND_DERIVATIVES, small_q)
         wronskian = n * d_slope - n_slope * d
         d_squared = d * d
         f[is_small] = small_q * n / d

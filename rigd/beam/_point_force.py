@@ -56,7 +56,8 @@ class PointForceGrid:
     >>> from rigd.beam import Beam, Damping, PointForceGrid
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> response = PointForceGrid([0.0], beam, Damping())
-    >>> print(response.per_force(0.6, 0.6).real, round(0.6**3 / (3 * 0.0903), 6))  # m/N
+    >>> displacement_m_per_n = response.displacement_per_force(0.6, 0.6).real
+    >>> print(displacement_m_per_n, round(0.6**3 / (3 * 0.0903), 6))
     [0.79734219] 0.797342
     """
 
@@ -86,7 +87,7 @@ class PointForceGrid:
         )
         self._exponentials = _ExponentialSolution(self._b4[self._large_q_indices], beam.length_m)
 
-    def per_angle(self, x_m: ArrayLike, derivative_order: int = 0) -> Complex:
+    def displacement_per_angle(self, x_m: ArrayLike, derivative_order: int = 0) -> Complex:
         """Return the displacement of the beam per angle of its root, or its derivative by x.
 
         Parameters
@@ -117,7 +118,7 @@ class PointForceGrid:
         )
         return out.reshape((*self._shape, *x.shape))
 
-    def per_force(
+    def displacement_per_force(
         self, x_m: ArrayLike, force_at_m: ArrayLike, derivative_order: int = 0
     ) -> Complex:
         """Return the displacement of the beam per point force, or its derivative by x.
@@ -169,11 +170,11 @@ class PointForceGrid:
 
         The shape is that of the grid.
         """
-        return -self._bending_stiffness() * self.per_angle(0.0, 2)
+        return -self._bending_stiffness() * self.displacement_per_angle(0.0, 2)
 
     def shear_per_angle(self) -> Complex:
         """Return the shear force at the root per angle in N/rad, in the shape of the grid."""
-        return self._bending_stiffness() * self.per_angle(0.0, 3)
+        return self._bending_stiffness() * self.displacement_per_angle(0.0, 3)
 
     def torque_per_force(self, force_at_m: ArrayLike) -> Complex:
         """Return the motor's torque on the beam per point force on it, in N·m/N.
@@ -186,7 +187,9 @@ class PointForceGrid:
             Position of the force, as a distance from the motor's axis.
         """
         at = np.asarray(force_at_m, dtype=np.float64)
-        return -self._bending_stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 2)
+        return -self._bending_stiffness(at.ndim) * self.displacement_per_force(
+            np.zeros_like(at), at, 2
+        )
 
     def shear_per_force(self, force_at_m: ArrayLike) -> Complex:
         """Return the shear force at the root per point force on the beam, dimensionless.
@@ -199,7 +202,9 @@ class PointForceGrid:
             Position of the force, as a distance from the motor's axis.
         """
         at = np.asarray(force_at_m, dtype=np.float64)
-        return self._bending_stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 3)
+        return self._bending_stiffness(at.ndim) * self.displacement_per_force(
+            np.zeros_like(at), at, 3
+        )
 
     def _bending_stiffness(self, axes: int = 0) -> Complex:
         """Return the complex bending stiffness Q in N·m²; `axes` axes of length 1 are appended."""
@@ -214,7 +219,8 @@ class PointForceGrid:
     ) -> tuple[Complex, Complex]:
         """Return y''(0) and y'''(0) of the beam whose moment and shear force at the tip are zero.
 
-        `tip_moment` and `tip_shear` are the derivatives y''(L) and y'''(L) of the other terms.
+        `tip_moment` and `tip_shear` are y''(L) and y'''(L) of the solution without the terms in K_2
+        and K_3 that y''(0) and y'''(0) multiply.
         """
         k0, k1, k3 = self._series_at_tip(0), self._series_at_tip(1), self._series_at_tip(3)
         determinant = k0 * k0 - b4 * k1 * k3

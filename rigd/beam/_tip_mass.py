@@ -84,7 +84,7 @@ def loaded_response(
     elastic_factor, inertial_factor : ndarray of complex
         Elastic factor c and inertial factor p at these s.
     beam : Beam
-        Beam with this stiffness and length. Its density is not used: p contains it.
+        Beam, of which stiffness and length are used; p already contains the density.
     tip_mass_kg : float
         Point mass at the tip.
     """
@@ -161,7 +161,7 @@ def add_stiffness_offsets(
 
 
 Slopes = dict[str, Callable[[], Complex]]
-"""Map from a parameter's name to a function that computes the response's derivative by it."""
+"""Map from a parameter's name to a function that computes the derivative of the response."""
 
 
 def differentiated_response(
