@@ -33,7 +33,7 @@ class DisturbedRig(Protocol):
 
     @property
     def disturbed(self) -> Callable[[Real, int], tuple[Real, Real]]:
-        """Function of a reference, shape (n,), and a number of lowest modes.
+        """Function that simulates the rig, of a reference, shape (n,), and a number of modes.
 
         It returns the angle in rad, shape (n, draws), and the amplitude of each mode's coupling
         torque in N·m, shape (n, modes, draws), for several random draws.
@@ -68,8 +68,8 @@ class MoveEnd:
     residual_nm: float
     """Coupling torque in N·m of the residual vibration, with friction, encoder steps and noise."""
     floor_nm: float
-    """Coupling torque in N·m that the sensor's noise alone simulates in the ring-down, exceeded in
-    one of 1000 cases. A smaller vibration cannot be detected."""
+    """Amplitude in N·m of the coupling torque that noise of the sensor alone exceeds in one of 1000
+    ring-downs. A smaller vibration cannot be detected."""
 
 
 def predict_move_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:

@@ -47,8 +47,8 @@ _MAX_ROUNDS: Final = 14
 """Largest number of durations that the search tries."""
 _MAX_BACKWARD_SPEED_FRACTION: Final = 0.01
 """Largest backward speed of a robust move, as a fraction of its mean speed."""
-_BRAKING_STARTS: Final = 16
-"""Number of ticks along a reference from which braking is simulated."""
+_BRAKING_START_COUNT: Final = 16
+"""Number of ticks, spread over a reference, from which braking is simulated."""
 _BRAKING_DURATIONS_S: Final = (0.02, 5.0)
 """Shortest and longest duration in s of a braking path that is tried."""
 
@@ -539,7 +539,9 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
     torque is linear in speed and acceleration of the reference at the start.
     """
     held_reference = np.zeros(round(plant.settling_s * plant.rate_hz))
-    start_ticks = np.unique(np.linspace(2, reference_rad.size - 1, _BRAKING_STARTS).astype(int))
+    start_ticks = np.unique(
+        np.linspace(2, reference_rad.size - 1, _BRAKING_START_COUNT).astype(int)
+    )
     available_torque_nm = plant.peak_torque_nm - plant.friction_nm
     duration_s, longest_s = _BRAKING_DURATIONS_S
     while duration_s <= longest_s:

@@ -85,7 +85,7 @@ class SineMixture:
     times_s: Real
     """Time in s for which each sine lasts; shape (m,)."""
     weights: Real
-    """Combinations of the torque's derivatives by the parameters, the sum of whose squares is the
+    """Weights of q combinations of the k derivatives of the torque, whose sum of squares is the
     information that brings the targets closer; shape (q, k)."""
 
 
@@ -99,9 +99,9 @@ def best_mixture(
 ) -> SineMixture:
     """Return durations of steady sines that together reach all target precisions soonest.
 
-    Uses multiplicative steps, as `time_fractions`, with a multiplier for each quantity. By the
-    equivalence theorem all sines of the best mixture give the same information per second on the
-    returned combinations, and no other sine gives more (V. V. Fedorov, Theory of optimal
+    The search takes multiplicative steps, as `time_fractions`, with a multiplier for each quantity.
+    By the equivalence theorem all sines of the best mixture give the same information per second on
+    the returned combinations, and no other sine gives more (V. V. Fedorov, Theory of optimal
     experiments, 1972).
 
     Parameters

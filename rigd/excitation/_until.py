@@ -40,7 +40,7 @@ _FADE_S: Final = 0.25
 _SCAN_LIMIT_FRACTION: Final = 0.8
 """Largest fraction of the limits that the scan uses, since the beam may differ from the profile."""
 _SCAN_RELATIVE_FREQUENCIES: Final = (0.2, 1.0, 2.3, 6.3, 12.0)
-"""Frequencies over that of mode 1 at which the relative amplitude of the scan is given."""
+"""Frequencies, divided by that of mode 1, at which the scan's relative amplitude is given."""
 _SCAN_RELATIVE_AMPLITUDES: Final = (1.0, 0.4, 0.19, 0.15, 1.0)
 """Relative amplitudes of the scan at these frequencies, with 1 for its largest amplitude.
 
