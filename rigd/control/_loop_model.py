@@ -28,7 +28,7 @@ class LinearController:
     Raises
     ------
     ValueError
-        If the shapes do not go together, or a number is not finite.
+        If the shapes do not match, or a number is not finite.
 
     Examples
     --------

@@ -12,12 +12,13 @@ angle reading
 torque reading
     The feed-forward alone: calibration, lever arm and delay of the sensor.
 
-The feed-forward is positive feedback that cancels the beam. Where the clamped beam resonates, its
-loop gain is -1 by design. The curve therefore passes close to the critical point at the first and
-the third signal with any controller: with a command that is `k` times too strong, ``1 - k`` times
-the beam's torque remains in the loop. A gain margin of 2 is impossible there, since it would mean
-that the inverted torque of the beam acts on the motor. There the tolerances of drive and sensor
-have to fit into the margin. The rules of thumb for a feedback loop apply to the angle only.
+The feed-forward is positive feedback that cancels the beam. At resonances of the clamped beam the
+loop gain of the feed-forward is -1 by design. The curve therefore passes close to the critical
+point at the first and the third signal with any controller: with a command that is `k` times too
+strong, ``1 - k`` times the beam's torque remains in the loop. A gain margin of 2 is impossible
+there, since it would mean that the inverted torque of the beam acts on the motor. There the
+tolerances of drive and sensor have to fit into the margin. The rules of thumb for a feedback loop
+apply to the angle only.
 """
 
 from collections.abc import Callable
