@@ -1,7 +1,7 @@
 """Encoder watch: detects an encoder that has failed while its messages stay fresh.
 
 A frozen encoder shows a shaft at rest, and a controller that trusts it turns the motor without
-limit. Three observations distinguish the two:
+limit. Three observations distinguish a frozen encoder from a shaft at rest:
 
 * *Momentum.* A moving shaft does not stop within two ticks: torques and friction would have to
   supply an impulse of ``J v``.
@@ -9,7 +9,7 @@ limit. Three observations distinguish the two:
   the breakaway torque. This needs no model of the beam, but friction limits it.
 * *Coupling torque.* If a beam pulls at an apparently resting shaft more than by its own vibration,
   the shaft moves, or the beam is touched. This needs no knowledge of the friction, but does not
-  distinguish the two. It therefore only starts a *test of the encoder*: the torque of the motor is
+  exclude a touch. It therefore only starts a *test of the encoder*: the torque of the motor is
   ramped until the encoder moves by two steps, or until the net torque exceeds the breakaway
   torque, which is a fault.
 
@@ -336,8 +336,10 @@ class EncoderMonitor:
             return None
         ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._torque_history) - 2)
         net_sum, motor_sum = self._torque_sums(ticks)
-        per_tick_nm = _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
-        needed_nm = per_tick_nm * self._rate_hz**2 / _STANDSTILL_TICKS_AT_STOP
+        momentum_per_tick = (
+            _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
+        )
+        stopping_torque_nm = momentum_per_tick * self._rate_hz**2 / _STANDSTILL_TICKS_AT_STOP
         braking_nm = max(0.0, -net_sum if moved_rad > 0 else net_sum)
         allowed_nm = (
             self._breakaway_nm
@@ -347,9 +349,9 @@ class EncoderMonitor:
             )
             / _STANDSTILL_TICKS_AT_STOP
         )
-        if needed_nm <= allowed_nm:
+        if stopping_torque_nm <= allowed_nm:
             return None
-        return INTERLOCKS_BY_NAME["stopped encoder"].violated(needed_nm, allowed_nm)
+        return INTERLOCKS_BY_NAME["stopped encoder"].violated(stopping_torque_nm, allowed_nm)
 
     def _check_net_torque(self, ticks: int, max_turning_nm: float) -> Violation | None:
         """Return a violation if the mean net torque should have turned a shaft that seems at rest.
@@ -408,7 +410,7 @@ class EncoderMonitor:
         return INTERLOCKS_BY_NAME["repeated angle"].violated(len(repeat_ticks), _MAX_REPEATS - 1)
 
     def _compare_scales(self, scale_monitor: ScaleMonitor) -> Violation | None:
-        """Pass acceleration and net torque over the last `WINDOW_TICKS` to the scale watch."""
+        """Pass acceleration and net torque of the last window to the scale monitor."""
         angles, torque_history = self._angles, self._torque_history
         n = WINDOW_TICKS
         if len(angles) < n + SPEED_TICKS + 1 or len(torque_history) < n + SPEED_TICKS + 3:

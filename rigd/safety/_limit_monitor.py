@@ -424,7 +424,7 @@ class LimitMonitor:
         )
 
     def _percentage(self, counted_ticks: int, scheduled_ticks: int) -> float:
-        """Return ticks as a percentage of the scheduled ones, or of those in 10 s if more."""
+        """Return ticks in per cent of the scheduled ticks, or of those in 10 s if more."""
         return 100.0 * counted_ticks / max(scheduled_ticks, self._fraction_window)
 
     def _assess_fraction(self, *checked_values: _CheckedValue) -> Violation | None:

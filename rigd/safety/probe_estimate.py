@@ -168,7 +168,7 @@ def _coupling_ratio(
             ratio_variance = (
                 residual_nm
                 / expected_nm.size
-                * _samples_per_independent_one(smoothing_window)
+                * _samples_per_independent_sample(smoothing_window)
                 / torque_squares
             )
             best_fit = (
@@ -180,8 +180,8 @@ def _coupling_ratio(
     return (None, None, np.zeros_like(measured_nm)) if best_fit is None else best_fit[1:]
 
 
-def _samples_per_independent_one(smoothing_window: Real) -> float:
-    """Return how many smoothed samples carry the information of one independent sample."""
+def _samples_per_independent_sample(smoothing_window: Real) -> float:
+    """Return the number of smoothed samples with the information of one independent sample."""
     return 1.0 / float(smoothing_window @ smoothing_window)
 
 

@@ -1,9 +1,9 @@
 """Probing move: strokes at two speeds within tight bounds, on a rig with unverified scales.
 
-A wrong scale or sign makes every limit wrong by the same factor, so no check here relies on one
-alone. The shaft is driven by its speed, slowly at first. The coupling torque is independent of
-encoder and motor: in every tick it is compared with the torque of the profile's beam at the
-measured angle, and the move ends where they differ. The torque rises slowly enough that this
+A wrong scale or sign makes every limit wrong by the same factor, so no check here relies on a
+single scale. The speed of the shaft is controlled, slow at first. The coupling torque is
+independent of encoder and motor: in every tick it is compared with the torque of the profile's beam
+at the measured angle, and the move ends where they differ. The torque rises slowly enough that this
 comparison stops the shaft of a frozen or coarse encoder within a tenth of a radian.
 
 A speed controller at the same shaft as the beam is stable for a motor with a fifth to five times
@@ -255,9 +255,9 @@ _FROZEN_ENCODER_S = 0.025
 _STROKE_PAUSE_S = 0.15
 """Pause in seconds after a stroke."""
 _MAX_STROKE_S = 5.0
-"""Time in seconds after which a stroke ends the move; strokes of a sound rig take less."""
+"""Time in seconds after which a stroke that has not finished ends the move."""
 _INITIAL_TORQUE_FRACTION = 0.7
-"""Torque at which a stroke begins, as a fraction of that needed in the stroke before."""
+"""Torque at which a stroke begins, as a fraction of the torque that moved the previous one."""
 _COUPLING_RATIO_BAND = 0.5, 2.0
 """Smallest and largest ratio of coupling torque and beam's torque for a further stroke."""
 
