@@ -1,7 +1,8 @@
 """Checks for contradictions between a profile's values, and the messages on its mistakes.
 
-Values may contradict each other (`contradictions`), also for the wiring of the devices
-(`wiring_contradictions`). Sources, keys and sections may be missing or unknown.
+`contradictions` finds values that contradict each other, `wiring_contradictions` those in the
+wiring of the devices. The messages are also on sources, keys and sections that are missing or
+unknown.
 """
 
 import difflib

@@ -129,9 +129,9 @@ class RigSection:
     rate_hz: Annotated[float, Ge(100), Le(20_000)]
     """Rate of the loop; slower loops would check the other processes too seldom."""
     axis_tilt_deg: Annotated[float, Ge(-90), Le(90)] | None = field(default=None, metadata=OPTIONAL)
-    """Inclination of the resting beam in the plane of motion, or None if it was not measured.
+    """Angle between the horizontal and the resting beam, or None if it was not measured.
 
-    It is positive if the tip is lower than the motor's axis; gravity then pulls along the beam."""
+    Its sine is (height of the root - height of the tip) / length: positive if the tip is lower."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +171,7 @@ SECTIONS: dict[str, type] = {
 }
 """Map from a section's name to the dataclass of its keys."""
 _ADDED_SECTIONS: dict[str, str] = {}
-"""Names in `SECTIONS` of the sections of parts that installed packages add, with their group."""
+"""Map from each section that a part of an installed package has added, to the part's group."""
 
 
 def optional_sections() -> tuple[str, ...]:
@@ -375,7 +375,7 @@ _MIN_BREAKAWAY_FRACTION = 0.05
 
 
 class UnknownValueError(UserError):
-    """A value that is needed is stated as unknown in the profile."""
+    """Error if the profile states a value as unknown that is needed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,7 +411,7 @@ class Profile:
     tip_mass_kg: float | None = None
     """Measured point mass at the beam's tip, or None if it is unknown."""
     axis_tilt_deg: float | None = None
-    """Inclination of the resting beam in the plane of motion, or None if it was not measured.
+    """Angle between the horizontal and the resting beam, or None if it was not measured.
 
     It is positive if the tip is lower than the motor's axis."""
     controller_settings: object | None = None
@@ -449,9 +449,9 @@ class Profile:
 
     @property
     def is_loop_modelled(self) -> bool:
-        """Whether the model of the closed loop has the controller, and not the PID instead.
+        """Whether the model of the closed loop contains the rig's controller, not the PID instead.
 
-        Own code of a package need not state matrices.
+        The PID replaces a controller of a package that states no matrices.
         """
         name = self.control.controller
         kind = None if name == SHIPPED_CONTROLLER else CONTROLLERS.get(name)
