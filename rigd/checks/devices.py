@@ -469,7 +469,7 @@ def _probing_rows(profile: Profile, target: ActuationTarget) -> Iterator[CheckRo
 def inspect_devices(profile: Profile) -> list[CheckRow]:
     """Connect to the devices of a profile, check them without torque, and return the rows.
 
-    The drive is never enabled. Both devices are closed in the end, also after an error.
+    The drive is never enabled. Both devices are closed at the end, even after an error.
     """
     rig = profile.rig
     target = actuation_target(rig)
