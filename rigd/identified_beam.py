@@ -128,7 +128,7 @@ class IdentifiedBeam:
     """Relative standard uncertainty of the pole of each mode in the document."""
 
     def pole_uncertainty(self, mode_count: int) -> tuple[float, ...]:
-        """Return the relative standard uncertainty of the poles of the first modes.
+        """Return the relative standard uncertainty of the pole of each of the first modes.
 
         Parameters
         ----------
@@ -146,7 +146,7 @@ class IdentifiedBeam:
 def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> IdentifiedBeam:
     """Read the identified beam from the document of an analysis or a campaign.
 
-    It is that of the first headline, for a campaign that of the pooled headline. If a uniform beam
+    The beam is that of the first headline, or of a campaign's pooled headline. If a uniform beam
     predicts the modes, the parameters are those of an exactly uniform beam, which predict the
     record best. Otherwise no uniform beam describes the rig, and the modes themselves are used if
     the purpose permits it.
@@ -157,8 +157,8 @@ def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> 
         Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes``,
         ``exact_geometry``, ``validity.uniform_beam`` and ``named``.
     stated
-        Stated plant: its length, which is not observable in a session, its delay and tool inertia
-        apply if the document has none.
+        Plant with the stated length, which no session determines, and with the delay and the tool
+        inertia to use if the document has none.
     use
         Purpose of the beam: `MOVE` or `TOUCH`.
 
@@ -327,7 +327,7 @@ def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any
 
 
 def _is_of_one_file(numbered_headline: tuple[int, Mapping[str, Any]]) -> bool:
-    """Return whether a headline is of a single file, and not of all together."""
+    """Return whether a headline is of a single file, and not of all files together."""
     return numbered_headline[1].get("file", "") is not None
 
 

@@ -59,9 +59,9 @@ def sweep_ticks(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
 
 
 class SweepResponse:
-    """Running estimate of the frequency response torque over motor angle in a sweep.
+    """Running estimate of the frequency response from motor angle to torque in a sweep.
 
-    It is computed by Welch's method, with the default segments of `analyze`.
+    The estimate uses Welch's method, with the default segments of `analyze`.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class SweepResponse:
 def nominal_response(
     beam: Beam, damping: Damping, tool_inertia_kg_m2: float
 ) -> tuple[Real, Complex]:
-    """Return the nominal response torque over angle at the sensor, in the band that is shown.
+    """Return the nominal frequency response from motor angle to the sensor's torque.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def nominal_response(
     Returns
     -------
     tuple of two arrays (n,)
-        Frequencies in Hz; torque over angle in N·m/rad, complex.
+        Frequencies in Hz of the band that is shown; complex response in N·m/rad.
     """
     frequency_hz = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
     s = 2j * np.pi * frequency_hz
