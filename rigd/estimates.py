@@ -99,10 +99,10 @@ class Estimate:
             or (value := finite_number(document.get("value"))) is None
         ):
             return None
-        ends, flag = document.get("interval_95"), document.get("flag")
+        interval_ends, flag = document.get("interval_95"), document.get("flag")
         interval_95 = None
-        if isinstance(ends, list) and len(ends) == 2:
-            low, high = map(finite_number, ends)
+        if isinstance(interval_ends, list) and len(interval_ends) == 2:
+            low, high = map(finite_number, interval_ends)
             interval_95 = None if low is None or high is None else (low, high)
         return cls(
             value,

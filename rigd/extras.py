@@ -31,8 +31,8 @@ def require_extra(extra: str, subject: str) -> None:
     MissingExtraError
         If a package is missing.
     """
-    missing = [module for module in _EXTRA_MODULES[extra] if find_spec(module) is None]
-    if missing:
+    missing_modules = [module for module in _EXTRA_MODULES[extra] if find_spec(module) is None]
+    if missing_modules:
         raise _missing_extra_error(subject, extra)
 
 

@@ -270,8 +270,8 @@ def _read_headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
     document: Any = read_document(path)
     label, headline = select_headline(path, document)
     # A single record of a campaign can exclude a uniform beam.
-    pooled = headline.get("file", "") is None
-    headlines = document["headlines"] if pooled else [headline]
+    is_pooled = headline.get("file", "") is None
+    headlines = document["headlines"] if is_pooled else [headline]
     refusals = [_uniform_beam_refusal(path, each) for each in headlines if isinstance(each, dict)]
     return label, headline, next(filter(None, refusals), "")
 
@@ -485,8 +485,8 @@ def _require_certain(label: str, estimates: Mapping[str, Estimate], use: Use) ->
     for name, estimate in estimates.items():
         # For a move the uncertainty of the modes includes the damping.
         covered_by_modes = use is MOVE and _effect_key(name) not in _EFFECTS
-        covered = covered_by_modes or _standard_deviation(estimate) is not None
-        if estimate.flag is not None and (_effect_key(name) in use.certain or not covered):
+        is_covered = covered_by_modes or _standard_deviation(estimate) is not None
+        if estimate.flag is not None and (_effect_key(name) in use.certain or not is_covered):
             raise IdentifiedBeamError(
                 f"{label}.parameters.{name} is flagged ({estimate.flag[:100]}), and {use.name} "
                 "relies on it; record a session that shows more modes or is longer and analyze it, "

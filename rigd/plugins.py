@@ -45,9 +45,9 @@ GROUPS: Final = {
 """Map from each group of entry points to the word for its parts in messages, and to the function
 that checks a part of the group."""
 
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 """Pattern of the names that a package can add; they are keys of profiles and options."""
-_REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+_REFERENCE_PATTERN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """Pattern of the object that an entry point names: module and attribute."""
 _MAX_FILE_BYTES = 1 << 20
 """Largest size in bytes of a file ``entry_points.txt`` that is read."""
@@ -322,12 +322,12 @@ def error_of_package(error: Exception, plugin: Plugin) -> PluginError | None:
         Part of an installed package.
     """
     package_module = plugin.reference.partition(":")[0].partition(".")[0]
-    call = error.__traceback__
-    while call is not None:
-        module = str(call.tb_frame.f_globals.get("__name__"))
+    traceback = error.__traceback__
+    while traceback is not None:
+        module = str(traceback.tb_frame.f_globals.get("__name__"))
         if module.partition(".")[0] == package_module:
             return _failure_of(plugin, error)
-        call = call.tb_next
+        traceback = traceback.tb_next
     return None
 
 
@@ -399,8 +399,8 @@ def _with_clashes(found: list[Plugin]) -> Iterator[Plugin]:
         owners.setdefault((plugin.group, plugin.name), []).append(plugin.label)
     for plugin in found:
         labels = owners[plugin.group, plugin.name]
-        clash = f"{listed(labels)} add the same name; uninstall all but one."
-        yield plugin if len(labels) == 1 else replace(plugin, problem=clash)
+        clash_problem = f"{listed(labels)} add the same name; uninstall all but one."
+        yield plugin if len(labels) == 1 else replace(plugin, problem=clash_problem)
 
 
 def _read_entry_points(path: Path, package: str, version: str) -> Iterator[Plugin]:
@@ -421,9 +421,9 @@ def _read_entry_points(path: Path, package: str, version: str) -> Iterator[Plugi
             name, equals_sign, reference = (part.strip() for part in text.partition("="))
             reference = reference.partition("[")[0].strip()
             problem = ""
-            if not equals_sign or not _REFERENCE.fullmatch(reference):
+            if not equals_sign or not _REFERENCE_PATTERN.fullmatch(reference):
                 problem = "its line is not of the form name = module:object; correct it."
-            elif not _NAME.fullmatch(name):
+            elif not _NAME_PATTERN.fullmatch(name):
                 problem = (
                     "its name is not of lower-case letters, digits and _, at most 32; rename it."
                 )

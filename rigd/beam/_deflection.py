@@ -167,12 +167,16 @@ def _modal_stiffness_terms(
     s: Complex, z: Real, beam: Beam, damping: Damping
 ) -> tuple[Complex, Complex, Complex]:
     """Return ``P / EI``, ``Q k⁴ / EI`` and ``s d/ds`` of their sum for each mode at `s` (rad/s)."""
-    inertial = beam.density_over_stiffness * s * s
-    external = damping.gamma * s**damping.lambda_
-    internal = damping.zeta * s**damping.alpha
+    inertial_term = beam.density_over_stiffness * s * s
+    external_term = damping.gamma * s**damping.lambda_
+    internal_term = damping.zeta * s**damping.alpha
     k_fourth = (z / beam.length_m) ** 4
-    log_slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal * k_fourth
-    return inertial + external, (1 + internal) * k_fourth, log_slope
+    log_slope = (
+        2 * inertial_term
+        + damping.lambda_ * external_term
+        + damping.alpha * internal_term * k_fourth
+    )
+    return inertial_term + external_term, (1 + internal_term) * k_fourth, log_slope
 
 
 def _mode_residues(z: Real, pole_pairs: Complex, beam: Beam, damping: Damping) -> Complex:

@@ -238,13 +238,15 @@ def _modal_poles_and_residues(
     shape_mean = mode_mean(_MAX_MODES)[is_selected]
 
     k_fourth = (z / beam.length_m) ** 4
-    inertial = beam.density_over_stiffness * poles**2
-    external = damping.gamma * poles**damping.lambda_
-    internal = damping.zeta * poles**damping.alpha * k_fourth
-    equation_slope = (2 * inertial + damping.lambda_ * external + damping.alpha * internal) / poles
+    inertial_term = beam.density_over_stiffness * poles**2
+    external_term = damping.gamma * poles**damping.lambda_
+    internal_term = damping.zeta * poles**damping.alpha * k_fourth
+    equation_slope = (
+        2 * inertial_term + damping.lambda_ * external_term + damping.alpha * internal_term
+    ) / poles
     shape_at_force = mode_shapes[:, -1] / equation_slope
     per_length = beam.length_m * beam.bending_stiffness_n_m2
-    root_residue = shape_at_force * (inertial + external)
+    root_residue = shape_at_force * (inertial_term + external_term)
     residues: Complex = np.vstack(
         [
             mode_shapes[:, :-1].T * shape_at_force / per_length,

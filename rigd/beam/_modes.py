@@ -308,18 +308,18 @@ def pole_gradient(
     """
     s, density_ratio = complex(pole_rad_s), beam.density_over_stiffness
     log_s = np.log(s)
-    internal = k4_per_m4 * np.exp(damping.alpha * log_s)
-    external = np.exp(damping.lambda_ * log_s)
+    internal_term = k4_per_m4 * np.exp(damping.alpha * log_s)
+    external_term = np.exp(damping.lambda_ * log_s)
     equation_slope = (
         2 * density_ratio * s
-        + damping.gamma * damping.lambda_ * external / s
-        + damping.zeta * damping.alpha * internal / s
+        + damping.gamma * damping.lambda_ * external_term / s
+        + damping.zeta * damping.alpha * internal_term / s
     )
     derivatives: dict[str, complex] = {
-        "zeta": internal,
-        "alpha": damping.zeta * log_s * internal,
-        "gamma": external,
-        "lambda": damping.gamma * log_s * external,
+        "zeta": internal_term,
+        "alpha": damping.zeta * log_s * internal_term,
+        "gamma": external_term,
+        "lambda": damping.gamma * log_s * external_term,
         "ln_density_over_stiffness": density_ratio * s * s,
     }
     return np.array(
@@ -415,8 +415,8 @@ def _poles_by_search(omega_squared: Real, external_coefficient: float, damping: 
     log_s = _newton_roots(
         log_s, omega_squared[:, None], external_coefficient, damping.zeta, damping
     )
-    converged = ~np.isnan(log_s)
-    first_converged = np.argmax(converged, axis=1)[:, None]
+    has_converged = ~np.isnan(log_s)
+    first_converged = np.argmax(has_converged, axis=1)[:, None]
     poles: Complex = np.exp(np.take_along_axis(log_s, first_converged, axis=1)[:, 0])
     return poles
 
@@ -436,16 +436,20 @@ def _newton_roots(
     """
     with np.errstate(all="ignore"):  # a diverging start overflows
         for _ in range(40):
-            inertial = np.exp(2 * log_s)
-            external = external_coefficient * np.exp(damping.lambda_ * log_s)
-            internal = zeta * omega_squared * np.exp(damping.alpha * log_s)
-            equation_residual = inertial + external + internal + omega_squared
-            residual_slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal
+            inertial_term = np.exp(2 * log_s)
+            external_term = external_coefficient * np.exp(damping.lambda_ * log_s)
+            internal_term = zeta * omega_squared * np.exp(damping.alpha * log_s)
+            equation_residual = inertial_term + external_term + internal_term + omega_squared
+            residual_slope = (
+                2 * inertial_term + damping.lambda_ * external_term + damping.alpha * internal_term
+            )
             newton_step = equation_residual / residual_slope
             log_s = log_s - newton_step
             if not (np.abs(newton_step) > 1e-12).any():  # nor where one is NaN
                 break
-        residual_scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
+        residual_scale = (
+            np.abs(inertial_term) + np.abs(external_term) + np.abs(internal_term) + omega_squared
+        )
         on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _MAX_ARGUMENT_EXCESS_RAD)
         is_solution = np.abs(equation_residual) < 1e-9 * residual_scale
         return np.where(is_solution & on_sheet, log_s, np.nan + 0j)

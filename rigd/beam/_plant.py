@@ -316,8 +316,8 @@ class Plant:
         """
         s = np.asarray(s, dtype=np.complex128)
         response: Complex = np.exp(-self.delay_s * s)
-        for first, second in self.lags:
-            response /= 1 + s * (first + s * second)
+        for linear_coefficient, quadratic_coefficient in self.lags:
+            response /= 1 + s * (linear_coefficient + s * quadratic_coefficient)
         return response
 
     @property
@@ -393,19 +393,19 @@ class Plant:
             displacement -= self.beam.length_m
             slope_per_angle -= 1
             return displacement, slope_per_angle
-        force_grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
+        force_grid, tip_m = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
         displacement, slope_per_angle = (
-            force_grid.displacement_per_angle(tip) - tip,
-            force_grid.displacement_per_angle(tip, 1) - 1,
+            force_grid.displacement_per_angle(tip_m) - tip_m,
+            force_grid.displacement_per_angle(tip_m, 1) - 1,
         )
         elastic_factor, inertial_factor = self.elastic_and_inertial_factors(s)
         z = clamped_free_eigenvalues(1 + len(self.stiffness_offsets))
-        tip_slopes = 2 * z * root_shear_ratio(z.size) / tip
+        tip_slopes = 2 * z * root_shear_ratio(z.size) / tip_m
         for offset_index, stiffness_offset in enumerate(self.stiffness_offsets, start=1):
             # Mode i contributes -p b / (c k⁴ (1 + d) + p); b is its part of a rigid rotation.
             k4, rotation_part = (
-                (z[offset_index] / tip) ** 4,
-                2 * (-1) ** offset_index * tip / z[offset_index] ** 2,
+                (z[offset_index] / tip_m) ** 4,
+                2 * (-1) ** offset_index * tip_m / z[offset_index] ** 2,
             )
             offset_term = inertial_factor * rotation_part * elastic_factor * k4 * stiffness_offset
             offset_term = offset_term / (
@@ -416,9 +416,11 @@ class Plant:
             slope_per_angle = slope_per_angle + tip_slopes[offset_index] * offset_term
         if self.tip_mass_kg:
             tip_force = self._tip_force_per_angle(s, force_grid)
-            displacement = displacement + force_grid.displacement_per_force(tip, tip) * tip_force
+            displacement = (
+                displacement + force_grid.displacement_per_force(tip_m, tip_m) * tip_force
+            )
             slope_per_angle = (
-                slope_per_angle + force_grid.displacement_per_force(tip, tip, 1) * tip_force
+                slope_per_angle + force_grid.displacement_per_force(tip_m, tip_m, 1) * tip_force
             )
         clamp_factor = 1 / (
             1 + self.root_compliance_rad_per_nm * self.rigid_clamp_response(s).response
@@ -427,11 +429,11 @@ class Plant:
 
     def _tip_force_per_angle(self, s: Complex, force_grid: PointForceGrid) -> Complex:
         """Return the force in N/rad that the tip mass exerts on the beam per angle of the root."""
-        tip, inertial_load = self.beam.length_m, self.tip_mass_kg * s * s
+        tip_m, inertial_load = self.beam.length_m, self.tip_mass_kg * s * s
         tip_force: Complex = (
             -inertial_load
-            * force_grid.displacement_per_angle(tip)
-            / (1 + inertial_load * force_grid.displacement_per_force(tip, tip))
+            * force_grid.displacement_per_angle(tip_m)
+            / (1 + inertial_load * force_grid.displacement_per_force(tip_m, tip_m))
         )
         return tip_force
 
@@ -492,8 +494,8 @@ class Plant:
         """Return the elastic factor c and the inertial factor p at `s` (rad/s)."""
         log_s, damping = np.log(s), self.damping
         elastic_factor = 1 + damping.zeta * np.exp(damping.alpha * log_s).astype(np.complex128)
-        external = damping.gamma * np.exp(damping.lambda_ * log_s).astype(np.complex128)
-        return elastic_factor, self.beam.density_over_stiffness * s * s + external
+        external_term = damping.gamma * np.exp(damping.lambda_ * log_s).astype(np.complex128)
+        return elastic_factor, self.beam.density_over_stiffness * s * s + external_term
 
     def derivative_by_s(self, s: Complex, clamped_response: LoadedResponse) -> Complex:
         """Return dG/ds, with G the coupling torque per motor angle of the beam on a rigid clamp.
@@ -506,11 +508,11 @@ class Plant:
             Response on a rigid clamp at `s`, as returned by `rigid_clamp_response`.
         """
         log_s, damping = np.log(s), self.damping
-        internal = damping.zeta * damping.alpha * np.exp(damping.alpha * log_s)
-        external = damping.gamma * damping.lambda_ * np.exp(damping.lambda_ * log_s)
-        inertial_factor = 2 * self.beam.density_over_stiffness * s * s + external
+        internal_term = damping.zeta * damping.alpha * np.exp(damping.alpha * log_s)
+        external_term = damping.gamma * damping.lambda_ * np.exp(damping.lambda_ * log_s)
+        inertial_factor = 2 * self.beam.density_over_stiffness * s * s + external_term
         by_log_s: Complex = (
-            clamped_response.by_elastic * internal
+            clamped_response.by_elastic * internal_term
             + clamped_response.by_inertial * inertial_factor
             + 2 * self.tip_mass_kg * clamped_response.by_mass
         )

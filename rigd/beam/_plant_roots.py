@@ -89,8 +89,8 @@ def followed_roots(
     roots = uniform_roots
     has_root = ~np.isnan(roots[:, 0])
     # One of a conjugate pair suffices; without oscillation both have to be found.
-    oscillating = roots[has_root][:, 0].imag != 0
-    second_real_poles = roots[has_root][~oscillating][:, 1]
+    is_oscillating = roots[has_root][:, 0].imag != 0
+    second_real_poles = roots[has_root][~is_oscillating][:, 1]
     current_roots = np.concatenate([roots[has_root][:, 0], second_real_poles])
     current_roots *= 1 - _START_POLE_DISTANCE  # G is infinite at an undamped pole
     # A change that moves the poles little needs few steps.
@@ -107,9 +107,9 @@ def followed_roots(
                 _NEWTON_TOLERANCE if is_last_step else _INTERMEDIATE_TOLERANCE,
             ),
         )
-    first_roots = current_roots[: oscillating.size]
+    first_roots = current_roots[: is_oscillating.size]
     second_roots = first_roots.conj()
-    second_roots[~oscillating] = current_roots[oscillating.size :]
+    second_roots[~is_oscillating] = current_roots[is_oscillating.size :]
     roots[has_root] = np.column_stack([first_roots, second_roots])
     return roots
 

@@ -75,11 +75,13 @@ class PointForceGrid:
         s_points = np.asarray(s, dtype=np.complex128)
         self._shape = s_points.shape
         s_points = s_points.ravel()
-        inertial = beam.density_over_stiffness * s_points * s_points
-        internal = 1 + damping.zeta * s_points**damping.alpha
+        inertial_term = beam.density_over_stiffness * s_points * s_points
+        internal_factor = 1 + damping.zeta * s_points**damping.alpha
         self._length_m = beam.length_m
-        self._q_stiffness: Complex = beam.bending_stiffness_n_m2 * internal
-        self._b4: Complex = -(inertial + damping.gamma * s_points**damping.lambda_) / internal
+        self._q_stiffness: Complex = beam.bending_stiffness_n_m2 * internal_factor
+        self._b4: Complex = (
+            -(inertial_term + damping.gamma * s_points**damping.lambda_) / internal_factor
+        )
         is_small = np.abs(self._b4) * beam.length_m**4 < _SERIES_LIMIT
         self._small_q_indices, self._large_q_indices = (
             np.flatnonzero(is_small),
@@ -139,20 +141,22 @@ class PointForceGrid:
         complex ndarray, shape of s, then of the distances
             Displacement, or derivative, in m^(1 - order)/N.
         """
-        x, at = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(force_at_m, np.float64))
+        x, force_x = np.broadcast_arrays(
+            np.asarray(x_m, np.float64), np.asarray(force_at_m, np.float64)
+        )
         shape = x.shape
-        x, at = x.ravel(), at.ravel()
+        x, force_x = x.ravel(), force_x.ravel()
         out = np.empty((self._b4.size, x.size), dtype=np.complex128)
         b4, stiffness = (
             self._b4[self._small_q_indices, None],
             self._q_stiffness[self._small_q_indices, None],
         )
-        distance_to_tip = self._length_m - at
+        distance_to_tip = self._length_m - force_x
         moment, shear = self._root_derivatives(
             b4, _power_series(b4, distance_to_tip, 1), _power_series(b4, distance_to_tip, 0)
         )
         beyond_force = np.where(
-            x > at, _power_series(b4, np.maximum(x - at, 0.0), 3, derivative_order), 0.0
+            x > force_x, _power_series(b4, np.maximum(x - force_x, 0.0), 3, derivative_order), 0.0
         )
         out[self._small_q_indices] = (
             moment * _power_series(b4, x, 2, derivative_order)
@@ -160,7 +164,7 @@ class PointForceGrid:
             + beyond_force
         ) / stiffness
         out[self._large_q_indices] = (
-            self._exponentials.response_per_force_over_stiffness(x, at, derivative_order)
+            self._exponentials.response_per_force_over_stiffness(x, force_x, derivative_order)
             / self._q_stiffness[self._large_q_indices, None]
         )
         return out.reshape((*self._shape, *shape))
@@ -186,9 +190,9 @@ class PointForceGrid:
         force_at_m
             Position of the force, as a distance from the motor's axis.
         """
-        at = np.asarray(force_at_m, dtype=np.float64)
-        return -self._bending_stiffness(at.ndim) * self.displacement_per_force(
-            np.zeros_like(at), at, 2
+        force_x = np.asarray(force_at_m, dtype=np.float64)
+        return -self._bending_stiffness(force_x.ndim) * self.displacement_per_force(
+            np.zeros_like(force_x), force_x, 2
         )
 
     def shear_per_force(self, force_at_m: ArrayLike) -> Complex:
@@ -201,9 +205,9 @@ class PointForceGrid:
         force_at_m
             Position of the force, as a distance from the motor's axis.
         """
-        at = np.asarray(force_at_m, dtype=np.float64)
-        return self._bending_stiffness(at.ndim) * self.displacement_per_force(
-            np.zeros_like(at), at, 3
+        force_x = np.asarray(force_at_m, dtype=np.float64)
+        return self._bending_stiffness(force_x.ndim) * self.displacement_per_force(
+            np.zeros_like(force_x), force_x, 3
         )
 
     def _bending_stiffness(self, axes: int = 0) -> Complex:
@@ -280,20 +284,20 @@ class _ExponentialSolution:
         )
 
     def response_per_force_over_stiffness(
-        self, x: Real, at: Real, derivative_order: int
+        self, x: Real, force_x: Real, derivative_order: int
     ) -> Complex:
         """Return displacement times bending stiffness per point force, or its derivative by x.
 
-        Point i of x, shape (m,), is displaced by the force at point i of `at`. The result has the
-        shape (s, m).
+        Point i of x, shape (m,), is displaced by the force at point i of `force_x`. The result has
+        the shape (s, m).
         """
         b, c, kappa = self._b, self._kappa * self._b, self._kappa
         decaying_amplitude = -1 / (4 * b**3)  # A, of the decaying wave
         other_amplitude = -decaying_amplitude / kappa  # B, of the other
-        to_root = decaying_amplitude * np.exp(-b * at), other_amplitude * np.exp(-c * at)
+        to_root = decaying_amplitude * np.exp(-b * force_x), other_amplitude * np.exp(-c * force_x)
         to_tip = (
-            decaying_amplitude * np.exp(-b * (self._length_m - at)),
-            other_amplitude * np.exp(-c * (self._length_m - at)),
+            decaying_amplitude * np.exp(-b * (self._length_m - force_x)),
+            other_amplitude * np.exp(-c * (self._length_m - force_x)),
         )
         at_ends = np.stack(
             [
@@ -304,8 +308,10 @@ class _ExponentialSolution:
             ],
             axis=1,
         )
-        distance_m = np.abs(x - at)
-        derivative_sign = np.where(x > at, -1.0, 1.0)  # the sign of each derivative of exp(-b r)
+        distance_m = np.abs(x - force_x)
+        derivative_sign = np.where(
+            x > force_x, -1.0, 1.0
+        )  # the sign of each derivative of exp(-b r)
         direct_response = (derivative_sign * b) ** derivative_order * decaying_amplitude * np.exp(
             -b * distance_m
         ) + (derivative_sign * c) ** derivative_order * other_amplitude * np.exp(-c * distance_m)

@@ -32,13 +32,13 @@ class ResponseGrid:
         Laplace variable in rad/s, not 0.
     """
 
-    __slots__ = ("_beam", "_log_s", "_s", "_s_squared")
+    __slots__ = ("_beam_grid", "_log_s", "_s", "_s_squared")
 
     def __init__(self, s: ArrayLike) -> None:
         self._s = np.asarray(s, dtype=np.complex128)
         self._s_squared = self._s * self._s
         self._log_s = np.log(self._s)
-        self._beam = TransferGrid(self._s)
+        self._beam_grid = TransferGrid(self._s)
 
     @property
     def s(self) -> NDArray[np.complex128]:
@@ -112,8 +112,8 @@ class ResponseGrid:
                 parameter_name: derivatives[parameter_name]() for parameter_name in beam_names
             }
         if not beam_names:
-            return self._beam.evaluate(plant.beam, plant.damping), {}
-        beam_response, derivative_rows = self._beam.evaluate_with_gradient(
+            return self._beam_grid.evaluate(plant.beam, plant.damping), {}
+        beam_response, derivative_rows = self._beam_grid.evaluate_with_gradient(
             plant.beam, plant.damping, beam_names
         )
         return beam_response, dict(zip(beam_names, derivative_rows, strict=True))

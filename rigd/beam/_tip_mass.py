@@ -233,9 +233,9 @@ def uniform_tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Comp
     tip_slope
         Slope of the tip per angle, dimensionless, in the shape of `s`.
     """
-    external = damping.gamma * s**damping.lambda_
-    internal = 1 + damping.zeta * s**damping.alpha
-    fourth_power = -(beam.density_over_stiffness * s * s + external) / internal
+    external_term = damping.gamma * s**damping.lambda_
+    internal_factor = 1 + damping.zeta * s**damping.alpha
+    fourth_power = -(beam.density_over_stiffness * s * s + external_term) / internal_factor
     z = beam.length_m * np.sqrt(np.sqrt(fourth_power))
     # Numerators and denominator over exp(z - j sign z): nothing overflows.
     imaginary_sign = np.where(z.imag < 0, -1.0, 1.0)

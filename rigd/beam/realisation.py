@@ -325,37 +325,37 @@ def _realised_poles(plant: Plant, modes_of: Beam) -> tuple[Complex, NDArray[np.i
         is_selected = _select_poles(pole_pairs)
     else:
         is_selected = _select_poles(replace(plant, beam=modes_of).poles(eigenvalues))
-    oscillating = pole_pairs[:, 0].imag > 0
+    is_oscillating = pole_pairs[:, 0].imag > 0
     # A pair may have ceased, or begun, to oscillate; one pole alone cannot.
     if (
         np.isnan(pole_pairs[is_selected]).any()
-        or (oscillating & (is_selected.sum(axis=1) == 1)).any()
+        or (is_oscillating & (is_selected.sum(axis=1) == 1)).any()
     ):
         raise RealisationError(
             f"{plant.beam} with {plant.damping} does not have the modes of {modes_of}."
         )
-    upper_rows = np.flatnonzero(oscillating & is_selected[:, 0])
-    over_damped = is_selected & ~oscillating[:, None]
-    cut = np.full(_BRANCH_CUT_POLES_RAD_S.size, -1)
+    upper_rows = np.flatnonzero(is_oscillating & is_selected[:, 0])
+    over_damped = is_selected & ~is_oscillating[:, None]
+    cut_modes = np.full(_BRANCH_CUT_POLES_RAD_S.size, -1)
     return (
         np.concatenate(
             [pole_pairs[upper_rows, 0], pole_pairs[over_damped], _BRANCH_CUT_POLES_RAD_S]
         ),
-        np.concatenate([upper_rows, np.nonzero(over_damped)[0], cut]),
+        np.concatenate([upper_rows, np.nonzero(over_damped)[0], cut_modes]),
     )
 
 
 def _select_poles(pole_pairs: Complex) -> NDArray[np.bool_]:
     """Return a mask of the modal poles in the state space, in the shape of `pole_pairs`."""
-    oscillating = pole_pairs[:, 0].imag > 0
-    mode_indices = np.flatnonzero(oscillating)
+    is_oscillating = pole_pairs[:, 0].imag > 0
+    mode_indices = np.flatnonzero(is_oscillating)
     upper_poles = pole_pairs[mode_indices, 0]
     within_band = np.abs(upper_poles) < 2 * np.pi * _FIT_BAND_HZ[1]
     lightly_damped = within_band | (-upper_poles.real < _HEAVY_DAMPING_RATIO * np.abs(upper_poles))
     mode_indices, upper_poles = mode_indices[lightly_damped], upper_poles[lightly_damped]
     above_band = np.flatnonzero(upper_poles.imag > 2 * np.pi * _HIGHEST_MODE_HZ)
     mode_indices = mode_indices[: above_band[0] + 1] if above_band.size else mode_indices
-    is_selected = ~oscillating[:, None] & (np.abs(pole_pairs) < 2 * np.pi * _HIGHEST_MODE_HZ)
+    is_selected = ~is_oscillating[:, None] & (np.abs(pole_pairs) < 2 * np.pi * _HIGHEST_MODE_HZ)
     is_selected[mode_indices] = True
     return is_selected
 
@@ -713,13 +713,13 @@ def _matrix_exponential(square_matrix: Real) -> Real:
     x4 = x2 @ x2
     matrix_powers = np.stack([np.eye(len(x)), x2, x4, x2 @ x4])  # of x²: 0, 1, 2, 3
     pade_coefficients = np.cumprod([1.0] + [(13 - k) / ((26 - k) * (k + 1)) for k in range(13)])
-    even_part, odd = (
+    even_part, odd_part = (
         np.tensordot(pade_coefficients[parity:8:2], matrix_powers, 1)
         + matrix_powers[3] @ np.tensordot(pade_coefficients[8 + parity :: 2], matrix_powers[1:], 1)
         for parity in (0, 1)
     )
-    odd = x @ odd
-    matrix_exponential: Real = np.linalg.solve(even_part - odd, even_part + odd)
+    odd_part = x @ odd_part
+    matrix_exponential: Real = np.linalg.solve(even_part - odd_part, even_part + odd_part)
     for _ in range(squarings):
         matrix_exponential = matrix_exponential @ matrix_exponential
     return matrix_exponential

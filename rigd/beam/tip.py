@@ -107,12 +107,12 @@ def tip_motion(plant: Plant, angle_rad: Real, rate_hz: float) -> TipMotion:
     lead_in = _memory_samples(plant, rate_hz)
     chunk_length = max(_MAX_CHUNK_SAMPLES - lead_in, _MAX_CHUNK_SAMPLES // 2)
     largest = np.zeros(3)
-    for begin in range(0, angle_rad.size, chunk_length):
-        first = max(begin - lead_in, 0)
-        chunk_rad = angle_rad[first : begin + chunk_length] - angle_rad[first]
-        if first:  # no jump of the speed, which would let the beam ring
+    for chunk_begin in range(0, angle_rad.size, chunk_length):
+        lead_in_begin = max(chunk_begin - lead_in, 0)
+        chunk_rad = angle_rad[lead_in_begin : chunk_begin + chunk_length] - angle_rad[lead_in_begin]
+        if lead_in_begin:  # no jump of the speed, which would let the beam ring
             chunk_rad[: lead_in // 4] *= 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, lead_in // 4))
-        motion = _tip_motion_from_rest(plant, chunk_rad, rate_hz, begin - first)
+        motion = _tip_motion_from_rest(plant, chunk_rad, rate_hz, chunk_begin - lead_in_begin)
         largest = np.maximum(largest, [motion.deflection_m, motion.slope_rad, motion.speed_m_s])
     return TipMotion(*largest.tolist())
 

@@ -528,8 +528,8 @@ def _check_devices(
     elif drive_ok and sensor_ok:
         _collect_rows("exchange", _exchange_rows(profile, devices, target), check_rows)
     else:
-        why = "not without drive and sensor"
-        check_rows.append(CheckRow("exchange", "ticks", why, "", CheckResult.SKIPPED))
+        skip_reason = "not without drive and sensor"
+        check_rows.append(CheckRow("exchange", "ticks", skip_reason, "", CheckResult.SKIPPED))
 
 
 def _collect_rows(

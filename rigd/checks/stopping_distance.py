@@ -136,7 +136,7 @@ class _UncontrolledFailure:
 
     name: str
     """Name of the check's row."""
-    what: str
+    condition: str
     """Condition of the failure, as a clause for the operator ("if the encoder fails")."""
     duration_s: float
     """Longest time for which the torque remains on."""
@@ -241,7 +241,7 @@ def stopping_distance_rows(profile: Profile) -> Iterator[CheckRow]:
         if failure_index == longest_index:
             unlimited_failures = max_stopping_distance(rig, limits, uncontrolled_failure.duration_s)
             detail_text = (
-                "" if has_no_bound else f"Travel: the worst is {uncontrolled_failure.what}. "
+                "" if has_no_bound else f"Travel: the worst is {uncontrolled_failure.condition}. "
             )
             detail_text += (
                 "It relies on the drive's own speed limit of "
@@ -254,14 +254,14 @@ def stopping_distance_rows(profile: Profile) -> Iterator[CheckRow]:
             )
         if exceeds_margin:
             detail_text += (
-                f" Travel {uncontrolled_failure.what}: lower {uncontrolled_failure.key}, "
+                f" Travel {uncontrolled_failure.condition}: lower {uncontrolled_failure.key}, "
                 "cia402.max_speed_rad_s, "
                 "limits.velocity_rad_s or limits.angle_rad."
             )
         worst_failure = "worst, " if failure_index == longest_index and not has_no_bound else ""
         yield CheckRow(
             _STOPPING_GROUP,
-            f"{worst_failure}{uncontrolled_failure.what}",
+            f"{worst_failure}{uncontrolled_failure.condition}",
             f"{_format_angle(stopping_travel.total_rad)}: "
             f"{_format_angle(stopping_travel.driven_rad)} in the "
             f"{uncontrolled_failure.duration_s * 1e3:g} ms {uncontrolled_failure.ended_by}, "

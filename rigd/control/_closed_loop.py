@@ -149,8 +149,10 @@ class ClosedLoop:
         end = 0
         for chunk in self.simulate_in_chunks(reference_rad):
             begin, end = end, end + chunk.angle_rad.size
-            for channel in fields(LoopResponse):
-                getattr(response, channel.name)[begin:end] = getattr(chunk, channel.name)
+            for response_field in fields(LoopResponse):
+                getattr(response, response_field.name)[begin:end] = getattr(
+                    chunk, response_field.name
+                )
         return response
 
     def simulate_in_chunks(self, reference_rad: Real) -> Iterator[LoopResponse]:

@@ -40,7 +40,7 @@ _FREQUENCIES_PER_DECADE = 60
 _RESONANCE_OFFSETS = np.geomspace(0.03, 100.0, 16)
 """Offsets of examined frequencies from a resonance to either side, in its half-widths."""
 _MIN_HALF_WIDTH = 1e-6
-"""Smallest half-width of a resonance, over its frequency, for modes without damping."""
+"""Smallest half-width of a resonance relative to its frequency, used for undamped modes."""
 _MAX_DELAY_EIGENVALUE = 1e-3
 """Magnitude of an eigenvalue below which it belongs to a delay, not to a resonance."""
 _MAX_IMAGINARY_RATIO = 1e-3

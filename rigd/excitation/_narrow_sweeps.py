@@ -497,10 +497,13 @@ def modes(
     require_positive("taper_s", taper_s, "s")
     require_positive("tip_slope_rad", tip_slope_rad, "rad")
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
-    sweep_begin, end = segments["sweep"]
+    sweep_begin, sweep_end = segments["sweep"]
     sweep_bands = _read_bands(Path(path), stop_hz, widths, rate_hz)
     fade_ticks = 2 * round(taper_s * rate_hz)
-    if fade_ticks < 2 or LEAST_TIME_FRACTION * (end - sweep_begin) / len(sweep_bands) < fade_ticks:
+    if (
+        fade_ticks < 2
+        or LEAST_TIME_FRACTION * (sweep_end - sweep_begin) / len(sweep_bands) < fade_ticks
+    ):
         raise ExcitationError(
             f"duration_s = {duration_s:g} s is too short for fades of taper_s = {taper_s:g} s at "
             f"both ends of {len(sweep_bands)} sweeps; choose at least "
@@ -508,7 +511,7 @@ def modes(
             f"{2 / rate_hz:g} s."
         )
     sweep_ticks = _divide_ticks(
-        np.full(len(sweep_bands), 1.0 / len(sweep_bands)), end - sweep_begin
+        np.full(len(sweep_bands), 1.0 / len(sweep_bands)), sweep_end - sweep_begin
     )
     amplitudes_rad = [amplitude_rad] * len(sweep_bands)
     sweeps = [
@@ -518,7 +521,7 @@ def modes(
     if rig is not None:
         reduced_rad = _admissible_amplitudes(sweeps, amplitude_rad, tip_slope_rad, rig)
         sweep_ticks = _divide_ticks(
-            _raise_to_least(time_fractions(sweep_bands, reduced_rad, rig)), end - sweep_begin
+            _raise_to_least(time_fractions(sweep_bands, reduced_rad, rig)), sweep_end - sweep_begin
         )
         sweeps = [
             _unit_sweep(*band_and_ticks, fade_ticks, rate_hz)

@@ -134,7 +134,7 @@ class SegmentSearch:
         self.model = TorqueModel.for_records(
             estimate, plant.rate_hz, record.ringing_motion.shape[1]
         )
-        self.samples = record.future_rows.shape[1]
+        self.sample_count = record.future_rows.shape[1]
         self.limits = (
             LIMIT_FRACTION
             * limit_fraction
@@ -155,7 +155,7 @@ class SegmentSearch:
         ringing_channels = np.stack(
             [zero_channel, zero_channel, zero_channel, torque_nm, torque_nm, slope_rad]
         )
-        self.ringing = ringing_channels / self.limits[:, None]
+        self.ringing_fractions = ringing_channels / self.limits[:, None]
         self.line_hz, self.line_amplitudes_rad = steady_sines(
             estimate, self.modes, plant, self.limits
         )
@@ -163,13 +163,13 @@ class SegmentSearch:
         self.mixture = best_mixture(
             known_information, estimate, quantities, self.line_hz, self.line_amplitudes_rad
         )
-        self.needed_s = self._mixture_time_s()
+        self.mixture_s = self._mixture_time_s()
         # With too little time all targets are missed by one factor, not the last mode alone.
-        relaxation, needed_s = 1.0, self.needed_s
+        relaxation, mixture_s = 1.0, self.mixture_s
         for _ in range(_MAX_RELAXATIONS):
-            if not time_left_s < needed_s < UNREACHABLE_S:
+            if not time_left_s < mixture_s < UNREACHABLE_S:
                 break
-            relaxation *= (needed_s / time_left_s) ** 0.5
+            relaxation *= (mixture_s / time_left_s) ** 0.5
             self.mixture = best_mixture(
                 known_information,
                 estimate,
@@ -178,10 +178,10 @@ class SegmentSearch:
                 self.line_amplitudes_rad,
                 relaxation,
             )
-            needed_s = self._mixture_time_s()
+            mixture_s = self._mixture_time_s()
         self.rows_if_held = self.mixture.weights @ record.nuisance_projection @ record.future_rows
         self._continued_drives: dict[float, ContinuedDrive] = {}
-        self.tip_slope = self.ringing[-1, :: self.model.sample_ticks][: self.samples]
+        self.tip_slope = self.ringing_fractions[-1, :: self.model.sample_ticks][: self.sample_count]
 
     def best_candidate(
         self, time_left_s: float, mode_numbers: Collection[int] = ()
@@ -216,7 +216,7 @@ class SegmentSearch:
             duration_s,
             (),
             (),
-            self.ringing[:, : self.ticks(duration_s + _SETTLING_S) : _LIMIT_CHECK_TICKS],
+            self.ringing_fractions[:, : self.ticks(duration_s + _SETTLING_S) : _LIMIT_CHECK_TICKS],
             self.rows_if_held,
             self.tip_slope,
             0.0,
@@ -355,7 +355,7 @@ class SegmentSearch:
         )
         loop_response = self.plant.respond(extended_reference_rad)
         spectrum = self.model.spectrum(loop_response.angle_rad)
-        whitened_rows = self.model.whitened_derivatives(spectrum)[:, : self.samples]
+        whitened_rows = self.model.whitened_derivatives(spectrum)[:, : self.sample_count]
         slope_rad = self.model.torque_and_slope(spectrum)[1]
         limit_channels = np.stack(
             [
@@ -372,7 +372,7 @@ class SegmentSearch:
             angle_rad=loop_response.angle_rad[:n],
             rows=whitened_rows,
             weighted_rows=self.mixture.weights @ whitened_rows,
-            slope=slope_rad[:: self.model.sample_ticks][: self.samples] / self.limits[-1],
+            slope=slope_rad[:: self.model.sample_ticks][: self.sample_count] / self.limits[-1],
             channels=limit_channels / self.limits[:, None],
         )
 
@@ -392,7 +392,9 @@ class SegmentSearch:
         phase_rad = 2 * pi * phase_index / _PHASE_COUNT
         sine_factor, cosine_factor = float(np.cos(phase_rad)), float(np.sin(phase_rad))
         first_sweep, second_sweep = sweep_pair
-        ringing_channels = self.ringing[:, : first_sweep.channels.shape[1] : _LIMIT_CHECK_TICKS]
+        ringing_channels = self.ringing_fractions[
+            :, : first_sweep.channels.shape[1] : _LIMIT_CHECK_TICKS
+        ]
         unit_channels = (
             sine_factor * first_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
             + cosine_factor * second_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
@@ -452,7 +454,7 @@ class SegmentSearch:
         The motor then holds the amplitude that the mode has at the end of the segment.
         """
         first_sample = self.model_samples(duration_s)
-        remaining_samples = self.samples - first_sample
+        remaining_samples = self.sample_count - first_sample
         continued_drive = self.continued_drive(sweep_band)
         mode_amplitudes = (
             self.amplitude_matrix
@@ -515,7 +517,7 @@ class SegmentSearch:
         estimate, quantities = self.estimate, self.quantities
         segment_samples = self.model_samples(chosen_candidate.duration_s)
         segment_channels = chosen_candidate.weighted_sum("channels")
-        ringing_channels = self.ringing[:, : segment_channels.shape[1]]
+        ringing_channels = self.ringing_fractions[:, : segment_channels.shape[1]]
         # Between the checked ticks a peak is a little higher.
         amplitude_fraction = min(1.0, largest_factor(ringing_channels, segment_channels))
         present_covariance = covariance_of(self.record.information_after(None, 0), estimate)
@@ -551,7 +553,7 @@ class SegmentSearch:
         ]
         if impossible_reasons:
             return PrecisionForecast(inf, impossible_reasons[0])
-        forecast_s = self.needed_s
+        forecast_s = self.mixture_s
         if not forecast_s < UNREACHABLE_S:
             return PrecisionForecast(inf, "the motor cannot excite the modes that determine it")
         if forecast_s <= time_left_s:

@@ -63,7 +63,7 @@ class Excitation:
     model
         Beam of an analysis for which the excitation was planned; None: the profile's beam.
     motion
-        What the motor does in the sweep, as a clause for the operator; empty if the kind says it.
+        Motion of the motor in the sweep, as a clause for the operator; empty if `kind` states it.
     """
 
     kind: str

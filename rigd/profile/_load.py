@@ -182,10 +182,10 @@ def _add_sections_of_devices(document: Mapping[str, Any], profile_path: Path) ->
     ProfileError
         If a package that adds a device of the profile cannot be used.
     """
-    selection = document.get("devices")
-    names = selection.values() if isinstance(selection, dict) else ()
+    device_selection = document.get("devices")
+    device_names = device_selection.values() if isinstance(device_selection, dict) else ()
     added_sections = []
-    for name in dict.fromkeys(filter(lambda value: isinstance(value, str), names)):
+    for name in dict.fromkeys(filter(lambda value: isinstance(value, str), device_names)):
         try:
             plugin, kind = DEVICES.owner(name), DEVICES.get(name)
             if plugin is not None and kind is not None:

@@ -176,8 +176,10 @@ _ADDED_SECTIONS: dict[str, str] = {}
 
 def optional_sections() -> tuple[str, ...]:
     """Return the names of the sections that only some devices or controllers require."""
-    shipped = [name for kind in DEVICES.built_in.values() for name in kind.required_sections]
-    return tuple(dict.fromkeys([*shipped, *sorted(_ADDED_SECTIONS)]))
+    built_in_sections = [
+        name for kind in DEVICES.built_in.values() for name in kind.required_sections
+    ]
+    return tuple(dict.fromkeys([*built_in_sections, *sorted(_ADDED_SECTIONS)]))
 
 
 def add_section(kind: DeviceKind | ControllerKind, plugin: Plugin) -> None:
@@ -202,8 +204,8 @@ def add_section(kind: DeviceKind | ControllerKind, plugin: Plugin) -> None:
     if settings is None or SECTIONS.get(kind.name) is settings:
         return
     if kind.name in SECTIONS and _ADDED_SECTIONS.get(kind.name) != plugin.group:
-        where = "another package's part" if kind.name in _ADDED_SECTIONS else "every profile"
-        raise plugin.error(f"[{kind.name}] is a section of {where}; rename the {plugin.noun}.")
+        owner_text = "another package's part" if kind.name in _ADDED_SECTIONS else "every profile"
+        raise plugin.error(f"[{kind.name}] is a section of {owner_text}; rename the {plugin.noun}.")
     if problem := _settings_problem(settings):
         raise plugin.error(f"its settings {settings.__name__} are invalid: {problem}")
     if unknown := set(kind.required_sections) - {kind.name} - set(SECTIONS):
@@ -273,18 +275,18 @@ def section_text(kind: DeviceKind | ControllerKind) -> str:
     for settings_field in fields(kind.settings):
         hint = type_hints[settings_field.name]
         extras = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
-        plain = get_args(hint)[0] if extras else hint
-        notes = [each.documentation for each in extras if isinstance(each, DocInfo)]
-        if get_origin(plain) is Literal:
-            notes.append("one of " + ", ".join(map(str, get_args(plain))))
+        plain_type = get_args(hint)[0] if extras else hint
+        help_texts = [each.documentation for each in extras if isinstance(each, DocInfo)]
+        if get_origin(plain_type) is Literal:
+            help_texts.append("one of " + ", ".join(map(str, get_args(plain_type))))
         for each in extras:
-            for bound_name, words in _BOUND_WORDS.items():
+            for bound_name, bound_words in _BOUND_WORDS.items():
                 if (bound := getattr(each, bound_name, None)) is not None:
-                    notes.append(f"{words} {bound}")
+                    help_texts.append(f"{bound_words} {bound}")
         if unit := unit_of(settings_field.name):
-            notes.append(f"in {unit}")
-        if notes:
-            lines.append(f"# {'; '.join(notes)}")
+            help_texts.append(f"in {unit}")
+        if help_texts:
+            lines.append(f"# {'; '.join(help_texts)}")
         is_optional = settings_field.default is not MISSING
         if is_optional:
             value = json.dumps(settings_field.default, ensure_ascii=False)
@@ -306,8 +308,8 @@ def key_types() -> dict[str, Any]:
     A profile must have all keys except those of :func:`key_defaults`.
     """
     type_by_key: dict[str, Any] = dict.fromkeys(TEXT_KEYS, Annotated[str, MinLen(1)])
-    for section_name, cls in SECTIONS.items():
-        type_hints = get_type_hints(cls, include_extras=True)
+    for section_name, section_class in SECTIONS.items():
+        type_hints = get_type_hints(section_class, include_extras=True)
         type_by_key |= {
             key: type_hints[field_name] for key, field_name in section_fields(section_name)
         }
@@ -323,8 +325,8 @@ def key_defaults() -> dict[str, Any]:
     """
     return {
         f"{section_name}.{dataclass_field.name}": dataclass_field.default
-        for section_name, cls in SECTIONS.items()
-        for dataclass_field in fields(cls)
+        for section_name, section_class in SECTIONS.items()
+        for dataclass_field in fields(section_class)
         if dataclass_field.default is not MISSING
         and (dataclass_field.metadata.get("optional") or section_name in _ADDED_SECTIONS)
     }

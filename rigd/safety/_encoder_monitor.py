@@ -48,25 +48,25 @@ _RMS_TIME_CONSTANT_S = 0.25
 _TEST_RAMP_S = 0.02
 """Time in seconds in which the test torque rises by the breakaway torque."""
 _MAX_TEST_BREAKAWAY_TORQUES = 2.0
-"""Test torque at which the test starts again in the other direction, in breakaway torques."""
+"""Largest test torque, in breakaway torques; the test then restarts in the other direction."""
 _PASSED_TEST_STEPS = 1.5
 """Movement of the shaft, in encoder steps, that proves during a test that the encoder works."""
 _TEST_PAUSE_S = 0.5
 """Shortest time in seconds between a passed test and the next one."""
 _TORQUE_RELATIVE_ERROR = 0.25
-"""Relative error of the motor's torque that is not a fault."""
+"""Largest relative error of the motor's torque that is tolerated."""
 _MIN_MOMENTUM_FRACTION = 0.5
 """Fraction of the shaft's momentum that the measured torques must explain when the shaft stops.
 
 Inertias are known to a quarter."""
 _STANDSTILL_TICKS_AT_STOP = 2
-"""Ticks without an encoder step after which a sudden stop is checked."""
+"""Ticks without an encoder step after which the torques are checked to explain the stop."""
 _MIN_STEPS_PER_TICK_AT_STOP = 4.0
 """Speed before a stop from which the stop is checked, in encoder steps per tick."""
 _MIN_SCALE_STEPS = 3.0
 """Smallest movement within `SPEED_TICKS` that the scale comparison uses, in encoder steps."""
 _MAX_REPEATS = 6
-"""Number of repeated readings within `_REPEAT_WINDOW_TICKS` that is a fault."""
+"""Number of repeated readings within `_REPEAT_WINDOW_TICKS` from which they are a fault."""
 _REPEAT_WINDOW_TICKS = 32
 """Ticks within which repeated readings are counted."""
 _MIN_REPEAT_STEPS = 3.5
@@ -107,7 +107,6 @@ class EncoderMonitor:
     __slots__ = (
         "_angles",
         "_breakaway_nm",
-        "_count",
         "_coupling_nm2",
         "_decay",
         "_delayed_commands_nm",
@@ -126,6 +125,7 @@ class EncoderMonitor:
         "_standstill_count",
         "_test_start_rad",
         "_test_step_nm",
+        "_tick_count",
         "_torque_history",
         "_windows",
         "test_nm",
@@ -202,7 +202,7 @@ class EncoderMonitor:
         self._coupling_nm2 = 0.0
         if self._scale_monitor is not None:
             self._scale_monitor.reset()
-        self._standstill_count = self._count = self._next_test_tick = 0
+        self._standstill_count = self._tick_count = self._next_test_tick = 0
         self._irregular_ticks = 0
         self.tests = 0
         self._end_test()
@@ -238,14 +238,14 @@ class EncoderMonitor:
         self._torque_history.append((net_sum + motor_nm - coupling_nm, motor_sum + motor_nm))
         self._error_sums.append(self._error_sums[-1] + error_nm)
         self._coupling_nm2 += self._decay * (coupling_nm * coupling_nm - self._coupling_nm2)
-        self._count += 1
+        self._tick_count += 1
         angles = self._angles
         standstill_ticks = self._standstill_count
         moved_rad = angle_rad - angles[-1]
         angles.append(angle_rad)
         if self._irregular_ticks:
             self._irregular_ticks -= 1
-        elif self._count % WINDOW_TICKS == 0 and self._scale_monitor is not None:
+        elif self._tick_count % WINDOW_TICKS == 0 and self._scale_monitor is not None:
             violation = self._compare_scales(self._scale_monitor)
             if violation is not None:
                 return violation
@@ -258,7 +258,7 @@ class EncoderMonitor:
                 if abs(angle_rad - self._test_start_rad) > passed_rad:
                     self._end_test()
                     self.tests += 1
-                    self._next_test_tick = self._count + round(_TEST_PAUSE_S * self._rate_hz)
+                    self._next_test_tick = self._tick_count + round(_TEST_PAUSE_S * self._rate_hz)
                     return None
         else:
             self._standstill_count = standstill_ticks = standstill_ticks + 1
@@ -309,7 +309,9 @@ class EncoderMonitor:
         if standstill_ticks < ticks:
             return None
         violation = self._check_net_torque(ticks, max_turning_nm)
-        ticks, max_turning_nm = standstill_windows[1 + self._count % (len(standstill_windows) - 1)]
+        ticks, max_turning_nm = standstill_windows[
+            1 + self._tick_count % (len(standstill_windows) - 1)
+        ]
         if violation is not None or standstill_ticks < ticks:
             return violation
         violation = self._check_net_torque(ticks, max_turning_nm)
@@ -317,7 +319,7 @@ class EncoderMonitor:
             violation is None
             and standstill_ticks >= self._min_test_ticks
             and not self._test_step_nm
-            and self._count >= self._next_test_tick
+            and self._tick_count >= self._next_test_tick
         ):
             self._compare_coupling_torque(ticks)
         return violation
@@ -401,10 +403,10 @@ class EncoderMonitor:
         ):
             return None
         repeat_ticks = self._repeat_ticks
-        repeat_ticks.append(self._count)
+        repeat_ticks.append(self._tick_count)
         if (
             len(repeat_ticks) < _MAX_REPEATS
-            or self._count - repeat_ticks[0] >= _REPEAT_WINDOW_TICKS
+            or self._tick_count - repeat_ticks[0] >= _REPEAT_WINDOW_TICKS
         ):
             return None
         return INTERLOCKS_BY_NAME["repeated angle"].violated(len(repeat_ticks), _MAX_REPEATS - 1)

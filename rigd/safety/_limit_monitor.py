@@ -20,7 +20,7 @@ WARNING_REARM_S = 1.0
 _NO_JUMP_CHECK_TICKS = 3
 """Number of ticks after missed ticks in which no jump of the angle is checked.
 
-The encoder is latched at irregular times then."""
+Readings of the encoder are then taken at irregular times."""
 
 _MIN_STALL_S = 0.005
 """Shortest stall of the loop in seconds that is reported as the cause of a later violation."""

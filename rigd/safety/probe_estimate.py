@@ -40,7 +40,7 @@ _MAX_RELATIVE_STD = 0.1
 _SAME_RATIO_FACTOR = 1.3
 """Factor by which two ratios may differ and still count as the same."""
 _NO_TORQUE_RATIO = 0.15
-"""Ratio of the measured torque to the beam's torque below which the sensor shows no torque."""
+"""Ratio of measured torque to beam's torque below which the sensor counts as dead."""
 _ADVICE = (
     "Correct the profile or the rig. A value that was measured by other means and is marked "
     'source = "measured" (docs/safety.md) is not probed.'

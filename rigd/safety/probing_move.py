@@ -144,7 +144,7 @@ smaller at the same speed."""
 _SPEED_RAMP_S = 0.06
 """Time in seconds in which a stroke reaches its speed, or comes to rest."""
 _MIN_CRUISE_S = 0.35
-"""Approximate shortest time in seconds from the start of a stroke to the start of its end."""
+"""Approximate shortest time in seconds from the start of a stroke until it slows down."""
 _MAX_SPEED_FRACTION = 0.2
 """Largest speed of a fast stroke, as a fraction of the profile's limit."""
 _MAX_TRAVEL_FRACTION = 0.25
@@ -160,7 +160,7 @@ class ProbePlan:
     speed_rad_s: float
     """Speed of the first pair of strokes; the second pair is twice as fast."""
     cruise_s: float
-    """Time from the start of a stroke to the start of its end.
+    """Time from the start of a stroke until it slows down.
 
     It is a whole number of periods of the beam's first mode, so that the end of the stroke cancels
     the vibration of the start."""
@@ -236,9 +236,9 @@ _SPEED_WINDOW_S = 0.004
 _COMPARISON_TIME_CONSTANT_S = 0.012
 """Time constant in seconds of the filter before the coupling torque is compared."""
 _MIN_MOVEMENT_STEPS = 8
-"""Movement that shows that the shaft moves, in encoder steps of any size."""
+"""Smallest movement that proves motion of the shaft, in encoder steps of any size."""
 _MIN_MOVEMENT_RAD = 2e-4
-"""Smallest movement in rad that shows that the shaft moves."""
+"""Smallest movement in rad that proves motion of the shaft."""
 _MIN_DIFFERENCE_NM = 8e-3
 """Smallest difference in N·m between coupling torque and beam's torque that ends the move."""
 _MIN_DIFFERENCE_STDS = 2.0
