@@ -158,7 +158,7 @@ def _branch_cut_poles(damping: Damping, rate_hz: float) -> Real:
 
 
 def _steady_states(pole_factors: Complex) -> Complex:
-    """Return the steady states of the discrete poles `pole_factors` for a constant angle of 1."""
+    """Return the final state of each discrete pole of `pole_factors` for a constant angle of 1."""
     steady_states: Complex = 1 / (1 - pole_factors)
     return steady_states
 

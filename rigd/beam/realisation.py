@@ -472,10 +472,10 @@ def _build_realisation(
 
 
 def _growth_on_frictionless_motor(realisation: Realisation, beam: Beam) -> float:
-    """Return the growth rate (1/s) of the realised beam on a frictionless motor of equal inertia.
+    """Return the growth rate (1/s) of the realised beam on a frictionless motor.
 
-    Without friction and with little inertia of its own such a motor is the most critical case for
-    stability.
+    The motor has the inertia of the beam. Without friction and with little inertia it is the most
+    critical case for stability.
     """
     motor_and_beam = couple(realisation, motor_inertia_kg_m2=beam.inertia_kg_m2)
     return float(np.linalg.eigvals(motor_and_beam.a).real.max())

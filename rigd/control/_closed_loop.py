@@ -394,7 +394,7 @@ def check_stability(closed_loop: ClosedLoop) -> str | None:
 
 
 def stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
-    """Return the closed loop of a rig with a warning, and raise if the loop is unstable.
+    """Return the closed loop of a rig and a stability warning; raise if the loop is unstable.
 
     The results for the last few models are cached, because the check of a rig and the planning of a
     session need the same loop.

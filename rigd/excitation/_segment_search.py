@@ -449,9 +449,9 @@ class SegmentSearch:
         tip_slope_fractions: Real,
         duration_s: float,
     ) -> float:
-        """Return the information up to the planning horizon if a mode is driven after a segment.
+        """Return the information up to the planning horizon from a segment and the time after it.
 
-        The motor then holds the amplitude that the mode has at the end of the segment.
+        After the segment the motor holds the amplitude that the band's mode has at its end.
         """
         first_sample = self.model_samples(duration_s)
         remaining_samples = self.sample_count - first_sample

@@ -41,8 +41,8 @@ It applies to sensors without noise."""
 _MODEL_ERROR_FRACTION = 0.5
 """Error of the predicted coupling torque, as a fraction of the coupling torque's rms.
 
-Beams differ from their models. The error vibrates, so its mean over more than half a period of the
-first mode is smaller."""
+Beams differ from their models. The error oscillates, so its mean over more than half a period of
+the first mode is smaller."""
 _RMS_TIME_CONSTANT_S = 0.25
 """Time constant in seconds of the coupling torque's rms."""
 _TEST_RAMP_S = 0.02
