@@ -8,7 +8,7 @@ import sys
 _NOTHING_BEGAN_MESSAGE = b"Stopped before anything began.\n"
 """Message after Ctrl-C before a command has started."""
 _PORTABLE_COMMANDS = ("list", "info", "recover", "replay", "profiles", "specimens")
-"""Commands that use files only, which Windows has as well."""
+"""Commands that use files only, and therefore also run on Windows."""
 
 
 def main() -> None:

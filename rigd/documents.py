@@ -29,7 +29,7 @@ _MAX_DEPTH: Final = 16
 
 
 class DocumentError(ValueError):
-    """A document cannot be read; the message is a clause that follows the file's name."""
+    """Error of a document that cannot be read; the message is a clause after the file's name."""
 
 
 def read_text(path: Path, max_bytes: int = MAX_TOML_BYTES) -> str:

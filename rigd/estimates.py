@@ -60,7 +60,7 @@ class Estimate:
         return self if flag is None else replace(self, flag=self.flag or flag)
 
     def percent_above(self, other: "Estimate") -> float:
-        """Return the difference from another estimate in per cent of that; NaN if that is 0."""
+        """Return ``100 (self - other) / other`` of the estimates' values; NaN if `other` is 0."""
         return 100 * (self.value / other.value - 1) if other.value else math.nan
 
     def text(self, scale: float = 1.0) -> str:
@@ -84,10 +84,10 @@ class Estimate:
 
     @classmethod
     def from_json(cls, document: object) -> "Estimate | None":
-        """Return the estimate that a JSON value describes, or None if it is none.
+        """Return the estimate that a JSON value describes, or None if it describes none.
 
-        Numbers are finite. An interval without two finite ends is unknown. A flag that is no text
-        is a reason to doubt as well.
+        The value must be a finite number. An interval without two finite ends counts as unknown. A
+        flag of any type is converted to text.
 
         Parameters
         ----------
@@ -99,10 +99,10 @@ class Estimate:
             or (value := finite_number(document.get("value"))) is None
         ):
             return None
-        ends, flag = document.get("interval_95"), document.get("flag")
+        interval_ends, flag = document.get("interval_95"), document.get("flag")
         interval_95 = None
-        if isinstance(ends, list) and len(ends) == 2:
-            low, high = map(finite_number, ends)
+        if isinstance(interval_ends, list) and len(interval_ends) == 2:
+            low, high = map(finite_number, interval_ends)
             interval_95 = None if low is None or high is None else (low, high)
         return cls(
             value,
@@ -195,7 +195,7 @@ class EstimatedMode:
 
     @classmethod
     def from_json(cls, document: object, number: int) -> "EstimatedMode | None":
-        """Return the mode that a JSON value describes, or None if it is none.
+        """Return the mode that a JSON value describes, or None if it describes no mode.
 
         A mode has a positive frequency and a damping ratio.
 

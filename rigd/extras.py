@@ -9,7 +9,7 @@ _EXTRA_MODULES: Final = {
     "rig": ("aiohttp", "can", "canopen", "serial"),
     "live": ("rerun",),
 }
-"""Modules that each extra installs, of those that commands use without a message of their own."""
+"""Modules that each extra installs, except those whose absence a command reports itself."""
 
 
 class MissingExtraError(FailureError):
@@ -31,9 +31,9 @@ def require_extra(extra: str, subject: str) -> None:
     MissingExtraError
         If a package is missing.
     """
-    missing = [module for module in _EXTRA_MODULES[extra] if find_spec(module) is None]
-    if missing:
-        raise _missing_extra(subject, extra)
+    missing_modules = [module for module in _EXTRA_MODULES[extra] if find_spec(module) is None]
+    if missing_modules:
+        raise _missing_extra_error(subject, extra)
 
 
 def explain_missing_module(error: ModuleNotFoundError) -> MissingExtraError | None:
@@ -41,10 +41,10 @@ def explain_missing_module(error: ModuleNotFoundError) -> MissingExtraError | No
     module = (error.name or "").partition(".")[0]
     for extra, modules in _EXTRA_MODULES.items():
         if module in modules:
-            return _missing_extra("This command", extra)
+            return _missing_extra_error("This command", extra)
     return None
 
 
-def _missing_extra(subject: str, extra: str) -> MissingExtraError:
-    """Return the error on the missing packages of an extra."""
+def _missing_extra_error(subject: str, extra: str) -> MissingExtraError:
+    """Return the error to raise if packages of an extra are missing."""
     return MissingExtraError(f"{subject} needs optional packages: pip install 'rigd[{extra}]'.")

@@ -76,7 +76,9 @@ class Gauges:
         }
         self._time_constant_s = thermal_time_constant_s
         self._heat_nm2 = 0.0
-        self._last: tuple[int, float] | None = None  # tick and angle of the last fresh reading
+        self._last_fresh_angle: tuple[int, float] | None = (
+            None  # tick and angle of the last fresh reading
+        )
 
     def take(self, samples: Records) -> dict[str, Gauge]:
         """Return the largest magnitudes in a block of samples, by the names of ``UNITS``.
@@ -125,7 +127,7 @@ class Gauges:
 
     def forget_angle(self) -> None:
         """Forget the last motor angle, so that no speed is computed from angles of two records."""
-        self._last = None
+        self._last_fresh_angle = None
 
     def _speeds_from_fresh_angles(self, samples: Records) -> npt.NDArray[np.float64]:
         """Return the speeds in rad/s between fresh readings of the angle, shape (n,).
@@ -134,11 +136,11 @@ class Gauges:
         """
         fresh_samples = samples[(samples["status"] & Status.ANGLE_STALE) == 0]
         fresh_ticks, angles_rad = fresh_samples["tick"].astype(np.int64), fresh_samples["angle_rad"]
-        if self._last is not None:
-            fresh_ticks = np.append(self._last[0], fresh_ticks)
-            angles_rad = np.append(self._last[1], angles_rad)
+        if self._last_fresh_angle is not None:
+            fresh_ticks = np.append(self._last_fresh_angle[0], fresh_ticks)
+            angles_rad = np.append(self._last_fresh_angle[1], angles_rad)
         if fresh_ticks.size:
-            self._last = int(fresh_ticks[-1]), float(angles_rad[-1])
+            self._last_fresh_angle = int(fresh_ticks[-1]), float(angles_rad[-1])
         speeds_rad_s: npt.NDArray[np.float64] = (
             np.diff(angles_rad) / np.diff(fresh_ticks) * self._rate_hz
         )

@@ -128,7 +128,7 @@ class IdentifiedBeam:
     """Relative standard uncertainty of the pole of each mode in the document."""
 
     def pole_uncertainty(self, mode_count: int) -> tuple[float, ...]:
-        """Return the relative standard uncertainty of the poles of the first modes.
+        """Return the relative standard uncertainty of the pole of each of the first modes.
 
         Parameters
         ----------
@@ -146,7 +146,7 @@ class IdentifiedBeam:
 def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> IdentifiedBeam:
     """Read the identified beam from the document of an analysis or a campaign.
 
-    It is that of the first headline, for a campaign that of the pooled headline. If a uniform beam
+    The beam is that of the first headline, or of a campaign's pooled headline. If a uniform beam
     predicts the modes, the parameters are those of an exactly uniform beam, which predict the
     record best. Otherwise no uniform beam describes the rig, and the modes themselves are used if
     the purpose permits it.
@@ -157,8 +157,8 @@ def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> 
         Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes``,
         ``exact_geometry``, ``validity.uniform_beam`` and ``named``.
     stated
-        Stated plant: its length, which is not observable in a session, its delay and tool inertia
-        apply if the document has none.
+        Plant with the stated length, which no session determines, and with the delay and the tool
+        inertia to use if the document has none.
     use
         Purpose of the beam: `MOVE` or `TOUCH`.
 
@@ -270,8 +270,8 @@ def _read_headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
     document: Any = read_document(path)
     label, headline = select_headline(path, document)
     # A single record of a campaign can exclude a uniform beam.
-    pooled = headline.get("file", "") is None
-    headlines = document["headlines"] if pooled else [headline]
+    is_pooled = headline.get("file", "") is None
+    headlines = document["headlines"] if is_pooled else [headline]
     refusals = [_uniform_beam_refusal(path, each) for each in headlines if isinstance(each, dict)]
     return label, headline, next(filter(None, refusals), "")
 
@@ -327,7 +327,7 @@ def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any
 
 
 def _is_of_one_file(numbered_headline: tuple[int, Mapping[str, Any]]) -> bool:
-    """Return whether a headline is of a single file, and not of all together."""
+    """Return whether a headline is of a single file, and not of all files together."""
     return numbered_headline[1].get("file", "") is not None
 
 
@@ -485,8 +485,8 @@ def _require_certain(label: str, estimates: Mapping[str, Estimate], use: Use) ->
     for name, estimate in estimates.items():
         # For a move the uncertainty of the modes includes the damping.
         covered_by_modes = use is MOVE and _effect_key(name) not in _EFFECTS
-        covered = covered_by_modes or _standard_deviation(estimate) is not None
-        if estimate.flag is not None and (_effect_key(name) in use.certain or not covered):
+        is_covered = covered_by_modes or _standard_deviation(estimate) is not None
+        if estimate.flag is not None and (_effect_key(name) in use.certain or not is_covered):
             raise IdentifiedBeamError(
                 f"{label}.parameters.{name} is flagged ({estimate.flag[:100]}), and {use.name} "
                 "relies on it; record a session that shows more modes or is longer and analyze it, "

@@ -42,21 +42,21 @@ GROUPS: Final = {
     "analysis.formats": ("file format", "analysis.exchange:check_format_plugin"),
     "analysis.structures": ("structure", "analysis.structures:check_structure_plugin"),
 }
-"""Groups of entry points, each with the word for its parts in messages, and with the function that
-checks an entry point of the group."""
+"""Map from each group of entry points to the word for its parts in messages, and to the function
+that checks a part of the group."""
 
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 """Pattern of the names that a package can add; they are keys of profiles and options."""
-_REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+_REFERENCE_PATTERN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """Pattern of the object that an entry point names: module and attribute."""
 _MAX_FILE_BYTES = 1 << 20
 """Largest size in bytes of a file ``entry_points.txt`` that is read."""
-_GROUP_MARKS = tuple(f"[{group}]".encode() for group in GROUPS)
-"""Headings of the groups, one of which a file must contain to be of interest."""
+_GROUP_HEADINGS = tuple(f"[{group}]".encode() for group in GROUPS)
+"""Headings of the groups; a file without any of them adds no part."""
 
 
 class PluginError(UserError):
-    """A package that adds a part cannot be used; the message names package, reason and remedy."""
+    """Error of a package's part that cannot be used; the message has package, reason and remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class Plugin:
 
 
 def installed_plugins(group: str) -> tuple[Plugin, ...]:
-    """Return what the installed packages add to a group, in the order of the names.
+    """Return the parts that the installed packages add to a group, sorted by name.
 
     Nothing is imported. A part whose `Plugin.problem` is not empty cannot be used.
 
@@ -102,11 +102,11 @@ def installed_plugins(group: str) -> tuple[Plugin, ...]:
     group
         Group of entry points, a key of `GROUPS`.
     """
-    return tuple(plugin for plugin in _scan(_search_folders()) if plugin.group == group)
+    return tuple(plugin for plugin in _scan_folders(_search_folders()) if plugin.group == group)
 
 
 def find_plugin(group: str, name: str) -> Plugin | None:
-    """Return the part of a name that an installed package adds, or None if there is none.
+    """Return the part with a given name that an installed package adds, or None.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ class Registry(Mapping[str, T]):
         return self._load(plugin)
 
     def added(self) -> tuple[Plugin, ...]:
-        """Return what installed packages add, in the order of the names; nothing is imported."""
+        """Return the parts that installed packages add, sorted by name; nothing is imported."""
         return installed_plugins(self.group)
 
     def names(self) -> list[str]:
@@ -254,7 +254,7 @@ class Registry(Mapping[str, T]):
         return [*self.built_in, *(plugin.name for plugin in self.added())]
 
     def __getitem__(self, name: str) -> T:
-        """Return the part of a name."""
+        """Return the part with a given name."""
         owner = self.owner(name)
         return self.built_in[name] if owner is None else self.load(owner)
 
@@ -272,7 +272,7 @@ class Registry(Mapping[str, T]):
 
 
 def check_plugin(plugin: Plugin) -> str:
-    """Import a part that a package adds, check it, and return one line on it.
+    """Import a part that a package adds, check it, and return its one-line summary.
 
     Raises
     ------
@@ -290,8 +290,8 @@ def plugin_errors(
 ) -> Iterator[None]:
     """Turn an unexpected exception of a package's code into an error that names the package.
 
-    Errors for the operator and of the operating system are passed on. Nothing is changed for a part
-    of rigd itself.
+    Errors whose message is for the operator, errors of the operating system, and all errors of
+    rigd's own parts are passed on unchanged.
 
     Parameters
     ----------
@@ -322,12 +322,12 @@ def error_of_package(error: Exception, plugin: Plugin) -> PluginError | None:
         Part of an installed package.
     """
     package_module = plugin.reference.partition(":")[0].partition(".")[0]
-    call = error.__traceback__
-    while call is not None:
-        module = str(call.tb_frame.f_globals.get("__name__"))
+    traceback = error.__traceback__
+    while traceback is not None:
+        module = str(traceback.tb_frame.f_globals.get("__name__"))
         if module.partition(".")[0] == package_module:
             return _failure_of(plugin, error)
-        call = call.tb_next
+        traceback = traceback.tb_next
     return None
 
 
@@ -373,7 +373,7 @@ def _search_folders() -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=8)
-def _scan(folders: tuple[str, ...]) -> tuple[Plugin, ...]:
+def _scan_folders(folders: tuple[str, ...]) -> tuple[Plugin, ...]:
     """Return all parts that the packages in these folders add, in the order of their names."""
     found: list[Plugin] = []
     packages: set[str] = set()
@@ -383,32 +383,34 @@ def _scan(folders: tuple[str, ...]) -> tuple[Plugin, ...]:
                 if not entry.name.endswith(".dist-info"):
                     continue
                 package, _, version = entry.name.removesuffix(".dist-info").partition("-")
-                identity = re.sub(r"[-_.]+", "-", package).lower()
-                if identity not in packages:  # else it is hidden by the one found before
-                    packages.add(identity)
-                    found += _read(Path(entry.path, "entry_points.txt"), identity, version)
+                normalized_name = re.sub(r"[-_.]+", "-", package).lower()
+                if normalized_name not in packages:  # else it is hidden by the one found before
+                    packages.add(normalized_name)
+                    found += _read_entry_points(
+                        Path(entry.path, "entry_points.txt"), normalized_name, version
+                    )
     return tuple(sorted(_with_clashes(found), key=lambda p: (p.group, p.name)))
 
 
 def _with_clashes(found: list[Plugin]) -> Iterator[Plugin]:
-    """Yield the parts; those of the same name have the problem that several packages add them."""
+    """Yield the parts, with a stated problem in those whose name several packages add."""
     owners: dict[tuple[str, str], list[str]] = {}
     for plugin in found:
         owners.setdefault((plugin.group, plugin.name), []).append(plugin.label)
     for plugin in found:
         labels = owners[plugin.group, plugin.name]
-        clash = f"{listed(labels)} add the same name; uninstall all but one."
-        yield plugin if len(labels) == 1 else replace(plugin, problem=clash)
+        clash_problem = f"{listed(labels)} add the same name; uninstall all but one."
+        yield plugin if len(labels) == 1 else replace(plugin, problem=clash_problem)
 
 
-def _read(path: Path, package: str, version: str) -> Iterator[Plugin]:
-    """Yield the parts that the file of a package's entry points names."""
+def _read_entry_points(path: Path, package: str, version: str) -> Iterator[Plugin]:
+    """Yield the parts that a package's file ``entry_points.txt`` names."""
     try:
         with path.open("rb") as file:
             content = file.read(_MAX_FILE_BYTES)
     except OSError:
         return  # the package has none
-    if not any(mark in content for mark in _GROUP_MARKS):
+    if not any(heading in content for heading in _GROUP_HEADINGS):
         return
     group = ""
     for line in content.decode("utf-8", errors="replace").splitlines():
@@ -416,12 +418,12 @@ def _read(path: Path, package: str, version: str) -> Iterator[Plugin]:
         if text.startswith("[") and text.endswith("]"):
             group = text[1:-1].strip()
         elif group in GROUPS and text and not text.startswith(("#", ";")):
-            name, equals, reference = (part.strip() for part in text.partition("="))
+            name, equals_sign, reference = (part.strip() for part in text.partition("="))
             reference = reference.partition("[")[0].strip()
             problem = ""
-            if not equals or not _REFERENCE.fullmatch(reference):
+            if not equals_sign or not _REFERENCE_PATTERN.fullmatch(reference):
                 problem = "its line is not of the form name = module:object; correct it."
-            elif not _NAME.fullmatch(name):
+            elif not _NAME_PATTERN.fullmatch(name):
                 problem = (
                     "its name is not of lower-case letters, digits and _, at most 32; rename it."
                 )

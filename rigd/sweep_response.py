@@ -59,9 +59,9 @@ def sweep_ticks(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
 
 
 class SweepResponse:
-    """Running estimate of the frequency response torque over motor angle in a sweep.
+    """Running estimate of the frequency response from motor angle to torque in a sweep.
 
-    It is computed by Welch's method, with the default segments of `analyze`.
+    The estimate uses Welch's method, with the default segments of `analyze`.
 
     Parameters
     ----------
@@ -83,14 +83,14 @@ class SweepResponse:
         *,
         resolution_divisor: int = 1,
     ) -> None:
-        self._first, end_tick = sweep
-        sweep_sample_count = end_tick - self._first
+        self._first_tick, end_tick = sweep
+        sweep_sample_count = end_tick - self._first_tick
         segmentation = segmentation_of(sweep_sample_count, rate_hz)
         segmentation = replace(
             segmentation,
             nfft=max(segmentation.nfft // resolution_divisor, segmentation.segment_length),
         )
-        self._running = RunningResponse(
+        self._running_response = RunningResponse(
             rate_hz, sweep_sample_count, last_hz=last_hz, segmentation=segmentation
         )
         self._at_rest: list[npt.NDArray[np.float64]] = []
@@ -101,7 +101,7 @@ class SweepResponse:
 
         The samples are in order. Gaps are allowed.
         """
-        sweep_ticks = samples["tick"].astype(np.int64) - self._first
+        sweep_ticks = samples["tick"].astype(np.int64) - self._first_tick
         samples_before_sweep = int(np.searchsorted(sweep_ticks, 0))
         if samples_before_sweep:
             self._at_rest.append(samples["angle_rad"][:samples_before_sweep].copy())
@@ -114,7 +114,7 @@ class SweepResponse:
         sweep_samples = samples[samples_before_sweep:]
         # A stale reading is not a measurement: its gap is filled like any other.
         fresh_or_nan = np.where(sweep_samples["status"] & _STALE_STATUS, np.nan, 1.0)
-        self._running.feed(
+        self._running_response.feed(
             sweep_ticks[samples_before_sweep:],
             sweep_samples["angle_reference_rad"] - self._rest_rad,
             (sweep_samples["angle_rad"] - self._rest_rad) * fresh_or_nan,
@@ -123,13 +123,13 @@ class SweepResponse:
 
     def estimate(self) -> RunningEstimate | None:
         """Return the response estimated so far; None while there are too few samples."""
-        return self._running.estimate()
+        return self._running_response.estimate()
 
 
 def nominal_response(
     beam: Beam, damping: Damping, tool_inertia_kg_m2: float
 ) -> tuple[Real, Complex]:
-    """Return the nominal response torque over angle at the sensor, in the band that is shown.
+    """Return the nominal frequency response from motor angle to the sensor's torque.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def nominal_response(
     Returns
     -------
     tuple of two arrays (n,)
-        Frequencies in Hz; torque over angle in N·m/rad, complex.
+        Frequencies in Hz of the band that is shown; complex response in N·m/rad.
     """
     frequency_hz = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
     s = 2j * np.pi * frequency_hz
@@ -149,7 +149,7 @@ def nominal_response(
 
 
 def response_decimation(frequency_hz: Real) -> CurveDecimation:
-    """Return the decimation of curves over frequency for the charts.
+    """Return the object that decimates curves over frequency for the charts.
 
     Parameters
     ----------

@@ -2,11 +2,11 @@
 
 Offers the transfer function from motor angle to coupling torque (`transfer`, `TransferGrid`), the
 modes and their poles (`modes`, `poles`), the deflection (`DeflectionFilter`), a force at a point of
-the beam (`PointForceGrid`, `realise_force`), the whole of beam, ends and torque channel (`Plant`)
+the beam (`PointForceGrid`, `realise_force`), the plant of beam, ends and torque channel (`Plant`)
 with the table of its parameters (`PARAMETERS`), the air's drag (`DragGrid`), and responses in time
 from transfer functions (`CausalTransform`). Its public module
-`realisation` has the state space that runs in real time, and `tip` the motion of the free end. It
-knows of no rig and no file.
+`realisation` has the state space that runs in real time, and `tip` the motion of the free end. The
+package does not depend on rigs or files.
 """
 
 import lazy_loader as lazy

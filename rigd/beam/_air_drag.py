@@ -1,8 +1,8 @@
 """Drag of still air on a thin beam: the force along the beam, and its effect on the modes.
 
 Each length of a round beam of diameter d that moves across the air at the speed v is held back by
-the quasi-steady force per metre ``-rho_air/2 C_D d |v| v`` (Morison's drag term). The
-beam enters by the product `C_D d` (in m) only; for a constant coefficient it is one number.
+the quasi-steady force per metre ``-rho_air/2 C_D d |v| v`` (Morison's drag term). The only property
+of the beam in it is the product `C_D d` (in m), which is one number if C_D is constant.
 
 The force is evaluated at the points of a Gauss-Legendre rule along the beam, whose weights convert
 it into the forces on each mode and the root.
@@ -50,7 +50,7 @@ class DragGrid:
         Parameters
         ----------
         beam
-            Beam with this length.
+            Beam; only its length is used.
         modes
             Number of modes whose shapes are evaluated.
         points

@@ -2,8 +2,9 @@
 
 A convolution by FFT is circular, and a lightly damped beam rings longer than any padding. So the
 signal is multiplied by ``exp(-sigma t)`` before the FFT, which gives its Laplace transform on the
-line ``s = sigma + j omega``. The transform is multiplied by the transfer function, and the product
-of the inverse FFT by ``exp(sigma t)``. What wraps round has decayed by then [1]_.
+line ``s = sigma + j omega``. The transform is multiplied by the transfer function, transformed back
+by the inverse FFT, and multiplied by ``exp(sigma t)``. The part of the response that the circular
+convolution wraps round to the beginning has then decayed [1]_.
 
 References
 ----------
@@ -45,8 +46,8 @@ class CausalTransform:
     rate_hz
         Sampling rate.
     decay_exponent
-        Product of sigma and the duration of the FFT. What wraps round is smaller by ``exp`` of it;
-        rounding errors grow by up to the same factor.
+        Product of sigma and the duration of the FFT. The part of a response that wraps round is
+        reduced by the factor ``exp(decay_exponent)``; rounding errors grow by up to this factor.
     highest_hz
         Upper end of the band. The transform is zero above it, and has no values there.
 
@@ -91,11 +92,11 @@ class CausalTransform:
         padding_ratio: float = 1.1,
         decay_exponent: float = 6.6,
     ) -> "CausalTransform":
-        """Return the transform for records of a length, padded to a length whose FFT is fast.
+        """Return a transform for records of a given length, padded to a length whose FFT is fast.
 
-        With the defaults, what wraps round shrinks to 1e-3 of the response of a beam after a whole
-        record. It has the form of a free decay, which no fit mistakes for the response. Rounding
-        errors, and what a decimation left beyond the band, grow by exp(6.6 / 1.1) = 400.
+        With the defaults, the part of a beam's response that wraps round is reduced to 1e-3 of its
+        size. It has the form of a free decay, which no fit mistakes for the response. Rounding
+        errors, and remainders of a decimation above the band, grow by exp(6.6 / 1.1) = 400.
 
         Parameters
         ----------
@@ -113,7 +114,7 @@ class CausalTransform:
         return cls(next_fast_len(ceil(padding_ratio * sample_count)), rate_hz, decay_exponent)
 
     def forward(self, values: Real, *, oversampling: int = 1, hold: bool = False) -> Complex:
-        """Return the Laplace transform of signals over the time step of a sample, shape (…, bins).
+        """Return the Laplace transform of signals, divided by the sampling period, shape (…, bins).
 
         Parameters
         ----------
@@ -142,7 +143,7 @@ class CausalTransform:
         transform
             Transforms as `forward` returns them, shape (…, bins).
         samples
-            Slice of the m values that are returned, or m for the first ones.
+            Slice of the m values to return, or the number m to return the first m values.
         oversampling
             Number of values per sample.
         """
@@ -197,7 +198,7 @@ class CausalTransform:
         return self.inverse(self.forward(values) * response, values.shape[-1])
 
     def _weight(self, sign: int, count: int, oversampling: int) -> Real:
-        """Return exp(±sigma t) at the first values, shape (count,), computed once."""
+        """Return ``exp(sign sigma t)`` at the first `count` values, from a cache if possible."""
         weight = self._weights.get((sign, oversampling))
         if weight is None or weight.size < count:
             time_s = np.arange(count) / (oversampling * self.rate_hz)

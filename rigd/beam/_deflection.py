@@ -11,8 +11,9 @@ except at the modes.
 
 Each H_i is a sum over poles. For damping of first order it consists of the two poles of its mode,
 with their exact residues; a fitted ladder of fixed real poles approximates the branch cut of
-fractional orders. Every pole is discretised by impulse invariance, with a direct term that gives a
-zero at standstill: for a sinusoid of frequency omega the error is ``(omega / rate)⁴ / 720``,
+fractional orders. Every pole is discretised by impulse invariance, with a direct term that makes
+the deflection zero at a constant angle: for a sinusoid of frequency omega the error is
+``(omega / rate)⁴ / 720``,
 compared with ``(omega / rate)² / 12`` for linear interpolation between samples.
 """
 
@@ -25,21 +26,21 @@ from rigd.beam._modes import clamped_free_eigenvalues, mode_shape, poles_for_eig
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-_CHUNK = 256
+_CHUNK_SAMPLES = 256
 """Number of samples processed at once; a table of as many powers of each pole is stored."""
 
 _MAX_FREQUENCY_FRACTION = 0.5
 """Highest modal frequency in use, as a fraction of the sampling rate: higher ones would alias."""
 
-_REAL_POLES = 10
+_REAL_POLE_COUNT = 10
 """Number of real poles for the branch cut, about two a decade.
 
 They range from `_SLOWEST_POLE_RAD_S` to the sampling rate."""
 _SLOWEST_POLE_RAD_S = 0.03
 """Slowest real pole in rad/s (magnitude)."""
-_FIT_FROM_HZ = 0.05
+_LOWEST_FIT_HZ = 0.05
 """Lowest frequency in Hz to which the real poles' weights are fitted."""
-_FIT_TO_FRACTION = 0.1
+_HIGHEST_FIT_FRACTION = 0.1
 """Highest frequency of the real poles' fit, as a fraction of the sampling rate."""
 _SMALL_RESPONSE = 0.01
 """Magnitude of H_i below which the fit minimises the absolute, not relative, error.
@@ -100,7 +101,7 @@ class DeflectionFilter:
             )
 
         # Powers of the poles, the highest first: effect of each sample of a chunk at its end.
-        self._powers: Complex = pole_factors[:, None] ** np.arange(_CHUNK, -1, -1)
+        self._powers: Complex = pole_factors[:, None] ** np.arange(_CHUNK_SAMPLES, -1, -1)
         self._scaled_shapes: Complex = (
             -_scaled_shapes(beam, self.x_m / beam.length_m, z) @ pole_weights
         )
@@ -128,9 +129,9 @@ class DeflectionFilter:
         if self._start_rad is None:
             self._start_rad = float(angle_rad[0])
         turned_rad = angle_rad - self._start_rad
-        for chunk_start in range(0, turned_rad.size, _CHUNK):
-            chunk_rad = turned_rad[chunk_start : chunk_start + _CHUNK]
-            chunk_powers = self._powers[:, _CHUNK - chunk_rad.size :]
+        for chunk_start in range(0, turned_rad.size, _CHUNK_SAMPLES):
+            chunk_rad = turned_rad[chunk_start : chunk_start + _CHUNK_SAMPLES]
+            chunk_powers = self._powers[:, _CHUNK_SAMPLES - chunk_rad.size :]
             self._state = chunk_powers[:, 0] * self._state + chunk_powers[:, 1:] @ chunk_rad
         deflection: Real = (self._scaled_shapes @ self._state).real + self._direct * turned_rad[-1]
         return deflection
@@ -144,17 +145,20 @@ def _usable_mode_count(pole_pairs: Complex, rate_hz: float) -> int:
 
 
 def _branch_cut_poles(damping: Damping, rate_hz: float) -> Real:
-    """Return real poles in rad/s that stand for the branch cut, or none without a cut."""
-    internal_integer = damping.zeta == 0 or damping.alpha in (0, 1)
-    external_integer = damping.gamma == 0 or damping.lambda_ in (0, 1)
-    if internal_integer and external_integer:
+    """Return the real poles in rad/s that approximate the branch cut of fractional damping orders.
+
+    The array is empty if the damping is of integer order, which has no branch cut.
+    """
+    internal_is_integer = damping.zeta == 0 or damping.alpha in (0, 1)
+    external_is_integer = damping.gamma == 0 or damping.lambda_ in (0, 1)
+    if internal_is_integer and external_is_integer:
         return np.zeros(0)
-    poles: Real = -np.geomspace(_SLOWEST_POLE_RAD_S, rate_hz, _REAL_POLES)
+    poles: Real = -np.geomspace(_SLOWEST_POLE_RAD_S, rate_hz, _REAL_POLE_COUNT)
     return poles
 
 
 def _steady_states(pole_factors: Complex) -> Complex:
-    """Return the steady states of the discrete poles `pole_factors` for a constant angle of 1."""
+    """Return the final state of each discrete pole of `pole_factors` for a constant angle of 1."""
     steady_states: Complex = 1 / (1 - pole_factors)
     return steady_states
 
@@ -163,12 +167,16 @@ def _modal_stiffness_terms(
     s: Complex, z: Real, beam: Beam, damping: Damping
 ) -> tuple[Complex, Complex, Complex]:
     """Return ``P / EI``, ``Q k⁴ / EI`` and ``s d/ds`` of their sum for each mode at `s` (rad/s)."""
-    inertial = beam.density_over_stiffness * s * s
-    external = damping.gamma * s**damping.lambda_
-    internal = damping.zeta * s**damping.alpha
+    inertial_term = beam.density_over_stiffness * s * s
+    external_term = damping.gamma * s**damping.lambda_
+    internal_term = damping.zeta * s**damping.alpha
     k_fourth = (z / beam.length_m) ** 4
-    log_slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal * k_fourth
-    return inertial + external, (1 + internal) * k_fourth, log_slope
+    log_slope = (
+        2 * inertial_term
+        + damping.lambda_ * external_term
+        + damping.alpha * internal_term * k_fourth
+    )
+    return inertial_term + external_term, (1 + internal_term) * k_fourth, log_slope
 
 
 def _mode_residues(z: Real, pole_pairs: Complex, beam: Beam, damping: Damping) -> Complex:
@@ -192,32 +200,32 @@ def _branch_cut_weights(
     pairs with the given `pair_weights`.
     """
     frequency_hz = np.geomspace(
-        _FIT_FROM_HZ, max(_FIT_TO_FRACTION * rate_hz, 2 * _FIT_FROM_HZ), 200
+        _LOWEST_FIT_HZ, max(_HIGHEST_FIT_FRACTION * rate_hz, 2 * _LOWEST_FIT_HZ), 200
     )
     s = 2j * np.pi * frequency_hz[:, None]
     inertial_load, spring_term, _ = _modal_stiffness_terms(s, z, beam, damping)
     exact_response = inertial_load / (spring_term + inertial_load)
     pole_columns = 1 / (1 - pole_factors * np.exp(-s / rate_hz)) - _steady_states(pole_factors)
     fit_residual = exact_response - pole_columns @ pair_weights.T
-    cut = np.empty((z.size, _REAL_POLES))
+    cut_weights = np.empty((z.size, _REAL_POLE_COUNT))
     for i in range(z.size):
         point_weight = 1 / (np.abs(exact_response[:, i, None]) + _SMALL_RESPONSE)
         equation_matrix, equation_target = (
-            pole_columns[:, -_REAL_POLES:] * point_weight,
+            pole_columns[:, -_REAL_POLE_COUNT:] * point_weight,
             fit_residual[:, i, None] * point_weight,
         )
-        cut[i] = np.linalg.lstsq(
+        cut_weights[i] = np.linalg.lstsq(
             np.concatenate([equation_matrix.real, equation_matrix.imag]),
             np.concatenate([equation_target.real, equation_target.imag])[:, 0],
         )[0]
-    return cut
+    return cut_weights
 
 
 def _scaled_shapes(beam: Beam, x: Real, z: Real) -> Real:
     """Return ``b_i phi_i`` in m of the used modes at x = 0…1, shape (x.size, z.size).
 
-    The last one includes all later modes by their low-frequency sum: the ``b_i phi_i / k_i⁴`` of
-    all modes add up to the bend under a load that grows like x.
+    The last mode includes all higher ones in the low-frequency limit, in which the sum of
+    ``b_i phi_i / k_i⁴`` over all modes is the deflection under a static load proportional to x.
     """
     mode_numbers = np.arange(1, z.size + 1)
     shape_factors = 2 * (-1.0) ** (mode_numbers - 1) / z**2

@@ -32,13 +32,13 @@ _SLOWEST_POLE_RAD_S = 0.03
 """Slowest real pole in rad/s (magnitude)."""
 _REAL_POLES_PER_DECADE = 5
 """Number of real poles per decade of frequency."""
-_MODES_UP_TO_FACTOR = 2.0
+_HIGHEST_MODE_FACTOR = 2.0
 """Multiple of the highest frequency of interest up to which modes are included.
 
 The omitted modes are static below the highest frequency."""
-_REAL_POLES_UP_TO_FACTOR = 10.0
+_HIGHEST_REAL_POLE_FACTOR = 10.0
 """Multiple of the highest frequency of interest up to which there are real poles."""
-_TAIL_UP_TO_FACTOR = 30.0
+_TAIL_END_FACTOR = 30.0
 """Multiple of the highest frequency of interest up to which the fit bounds the response."""
 _TAIL_WEIGHT = 1e-2
 """Weight of the fit beyond the highest frequency, which bounds the response there.
@@ -49,10 +49,10 @@ _POINTS_PER_DECADE = 40
 _SMALL_RESPONSE = 0.01
 """Size of a response below which the fit minimises its absolute, not relative, error.
 
-The responses are torque per force over the lever arm, and shear per force."""
+The responses are the torque per force, divided by the lever arm, and the shear per force."""
 _SINGULAR_VALUE_CUTOFF = 1e-11
 """Relative singular value below which the least-squares fit drops a combination of poles."""
-_HIGHEST_ORDER = 1.5
+_MAX_DAMPING_ORDER = 1.5
 """Highest damping order that is accepted.
 
 For orders up to it the displacements of 580 random beams were right to 0.6 %."""
@@ -80,7 +80,7 @@ class ForceRealisation:
     The outputs are the displacement at each output point (m), then the torque (N·m) and the shear
     force (N) of the motor on the beam."""
     direct: Real
-    """Change of each output per N of the force without delay, shape (outputs,)."""
+    """Direct term: immediate change of each output per N of the force, shape (outputs,)."""
 
 
 def realise_force(
@@ -120,7 +120,7 @@ def realise_force(
     poles, residues = _modal_poles_and_residues(beam, damping, x, highest_rad_s)
     if poles.size == _MAX_MODES and -poles[-1].real < _RESONANT_DAMPING_RATIO * np.abs(poles[-1]):
         # The next modes resonate and are not included.
-        highest_rad_s = min(highest_rad_s, float(np.abs(poles[-1])) / _MODES_UP_TO_FACTOR)
+        highest_rad_s = min(highest_rad_s, float(np.abs(poles[-1])) / _HIGHEST_MODE_FACTOR)
 
     lowest_fit_rad_s, highest_fit_rad_s = _SLOWEST_POLE_RAD_S / 300, highest_rad_s
     s = 1j * np.geomspace(
@@ -130,14 +130,14 @@ def realise_force(
     )
     s = s[np.abs(s[:, None] - poles).min(axis=1, initial=np.inf) > 1e-6 * np.abs(s)]
     tail_rad_s = np.geomspace(
-        highest_fit_rad_s, _TAIL_UP_TO_FACTOR * highest_fit_rad_s, _POINTS_PER_DECADE
+        highest_fit_rad_s, _TAIL_END_FACTOR * highest_fit_rad_s, _POINTS_PER_DECADE
     ) * np.exp(0.25j * np.pi)
     fit_emphasis = np.append(np.ones(s.size), np.full(tail_rad_s.size, _TAIL_WEIGHT))
     s = np.append(s, tail_rad_s)
     grid = PointForceGrid(s, beam, damping)
     exact_response = np.column_stack(
         [
-            grid.per_force(output_at_m, np.full_like(output_at_m, force_at_m)),
+            grid.displacement_per_force(output_at_m, np.full_like(output_at_m, force_at_m)),
             grid.torque_per_force(force_at_m),
             grid.shear_per_force(force_at_m),
         ]
@@ -146,7 +146,7 @@ def realise_force(
     real_pole_count = (
         ceil(
             _REAL_POLES_PER_DECADE
-            * np.log10(_REAL_POLES_UP_TO_FACTOR * highest_fit_rad_s / _SLOWEST_POLE_RAD_S)
+            * np.log10(_HIGHEST_REAL_POLE_FACTOR * highest_fit_rad_s / _SLOWEST_POLE_RAD_S)
         )
         + 1
     )
@@ -209,10 +209,10 @@ def check_force_damping_order(damping: Damping) -> None:
         If an order of the damping is above 1.5.
     """
     damping_orders = (damping.alpha if damping.zeta else 0, damping.lambda_ if damping.gamma else 0)
-    if max(damping_orders) > _HIGHEST_ORDER:
+    if max(damping_orders) > _MAX_DAMPING_ORDER:
         raise RealisationError(
-            f"{damping} has an order above {_HIGHEST_ORDER:g}, with which the response to a force "
-            "at a point cannot be realised; leave the obstacle out, or choose a lower order."
+            f"{damping} has an order above {_MAX_DAMPING_ORDER:g}, with which the response to a "
+            "force at a point cannot be realised; leave the obstacle out, or choose a lower order."
         )
 
 
@@ -221,13 +221,13 @@ def _modal_poles_and_residues(
 ) -> tuple[Complex, Complex]:
     """Return the oscillating modes' poles in rad/s and the outputs' residues (outputs, modes).
 
-    `x` has the output points and last the force's point, as fractions of the length.
+    `x` contains the output points, then the point of the force, as fractions of the length.
     """
     z = clamped_free_eigenvalues(_MAX_MODES)
     poles = poles_for_eigenvalues(z, beam, damping)[:, 0]
     pole_magnitude = np.abs(poles)  # not a number where there is none: then False below
     is_selected = (poles.imag > 0) & (-poles.real < _HEAVY_DAMPING_RATIO * pole_magnitude)
-    is_selected &= pole_magnitude < _MODES_UP_TO_FACTOR * highest_rad_s
+    is_selected &= pole_magnitude < _HIGHEST_MODE_FACTOR * highest_rad_s
     poles, z = poles[is_selected], z[is_selected]
     mode_numbers = np.flatnonzero(is_selected) + 1
     mode_shapes = np.array(
@@ -238,13 +238,15 @@ def _modal_poles_and_residues(
     shape_mean = mode_mean(_MAX_MODES)[is_selected]
 
     k_fourth = (z / beam.length_m) ** 4
-    inertial = beam.density_over_stiffness * poles**2
-    external = damping.gamma * poles**damping.lambda_
-    internal = damping.zeta * poles**damping.alpha * k_fourth
-    equation_slope = (2 * inertial + damping.lambda_ * external + damping.alpha * internal) / poles
+    inertial_term = beam.density_over_stiffness * poles**2
+    external_term = damping.gamma * poles**damping.lambda_
+    internal_term = damping.zeta * poles**damping.alpha * k_fourth
+    equation_slope = (
+        2 * inertial_term + damping.lambda_ * external_term + damping.alpha * internal_term
+    ) / poles
     shape_at_force = mode_shapes[:, -1] / equation_slope
     per_length = beam.length_m * beam.bending_stiffness_n_m2
-    root_residue = shape_at_force * (inertial + external)
+    root_residue = shape_at_force * (inertial_term + external_term)
     residues: Complex = np.vstack(
         [
             mode_shapes[:, :-1].T * shape_at_force / per_length,
@@ -256,7 +258,10 @@ def _modal_poles_and_residues(
 
 
 def _modal_response(s: Complex, poles: Complex, residues: Complex) -> Complex:
-    """Return each output's sum over the modes' conjugate pole pairs at `s`, shape (s, outputs)."""
+    """Return the modes' part of each output at `s`: the sum over conjugate pole pairs.
+
+    The shape is (number of s, outputs).
+    """
     upper_terms, lower_terms = 1 / (s[:, None] - poles), 1 / (s[:, None] - poles.conj())
     modal_outputs: Complex = upper_terms @ residues.T + lower_terms @ residues.conj().T
     return modal_outputs

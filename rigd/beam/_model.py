@@ -111,10 +111,10 @@ _SERIES = np.array(
     ]
 )
 """Power series coefficients of the numerator N(q) and the denominator D(q), lowest power first."""
-_SERIES_WITH_SLOPES = np.concatenate(
+_SERIES_AND_DERIVATIVES = np.concatenate(
     [_SERIES, np.pad(_SERIES[:, 1:] * np.arange(1.0, 10.0), ((0, 0), (0, 1)))]
 )
-"""The same, followed by those of their derivatives."""
+"""Power series coefficients of N(q) and D(q), then of dN/dq and dD/dq, lowest power first."""
 
 
 class TransferGrid:
@@ -129,7 +129,7 @@ class TransferGrid:
         real axis). Zero is allowed: an order above 0 gives ``0^order = 0``, so that G(0) = 0.
     """
 
-    __slots__ = ("_is_zero", "_log_magnitude", "_log_s", "_parts", "_s_squared", "shape")
+    __slots__ = ("_grid_slices", "_is_zero", "_log_magnitude", "_log_s", "_s_squared", "shape")
 
     def __init__(self, s: ArrayLike) -> None:
         s_points = np.asarray(s, dtype=np.complex128)
@@ -142,7 +142,9 @@ class TransferGrid:
         # On the imaginary axis, where fits live, s^order is a real power times one constant phase.
         on_axis = bool(np.all((nonzero_s.real == 0) & (nonzero_s.imag > 0)))
         self._log_magnitude = np.log(nonzero_s.imag) if on_axis else None
-        self._parts = [slice(i, i + _BLOCK_POINTS) for i in range(0, s_points.size, _BLOCK_POINTS)]
+        self._grid_slices = [
+            slice(i, i + _BLOCK_POINTS) for i in range(0, s_points.size, _BLOCK_POINTS)
+        ]
 
     def evaluate(self, beam: Beam, damping: Damping) -> Complex:
         """Return the coupling torque per motor angle in N·m/rad at all s of the grid.
@@ -153,7 +155,7 @@ class TransferGrid:
             Parameters of the exact model.
         """
         g = np.empty(self._s_squared.size, dtype=np.complex128)
-        for grid_slice in self._parts:
+        for grid_slice in self._grid_slices:
             c = 1 + damping.zeta * self._power_of_s(damping.alpha, grid_slice)
             s_lambda = self._power_of_s(damping.lambda_, grid_slice)
             f = _evaluate_f(self._fourth_power_of_z(beam, damping, c, s_lambda, grid_slice))
@@ -163,7 +165,7 @@ class TransferGrid:
     def evaluate_with_gradient(
         self, beam: Beam, damping: Damping, wrt: Sequence[str] = GRADIENT_NAMES[:4]
     ) -> tuple[Complex, Complex]:
-        """Return the coupling torque per motor angle and its derivatives by parameters.
+        """Return the coupling torque per motor angle and its derivatives for the parameters `wrt`.
 
         Parameters
         ----------
@@ -194,29 +196,29 @@ class TransferGrid:
         stiffness_volume = beam.bending_stiffness_n_m2 * beam.length_m**3
         g = np.empty(self._s_squared.size, dtype=np.complex128)
         gradient = np.empty((len(wrt), g.size), dtype=np.complex128)
-        for grid_slice in self._parts:
+        for grid_slice in self._grid_slices:
             s_alpha = self._power_of_s(damping.alpha, grid_slice)
             s_lambda = self._power_of_s(damping.lambda_, grid_slice)
             c = 1 + damping.zeta * s_alpha
             q = self._fourth_power_of_z(beam, damping, c, s_lambda, grid_slice)
             f, f_slope, remainder = _f_with_slope(q)
             np.multiply(per_length * c, f, out=g[grid_slice])
-            internal = (per_length * s_alpha) * remainder
+            internal_term = (per_length * s_alpha) * remainder
             f_slope *= stiffness_volume
-            external = s_lambda * f_slope
+            external_term = s_lambda * f_slope
             for row, parameter_name in zip(gradient[:, grid_slice], wrt, strict=True):
                 match parameter_name:
                     case "zeta":
-                        row[:] = internal
+                        row[:] = internal_term
                     case "alpha":
-                        np.multiply(damping.zeta * self._log_s[grid_slice], internal, out=row)
+                        np.multiply(damping.zeta * self._log_s[grid_slice], internal_term, out=row)
                     case "gamma":
-                        row[:] = external
+                        row[:] = external_term
                     case "lambda":
-                        np.multiply(damping.gamma * self._log_s[grid_slice], external, out=row)
+                        np.multiply(damping.gamma * self._log_s[grid_slice], external_term, out=row)
                     case "ln_density_over_stiffness":
-                        inertial = beam.density_over_stiffness * self._s_squared[grid_slice]
-                        np.multiply(inertial, f_slope, out=row)
+                        inertial_term = beam.density_over_stiffness * self._s_squared[grid_slice]
+                        np.multiply(inertial_term, f_slope, out=row)
                     case "ln_stiffness":
                         row[:] = g[grid_slice]
         return g.reshape(self.shape), gradient.reshape(len(wrt), *self.shape)
@@ -235,8 +237,8 @@ class TransferGrid:
         self, beam: Beam, damping: Damping, c: Complex, s_lambda: Complex, grid_slice: slice
     ) -> Complex:
         """Return ``q = z⁴``, with z the wave number times L, in a slice of the grid."""
-        inertial = beam.density_over_stiffness * self._s_squared[grid_slice]
-        q: Complex = (inertial + damping.gamma * s_lambda) / c
+        inertial_term = beam.density_over_stiffness * self._s_squared[grid_slice]
+        q: Complex = (inertial_term + damping.gamma * s_lambda) / c
         q *= -(beam.length_m**4)
         return q
 
@@ -277,7 +279,7 @@ def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
 def transfer_and_gradient(
     s: ArrayLike, beam: Beam, damping: Damping, wrt: Sequence[str] = GRADIENT_NAMES[:4]
 ) -> tuple[Complex, Complex]:
-    """Return the coupling torque per motor angle at `s`, and its derivatives by parameters.
+    """Return the coupling torque per motor angle at `s` and its derivatives for parameters `wrt`.
 
     Parameters
     ----------
@@ -387,7 +389,7 @@ def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
     is_small = np.abs(q) < _SERIES_LIMIT
     if is_small.any():
         small_q = q[is_small]
-        n, d, n_slope, d_slope = _polynomials(_SERIES_WITH_SLOPES, small_q)
+        n, d, n_slope, d_slope = _polynomials(_SERIES_AND_DERIVATIVES, small_q)
         wronskian = n * d_slope - n_slope * d
         d_squared = d * d
         f[is_small] = small_q * n / d

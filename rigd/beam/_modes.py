@@ -27,7 +27,7 @@ _HOMOTOPY_STEP_COUNTS = (8, 64)
 The larger number is used for beams for which the smaller one loses a pole."""
 
 SAME_ROOT_TOLERANCE = 0.05
-"""Relative distance from the expected root up to which a found root is taken for the same mode.
+"""Largest relative distance between an expected and a found root of the same mode.
 
 Neighbouring modes differ by much more."""
 
@@ -216,7 +216,7 @@ def poles(beam: Beam, damping: Damping, n: int) -> Complex:
     """Return the poles of the first `n` modes, shape (n, 2), in rad/s.
 
     A row has a conjugate pair (positive frequency first), or two real poles (slow one first) where
-    integer-order damping exceeds the critical one.
+    integer-order damping exceeds critical damping.
 
     Parameters
     ----------
@@ -253,9 +253,9 @@ def poles_for_eigenvalues(
 ) -> Complex:
     """Return the pole pair of each mode from its eigenvalue z, shape (len(z), 2), in rad/s.
 
-    They are the roots of ``Q (z/L)⁴ + P = 0``, ordered as in `poles`. With the roots of ``tan z =
-    tanh z`` instead of the clamped–free eigenvalues they are the zeros of G. A row is NaN if there
-    is no root on the principal sheet.
+    The poles are the roots of ``Q (z/L)⁴ + P = 0``, ordered as in `poles`. If z are the roots of
+    ``tan z = tanh z`` instead of the clamped–free eigenvalues, the function returns the zeros of G.
+    A row is NaN if there is no root on the principal sheet.
 
     Parameters
     ----------
@@ -264,9 +264,9 @@ def poles_for_eigenvalues(
     beam, damping
         Parameters of the exact model.
     near_rad_s
-        Expected roots in the upper half plane, shape (m,). If all are within the relative distance
-        `SAME_ROOT_TOLERANCE` of the roots, the roots are found from them, ten times faster than
-        from those of the undamped beam.
+        Expected roots in the upper half plane, shape (m,). If all of them are within the relative
+        distance `SAME_ROOT_TOLERANCE` of the true roots, the search starts from them, which is ten
+        times faster than a start from the roots of the undamped beam.
     """
     omega_squared = (z / beam.length_m) ** 4 / beam.density_over_stiffness
     external_coefficient = damping.gamma / beam.density_over_stiffness
@@ -301,28 +301,29 @@ def pole_gradient(
 ) -> Complex:
     """Return the derivatives of a mode's pole with respect to parameters, shape (len(wrt),).
 
-    They follow by implicit differentiation of ``rho/EI s² + gamma s^lambda + k⁴ (1 + zeta s^alpha)
-    = 0``, where k = z/L is the mode's wave number. A parameter of `rigd.beam.GRADIENT_NAMES` that
-    does not affect the pole has the derivative 0.
+    The derivatives follow by implicit differentiation of the mode's characteristic equation
+    ``rho/EI s² + gamma s^lambda + k⁴ (1 + zeta s^alpha) = 0``, where k = z/L is the mode's wave
+    number. A parameter of `rigd.beam.GRADIENT_NAMES` that does not affect the pole has the
+    derivative 0.
     """
     s, density_ratio = complex(pole_rad_s), beam.density_over_stiffness
     log_s = np.log(s)
-    internal = k4_per_m4 * np.exp(damping.alpha * log_s)
-    external = np.exp(damping.lambda_ * log_s)
+    internal_term = k4_per_m4 * np.exp(damping.alpha * log_s)
+    external_term = np.exp(damping.lambda_ * log_s)
     equation_slope = (
         2 * density_ratio * s
-        + damping.gamma * damping.lambda_ * external / s
-        + damping.zeta * damping.alpha * internal / s
+        + damping.gamma * damping.lambda_ * external_term / s
+        + damping.zeta * damping.alpha * internal_term / s
     )
-    by: dict[str, complex] = {
-        "zeta": internal,
-        "alpha": damping.zeta * log_s * internal,
-        "gamma": external,
-        "lambda": damping.gamma * log_s * external,
+    derivatives: dict[str, complex] = {
+        "zeta": internal_term,
+        "alpha": damping.zeta * log_s * internal_term,
+        "gamma": external_term,
+        "lambda": damping.gamma * log_s * external_term,
         "ln_density_over_stiffness": density_ratio * s * s,
     }
     return np.array(
-        [-by.get(parameter_name, 0.0) / equation_slope for parameter_name in wrt],
+        [-derivatives.get(parameter_name, 0.0) / equation_slope for parameter_name in wrt],
         dtype=np.complex128,
     )
 
@@ -414,8 +415,8 @@ def _poles_by_search(omega_squared: Real, external_coefficient: float, damping: 
     log_s = _newton_roots(
         log_s, omega_squared[:, None], external_coefficient, damping.zeta, damping
     )
-    converged = ~np.isnan(log_s)
-    first_converged = np.argmax(converged, axis=1)[:, None]
+    has_converged = ~np.isnan(log_s)
+    first_converged = np.argmax(has_converged, axis=1)[:, None]
     poles: Complex = np.exp(np.take_along_axis(log_s, first_converged, axis=1)[:, 0])
     return poles
 
@@ -427,23 +428,28 @@ def _newton_roots(
     zeta: float,
     damping: Damping,
 ) -> Complex:
-    """Return the roots ln s of the characteristic equation that Newton's method finds in ln s.
+    """Return ln s of the roots s of the characteristic equation, found by Newton's method.
 
-    In ln s a pole moves almost linearly, and a pole off the principal sheet has an argument beyond
-    pi. The result is NaN where no root is found in the upper half of the principal sheet.
+    The unknown is ln s: in ln s a pole moves almost linearly, and a pole off the principal sheet
+    has an argument beyond pi. The result is NaN where no root is found in the upper half of the
+    principal sheet.
     """
     with np.errstate(all="ignore"):  # a diverging start overflows
         for _ in range(40):
-            inertial = np.exp(2 * log_s)
-            external = external_coefficient * np.exp(damping.lambda_ * log_s)
-            internal = zeta * omega_squared * np.exp(damping.alpha * log_s)
-            equation_residual = inertial + external + internal + omega_squared
-            residual_slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal
+            inertial_term = np.exp(2 * log_s)
+            external_term = external_coefficient * np.exp(damping.lambda_ * log_s)
+            internal_term = zeta * omega_squared * np.exp(damping.alpha * log_s)
+            equation_residual = inertial_term + external_term + internal_term + omega_squared
+            residual_slope = (
+                2 * inertial_term + damping.lambda_ * external_term + damping.alpha * internal_term
+            )
             newton_step = equation_residual / residual_slope
             log_s = log_s - newton_step
             if not (np.abs(newton_step) > 1e-12).any():  # nor where one is NaN
                 break
-        residual_scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
+        residual_scale = (
+            np.abs(inertial_term) + np.abs(external_term) + np.abs(internal_term) + omega_squared
+        )
         on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _MAX_ARGUMENT_EXCESS_RAD)
         is_solution = np.abs(equation_residual) < 1e-9 * residual_scale
         return np.where(is_solution & on_sheet, log_s, np.nan + 0j)

@@ -15,7 +15,7 @@ class Parameter:
     """Definition of a parameter: its symbol, units, scale and valid range."""
 
     name: str
-    """Name in estimates and documents; of the beam, the damping and the ends also in gradients."""
+    """Name in estimates and documents, and in gradients if it is of beam, damping or ends."""
     symbol: str
     """Symbol in tables and figures."""
     meaning: str
@@ -31,11 +31,11 @@ class Parameter:
     lower: float = 0.0
     """Smallest valid value."""
     upper: float = inf
-    """Upper limit, which valid values do not reach."""
+    """Upper limit; valid values are less."""
     positive: bool = False
-    """Whether 0 is not valid either."""
+    """Whether valid values must be greater than 0."""
     gradient_name: str = ""
-    """Name of the logarithm by which the response is differentiated; "" for the parameter."""
+    """Name of the parameter's logarithm in gradients; "" if gradients use the parameter itself."""
     starts: tuple[float, ...] = ()
     """Values from which a fit starts, in the SI unit; () if a fit derives them from the beam."""
 
@@ -102,7 +102,7 @@ DAMPING_PARAMETERS: Final[tuple[DampingParameter, ...]] = ("zeta", "alpha", "gam
 COEFFICIENT_OF: Final[Mapping[str, DampingParameter]] = MappingProxyType(
     {"alpha": "zeta", "lambda": "gamma"}
 )
-"""Coefficient of the damping whose order each parameter is."""
+"""Map from the name of each damping order to the name of the coefficient it belongs to."""
 BEAM_PARAMETERS: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 """Names of the parameters of the beam other than its damping."""
 END_PARAMETERS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
@@ -121,7 +121,7 @@ def parameter_named(name: str) -> Parameter:
     Parameters
     ----------
     name
-        Name of `PARAMETERS`, or ``stiffness_offset_N`` for mode N.
+        Key of `PARAMETERS`, or ``stiffness_offset_N`` for mode N.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def parameter_named(name: str) -> Parameter:
 
 
 def gradient_name(name: str) -> str:
-    """Return the name by which the response is differentiated by a parameter.
+    """Return the name that gradients of the response use for a parameter or its logarithm.
 
     Parameters
     ----------

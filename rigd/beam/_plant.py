@@ -50,14 +50,14 @@ _OWN_PARAMETERS: Final = (
 )
 """Names of the parameters that are attributes of `Plant`."""
 _ATTRIBUTE_NAMES: Final = {"lambda": "lambda_"}
-"""Attribute of a parameter of the damping, where it is not the parameter's name."""
+"""Map from a damping parameter's name to its attribute, if the two names differ."""
 
 _POLE_DISTANCE = 1e-8
 """Relative distance from a pole at which the response and its derivatives are evaluated.
 
 At the pole itself of a rigidly clamped beam they are infinite.
 
-It is the square root of the rounding error relative to G there."""
+The distance is the square root of the relative rounding error of G there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class Plant:
     damping: Damping
     """Internal and external damping of the beam."""
     delay_s: float = 0.0
-    """Age of the torque relative to the angle."""
+    """Delay of the measured torque relative to the measured angle."""
     tool_inertia_kg_m2: float = 0.0
     """Inertia between torque sensor and beam. It is on the motor's side of the clamp's compliance:
     the bolted parts are stiff, and the grip on the beam yields."""
@@ -280,7 +280,7 @@ class Plant:
         return response / (1 + self.root_compliance_rad_per_nm * response)
 
     def transfer_and_gradient(self, s: ArrayLike, wrt: Sequence[str]) -> tuple[Complex, Complex]:
-        """Return the coupling torque per motor angle and its derivatives by parameters.
+        """Return the coupling torque per motor angle and its derivatives for the parameters `wrt`.
 
         Parameters
         ----------
@@ -294,15 +294,17 @@ class Plant:
         transfer : complex ndarray, shape of `s`
             Coupling torque per motor angle in N·m/rad.
         gradient : complex ndarray, shape ``(len(wrt), *shape of s)``
-            Its derivative with respect to each parameter.
+            Derivative of `transfer` with respect to each parameter.
         """
         s = np.asarray(s, dtype=np.complex128)
         if self.is_uniform_cantilever and set(wrt) <= set(GRADIENT_NAMES):
             return TransferGrid(s).evaluate_with_gradient(self.beam, self.damping, wrt)
-        at, by = self._response_and_slopes(s)
-        clamp_factor = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
-        gradient = np.array([by[parameter_name]() for parameter_name in wrt], dtype=np.complex128)
-        return at.response * clamp_factor, gradient * clamp_factor * clamp_factor
+        clamped_response, derivative_functions = self._response_and_slopes(s)
+        clamp_factor = 1 / (1 + self.root_compliance_rad_per_nm * clamped_response.response)
+        gradient = np.array(
+            [derivative_functions[parameter_name]() for parameter_name in wrt], dtype=np.complex128
+        )
+        return clamped_response.response * clamp_factor, gradient * clamp_factor * clamp_factor
 
     def channel_response(self, s: ArrayLike) -> Complex:
         """Return the dimensionless transfer function of the torque channel's delay and filters.
@@ -314,8 +316,8 @@ class Plant:
         """
         s = np.asarray(s, dtype=np.complex128)
         response: Complex = np.exp(-self.delay_s * s)
-        for first, second in self.lags:
-            response /= 1 + s * (first + s * second)
+        for linear_coefficient, quadratic_coefficient in self.lags:
+            response /= 1 + s * (linear_coefficient + s * quadratic_coefficient)
         return response
 
     @property
@@ -341,12 +343,12 @@ class Plant:
         """
         pole_distance = 0.0 if self.root_compliance_rad_per_nm else _POLE_DISTANCE
         s = poles_rad_s * (1 - pole_distance)
-        at, by = self._response_and_slopes(s)
-        response_slope = self.derivative_by_s(s, at)
+        clamped_response, derivative_functions = self._response_and_slopes(s)
+        response_slope = self.derivative_by_s(s, clamped_response)
         gradients = np.zeros((s.size, len(wrt)), dtype=np.complex128)
         for gradient_column, parameter_name in zip(gradients.T, wrt, strict=True):
-            if parameter_name in by:
-                gradient_column[:] = -by[parameter_name]() / response_slope
+            if parameter_name in derivative_functions:
+                gradient_column[:] = -derivative_functions[parameter_name]() / response_slope
         return gradients
 
     def _require_uniform(self) -> None:
@@ -359,7 +361,7 @@ class Plant:
 
         The derivative with respect to the clamp's compliance is that at a compliance of 0.
         """
-        at, by = differentiated_response(
+        clamped_response, derivative_functions = differentiated_response(
             np.log(s),
             s * s,
             self.beam,
@@ -367,10 +369,14 @@ class Plant:
             self.tip_mass_kg,
             self.stiffness_offsets,
         )
-        return at, by | {"root_compliance_rad_per_nm": lambda: -at.response * at.response}
+        return clamped_response, derivative_functions | {
+            "root_compliance_rad_per_nm": lambda: (
+                -clamped_response.response * clamped_response.response
+            )
+        }
 
     def tip_slope(self, s: ArrayLike) -> Complex:
-        """Return the tip's slope relative to the root's per motor angle, in the shape of `s`."""
+        """Return the slope of the tip relative to the root per motor angle, in the shape of `s`."""
         return self.tip_response(s)[1]
 
     def tip_response(self, s: ArrayLike) -> tuple[Complex, Complex]:
@@ -387,19 +393,19 @@ class Plant:
             displacement -= self.beam.length_m
             slope_per_angle -= 1
             return displacement, slope_per_angle
-        force_grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
+        force_grid, tip_m = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
         displacement, slope_per_angle = (
-            force_grid.per_angle(tip) - tip,
-            force_grid.per_angle(tip, 1) - 1,
+            force_grid.displacement_per_angle(tip_m) - tip_m,
+            force_grid.displacement_per_angle(tip_m, 1) - 1,
         )
         elastic_factor, inertial_factor = self.elastic_and_inertial_factors(s)
         z = clamped_free_eigenvalues(1 + len(self.stiffness_offsets))
-        tip_slopes = 2 * z * root_shear_ratio(z.size) / tip
+        tip_slopes = 2 * z * root_shear_ratio(z.size) / tip_m
         for offset_index, stiffness_offset in enumerate(self.stiffness_offsets, start=1):
             # Mode i contributes -p b / (c k⁴ (1 + d) + p); b is its part of a rigid rotation.
             k4, rotation_part = (
-                (z[offset_index] / tip) ** 4,
-                2 * (-1) ** offset_index * tip / z[offset_index] ** 2,
+                (z[offset_index] / tip_m) ** 4,
+                2 * (-1) ** offset_index * tip_m / z[offset_index] ** 2,
             )
             offset_term = inertial_factor * rotation_part * elastic_factor * k4 * stiffness_offset
             offset_term = offset_term / (
@@ -410,8 +416,12 @@ class Plant:
             slope_per_angle = slope_per_angle + tip_slopes[offset_index] * offset_term
         if self.tip_mass_kg:
             tip_force = self._tip_force_per_angle(s, force_grid)
-            displacement = displacement + force_grid.per_force(tip, tip) * tip_force
-            slope_per_angle = slope_per_angle + force_grid.per_force(tip, tip, 1) * tip_force
+            displacement = (
+                displacement + force_grid.displacement_per_force(tip_m, tip_m) * tip_force
+            )
+            slope_per_angle = (
+                slope_per_angle + force_grid.displacement_per_force(tip_m, tip_m, 1) * tip_force
+            )
         clamp_factor = 1 / (
             1 + self.root_compliance_rad_per_nm * self.rigid_clamp_response(s).response
         )
@@ -419,11 +429,11 @@ class Plant:
 
     def _tip_force_per_angle(self, s: Complex, force_grid: PointForceGrid) -> Complex:
         """Return the force in N/rad that the tip mass exerts on the beam per angle of the root."""
-        tip, inertial_load = self.beam.length_m, self.tip_mass_kg * s * s
+        tip_m, inertial_load = self.beam.length_m, self.tip_mass_kg * s * s
         tip_force: Complex = (
             -inertial_load
-            * force_grid.per_angle(tip)
-            / (1 + inertial_load * force_grid.per_force(tip, tip))
+            * force_grid.displacement_per_angle(tip_m)
+            / (1 + inertial_load * force_grid.displacement_per_force(tip_m, tip_m))
         )
         return tip_force
 
@@ -474,35 +484,37 @@ class Plant:
         # On a rigid clamp G is infinite at a pole, but close to it the ratio is accurate.
         pole_distance = 0.0 if self.root_compliance_rad_per_nm else _POLE_DISTANCE
         s = poles_rad_s * (1 - pole_distance)
-        at = self.rigid_clamp_response(s)
-        residues: Complex = -(at.response**2) / self.derivative_by_s(s, at) / s**2
+        clamped_response = self.rigid_clamp_response(s)
+        residues: Complex = (
+            -(clamped_response.response**2) / self.derivative_by_s(s, clamped_response) / s**2
+        )
         return residues
 
     def elastic_and_inertial_factors(self, s: Complex) -> tuple[Complex, Complex]:
         """Return the elastic factor c and the inertial factor p at `s` (rad/s)."""
         log_s, damping = np.log(s), self.damping
         elastic_factor = 1 + damping.zeta * np.exp(damping.alpha * log_s).astype(np.complex128)
-        external = damping.gamma * np.exp(damping.lambda_ * log_s).astype(np.complex128)
-        return elastic_factor, self.beam.density_over_stiffness * s * s + external
+        external_term = damping.gamma * np.exp(damping.lambda_ * log_s).astype(np.complex128)
+        return elastic_factor, self.beam.density_over_stiffness * s * s + external_term
 
-    def derivative_by_s(self, s: Complex, at: LoadedResponse) -> Complex:
-        """Return the derivative by s of the coupling torque per angle on a rigid clamp.
+    def derivative_by_s(self, s: Complex, clamped_response: LoadedResponse) -> Complex:
+        """Return dG/ds, with G the coupling torque per motor angle of the beam on a rigid clamp.
 
         Parameters
         ----------
         s
             Laplace variable in rad/s, not 0.
-        at
+        clamped_response
             Response on a rigid clamp at `s`, as returned by `rigid_clamp_response`.
         """
         log_s, damping = np.log(s), self.damping
-        internal = damping.zeta * damping.alpha * np.exp(damping.alpha * log_s)
-        external = damping.gamma * damping.lambda_ * np.exp(damping.lambda_ * log_s)
-        inertial_factor = 2 * self.beam.density_over_stiffness * s * s + external
+        internal_term = damping.zeta * damping.alpha * np.exp(damping.alpha * log_s)
+        external_term = damping.gamma * damping.lambda_ * np.exp(damping.lambda_ * log_s)
+        inertial_factor = 2 * self.beam.density_over_stiffness * s * s + external_term
         by_log_s: Complex = (
-            at.by_elastic * internal
-            + at.by_inertial * inertial_factor
-            + 2 * self.tip_mass_kg * at.by_mass
+            clamped_response.by_elastic * internal_term
+            + clamped_response.by_inertial * inertial_factor
+            + 2 * self.tip_mass_kg * clamped_response.by_mass
         )
         return by_log_s / s
 
@@ -573,12 +585,16 @@ class Plant:
         return followed_roots(roots, relative_change, roots_near)
 
     def _newton_roots(self, s: Complex, step_tolerance: float, *, zeros: bool) -> Complex:
-        """Return the roots of ``1/G + kappa``, or with `zeros` of G, near the start values `s`."""
+        """Return the roots near `s` of ``1/G + kappa``, or of G if `zeros` is true."""
 
         def newton_step(s: Complex) -> Complex:
-            at = self.rigid_clamp_response(s)
-            factor = -1 if zeros else 1 + self.root_compliance_rad_per_nm * at.response
-            step: Complex = at.response / self.derivative_by_s(s, at) * factor
+            clamped_response = self.rigid_clamp_response(s)
+            factor = (
+                -1 if zeros else 1 + self.root_compliance_rad_per_nm * clamped_response.response
+            )
+            step: Complex = (
+                clamped_response.response / self.derivative_by_s(s, clamped_response) * factor
+            )
             return step
 
         return newton_roots(newton_step, s, step_tolerance)
@@ -586,7 +602,7 @@ class Plant:
     def mode_poles(
         self, mode_count: int, wrt: Sequence[str] = (), near_rad_s: Sequence[complex] = ()
     ) -> tuple[Pole, ...]:
-        """Return the poles of the first modes, with their derivatives by parameters.
+        """Return the poles of the first modes, with their derivatives for the parameters `wrt`.
 
         A mode for which no pole is found is left out.
 
@@ -595,8 +611,8 @@ class Plant:
         mode_count
             Number of modes.
         wrt
-            Names of parameters as for `transfer_and_gradient`. The derivative by a parameter that
-            does not affect the poles is 0.
+            Names of parameters as for `transfer_and_gradient`. The derivative with respect to a
+            parameter that does not affect the poles is 0.
         near_rad_s
             Approximate poles in the order of the modes, if all are known.
         """

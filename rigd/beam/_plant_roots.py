@@ -39,13 +39,13 @@ class Pole:
     mode: int
     """Number of the mode, from 1."""
     at_rad_s: complex
-    """Position of the pole."""
+    """Pole in the complex plane."""
     derivative: Complex
-    """Derivatives of the position by the requested parameters, shape (k,)."""
+    """Derivatives of the pole with respect to the k requested parameters, shape (k,)."""
 
     @property
     def oscillates(self) -> bool:
-        """Whether the decay of this pole oscillates. Then it has two spectra instead of one."""
+        """Whether the free decay oscillates, so that it has a cosine and a sine component."""
         return self.at_rad_s.imag != 0
 
     @property
@@ -60,12 +60,12 @@ class Pole:
 
     @property
     def frequency_derivative_hz(self) -> Real:
-        """Derivatives of the frequency in Hz by the parameters, shape (k,)."""
+        """Derivatives of the frequency in Hz with respect to the parameters, shape (k,)."""
         return np.asarray(self.derivative.imag / (2 * math.pi), dtype=np.float64)
 
     @property
     def damping_ratio_derivative(self) -> Real:
-        """Derivatives of the damping ratio by the parameters, shape (k,)."""
+        """Derivatives of the damping ratio with respect to the parameters, shape (k,)."""
         p, pole_magnitude = self.at_rad_s, abs(self.at_rad_s)
         magnitude_derivative = (p.conjugate() * self.derivative).real / pole_magnitude
         damping_derivatives = (
@@ -82,15 +82,15 @@ def followed_roots(
 ) -> Complex:
     """Return poles or zeros, followed from those of the uniform beam on a rigid clamp.
 
-    `relative_change` is how far the plant differs from that beam, relative to the beam's own
-    values. ``roots_near(fraction, start_roots, step_tolerance)`` returns the roots of a plant with
-    a fraction of this difference. A row is NaN if the path was lost.
+    `relative_change` is the difference of the plant's tip mass and compliance from that beam,
+    relative to the beam's own values. ``roots_near(fraction, start_roots, step_tolerance)`` returns
+    the roots of a plant with a fraction of this difference. A row is NaN if the path was lost.
     """
     roots = uniform_roots
     has_root = ~np.isnan(roots[:, 0])
     # One of a conjugate pair suffices; without oscillation both have to be found.
-    oscillating = roots[has_root][:, 0].imag != 0
-    second_real_poles = roots[has_root][~oscillating][:, 1]
+    is_oscillating = roots[has_root][:, 0].imag != 0
+    second_real_poles = roots[has_root][~is_oscillating][:, 1]
     current_roots = np.concatenate([roots[has_root][:, 0], second_real_poles])
     current_roots *= 1 - _START_POLE_DISTANCE  # G is infinite at an undamped pole
     # A change that moves the poles little needs few steps.
@@ -107,9 +107,9 @@ def followed_roots(
                 _NEWTON_TOLERANCE if is_last_step else _INTERMEDIATE_TOLERANCE,
             ),
         )
-    first_roots = current_roots[: oscillating.size]
+    first_roots = current_roots[: is_oscillating.size]
     second_roots = first_roots.conj()
-    second_roots[~oscillating] = current_roots[oscillating.size :]
+    second_roots[~is_oscillating] = current_roots[is_oscillating.size :]
     roots[has_root] = np.column_stack([first_roots, second_roots])
     return roots
 

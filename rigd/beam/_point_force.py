@@ -56,7 +56,8 @@ class PointForceGrid:
     >>> from rigd.beam import Beam, Damping, PointForceGrid
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> response = PointForceGrid([0.0], beam, Damping())
-    >>> print(response.per_force(0.6, 0.6).real, round(0.6**3 / (3 * 0.0903), 6))  # m/N
+    >>> displacement_m_per_n = response.displacement_per_force(0.6, 0.6).real
+    >>> print(displacement_m_per_n, round(0.6**3 / (3 * 0.0903), 6))
     [0.79734219] 0.797342
     """
 
@@ -74,11 +75,13 @@ class PointForceGrid:
         s_points = np.asarray(s, dtype=np.complex128)
         self._shape = s_points.shape
         s_points = s_points.ravel()
-        inertial = beam.density_over_stiffness * s_points * s_points
-        internal = 1 + damping.zeta * s_points**damping.alpha
+        inertial_term = beam.density_over_stiffness * s_points * s_points
+        internal_factor = 1 + damping.zeta * s_points**damping.alpha
         self._length_m = beam.length_m
-        self._q_stiffness: Complex = beam.bending_stiffness_n_m2 * internal
-        self._b4: Complex = -(inertial + damping.gamma * s_points**damping.lambda_) / internal
+        self._q_stiffness: Complex = beam.bending_stiffness_n_m2 * internal_factor
+        self._b4: Complex = (
+            -(inertial_term + damping.gamma * s_points**damping.lambda_) / internal_factor
+        )
         is_small = np.abs(self._b4) * beam.length_m**4 < _SERIES_LIMIT
         self._small_q_indices, self._large_q_indices = (
             np.flatnonzero(is_small),
@@ -86,7 +89,7 @@ class PointForceGrid:
         )
         self._exponentials = _ExponentialSolution(self._b4[self._large_q_indices], beam.length_m)
 
-    def per_angle(self, x_m: ArrayLike, derivative_order: int = 0) -> Complex:
+    def displacement_per_angle(self, x_m: ArrayLike, derivative_order: int = 0) -> Complex:
         """Return the displacement of the beam per angle of its root, or its derivative by x.
 
         Parameters
@@ -117,7 +120,7 @@ class PointForceGrid:
         )
         return out.reshape((*self._shape, *x.shape))
 
-    def per_force(
+    def displacement_per_force(
         self, x_m: ArrayLike, force_at_m: ArrayLike, derivative_order: int = 0
     ) -> Complex:
         """Return the displacement of the beam per point force, or its derivative by x.
@@ -138,20 +141,22 @@ class PointForceGrid:
         complex ndarray, shape of s, then of the distances
             Displacement, or derivative, in m^(1 - order)/N.
         """
-        x, at = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(force_at_m, np.float64))
+        x, force_x = np.broadcast_arrays(
+            np.asarray(x_m, np.float64), np.asarray(force_at_m, np.float64)
+        )
         shape = x.shape
-        x, at = x.ravel(), at.ravel()
+        x, force_x = x.ravel(), force_x.ravel()
         out = np.empty((self._b4.size, x.size), dtype=np.complex128)
         b4, stiffness = (
             self._b4[self._small_q_indices, None],
             self._q_stiffness[self._small_q_indices, None],
         )
-        distance_to_tip = self._length_m - at
+        distance_to_tip = self._length_m - force_x
         moment, shear = self._root_derivatives(
             b4, _power_series(b4, distance_to_tip, 1), _power_series(b4, distance_to_tip, 0)
         )
         beyond_force = np.where(
-            x > at, _power_series(b4, np.maximum(x - at, 0.0), 3, derivative_order), 0.0
+            x > force_x, _power_series(b4, np.maximum(x - force_x, 0.0), 3, derivative_order), 0.0
         )
         out[self._small_q_indices] = (
             moment * _power_series(b4, x, 2, derivative_order)
@@ -159,7 +164,7 @@ class PointForceGrid:
             + beyond_force
         ) / stiffness
         out[self._large_q_indices] = (
-            self._exponentials.response_per_force_over_stiffness(x, at, derivative_order)
+            self._exponentials.response_per_force_over_stiffness(x, force_x, derivative_order)
             / self._q_stiffness[self._large_q_indices, None]
         )
         return out.reshape((*self._shape, *shape))
@@ -169,11 +174,11 @@ class PointForceGrid:
 
         The shape is that of the grid.
         """
-        return -self._bending_stiffness() * self.per_angle(0.0, 2)
+        return -self._bending_stiffness() * self.displacement_per_angle(0.0, 2)
 
     def shear_per_angle(self) -> Complex:
         """Return the shear force at the root per angle in N/rad, in the shape of the grid."""
-        return self._bending_stiffness() * self.per_angle(0.0, 3)
+        return self._bending_stiffness() * self.displacement_per_angle(0.0, 3)
 
     def torque_per_force(self, force_at_m: ArrayLike) -> Complex:
         """Return the motor's torque on the beam per point force on it, in N·m/N.
@@ -185,8 +190,10 @@ class PointForceGrid:
         force_at_m
             Position of the force, as a distance from the motor's axis.
         """
-        at = np.asarray(force_at_m, dtype=np.float64)
-        return -self._bending_stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 2)
+        force_x = np.asarray(force_at_m, dtype=np.float64)
+        return -self._bending_stiffness(force_x.ndim) * self.displacement_per_force(
+            np.zeros_like(force_x), force_x, 2
+        )
 
     def shear_per_force(self, force_at_m: ArrayLike) -> Complex:
         """Return the shear force at the root per point force on the beam, dimensionless.
@@ -198,8 +205,10 @@ class PointForceGrid:
         force_at_m
             Position of the force, as a distance from the motor's axis.
         """
-        at = np.asarray(force_at_m, dtype=np.float64)
-        return self._bending_stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 3)
+        force_x = np.asarray(force_at_m, dtype=np.float64)
+        return self._bending_stiffness(force_x.ndim) * self.displacement_per_force(
+            np.zeros_like(force_x), force_x, 3
+        )
 
     def _bending_stiffness(self, axes: int = 0) -> Complex:
         """Return the complex bending stiffness Q in N·m²; `axes` axes of length 1 are appended."""
@@ -214,7 +223,8 @@ class PointForceGrid:
     ) -> tuple[Complex, Complex]:
         """Return y''(0) and y'''(0) of the beam whose moment and shear force at the tip are zero.
 
-        `tip_moment` and `tip_shear` are the derivatives y''(L) and y'''(L) of the other terms.
+        `tip_moment` and `tip_shear` are y''(L) and y'''(L) of the solution without the terms in K_2
+        and K_3 that y''(0) and y'''(0) multiply.
         """
         k0, k1, k3 = self._series_at_tip(0), self._series_at_tip(1), self._series_at_tip(3)
         determinant = k0 * k0 - b4 * k1 * k3
@@ -274,20 +284,20 @@ class _ExponentialSolution:
         )
 
     def response_per_force_over_stiffness(
-        self, x: Real, at: Real, derivative_order: int
+        self, x: Real, force_x: Real, derivative_order: int
     ) -> Complex:
         """Return displacement times bending stiffness per point force, or its derivative by x.
 
-        Point i of x, shape (m,), is displaced by the force at point i of `at`. The result has the
-        shape (s, m).
+        Point i of x, shape (m,), is displaced by the force at point i of `force_x`. The result has
+        the shape (s, m).
         """
         b, c, kappa = self._b, self._kappa * self._b, self._kappa
         decaying_amplitude = -1 / (4 * b**3)  # A, of the decaying wave
         other_amplitude = -decaying_amplitude / kappa  # B, of the other
-        to_root = decaying_amplitude * np.exp(-b * at), other_amplitude * np.exp(-c * at)
+        to_root = decaying_amplitude * np.exp(-b * force_x), other_amplitude * np.exp(-c * force_x)
         to_tip = (
-            decaying_amplitude * np.exp(-b * (self._length_m - at)),
-            other_amplitude * np.exp(-c * (self._length_m - at)),
+            decaying_amplitude * np.exp(-b * (self._length_m - force_x)),
+            other_amplitude * np.exp(-c * (self._length_m - force_x)),
         )
         at_ends = np.stack(
             [
@@ -298,8 +308,10 @@ class _ExponentialSolution:
             ],
             axis=1,
         )
-        distance_m = np.abs(x - at)
-        derivative_sign = np.where(x > at, -1.0, 1.0)  # the sign of each derivative of exp(-b r)
+        distance_m = np.abs(x - force_x)
+        derivative_sign = np.where(
+            x > force_x, -1.0, 1.0
+        )  # the sign of each derivative of exp(-b r)
         direct_response = (derivative_sign * b) ** derivative_order * decaying_amplitude * np.exp(
             -b * distance_m
         ) + (derivative_sign * c) ** derivative_order * other_amplitude * np.exp(-c * distance_m)

@@ -24,7 +24,7 @@ from rigd.beam._tip_mass import differentiated_response
 class ResponseGrid:
     """Evaluates the transfer function from motor angle to torque on a grid of the variable s.
 
-    It also evaluates the derivatives of the transfer function by parameters of the plant.
+    It also evaluates its derivatives with respect to parameters of the plant.
 
     Parameters
     ----------
@@ -32,13 +32,13 @@ class ResponseGrid:
         Laplace variable in rad/s, not 0.
     """
 
-    __slots__ = ("_beam", "_log_s", "_s", "_s_squared")
+    __slots__ = ("_beam_grid", "_log_s", "_s", "_s_squared")
 
     def __init__(self, s: ArrayLike) -> None:
         self._s = np.asarray(s, dtype=np.complex128)
         self._s_squared = self._s * self._s
         self._log_s = np.log(self._s)
-        self._beam = TransferGrid(self._s)
+        self._beam_grid = TransferGrid(self._s)
 
     @property
     def s(self) -> NDArray[np.complex128]:
@@ -63,7 +63,7 @@ class ResponseGrid:
             Names of k parameters: `GRADIENT_NAMES`, "delay_s", "tool_inertia_kg_m2".
             The torque is differentiated with respect to each while all others are constant.
         angle_transform : ndarray of complex, shape (n,), or float
-            Transform of the angle.
+            Laplace transform of the motor angle at the grid's s.
 
         Returns
         -------
@@ -93,10 +93,10 @@ class ResponseGrid:
     def _beam_response(
         self, plant: Plant, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
-        """Return the transfer function G of the beam on a rigid clamp, and derivatives by name.
+        """Return the transfer function G of the beam on a rigid clamp, and its derivatives.
 
-        G is the torque over the motor angle, in N·m/rad. The derivatives are those by the
-        parameters in `wrt` on which G depends.
+        G is the torque over the motor angle, in N·m/rad. The derivatives are with respect to the
+        parameters in `wrt` on which G depends, by the parameters' names.
         """
         beam_names = [parameter_name for parameter_name in wrt if parameter_name in GRADIENT_NAMES]
         if plant.tip_mass_kg or plant.stiffness_offsets:
@@ -112,8 +112,8 @@ class ResponseGrid:
                 parameter_name: derivatives[parameter_name]() for parameter_name in beam_names
             }
         if not beam_names:
-            return self._beam.evaluate(plant.beam, plant.damping), {}
-        beam_response, derivative_rows = self._beam.evaluate_with_gradient(
+            return self._beam_grid.evaluate(plant.beam, plant.damping), {}
+        beam_response, derivative_rows = self._beam_grid.evaluate_with_gradient(
             plant.beam, plant.damping, beam_names
         )
         return beam_response, dict(zip(beam_names, derivative_rows, strict=True))

@@ -84,7 +84,7 @@ def loaded_response(
     elastic_factor, inertial_factor : ndarray of complex
         Elastic factor c and inertial factor p at these s.
     beam : Beam
-        Beam with this stiffness and length. Its density is not used: p contains it.
+        Beam, of which stiffness and length are used; p already contains the density.
     tip_mass_kg : float
         Point mass at the tip.
     """
@@ -161,7 +161,7 @@ def add_stiffness_offsets(
 
 
 Slopes = dict[str, Callable[[], Complex]]
-"""Map from a parameter's name to a function that computes the response's derivative by it."""
+"""Map from a parameter's name to a function that computes the derivative of the response."""
 
 
 def differentiated_response(
@@ -233,9 +233,9 @@ def uniform_tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Comp
     tip_slope
         Slope of the tip per angle, dimensionless, in the shape of `s`.
     """
-    external = damping.gamma * s**damping.lambda_
-    internal = 1 + damping.zeta * s**damping.alpha
-    fourth_power = -(beam.density_over_stiffness * s * s + external) / internal
+    external_term = damping.gamma * s**damping.lambda_
+    internal_factor = 1 + damping.zeta * s**damping.alpha
+    fourth_power = -(beam.density_over_stiffness * s * s + external_term) / internal_factor
     z = beam.length_m * np.sqrt(np.sqrt(fourth_power))
     # Numerators and denominator over exp(z - j sign z): nothing overflows.
     imaginary_sign = np.where(z.imag < 0, -1.0, 1.0)

@@ -77,7 +77,7 @@ class RealisationError(UserError, ValueError):
 class Realisation:
     """State space of the beam: motor angle θ as input, coupling torque Γ as output.
 
-    It reads ``x' = a x + b θ''``, ``Γ = c x + D θ'' + V θ' + K θ``.
+    The equations are ``x' = a x + b θ''`` and ``Γ = c x + D θ'' + V θ' + K θ``.
 
     `a` is block diagonal: 2 × 2 blocks for the complex pairs, then the real poles.
     """
@@ -119,17 +119,17 @@ class Realisation:
 class StateOutput:
     """Response of the beam to the motor angle, written as an output of a realisation's states.
 
-    It is ``c x + D θ'' + V θ' + K θ``, with the states x of a `Realisation`.
+    The output is ``c x + D θ'' + V θ' + K θ``, with the states x of a `Realisation`.
     """
 
     c: Real
     """Output vector, shape (n,), in the response's unit."""
-    per_acceleration: float
-    """Coefficient D of the angular acceleration."""
-    per_velocity: float
-    """Coefficient V of the angular velocity."""
-    per_angle: float
-    """Coefficient K of the angle."""
+    output_per_acceleration: float
+    """Output per angular acceleration that bypasses the states (D)."""
+    output_per_velocity: float
+    """Output per angular velocity that bypasses the states (V)."""
+    output_per_angle: float
+    """Output per angle that bypasses the states (K)."""
 
 
 def state_output(
@@ -165,9 +165,9 @@ def state_output(
     """
     poles = realisation.poles_rad_s
     omega, point_weights = _fit_grid(poles[poles.imag > 0])
-    far = _far_from_landmarks(omega, poles, np.zeros(0, dtype=np.complex128))
-    s = (1j * omega[far]).astype(np.complex128)
-    point_weights = point_weights[far]
+    is_far = _far_from_poles_and_zeros(omega, poles, np.zeros(0, dtype=np.complex128))
+    s = (1j * omega[is_far]).astype(np.complex128)
+    point_weights = point_weights[is_far]
     exact_response = response(s)
     basis_columns = _basis_functions(s, poles)
     fitted_columns = np.arange(basis_columns.shape[1])
@@ -200,9 +200,9 @@ def state_output(
 
 
 def _basis_functions(s: Complex, poles: Complex) -> Complex:
-    """Return the functions of s whose sum, weighted by ``c, D, V, K``, is torque per angle.
+    """Return the functions of s whose sum, weighted by ``c, D, V, K``, is the torque per angle.
 
-    Shape (len(s), n + 3).
+    The shape is (len(s), n + 3), for n states.
     """
     upper_poles, real_poles = poles[poles.imag > 0], poles[poles.imag == 0].real
     s2 = (s * s)[:, None]
@@ -263,13 +263,13 @@ def realise(
     poles_and_zeros = np.concatenate([poles[poles.imag > 0], zeros])
 
     omega, point_weights = _fit_grid(poles_and_zeros)
-    far = _far_from_landmarks(omega, poles, zeros)
-    s = 1j * omega[far]
+    is_far = _far_from_poles_and_zeros(omega, poles, zeros)
+    s = 1j * omega[is_far]
     exact_response = plant.transfer(s)
-    relative_weight = point_weights[far] / exact_response
+    relative_weight = point_weights[is_far] / exact_response
     output_coefficients = _fit_coefficients(
         _basis_functions(s, poles) * relative_weight[:, None],
-        point_weights[far].astype(np.complex128),
+        point_weights[is_far].astype(np.complex128),
     )
 
     relative_error = _relative_error(plant, poles, zeros, output_coefficients)
@@ -325,37 +325,37 @@ def _realised_poles(plant: Plant, modes_of: Beam) -> tuple[Complex, NDArray[np.i
         is_selected = _select_poles(pole_pairs)
     else:
         is_selected = _select_poles(replace(plant, beam=modes_of).poles(eigenvalues))
-    oscillating = pole_pairs[:, 0].imag > 0
+    is_oscillating = pole_pairs[:, 0].imag > 0
     # A pair may have ceased, or begun, to oscillate; one pole alone cannot.
     if (
         np.isnan(pole_pairs[is_selected]).any()
-        or (oscillating & (is_selected.sum(axis=1) == 1)).any()
+        or (is_oscillating & (is_selected.sum(axis=1) == 1)).any()
     ):
         raise RealisationError(
             f"{plant.beam} with {plant.damping} does not have the modes of {modes_of}."
         )
-    upper_rows = np.flatnonzero(oscillating & is_selected[:, 0])
-    over_damped = is_selected & ~oscillating[:, None]
-    cut = np.full(_BRANCH_CUT_POLES_RAD_S.size, -1)
+    upper_rows = np.flatnonzero(is_oscillating & is_selected[:, 0])
+    over_damped = is_selected & ~is_oscillating[:, None]
+    cut_modes = np.full(_BRANCH_CUT_POLES_RAD_S.size, -1)
     return (
         np.concatenate(
             [pole_pairs[upper_rows, 0], pole_pairs[over_damped], _BRANCH_CUT_POLES_RAD_S]
         ),
-        np.concatenate([upper_rows, np.nonzero(over_damped)[0], cut]),
+        np.concatenate([upper_rows, np.nonzero(over_damped)[0], cut_modes]),
     )
 
 
 def _select_poles(pole_pairs: Complex) -> NDArray[np.bool_]:
     """Return a mask of the modal poles in the state space, in the shape of `pole_pairs`."""
-    oscillating = pole_pairs[:, 0].imag > 0
-    mode_indices = np.flatnonzero(oscillating)
+    is_oscillating = pole_pairs[:, 0].imag > 0
+    mode_indices = np.flatnonzero(is_oscillating)
     upper_poles = pole_pairs[mode_indices, 0]
     within_band = np.abs(upper_poles) < 2 * np.pi * _FIT_BAND_HZ[1]
     lightly_damped = within_band | (-upper_poles.real < _HEAVY_DAMPING_RATIO * np.abs(upper_poles))
     mode_indices, upper_poles = mode_indices[lightly_damped], upper_poles[lightly_damped]
     above_band = np.flatnonzero(upper_poles.imag > 2 * np.pi * _HIGHEST_MODE_HZ)
     mode_indices = mode_indices[: above_band[0] + 1] if above_band.size else mode_indices
-    is_selected = ~oscillating[:, None] & (np.abs(pole_pairs) < 2 * np.pi * _HIGHEST_MODE_HZ)
+    is_selected = ~is_oscillating[:, None] & (np.abs(pole_pairs) < 2 * np.pi * _HIGHEST_MODE_HZ)
     is_selected[mode_indices] = True
     return is_selected
 
@@ -372,7 +372,7 @@ def _zeros_in_band(plant: Plant) -> Complex:
 
 
 def _fit_grid(poles_and_zeros: Complex) -> tuple[Real, Real]:
-    """Return the angular frequencies (rad/s) of the fit and their weights.
+    """Return the angular frequencies (rad/s) of the fit, and the weight of each in the fit.
 
     The grid covers the fit's band, where it is dense near `poles_and_zeros`, and both tails.
     """
@@ -434,17 +434,20 @@ def _relative_error(plant: Plant, poles: Complex, zeros: Complex, coefficients: 
         [np.geomspace(lowest_hz, highest_hz, 1200), _grid_around(poles_and_zeros, 34)]
     )
     omega = 2 * np.pi * frequency_hz[(frequency_hz >= lowest_hz) & (frequency_hz <= highest_hz)]
-    s = 1j * omega[_far_from_landmarks(omega, poles, zeros)]
+    s = 1j * omega[_far_from_poles_and_zeros(omega, poles, zeros)]
     exact_response = plant.transfer(s)
     return float(np.max(np.abs(_basis_functions(s, poles) @ coefficients / exact_response - 1)))
 
 
-def _far_from_landmarks(omega: Real, poles: Complex, zeros: Complex) -> NDArray[np.bool_]:
-    """Return a mask of the frequencies far enough from poles and zeros for a relative error."""
+def _far_from_poles_and_zeros(omega: Real, poles: Complex, zeros: Complex) -> NDArray[np.bool_]:
+    """Return a mask of the frequencies at which a relative error of the response is meaningful.
+
+    At a pole or zero, where the exact response is infinite or zero, it is not.
+    """
     poles_and_zeros = np.concatenate([poles, zeros])
     distance = np.abs(1j * omega[:, None] - poles_and_zeros).min(axis=1)
-    far: NDArray[np.bool_] = distance > _MIN_RELATIVE_DISTANCE * omega
-    return far
+    is_far: NDArray[np.bool_] = distance > _MIN_RELATIVE_DISTANCE * omega
+    return is_far
 
 
 def _build_realisation(
@@ -469,10 +472,10 @@ def _build_realisation(
 
 
 def _growth_on_frictionless_motor(realisation: Realisation, beam: Beam) -> float:
-    """Return the growth rate (1/s) of the realised beam on a frictionless motor of equal inertia.
+    """Return the growth rate (1/s) of the realised beam on a frictionless motor.
 
-    Without friction and with little inertia of its own such a motor is the most critical case for
-    stability.
+    The motor has the inertia of the beam. Without friction and with little inertia it is the most
+    critical case for stability.
     """
     motor_and_beam = couple(realisation, motor_inertia_kg_m2=beam.inertia_kg_m2)
     return float(np.linalg.eigvals(motor_and_beam.a).real.max())
@@ -487,7 +490,7 @@ class CoupledModel:
 
     The state is angle (rad), angular velocity (rad/s), then the states of the beam. τ is the torque
     on the shaft in N·m: the motor's torque minus any friction that the model does not contain. An
-    output row times the state, plus a factor times τ where the model states one, is the output.
+    output is its output row times the state, plus its factor times τ if the model has one.
     """
 
     a: Real
@@ -625,8 +628,8 @@ def couple(
     sensed_inertia = direct_inertia + tool_inertia_kg_m2
     shear_row, shear_per_acceleration = np.zeros(n), 0.0
     if shear is not None:
-        shear_per_acceleration = shear.per_acceleration
-        shear_row = np.concatenate([[shear.per_angle, shear.per_velocity], shear.c])
+        shear_per_acceleration = shear.output_per_acceleration
+        shear_row = np.concatenate([[shear.output_per_angle, shear.output_per_velocity], shear.c])
         shear_row += shear_per_acceleration * acceleration_row
     return CoupledModel(
         a=a,
@@ -647,7 +650,7 @@ def couple(
 def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
     """Return the matrices of the exact discrete-time model for a constant torque.
 
-    ``x(t + duration_s) = phi x(t) + gamma τ`` for a torque τ that is constant meanwhile.
+    ``x(t + duration_s) = phi x(t) + gamma τ`` for a torque τ that is constant during that time.
 
     Parameters
     ----------
@@ -684,7 +687,7 @@ def states_after_constant_inputs(model: CoupledModel, inputs: Real, duration_s: 
     Parameters
     ----------
     model
-        State space that is at rest in the beginning.
+        State space, initially at rest.
     inputs
         Effect of each input on the state's derivative, shape (n, inputs).
     duration_s
@@ -701,7 +704,7 @@ def _matrix_exponential(square_matrix: Real) -> Real:
     """Return the matrix exponential by scaling and squaring with the [13/13] Padé approximant.
 
     Algorithm 2.3 of N. J. Higham, SIAM J. Matrix Anal. Appl. 26 (2005) 1179, without its low-order
-    cases. scipy has the same, but importing it takes longer than all else a fast session starts.
+    cases. scipy has the same function, but its import takes longer than the rest of a fast start.
     """
     matrix_norm = float(np.linalg.norm(square_matrix, 1))
     squarings = max(0, math.ceil(math.log2(matrix_norm / 5.37))) if matrix_norm > 0 else 0
@@ -710,13 +713,13 @@ def _matrix_exponential(square_matrix: Real) -> Real:
     x4 = x2 @ x2
     matrix_powers = np.stack([np.eye(len(x)), x2, x4, x2 @ x4])  # of x²: 0, 1, 2, 3
     pade_coefficients = np.cumprod([1.0] + [(13 - k) / ((26 - k) * (k + 1)) for k in range(13)])
-    even_part, odd = (
+    even_part, odd_part = (
         np.tensordot(pade_coefficients[parity:8:2], matrix_powers, 1)
         + matrix_powers[3] @ np.tensordot(pade_coefficients[8 + parity :: 2], matrix_powers[1:], 1)
         for parity in (0, 1)
     )
-    odd = x @ odd
-    matrix_exponential: Real = np.linalg.solve(even_part - odd, even_part + odd)
+    odd_part = x @ odd_part
+    matrix_exponential: Real = np.linalg.solve(even_part - odd_part, even_part + odd_part)
     for _ in range(squarings):
         matrix_exponential = matrix_exponential @ matrix_exponential
     return matrix_exponential

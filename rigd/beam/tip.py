@@ -1,7 +1,7 @@
 """Motion of the beam's free end, predicted from the motor's angle.
 
 The boundary value problem of the beam, clamped on the shaft and free at its tip, gives the tip's
-displacement and slope over the angle, with ``z = beta L`` as in `rigd.beam._model`::
+displacement and slope per motor angle, with ``z = beta L`` as in `rigd.beam._model`::
 
     Y(L)  = L (sin z + sinh z) / (z (1 + cos z cosh z))
     Y'(L) = (cos z + cosh z) / (1 + cos z cosh z)
@@ -23,22 +23,23 @@ SMALL_SLOPE_RAD = 0.14
 
 No part of a clamped beam slopes more than its tip. In the first mode this is a deflection of 10 %
 of the length, in the second of 3 %. The error of the linear model grows with the square: the tip
-approaches the axis by up to a third of it in lengths, here 0.6 %, and curvature and inertia differ
-from the linear ones by fractions of that size, the accuracy of a careful session.
+approaches the axis by up to a third of the squared slope, as a fraction of the length: here 0.6 %.
+Curvature and inertia differ from the linear ones by similar fractions, about the accuracy of a
+careful session.
 """
 
 _EXTENSION_FACTOR = 1.125
 """Length of the extended record relative to the record."""
 _DECAY_EXPONENT = 7.0
 """Exponent of the transform's damping."""
-_LONGEST_AT_ONCE = 720_000
+_MAX_CHUNK_SAMPLES = 720_000
 """Maximum number of samples whose motion is computed at once. A longer record is divided into
 chunks, each with the motion before it that the beam still remembers, because an hour at 1 kHz would
 take 0.3 GB."""
 _MEMORY_EXPONENT = 12.0
-"""Decays that a chunk of a record includes, as an exponent: exp(-12) is negligible."""
-_SLOWEST_MODES = 3
-"""Number of modes among which that with the slowest decay is searched for."""
+"""Exponent of the decay after which earlier motion is neglected: exp(-12)."""
+_SEARCHED_MODE_COUNT = 3
+"""Number of modes, from the first on, among which the slowest decay is searched for."""
 _BLOCK_POINTS = 1 << 15
 """Number of frequencies evaluated at once: those of an hour at 1 kHz would take a gigabyte."""
 
@@ -101,26 +102,26 @@ def tip_motion(plant: Plant, angle_rad: Real, rate_hz: float) -> TipMotion:
     >>> print(f"{1e3 * motion.deflection_m:.1f} mm, {motion.slope_rad:.4f} rad")
     14.2 mm, 0.0201 rad
     """
-    if angle_rad.size <= _LONGEST_AT_ONCE:
+    if angle_rad.size <= _MAX_CHUNK_SAMPLES:
         return _tip_motion_from_rest(plant, angle_rad - angle_rad[0], rate_hz)
     lead_in = _memory_samples(plant, rate_hz)
-    chunk_length = max(_LONGEST_AT_ONCE - lead_in, _LONGEST_AT_ONCE // 2)
+    chunk_length = max(_MAX_CHUNK_SAMPLES - lead_in, _MAX_CHUNK_SAMPLES // 2)
     largest = np.zeros(3)
-    for begin in range(0, angle_rad.size, chunk_length):
-        first = max(begin - lead_in, 0)
-        chunk_rad = angle_rad[first : begin + chunk_length] - angle_rad[first]
-        if first:  # no jump of the speed, which would let the beam ring
+    for chunk_begin in range(0, angle_rad.size, chunk_length):
+        lead_in_begin = max(chunk_begin - lead_in, 0)
+        chunk_rad = angle_rad[lead_in_begin : chunk_begin + chunk_length] - angle_rad[lead_in_begin]
+        if lead_in_begin:  # no jump of the speed, which would let the beam ring
             chunk_rad[: lead_in // 4] *= 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, lead_in // 4))
-        motion = _tip_motion_from_rest(plant, chunk_rad, rate_hz, begin - first)
+        motion = _tip_motion_from_rest(plant, chunk_rad, rate_hz, chunk_begin - lead_in_begin)
         largest = np.maximum(largest, [motion.deflection_m, motion.slope_rad, motion.speed_m_s])
     return TipMotion(*largest.tolist())
 
 
 def _memory_samples(plant: Plant, rate_hz: float) -> int:
     """Return the number of samples after which a free decay of the beam is negligible."""
-    decay_rates_per_s = [-pole.at_rad_s.real for pole in plant.mode_poles(_SLOWEST_MODES)]
+    decay_rates_per_s = [-pole.at_rad_s.real for pole in plant.mode_poles(_SEARCHED_MODE_COUNT)]
     slowest_per_s = min([rate for rate in decay_rates_per_s if rate > 0], default=0.0)
-    longest_s = _LONGEST_AT_ONCE / 2 / rate_hz
+    longest_s = _MAX_CHUNK_SAMPLES / 2 / rate_hz
     memory_s = _MEMORY_EXPONENT / slowest_per_s if slowest_per_s else longest_s
     return int(min(memory_s, longest_s) * rate_hz)
 
@@ -128,7 +129,7 @@ def _memory_samples(plant: Plant, rate_hz: float) -> int:
 def _tip_motion_from_rest(
     plant: Plant, angle_rad: Real, rate_hz: float, first_sample: int = 0
 ) -> TipMotion:
-    """Return the tip's largest motion from a sample on, for an angle that begins at rest at 0."""
+    """Return the tip's largest motion from `first_sample` on, for an angle from rest at 0."""
     n = angle_rad.size
     transform = CausalTransform(
         fast_transform_length(int(np.ceil(_EXTENSION_FACTOR * n))), rate_hz, _DECAY_EXPONENT

@@ -2,8 +2,8 @@
 
 Offers the whole check (`check_rig`) and the part that every session runs (`run_offline_checks`). In
 this order: what profile and EDS file show (module `offline`, listed in `_offline_checks`),
-this computer (`machine`), the devices (`devices`). Each is a list of `rows.CheckRow`, with their
-verdict. No torque is ever commanded.
+this computer (`machine`), the devices (`devices`). Each check gives a list of `CheckRow`, each row
+with its verdict. No torque is ever commanded.
 """
 
 import lazy_loader as lazy

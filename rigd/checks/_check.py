@@ -20,9 +20,9 @@ from rigd.runner.planning import RigPreview, excitation_for
 def check_rig(profile: Profile) -> list[CheckRow]:
     """Run all checks of a rig that need no torque, and return their results as table rows.
 
-    The devices are not connected if identifiers collide or the bus load is too high, because
-    devices might obey frames for others. They are not connected either if a value of the profile is
-    unknown.
+    The devices are not connected if identifiers collide or the bus load is too high, because a
+    device might then act on frames for another device. They are not connected either if a value of
+    the profile is unknown.
     """
     check_rows = _rows_without_devices(profile)
     if any(row.verdict is CheckResult.FAIL for row in wiring_rows(profile.rig)):
@@ -83,7 +83,7 @@ def _rows_without_devices(profile: Profile) -> list[CheckRow]:
 def default_session_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield the result on whether a default `rigd run chirp` stays within the profile's limits.
 
-    It is at most a warning, since other sessions may stay within the limits: a hold moves nothing.
+    If not, there is a warning only: other sessions, such as a hold, may stay within the limits.
     """
     try:
         chirp = excitation_for(profile, "chirp", {})

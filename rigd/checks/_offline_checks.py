@@ -16,7 +16,7 @@ from rigd.profile import Profile
 
 
 class CheckFailedError(FailureError):
-    """Checks that need no device have failed; the message names them, and how to accept them.
+    """Error if offline checks have failed; the message names them, and how to accept them.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class CheckFailedError(FailureError):
 
 
 class UnknownRowError(UserError):
-    """The operator accepts a row that no offline check has; the message lists the valid names."""
+    """Error if the operator accepts an unknown row; the message lists the valid names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +195,7 @@ def run_offline_checks(profile: Profile, accepted_names: Sequence[str] = ()) -> 
         If no row has such a name, or its failure cannot be accepted.
     """
     for row_name in accepted_names:
-        _check_name(row_name)
+        _require_acceptable_name(row_name)
     failed_rows: dict[str, FailedCheck] = {}
     for offline_check in OFFLINE_CHECKS:
         for row in _rows_of_check(offline_check, profile) if offline_check.names else ():
@@ -221,7 +221,7 @@ def run_offline_checks(profile: Profile, accepted_names: Sequence[str] = ()) -> 
     )
 
 
-def _check_name(row_name: str) -> None:
+def _require_acceptable_name(row_name: str) -> None:
     """Raise UnknownRowError unless a failed check of this name can be accepted by the operator."""
     offline_check = _CHECK_BY_ROW_NAME.get(row_name)
     if offline_check is None:

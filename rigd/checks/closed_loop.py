@@ -1,14 +1,14 @@
 """Checks of the closed loop on paper: its stability and its margins.
 
-The required value depends on what a margin protects against (see :mod:`rigd.control._margins`). At
-the angle it is the rule of thumb for the gain of a feedback loop, a factor of 2. At torque command
-and torque reading, where the beam is cancelled and a factor of 2 cannot be had, it is the tolerance
-of a drive's torque constant and of a calibration, taken twice: 20 %. The phase margin has to
-tolerate the largest rotation by such an error (an error of 20 % across it: 11.5°), together with
-one period of delay at the second mode (16 Hz: 5.8°): 20°, rounded up. The delay margin has to
-tolerate one period more than the profile states: a reading or a command that is a tick late. A loop
-that misses this is a warning, not a failure: it is stable as described, and whether the description
-is right is what such a session may be for.
+The required value depends on what a margin protects against (see :mod:`rigd.control._margins`). The
+gain margin at the angle must be a factor of 2, the rule of thumb for a feedback loop. At torque
+command and torque reading, where the cancelled beam makes a factor of 2 impossible, the gain margin
+must be 20 %: twice the tolerance of a drive's torque constant or of a calibration. The phase margin
+must be 20°: the largest rotation of the open loop's gain by an error of 20 % (11.5°), plus one
+period of delay at the second mode (16 Hz: 5.8°), rounded up. The delay margin must be one period,
+for a reading or a command that is a tick late. A smaller margin is a warning, not a failure: the
+loop is stable with the values of the profile, and a session may be needed to find out whether they
+are right.
 """
 
 from collections.abc import Iterator

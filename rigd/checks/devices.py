@@ -469,7 +469,7 @@ def _probing_rows(profile: Profile, target: ActuationTarget) -> Iterator[CheckRo
 def inspect_devices(profile: Profile) -> list[CheckRow]:
     """Connect to the devices of a profile, check them without torque, and return the rows.
 
-    The drive is never enabled. Both devices are closed in the end, also after an error.
+    The drive is never enabled. Both devices are closed at the end, even after an error.
     """
     rig = profile.rig
     target = actuation_target(rig)
@@ -528,8 +528,8 @@ def _check_devices(
     elif drive_ok and sensor_ok:
         _collect_rows("exchange", _exchange_rows(profile, devices, target), check_rows)
     else:
-        why = "not without drive and sensor"
-        check_rows.append(CheckRow("exchange", "ticks", why, "", CheckResult.SKIPPED))
+        skip_reason = "not without drive and sensor"
+        check_rows.append(CheckRow("exchange", "ticks", skip_reason, "", CheckResult.SKIPPED))
 
 
 def _collect_rows(

@@ -50,7 +50,7 @@ _IDLE_STATES_ADVICE = (  # Advice if the depth of the processor's idle states ca
 
 
 def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
-    """Return the real-time settings that the system grants, found out by a short-lived process.
+    """Return the real-time settings that the system grants, as tried by a short-lived process.
 
     The keys are those of `apply_realtime`, for the control process. The key ``supervision`` holds
     the scheduling of supervisor and recorder.

@@ -14,8 +14,8 @@ _MILLISECONDS_PER_UNIT = {"s": 1e3, "ns": 1e-6, "µs": 1e-3}
 
 def key_label(key: str) -> str:
     """Return a key as a label: with spaces instead of underscores and without its unit's suffix."""
-    end = _unit_suffix(key)
-    return (key[: -len(end)] if end else key).replace("_", " ")
+    suffix = _unit_suffix(key)
+    return (key[: -len(suffix)] if suffix else key).replace("_", " ")
 
 
 def format_value(key: str, value: object) -> str:
@@ -111,10 +111,10 @@ def print_table(
                 table.add_row()
             table.add_row(Text(group, style="bold"))
         style = _VERDICT_STYLES[row.verdict]
-        new = {row.name} - shown_names - {""}
-        shown_names |= new
+        new_names = {row.name} - shown_names - {""}
+        shown_names |= new_names
         table.add_row(
-            Text(f"  {row.what}").append("".join(f"\n  {name}" for name in new), style="dim"),
+            Text(f"  {row.what}").append("".join(f"\n  {name}" for name in new_names), style="dim"),
             Text(row.found),
             Text(row.wanted),
             Text(row.verdict.value, style=style),

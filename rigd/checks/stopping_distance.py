@@ -1,19 +1,19 @@
 """Checks of the stopping distance: how far the shaft still turns when nothing controls it.
 
-The loop has failed or runs blind. The distance is the worst that the limits allow: at the limit of
-the angle, moving outwards at the limit of the speed, with the peak torque pushing on. Four things
-end that, each after its own time:
+The loop has failed, or receives no valid angle. The distance is the longest that the limits allow:
+the shaft starts at the limit of the angle, moves outwards at the limit of the speed, and the peak
+torque drives it on. The torque is removed after a time that depends on the failure:
 
-* the drive watches over the loop's heartbeat, and misses it when the loop has stopped;
-* a loop whose angles do not come goes on with the last one, heartbeat included, and ends the
+* if the loop has stopped, the drive's watchdog no longer receives its heartbeat;
+* if no new angles arrive, the loop continues with the last one, sends its heartbeat, and ends the
   session after ``limits.stale_ticks_in_a_row``;
-* a loop whose encoder has failed, though its messages are fresh, ends the session by what the
-  torques say of the shaft, at full torque within `ENCODER_FAILURE_S`;
-* a loop that was delayed reads its sensors again after the ticks it missed, up to
-  ``limits.missed_ticks_in_a_row`` of them.
+* if the encoder has failed but still sends messages, the loop detects this from the torques on the
+  shaft and ends the session, at full torque within `ENCODER_FAILURE_S`;
+* if the loop was delayed, it reads the sensors again after the missed ticks, at most
+  ``limits.missed_ticks_in_a_row``.
 
-Each is checked by itself, as if the others did not act. Then the shaft coasts to rest, braked by
-its friction alone.
+Each failure is checked separately, as if the others did not occur. The shaft then coasts to rest,
+braked by friction alone.
 """
 
 from collections.abc import Iterator
@@ -136,7 +136,7 @@ class _UncontrolledFailure:
 
     name: str
     """Name of the check's row."""
-    what: str
+    condition: str
     """Condition of the failure, as a clause for the operator ("if the encoder fails")."""
     duration_s: float
     """Longest time for which the torque remains on."""
@@ -241,7 +241,7 @@ def stopping_distance_rows(profile: Profile) -> Iterator[CheckRow]:
         if failure_index == longest_index:
             unlimited_failures = max_stopping_distance(rig, limits, uncontrolled_failure.duration_s)
             detail_text = (
-                "" if has_no_bound else f"Travel: the worst is {uncontrolled_failure.what}. "
+                "" if has_no_bound else f"Travel: the worst is {uncontrolled_failure.condition}. "
             )
             detail_text += (
                 "It relies on the drive's own speed limit of "
@@ -254,14 +254,14 @@ def stopping_distance_rows(profile: Profile) -> Iterator[CheckRow]:
             )
         if exceeds_margin:
             detail_text += (
-                f" Travel {uncontrolled_failure.what}: lower {uncontrolled_failure.key}, "
+                f" Travel {uncontrolled_failure.condition}: lower {uncontrolled_failure.key}, "
                 "cia402.max_speed_rad_s, "
                 "limits.velocity_rad_s or limits.angle_rad."
             )
         worst_failure = "worst, " if failure_index == longest_index and not has_no_bound else ""
         yield CheckRow(
             _STOPPING_GROUP,
-            f"{worst_failure}{uncontrolled_failure.what}",
+            f"{worst_failure}{uncontrolled_failure.condition}",
             f"{_format_angle(stopping_travel.total_rad)}: "
             f"{_format_angle(stopping_travel.driven_rad)} in the "
             f"{uncontrolled_failure.duration_s * 1e3:g} ms {uncontrolled_failure.ended_by}, "

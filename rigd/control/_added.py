@@ -17,7 +17,7 @@ class AddedController:
     torque_limit_nm
         Largest magnitude of the returned torque.
     owner
-        Package, for messages.
+        Package that adds the controller, for messages.
     pid
         PID to whose reference the output is added; None: the output is the torque.
     """
@@ -76,7 +76,7 @@ class AddedController:
         Raises
         ------
         ControllerError
-            If the package's code fails, or its output is no finite number.
+            If the package's code fails, or its output is not a finite number.
         """
         try:
             output = self._step(reference_rad, angle_rad, coupling_torque_nm)
@@ -97,13 +97,14 @@ class AddedController:
         self.saturated = not -limit_nm <= output <= limit_nm
         return min(max(float(output), -limit_nm), limit_nm)
 
-    def _failure(self, method: str, found: str) -> ControllerError:
-        """Return the error that names the package, its method and what was found."""
+    def _failure(self, method: str, failure_text: str) -> ControllerError:
+        """Return the error that names the package, the failed method and the kind of failure."""
         return ControllerError(
             str(
                 self._owner.error(
-                    f"the controller's {method} failed ({found}), and the torque was switched off; "
-                    'report that to the package\'s author, or set control.controller = "pid".'
+                    f"the controller's {method} failed ({failure_text}), and the torque was "
+                    "switched off; report that to the package's author, or set "
+                    'control.controller = "pid".'
                 )
             )
         )

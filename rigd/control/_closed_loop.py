@@ -1,7 +1,7 @@
 """The discrete closed loop of motor, beam, delays and controller: linear, exact at ticks.
 
-The plant is propagated exactly for a torque that is constant between two switches. A switch is at
-the instant inside a period at which a command takes effect after the actuation delay. Delayed
+The plant is propagated exactly for a torque that is constant between two switches. A switch is the
+instant within a period at which a command takes effect after the actuation delay. Delayed
 readings are the exact values of the earlier instant. Friction, quantisation, the torque limit and
 noise are left out. A sensor that is read at the instant when a new torque takes effect shows the
 effect of the old torque.
@@ -28,9 +28,10 @@ Complex = NDArray[np.complex128]
 MAX_GROWTH_PER_S = 0.02
 """Largest growth rate of an oscillation of the loop in 1/s that is accepted, with a warning.
 
-A beam with almost no damping leaves the loop slightly unstable with any controller (below 0.02 % at
-a pole of 80 rad/s, at up to 0.003 /s). At the rate allowed here an oscillation grows by 35 % over
-the 15 s of a ring-down, and from the noise floor by a factor of 15 in a session of 136 s.
+With any controller a beam of almost no damping leaves the loop slightly unstable: at a pole of
+80 rad/s with damping ratios below 0.02 %, by up to 0.003 /s. At the accepted rate an oscillation
+grows by 35 % over the 15 s of a ring-down, and from the noise floor by a factor of 15 in a session
+of 136 s.
 """
 
 MAX_DAMPING_REDUCTION = 0.004
@@ -44,8 +45,8 @@ Without feed-forward it falls by 0.0045 to 0.013.
 """
 
 _LIGHT_DAMPING_RATIO = 1e-4
-"""Damping ratio of the beam's first mode in this check. It is not 0, because rounding may make the
-realisation of an undamped beam unstable."""
+"""Damping ratio of the beam's first mode in the check of `MAX_DAMPING_REDUCTION`. It is not 0,
+because rounding may make the realisation of an undamped beam unstable."""
 
 _MAX_DELAY_EIGENVALUE = 1e-9
 """Magnitude of an eigenvalue below which it belongs to a delay, which decays within a few ticks."""
@@ -130,9 +131,9 @@ class ClosedLoop:
     def simulate(self, reference_rad: Real) -> LoopResponse:
         """Return the closed loop's response to a reference from rest, exact at the ticks.
 
-        The record is divided into blocks of ticks. Within a block the response is a product of
-        matrices: the block's impulse response with the reference, plus its free response with the
-        state at its start. Only these states are computed one after the other.
+        The record is divided into blocks of ticks. The response within a block is the sum of two
+        matrix products: impulse response times reference, and free response times the state at the
+        start of the block. Only these initial states are computed sequentially.
 
         Parameters
         ----------
@@ -148,8 +149,10 @@ class ClosedLoop:
         end = 0
         for chunk in self.simulate_in_chunks(reference_rad):
             begin, end = end, end + chunk.angle_rad.size
-            for channel in fields(LoopResponse):
-                getattr(response, channel.name)[begin:end] = getattr(chunk, channel.name)
+            for response_field in fields(LoopResponse):
+                getattr(response, response_field.name)[begin:end] = getattr(
+                    chunk, response_field.name
+                )
         return response
 
     def simulate_in_chunks(self, reference_rad: Real) -> Iterator[LoopResponse]:
@@ -215,9 +218,9 @@ class ClosedLoop:
     def _block_matrices(self) -> tuple[Real, Real, Real, Real]:
         """Return the matrices that compute the response of a block of L ticks.
 
-        They are free response (5, n, L) from the state, forced response (5, L, L) from the
-        reference, and the effects on the next block's state: of the state (n, n) and of the
-        reference (L, n).
+        They are the free response (5, n, L) to the state at the start of the block, the forced
+        response (5, L, L) to the reference, and the effects of this state (n, n) and of the
+        reference (L, n) on the state at the start of the next block.
         """
         n = self.b.size
         free_response = np.empty((_BLOCK_TICKS, _OUTPUT_ROWS, n))  # c aⁱ
@@ -264,7 +267,7 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     Raises
     ------
     ControlDesignError
-        If the controller cannot be designed, or a delay is out of proportion.
+        If the controller cannot be designed, or a delay is too long.
     RealisationError
         If the beam's damping cannot be realised.
 
@@ -350,7 +353,7 @@ def continuous_poles(a: Real, rate_hz: float) -> Complex:
 
 
 def check_stability(closed_loop: ClosedLoop) -> str | None:
-    """Return a warning if a closed loop is slightly unstable, or None; raise if it is more so.
+    """Return a warning if a closed loop is slightly unstable, else None; raise if it is clearly so.
 
     Returns
     -------
@@ -391,7 +394,7 @@ def check_stability(closed_loop: ClosedLoop) -> str | None:
 
 
 def stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
-    """Return the closed loop of a rig with a warning, and raise if the loop is unstable.
+    """Return the closed loop of a rig and a stability warning; raise if the loop is unstable.
 
     The results for the last few models are cached, because the check of a rig and the planning of a
     session need the same loop.
@@ -453,7 +456,7 @@ def lightly_damped_model(model: LoopModel, plant: Plant) -> LoopModel:
     model
         Model of the loop.
     plant
-        Plant of the returned model, but for the damping.
+        Plant of the returned model, in which its damping is replaced.
     """
     first_mode_rad_s = float(undamped_frequencies_rad_s(plant.beam, 1)[0])
     damping = Damping(zeta=2.0 * _LIGHT_DAMPING_RATIO / first_mode_rad_s)

@@ -15,8 +15,9 @@ Real = NDArray[np.float64]
 class ControlLaw:
     """State space from reference, angle and coupling torque to torque and friction speed.
 
-    The equations are ``x[k+1] = a x[k] + b w[k]`` and ``y[k] = c x[k] + d w[k]``. The outputs y are
-    the torque without friction compensation (N·m) and the speed of that compensation (rad/s).
+    The equations are ``x[k+1] = a x[k] + b w[k]`` and ``y[k] = c x[k] + d w[k]``. The inputs w are
+    reference, angle (rad) and coupling torque (N·m). The outputs y are the torque without friction
+    compensation (N·m) and the speed that the compensation uses (rad/s).
     """
 
     a: Real
@@ -127,7 +128,7 @@ class LinearStep:
         self._origin_rad = 0.0
 
     def reset(self, angle_rad: float) -> None:
-        """Set the states to zero, and relate both angles to this angle."""
+        """Set the states to zero; reference and angle then count from this angle."""
         self._states_and_inputs[:] = 0.0
         self._origin_rad = angle_rad
 

@@ -28,7 +28,7 @@ class LinearController:
     Raises
     ------
     ValueError
-        If the shapes do not go together, or a number is not finite.
+        If the shapes do not match, or a number is not finite.
 
     Examples
     --------
@@ -58,10 +58,10 @@ class LinearController:
         if not 0 < n <= MAX_CONTROLLER_STATES:
             raise ValueError(f"a has {n} rows; a controller has 1 to {MAX_CONTROLLER_STATES}.")
         rows_of = {"a": (n, n), "b": (n, len(INPUTS))}
-        for name, (row_count, columns) in rows_of.items():
+        for name, (row_count, column_count) in rows_of.items():
             matrix = tuple(tuple(map(float, row)) for row in getattr(self, name))
-            if len(matrix) != row_count or {len(row) for row in matrix} != {columns}:
-                raise ValueError(f"{name} must have the shape ({row_count}, {columns}).")
+            if len(matrix) != row_count or {len(row) for row in matrix} != {column_count}:
+                raise ValueError(f"{name} must have the shape ({row_count}, {column_count}).")
             object.__setattr__(self, name, matrix)
         lengths = {"c": n, "d": len(INPUTS), "anti_windup": n if len(self.anti_windup) else 0}
         for name, length in lengths.items():

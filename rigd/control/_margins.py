@@ -12,12 +12,13 @@ angle reading
 torque reading
     The feed-forward alone: calibration, lever arm and delay of the sensor.
 
-The feed-forward is positive feedback that cancels the beam. Where the clamped beam resonates, its
-loop gain is -1 by design. The curve therefore passes close to the critical point at the first and
-the third signal with any controller: with a command that is `k` times too strong, ``1 - k`` times
-the beam's torque remains in the loop. A gain margin of 2 is impossible there, since it would mean
-that the inverted torque of the beam acts on the motor. There the tolerances of drive and sensor
-have to fit into the margin. The rules of thumb for a feedback loop apply to the angle only.
+The feed-forward is positive feedback that cancels the beam. At resonances of the clamped beam the
+loop gain of the feed-forward is -1 by design. The curve therefore passes close to the critical
+point at the first and the third signal with any controller: with a command that is `k` times too
+strong, ``1 - k`` times the beam's torque remains in the loop. A gain margin of 2 is impossible
+there, since it would mean that the inverted torque of the beam acts on the motor. There the
+tolerances of drive and sensor have to fit into the margin. The rules of thumb for a feedback loop
+apply to the angle only.
 """
 
 from collections.abc import Callable
@@ -39,7 +40,7 @@ _FREQUENCIES_PER_DECADE = 60
 _RESONANCE_OFFSETS = np.geomspace(0.03, 100.0, 16)
 """Offsets of examined frequencies from a resonance to either side, in its half-widths."""
 _MIN_HALF_WIDTH = 1e-6
-"""Smallest half-width of a resonance, over its frequency, for modes without damping."""
+"""Smallest half-width of a resonance relative to its frequency, used for undamped modes."""
 _MAX_DELAY_EIGENVALUE = 1e-3
 """Magnitude of an eigenvalue below which it belongs to a delay, not to a resonance."""
 _MAX_IMAGINARY_RATIO = 1e-3

@@ -308,9 +308,9 @@ class PidController:
 
 
 def derivative_coefficients(gains: PidGains, rate_hz: float) -> tuple[float, float]:
-    """Return the coefficients of the discrete derivative term.
+    """Return decay and gain of the discrete derivative term.
 
-    The decay and the gain belong to ``d[k] = decay d[k-1] + gain (e[k] - e[k-1])``, which is
+    The term is ``d[k] = decay d[k-1] + gain (e[k] - e[k-1])`` for the error e, which is
     ``Kd s/(1 + Tf s)`` by Tustin's rule. The term d is in N·m, the gain in N·m/rad.
     """
     two_tf = 2.0 * gains.filter_s * rate_hz
@@ -318,9 +318,9 @@ def derivative_coefficients(gains: PidGains, rate_hz: float) -> tuple[float, flo
 
 
 def lowpass_coefficients(settings: ControlSettings, rate_hz: float) -> tuple[float, float]:
-    """Return the coefficients of the discrete low-pass filter of the reference.
+    """Return decay and gain of the discrete low-pass filter of the reference.
 
-    The decay and the gain belong to ``x[k] = decay x[k-1] + gain (u[k] + u[k-1])``, which is
+    The filter is ``x[k] = decay x[k-1] + gain (u[k] + u[k-1])`` for the input u, which is
     ``1/(1 + s/p)`` by Tustin's rule.
     """
     pole_times_period = settings.pole_rad_s / rate_hz

@@ -10,7 +10,7 @@ class ControllerError(FailureError):
 
 
 class Controller(Protocol):
-    """Controller of an installed package, written as own code.
+    """Controller of an installed package, given as Python code and not by matrices.
 
     The loop calls `reset` before the first tick of a session, while the motor is without torque,
     and `step` once a tick. All limits of the profile are checked outside of the controller.
@@ -31,8 +31,8 @@ class Controller(Protocol):
     def step(self, reference_rad: float, angle_rad: float, coupling_torque_nm: float) -> float:
         """Return the output of a tick: a torque in N·m, or a shift of the reference in rad.
 
-        It is a finite ``float``. The call takes a few microseconds, waits for nothing, and leaves
-        no memory behind.
+        The output is a finite ``float``. The call takes a few microseconds, does not block, and
+        leaves no memory allocated.
 
         Parameters
         ----------
@@ -45,7 +45,7 @@ class Controller(Protocol):
 
 @runtime_checkable
 class LoopController(Protocol):
-    """What the loop uses of any controller: its torque, limited, and how it came about."""
+    """Interface between the loop and any controller: the limited torque, and its terms."""
 
     torque_limit_nm: float
     """Largest magnitude of the returned torque."""
@@ -58,7 +58,7 @@ class LoopController(Protocol):
     def terms_nm(self) -> tuple[float, float, float, float, float]:
         """Terms of the last torque: proportional, integral, derivative, feed-forward, friction.
 
-        They are zero if a controller has no such terms.
+        They are zero for a controller without such terms.
         """
 
     def reset(self, angle_rad: float) -> None:

@@ -27,8 +27,8 @@ _MAX_HALVINGS = 5
 """Largest number of times that the strength of the damping is halved to make the loop stable."""
 _STIFFNESS_RATIOS = (0.8, 1.0, 1.25)
 """Ratios of the beam's stiffness to the profile's for which the loop must be stable."""
-_HIGH_PASS_CORNER_OVER_MODE = 0.25
-"""Frequency below which torques are filtered out, over the frequency of the first mode."""
+_HIGH_PASS_CORNER_RATIO = 0.25
+"""Frequency below which torques are filtered out, relative to that of the first mode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ def design_damper(closed_loop: "ClosedLoop") -> DamperSettings | None:
     settings = DamperSettings(
         gain_rad_per_nm_s=_DAMPING_STRENGTH / (plant.beam.inertia_kg_m2 * first_rad_s),
         lead_s=2.0 / loop_model.settings.pole_rad_s,
-        high_pass_rad_s=_HIGH_PASS_CORNER_OVER_MODE * first_rad_s,
+        high_pass_rad_s=_HIGH_PASS_CORNER_RATIO * first_rad_s,
         low_pass_rad_s=4.0 * loop_model.settings.pole_rad_s,
     )
     bending_stiffness_n_m2 = plant.beam.bending_stiffness_n_m2

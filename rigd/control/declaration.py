@@ -30,8 +30,8 @@ class ControlledRig:
 class ControllerKind:
     """Declaration of a controller that a profile can name as ``control.controller``.
 
-    It is given by its matrices (`linear`), or as own code (`make`). Own code can state the matrices
-    as well, which then serve for checks and predictions only.
+    The controller is given by its matrices (`linear`), or as Python code (`make`). A kind with code
+    can state matrices as well, which then serve for checks and predictions only.
     """
 
     name: str
@@ -41,7 +41,7 @@ class ControllerKind:
     linear: Callable[[ControlledRig], LinearController] | None = None
     """Function that returns the controller's matrices at the rig's rate."""
     make: Callable[[ControlledRig], Controller] | None = None
-    """Function that returns a new controller of own code; None: the matrices are the controller."""
+    """Function that returns a new controller with its own code; None: the matrices are used."""
     shifts_reference: bool = False
     """Whether the output is an angle in rad that is added to the reference of rigd's PID.
 
@@ -52,11 +52,11 @@ class ControllerKind:
     The fields are declared like those of a device: units in the names, ranges and help
     (``annotated_types.doc``) in ``Annotated``. A key may be omitted if its field has a default."""
     contradictions: Callable[[Mapping[str, Any]], Iterable[str]] | None = None
-    """Function that yields messages on values of a profile that do not go together.
+    """Function that yields messages on values of a profile that contradict each other.
 
     Its argument maps the dotted keys of the profile (``"rig.rate_hz"``) to validated values."""
     check_rows: Callable[[ControlledRig], Iterable[CheckRow]] | None = None
-    """Function that yields rows of ``rigd check``; a failed row refuses every session."""
+    """Function that yields rows of ``rigd check``; a failed row prevents every session."""
 
     @property
     def required_sections(self) -> tuple[str, ...]:

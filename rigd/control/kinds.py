@@ -63,9 +63,9 @@ def make_controller(rig: ControlledRig) -> LoopController:
     """
     owner = _owner_of(rig)
     if owner is None:
-        shipped = SHIPPED[rig.loop.settings.controller].make
-        assert shipped is not None
-        loop_controller = shipped(rig)
+        make_shipped = SHIPPED[rig.loop.settings.controller].make
+        assert make_shipped is not None
+        loop_controller = make_shipped(rig)
         assert isinstance(loop_controller, LoopController)
         return loop_controller
     kind = CONTROLLERS.load(owner)

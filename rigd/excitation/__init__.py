@@ -2,9 +2,9 @@
 
 A reference is relative to the angle at which the session starts. Every excitation has the same
 three segments: rest (reference zero), sweep, ring-down (the sweep's last value held). The package
-has a function per kind (`chirp` … `from_csv`, `modes`, `move`) and `make_excitation` for one by its
-name; the module `moves` has the paths of which moves consist, `targets` the precisions to search
-for. `rigd.runner` predicts whether a rig can follow a reference.
+has a function per kind (`chirp` … `from_csv`, `modes`, `move`); `make_excitation` calls that of a
+given name. The module `moves` has the paths of which moves consist, `targets` the target precisions
+of a session. `rigd.runner` predicts whether a rig can follow a reference.
 """
 
 import lazy_loader as lazy

@@ -23,7 +23,7 @@ _SEGMENT_OPTIONS: Final = ("duration_s", "rest_s", "ring_down_s")
 """Options that every excitation of a package has."""
 
 MakeExcitation = Callable[..., Excitation]
-"""Function that returns an excitation, of the rate and its options."""
+"""Function of the rate and the options that returns an excitation."""
 
 
 def load_excitation(plugin: Plugin) -> ExcitationKind:
@@ -32,14 +32,14 @@ def load_excitation(plugin: Plugin) -> ExcitationKind:
     Raises
     ------
     PluginError
-        If it cannot be used.
+        If the excitation cannot be used.
     """
     kind = load_declaration(plugin, ExcitationKind)
     with plugin_errors(plugin):
         options = {option.name for option in fields(kind.options)}
-        missing = [name for name in _SEGMENT_OPTIONS if name not in options]
-        if missing:
-            raise plugin.error(f"its options lack {', '.join(missing)}; add them.")
+        missing_options = [name for name in _SEGMENT_OPTIONS if name not in options]
+        if missing_options:
+            raise plugin.error(f"its options lack {', '.join(missing_options)}; add them.")
         try:
             _checked_options(kind, {})
         except ExcitationError as error:
@@ -49,11 +49,11 @@ def load_excitation(plugin: Plugin) -> ExcitationKind:
 
 @lru_cache(maxsize=64)
 def added_function(plugin: Plugin) -> MakeExcitation:
-    """Return a function with the options of a package's excitation as its arguments."""
+    """Return the function that makes a package's excitation; its arguments are the options."""
     kind = load_excitation(plugin)
 
-    def make(*, rate_hz: float, **given: Any) -> Excitation:  # noqa: ANN401 - of the options
-        options = _checked_options(kind, given)
+    def make(*, rate_hz: float, **given_options: Any) -> Excitation:  # noqa: ANN401 - of the options
+        options = _checked_options(kind, given_options)
         segments = lay_out_segments(
             rate_hz, options.rest_s, options.duration_s, options.ring_down_s
         )
@@ -68,9 +68,9 @@ def added_function(plugin: Plugin) -> MakeExcitation:
 
     hints = get_type_hints(kind.options, include_extras=True)
     keyword = inspect.Parameter.KEYWORD_ONLY
-    rate = inspect.Parameter("rate_hz", keyword, annotation=float)
+    rate_parameter = inspect.Parameter("rate_hz", keyword, annotation=float)
     make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [rate]
+        [rate_parameter]
         + [
             inspect.Parameter(
                 option.name, keyword, default=option.default, annotation=hints[option.name]
@@ -82,19 +82,19 @@ def added_function(plugin: Plugin) -> MakeExcitation:
     return documented(make)
 
 
-def _checked_options(kind: ExcitationKind, given: Mapping[str, Any]) -> Any:  # noqa: ANN401
+def _checked_options(kind: ExcitationKind, given_options: Mapping[str, Any]) -> Any:  # noqa: ANN401
     """Return the options with checked values; raise ExcitationError for one out of its range."""
     from pydantic import ConfigDict, TypeAdapter, ValidationError  # late: half a second
 
     hints = get_type_hints(kind.options, include_extras=True)
-    checked = {}
+    checked_options = {}
     for option in fields(kind.options):
-        value = given.get(option.name, option.default)
+        value = given_options.get(option.name, option.default)
         validator = TypeAdapter(hints[option.name], config=ConfigDict(allow_inf_nan=False))
         try:
-            checked[option.name] = validator.validate_python(value)
+            checked_options[option.name] = validator.validate_python(value)
         except ValidationError as error:
             reason = error.errors()[0]["msg"].replace("Input should be", "must be")
             unit = f" {unit_of(option.name)}".rstrip()
             raise ExcitationError(f"{option.name} = {value}{unit} {reason}.") from error
-    return kind.options(**checked)
+    return kind.options(**checked_options)

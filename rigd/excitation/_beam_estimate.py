@@ -37,9 +37,9 @@ PARAMETERS: Final = (*UNIFORM_BEAM_PARAMETERS, *END_PARAMETERS)
 """Names of all parameters of the fit; `LOGARITHMIC_PARAMETERS` are fitted as logarithms."""
 
 TOLERATED_DEVIATIONS: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
-"""Constants of a mode that may deviate from those of a uniform beam, with the standard deviation of
-the deviation over the uniformity, as in the analyser. In the names of free parameters the number of
-the mode follows."""
+"""Map from a constant of a mode that may deviate from that of a uniform beam, to the standard
+deviation of this deviation divided by the uniformity, as in the analyser. The names of free
+parameters append the number of the mode."""
 
 MODAL_CONSTANTS: Final = (*TOLERATED_DEVIATIONS, "ln_damping_ratio", "residue_phase_rad")
 """Names of the free constants of each mode in the modal model."""
@@ -100,12 +100,12 @@ class BeamEstimate:
 
     @classmethod
     def stated(cls, plant: Plant, noise_nm2_per_hz: float) -> "BeamEstimate":
-        """Return an estimate with a given plant, whose parameters are all to be fitted.
+        """Return an estimate equal to a known plant, with the parameters of a uniform beam free.
 
         Parameters
         ----------
         plant
-            Known plant. Its ends are not free parameters.
+            Known plant. Its ends, and a damping that it lacks, are not free parameters.
         noise_nm2_per_hz
             One-sided power spectral density of the torque's white noise.
         """
@@ -211,7 +211,7 @@ class BeamEstimate:
         return dict.fromkeys(PARAMETERS, 0.0) | self.plant.parameters
 
     def modes(self, highest_hz: float = BAND_HZ) -> tuple[Pole, ...]:
-        """Return the beam's poles below a frequency, with their derivatives by the free parameters.
+        """Return the beam's poles below a frequency, with derivatives for the free parameters.
 
         Parameters
         ----------
@@ -253,12 +253,12 @@ POLE_AND_RESIDUE_DERIVATIVES: Final[
     "residue_phase_rad": lambda _, residue: (0j, 1j * residue),
     "background": lambda *_: (0j, 0j),
 }
-"""Functions that return the derivatives of a mode's pole and residue by one of its constants, from
-pole and residue."""
+"""Map from a constant of a mode to a function of the mode's pole and residue, which returns the
+derivatives of both with respect to the constant."""
 
 
 def parameter_scales(estimate: BeamEstimate) -> Real:
-    """Return the factors that convert derivatives of the exact model to the fit's parameters.
+    """Return the factors that convert derivatives for model parameters to those for fit parameters.
 
     The fit uses the logarithms of zeta and gamma, so their factors are zeta and gamma. The other
     factors are 1.

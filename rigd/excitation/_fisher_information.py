@@ -1,7 +1,7 @@
 """Fisher information of a record on the parameters of the beam, before or after it is recorded.
 
-The torque caused by a motion of the motor is known except for the parameters. Its derivatives by
-the parameters, whitened with the spectrum of the noise, determine the precision of a whole-record
+The torque caused by a motion of the motor depends on the parameters. Its derivatives with respect
+to them, whitened with the spectrum of the noise, determine the precision of a whole-record
 fit: the inverse of their Gram matrix is the lower bound of any unbiased estimate's covariance
 (Cramér and Rao), and the fit of `analysis` attains it. The nuisance terms of that fit are projected
 out here as well: free decay from before the record, offset and drift of the torque.
@@ -48,12 +48,12 @@ _PRIOR_STD: Final = {
 """Prior standard deviation of each parameter without a record: coefficients are known within a
 factor of 20, and orders are in (0, 2)."""
 
-_SAMPLE_RATE_OVER_BAND: Final = 2.4
-"""Smallest rate of the samples over the upper end of the band."""
-_FADED_OVER_BAND: Final = 1.1
-"""Frequency at which the weight of the noise has faded to 0, over the upper end of the band."""
-_WRAP_AROUND_DECAY: Final = 5.0
-"""Exponent of the damping of a transform of twice the length."""
+_MIN_SAMPLE_RATE_RATIO: Final = 2.4
+"""Smallest sampling rate, divided by the upper end of the band."""
+_FADE_END_RATIO: Final = 1.1
+"""Frequency from which the whitening weight is 0, divided by the upper end of the band."""
+_DECAY_EXPONENT: Final = 5.0
+"""Exponent of the damping of the Laplace transform, which is twice as long as the record."""
 
 
 # Whitened derivatives of the torque
@@ -63,7 +63,7 @@ _WRAP_AROUND_DECAY: Final = 5.0
 class TorqueModel:
     """Exact beam model, evaluated once at the frequencies of records of a given length.
 
-    It then predicts torque and slope of the tip for any motion of the motor.
+    The model predicts torque and slope of the tip for any motion of the motor.
     """
 
     estimate: BeamEstimate
@@ -71,14 +71,14 @@ class TorqueModel:
     rate_hz: float
     """Rate of the angle in ticks a second."""
     ticks: int
-    """Length of the records in ticks, a multiple of `factor`."""
-    factor: int
-    """Number of ticks from one sample to the next."""
+    """Length of the records in ticks, a multiple of `sample_ticks`."""
+    sample_ticks: int
+    """Number of ticks from one sample of the model to the next."""
     transform: CausalTransform
     """Laplace transform of records, at the rate of the samples."""
     kernels: Complex
-    """Whitened derivatives of the response from angle to torque by the free parameters, shape
-    (k, K)."""
+    """Whitened derivatives of the response from angle to torque with respect to the free
+    parameters, shape (k, K)."""
     channels: Complex
     """Responses from angle to torque in N·m/rad and to the slope of the tip, shape (2, K)."""
 
@@ -101,8 +101,8 @@ class TorqueModel:
         transform = CausalTransform(
             2 * sample_count,
             rate_hz / ticks_per_point,
-            _WRAP_AROUND_DECAY,
-            highest_hz=_FADED_OVER_BAND * BAND_HZ,
+            _DECAY_EXPONENT,
+            highest_hz=_FADE_END_RATIO * BAND_HZ,
         )
         return cls(
             estimate,
@@ -117,21 +117,23 @@ class TorqueModel:
     @property
     def sample_hz(self) -> float:
         """Rate of the samples in Hz, at which derivatives of the torque are computed."""
-        return self.rate_hz / self.factor
+        return self.rate_hz / self.sample_ticks
 
     def spectrum(self, angle_rad: Real) -> Complex:
         """Return the Laplace transform of a motor angle at the frequencies of the band.
 
         The angle in rad begins at rest and has the shape (n,), with n at most `ticks`.
         """
-        return self.transform.forward(angle_rad, oversampling=self.factor)
+        return self.transform.forward(angle_rad, oversampling=self.sample_ticks)
 
     def whitened_derivatives(self, angle_transform: Complex) -> Real:
-        """Return derivatives of the torque by the free parameters over the noise, at each sample.
+        """Return the whitened derivatives of the torque for the k free parameters, at each sample.
 
-        `angle_transform` is the transform of the angle. The shape is (k, ticks / factor).
+        `angle_transform` is the transform of the angle. The shape is (k, ticks / sample_ticks).
         """
-        return self.transform.inverse(self.kernels * angle_transform, self.ticks // self.factor)
+        return self.transform.inverse(
+            self.kernels * angle_transform, self.ticks // self.sample_ticks
+        )
 
     def torque_and_slope(self, angle_transform: Complex) -> Real:
         """Return torque in N·m and slope of the tip in rad at every tick, shape (2, ticks).
@@ -139,7 +141,7 @@ class TorqueModel:
         `angle_transform` is the transform of the angle.
         """
         return self.transform.inverse(
-            self.channels * angle_transform, self.ticks, oversampling=self.factor
+            self.channels * angle_transform, self.ticks, oversampling=self.sample_ticks
         )
 
 
@@ -166,9 +168,10 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
 
 
 def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Complex:
-    """Return derivatives of the response from angle to torque by the parameters, shape (k, K).
+    """Return whitened derivatives of the response from angle to torque for each parameter.
 
-    They are whitened: divided by the noise spectrum so that the noise of a sample has variance 1.
+    They are divided by the noise spectrum so that the noise of a sample has variance 1. The shape
+    is (k, K).
 
     Parameters
     ----------
@@ -191,7 +194,7 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
         g, beam_gradient = plant.transfer_and_gradient(s, derivative_names)
     channel_response = plant.channel_response(s)
     kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
-    kernels[len(parameter_names) :] = _derivatives_by_constants(estimate, s) * channel_response
+    kernels[len(parameter_names) :] = _modal_derivatives(estimate, s) * channel_response
     gradient_rows = iter(beam_gradient)
     for out, parameter_name, parameter_scale in zip(
         kernels[: len(parameter_names)], parameter_names, parameter_scales(estimate), strict=True
@@ -206,8 +209,8 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     return kernels
 
 
-def _derivatives_by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
-    """Return derivatives of the response by the constants of free modes and of the background.
+def _modal_derivatives(estimate: BeamEstimate, s: Complex) -> Complex:
+    """Return the response's derivatives for the constants of free modes and of the background.
 
     The shape is (number of constants, K).
     """
@@ -235,21 +238,21 @@ def _derivatives_by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
 
 
 def ticks_per_sample(rate_hz: float) -> int:
-    """Return the number of ticks from one sample to the next, so that samples contain the band."""
-    return max(int(rate_hz / (_SAMPLE_RATE_OVER_BAND * BAND_HZ)), 1)
+    """Return the number of ticks per sample, so small that the samples contain the band."""
+    return max(int(rate_hz / (_MIN_SAMPLE_RATE_RATIO * BAND_HZ)), 1)
 
 
 def _whitening_weights(
     estimate: BeamEstimate, frequency_hz: NDArray[np.floating[Any]], sample_hz: float
 ) -> Real:
-    """Return weights of frequencies with which the torque noise of a sample has variance 1.
+    """Return the weights of frequencies that whiten the torque noise: a sample has variance 1.
 
     They fade to 0 above the end of the band.
     """
     log_noise_density = np.interp(
         frequency_hz, estimate.noise_frequency_hz, np.log(estimate.noise_nm2_per_hz)
     )
-    fade_factors = np.clip((frequency_hz / BAND_HZ - 1.0) / (_FADED_OVER_BAND - 1.0), 0.0, 1.0)
+    fade_factors = np.clip((frequency_hz / BAND_HZ - 1.0) / (_FADE_END_RATIO - 1.0), 0.0, 1.0)
     whitening_weights: Real = np.exp(-0.5 * log_noise_density) * np.sqrt(2.0 / sample_hz)
     whitening_weights *= 0.5 + 0.5 * np.cos(pi * fade_factors)
     return whitening_weights
@@ -264,20 +267,20 @@ class RecordSoFar:
 
     estimate: BeamEstimate
     """Estimate of the beam from which the information is computed."""
-    before: Real
-    """Gram matrix of the torque's derivatives and of m nuisance terms up to now, shape
+    past_gram: Real
+    """Gram matrix of the record's k torque derivatives and m nuisance terms, shape
     (k + m, k + m)."""
-    ahead: Real
+    future_rows: Real
     """Derivatives and nuisance terms from now on if the motor is held, shape (k + m, samples)."""
-    ringing: Real
+    ringing_motion: Real
     """Torque in N·m and slope of the tip in rad from now on if the motor is held, shape
     (2, ticks)."""
 
     @classmethod
     def from_angle(
-        cls, angle_rad: Real, estimate: BeamEstimate, rate_hz: float, ahead_s: float = 0.0
+        cls, angle_rad: Real, estimate: BeamEstimate, rate_hz: float, future_s: float = 0.0
     ) -> "RecordSoFar":
-        """Return derivatives and continuing vibration, predicted from the motor's angle.
+        """Return a record's derivatives and continuing vibration, predicted from the motor's angle.
 
         Parameters
         ----------
@@ -288,7 +291,7 @@ class RecordSoFar:
             Beam, damping and noise.
         rate_hz
             Rate of the angle.
-        ahead_s
+        future_s
             Time in s from now on for which the continuing vibration is computed.
         """
         ticks_per_point = ticks_per_sample(rate_hz)
@@ -296,23 +299,23 @@ class RecordSoFar:
         angle_rad = np.concatenate(
             [np.zeros(-angle_rad.size % ticks_per_point), angle_rad - angle_rad[0]]
         )
-        ahead_samples = -(-round(ahead_s * rate_hz) // ticks_per_point)
+        future_samples = -(-round(future_s * rate_hz) // ticks_per_point)
         record_samples = angle_rad.size // ticks_per_point
         torque_model = TorqueModel.for_records(
-            estimate, rate_hz, angle_rad.size + ahead_samples * ticks_per_point
+            estimate, rate_hz, angle_rad.size + future_samples * ticks_per_point
         )
         spectrum = torque_model.spectrum(angle_rad)
         whitened_rows = np.concatenate(
             [
-                torque_model.whitened_derivatives(spectrum)[:, : record_samples + ahead_samples],
-                _nuisance_terms(estimate, record_samples + ahead_samples, torque_model.sample_hz),
+                torque_model.whitened_derivatives(spectrum)[:, : record_samples + future_samples],
+                _nuisance_terms(estimate, record_samples + future_samples, torque_model.sample_hz),
             ]
         )
         ringing_motion = np.zeros((2, 0))
-        if ahead_samples:
+        if future_samples:
             next_tick = angle_rad.size
             ringing_motion = torque_model.torque_and_slope(spectrum)[
-                :, next_tick : next_tick + ahead_samples * ticks_per_point
+                :, next_tick : next_tick + future_samples * ticks_per_point
             ]
         recorded_rows = whitened_rows[:, :record_samples]
         return cls(
@@ -326,7 +329,7 @@ class RecordSoFar:
     def nuisance_projection(self) -> Real:
         """Matrix that projects the nuisance terms out of the derivatives, shape (k, k + m)."""
         k = len(self.estimate.names)
-        return np.concatenate([np.eye(k), -_regression_coefficients(self.before, k)], axis=1)
+        return np.concatenate([np.eye(k), -_regression_coefficients(self.past_gram, k)], axis=1)
 
     def information_after(self, added_rows: Real | None, sample_count: int) -> Real:
         """Return the Fisher information on the parameters after further samples, shape (k, k).
@@ -339,12 +342,12 @@ class RecordSoFar:
         sample_count
             Number of further samples that count.
         """
-        whitened_rows = self.ahead[:, :sample_count]
+        whitened_rows = self.future_rows[:, :sample_count]
         if added_rows is not None:
             whitened_rows = whitened_rows.copy()
             whitened_rows[: added_rows.shape[0]] += added_rows[:, :sample_count]
         return projected_information(
-            self.before + whitened_rows @ whitened_rows.T, len(self.estimate.names)
+            self.past_gram + whitened_rows @ whitened_rows.T, len(self.estimate.names)
         )
 
 
@@ -353,7 +356,7 @@ def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real
 
     Free decay from before the record, and offset and drift of the torque, are unknown as well and
     reduce the information. The parameters are in the order of ``estimate.names``. For zeta, gamma,
-    density over stiffness and stiffness they are the logarithms. The inverse of the information is
+    density over stiffness and stiffness, logarithms are used. The inverse of the information is
     the smallest covariance that an unbiased estimate can have.
 
     Parameters
@@ -391,7 +394,7 @@ def projected_information(gram: Real, k: int) -> Real:
     Parameters
     ----------
     gram
-        Gram matrix of the derivatives by all parameters, shape (k + m, k + m).
+        Gram matrix of the derivatives for all parameters, shape (k + m, k + m).
     k
         Number of parameters of interest.
     """
@@ -449,7 +452,7 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
 
 
 def _nuisance_terms(estimate: BeamEstimate, sample_count: int, sample_hz: float) -> Real:
-    """Return effects on a record's torque that are not of interest: free decays, offset, drift.
+    """Return the nuisance terms of a record's torque: free decays, offset and drift.
 
     The shape is (m, samples).
     """

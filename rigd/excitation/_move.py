@@ -109,7 +109,7 @@ def move(
         )
     planned_move = shortest_move(rig_plant, distance_rad, start_rad=start_rad, robust=bool(robust))
     segment_ticks = lay_out_segments(rate_hz, rest_s, planned_move.duration_s, ring_down_s)
-    end = predict_move_end(rig_plant, planned_move.reference_rad, ring_down_s)
+    move_end = predict_move_end(rig_plant, planned_move.reference_rad, ring_down_s)
     parameters: dict[str, float | int | str] = {
         "angle_rad": target_rad,
         "by_rad": distance_rad,
@@ -119,13 +119,13 @@ def move(
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
         "limits_share": planned_move.limit_fraction,
-        "residual_nm": end.residual_nm,
-        "residual_floor_nm": end.floor_nm,
+        "residual_nm": move_end.residual_nm,
+        "residual_floor_nm": move_end.floor_nm,
         "frequency_residual_nm": planned_move.residual_nm,
         "quintic_residual_nm": planned_move.quintic_residual_nm,
     }
-    if end.arrival_s is not None:
-        parameters["arrival_s"] = end.arrival_s
+    if move_end.arrival_s is not None:
+        parameters["arrival_s"] = move_end.arrival_s
     return Excitation(
         kind="move",
         parameters=parameters,

@@ -49,10 +49,10 @@ Complex = NDArray[np.complex128]
 _MAX_REDUCTIONS: Final = 8
 """Largest number of times that the amplitude of a sweep is reduced to stay within the limits."""
 _LIMIT_TOLERANCE: Final = 1.005
-"""Factor by which a sweep may exceed its fraction of the limits, which ends the reductions."""
+"""Factor by which a sweep may still exceed its fraction of the limits after the last reduction."""
 
 LEAST_TIME_FRACTION: Final = 0.5
-"""Shortest time of a band over the time of an equal division, so that no mode is left out."""
+"""Shortest time of a band, relative to its time in an equal division: no mode is left out."""
 
 SAME_MODE_FREQUENCY_RATIO: Final = 1.1
 """Largest ratio of two frequencies that belong to one mode. Fits of one record differ by less in a
@@ -331,7 +331,7 @@ def time_fractions(
 ) -> Real:
     """Return the fraction of the sweep's time for each band that measures damping most precisely.
 
-    They minimise the geometric mean of the standard deviations of the damping's parameters, with
+    The geometric mean of the standard deviations of the damping's parameters is minimised, with
     all other parameters free, by multiplicative steps (D. M. Titterington, 1976; for criteria
     other than the determinant S. D. Silvey, D. M. Titterington and B. Torsney, 1978).
 
@@ -370,8 +370,8 @@ def time_fractions(
 def first_order_damping(modes: Sequence[FoundMode], beam: Beam) -> Damping:
     """Return the internal and external damping of order 1 that fits the modes' damping ratios best.
 
-    It minimises the relative squares of ``2 ratio = zeta omega + gamma / ((rho/EI) omega)`` with
-    coefficients that are not negative.
+    It minimises the squared relative errors of ``2 ratio = zeta omega + gamma / ((rho/EI) omega)``,
+    with coefficients that are not negative.
     """
     mode_rad_s = np.array([2.0 * pi * found_mode.frequency_hz for found_mode in modes])
     damping_ratios = np.array([found_mode.damping_ratio for found_mode in modes])
@@ -393,8 +393,8 @@ def _information_rates(
 ) -> tuple[Real, int]:
     """Return the Fisher information per second of each band, and the number of damping parameters.
 
-    The information has the shape (bands, k, k), with the damping's parameters first. Coefficients
-    are relative. The order of an absent damping cannot be estimated.
+    The information has the shape (bands, k, k), with the damping's parameters first. That on
+    coefficients is on their relative changes. The order of an absent damping is not a parameter.
     """
     damping_factors = {"zeta": damping.zeta, "alpha": 1.0, "gamma": damping.gamma, "lambda": 1.0}
     coefficients_by_order = {"alpha": damping.zeta, "lambda": damping.gamma}
@@ -423,7 +423,7 @@ def _information_rates(
 def _beam_with_mode(beam: Beam, frequency_hz: float) -> Beam:
     """Return the beam with a density such that its mode nearest to a frequency has this frequency.
 
-    The profile's beam is wrong by more than the width of a band.
+    It is needed because the profile's frequencies may be wrong by more than the width of a band.
     """
     mode_rad_s = 2.0 * pi * frequency_hz
     modes_rad_s = undamped_frequencies_rad_s(beam, 12)
@@ -497,10 +497,13 @@ def modes(
     require_positive("taper_s", taper_s, "s")
     require_positive("tip_slope_rad", tip_slope_rad, "rad")
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
-    sweep_begin, end = segments["sweep"]
+    sweep_begin, sweep_end = segments["sweep"]
     sweep_bands = _read_bands(Path(path), stop_hz, widths, rate_hz)
     fade_ticks = 2 * round(taper_s * rate_hz)
-    if fade_ticks < 2 or LEAST_TIME_FRACTION * (end - sweep_begin) / len(sweep_bands) < fade_ticks:
+    if (
+        fade_ticks < 2
+        or LEAST_TIME_FRACTION * (sweep_end - sweep_begin) / len(sweep_bands) < fade_ticks
+    ):
         raise ExcitationError(
             f"duration_s = {duration_s:g} s is too short for fades of taper_s = {taper_s:g} s at "
             f"both ends of {len(sweep_bands)} sweeps; choose at least "
@@ -508,7 +511,7 @@ def modes(
             f"{2 / rate_hz:g} s."
         )
     sweep_ticks = _divide_ticks(
-        np.full(len(sweep_bands), 1.0 / len(sweep_bands)), end - sweep_begin
+        np.full(len(sweep_bands), 1.0 / len(sweep_bands)), sweep_end - sweep_begin
     )
     amplitudes_rad = [amplitude_rad] * len(sweep_bands)
     sweeps = [
@@ -518,7 +521,7 @@ def modes(
     if rig is not None:
         reduced_rad = _admissible_amplitudes(sweeps, amplitude_rad, tip_slope_rad, rig)
         sweep_ticks = _divide_ticks(
-            _raise_to_least(time_fractions(sweep_bands, reduced_rad, rig)), end - sweep_begin
+            _raise_to_least(time_fractions(sweep_bands, reduced_rad, rig)), sweep_end - sweep_begin
         )
         sweeps = [
             _unit_sweep(*band_and_ticks, fade_ticks, rate_hz)

@@ -69,26 +69,28 @@ def declared_options(
 def _option(argument: inspect.Parameter) -> ExcitationOption:
     """Return the option that an argument declares."""
     value_type: Any = argument.annotation
-    extras: list[Any] = []
+    metadata: list[Any] = []
     if get_origin(value_type) is Annotated:
-        value_type, *extras = get_args(value_type)
+        value_type, *metadata = get_args(value_type)
     required = argument.default is inspect.Parameter.empty
     return ExcitationOption(
         name=argument.name,
         value_type=value_type,
         default=None if required else argument.default,
         required=required,
-        help=next((each.documentation for each in extras if isinstance(each, DocInfo)), ""),
+        help=next((each.documentation for each in metadata if isinstance(each, DocInfo)), ""),
     )
 
 
 def documented(function: F) -> F:
     """Add the section ``Parameters`` to the docstring of a function, from its signature."""
-    summary, separator, rest = inspect.cleandoc(function.__doc__ or "").partition("\nRaises\n---")
+    summary, separator, raises_text = inspect.cleandoc(function.__doc__ or "").partition(
+        "\nRaises\n---"
+    )
     entries = "".join(
         f"{option.name}\n    {option.help}\n"
         for option in declared_options(function, with_rig=True)
     )
     section = f"\nParameters\n----------\n{entries}"
-    function.__doc__ = f"{summary.rstrip()}\n{section}{separator}{rest}"
+    function.__doc__ = f"{summary.rstrip()}\n{section}{separator}{raises_text}"
     return function

@@ -33,7 +33,7 @@ class DisturbedRig(Protocol):
 
     @property
     def disturbed(self) -> Callable[[Real, int], tuple[Real, Real]]:
-        """Function of a reference, shape (n,), and a number of lowest modes.
+        """Function that simulates the rig, of a reference, shape (n,), and a number of modes.
 
         It returns the angle in rad, shape (n, draws), and the amplitude of each mode's coupling
         torque in N·m, shape (n, modes, draws), for several random draws.
@@ -68,8 +68,8 @@ class MoveEnd:
     residual_nm: float
     """Coupling torque in N·m of the residual vibration, with friction, encoder steps and noise."""
     floor_nm: float
-    """Coupling torque in N·m that the sensor's noise alone simulates in the ring-down, exceeded in
-    one of 1000 cases. A smaller vibration cannot be detected."""
+    """Amplitude in N·m of the coupling torque that noise of the sensor alone exceeds in one of 1000
+    ring-downs. A smaller vibration cannot be detected."""
 
 
 def predict_move_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
@@ -84,15 +84,15 @@ def predict_move_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float)
     ring_down_s
         Duration of the ring-down in the session, in s.
     """
-    rate_hz, end = rig.rate_hz, reference_rad.size
+    rate_hz, end_tick = rig.rate_hz, reference_rad.size
     ringing_poles = rig.poles_rad_s[np.abs(rig.poles_rad_s) < 2 * np.pi * ROBUST_BELOW_HZ]
     if not ringing_poles.size:
         ringing_poles = rig.poles_rad_s[:1]
     decay_per_s = -ringing_poles.real
     # The loop has followed up and the motor is at rest; from here the amplitudes only decay.
-    measured_tick = end + round(2 * rig.settling_s * rate_hz)
+    measured_tick = end_tick + round(2 * rig.settling_s * rate_hz)
     held_angle_rad = np.full(
-        max(measured_tick - end + 1, round(_MIN_SIMULATED_S * rate_hz)), reference_rad[-1]
+        max(measured_tick - end_tick + 1, round(_MIN_SIMULATED_S * rate_hz)), reference_rad[-1]
     )
     angles_rad, mode_torques_nm = rig.disturbed(
         np.concatenate([[0.0], reference_rad, held_angle_rad]), ringing_poles.size
@@ -103,10 +103,10 @@ def predict_move_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float)
     arrival_tick = int(ticks_outside[-1]) + 1 if ticks_outside.size else 0
     mode_amplitudes = (
         mode_torques_nm[measured_tick]
-        * np.exp(decay_per_s * (measured_tick - end) / rate_hz)[:, None]
+        * np.exp(decay_per_s * (measured_tick - end_tick) / rate_hz)[:, None]
     )
     # Variance of a decaying cosine's amplitude in white noise, by least squares.
-    first_s, last_s = max(arrival_tick - end, 0) / rate_hz, max(ring_down_s, _MIN_RING_DOWN_S)
+    first_s, last_s = max(arrival_tick - end_tick, 0) / rate_hz, max(ring_down_s, _MIN_RING_DOWN_S)
     decay_factors = [
         np.exp(-2 * decay_per_s * time_s) for time_s in (first_s, max(last_s, 2 * first_s))
     ]

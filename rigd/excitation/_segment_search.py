@@ -47,8 +47,8 @@ _SETTLING_S: Final = 0.25
 """Time in s after a segment for which its response is checked against the limits."""
 
 _TAIL_S: Final = 1.0
-"""Time in s after a segment over which the vibration of the modes is separated, and the modes that
-the segment does not excite are brought to rest."""
+"""Time in s after a segment from which the vibration of each mode is computed, to bring the modes
+that the segment does not excite to rest."""
 
 HORIZON_S: Final = 8.0
 """Planning horizon in s from the start of a segment. A mode gives information on its damping only
@@ -61,8 +61,8 @@ _BASE_AMPLITUDE_FACTORS: Final = (1.0, 0.8, 0.5)
 """Factors by which a segment's amplitude is multiplied when a further band is added to it."""
 
 _MIXTURE_EFFICIENCY: Final = 0.7
-"""Time of a mixture of steady sines over the time of segments with the same information, whose
-modes have to ring up (measured)."""
+"""Ratio of the time of a mixture of steady sines to that of segments with the same information, in
+which the modes have to ring up first; a measured value."""
 
 _MAX_RELAXATIONS: Final = 3
 """Largest number of times that the targets are relaxed to fit into the remaining time."""
@@ -131,8 +131,10 @@ class SegmentSearch:
             raise ExcitationError(
                 f"The estimated beam has no mode below {BAND_HZ:g} Hz that could be driven."
             )
-        self.model = TorqueModel.for_records(estimate, plant.rate_hz, record.ringing.shape[1])
-        self.samples = record.ahead.shape[1]
+        self.model = TorqueModel.for_records(
+            estimate, plant.rate_hz, record.ringing_motion.shape[1]
+        )
+        self.sample_count = record.future_rows.shape[1]
         self.limits = (
             LIMIT_FRACTION
             * limit_fraction
@@ -148,12 +150,12 @@ class SegmentSearch:
             )
         )
         # The torque of the remaining vibration acts on the motor that holds, and on the sensor.
-        torque_nm, slope_rad = record.ringing
+        torque_nm, slope_rad = record.ringing_motion
         zero_channel = np.zeros_like(torque_nm)
         ringing_channels = np.stack(
             [zero_channel, zero_channel, zero_channel, torque_nm, torque_nm, slope_rad]
         )
-        self.ringing = ringing_channels / self.limits[:, None]
+        self.ringing_fractions = ringing_channels / self.limits[:, None]
         self.line_hz, self.line_amplitudes_rad = steady_sines(
             estimate, self.modes, plant, self.limits
         )
@@ -161,13 +163,13 @@ class SegmentSearch:
         self.mixture = best_mixture(
             known_information, estimate, quantities, self.line_hz, self.line_amplitudes_rad
         )
-        self.needed_s = self._mixture_time_s()
+        self.mixture_s = self._mixture_time_s()
         # With too little time all targets are missed by one factor, not the last mode alone.
-        relaxation, needed_s = 1.0, self.needed_s
+        relaxation, mixture_s = 1.0, self.mixture_s
         for _ in range(_MAX_RELAXATIONS):
-            if not time_left_s < needed_s < UNREACHABLE_S:
+            if not time_left_s < mixture_s < UNREACHABLE_S:
                 break
-            relaxation *= (needed_s / time_left_s) ** 0.5
+            relaxation *= (mixture_s / time_left_s) ** 0.5
             self.mixture = best_mixture(
                 known_information,
                 estimate,
@@ -176,10 +178,10 @@ class SegmentSearch:
                 self.line_amplitudes_rad,
                 relaxation,
             )
-            needed_s = self._mixture_time_s()
-        self.weighted_if_held = self.mixture.weights @ record.nuisance_projection @ record.ahead
+            mixture_s = self._mixture_time_s()
+        self.rows_if_held = self.mixture.weights @ record.nuisance_projection @ record.future_rows
         self._continued_drives: dict[float, ContinuedDrive] = {}
-        self.tip_slope = self.ringing[-1, :: self.model.factor][: self.samples]
+        self.tip_slope = self.ringing_fractions[-1, :: self.model.sample_ticks][: self.sample_count]
 
     def best_candidate(
         self, time_left_s: float, mode_numbers: Collection[int] = ()
@@ -196,7 +198,7 @@ class SegmentSearch:
             )
         return max(
             (self.best_of_duration(d, mode_numbers) for d in durations_s),
-            key=lambda each: each.value,
+            key=lambda each: each.information_s,
         )
 
     def best_of_duration(
@@ -214,8 +216,8 @@ class SegmentSearch:
             duration_s,
             (),
             (),
-            self.ringing[:, : self.ticks(duration_s + _SETTLING_S) : _LIMIT_CHECK_TICKS],
-            self.weighted_if_held,
+            self.ringing_fractions[:, : self.ticks(duration_s + _SETTLING_S) : _LIMIT_CHECK_TICKS],
+            self.rows_if_held,
             self.tip_slope,
             0.0,
         )
@@ -243,7 +245,7 @@ class SegmentSearch:
                 for start_candidate in (empty_candidate, candidates_at_rest[sweep_band.mode_number])
                 for phase_index in range(_PHASE_COUNT)
             ),
-            key=lambda each: each.value,
+            key=lambda each: each.information_s,
         )
         for _ in range(2):
             driven_modes = {sweep_band.mode_number for sweep_band, _ in leading_candidate.parts}
@@ -257,9 +259,9 @@ class SegmentSearch:
                 for phase_index in range(0, _PHASE_COUNT, 2)
             ]
             better_candidate = max(
-                extended_candidates, key=lambda each: each.value, default=leading_candidate
+                extended_candidates, key=lambda each: each.information_s, default=leading_candidate
             )
-            if better_candidate.value <= leading_candidate.value:
+            if better_candidate.information_s <= leading_candidate.information_s:
                 break
             leading_candidate = better_candidate
         return leading_candidate
@@ -304,7 +306,7 @@ class SegmentSearch:
         )
         amplitude_fraction = min(1.0, largest_factor(start_candidate.channels, summed_channels))
         summed_weighted = sum(
-            f * other_sweep.weighted
+            f * other_sweep.weighted_rows
             for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
         )
         return SegmentCandidate(
@@ -315,7 +317,7 @@ class SegmentSearch:
                 for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
             ),
             start_candidate.channels + amplitude_fraction * summed_channels,
-            start_candidate.weighted + amplitude_fraction * summed_weighted,
+            start_candidate.weighted_rows + amplitude_fraction * summed_weighted,
             start_candidate.tip_slope
             + amplitude_fraction
             * sum(
@@ -353,7 +355,7 @@ class SegmentSearch:
         )
         loop_response = self.plant.respond(extended_reference_rad)
         spectrum = self.model.spectrum(loop_response.angle_rad)
-        whitened_rows = self.model.whitened_derivatives(spectrum)[:, : self.samples]
+        whitened_rows = self.model.whitened_derivatives(spectrum)[:, : self.sample_count]
         slope_rad = self.model.torque_and_slope(spectrum)[1]
         limit_channels = np.stack(
             [
@@ -369,8 +371,8 @@ class SegmentSearch:
             reference_rad=reference_rad,
             angle_rad=loop_response.angle_rad[:n],
             rows=whitened_rows,
-            weighted=self.mixture.weights @ whitened_rows,
-            slope=slope_rad[:: self.model.factor][: self.samples] / self.limits[-1],
+            weighted_rows=self.mixture.weights @ whitened_rows,
+            slope=slope_rad[:: self.model.sample_ticks][: self.sample_count] / self.limits[-1],
             channels=limit_channels / self.limits[:, None],
         )
 
@@ -390,7 +392,9 @@ class SegmentSearch:
         phase_rad = 2 * pi * phase_index / _PHASE_COUNT
         sine_factor, cosine_factor = float(np.cos(phase_rad)), float(np.sin(phase_rad))
         first_sweep, second_sweep = sweep_pair
-        ringing_channels = self.ringing[:, : first_sweep.channels.shape[1] : _LIMIT_CHECK_TICKS]
+        ringing_channels = self.ringing_fractions[
+            :, : first_sweep.channels.shape[1] : _LIMIT_CHECK_TICKS
+        ]
         unit_channels = (
             sine_factor * first_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
             + cosine_factor * second_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
@@ -405,11 +409,11 @@ class SegmentSearch:
         tip_slope_fractions += amplitude_rad * (
             sine_factor * first_sweep.slope + cosine_factor * second_sweep.slope
         )
-        weighted_rows = self.weighted_if_held + amplitude_fraction * (
-            base_candidate.weighted - self.weighted_if_held
+        weighted_rows = self.rows_if_held + amplitude_fraction * (
+            base_candidate.weighted_rows - self.rows_if_held
         )
         weighted_rows += amplitude_rad * (
-            sine_factor * first_sweep.weighted + cosine_factor * second_sweep.weighted
+            sine_factor * first_sweep.weighted_rows + cosine_factor * second_sweep.weighted_rows
         )
         leading_band = base_candidate.parts[0][0] if base_candidate.parts else sweep_band
         information_value = self.information_to_horizon(
@@ -445,28 +449,30 @@ class SegmentSearch:
         tip_slope_fractions: Real,
         duration_s: float,
     ) -> float:
-        """Return the information up to the planning horizon if a mode is driven after a segment.
+        """Return the information up to the planning horizon from a segment and the time after it.
 
-        The motor then holds the amplitude that the mode has at the end of the segment.
+        After the segment the motor holds the amplitude that the band's mode has at its end.
         """
         first_sample = self.model_samples(duration_s)
-        remaining_samples = self.samples - first_sample
+        remaining_samples = self.sample_count - first_sample
         continued_drive = self.continued_drive(sweep_band)
         mode_amplitudes = (
             self.amplitude_matrix
             @ tip_slope_fractions[first_sample : first_sample + self.amplitude_matrix.shape[1]]
         )
         mode_row = 2 * [beam_mode.mode for beam_mode in self.modes].index(sweep_band.mode_number)
-        drive_factors = continued_drive.per_amplitude @ mode_amplitudes[mode_row : mode_row + 2]
+        drive_factors = (
+            continued_drive.drive_per_amplitude @ mode_amplitudes[mode_row : mode_row + 2]
+        )
         rows_before = weighted_rows[:, :first_sample]
         rows_after = weighted_rows[:, first_sample:] + np.tensordot(
-            drive_factors, continued_drive.weighted[:, :, :remaining_samples], axes=1
+            drive_factors, continued_drive.weighted_rows[:, :, :remaining_samples], axes=1
         )
         return float(np.vdot(rows_before, rows_before) + np.vdot(rows_after, rows_after))
 
     @cached_property
     def amplitude_matrix(self) -> Real:
-        """Matrix from one second of the tip's slope to the modes' complex amplitudes.
+        """Matrix that maps one second of the tip's slope to the modes' complex amplitudes.
 
         The shape is (2 m, n), with a row each for real and imaginary part of the m amplitudes.
         """
@@ -484,7 +490,7 @@ class SegmentSearch:
         if sweep_band.middle_hz not in self._continued_drives:
             duration_s = HORIZON_S - DURATIONS_S[0]
             sine_pair = self.sweep_pair(replace(sweep_band, half_width_hz=0.0), duration_s)
-            weighted_rows = np.stack([sine_sweep.weighted for sine_sweep in sine_pair])
+            weighted_rows = np.stack([sine_sweep.weighted_rows for sine_sweep in sine_pair])
             driven_mode = next(
                 beam_mode for beam_mode in self.modes if beam_mode.mode == sweep_band.mode_number
             )
@@ -511,7 +517,7 @@ class SegmentSearch:
         estimate, quantities = self.estimate, self.quantities
         segment_samples = self.model_samples(chosen_candidate.duration_s)
         segment_channels = chosen_candidate.weighted_sum("channels")
-        ringing_channels = self.ringing[:, : segment_channels.shape[1]]
+        ringing_channels = self.ringing_fractions[:, : segment_channels.shape[1]]
         # Between the checked ticks a peak is a little higher.
         amplitude_fraction = min(1.0, largest_factor(ringing_channels, segment_channels))
         present_covariance = covariance_of(self.record.information_after(None, 0), estimate)
@@ -536,7 +542,7 @@ class SegmentSearch:
         )
 
     def _mixture_time_s(self) -> float:
-        """Return the time in s of segments with the information of the best mixture."""
+        """Return the time in s that segments need for the information of the best mixture."""
         ring_up_s = time_with_ring_up(self.mixture.times_s, self.line_hz, self.modes)
         return ring_up_s / _MIXTURE_EFFICIENCY
 
@@ -547,7 +553,7 @@ class SegmentSearch:
         ]
         if impossible_reasons:
             return PrecisionForecast(inf, impossible_reasons[0])
-        forecast_s = self.needed_s
+        forecast_s = self.mixture_s
         if not forecast_s < UNREACHABLE_S:
             return PrecisionForecast(inf, "the motor cannot excite the modes that determine it")
         if forecast_s <= time_left_s:

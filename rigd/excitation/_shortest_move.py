@@ -47,8 +47,8 @@ _MAX_ROUNDS: Final = 14
 """Largest number of durations that the search tries."""
 _MAX_BACKWARD_SPEED_FRACTION: Final = 0.01
 """Largest backward speed of a robust move, as a fraction of its mean speed."""
-_BRAKING_STARTS: Final = 16
-"""Number of ticks along a reference from which braking is simulated."""
+_BRAKING_START_COUNT: Final = 16
+"""Number of ticks, spread over a reference, from which braking is simulated."""
 _BRAKING_DURATIONS_S: Final = (0.02, 5.0)
 """Shortest and longest duration in s of a braking path that is tried."""
 
@@ -218,8 +218,8 @@ class _MoveSearch:
         self._plant = plant
         self._distance_rad = distance_rad
         self._start_rad = start_rad
-        self._order = zero_order
-        self._ringing = initial_states
+        self._zero_order = zero_order
+        self._initial_states = initial_states
         self._unit_response = _UnitResponse(plant)
         ringing_torque_nm = 0.0
         if initial_states is not None:
@@ -245,7 +245,7 @@ class _MoveSearch:
         rate_hz = self._plant.rate_hz
         longest_ticks = round(LONGEST_MOVE_S * rate_hz)
         slowest_rad_s = float(np.abs(self._plant.poles_rad_s).min())
-        n = round((1.0 if self._order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
+        n = round((1.0 if self._zero_order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
         too_short_ticks, sufficient_ticks, fraction_short, fraction_sufficient = (
             8,
             longest_ticks + 1,
@@ -276,7 +276,7 @@ class _MoveSearch:
                 fraction_sufficient,
                 n,
                 used_fraction,
-                self._order,
+                self._zero_order,
             )
             n = min(n, longest_ticks)
         if best_accelerations is None:
@@ -301,7 +301,7 @@ class _MoveSearch:
         edge_ticks = np.round(np.linspace(0, n, interval_count + 1)).astype(int)
         acceleration_scale = plant.largest_acceleration_rad_s2
 
-        vibration_map = residual_vibration_map(n, rate_hz, plant.poles_rad_s, self._order)
+        vibration_map = residual_vibration_map(n, rate_hz, plant.poles_rad_s, self._zero_order)
         vibration_per_interval = (
             np.add.reduceat(vibration_map, edge_ticks[:-1], axis=1) * acceleration_scale
         )
@@ -317,7 +317,7 @@ class _MoveSearch:
         )
         equality_values = np.zeros(len(equality_matrix))
         equality_values[1] = self._distance_rad
-        if self._ringing is not None:
+        if self._initial_states is not None:
             equality_values[2:] = np.negative(self._ringing_rows(n))
         row_norms = np.linalg.norm(equality_matrix, axis=1)
 
@@ -357,12 +357,14 @@ class _MoveSearch:
 
         Real and imaginary parts are in the order of the rows of `residual_vibration_map`.
         """
-        assert self._ringing is not None
+        assert self._initial_states is not None
         state_rows: list[float] = []
-        for mode_pole, mode_state in zip(self._plant.poles_rad_s, self._ringing, strict=True):
+        for mode_pole, mode_state in zip(
+            self._plant.poles_rad_s, self._initial_states, strict=True
+        ):
             end_state = mode_state * np.exp(mode_pole * n / self._plant.rate_hz)
             # The row of the derivative weighs the start by 1.
-            second_order = self._order > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
+            second_order = self._zero_order > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
             for _ in range(2 if second_order else 1):
                 state_rows += (
                     [end_state.real, end_state.imag] if mode_pole.imag != 0.0 else [end_state.real]
@@ -383,10 +385,12 @@ class _MoveSearch:
         angle.
         """
         plant = self._plant
-        end = n + round(plant.settling_s * plant.rate_hz)
+        end_tick = n + round(plant.settling_s * plant.rate_hz)
         # The ends of all intervals and the ticks between them: the solution exploits every gap.
         interval_middles = np.round((edge_ticks[:-1] + edge_ticks[1:]) / 2).astype(int)
-        settling_ticks = np.arange(n, end, max(1, ceil(n / len(edge_ticks))))[: _MAX_INTERVALS // 2]
+        settling_ticks = np.arange(n, end_tick, max(1, ceil(n / len(edge_ticks))))[
+            : _MAX_INTERVALS // 2
+        ]
         checked_ticks = np.unique(
             np.concatenate(
                 [edge_ticks, interval_middles if n > 2 * len(edge_ticks) else [], settling_ticks]
@@ -394,7 +398,7 @@ class _MoveSearch:
         )
         checked_ticks = checked_ticks.astype(int)
         every_second_tick = checked_ticks[::2]
-        unit_responses = self._unit_response.for_ticks(end)
+        unit_responses = self._unit_response.for_ticks(end_tick)
         limited_rows = [
             _interval_responses(
                 unit_responses[limit_name],
@@ -404,7 +408,7 @@ class _MoveSearch:
             * (acceleration_scale / self._limits[limit_name])
             for limit_name in self._limits
         ]
-        if self._order > 1 and self._ringing is None:
+        if self._zero_order > 1 and self._initial_states is None:
             forward_scale = np.copysign(acceleration_scale, self._distance_rad)
             backward_speed_map = -forward_scale * _interval_responses(
                 unit_responses["velocity"], edge_ticks, every_second_tick
@@ -487,8 +491,8 @@ class _UnitResponse:
         """Return the response of each quantity by name, for at least the given number of ticks."""
         if tick_count > self._ticks:
             self._ticks = max(2 * tick_count, 1024)
-            one = from_acceleration(np.ones(self._ticks), self._plant.rate_hz)
-            reference_rad = np.concatenate([[0.0], one[:-1]])
+            unit_reference_rad = from_acceleration(np.ones(self._ticks), self._plant.rate_hz)
+            reference_rad = np.concatenate([[0.0], unit_reference_rad[:-1]])
             loop_response = self._plant.respond(reference_rad)
             self._rows = {
                 "torque": loop_response.torque_nm,
@@ -539,7 +543,9 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
     torque is linear in speed and acceleration of the reference at the start.
     """
     held_reference = np.zeros(round(plant.settling_s * plant.rate_hz))
-    start_ticks = np.unique(np.linspace(2, reference_rad.size - 1, _BRAKING_STARTS).astype(int))
+    start_ticks = np.unique(
+        np.linspace(2, reference_rad.size - 1, _BRAKING_START_COUNT).astype(int)
+    )
     available_torque_nm = plant.peak_torque_nm - plant.friction_nm
     duration_s, longest_s = _BRAKING_DURATIONS_S
     while duration_s <= longest_s:

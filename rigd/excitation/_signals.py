@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 SAMPLES_PER_PERIOD = 4
-"""Smallest number of samples in a period of the reference; with fewer samples the reference is not
-a sine any more."""
+"""Smallest number of samples in a period of the reference; with fewer samples the reference no
+longer resembles a sine."""
 
 LIMIT_FRACTION = 0.9
 """Largest fraction of each of the rig's limits that the predicted motion may use. The remainder is
@@ -63,7 +63,7 @@ class Excitation:
     model
         Beam of an analysis for which the excitation was planned; None: the profile's beam.
     motion
-        What the motor does in the sweep, as a clause for the operator; empty if the kind says it.
+        Motion of the motor in the sweep, as a clause for the operator; empty if `kind` states it.
     """
 
     kind: str
@@ -82,7 +82,7 @@ class Excitation:
 
     @property
     def limits_force(self) -> bool:
-        """Whether a contact force ends the session, which the rig knows from the base shear."""
+        """Whether too large a contact force, derived from the base shear, ends the session."""
         return False
 
     @property
@@ -92,19 +92,19 @@ class Excitation:
 
     @property
     def ends_itself(self) -> bool:
-        """Whether the session itself plans its end."""
+        """Whether the end of the session is determined during the session."""
         return self.planned_ticks is not None
 
     @property
     def later_tip_slope_rad(self) -> float:
-        """Largest slope of the beam's free end in what is planned during the session; 0: none."""
+        """Largest slope of the beam's free end in segments planned during the session; 0: none."""
         return 0.0
 
 
 def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
-    """Return the frequency of a chirp in Hz at a tick, or None outside the sweep.
+    """Return the frequency in Hz of a chirp at a tick.
 
-    Return None for other excitations as well.
+    Return None outside the sweep, and for all other excitations.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def to_whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
 
 
 def require_finite(option: str, value: float, unit: str) -> None:
-    """Raise `ExcitationError` if an option's value is not finite, or has no size of a real rig."""
+    """Raise `ExcitationError` if an option's value is not finite, or implausible for any rig."""
     if not isfinite(value):
         raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
     if not is_usable_size(value):
@@ -210,8 +210,10 @@ def lay_out_segments(
     require_not_negative("rest_s", rest_s)
     require_positive("duration_s", duration_s, "s")
     require_not_negative("ring_down_s", ring_down_s)
-    around_s = rest_s + ring_down_s
-    check_ticks("The session", (duration_s + around_s) * rate_hz, rate_hz, around_s)
+    rest_and_ring_down_s = rest_s + ring_down_s
+    check_ticks(
+        "The session", (duration_s + rest_and_ring_down_s) * rate_hz, rate_hz, rest_and_ring_down_s
+    )
     sweep_begin = round(rate_hz * rest_s)
     sweep_end = sweep_begin + round(rate_hz * duration_s)
     record_end = max(sweep_end, round(rate_hz * (rest_s + duration_s + ring_down_s)))
@@ -227,22 +229,25 @@ def lay_out_segments(
     }
 
 
-def check_ticks(what: str, ticks: float, rate_hz: float, around_s: float = 0.0) -> None:
+def check_ticks(
+    message_start: str, ticks: float, rate_hz: float, rest_and_ring_down_s: float = 0.0
+) -> None:
     """Raise `ExcitationError` if a record has more ticks than can be analysed.
 
-    `what` begins the message, and `around_s` is the time of rest and ring-down together.
+    `message_start` is the subject of the message, and `rest_and_ring_down_s` the total duration of
+    rest and ring-down.
     """
     if ticks > MAX_SAMPLES:
         longest_s = MAX_SAMPLES / rate_hz
         limit_text = (
-            f" ({longest_s - around_s:g} s between rest and ring-down)"
-            if 0.0 < around_s < longest_s
+            f" ({longest_s - rest_and_ring_down_s:g} s between rest and ring-down)"
+            if 0.0 < rest_and_ring_down_s < longest_s
             else ""
         )
         raise ExcitationError(
-            f"{what} would take {ticks / rate_hz:g} s; {longest_s:g} s is the most at {rate_hz:g} "
-            f"Hz{limit_text}, because no more than {MAX_SAMPLES} samples can be analysed, exported "
-            "or replayed: shorten it or run several sessions."
+            f"{message_start} would take {ticks / rate_hz:g} s; {longest_s:g} s is the most at "
+            f"{rate_hz:g} Hz{limit_text}, because no more than {MAX_SAMPLES} samples can be "
+            "analysed, exported or replayed: shorten it or run several sessions."
         )
 
 

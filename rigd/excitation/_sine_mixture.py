@@ -59,7 +59,9 @@ def steady_sines(
     pulse_response = plant.respond(pulse_reference_rad)
     laplace_factors = np.exp(-np.outer(s, np.arange(pulse_reference_rad.size) / plant.rate_hz))
     angle_transform = laplace_factors @ pulse_response.angle_rad
-    lag = laplace_factors @ (pulse_reference_rad - pulse_response.angle_rad) / angle_transform
+    relative_error_response = (
+        laplace_factors @ (pulse_reference_rad - pulse_response.angle_rad) / angle_transform
+    )
     motor_torque_response = (
         laplace_factors
         @ (pulse_response.torque_nm - pulse_response.coupling_torque_nm)
@@ -69,7 +71,7 @@ def steady_sines(
         [
             np.ones_like(s),
             s,
-            lag,
+            relative_error_response,
             motor_torque_response + torque_response,
             torque_response,
             slope_response,
@@ -85,7 +87,7 @@ class SineMixture:
     times_s: Real
     """Time in s for which each sine lasts; shape (m,)."""
     weights: Real
-    """Combinations of the torque's derivatives by the parameters, the sum of whose squares is the
+    """Weights of q combinations of the k derivatives of the torque, whose sum of squares is the
     information that brings the targets closer; shape (q, k)."""
 
 
@@ -99,9 +101,9 @@ def best_mixture(
 ) -> SineMixture:
     """Return durations of steady sines that together reach all target precisions soonest.
 
-    Uses multiplicative steps, as `time_fractions`, with a multiplier for each quantity. By the
-    equivalence theorem all sines of the best mixture give the same information per second on the
-    returned combinations, and no other sine gives more (V. V. Fedorov, Theory of optimal
+    The search takes multiplicative steps, as `time_fractions`, with a multiplier for each quantity.
+    By the equivalence theorem all sines of the best mixture give the same information per second on
+    the returned combinations, and no other sine gives more (V. V. Fedorov, Theory of optimal
     experiments, 1972).
 
     Parameters
@@ -203,7 +205,7 @@ def time_with_ring_up(times_s: Real, frequency_hz: Real, modes: Sequence[Pole]) 
 
     The information on the damping grows as ``1 - exp(-t / tau)`` at a constant amplitude.
     """
-    needed_s = float(times_s.sum())
+    total_s = float(times_s.sum())
     time_ratios = np.geomspace(1e-3, 1e3, 400)
     information_gain = (
         time_ratios - 2.0 * (1.0 - np.exp(-time_ratios)) + 0.5 * (1.0 - np.exp(-2.0 * time_ratios))
@@ -212,9 +214,9 @@ def time_with_ring_up(times_s: Real, frequency_hz: Real, modes: Sequence[Pole]) 
         range_hz = 1.5 * _SINE_OFFSETS[-1] * beam_mode.damping_ratio * beam_mode.frequency_hz
         at_mode_s = float(times_s[np.abs(frequency_hz - beam_mode.frequency_hz) < range_hz].sum())
         decay_s = -1.0 / beam_mode.at_rad_s.real
-        if at_mode_s > 0.01 * needed_s:
-            needed_s += (
+        if at_mode_s > 0.01 * total_s:
+            total_s += (
                 decay_s * float(np.interp(at_mode_s / decay_s, information_gain, time_ratios))
                 - at_mode_s
             )
-    return needed_s
+    return total_s

@@ -52,10 +52,10 @@ class UnitSweep:
     angle_rad: Real
     """Predicted angle of the motor at each tick of the segment; shape (n,)."""
     rows: Real
-    """Whitened derivatives of the torque by the free parameters from the beginning of the segment;
+    """Whitened derivatives of the torque for the free parameters, from the segment's beginning on;
     shape (k, samples)."""
-    weighted: Real
-    """Combinations of these derivatives with the weights of the mixture; shape (q, samples)."""
+    weighted_rows: Real
+    """Combinations of `rows` with the weights of the mixture; shape (q, samples)."""
     channels: Real
     """Limited quantities, such as speed and torque, as fractions of their limits; shape
     (6, ticks)."""
@@ -76,14 +76,14 @@ class SegmentCandidate:
     channels: Real
     """Limited quantities as fractions of their limits, at one tick in `_LIMIT_CHECK_TICKS`; shape
     (6, ticks)."""
-    weighted: Real
+    weighted_rows: Real
     """Combinations of the torque's derivatives with the weights of the mixture; shape
     (q, samples)."""
     tip_slope: Real
     """Slope of the tip as a fraction of its limit; shape (samples,)."""
-    value: float
-    """Information up to the planning horizon if the first band is driven on after the segment, as
-    the time in s in which the best mixture would give it."""
+    information_s: float
+    """Information up to the planning horizon if the first band is still driven after the segment,
+    expressed as the time in s in which the best mixture would give it."""
 
     def weighted_sum(self, attribute_name: str) -> Real:
         """Return the sum of an array attribute of the segment's sweeps, weighted by amplitude.
@@ -101,10 +101,10 @@ class SegmentCandidate:
 class ContinuedDrive:
     """Response to exciting a mode by a sine after a segment, in two phases of the sine."""
 
-    weighted: Real
+    weighted_rows: Real
     """Weighted derivatives of the torque for a sine of amplitude 1 rad in either phase; shape
     (2, q, samples)."""
-    per_amplitude: Real
+    drive_per_amplitude: Real
     """Amplitudes of the two sines that hold the mode's vibration constant, per real and imaginary
     part of its amplitude; shape (2, 2)."""
 

@@ -40,7 +40,7 @@ _FADE_S: Final = 0.25
 _SCAN_LIMIT_FRACTION: Final = 0.8
 """Largest fraction of the limits that the scan uses, since the beam may differ from the profile."""
 _SCAN_RELATIVE_FREQUENCIES: Final = (0.2, 1.0, 2.3, 6.3, 12.0)
-"""Frequencies over that of mode 1 at which the relative amplitude of the scan is given."""
+"""Frequencies, divided by that of mode 1, at which the scan's relative amplitude is given."""
 _SCAN_RELATIVE_AMPLITUDES: Final = (1.0, 0.4, 0.19, 0.15, 1.0)
 """Relative amplitudes of the scan at these frequencies, with 1 for its largest amplitude.
 
@@ -205,24 +205,24 @@ def until(
             f"{_MAX_UNIFORMITY_PERCENT:g} %."
         )
     segment_ticks = lay_out_segments(rate_hz, rest_s, scan_s, 0.0)
-    scan_begin, end = segment_ticks["sweep"]
+    scan_begin, sweep_end = segment_ticks["sweep"]
     if scan_s < 2 * _FADE_S:
         raise ExcitationError(
             f"scan_s = {scan_s:g} s is too short for fades of {_FADE_S:g} s at both ends; choose "
             f"at least {2 * _FADE_S:g} s."
         )
     check_ticks("With at_most_s, the session", at_most_s * rate_hz, rate_hz)
-    planned_ticks = end + round(PAUSE_S * rate_hz)
+    planned_ticks = sweep_end + round(PAUSE_S * rate_hz)
     record_ticks = round(at_most_s * rate_hz)
     if record_ticks < planned_ticks:
         raise ExcitationError(
             f"at_most_s = {at_most_s:g} s is too short for rest, scan and pause; choose at least "
             f"{planned_ticks / rate_hz:g} s."
         )
-    scan_rad = np.zeros(end)
+    scan_rad = np.zeros(sweep_end)
     profile_beam = None if rig is None else rig.beam
     scan_rad[scan_begin:] = amplitude_rad * _unit_scan(
-        end - scan_begin, rate_hz, start_hz, stop_hz, profile_beam
+        sweep_end - scan_begin, rate_hz, start_hz, stop_hz, profile_beam
     )
     if rig is not None:
         uniformity = rig.uniformity if uniformity_percent is None else uniformity_percent / 100.0
@@ -255,7 +255,7 @@ def until(
         # The sweep goes on for as long as it takes.
         segments={
             "rest": (0, scan_begin),
-            "scan": (scan_begin, end),
+            "scan": (scan_begin, sweep_end),
             "sweep": (scan_begin, record_ticks),
         },
         motion=(

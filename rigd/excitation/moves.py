@@ -3,9 +3,9 @@
 A reference consists of one acceleration a tick: ``r[k] = dt² Σ_{j<k} (k - j) a[j]``. The closed
 loop is linear. A mode with the pole s is therefore at rest after the move if the accelerations'
 transform ``Σ a[j] exp(-s j dt)`` is zero, because the angle that follows the reference has the same
-zero. With a zero of second order (its derivative by s is zero as well) little vibration remains
-even if the pole is not well known. The poles are those of the closed loop with the motor held,
-since its modes continue to ring.
+zero. With a zero of second order (the derivative of the transform is zero as well) little vibration
+remains even if the pole is not well known. The poles are those of the closed loop with the motor
+held, since its modes continue to ring.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ ROBUST_BELOW_HZ = 60.0
 are too weak to matter after a change of 1 % in their frequency."""
 
 _MAX_PEAK_ACCELERATION = 24.0
-"""Largest acceleration of a path over ``distance / duration²``: four times that of a quintic. A
+"""Largest acceleration of a path, divided by ``distance / duration²``: four times a quintic's. A
 path shorter than about half a period of a mode would exceed it, and then has fewer zeros."""
 
 
@@ -188,7 +188,7 @@ def _motion_map(n: int, rate_hz: float) -> Real:
 
 
 def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, zero_order: int) -> Real:
-    """Return the linear map from n accelerations to the modes' residual vibration after them.
+    """Return the linear map from n accelerations to the modes' vibration after the last one.
 
     Its product with the accelerations is zero if the path leaves all modes at rest. Each mode has a
     row for the real part and one for the imaginary part of its complex state at the end of the
@@ -223,7 +223,9 @@ def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, zero_or
 
 
 def _least_norm_solution(linear_map: Real, wanted_values: Real) -> tuple[Real, bool]:
-    """Return the least-norm solution a of ``rows @ a = wanted``, and whether it is a solution.
+    """Return the least-squares solution a of ``linear_map @ a = wanted_values``, of least norm.
+
+    The second result is whether a solves the equations within rounding errors.
 
     Rows beyond the length of `wanted_values` have the right-hand side 0.
     """

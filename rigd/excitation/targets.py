@@ -51,7 +51,7 @@ class Target:
     relative: bool
     """Whether the standard deviation is a fraction of the value."""
     mode: int | None = None
-    """Number of the mode, from 1; None: every mode in the band, or not a quantity of modes."""
+    """Number of the mode, from 1; None: every mode in the band, or a quantity without modes."""
 
     @property
     def name(self) -> str:
@@ -170,7 +170,7 @@ class Quantities:
     items: tuple[Precision, ...]
     """Value and target of each quantity; the standard deviations are still unknown."""
     gradients: Real
-    """Derivatives of the quantities by the free parameters, shape (q, k)."""
+    """Derivatives of the q quantities with respect to the k free parameters, shape (q, k)."""
 
     @classmethod
     def linearised(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
@@ -246,7 +246,7 @@ def _targets_of_modes(given_target: Target, modes: tuple[Pole, ...]) -> list[Tar
 def _linearise(
     given_target: Target, estimate: BeamEstimate, modes: tuple[Pole, ...]
 ) -> tuple[float, Real, str]:
-    """Return the value of a quantity and its derivatives by the beam's parameters, shape (k,).
+    """Return the value of a quantity and its derivatives for the beam's parameters, shape (k,).
 
     The third result is the reason why no record can determine the quantity, or an empty text.
     """

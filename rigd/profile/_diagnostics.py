@@ -1,7 +1,8 @@
 """Checks for contradictions between a profile's values, and the messages on its mistakes.
 
-Values may contradict each other (`contradictions`), also for the wiring of the devices
-(`wiring_contradictions`). Sources, keys and sections may be missing or unknown.
+`contradictions` finds values that contradict each other, `wiring_contradictions` those in the
+wiring of the devices. The messages are also on sources, keys and sections that are missing or
+unknown.
 """
 
 import difflib
@@ -53,7 +54,7 @@ _AXIS_UNITS = {  # Units of keys with six numbers, one for each axis of the sens
 _MAX_ACCELERATION_FACTOR = 100.0
 """Largest limit of the acceleration, relative to the motor's largest acceleration.
 
-A higher limit would find no jump of the encoder."""
+With a higher limit no jump of the encoder would be detected."""
 
 _RIG_NAME = re.compile(r"[^\W_][\w .-]{0,63}")
 """Pattern of valid names of a rig, which file names contain."""
@@ -308,11 +309,12 @@ def _unreachable_limits(profile_values: Mapping[str, Any]) -> Iterator[str]:
             f"is more than {_MAX_ACCELERATION_FACTOR:g} times the {own_rad_s2:.4g} rad/s² that the "
             "peak torque gives the motor alone; choose some two to five times that."
         )
-    lag = profile_values["limits.recorder_lag_s"]
-    if lag >= RECORDER_BUFFER_S:
+    recorder_lag_s = profile_values["limits.recorder_lag_s"]
+    if recorder_lag_s >= RECORDER_BUFFER_S:
         yield (
-            f"limits.recorder_lag_s = {lag:g} s can never be exceeded: shared memory holds "
-            f"{RECORDER_BUFFER_S:g} s, and the next sample is lost; choose less, 12 s for example."
+            f"limits.recorder_lag_s = {recorder_lag_s:g} s can never be exceeded: shared memory "
+            f"holds {RECORDER_BUFFER_S:g} s, and the next sample is lost; choose less, 12 s for "
+            "example."
         )
 
 

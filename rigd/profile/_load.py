@@ -41,7 +41,7 @@ from rigd.profile._schema import (
 
 
 class ProfileError(UserError, ValueError):
-    """A profile or specimen file cannot be used; the message has a line for each problem."""
+    """Error of an unusable profile or specimen file; the message has a line for each problem."""
 
 
 def load_profile(name_or_path: str | Path) -> Profile:
@@ -175,17 +175,17 @@ def _controller_settings(sections: Mapping[str, Any]) -> object | None:
 
 
 def _add_sections_of_devices(document: Mapping[str, Any], profile_path: Path) -> list[str]:
-    """Make the sections known that devices of installed packages require; return their names.
+    """Register the profile sections that devices of installed packages need; return their names.
 
     Raises
     ------
     ProfileError
         If a package that adds a device of the profile cannot be used.
     """
-    selection = document.get("devices")
-    names = selection.values() if isinstance(selection, dict) else ()
+    device_selection = document.get("devices")
+    device_names = device_selection.values() if isinstance(device_selection, dict) else ()
     added_sections = []
-    for name in dict.fromkeys(filter(lambda value: isinstance(value, str), names)):
+    for name in dict.fromkeys(filter(lambda value: isinstance(value, str), device_names)):
         try:
             plugin, kind = DEVICES.owner(name), DEVICES.get(name)
             if plugin is not None and kind is not None:
@@ -198,7 +198,7 @@ def _add_sections_of_devices(document: Mapping[str, Any], profile_path: Path) ->
 
 
 def _add_section_of_controller(document: Mapping[str, Any], profile_path: Path) -> None:
-    """Make the section known that the controller of an installed package requires.
+    """Register the profile section that the controller of an installed package needs.
 
     Raises
     ------

@@ -129,9 +129,9 @@ class RigSection:
     rate_hz: Annotated[float, Ge(100), Le(20_000)]
     """Rate of the loop; slower loops would check the other processes too seldom."""
     axis_tilt_deg: Annotated[float, Ge(-90), Le(90)] | None = field(default=None, metadata=OPTIONAL)
-    """Inclination of the resting beam in the plane of motion, or None if it was not measured.
+    """Angle between the horizontal and the resting beam, or None if it was not measured.
 
-    It is positive if the tip is lower than the motor's axis; gravity then pulls along the beam."""
+    Its sine is (height of the root - height of the tip) / length: positive if the tip is lower."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,13 +171,15 @@ SECTIONS: dict[str, type] = {
 }
 """Map from a section's name to the dataclass of its keys."""
 _ADDED_SECTIONS: dict[str, str] = {}
-"""Names in `SECTIONS` of the sections of parts that installed packages add, with their group."""
+"""Map from each section that a part of an installed package has added, to the part's group."""
 
 
 def optional_sections() -> tuple[str, ...]:
     """Return the names of the sections that only some devices or controllers require."""
-    shipped = [name for kind in DEVICES.built_in.values() for name in kind.required_sections]
-    return tuple(dict.fromkeys([*shipped, *sorted(_ADDED_SECTIONS)]))
+    built_in_sections = [
+        name for kind in DEVICES.built_in.values() for name in kind.required_sections
+    ]
+    return tuple(dict.fromkeys([*built_in_sections, *sorted(_ADDED_SECTIONS)]))
 
 
 def add_section(kind: DeviceKind | ControllerKind, plugin: Plugin) -> None:
@@ -202,8 +204,8 @@ def add_section(kind: DeviceKind | ControllerKind, plugin: Plugin) -> None:
     if settings is None or SECTIONS.get(kind.name) is settings:
         return
     if kind.name in SECTIONS and _ADDED_SECTIONS.get(kind.name) != plugin.group:
-        where = "another package's part" if kind.name in _ADDED_SECTIONS else "every profile"
-        raise plugin.error(f"[{kind.name}] is a section of {where}; rename the {plugin.noun}.")
+        owner_text = "another package's part" if kind.name in _ADDED_SECTIONS else "every profile"
+        raise plugin.error(f"[{kind.name}] is a section of {owner_text}; rename the {plugin.noun}.")
     if problem := _settings_problem(settings):
         raise plugin.error(f"its settings {settings.__name__} are invalid: {problem}")
     if unknown := set(kind.required_sections) - {kind.name} - set(SECTIONS):
@@ -273,18 +275,18 @@ def section_text(kind: DeviceKind | ControllerKind) -> str:
     for settings_field in fields(kind.settings):
         hint = type_hints[settings_field.name]
         extras = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
-        plain = get_args(hint)[0] if extras else hint
-        notes = [each.documentation for each in extras if isinstance(each, DocInfo)]
-        if get_origin(plain) is Literal:
-            notes.append("one of " + ", ".join(map(str, get_args(plain))))
+        plain_type = get_args(hint)[0] if extras else hint
+        help_texts = [each.documentation for each in extras if isinstance(each, DocInfo)]
+        if get_origin(plain_type) is Literal:
+            help_texts.append("one of " + ", ".join(map(str, get_args(plain_type))))
         for each in extras:
-            for bound_name, words in _BOUND_WORDS.items():
+            for bound_name, bound_words in _BOUND_WORDS.items():
                 if (bound := getattr(each, bound_name, None)) is not None:
-                    notes.append(f"{words} {bound}")
+                    help_texts.append(f"{bound_words} {bound}")
         if unit := unit_of(settings_field.name):
-            notes.append(f"in {unit}")
-        if notes:
-            lines.append(f"# {'; '.join(notes)}")
+            help_texts.append(f"in {unit}")
+        if help_texts:
+            lines.append(f"# {'; '.join(help_texts)}")
         is_optional = settings_field.default is not MISSING
         if is_optional:
             value = json.dumps(settings_field.default, ensure_ascii=False)
@@ -306,8 +308,8 @@ def key_types() -> dict[str, Any]:
     A profile must have all keys except those of :func:`key_defaults`.
     """
     type_by_key: dict[str, Any] = dict.fromkeys(TEXT_KEYS, Annotated[str, MinLen(1)])
-    for section_name, cls in SECTIONS.items():
-        type_hints = get_type_hints(cls, include_extras=True)
+    for section_name, section_class in SECTIONS.items():
+        type_hints = get_type_hints(section_class, include_extras=True)
         type_by_key |= {
             key: type_hints[field_name] for key, field_name in section_fields(section_name)
         }
@@ -323,8 +325,8 @@ def key_defaults() -> dict[str, Any]:
     """
     return {
         f"{section_name}.{dataclass_field.name}": dataclass_field.default
-        for section_name, cls in SECTIONS.items()
-        for dataclass_field in fields(cls)
+        for section_name, section_class in SECTIONS.items()
+        for dataclass_field in fields(section_class)
         if dataclass_field.default is not MISSING
         and (dataclass_field.metadata.get("optional") or section_name in _ADDED_SECTIONS)
     }
@@ -375,7 +377,7 @@ _MIN_BREAKAWAY_FRACTION = 0.05
 
 
 class UnknownValueError(UserError):
-    """A value that is needed is stated as unknown in the profile."""
+    """Error if the profile states a value as unknown that is needed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,7 +413,7 @@ class Profile:
     tip_mass_kg: float | None = None
     """Measured point mass at the beam's tip, or None if it is unknown."""
     axis_tilt_deg: float | None = None
-    """Inclination of the resting beam in the plane of motion, or None if it was not measured.
+    """Angle between the horizontal and the resting beam, or None if it was not measured.
 
     It is positive if the tip is lower than the motor's axis."""
     controller_settings: object | None = None
@@ -449,9 +451,9 @@ class Profile:
 
     @property
     def is_loop_modelled(self) -> bool:
-        """Whether the model of the closed loop has the controller, and not the PID instead.
+        """Whether the model of the closed loop contains the rig's controller, not the PID instead.
 
-        Own code of a package need not state matrices.
+        The PID replaces a controller of a package that states no matrices.
         """
         name = self.control.controller
         kind = None if name == SHIPPED_CONTROLLER else CONTROLLERS.get(name)

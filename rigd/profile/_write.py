@@ -17,7 +17,7 @@ _COMMENT_WIDTH = 100
 """Largest length of a comment's lines, in characters."""
 
 _NAMING_LINE = re.compile(r"\[([^\]]+)\]|(\w+)\s*=|# (\w+) = ")
-"""Beginning of a line with the title of a section, a key, or a key in a comment."""
+"""Pattern for the beginning of a line that names a section, a key, or a key in a comment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class Setting:
     value: SettingValue
     """New value of the key."""
     source: str = "assumed"
-    """Source of the value if it is a number; if it is "unknown", no value is written."""
+    """Source of the value if it is a number; if the source is "unknown", no value is written."""
     reason: str = ""
     """Text of the comment above the key, or an empty string for no comment."""
     hexadecimal: bool = False
@@ -76,7 +76,7 @@ def with_settings(text: str, settings: Iterable[Setting]) -> str:
 def with_head(text: str, head: Sequence[str]) -> str:
     """Return the text of a profile after the comments before its first key are replaced.
 
-    `head` has the lines of the new comments.
+    `head` contains the lines of the new comments.
     """
     text_lines = text.splitlines()
     first_key_line = next(

@@ -14,9 +14,9 @@ _MAX_FREQUENCY_FRACTION = 0.25
 _OBSERVER_BANDWIDTH_RAD_S = 6.0
 """Bandwidth in rad/s with which the observer corrects the modes.
 
-It follows vibration that the angle does not explain, as of a beam that was not at rest. It is slow
-compared with a shaft that runs away, and fast compared with the phase drift of modes whose
-frequencies are wrong by a few per cent."""
+The observer follows vibration that the angle does not explain, such as that of a beam that was not
+at rest. It is slow compared with a shaft that runs away, and fast compared with the phase drift of
+modes whose frequencies are wrong by a few per cent."""
 _OFFSET_BANDWIDTH_RAD_S = 0.5
 """Bandwidth in rad/s with which the observer follows the sensor's zero."""
 

@@ -1,7 +1,7 @@
 """Encoder watch: detects an encoder that has failed while its messages stay fresh.
 
 A frozen encoder shows a shaft at rest, and a controller that trusts it turns the motor without
-limit. Three observations distinguish the two:
+limit. Three observations distinguish a frozen encoder from a shaft at rest:
 
 * *Momentum.* A moving shaft does not stop within two ticks: torques and friction would have to
   supply an impulse of ``J v``.
@@ -9,7 +9,7 @@ limit. Three observations distinguish the two:
   the breakaway torque. This needs no model of the beam, but friction limits it.
 * *Coupling torque.* If a beam pulls at an apparently resting shaft more than by its own vibration,
   the shaft moves, or the beam is touched. This needs no knowledge of the friction, but does not
-  distinguish the two. It therefore only starts a *test of the encoder*: the torque of the motor is
+  exclude a touch. It therefore only starts a *test of the encoder*: the torque of the motor is
   ramped until the encoder moves by two steps, or until the net torque exceeds the breakaway
   torque, which is a fault.
 
@@ -41,32 +41,32 @@ It applies to sensors without noise."""
 _MODEL_ERROR_FRACTION = 0.5
 """Error of the predicted coupling torque, as a fraction of the coupling torque's rms.
 
-Beams differ from their models. The error vibrates, so its mean over more than half a period of the
-first mode is smaller."""
+Beams differ from their models. The error oscillates, so its mean over more than half a period of
+the first mode is smaller."""
 _RMS_TIME_CONSTANT_S = 0.25
 """Time constant in seconds of the coupling torque's rms."""
 _TEST_RAMP_S = 0.02
 """Time in seconds in which the test torque rises by the breakaway torque."""
 _MAX_TEST_BREAKAWAY_TORQUES = 2.0
-"""Test torque at which the test starts again in the other direction, in breakaway torques."""
+"""Largest test torque, in breakaway torques; the test then restarts in the other direction."""
 _PASSED_TEST_STEPS = 1.5
 """Movement of the shaft, in encoder steps, that proves during a test that the encoder works."""
 _TEST_PAUSE_S = 0.5
 """Shortest time in seconds between a passed test and the next one."""
 _TORQUE_RELATIVE_ERROR = 0.25
-"""Relative error of the motor's torque that is not a fault."""
+"""Largest relative error of the motor's torque that is tolerated."""
 _MIN_MOMENTUM_FRACTION = 0.5
 """Fraction of the shaft's momentum that the measured torques must explain when the shaft stops.
 
 Inertias are known to a quarter."""
 _STANDSTILL_TICKS_AT_STOP = 2
-"""Ticks without an encoder step after which a sudden stop is checked."""
+"""Ticks without an encoder step after which the torques are checked to explain the stop."""
 _MIN_STEPS_PER_TICK_AT_STOP = 4.0
 """Speed before a stop from which the stop is checked, in encoder steps per tick."""
 _MIN_SCALE_STEPS = 3.0
 """Smallest movement within `SPEED_TICKS` that the scale comparison uses, in encoder steps."""
 _MAX_REPEATS = 6
-"""Number of repeated readings within `_REPEAT_WINDOW_TICKS` that is a fault."""
+"""Number of repeated readings within `_REPEAT_WINDOW_TICKS` from which they are a fault."""
 _REPEAT_WINDOW_TICKS = 32
 """Ticks within which repeated readings are counted."""
 _MIN_REPEAT_STEPS = 3.5
@@ -107,7 +107,6 @@ class EncoderMonitor:
     __slots__ = (
         "_angles",
         "_breakaway_nm",
-        "_count",
         "_coupling_nm2",
         "_decay",
         "_delayed_commands_nm",
@@ -126,6 +125,7 @@ class EncoderMonitor:
         "_standstill_count",
         "_test_start_rad",
         "_test_step_nm",
+        "_tick_count",
         "_torque_history",
         "_windows",
         "test_nm",
@@ -202,7 +202,7 @@ class EncoderMonitor:
         self._coupling_nm2 = 0.0
         if self._scale_monitor is not None:
             self._scale_monitor.reset()
-        self._standstill_count = self._count = self._next_test_tick = 0
+        self._standstill_count = self._tick_count = self._next_test_tick = 0
         self._irregular_ticks = 0
         self.tests = 0
         self._end_test()
@@ -238,14 +238,14 @@ class EncoderMonitor:
         self._torque_history.append((net_sum + motor_nm - coupling_nm, motor_sum + motor_nm))
         self._error_sums.append(self._error_sums[-1] + error_nm)
         self._coupling_nm2 += self._decay * (coupling_nm * coupling_nm - self._coupling_nm2)
-        self._count += 1
+        self._tick_count += 1
         angles = self._angles
         standstill_ticks = self._standstill_count
         moved_rad = angle_rad - angles[-1]
         angles.append(angle_rad)
         if self._irregular_ticks:
             self._irregular_ticks -= 1
-        elif self._count % WINDOW_TICKS == 0 and self._scale_monitor is not None:
+        elif self._tick_count % WINDOW_TICKS == 0 and self._scale_monitor is not None:
             violation = self._compare_scales(self._scale_monitor)
             if violation is not None:
                 return violation
@@ -258,7 +258,7 @@ class EncoderMonitor:
                 if abs(angle_rad - self._test_start_rad) > passed_rad:
                     self._end_test()
                     self.tests += 1
-                    self._next_test_tick = self._count + round(_TEST_PAUSE_S * self._rate_hz)
+                    self._next_test_tick = self._tick_count + round(_TEST_PAUSE_S * self._rate_hz)
                     return None
         else:
             self._standstill_count = standstill_ticks = standstill_ticks + 1
@@ -309,7 +309,9 @@ class EncoderMonitor:
         if standstill_ticks < ticks:
             return None
         violation = self._check_net_torque(ticks, max_turning_nm)
-        ticks, max_turning_nm = standstill_windows[1 + self._count % (len(standstill_windows) - 1)]
+        ticks, max_turning_nm = standstill_windows[
+            1 + self._tick_count % (len(standstill_windows) - 1)
+        ]
         if violation is not None or standstill_ticks < ticks:
             return violation
         violation = self._check_net_torque(ticks, max_turning_nm)
@@ -317,7 +319,7 @@ class EncoderMonitor:
             violation is None
             and standstill_ticks >= self._min_test_ticks
             and not self._test_step_nm
-            and self._count >= self._next_test_tick
+            and self._tick_count >= self._next_test_tick
         ):
             self._compare_coupling_torque(ticks)
         return violation
@@ -336,8 +338,10 @@ class EncoderMonitor:
             return None
         ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._torque_history) - 2)
         net_sum, motor_sum = self._torque_sums(ticks)
-        per_tick_nm = _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
-        needed_nm = per_tick_nm * self._rate_hz**2 / _STANDSTILL_TICKS_AT_STOP
+        momentum_per_tick = (
+            _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
+        )
+        stopping_torque_nm = momentum_per_tick * self._rate_hz**2 / _STANDSTILL_TICKS_AT_STOP
         braking_nm = max(0.0, -net_sum if moved_rad > 0 else net_sum)
         allowed_nm = (
             self._breakaway_nm
@@ -347,9 +351,9 @@ class EncoderMonitor:
             )
             / _STANDSTILL_TICKS_AT_STOP
         )
-        if needed_nm <= allowed_nm:
+        if stopping_torque_nm <= allowed_nm:
             return None
-        return INTERLOCKS_BY_NAME["stopped encoder"].violated(needed_nm, allowed_nm)
+        return INTERLOCKS_BY_NAME["stopped encoder"].violated(stopping_torque_nm, allowed_nm)
 
     def _check_net_torque(self, ticks: int, max_turning_nm: float) -> Violation | None:
         """Return a violation if the mean net torque should have turned a shaft that seems at rest.
@@ -399,16 +403,16 @@ class EncoderMonitor:
         ):
             return None
         repeat_ticks = self._repeat_ticks
-        repeat_ticks.append(self._count)
+        repeat_ticks.append(self._tick_count)
         if (
             len(repeat_ticks) < _MAX_REPEATS
-            or self._count - repeat_ticks[0] >= _REPEAT_WINDOW_TICKS
+            or self._tick_count - repeat_ticks[0] >= _REPEAT_WINDOW_TICKS
         ):
             return None
         return INTERLOCKS_BY_NAME["repeated angle"].violated(len(repeat_ticks), _MAX_REPEATS - 1)
 
     def _compare_scales(self, scale_monitor: ScaleMonitor) -> Violation | None:
-        """Pass acceleration and net torque over the last `WINDOW_TICKS` to the scale watch."""
+        """Pass acceleration and net torque of the last window to the scale monitor."""
         angles, torque_history = self._angles, self._torque_history
         n = WINDOW_TICKS
         if len(angles) < n + SPEED_TICKS + 1 or len(torque_history) < n + SPEED_TICKS + 3:

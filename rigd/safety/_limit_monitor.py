@@ -20,7 +20,7 @@ WARNING_REARM_S = 1.0
 _NO_JUMP_CHECK_TICKS = 3
 """Number of ticks after missed ticks in which no jump of the angle is checked.
 
-The encoder is latched at irregular times then."""
+Readings of the encoder are then taken at irregular times."""
 
 _MIN_STALL_S = 0.005
 """Shortest stall of the loop in seconds that is reported as the cause of a later violation."""
@@ -424,7 +424,7 @@ class LimitMonitor:
         )
 
     def _percentage(self, counted_ticks: int, scheduled_ticks: int) -> float:
-        """Return ticks as a percentage of the scheduled ones, or of those in 10 s if more."""
+        """Return ticks in per cent of the scheduled ticks, or of those in 10 s if more."""
         return 100.0 * counted_ticks / max(scheduled_ticks, self._fraction_window)
 
     def _assess_fraction(self, *checked_values: _CheckedValue) -> Violation | None:

@@ -1,9 +1,9 @@
 """Sensor watch: detects a force-torque sensor, or a channel of it, that repeats its readings.
 
-Every reading of a working sensor contains noise, so that readings rarely repeat. How rarely depends
-on noise and resolution, and is measured at the tare for each channel. Afterwards an improbably long
-run of identical readings is a fault: of all channels together (a frozen sensor) or of one (a broken
-gauge, or one clipped at a plausible value).
+Every reading of a working sensor contains noise, so that readings rarely repeat. The frequency of
+repeats depends on noise and resolution; the tare measures it for each channel. Afterwards an
+improbably long run of identical readings is a fault: of all channels together (a frozen sensor) or
+of one (a broken gauge, or one clipped at a plausible value).
 """
 
 from collections.abc import Sequence

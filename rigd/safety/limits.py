@@ -19,7 +19,7 @@ PercentageBelow100 = Annotated[float, Gt(0), Lt(100)]
 """Type of a percentage above 0 and below 100."""
 
 RECORDER_BUFFER_S = 16.0
-"""Seconds of samples that shared memory buffers, so that no stall of the disk loses a sample."""
+"""Duration in s of the samples that shared memory buffers while the disk stalls."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,9 +136,9 @@ class Violation:
                 f"{self.warning:.4g} {self.unit} "
                 f"(limit {self.limit:.4g}{key_text}).{remedy_text}"
             )
-        how = "below" if self.below else "exceeds"
+        relation = "below" if self.below else "exceeds"
         key_text = f" ({self.key})" if self.key else ""
-        return f"{channel_text} {value_text} {how} limit {limit_text}{key_text}.{remedy_text}"
+        return f"{channel_text} {value_text} {relation} limit {limit_text}{key_text}.{remedy_text}"
 
 
 # Table of interlocks
@@ -183,7 +183,7 @@ class Interlock:
     below
         Whether the limit is the smallest allowed value, not the largest.
     follows_missed_ticks
-        Whether a stalled loop can trigger it although the rig is sound: meanwhile the drive
+        Whether a stall of the loop can trigger the interlock of a sound rig, because the drive
         continues to exert the last torque.
     """
 

@@ -40,7 +40,7 @@ _MAX_RELATIVE_STD = 0.1
 _SAME_RATIO_FACTOR = 1.3
 """Factor by which two ratios may differ and still count as the same."""
 _NO_TORQUE_RATIO = 0.15
-"""Ratio of the measured torque to the beam's torque below which the sensor shows no torque."""
+"""Ratio of measured torque to beam's torque below which the sensor counts as dead."""
 _ADVICE = (
     "Correct the profile or the rig. A value that was measured by other means and is marked "
     'source = "measured" (docs/safety.md) is not probed.'
@@ -168,7 +168,7 @@ def _coupling_ratio(
             ratio_variance = (
                 residual_nm
                 / expected_nm.size
-                * _samples_per_independent_one(smoothing_window)
+                * _samples_per_independent_sample(smoothing_window)
                 / torque_squares
             )
             best_fit = (
@@ -180,8 +180,8 @@ def _coupling_ratio(
     return (None, None, np.zeros_like(measured_nm)) if best_fit is None else best_fit[1:]
 
 
-def _samples_per_independent_one(smoothing_window: Real) -> float:
-    """Return how many smoothed samples carry the information of one independent sample."""
+def _samples_per_independent_sample(smoothing_window: Real) -> float:
+    """Return the number of smoothed samples with the information of one independent sample."""
     return 1.0 / float(smoothing_window @ smoothing_window)
 
 

@@ -1,9 +1,9 @@
 """Probing move: strokes at two speeds within tight bounds, on a rig with unverified scales.
 
-A wrong scale or sign makes every limit wrong by the same factor, so no check here relies on one
-alone. The shaft is driven by its speed, slowly at first. The coupling torque is independent of
-encoder and motor: in every tick it is compared with the torque of the profile's beam at the
-measured angle, and the move ends where they differ. The torque rises slowly enough that this
+A wrong scale or sign makes every limit wrong by the same factor, so no check here relies on a
+single scale. The speed of the shaft is controlled, slow at first. The coupling torque is
+independent of encoder and motor: in every tick it is compared with the torque of the profile's beam
+at the measured angle, and the move ends where they differ. The torque rises slowly enough that this
 comparison stops the shaft of a frozen or coarse encoder within a tenth of a radian.
 
 A speed controller at the same shaft as the beam is stable for a motor with a fifth to five times
@@ -144,7 +144,7 @@ smaller at the same speed."""
 _SPEED_RAMP_S = 0.06
 """Time in seconds in which a stroke reaches its speed, or comes to rest."""
 _MIN_CRUISE_S = 0.35
-"""Approximate shortest time in seconds from the start of a stroke to the start of its end."""
+"""Approximate shortest time in seconds from the start of a stroke until it slows down."""
 _MAX_SPEED_FRACTION = 0.2
 """Largest speed of a fast stroke, as a fraction of the profile's limit."""
 _MAX_TRAVEL_FRACTION = 0.25
@@ -160,7 +160,7 @@ class ProbePlan:
     speed_rad_s: float
     """Speed of the first pair of strokes; the second pair is twice as fast."""
     cruise_s: float
-    """Time from the start of a stroke to the start of its end.
+    """Time from the start of a stroke until it slows down.
 
     It is a whole number of periods of the beam's first mode, so that the end of the stroke cancels
     the vibration of the start."""
@@ -236,9 +236,9 @@ _SPEED_WINDOW_S = 0.004
 _COMPARISON_TIME_CONSTANT_S = 0.012
 """Time constant in seconds of the filter before the coupling torque is compared."""
 _MIN_MOVEMENT_STEPS = 8
-"""Movement that shows that the shaft moves, in encoder steps of any size."""
+"""Smallest movement that proves motion of the shaft, in encoder steps of any size."""
 _MIN_MOVEMENT_RAD = 2e-4
-"""Smallest movement in rad that shows that the shaft moves."""
+"""Smallest movement in rad that proves motion of the shaft."""
 _MIN_DIFFERENCE_NM = 8e-3
 """Smallest difference in N·m between coupling torque and beam's torque that ends the move."""
 _MIN_DIFFERENCE_STDS = 2.0
@@ -255,9 +255,9 @@ _FROZEN_ENCODER_S = 0.025
 _STROKE_PAUSE_S = 0.15
 """Pause in seconds after a stroke."""
 _MAX_STROKE_S = 5.0
-"""Time in seconds after which a stroke ends the move; strokes of a sound rig take less."""
+"""Time in seconds after which a stroke that has not finished ends the move."""
 _INITIAL_TORQUE_FRACTION = 0.7
-"""Torque at which a stroke begins, as a fraction of that needed in the stroke before."""
+"""Torque at which a stroke begins, as a fraction of the torque that moved the previous one."""
 _COUPLING_RATIO_BAND = 0.5, 2.0
 """Smallest and largest ratio of coupling torque and beam's torque for a further stroke."""
 

@@ -118,7 +118,9 @@ class AttachedObstacles:
             )
             for x in positions_m.tolist()
         ]
-        self._rigid_rows = np.array([[t.per_angle, t.per_velocity, *t.c] for t in angle_outputs])
+        self._rigid_rows = np.array(
+            [[t.output_per_angle, t.output_per_velocity, *t.c] for t in angle_outputs]
+        )
         self._positions_m = positions_m
         self._obstacles = [
             (
@@ -675,4 +677,4 @@ def _substeps_per_period(beam: Beam, bodies: tuple[Disturbance, ...], period_s: 
 
 def _displacement_per_angle(beam: Beam, damping: Damping, x_m: float, s: Complex) -> Complex:
     """Return the transfer function in m/rad from motor angle to beam displacement at `x_m`."""
-    return PointForceGrid(s, beam, damping).per_angle(x_m)
+    return PointForceGrid(s, beam, damping).displacement_per_angle(x_m)

@@ -144,7 +144,7 @@ class FreeBeam:
         nodes_m, self._between = x_m, np.eye(x_m.size)
         if x_m.size > _NODE_COUNT:
             nodes_m, self._between = chebyshev_nodes(x_m, _NODE_COUNT)
-        self._displacement: Complex = self._grid.per_angle(nodes_m).T
+        self._displacement: Complex = self._grid.displacement_per_angle(nodes_m).T
         self.modes = self.modes.at_positions(x_m / self.model.plant.beam.length_m)
 
     def displacement_per_sample(self, position_index: int, sample_count: int) -> Real:

@@ -189,9 +189,11 @@ def contact_kernels(
     for i in range(0, x_m.size, _POSITIONS_AT_ONCE):
         x = x_m[i : i + _POSITIONS_AT_ONCE]
         responses = (
-            force_grid.per_force(x, x).T,
-            -filter_response * force_grid.per_angle(x).T,
-            filter_response * complex_stiffness * force_grid.per_force(np.zeros_like(x), x, 3).T,
+            force_grid.displacement_per_force(x, x).T,
+            -filter_response * force_grid.displacement_per_angle(x).T,
+            filter_response
+            * complex_stiffness
+            * force_grid.displacement_per_force(np.zeros_like(x), x, 3).T,
         )
         for kernel_table, laplace_response in zip(kernel_tables, responses, strict=True):
             kernel_table[i : i + _POSITIONS_AT_ONCE] = force_pulse.kernels(laplace_response)

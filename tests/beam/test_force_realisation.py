@@ -37,7 +37,7 @@ def test_response_to_a_force_is_the_exact_one(damping, at_m, highest_rad_s):
     grid = PointForceGrid(s, BEAM, damping)
     exact = np.column_stack(
         [
-            grid.per_force(TOLD_M, np.full(3, at_m)),
+            grid.displacement_per_force(TOLD_M, np.full(3, at_m)),
             grid.torque_per_force(at_m),
             grid.shear_per_force(at_m),
         ]
@@ -75,10 +75,12 @@ def test_an_order_that_is_too_high_is_refused_where_it_damps():
 def test_displacement_told_by_the_states(damping, x_m):
     realisation = realise(Plant(BEAM, damping))
     told = state_output(
-        realisation, lambda s: PointForceGrid(s, BEAM, damping).per_angle(x_m), inertial=False
+        realisation,
+        lambda s: PointForceGrid(s, BEAM, damping).displacement_per_angle(x_m),
+        inertial=False,
     )
-    assert told.per_acceleration == 0
-    assert errors(realisation, told, damping, lambda grid: grid.per_angle(x_m)) < 2e-3
+    assert told.output_per_acceleration == 0
+    assert errors(realisation, told, damping, lambda grid: grid.displacement_per_angle(x_m)) < 2e-3
 
 
 @pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
@@ -95,9 +97,9 @@ def with_output(realisation, told):
     return replace(
         realisation,
         c=told.c,
-        direct_inertia_kg_m2=told.per_acceleration,
-        direct_viscosity_nm_s_per_rad=told.per_velocity,
-        direct_stiffness_nm_per_rad=told.per_angle,
+        direct_inertia_kg_m2=told.output_per_acceleration,
+        direct_viscosity_nm_s_per_rad=told.output_per_velocity,
+        direct_stiffness_nm_per_rad=told.output_per_angle,
     )
 
 
@@ -114,7 +116,9 @@ def test_torque_of_a_force_is_the_displacement_of_an_angle(at_m):
     s = 2j * pi * np.geomspace(0.05, 300, 1000)
     realisation = realise(Plant(BEAM, damping))
     told = state_output(
-        realisation, lambda s: PointForceGrid(s, BEAM, damping).per_angle(at_m), inertial=False
+        realisation,
+        lambda s: PointForceGrid(s, BEAM, damping).displacement_per_angle(at_m),
+        inertial=False,
     )
     displacement = with_output(realisation, told).transfer(s)
     torque = response(realise_force(BEAM, damping, at_m, np.array([at_m]), 1e4), s)[:, -2]

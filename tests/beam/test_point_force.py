@@ -37,13 +37,13 @@ def test_without_a_force_the_torque_is_that_of_eq_25(line, damping):
 @pytest.mark.parametrize("damping", [FRACTIONAL, HALF])
 def test_torque_of_a_force_is_the_displacement_of_an_angle(line, damping):
     grid = PointForceGrid(S[line], BEAM, damping)
-    displacement = grid.per_angle(PLACES_M)
+    displacement = grid.displacement_per_angle(PLACES_M)
     assert np.abs(grid.torque_per_force(PLACES_M) / displacement + 1).max() < 1e-12
 
 
 def test_forces_and_displacements_change_places():
     grid = PointForceGrid(S["axis"], BEAM, FRACTIONAL)
-    there = grid.per_force(PLACES_M[:, None], PLACES_M)
+    there = grid.displacement_per_force(PLACES_M[:, None], PLACES_M)
     assert there.shape == (801, 4, 4)
     size = np.sqrt(np.abs(np.einsum("sii,sjj->sij", there, there)))
     assert (np.abs(there - there.swapaxes(1, 2)) / size).max() < 1e-10
@@ -59,7 +59,7 @@ def test_balance_of_forces_and_moments(at_m):
     x = np.concatenate([a + (b - a) * (node + 1) / 2 for a, b in ends])
     w = np.concatenate([(b - a) * weight / 2 for a, b in ends])
     _, load = stiffness_and_load(s, HALF)
-    turned, pushed = grid.per_angle(x), grid.per_force(x, at_m)
+    turned, pushed = grid.displacement_per_angle(x), grid.displacement_per_force(x, at_m)
     assert load * (turned @ w) == pytest.approx(grid.shear_per_angle(), rel=1e-9)
     assert load * (turned @ (w * x)) == pytest.approx(grid.torque_per_angle(), rel=1e-9)
     assert load * (pushed @ w) == pytest.approx(grid.shear_per_force(at_m) + 1, rel=1e-8, abs=1e-9)
@@ -76,10 +76,12 @@ def test_derivatives_along_the_beam(order):
     def differences(told):
         return (told(x + h, order - 1) - told(x - h, order - 1)) / (2 * h)
 
-    assert grid.per_angle(x, order) == pytest.approx(differences(grid.per_angle), rel=1e-5)
+    assert grid.displacement_per_angle(x, order) == pytest.approx(
+        differences(grid.displacement_per_angle), rel=1e-5
+    )
 
     def pushed(x, order):
-        return grid.per_force(x, 0.5, order)
+        return grid.displacement_per_force(x, 0.5, order)
 
     assert pushed(x, order) == pytest.approx(differences(pushed), rel=1e-5)
 
@@ -88,15 +90,20 @@ def test_series_and_waves_meet():
     q = 40 * (1 + np.array([-1e-9, 1e-9]))
     s = 1j * np.sqrt(q / (BEAM.density_over_stiffness * BEAM.length_m**4))
     grid = PointForceGrid(s, BEAM, Damping())
-    for curve in (grid.per_angle(PLACES_M), grid.per_force(PLACES_M, 0.5)):
+    for curve in (
+        grid.displacement_per_angle(PLACES_M),
+        grid.displacement_per_force(PLACES_M, 0.5),
+    ):
         assert curve[0] == pytest.approx(curve[1], rel=1e-6)
 
 
 def test_at_rest():
     grid = PointForceGrid([0.0], BEAM, FRACTIONAL)
     ei = BEAM.bending_stiffness_n_m2
-    assert grid.per_force(PLACES_M, PLACES_M)[0] == pytest.approx(PLACES_M**3 / (3 * ei))
-    assert grid.per_angle(PLACES_M)[0] == pytest.approx(PLACES_M)
+    assert grid.displacement_per_force(PLACES_M, PLACES_M)[0] == pytest.approx(
+        PLACES_M**3 / (3 * ei)
+    )
+    assert grid.displacement_per_angle(PLACES_M)[0] == pytest.approx(PLACES_M)
     assert grid.torque_per_force(PLACES_M)[0] == pytest.approx(-PLACES_M)
     assert grid.shear_per_force(PLACES_M)[0] == pytest.approx(-1.0)
 
@@ -106,7 +113,7 @@ def test_a_beam_on_a_rigid_obstacle_at_its_tip_has_the_frequencies_of_a_pinned_o
         omega = (z * (1 + np.array([-1e-5, 1e-5])) / BEAM.length_m) ** 2
         s = 1j * omega / np.sqrt(BEAM.density_over_stiffness)
         grid, tip = PointForceGrid(s, BEAM, Damping()), BEAM.length_m
-        force = -grid.per_angle(tip) / grid.per_force(tip, tip)
+        force = -grid.displacement_per_angle(tip) / grid.displacement_per_force(tip, tip)
         assert force[0].real * force[1].real < 0  # passes through infinity
         assert np.abs(force).min() > 1e3
 
@@ -114,12 +121,12 @@ def test_a_beam_on_a_rigid_obstacle_at_its_tip_has_the_frequencies_of_a_pinned_o
 def test_shapes():
     grid = PointForceGrid(np.full((2, 3), 5j), BEAM, FRACTIONAL)
     assert grid.torque_per_angle().shape == (2, 3)
-    assert grid.per_angle(PLACES_M).shape == (2, 3, 4)
-    assert grid.per_force(0.2, 0.5).shape == (2, 3)
-    assert grid.per_force(PLACES_M, PLACES_M).shape == (2, 3, 4)
+    assert grid.displacement_per_angle(PLACES_M).shape == (2, 3, 4)
+    assert grid.displacement_per_force(0.2, 0.5).shape == (2, 3)
+    assert grid.displacement_per_force(PLACES_M, PLACES_M).shape == (2, 3, 4)
 
 
 def test_one_point():
     grid = PointForceGrid(5j, BEAM, FRACTIONAL)
     assert grid.torque_per_angle() == pytest.approx(transfer(5j, BEAM, FRACTIONAL))
-    assert grid.per_force(0.2, 0.5).shape == ()
+    assert grid.displacement_per_force(0.2, 0.5).shape == ()

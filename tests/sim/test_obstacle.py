@@ -97,12 +97,12 @@ class OtherSolution:
             return (np.fft.irfft(spectrum, padded) * growth / step_s)[: self.points]
 
         angle = START_RAD_S2 * (1 - np.exp(-s * START_S)) / s**3
-        self.free = in_time(grid.per_angle(at_m) * angle)
+        self.free = in_time(grid.displacement_per_angle(at_m) * angle)
         self.torque = in_time(grid.torque_per_angle() * angle)
         self.shear = in_time(grid.shear_per_angle() * angle)
         # Of a force that goes from 0 to 1 N and back within two steps.
         hat = (1 - np.exp(-s * step_s)) ** 2 / (s**2 * step_s)
-        self.by_force = in_time(grid.per_force(at_m, at_m) * hat)
+        self.by_force = in_time(grid.displacement_per_force(at_m, at_m) * hat)
         self.torque_by_force = in_time(grid.torque_per_force(at_m) * hat)
         self.shear_by_force = in_time(grid.shear_per_force(at_m) * hat)
         self.surface = TOUCH_RAD * at_m

@@ -85,9 +85,14 @@ def test_shear_is_what_accelerates_the_beam_and_its_tip_mass(rig):
     grid = PointForceGrid(s, rig.beam, rig.damping)
     load = rig.beam.bending_stiffness_n_m2 * rig.damping.gamma * s**rig.damping.lambda_
     load += rig.beam.density_kg_per_m * s**2
-    tip = grid.per_angle(length) / (1 + mass_kg * s**2 * grid.per_force(length, length))
-    pushed = grid.per_force(x, length) * (-mass_kg * s**2 * tip)[:, None]
-    momentum = load * ((grid.per_angle(x) + pushed) @ weight) * length / 2 + mass_kg * s**2 * tip
+    tip = grid.displacement_per_angle(length) / (
+        1 + mass_kg * s**2 * grid.displacement_per_force(length, length)
+    )
+    pushed = grid.displacement_per_force(x, length) * (-mass_kg * s**2 * tip)[:, None]
+    momentum = (
+        load * ((grid.displacement_per_angle(x) + pushed) @ weight) * length / 2
+        + mass_kg * s**2 * tip
+    )
     clamped = Plant(rig.beam, rig.damping, tip_mass_kg=mass_kg)
     assert clamped.shear(s) == pytest.approx(momentum, rel=1e-9)
     soft = replace(clamped, root_compliance_rad_per_nm=compliance)

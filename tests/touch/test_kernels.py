@@ -61,7 +61,9 @@ def test_kernels_between_places_are_those_of_the_exact_model():
     crossing = cross_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), 2 * STEP_S, 400)
     told = crossing.between_positions(x, other, 300)
     hat = ForcePulse(2 * STEP_S, 400)
-    exact = hat.kernels(PointForceGrid(hat.transform.s, LINK, DAMPED).per_force(x, other).T)
+    exact = hat.kernels(
+        PointForceGrid(hat.transform.s, LINK, DAMPED).displacement_per_force(x, other).T
+    )
     assert told == pytest.approx(exact[:, :300], abs=1e-3 * np.abs(exact).max())
     assert crossing.between_positions(other, x, 300) == pytest.approx(told)
 
