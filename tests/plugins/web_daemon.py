@@ -133,7 +133,7 @@ class Served(Requests):
         self.loop = asyncio.get_running_loop()
         self._end = asyncio.Event()
         behind = await asyncio.start_unix_server(self.daemon.serve, self._path)
-        self.server, runner, listening = await _server.open_page(self._job)
+        self.server, runner, listening = await _server.start_page_server(self._job)
         self.port = _server.port_of(listening)
         running = asyncio.create_task(self.server.run())
         while self.server._status is None:
