@@ -12,7 +12,7 @@ from rigd.printable import readable_message
 
 
 def main() -> None:
-    """Run ``rigd status`` without options, without loading the option parser, which is slow."""
+    """Run ``rigd status`` without options; this does not load the option parser, which is slow."""
     run_command(_request_and_report)
 
 

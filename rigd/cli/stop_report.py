@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Run ``rigd stop`` without options, without loading the option parser, which is slow."""
+    """Run ``rigd stop`` without options; this does not load the option parser, which is slow."""
     run_command(lambda: sys.exit(stop_and_report(None, wait=True)))
 
 

@@ -165,7 +165,7 @@ def resolve_user(uid: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Client of the daemon, identified by the kernel."""
+    """Client of the daemon, with the process id and user id that the kernel reports."""
 
     number: int
     """Number of the client's connection."""

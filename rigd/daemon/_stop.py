@@ -304,7 +304,7 @@ class _DaemonStop:
         self._thread.start()
 
     def join(self, patience_s: float) -> None:
-        """Wait until the stop has succeeded or failed, or a time in seconds has passed."""
+        """Wait, for at most `patience_s` seconds, until the stop has succeeded or failed."""
         self._thread.join(patience_s)
 
     @property

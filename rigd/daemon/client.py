@@ -59,8 +59,8 @@ class DaemonUnreachableError(FailureError):
     message
         Text for the operator.
     lost_process
-        Process id and user id of a daemon whose connection was lost, or None if the message is
-        complete without further examination.
+        Process id and user id of a daemon whose connection was lost; None if `message` needs no
+        report on the processes that it leaves.
     """
 
     def __init__(self, message: str, lost_process: tuple[int, int] | None = None) -> None:

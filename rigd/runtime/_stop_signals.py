@@ -1,4 +1,4 @@
-"""Signals that request the end of a command, which an exception then ends (on every system)."""
+"""Signals that request the end of a command: they raise an exception in it, on every system."""
 
 import contextlib
 import ctypes

@@ -90,7 +90,7 @@ def folder_fault(folder: Path, *, shared: bool = False) -> str:
 
 
 def known_folders(uid: int | None) -> list[Path]:
-    """Return all folders that a process of the user may use as runtime folder, by its environment.
+    """Return the folders that processes of a user may use as runtime folder.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def announce(path: Path, address: Mapping[str, object]) -> None:
 
 
 def read_address(path: Path) -> dict[str, Any]:
-    """Return the address that `announce` wrote to a file, or an empty dictionary if invalid."""
+    """Return the address that `announce` wrote to a file; empty if the file is not valid."""
     try:
         # The file may be of any kind, even one that blocks on opening.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)

@@ -229,7 +229,7 @@ class Antenna:
     def _interpolate_to_ticks(self, samples: Records) -> Real:
         """Return time (ns) and motor angle (rad) of all new ticks, shape (n, 2).
 
-        They follow the last sample of the previous call, and end with the last of `samples`.
+        The new ticks are those after the last sample of the previous call, to the last sample.
         Ticks without a sample have interpolated values.
         """
         ticks = samples["tick"].astype(np.int64)

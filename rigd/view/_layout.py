@@ -451,9 +451,9 @@ class Scale:
         ]
 
     def frame(self) -> list[Drawing]:
-        """Return the function that sends a first, empty invisible point of each axis to Rerun.
+        """Return the function that sends an empty first value of each axis's invisible points.
 
-        Without a point Rerun reports an error.
+        Without any value Rerun reports an error.
         """
         empty_values = {axis.view.tick_component: np.array([[np.nan]]) for axis in self._axes}
         start_ns = np.array([0])

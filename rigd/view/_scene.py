@@ -198,7 +198,7 @@ class Scene:
         return self._draw_banner()
 
     def health(self, t_ns: int, health_reading: Health) -> list[Drawing]:
-        """Return functions that draw the condition of loop, recorder, disk and bus at one time.
+        """Return functions that draw the health of loop, recorder, disk and bus at a time.
 
         Parameters
         ----------

@@ -29,7 +29,7 @@ _OS_ERROR_PATTERN: Final = re.compile(r"os error (\d+)")
 
 
 def without_rerun_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return an environment without Rerun's variables, such as ``RERUN=off``."""
+    """Return environment variables without those that affect Rerun, such as ``RERUN=off``."""
     return {
         variable_name: variable_value
         for variable_name, variable_value in environment.items()
@@ -49,7 +49,7 @@ def prepare_sdk_environment() -> None:
 
 
 class RrdFileError(FailureError):
-    """Error: a Rerun file cannot be written, or a file is not a Rerun file."""
+    """Raised if a Rerun file cannot be written, or a file is not a Rerun file."""
 
 
 @contextlib.contextmanager
@@ -143,7 +143,7 @@ def _translate_write_errors(path: Path, temporary_path: Path) -> Iterator[None]:
 
 
 def _reason_of_write_failure(temporary_path: Path) -> str:
-    """Append to a file, and return the reason for which the operating system refuses that.
+    """Return the reason for which the operating system refuses to append to a file, by a trial.
 
     Rerun's SDK may not report the reason.
     """

@@ -172,7 +172,7 @@ def refusal_response(status: int, text: str) -> web.Response:
 
 
 def _refusal_of_other_pages(request: web.Request) -> web.Response | None:
-    """Return the refusal of a request that this server's own page would not send, or None."""
+    """Return the refusal of a request from another page; None if it is from this server's page."""
     host_name = request.headers.get("Host", "")
     # The port may differ because of a tunnel, but the name must be local.
     if _host_name_of(host_name) not in _PERMITTED_HOSTS:

@@ -17,7 +17,7 @@ import warm_start
 from processes import eventually
 
 from rigd.daemon import page_address
-from rigd.daemon._page import _job
+from rigd.daemon._page import _page_job
 from rigd.profile import load_profile
 from rigd.web import _access, _jobs, _library, _live, _server
 
@@ -120,7 +120,11 @@ class Served(Requests):
         self.folder = folder
         self.daemon = FakeDaemon()
         self._path = path
-        self._job = _job(profile, folder, path) | {"token": TOKEN, "port": 0, "any_port": False}
+        self._job = _page_job(profile, folder, path) | {
+            "token": TOKEN,
+            "port": 0,
+            "any_port": False,
+        }
         self._thread = threading.Thread(target=self._work)
         self._ready = threading.Event()
         self._thread.start()
