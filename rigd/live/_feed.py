@@ -103,7 +103,7 @@ class DrawingStream:
         return self._stream is not None
 
     def _has_recovered(self) -> bool:
-        """Return whether a stalled server accepts drawings again; kill it after `_MAX_STALLED_POLLS`."""
+        """Return whether a stalled server accepts drawings again; kill it if that takes long."""
         self._flush(_STALLED_FLUSH_TIMEOUT_S)
         if self.stalled:
             self._stalled_polls += 1
