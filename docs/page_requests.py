@@ -158,7 +158,7 @@ def page_document() -> Document:
 
 def page_routes() -> Iterator[tuple[str, str]]:
     """Yield method and path of each route with the first sentence of its handler's docstring."""
-    job = _page._job(load_profile("sim"), Path(), Path()) | {"token": ""}
+    job = _page._page_job(load_profile("sim"), Path(), Path()) | {"token": ""}
     for route in _server.OperatorPageServer(job).application().router.routes():
         if route.method != "HEAD" and route.resource is not None:
             text = inspect.getdoc(route.handler) or ""

@@ -22,7 +22,7 @@ from rigd.printable import readable_errors
 
 
 def _show_version(requested: bool) -> None:
-    """Print the version and end the command, if it is requested."""
+    """Print the version and end the program, if the option ``--version`` was given."""
     if requested:
         typer.echo(f"rigd {rigd.__version__}")
         raise typer.Exit
@@ -47,16 +47,16 @@ _SECTIONS: Final = {
     "Simulated devices": ("simulate", "inject"),
 }
 """Names of the commands in each section of the help."""
-_OTHERS: Final = "Other commands"
-"""Title of the help's section with commands that are in no other section."""
+_OTHERS_TITLE: Final = "Other commands"
+"""Title of the section of the help with all commands that are not in `_SECTIONS`."""
 
 
 class RigdGroup(TyperGroup):
-    """Group of all commands, which turns errors into messages and exit codes."""
+    """Group of all commands of ``rigd``, which turns errors into messages and exit codes."""
 
     # Typer's click is its own in some versions and the package of that name in others.
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
-        """Write the list of commands of the help text, in sections."""
+        """Write the list of commands into the help text, in sections."""
         listed_names = {
             command_name for command_names in _SECTIONS.values() for command_name in command_names
         }
@@ -65,21 +65,21 @@ class RigdGroup(TyperGroup):
             for command_name in self.list_commands(ctx)
             if command_name not in listed_names
         )
-        for section_title, command_names in {**_SECTIONS, _OTHERS: other_names}.items():
-            known = [
+        for section_title, command_names in {**_SECTIONS, _OTHERS_TITLE: other_names}.items():
+            known_names = [
                 command_name for command_name in command_names if command_name in self.commands
             ]
-            if known:
-                name_width = formatter.width - 6 - max(map(len, known))
+            if known_names:
+                name_width = formatter.width - 6 - max(map(len, known_names))
                 help_rows = [
                     (command_name, self.commands[command_name].get_short_help_str(name_width))
-                    for command_name in known
+                    for command_name in known_names
                 ]
                 with formatter.section(section_title):
                     formatter.write_dl(help_rows)
 
     def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
-        """Parse the options before the command, with readable error messages."""
+        """Parse the options that precede the command's name, with readable error messages."""
         with readable_errors():
             return super().make_context(*args, **extra)
 

@@ -69,7 +69,7 @@ def _eds_file_rows(eds: Path, profile: str | None) -> "list[CheckRow]":
 def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, eds_only: bool) -> None:
     """Print the rows of a check as a table or JSON, and end with exit code 1 if it failed.
 
-    `eds_only` states that the rows are those of an EDS file only.
+    `eds_only` states that only an EDS file was checked.
     """
     from rigd.check_rows import overall
 
@@ -83,10 +83,10 @@ def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, eds_only: bool
         from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, print_table
 
         print_table(check_rows, EDS_CONSEQUENCES if eds_only else RIG_CONSEQUENCES)
-        has_failed = {row.name for row in check_rows if row.verdict is CheckResult.FAIL}
-        if has_failed and has_failed.issubset(ACCEPTABLE) and not eds_only:
+        failed_names = {row.name for row in check_rows if row.verdict is CheckResult.FAIL}
+        if failed_names and failed_names.issubset(ACCEPTABLE) and not eds_only:
             accepted_rows = " ".join(
-                f"--accept {row_name}" for row_name in ACCEPTABLE if row_name in has_failed
+                f"--accept {row_name}" for row_name in ACCEPTABLE if row_name in failed_names
             )
             typer.echo(f"To accept that for one session: rigd run … {accepted_rows}")
     if verdict == "failed":
@@ -129,7 +129,7 @@ def _openable_profile(name: str) -> "Profile":
 
 
 def _interrupt_on_end_signals() -> None:
-    """Make SIGTERM and SIGHUP raise KeyboardInterrupt, so that the devices are closed."""
+    """Make SIGTERM and SIGHUP raise KeyboardInterrupt, so that the devices are then closed."""
     raise_on_signals(signal.SIGTERM, signal.SIGHUP)
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 _UPDATE_PERIOD_S = 0.5
-"""Period in seconds in which ``rigd status --watch`` updates the status."""
+"""Interval in seconds at which ``rigd status --watch`` updates the status."""
 
 
 def serve(
@@ -92,15 +92,15 @@ def serve(
         raise typer.Exit(EXIT_INTERRUPTED)
 
 
-DaemonOf = Annotated[
+DaemonProfile = Annotated[
     str | None,
     typer.Option("--profile", help="Profile of the rig (default: the only running daemon)."),
 ]
 
 
 @contextmanager
-def daemon_of(profile: str | None) -> "Iterator[Client]":
-    """Connect to the daemon of a profile, or the only running one; yield the connected client."""
+def daemon_client(profile: str | None) -> "Iterator[Client]":
+    """Yield a client of the daemon of a profile, or of the only running daemon, in this context."""
     from rigd.daemon.client import Client
 
     with Client(_socket_path(profile)) as client:
@@ -108,14 +108,14 @@ def daemon_of(profile: str | None) -> "Iterator[Client]":
 
 
 def _socket_path(profile: str | None) -> "Path":
-    """Return the path of the control socket of a profile's daemon, or of the only daemon."""
+    """Return the path of the control socket of a profile's daemon, or of the only running one."""
     from rigd.daemon.address import find
 
     return find(rig_name(profile))
 
 
 def rig_name(profile: str | None) -> str | None:
-    """Return the name of a profile's rig, which identifies its daemon; None for no profile."""
+    """Return the name of a profile's rig, which identifies its daemon; None without profile."""
     if profile is None:
         return None
     from rigd.daemon.address import running, socket_path
@@ -129,7 +129,7 @@ def rig_name(profile: str | None) -> str | None:
 
 
 def status(
-    profile: DaemonOf = None,
+    profile: DaemonProfile = None,
     watch: Annotated[
         bool, typer.Option("--watch", help="Update continuously until Ctrl-C.")
     ] = False,
@@ -150,7 +150,7 @@ def status(
             )
         _watch_status(profile)
         return
-    with daemon_of(profile) as client:
+    with daemon_client(profile) as client:
         daemon_reply = client.ask("status")
     from rigd.cli.status_report import report_status
 
@@ -175,17 +175,17 @@ def stop(
     """
     from rigd.cli.stop_report import stop_and_report
 
-    code = stop_and_report(profile, wait=not no_wait)
-    if code:
-        raise typer.Exit(code)
+    exit_code = stop_and_report(profile, wait=not no_wait)
+    if exit_code:
+        raise typer.Exit(exit_code)
 
 
-def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
+def tare(profile: DaemonProfile = None, as_json: AsJson = False) -> None:
     """Tare the sensor: take its mean at rest as zero. No torque.
 
     Example: rigd tare
     """
-    with daemon_of(profile) as client:
+    with daemon_client(profile) as client:
         daemon_reply = client.ask("tare")
     if as_json:
         typer.echo(json.dumps(_measured_values(daemon_reply)))
@@ -199,14 +199,14 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     typer.echo(f"coupling torque: s.d. {daemon_reply['torque_std_nm']:.3f} N·m")
 
 
-def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
+def zero(profile: DaemonProfile = None, as_json: AsJson = False) -> None:
     """Set the present motor angle as zero.
 
     The angle limits are relative to this zero. The torque stays off.
 
     Example: rigd zero
     """
-    with daemon_of(profile) as client:
+    with daemon_client(profile) as client:
         daemon_reply = client.ask("zero")
     if as_json:
         typer.echo(json.dumps(_measured_values(daemon_reply)))
@@ -215,7 +215,7 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
 
 
 def reset_by_daemon(profile: str | None) -> bool:
-    """Reset the rig's fault by its daemon, or the only daemon; return False if none runs."""
+    """Have the daemon of a rig, or the only running one, reset the fault; False if none runs."""
     from rigd.daemon.address import running, socket_path
 
     socket_paths = running()
@@ -228,7 +228,7 @@ def reset_by_daemon(profile: str | None) -> bool:
             path.name for path in socket_paths
         }:
             return False
-    with daemon_of(profile) as client:
+    with daemon_client(profile) as client:
         daemon_reply = client.ask("reset")
     typer.echo("The fault is reset; the devices are connected and the torque is off.")
     if daemon_reply["zero_lost"]:
@@ -237,7 +237,7 @@ def reset_by_daemon(profile: str | None) -> bool:
 
 
 def _measured_values(daemon_reply: dict[str, Any]) -> dict[str, Any]:
-    """Return the measured values in a daemon's reply, without the reply's name and result."""
+    """Return only the measured values in a daemon's reply to ``tare`` or ``zero``."""
     return {
         value_name: measured_value
         for value_name, measured_value in daemon_reply.items()
@@ -246,7 +246,7 @@ def _measured_values(daemon_reply: dict[str, Any]) -> dict[str, Any]:
 
 
 def _watch_status(profile: str | None) -> None:
-    """Show the daemon's status repeatedly until Ctrl-C, also after a restart of the daemon."""
+    """Show the daemon's status repeatedly until Ctrl-C, even if the daemon is restarted."""
     from rich.console import Console
     from rich.live import Live
 
@@ -255,7 +255,10 @@ def _watch_status(profile: str | None) -> None:
     from rigd.daemon.client import Client
 
     wanted_rig = rig_name(profile)
-    with daemon_of(profile) as client, Live(console=Console(), auto_refresh=False) as live_display:
+    with (
+        daemon_client(profile) as client,
+        Live(console=Console(), auto_refresh=False) as live_display,
+    ):
         connected_client: Client | None = client
         while True:
             try:

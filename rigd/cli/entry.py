@@ -1,4 +1,4 @@
-"""Start and end of every command of ``rigd``, in a module that is imported quickly for a stop."""
+"""Start and end of every command of ``rigd``; quick to import, so that ``rigd stop`` is quick."""
 
 import contextlib
 import errno
@@ -20,7 +20,7 @@ EXIT_INTERRUPTED = 130
 
 
 def run_command(command: Callable[[], object]) -> None:
-    """Run a command; Ctrl-C and system errors end the process with a message and an exit code."""
+    """Run a command; Ctrl-C or a system error ends the process with a message and an exit code."""
     raise_on_signals(signal.SIGINT)
     for stream in (sys.stdout, sys.stderr):
         # A terminal that cannot encode "·" or "²" gets a "?" instead of an error.
@@ -39,7 +39,7 @@ def run_command(command: Callable[[], object]) -> None:
 
 
 def _system_error_message(error: OSError) -> str:
-    """Return the message on a system error that no command has caught."""
+    """Return the message for the user on a system error that no command has caught."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return (
             f"Too many open files ({error.strerror}); raise the limit (ulimit -n) "

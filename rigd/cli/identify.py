@@ -130,10 +130,10 @@ def _run_sessions(
     hardware: bool,
     quiet_stdout: bool,
 ) -> list[Path]:
-    """Run a trial session and the two sessions of the estimate; return the files of these two.
+    """Run a trial session and two sessions for the estimate; return the files of the latter two.
 
-    An incomplete session ends the command. The file of the trial is not returned, because its
-    controller is too slow for the estimate.
+    An incomplete session ends the command. The file of the trial is not used for the estimate,
+    because the controller is too slow in the trial.
     """
     stop_request, process_group = start_processes(live=False)
     from rigd.identification import with_cautious_controller, with_tuned_controller

@@ -32,7 +32,7 @@ _FIRST_SESSION_TEXT: Final = (
     f"No sessions yet: there is no folder {SESSIONS}. Record one on the simulated rig with "
     "rigd run chirp --fast, or list those of another folder with rigd list FOLDER."
 )
-"""What is listed where the default folder does not exist."""
+"""Text that is printed if the default folder of sessions does not exist."""
 
 
 def list_sessions(
@@ -121,14 +121,14 @@ def specimens() -> None:
 
     for specimen_name, specimen_path in specimen_files().items():
         try:
-            described = load_specimen(specimen_path)
+            specimen = load_specimen(specimen_path)
         except ProfileError as error:
             beam_text = f"cannot be used: {str(error).splitlines()[0]}"
         else:
-            beam = described.beam
+            beam = specimen.beam
             beam_text = (
                 f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
-                f"{beam.bending_stiffness_n_m2:g} N·m²{described.note and f', {described.note}'} "
+                f"{beam.bending_stiffness_n_m2:g} N·m²{specimen.note and f', {specimen.note}'} "
                 f"({specimen_path})"
             )
         typer.echo(readable_message(f"{specimen_name}: {beam_text}"))
@@ -136,15 +136,15 @@ def specimens() -> None:
 
 def _sessions_of_one_specimen(session_rows: "list[SessionRow]") -> "list[SessionRow]":
     """Return the sessions whose modes are known; end the command if they have several specimens."""
-    with_modes = [row for row in session_rows if row.modes]
-    specimen_names = sorted({row.specimen for row in with_modes})
+    rows_with_modes = [row for row in session_rows if row.modes]
+    specimen_names = sorted({row.specimen for row in rows_with_modes})
     if len(specimen_names) > 1:
-        named = ", ".join(
+        names = ", ".join(
             repr(specimen_name) if specimen_name else "none" for specimen_name in specimen_names
         )
-        fail(f"--trend: the sessions are of several specimens ({named}); name one by --specimen.",
+        fail(f"--trend: the sessions are of several specimens ({names}); name one by --specimen.",
              EXIT_WRONG_USE)  # fmt: skip
-    return with_modes
+    return rows_with_modes
 
 
 def _local_start(row: "SessionRow") -> str:
@@ -158,7 +158,7 @@ def _local_start(row: "SessionRow") -> str:
 
 
 def _table_lines(titles: Sequence[str], table_rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Yield the lines of a table, without columns whose cells are all empty."""
+    """Yield the lines of a text table, without the columns whose cells are all empty."""
     filled_columns = [
         column_index
         for column_index in range(len(titles))
@@ -175,7 +175,7 @@ def _table_lines(titles: Sequence[str], table_rows: Sequence[Sequence[str]]) -> 
 
 
 def _session_lines(session_rows: "list[SessionRow]") -> Iterator[str]:
-    """Yield the lines of the list of sessions."""
+    """Yield the lines of the table of recorded sessions."""
     if not session_rows:
         yield "No sessions."
         return
@@ -213,14 +213,14 @@ def _mode_text(mode: "EstimatedMode") -> str:
 
 
 def _validity_text(row: "SessionRow") -> str:
-    """Return in short whether a session's linear model is valid; "" if it has no modes."""
+    """Return a short text on whether a session's linear model is valid; "" if it has no modes."""
     from rigd.session import Validity
 
     return Validity.from_document(row.validity).short if row.modes else ""
 
 
 def _uniform_beam_text(row: "SessionRow") -> str:
-    """Return in short whether a uniform beam predicts a session's modes; "" if it is unknown."""
+    """Return a short text on whether a uniform beam predicts a session's modes; "" if unknown."""
     from rigd.session import Validity
 
     check_result = Validity.from_document(row.validity).uniform_beam
@@ -271,7 +271,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
 
 
 def _frequency_limits(trend: "ModeTrend") -> tuple[float, float]:
-    """Return the lowest and the highest limit of a mode's frequency intervals in Hz."""
+    """Return the lowest and highest end of all sessions' frequency intervals of a mode, in Hz."""
     interval_ends_hz = [
         end
         for trend_point in trend.points
@@ -281,7 +281,10 @@ def _frequency_limits(trend: "ModeTrend") -> tuple[float, float]:
 
 
 def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> str:
-    """Return a line that shows a session's frequency interval between the plot's limits in Hz."""
+    """Return a line of characters that draws a session's frequency and its interval.
+
+    The line extends from `lowest_hz` to `highest_hz`.
+    """
     if highest_hz <= lowest_hz:
         return ""
 
@@ -311,7 +314,7 @@ def _quantity_text(estimate: "Estimate", scale: float = 1.0) -> str:
 
 
 def _change_text(change: "Change | None", first_value: float) -> str:
-    """Format a mode's change in per cent of its first value; "*" marks a significant change."""
+    """Format the change of a mode's value in percent of the first; "*" marks a significant one."""
     if change is None or first_value == 0:
         return ""
     change_percent = 100 * change.difference / first_value

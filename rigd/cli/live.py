@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 _POLL_PERIOD_S = 0.5
-"""Period in seconds in which live views are searched for."""
+"""Interval in seconds at which live views are searched for."""
 
 
 def has_screen() -> bool:
@@ -31,7 +31,7 @@ def has_screen() -> bool:
 
 
 def tunnel_advice(live_view: "LiveAddress") -> str:
-    """Return a sentence with the command that opens a live view from another computer."""
+    """Return a sentence for the user with the command to open a live view on another computer."""
     page_port, grpc_port = live_view.page_port, live_view.grpc_port
     return (
         f"From another computer: ssh -L {page_port}:127.0.0.1:{page_port} -L "
@@ -56,7 +56,7 @@ def scratch_folder() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def interrupted_by_end_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP raise KeyboardInterrupt here, so that temporary files are removed."""
+    """Make SIGTERM and SIGHUP raise KeyboardInterrupt here, so that temporary files are removed."""
     signal_numbers = (signal.SIGTERM, signal.SIGHUP)
     previous_handlers = [signal.getsignal(signal_number) for signal_number in signal_numbers]
     raise_on_signals(*signal_numbers)
@@ -145,7 +145,7 @@ def _wait_for_view(rig: str | None) -> "LiveAddress":
 
 
 def _start_advice(profile: str | None) -> str:
-    """Return the advice for the operator if no live view is running."""
+    """Return the message that no live view is running, with the command that starts one."""
     from rigd.daemon.client import daemons
 
     rig_text = "" if profile is None else f" of the rig {profile}"
@@ -189,29 +189,29 @@ def _show_view(live_view: "LiveAddress") -> None:
         fail(f"{viewer.fault} rigd live --web shows the same in a browser.", EXIT_FAILED)
 
 
-def _follow_servers(viewer: "Viewer", shown: "LiveAddress") -> int:
+def _follow_servers(viewer: "Viewer", view: "LiveAddress") -> int:
     """Connect a viewer's window to each new server of a live view until the window is closed.
 
     Returns the exit code of the viewer.
     """
     from rigd.daemon.client import find_views
 
-    view_is_running = True
+    is_view_running = True
     while (exit_code := viewer.exit_code) is None:
         time.sleep(_POLL_PERIOD_S)
-        live_view = next(iter(find_views(shown.rig)), None)
-        if live_view is not None and live_view.server != shown.server:
+        live_view = next(iter(find_views(view.rig)), None)
+        if live_view is not None and live_view.server != view.server:
             if not viewer.connect(live_view):
                 continue  # tried again in the next round
             typer.echo(f"The live view of {live_view.rig} has restarted.", err=True)
-            shown = live_view
-        elif live_view is None and view_is_running:
+            view = live_view
+        elif live_view is None and is_view_running:
             typer.echo(
-                f"The live view of {shown.rig} has ended; the window stays open and shows the next "
+                f"The live view of {view.rig} has ended; the window stays open and shows the next "
                 "one.",
                 err=True,
             )
-        view_is_running = live_view is not None
+        is_view_running = live_view is not None
     return exit_code
 
 
@@ -266,7 +266,7 @@ def replay(
 
 
 def _save_recording(path: Path, out: Path, *, web: bool) -> None:
-    """Write a recording of a session for Rerun to a new file."""
+    """Convert a session file into a new Rerun file, for the option ``--save``."""
     if web:
         fail(
             "--save writes a file and shows nothing, so it cannot be combined with --web.",
@@ -278,7 +278,7 @@ def _save_recording(path: Path, out: Path, *, web: bool) -> None:
         check_new(out)
     except RrdFileError as error:
         fail(f"--save {error}", EXIT_WRONG_USE)
-    _convert(path, out)
+    _write_rerun_file(path, out)
     typer.echo(f"{out}: open it with rigd replay {out}.", err=True)
 
 
@@ -292,8 +292,8 @@ def _check_displayable(path: Path) -> None:
         check_magic_bytes(path)
 
 
-def _convert(path: Path, out: Path) -> None:
-    """Write a recording of a session for Rerun, with a progress line."""
+def _write_rerun_file(path: Path, out: Path) -> None:
+    """Convert a session file into a Rerun file, with a progress line."""
     from rigd.session import read_session, read_timings
     from rigd.view import draw_session
 
@@ -303,17 +303,17 @@ def _convert(path: Path, out: Path) -> None:
 
 
 def _as_recording(path: Path, scratch: Path) -> Path:
-    """Return the recording for Rerun's viewer; a session file is converted into `scratch`."""
+    """Return the path of a Rerun file; if `path` is a session file, convert it into `scratch`."""
     if path.suffix == SUFFIX:
         check_rrd_file(path)
         return path
     recording = scratch / f"session{SUFFIX}"
-    _convert(path, recording)
+    _write_rerun_file(path, recording)
     return recording
 
 
 def _open_window(recording: Path, scratch: Path, path: Path) -> None:
-    """Show a recording in a window until the window is closed."""
+    """Show a Rerun file in a window until the window is closed."""
     from rigd.live import FileWindow
 
     with FileWindow(recording, scratch) as file_window:
@@ -326,7 +326,7 @@ def _open_window(recording: Path, scratch: Path, path: Path) -> None:
 
 
 def _serve_recording(recording: Path, scratch: Path, path: Path) -> None:
-    """Serve a recording for browsers until Ctrl-C."""
+    """Show a Rerun file on a page for browsers until Ctrl-C."""
     from rigd.live import PageOfFile
 
     with PageOfFile(recording, scratch) as page:

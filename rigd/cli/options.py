@@ -34,7 +34,7 @@ def complain(message: str) -> None:
 
 @contextlib.contextmanager
 def exit_on_errors() -> Iterator[None]:
-    """Turn an error of the rig into a message and exit code 1, or 2 if the request is wrong."""
+    """Turn an error of rigd in this context into a message and exit code 1, or 2 for wrong use."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -170,7 +170,7 @@ WatchFit = Annotated[
 def session_notes(
     operator: str, specimen: str, note: str, meta: list[str] | None
 ) -> dict[str, str]:
-    """Return the metadata of a session from the options, by their keys in the session file.
+    """Return the metadata that the options state: key in the session file → text.
 
     Invalid metadata end the command.
     """
@@ -198,9 +198,10 @@ def session_notes(
 
 
 def profile_named(name_or_file: str) -> "Profile":
-    """Load a profile by its name or file.
+    """Load a profile by its name or the path of its file.
 
-    The slow modules of profiles are imported in the function, for a quick start of other commands.
+    The modules of profiles are imported here, because they are slow and other commands start
+    without them.
     """
     from rigd.profile import load_profile
 

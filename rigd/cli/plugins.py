@@ -85,11 +85,11 @@ def show(
 
 
 _TEMPLATE = Path(__file__).with_name("plugin_template")
-"""Folder with the files of a new package, in which NAME represents the name of its part."""
+"""Folder with the template of a package, in which NAME represents the name of its part."""
 
 
 class PartKind(StrEnum):
-    """Kind of part that a new package adds."""
+    """Kind of the part that a new package adds to rigd."""
 
     DEVICE = "device"
     """Force-torque sensor."""
@@ -148,30 +148,31 @@ def new(
         f"{kind.value}.py.txt": "rigd_NAME/__init__.py",
         f"test_{kind.value}.py.txt": "tests/test_NAME.py",
     }
-    target = folder if folder is not None else Path(f"rigd-{name}")
+    package_folder = folder if folder is not None else Path(f"rigd-{name}")
     try:
-        target.mkdir(parents=True)
+        package_folder.mkdir(parents=True)
         for template, path in template_files.items():
             text = (_TEMPLATE / template).read_text(encoding="utf-8")
             if not template.endswith(".py.txt"):
                 for word, replacement in _TEMPLATE_WORDS[kind].items():
                     text = text.replace(word, replacement)
-            new_file = target / path.replace("NAME", name)
+            new_file = package_folder / path.replace("NAME", name)
             new_file.parent.mkdir(exist_ok=True)
             new_file.write_text(text.replace("NAME", name), encoding="utf-8")
     except FileExistsError:
-        fail(f"{target} exists already; choose another folder (--folder).", EXIT_WRONG_USE)
+        fail(f"{package_folder} exists already; choose another folder (--folder).", EXIT_WRONG_USE)
     except OSError as error:
-        fail(f"{target} cannot be written ({error.strerror}).", EXIT_FAILED)
-    made = printable(str(target))
+        fail(f"{package_folder} cannot be written ({error.strerror}).", EXIT_FAILED)
+    folder_text = printable(str(package_folder))
     typer.echo(
-        f"{made} is made. In the environment of rigd: pip install --editable '{made}[test]', "
-        f"rigd plugins, python -m pytest {made}/tests."
+        f"{folder_text} is made. In the environment of rigd: pip install --editable "
+        f"'{folder_text}[test]', "
+        f"rigd plugins, python -m pytest {folder_text}/tests."
     )
 
 
 def _is_taken(kind: PartKind, name: str) -> bool:
-    """Return whether rigd or an installed package has a part of this kind and name."""
+    """Return whether rigd or an installed package already has a part of this kind and name."""
     from rigd.control.kinds import CONTROLLERS
     from rigd.devices.kinds import DEVICES
     from rigd.plugins import PluginError

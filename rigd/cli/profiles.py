@@ -142,9 +142,9 @@ def new(
     from rigd.devices.eds import read_eds
     from rigd.profile import Draft, check_new, write_new
 
-    base = profile_named(start_from)
+    base_profile = profile_named(start_from)
     check_new(output)
-    draft = Draft(base, read_eds(eds), output)
+    draft = Draft(base_profile, read_eds(eds), output)
     write_new(output, _ask_for_values(draft) if is_terminal() else draft.text())
     for draft_remark in draft.remarks:
         typer.echo(f"Note: {draft_remark}", err=True)
@@ -172,7 +172,7 @@ def is_terminal() -> bool:
 
 
 def _ask_for_values(draft: "Draft") -> str:
-    """Ask the user for values that no file states until the profile is valid; return its text."""
+    """Ask the user for missing values until the draft is a valid profile; return its text."""
     from rigd.profile import ProfileError
 
     typer.echo(
@@ -210,7 +210,7 @@ def _ask_for_acceptance(draft: "Draft") -> None:
 
 
 def _ask_for_value(draft: "Draft", key: str, text: str) -> None:
-    """Ask the user for the value of a key until the answer is valid."""
+    """Ask the user for the value of a key of the profile until the answer is valid."""
     while True:
         typed_reply = typer.prompt(text, default=draft.value_text(key), err=True)
         try:

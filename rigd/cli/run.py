@@ -50,19 +50,19 @@ if TYPE_CHECKING:
 
 
 class _AddedExcitations(TyperGroup):
-    """Group of the excitations' subcommands, with those of installed packages.
+    """Group of the subcommands of excitations, including excitations of installed packages.
 
-    A package is imported when its excitation is named; the help lists the names alone.
+    A package is imported only when its excitation is requested; the help lists names only.
     """
 
     # Typer's click is its own in some versions and the package of that name in others.
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ANN401
-        """Return a subcommand; that of a package is made first."""
+        """Return a subcommand by its name, also one for an excitation of an installed package."""
         command = super().get_command(ctx, cmd_name)
         return command or _added_command(self.name or "run", cmd_name)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
-        """Write the list of commands of the help text, and what installed packages add."""
+        """Write the list of commands into the help text, including those of installed packages."""
         from rigd.plugins import installed_plugins
 
         super().format_commands(ctx, formatter)
@@ -73,7 +73,7 @@ class _AddedExcitations(TyperGroup):
 
 
 class _RunCommands(_AddedExcitations, SessionCommands):
-    """Subcommands of ``rigd run``."""
+    """Group of the subcommands of ``rigd run``."""
 
 
 run_app = typer.Typer(
@@ -110,24 +110,26 @@ Model = Annotated[
 ]
 
 
-Parameters = Callable[..., "Mapping[str, Value | None]"]
+ParametersFunction = Callable[..., "Mapping[str, Value | None]"]
 """Type of a function that turns the options of an excitation into its parameters.
 
 A parameter has the name of its option if possible."""
 
 
-def excitation_command(parameters: Parameters) -> Parameters:
+def excitation_command(parameters: ParametersFunction) -> ParametersFunction:
     """Register the subcommands ``rigd run NAME`` and ``rigd start NAME`` of an excitation.
 
-    Both have the excitation's own options and those of every session.
+    Both have the excitation's own options and the options that all sessions have.
     """
     _add_subcommand(run_app, run_sessions, parameters)
     _add_subcommand(start_app, start_sessions, parameters)
     return parameters
 
 
-def _add_subcommand(app: typer.Typer, perform: Callable[..., None], parameters: Parameters) -> None:
-    """Add the subcommand of an excitation to a command; `perform` runs its sessions."""
+def _add_subcommand(
+    app: typer.Typer, perform: Callable[..., None], parameters: ParametersFunction
+) -> None:
+    """Add the subcommand of an excitation to `app`; `perform` runs the sessions."""
     excitation_kind = parameters.__name__
     own_parameters = list(map(_command_option, inspect.signature(parameters).parameters.values()))
     common_parameters = list(inspect.signature(perform).parameters.values())[2:]
@@ -160,13 +162,13 @@ def _add_subcommand(app: typer.Typer, perform: Callable[..., None], parameters: 
 
 
 def _added_command(app_name: str, name: str) -> Any:  # noqa: ANN401 - typer's click varies
-    """Return the subcommand of an excitation that an installed package adds, or None."""
+    """Return the subcommand of an installed package's excitation; None if there is none."""
     from rigd.excitation import excitation_options, find_excitation
 
-    added = find_excitation(name)
-    if added is None:
+    added_excitation = find_excitation(name)
+    if added_excitation is None:
         return None
-    kind, owner = added
+    kind, owner = added_excitation
 
     def parameters(**options: "Value") -> "dict[str, Value]":
         return options
@@ -190,18 +192,21 @@ def _added_command(app_name: str, name: str) -> Any:  # noqa: ANN401 - typer's c
 
 
 def _command_option(parameter: inspect.Parameter) -> inspect.Parameter:
-    """Return a parameter with a declared help (`doc`) as an option of the command line.
+    """Return a function's parameter that declares its help text (`doc`) as a command-line option.
 
-    Its flag has no units s and rad; its help has the unit in parentheses.
+    The suffix ``_s`` or ``_rad`` is dropped from the flag; the help text ends with the unit. A
+    parameter without such a help text is returned unchanged.
     """
     value_type, *extras = get_args(parameter.annotation) or (None,)
-    declared = next((each for each in extras if isinstance(each, DocInfo)), None)
-    if declared is None:
+    declared_help = next((each for each in extras if isinstance(each, DocInfo)), None)
+    if declared_help is None:
         return parameter
     name, unit = parameter.name, unit_of(parameter.name)
     flag = "--" + name.removesuffix("_s").removesuffix("_rad").replace("_", "-")
-    text = (declared.documentation or name).removesuffix(".") + (f" ({unit})." if unit else ".")
-    return parameter.replace(annotation=Annotated[value_type, typer.Option(flag, help=text)])
+    help_text = (declared_help.documentation or name).removesuffix(".") + (
+        f" ({unit})." if unit else "."
+    )
+    return parameter.replace(annotation=Annotated[value_type, typer.Option(flag, help=help_text)])
 
 
 def run_sessions(
@@ -230,8 +235,10 @@ def run_sessions(
     if live:
         require_extra("live", "--live")
     session_metadata = session_notes(operator, specimen, note, meta)
-    fits_live = watch_fit or kind == "until"
-    stop_request, process_group = start_processes(live=live, touch=kind == "touch", fit=fits_live)
+    with_live_fit = watch_fit or kind == "until"
+    stop_request, process_group = start_processes(
+        live=live, touch=kind == "touch", fit=with_live_fit
+    )
     from rigd.runner import SeriesFailedError, run_in_foreground
     from rigd.runner.planning import excitation_for
     from rigd.runtime import ignore

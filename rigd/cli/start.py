@@ -1,4 +1,4 @@
-"""Implementation of ``rigd start``, whose sessions the daemon runs, and start of processes."""
+"""Implementation of ``rigd start`` (sessions that the daemon runs), and start of processes."""
 
 import contextlib
 import json
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from rigd.cli.daemon import DaemonOf, daemon_of
+from rigd.cli.daemon import DaemonProfile, daemon_client
 from rigd.cli.options import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
@@ -47,9 +47,9 @@ _QUICK_LOOK_PATIENCE_S = 10.0
 
 
 class SessionCommands(TyperGroup):
-    """Group of commands that run sessions, which reports a Ctrl-C before a session begins.
+    """Group of commands that run sessions, which handles a Ctrl-C before a session begins.
 
-    After :func:`start_processes` Ctrl-C stops the session, which reports it.
+    After :func:`start_processes` a Ctrl-C stops the session, and the session reports it.
     """
 
     # Typer's click is its own in some versions and the package of that name in others.
@@ -68,7 +68,7 @@ def start_processes(
 ) -> "tuple[StopRequest, ProcessGroup]":
     """Make Ctrl-C a request to stop the session, and start the processes of the first session.
 
-    The processes import their modules while the command line imports others and plans.
+    The processes import their modules while the command imports others and plans the session.
     """
     from rigd.engine.workers import FIT, TOUCH
     from rigd.runner import ProcessGroup
@@ -92,7 +92,7 @@ def start_processes(
 def start_sessions(
     kind: str,
     parameters: "Mapping[str, Value]",
-    profile: DaemonOf = None,
+    profile: DaemonProfile = None,
     repeat: Repeat = 1,
     operator: Operator = "",
     specimen: Specimen = "",
@@ -140,7 +140,7 @@ def start_sessions(
         request["accept"] = accept
     if tip_slope_rad is not None:  # likewise
         request["tip_slope_rad"] = tip_slope_rad
-    with daemon_of(profile) as client:
+    with daemon_client(profile) as client:
         daemon_status = client.ask("status")["daemon"]
         typer.echo(daemon_status["what_moves"], err=True)
         if not detach:
@@ -178,7 +178,7 @@ def start_sessions(
 
 
 class _Interrupts:
-    """Counts presses of Ctrl-C: the first requests a stop, the second ends the command."""
+    """Counter of presses of Ctrl-C: the first requests a stop, the second ends the command."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -295,7 +295,7 @@ def _follow_series(
 
 
 def _print_plan(plan: dict[str, Any], *, err: bool) -> None:
-    """Print the plan of a session, with `err` to standard error."""
+    """Print the plan of a session to standard output, or to standard error if `err`."""
     from rigd.runner import plan_lines
 
     for plan_line in plan_lines(plan):

@@ -1,4 +1,4 @@
-"""Request and output of ``rigd status``, in a module that is imported quickly."""
+"""Request and output of ``rigd status``, in a module that is quick to import."""
 
 import json
 import sys
@@ -12,7 +12,7 @@ from rigd.printable import readable_message
 
 
 def main() -> None:
-    """Run ``rigd status`` without the parser of options, which is slower than the request."""
+    """Run ``rigd status`` without options; this does not load the option parser, which is slow."""
     run_command(_request_and_report)
 
 
@@ -28,7 +28,7 @@ def _request_and_report() -> None:
 
 
 def report_status(daemon_reply: dict[str, Any], *, as_json: bool) -> None:
-    """Print a daemon's reply to the request ``status``, as a table or as a JSON document."""
+    """Print a daemon's reply to the request ``status`` as a table or as a JSON document."""
     if as_json:
         del daemon_reply["reply"], daemon_reply["ok"]
         sys.stdout.write(f"{json.dumps(daemon_reply)}\n")

@@ -112,19 +112,19 @@ def progress_text(progress: dict[str, Any]) -> str:
 
 
 def _series_text(series: dict[str, Any]) -> str:
-    """Return a line on a running or ended series of sessions."""
+    """Return a line of text on the progress or the result of a series of sessions."""
     series_title = f"{series['excitation']} {series['session']} of {series['repeat']}"
     if series["running"]:
         return f"{series_title}: {series['path'] or 'being planned'}"
     complete_sessions = [
         session for session in series["sessions"] if session["outcome"] == "complete"
     ]
-    why = f" ({series['reason']})" if series["reason"] else ""
-    return f"{series_title}, ended: {len(complete_sessions)} complete{why}"
+    reason_text = f" ({series['reason']})" if series["reason"] else ""
+    return f"{series_title}, ended: {len(complete_sessions)} complete{reason_text}"
 
 
 def _empty_table(title: str, *columns: str) -> Table:
-    """Return an empty table with a left-aligned first column and right-aligned other ones."""
+    """Return a table without rows: first column left-aligned, other columns right-aligned."""
     empty_table = Table(
         box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold underline"
     )
@@ -171,7 +171,7 @@ def _signal_table(rig: dict[str, Any]) -> Table:
 
 
 def _health_table(rig: dict[str, Any]) -> Table:
-    """Return the table of the health of loop, recorder, bus and view, with coloured problems."""
+    """Return the table of the health of loop, recorder, bus and live view, problems in colour."""
     health_table = _empty_table("health", "")
     for row_name, row_text, row_style in _health_rows(rig):
         health_table.add_row(row_name, Text(row_text, style=row_style))
@@ -179,7 +179,7 @@ def _health_table(rig: dict[str, Any]) -> Table:
 
 
 def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Yield name, text and style of each row of the table of the rig's health."""
+    """Yield the name, text and style of each row of `_health_table`."""
     health, signals = rig["health"], rig["signals"]
     if signals is not None:
         # The expected rate of the samples is that of the loop.

@@ -1,4 +1,4 @@
-"""Action and output of ``rigd stop``, in a module that is imported quickly."""
+"""Action and output of ``rigd stop``, in a module that is quick to import."""
 
 import sys
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Run ``rigd stop`` without the parser of options, which is slower than the stop itself."""
+    """Run ``rigd stop`` without options; this does not load the option parser, which is slow."""
     run_command(lambda: sys.exit(stop_and_report(None, wait=True)))
 
 

@@ -45,7 +45,7 @@ class _DroppingQueueHandler(logging.handlers.QueueHandler):
 
 
 class DaemonLog:
-    """Context in which the records of the daemon's logger are written to standard error."""
+    """Context in which a thread writes the records of the daemon's logger to standard error."""
 
     def __init__(self) -> None:
         self._queue: queue.Queue[logging.LogRecord] = queue.Queue(_MAX_WAITING_RECORDS)

@@ -1,4 +1,4 @@
-"""Main program of ``rigd serve``: lock, socket, rig and signals."""
+"""Main program of ``rigd serve``: it takes the rig's lock, and runs until a signal."""
 
 import asyncio
 import logging
@@ -144,12 +144,12 @@ async def _run_until_signal(server: Server, service: Service) -> signal.Signals:
 
 
 def _log_stream_failure(streaming_task: "asyncio.Task[None]") -> None:
-    """Log that the publishing of signals has failed, on which the rig does not depend."""
+    """Log it if publishing the rig's signals has failed; the rig itself does not need that."""
     if not streaming_task.cancelled():
         _log.error("the signals are no longer published", exc_info=streaming_task.exception())
 
 
 def _stop_session(service: Service) -> None:
-    """Stop the running session; called when the daemon gets the stop signal."""
+    """Stop the running session; called when the daemon receives the stop signal."""
     _log.info("stop: requested by %s", STOP_SIGNAL.name)
     service.stop(f"the daemon got {STOP_SIGNAL.name}")

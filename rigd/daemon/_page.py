@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 PAGE_PORT: Final = 8720
 """Default port of the page on the loopback interface."""
 _SUCCESSFUL_RUN_S: Final = 60.0
-"""Run time in seconds from which a start counts as successful."""
+"""Run time in seconds above which a start of the process counts as successful."""
 _RESTART_PAUSE_S: Final = 1.0
 """Pause in seconds before the process is started again."""
 
@@ -50,8 +50,8 @@ class PageProcess:
     port
         Port on the loopback interface, or None for the default port or, if used, a free port.
     on_address
-        Called from a thread with the page's address without its token, or with None while the page
-        is not served.
+        Function that is called in a thread when the page's address changes: with the address
+        (without token), or with None if the page is not served any more.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class PageProcess:
         on_address: Callable[[str | None], None],
     ) -> None:
         self._token = secrets.token_urlsafe(24)
-        self._job = _job(profile, folder, socket) | {
+        self._job = _page_job(profile, folder, socket) | {
             "token": self._token,
             "port": PAGE_PORT if port is None else port,
             "any_port": port is None,
@@ -86,17 +86,17 @@ class PageProcess:
         self._address_path.unlink(missing_ok=True)
 
     def _restart_repeatedly(self) -> None:
-        """Start the process again whenever it ends, up to a number of times; run in a thread."""
-        short_starts = 0
-        while short_starts <= PAGE.restarts:
-            short_starts += 1
+        """Run the process again whenever it ends, unless it ends soon too often (in a thread)."""
+        short_run_count = 0
+        while short_run_count <= PAGE.restarts:
+            short_run_count += 1
             began_s = time.monotonic()
             try:
                 self._run_process()
             except ChildError as error:
                 _log.warning("page: its process cannot be started (%s)", error.system_reason)
             if time.monotonic() - began_s >= _SUCCESSFUL_RUN_S:
-                short_starts = 0
+                short_run_count = 0
             self._on_address(None)
             if self._is_closing.wait(_RESTART_PAUSE_S):
                 return
@@ -124,7 +124,7 @@ class PageProcess:
             )
 
     def _announce(self, port: int) -> None:
-        """Announce the page's address; a restarted process uses the same port, for open pages."""
+        """Announce the page's address, and store the port, which a restarted process uses again."""
         self._job["port"] = port
         url = f"http://127.0.0.1:{port}/"
         pid = os.getpid()
@@ -134,12 +134,12 @@ class PageProcess:
         )
         self._on_address(url)
         # The token is printed only on a terminal, because other users may read the journal.
-        shown_address = f"{url}#token={self._token}" if sys.stderr.isatty() else url
-        _log.info("page: %s (rigd status shows the address with its token)", shown_address)
+        printed_url = f"{url}#token={self._token}" if sys.stderr.isatty() else url
+        _log.info("page: %s (rigd status shows the address with its token)", printed_url)
 
 
 def page_address(rig: str) -> str | None:
-    """Return the address of the page of a rig's daemon with its token, or None if not served.
+    """Return the URL, with token, of the page of a rig's daemon; None if it is not served.
 
     Parameters
     ----------
@@ -160,8 +160,8 @@ def _address_path(rig: str) -> Path:
     return runtime_folder() / f"page-{file_name(rig)}.json"
 
 
-def _job(profile: "Profile", folder: Path, socket: Path) -> dict[str, Any]:
-    """Return the data of a rig that the page shows in addition to the daemon's status."""
+def _page_job(profile: "Profile", folder: Path, socket: Path) -> dict[str, Any]:
+    """Return the first message to the page's process: what it needs in addition to the status."""
     rig = profile.rig
     return {
         "socket": str(socket),

@@ -1,7 +1,7 @@
-"""Requests to the daemon, which are parsed from lines of untrusted bytes and checked.
+"""Requests to the daemon: parsing and validation of lines of untrusted bytes.
 
-An invalid line raises an error whose text states the reason. docs/control_socket.md states the
-rules.
+An invalid line raises an error whose text states the reason. docs/control_socket.md describes the
+requests.
 """
 
 import json
@@ -36,7 +36,7 @@ Id = int | Annotated[str, Field(max_length=_MAX_ID_CHARACTERS)]
 
 
 class RequestError(Exception):
-    """Raised if a request is invalid; it states why, and `request_id` identifies the request."""
+    """Raised if a request is invalid; the message states why, and `request_id` which request."""
 
     def __init__(self, message: str, request_id: Id | None = None) -> None:
         super().__init__(message)
@@ -71,7 +71,7 @@ class StatusRequest(Request):
 
 
 class WatchRequest(Request):
-    """Request to subscribe to the daemon's events, and to signals if `signals` is True."""
+    """Request to subscribe to the daemon's events, and to the rig's signals if `signals`."""
 
     command: Literal["watch"]
     signals: bool = False
@@ -84,7 +84,7 @@ class StopSessionRequest(Request):
 
 
 class TareRequest(Request):
-    """Request to tare the force-torque sensor: to average its readings at rest."""
+    """Request to tare the force-torque sensor: its mean reading at rest becomes zero."""
 
     controlling = True
     command: Literal["tare"]
@@ -98,7 +98,7 @@ class ZeroRequest(Request):
 
 
 class ResetRequest(Request):
-    """Request to leave the state of fault."""
+    """Request to reset a fault of the rig."""
 
     controlling = True
     command: Literal["reset"]
@@ -131,7 +131,7 @@ class Notes(BaseModel):
 
 
 class CheckRequest(Request):
-    """Request to check profile, control loop, computer and the data that devices reported."""
+    """Request to check profile, control loop, computer, and data that the devices have reported."""
 
     controlling = True
     command: Literal["check"]
@@ -234,7 +234,7 @@ def _refuse_json_constant(constant_name: str) -> NoReturn:
 
 
 def _first_error_sentence(error: ValidationError) -> str:
-    """Return the first error of a request's fields as a sentence."""
+    """Return a sentence on the first invalid field of a request."""
     first_error = error.errors(include_url=False, include_context=False)[0]
     if first_error["loc"][1:2] == ("id",):  # pydantic reports each of its two types separately
         return f"id is a whole number or a text of at most {_MAX_ID_CHARACTERS} characters."
@@ -251,7 +251,7 @@ AnySessionRequest = TypeVar("AnySessionRequest", bound=SessionRequest)
 
 
 def _checked_session_request(request: AnySessionRequest) -> AnySessionRequest:
-    """Return a session request with checked and converted parameters of the excitation.
+    """Return a session request after its parameters were checked and converted to their types.
 
     Raises RequestError if the excitation, a note or a parameter is invalid.
     """
@@ -341,7 +341,7 @@ def _finite_number(parameter_name: str, given_value: object) -> float:
 
 
 def _shown_value(json_value: object) -> str:
-    """Return a value as JSON for an error message, cut to 60 characters."""
+    """Return a value as JSON text for an error message, cut to 60 characters."""
     try:
         json_text = json.dumps(json_value)
     except (ValueError, RecursionError):

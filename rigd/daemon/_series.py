@@ -1,4 +1,4 @@
-"""Series of sessions that the daemon runs: progress, and reports to log and clients."""
+"""Series of sessions that the daemon runs: its progress, and reports on it to log and clients."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -51,7 +51,7 @@ class ServedSeries:
     reason: str = ""
     """Sentence that states why the series ended early; empty if it did not."""
     running: bool = False
-    """Whether the series is planned or run now."""
+    """Whether the series is being planned or run."""
     failed: bool = False
     """Whether the series failed, so that sessions are missing or incomplete."""
 
@@ -85,7 +85,7 @@ class ServedSeries:
         Parameters
         ----------
         fault_reason
-            Sentence on the rig's fault, or empty if the rig is ready.
+            Sentence that describes the rig's fault; empty if the rig is ready.
         """
         if fault_reason:
             return DaemonState.FAULT, fault_reason
@@ -109,9 +109,9 @@ _OUTCOME_LEVELS: Final = {"complete": "info", "stopped": "warning"}
 
 
 class SeriesReporter:
-    """Receiver of the progress of a series, which it stores, logs and publishes to clients.
+    """Observer of a running series, which stores, logs and publishes the progress to clients.
 
-    It is called in the worker thread.
+    Its methods are called in the worker thread.
     """
 
     def __init__(

@@ -43,7 +43,7 @@ MAX_SUBSCRIBERS = 24
 with short requests can always connect."""
 MAX_PENDING_CONNECTIONS = 64
 """Maximum number of connections that have not sent a complete line yet."""
-_BACKLOG = 128
+_LISTEN_BACKLOG = 128
 """Maximum number of connections that wait to be accepted."""
 _ACCEPTS_PER_ROUND = 64
 """Number of connections that are accepted before a pause."""
@@ -62,7 +62,7 @@ _log = logging.getLogger(LOGGER_NAME)
 
 
 class Server:
-    """Server through which clients send requests to the daemon's service.
+    """Server of the daemon's socket: passes the requests of clients to the service.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Server:
         self._listener = listener
         self._service: Service | None = None
         self._clients: set[_ClientConnection] = set()
-        self._is_leaving: set[_ClientConnection] = set()
+        self._leaving_clients: set[_ClientConnection] = set()
         self._pending_connections: dict[socket.socket, _PendingConnection] = {}
         """Connections without a complete line, oldest first."""
         self._stop_tasks: set[asyncio.Task[None]] = set()
@@ -85,9 +85,9 @@ class Server:
         self._reserve_spare_fd()
 
     def serve(self, service: Service) -> None:
-        """Start to accept the clients of a service in the running event loop."""
+        """Start to accept clients, whose requests are passed to `service`, in the event loop."""
         self._service = service
-        self._listener.listen(_BACKLOG)
+        self._listener.listen(_LISTEN_BACKLOG)
         self._await_connections()
 
     def publish(self, event: Document) -> None:
@@ -107,19 +107,19 @@ class Server:
             pending_connection.link.close()
         for client in list(self._clients):
             self._disconnect_when_sent(client)
-        while self._is_leaving:  # takes at most `_CLOSE_TIMEOUT_S`
+        while self._leaving_clients:  # takes at most `_CLOSE_TIMEOUT_S`
             await asyncio.sleep(0.01)
         self._release_spare_fd()
 
     def remove(self, client: "_ClientConnection") -> None:
         """Remove a client whose connection was lost."""
         self._clients.discard(client)
-        self._is_leaving.discard(client)
+        self._leaving_clients.discard(client)
 
     def _disconnect_when_sent(self, client: "_ClientConnection") -> None:
         """Remove a client, and disconnect it after its last output was sent."""
         self._clients.discard(client)
-        self._is_leaving.add(client)
+        self._leaving_clients.add(client)
         client.close_when_sent()
 
     def can_subscribe(self) -> bool:
@@ -134,7 +134,7 @@ class Server:
             asyncio.get_running_loop().add_reader(self._listener, self._accept_connections)
 
     def _accept_connections(self) -> None:
-        """Accept waiting connections up to a number, and pause after that."""
+        """Accept waiting connections; after `_ACCEPTS_PER_ROUND` of them, pause for a moment."""
         for _ in range(_ACCEPTS_PER_ROUND):
             try:
                 new_socket, _ = self._listener.accept()
@@ -151,7 +151,7 @@ class Server:
         event_loop.call_later(_ACCEPT_PAUSE_S, self._await_connections)
 
     def _read_new_connection(self, new_socket: socket.socket) -> None:
-        """Read from a new connection at once, because most have sent their line already."""
+        """Read from a new connection at once, because most clients have sent a request already."""
         try:
             pending_connection = self._identified_connection(new_socket)
         except OSError:
@@ -167,7 +167,7 @@ class Server:
         return _PendingConnection(new_socket, Peer(self._connection_count, pid, uid))
 
     def _receive(self, pending_connection: "_PendingConnection") -> None:
-        """Read from a connection, and make it a client when its first line is complete."""
+        """Read from a new connection, which becomes a client when its first line is complete."""
         try:
             received_bytes = pending_connection.link.recv(MAX_LINE_BYTES)
         except BlockingIOError:
@@ -190,7 +190,7 @@ class Server:
             pending_connection.link.close()
 
     def _await_line(self, pending_connection: "_PendingConnection") -> None:
-        """Wait for more data of a connection; if too many connections wait, close one of them."""
+        """Wait for more data of a connection; if too many are waiting, close the oldest."""
         if pending_connection.link in self._pending_connections:
             return
         if len(self._pending_connections) >= MAX_PENDING_CONNECTIONS:
@@ -201,10 +201,10 @@ class Server:
         )
 
     def _drop_oldest_pending(self) -> bool:
-        """Close the oldest waiting connection of the process that has most of them.
+        """Close a connection that has sent no complete line; return False if there is none.
 
-        Many connections of one process therefore never displace a new connection of another
-        process. Returns False if no connection waits.
+        It is the oldest one of the process that has the most. Many connections of one process
+        therefore never displace a new connection of another process.
         """
         if not self._pending_connections:
             return False
@@ -226,7 +226,7 @@ class Server:
     # Clients
 
     def _make_client(self, pending_connection: "_PendingConnection") -> None:
-        """Make a connection that has sent its first line a client, if there is room for one."""
+        """Make a connection with a complete first line a client; refuse it if there is no room."""
         assert self._service is not None
         if len(self._clients) >= MAX_CLIENTS and not self._disconnect_idle_client():
             self._refuse_unless_stop(pending_connection)
@@ -243,20 +243,20 @@ class Server:
         client.connecting = asyncio.create_task(_connect(pending_connection.link, client))
 
     def _disconnect_idle_client(self) -> bool:
-        """Disconnect an idle client of the process that has most idle clients.
+        """Disconnect an idle client to make room for another; return False if none is idle.
 
-        Returns False if no client is idle.
+        It is the longest idle client of the process that has the most idle clients.
         """
         idle_clients = [client for client in self._clients if client.is_idle]
         if not idle_clients:
             return False
         idle_count_by_pid = Counter(client.pid for client in idle_clients)
-        longest_idle = min(
+        longest_idle_client = min(
             idle_clients,
             key=lambda client: (-idle_count_by_pid[client.pid], client.last_received_s),
         )
-        longest_idle.write(_TOO_MANY_CLIENTS_LINE)
-        self._disconnect_when_sent(longest_idle)
+        longest_idle_client.write(_TOO_MANY_CLIENTS_LINE)
+        self._disconnect_when_sent(longest_idle_client)
         return True
 
     def _refuse_unless_stop(self, pending_connection: "_PendingConnection") -> None:
@@ -274,7 +274,7 @@ class Server:
     async def _stop_and_close(
         self, request: StopSessionRequest, pending_connection: "_PendingConnection"
     ) -> None:
-        """Execute the `stop` of a connection, send the reply, and close the connection."""
+        """Execute the request `stop` of a connection, send the reply, and close the connection."""
         assert self._service is not None
         _send_last_line(
             pending_connection.link,
@@ -282,7 +282,7 @@ class Server:
         )
 
     def _refuse_without_fd(self) -> None:
-        """Accept and refuse a connection although the process has no free file descriptor."""
+        """Make room for a new connection, or refuse it, if there is no free file descriptor."""
         if self._drop_oldest_pending():
             return  # the descriptor of the closed connection is free now
         if self._spare_fd is None:
@@ -340,7 +340,7 @@ class _ClientConnection(asyncio.Protocol):
 
     @property
     def is_idle(self) -> bool:
-        """Whether the client neither subscribes to events, controls the rig nor awaits a reply."""
+        """Whether the client has no subscription, does not control the rig and awaits no reply."""
         return not (
             self._received
             or self.is_subscribed
@@ -396,7 +396,7 @@ class _ClientConnection(asyncio.Protocol):
         return True
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - asyncio's
-        """Remove the client after its connection was lost; its sessions continue."""
+        """Remove the client, because its connection was lost; its sessions continue."""
         if self._next_line_timer is not None:
             self._next_line_timer.cancel()
         self._waiting_lines.clear()
@@ -479,13 +479,13 @@ class _ClientConnection(asyncio.Protocol):
         self._close_if_done()
 
     def _close_if_done(self) -> None:
-        """Close the connection if the client sends no more requests and all are replied to."""
+        """Close the connection if the client sends no more requests and has all replies."""
         if self._has_ended and not (self._tasks or self._waiting_lines):
             self.close_when_sent()
 
 
 async def _reply(service: Service, request: AnyRequest, peer: Peer) -> Document:
-    """Execute a request, and return the reply, or a refusal if that raises an error."""
+    """Execute a request, and return the reply; if the request fails, return a refusal."""
     try:
         reply_document = await service.execute(request, peer)
     except CommandError as error:
@@ -532,7 +532,7 @@ _TOO_MANY_CLIENTS_LINE = _json_line(
 
 
 def _send_last_line(client_socket: socket.socket, last_line: bytes) -> None:
-    """Send a last reply to a client without waiting, and close the connection."""
+    """Send a last line to a client without waiting, and close the connection."""
     with client_socket, suppress(OSError):
         client_socket.send(last_line)
 

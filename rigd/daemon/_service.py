@@ -1,7 +1,7 @@
 """Service of the daemon, which controls a rig, executes requests and publishes events.
 
-It knows no sockets. Everything runs in the event loop's thread, except for slow calls of the rig,
-which run one after another in a worker thread. A stop does not wait for the worker thread.
+It is independent of sockets. Everything runs in the event loop's thread, except for slow calls of
+the rig, which run one after another in a worker thread. A stop does not wait for the worker thread.
 """
 
 import asyncio
@@ -55,7 +55,7 @@ _UNRESPONSIVE_AFTER_S = 1.5
 """Time in seconds without a poll after which the event loop is assumed to receive no stop."""
 _RATE_POLLS = 10
 """Number of polls over which message rates are measured."""
-_SHUTTING_DOWN = "The daemon is being shut down."
+_SHUTTING_DOWN_MESSAGE = "The daemon is being shut down."
 """Reason with which requests are refused while the daemon ends."""
 
 T = TypeVar("T")
@@ -79,7 +79,7 @@ class Service:
     publish
         Function that sends an event to the clients that have subscribed.
     find_target
-        Function that returns what would move if the rig were connected now.
+        Function that returns what would move, such as hardware, if the rig were connected now.
     fast, live
         Options with which the rig was created.
     quick_looks
@@ -149,7 +149,7 @@ class Service:
         return self._state_machine.state
 
     async def open(self) -> None:
-        """Connect the rig for the first time; a failure leads to a fault that can be reset."""
+        """Connect the rig for the first time; if that fails, enter a fault, which can be reset."""
         self._current_command = "connecting"
         self._loop = asyncio.get_running_loop()
         try:
@@ -161,7 +161,7 @@ class Service:
             self._first_connection_tried.set()
 
     async def run(self) -> None:
-        """Check the rig and publish its progress several times a second, until cancelled."""
+        """Poll the rig and publish its progress several times a second, until cancelled."""
         while True:
             await asyncio.sleep(POLL_S)
             self._last_poll_s = time.monotonic()
@@ -179,7 +179,7 @@ class Service:
             self._publish_signals()
 
     def _publish_signals(self) -> None:
-        """Publish the signals since the last call, if a client has subscribed to them."""
+        """Publish the rig's signals since the last call, if a client has subscribed to them."""
         if not self._signal_watchers:
             return
         served_series = self._series
@@ -294,7 +294,7 @@ class Service:
         }
 
     def stop(self, reason: str) -> Document:
-        """Request the end of the running series; the reply states whether a series is running."""
+        """Request the end of the running series; the reply states whether a series was running."""
         self._stop_count += 1
         series = self._series
         if series is None or not series.running:
@@ -319,7 +319,7 @@ class Service:
             self._publish({"event": "progress", **progress_event})
 
     async def check_connection(self) -> None:
-        """Check between sessions that the rig is still connected; otherwise enter a fault."""
+        """Check between sessions that the rig is still connected; enter a fault if it is not."""
         # The command `check` does not use the worker thread, so the rig is checked meanwhile.
         is_busy = self._current_command not in ("", "check")
         if (
@@ -337,7 +337,7 @@ class Service:
     # Commands
 
     def _take_control(self, peer: Peer) -> None:
-        """Make a client the one that controls the rig; refuse if another client controls it."""
+        """Give a client the control of the rig; raise CommandError if another client has it."""
         if self.controller is not None and self.controller != peer:
             raise CommandError(
                 f"The rig is controlled by {self.controller}, until it is done; watch with rigd "
@@ -348,9 +348,9 @@ class Service:
             _log.info("control: taken by %s", peer)
 
     async def _await_first_connection(self, peer: Peer) -> None:
-        """Wait until the first attempt to connect has ended, if the daemon is still connecting.
+        """Wait for the end of the first attempt to connect the rig, if it has not ended yet.
 
-        Refuses the request if it was stopped meanwhile.
+        Raises CommandError if a stop was requested meanwhile.
         """
         if self._current_command != "connecting":
             return
@@ -362,19 +362,19 @@ class Service:
     def _require_command_allowed(self, command: str) -> None:
         """Raise CommandError if the state forbids a command, or if the rig is busy."""
         if self._is_closing:
-            raise CommandError(_SHUTTING_DOWN)
+            raise CommandError(_SHUTTING_DOWN_MESSAGE)
         refusal = self._state_machine.refusal(command)
         if refusal:
             raise CommandError(refusal)
         self._require_not_busy()
 
     def _require_not_busy(self) -> None:
-        """Raise if the rig is executing another command."""
+        """Raise CommandError if the rig is executing another command."""
         if self._current_command:
             raise CommandError(f"The rig is busy ({self._current_command}); try again in a moment.")
 
     async def _predict(self, request: protocol.PredictRequest) -> Document:
-        """Predict a session in a background process, while other requests are executed."""
+        """Predict a session in a background process, so that other requests are not delayed."""
         if self._prediction_count >= _MAX_PREDICTIONS:
             raise CommandError("Several predictions are running; try again in a moment.")
         job = background.PredictionJob(
@@ -395,7 +395,7 @@ class Service:
             self._prediction_count -= 1
 
     async def _check_rig(self) -> Document:
-        """Check the rig in a background process, and store the verdict for the status."""
+        """Check the rig in a background process, and return the results, also for the status."""
         if self.state in (DaemonState.RUNNING, DaemonState.STOPPING):
             raise CommandError(
                 "check needs a rig without a running session: wait for the session to end, or end "
@@ -476,7 +476,7 @@ class Service:
                     self._state_machine.change_to(DaemonState.READY, "reset by the operator")
                     return {"zero_lost": self._rig.zero_lost}
             if self._is_closing:
-                raise CommandError(_SHUTTING_DOWN)
+                raise CommandError(_SHUTTING_DOWN_MESSAGE)
             fault_reason = self._fault_reason
             self._state_machine.change_to(DaemonState.IDLE, "reset by the operator")
             await self._connect(reset_fault=True, earlier_fault=fault_reason)
@@ -487,7 +487,7 @@ class Service:
     async def _connect(self, *, reset_fault: bool, earlier_fault: str = "") -> None:
         """Connect the rig, and enter the state ready, or a fault if that fails.
 
-        `earlier_fault` is the reason of the fault that is being reset, if there is one.
+        `earlier_fault` is the reason of the fault that is being reset, or empty.
         """
         try:
             actuation_target = self._find_target()
@@ -511,7 +511,7 @@ class Service:
             raise CommandError(failure_reason) from None
         if self._is_closing:
             await self._call_in_worker(self._rig.disconnect)
-            raise CommandError(_SHUTTING_DOWN)
+            raise CommandError(_SHUTTING_DOWN_MESSAGE)
         self._state_machine.change_to(DaemonState.READY, f"{actuation_target.value} is connected")
 
     def _enter_fault(self, reason: str, earlier_fault: str) -> None:
@@ -528,7 +528,7 @@ class Service:
     # Series
 
     def _start_rad(self) -> float:
-        """Return the motor angle relative to the rig's zero, or 0 if unknown."""
+        """Return the motor angle relative to the rig's zero in rad, or 0 if unknown."""
         rig_status = self._rig.status()
         return 0.0 if rig_status is None else rig_status.angle_rad
 
@@ -600,7 +600,7 @@ class Service:
     def _can_receive_stop(self) -> bool:
         """Return whether the event loop can receive a stop; called in the worker thread.
 
-        If it cannot, the supervisor's heartbeat stops, and the session ends.
+        If it cannot, the worker stops the supervisor's heartbeat, and the session ends.
         """
         return time.monotonic() - self._last_poll_s < _UNRESPONSIVE_AFTER_S
 
@@ -631,20 +631,20 @@ class Service:
 
     def _report_transition(self, transition: Transition) -> None:
         """Log and publish a change of the daemon's state."""
-        if transition.after is DaemonState.FAULT:
+        if transition.new_state is DaemonState.FAULT:
             self._fault_reason = transition.reason
-        logging_level = logging.ERROR if transition.after is DaemonState.FAULT else logging.INFO
+        logging_level = logging.ERROR if transition.new_state is DaemonState.FAULT else logging.INFO
         _log.log(
             logging_level,
             "state: %s -> %s: %s",
-            transition.before,
-            transition.after,
+            transition.old_state,
+            transition.new_state,
             transition.reason,
         )
         self._publish({"event": "state", **transition_document(transition)})
 
     def _report_quick_look(self, quick_look: QuickLook) -> None:
-        """Log and publish a quick look; either thread may call this."""
+        """Log and publish a quick look at a session; any thread may call this."""
         if self._series is not None:
             quick_look.add_path_to_results(self._series.results)
         for report_line in quick_look.lines:

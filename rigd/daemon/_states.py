@@ -19,7 +19,7 @@ from rigd.runner.signal_blocks import SignalBlock
 from rigd.runner.status import ProcessStatus, RigStatus
 
 _MAX_HISTORY = 50
-"""Number of transitions that the daemon's status lists."""
+"""Largest number of transitions that the daemon's status lists."""
 
 
 class DaemonState(StrEnum):
@@ -68,21 +68,21 @@ _REQUIRED_STATES: Mapping[str, DaemonState] = {
 
 
 class IllegalTransitionError(Exception):
-    """Raised if the daemon's state must not change in this way, which is a bug."""
+    """Raised if a transition of the daemon's state is not permitted, which is a bug."""
 
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """Change of the daemon's state, with time (ns since the Unix epoch) and reason."""
+    """Change of the daemon's state, with its time (ns since the Unix epoch) and its reason."""
 
     utc_ns: int
-    before: DaemonState
-    after: DaemonState
+    old_state: DaemonState
+    new_state: DaemonState
     reason: str
 
 
 class DaemonStateMachine:
-    """State machine of the daemon, which also stores its last transitions.
+    """State of the daemon, with its permitted transitions and a list of the last ones.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class DaemonStateMachine:
         self._on_change(transition)
 
     def refusal(self, command: str) -> str:
-        """Return a sentence that refuses a command in the present state, or "" if it is allowed."""
+        """Return a sentence that refuses a command in the present state; "" if it is permitted."""
         required_state = _REQUIRED_STATES.get(command, self.state)
         if required_state is self.state:
             return ""
@@ -157,7 +157,7 @@ _USER_NAMES: dict[int, str] = {}
 
 
 def resolve_user(uid: int) -> None:
-    """Store the name of a user for :class:`Peer`; finding it may take a long time."""
+    """Find the name of a user and store it for :class:`Peer`; this may take a long time."""
     if uid not in _USER_NAMES:
         with suppress(KeyError):
             _USER_NAMES[uid] = pwd.getpwuid(uid).pw_name
@@ -165,7 +165,7 @@ def resolve_user(uid: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Client of the daemon, identified by the kernel."""
+    """Client of the daemon, with the process id and user id that the kernel reports."""
 
     number: int
     """Number of the client's connection."""
@@ -192,16 +192,16 @@ def transition_document(transition: Transition) -> Document:
     """Return a transition of the daemon's state as a dictionary for JSON."""
     return {
         "utc_ns": transition.utc_ns,
-        "from": transition.before.value,
-        "to": transition.after.value,
+        "from": transition.old_state.value,
+        "to": transition.new_state.value,
         "reason": transition.reason,
     }
 
 
-def rig_document(status: RigStatus, rates: Mapping[str, float | None]) -> Document:
+def rig_document(status: RigStatus, rates_hz: Mapping[str, float | None]) -> Document:
     """Return the status of the rig and of its processes as a dictionary for JSON.
 
-    `rates` are the measured numbers of messages per second, by topic.
+    `rates_hz` are the measured numbers of messages per second, by topic.
     """
     return {
         "phase": status.phase.name.lower(),
@@ -229,7 +229,7 @@ def rig_document(status: RigStatus, rates: Mapping[str, float | None]) -> Docume
                 "name": topic.name,
                 "written": topic.written,
                 "waiting": topic.waiting,
-                "rate_hz": rates.get(topic.name),
+                "rate_hz": rates_hz.get(topic.name),
                 "expected_hz": topic.expected_hz,
             }
             for topic in status.topics
@@ -269,7 +269,7 @@ def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | N
 
 
 def _finite_or_none(numbers_by_name: Mapping[str, float]) -> Document:
-    """Return a copy of a mapping with None in place of numbers that are not finite, for JSON."""
+    """Return a copy of a mapping in which None replaces NaN and infinity, for JSON."""
     return {
         quantity_name: quantity_value if isfinite(quantity_value) else None
         for quantity_name, quantity_value in numbers_by_name.items()
@@ -282,9 +282,9 @@ def _view_document(view: LiveAddress | None) -> Document | None:
 
 
 def _process_state(process: ProcessStatus, phase: Phase) -> str:
-    """Return the state of a process for clients.
+    """Return the state of a process, as the status reports it.
 
-    A process that runs for one session only has the state ``done``, not ``ended``, after it.
+    A process that runs for one session only is ``done``, not ``ended``, after the session.
     """
     is_for_one_session = any(p.is_per_session and p.name == process.name for p in PROCESSES)
     return (

@@ -55,7 +55,7 @@ class StopReport:
     stopped
         Sessions that have ended, with excitation or command, rig and process.
     stopping
-        Sessions that were requested to stop, if their end was not awaited.
+        Sessions that were requested to stop, if their end is not waited for.
     quiet
         Sentences on rigs that run no session.
     running
@@ -83,7 +83,7 @@ class StopReport:
 
     @property
     def sure(self) -> bool:
-        """Whether certainly no session of this user is running any more."""
+        """Whether it is certain that no session of this user is running any more."""
         return not (self.running or self.doubts)
 
 
@@ -101,7 +101,10 @@ def stop_all(rig: str | None, *, wait: bool = True) -> StopReport:
 
 
 class _StopOfAll:
-    """Stop of all sessions of a user; `rig` is the rig's name in file names, or None for all."""
+    """Stop of all sessions of a user, on all rigs or on one.
+
+    `rig` is the name of the rig as in file names, or None for all rigs.
+    """
 
     def __init__(self, rig: str | None, *, is_end_awaited: bool) -> None:
         self._rig = rig
@@ -149,7 +152,7 @@ class _StopOfAll:
     # Daemons, by their sockets
 
     def _find_daemons(self) -> "list[_DaemonStop]":
-        """Return the daemons that listen on a socket, sorted by its path."""
+        """Return the daemons that listen on a socket, sorted by the path of the socket."""
         report = self._report
         report.searched.append("the listening sockets (/proc/net/unix)")
         report.searched.append(f"{tempfile.gettempdir()}/rigd-{self._uid or ''}*")
@@ -164,7 +167,7 @@ class _StopOfAll:
             if folder_fault_text:
                 report.doubts.append(folder_fault_text)
             try:
-                group_sockets = [
+                folder_sockets = [
                     daemon_socket
                     for daemon_socket in folder.iterdir()
                     if daemon_socket.name.endswith(SOCKET_SUFFIX)
@@ -178,7 +181,7 @@ class _StopOfAll:
             except OSError as error:
                 report.doubts.append(f"The folder {folder} cannot be read ({error.strerror}).")
                 continue
-            socket_paths.update(group_sockets)
+            socket_paths.update(folder_sockets)
         daemons = []
         for daemon_socket in sorted(socket_paths):
             rig = daemon_socket.name.removesuffix(SOCKET_SUFFIX)
@@ -201,7 +204,7 @@ class _StopOfAll:
     # Other processes, by the process table
 
     def _stop_supervisors(self, daemons: "list[_DaemonStop]") -> "list[_SupervisorStop]":
-        """Stop the supervisors that are not stopped through a socket, and wait for all sessions.
+        """Signal the supervisors that no socket reaches, and wait for the end of all sessions.
 
         Returns the supervisors whose session has not ended in time.
         """
@@ -222,7 +225,7 @@ class _StopOfAll:
             for supervisor in self._update_supervisors(process_table):
                 if supervisor.process.pid in sufficient_pids:
                     continue
-                self._own_supervisors.setdefault(supervisor.key, supervisor)
+                self._own_supervisors.setdefault(supervisor.identity, supervisor)
                 supervisor.send_due_signals(self._elapsed_s)
                 if not supervisor.is_over:
                     unended_supervisors.append(supervisor)
@@ -237,11 +240,11 @@ class _StopOfAll:
                 awaited_daemons[0].join(_DAEMON_POLL_INTERVAL_S)
 
     def _is_reached(self, daemon: "_DaemonStop") -> bool:
-        """Return whether a daemon's reply is trusted and in time, so that no signal is needed."""
+        """Return whether a daemon is stopped through its socket, so that it needs no signal."""
         return daemon.doubt == "" and (daemon.is_done or self._elapsed_s < _STOP_CONTROL_DELAY_S)
 
     def _is_awaited(self, daemon: "_DaemonStop") -> bool:
-        """Return whether the report of a daemon is still awaited."""
+        """Return whether to wait longer for a daemon's report that its session has ended."""
         if daemon.is_done:
             return False
         supervisors = self._own_supervisors.values()
@@ -280,7 +283,10 @@ class _StopOfAll:
 
 
 class _DaemonStop:
-    """Stop of a daemon through its socket, in a thread; `peer` is its process id and user id."""
+    """Stop of a daemon through its socket, in a thread.
+
+    `path` is the path of the socket, `peer` the daemon's process id and user id.
+    """
 
     def __init__(self, path: Path, peer: tuple[int, int] | None, *, is_end_awaited: bool) -> None:
         self._path = path
@@ -298,7 +304,7 @@ class _DaemonStop:
         self._thread.start()
 
     def join(self, patience_s: float) -> None:
-        """Wait until the stop has succeeded or failed, or a time in seconds has passed."""
+        """Wait, for at most `patience_s` seconds, until the stop has succeeded or failed."""
         self._thread.join(patience_s)
 
     @property
@@ -319,7 +325,7 @@ class _DaemonStop:
             self._error = error
 
     def _reason_to_doubt(self, pid: int, uid: int) -> str:
-        """Return why replies of a process on this socket are not trusted, or "" if they are."""
+        """Return the reason not to trust the replies of a process on the socket; "" if trusted."""
         folder, rig = self._path.parent, self._path.name.removesuffix(SOCKET_SUFFIX)
         is_group_folder = folder == GROUP_FOLDER
         if folder_fault(folder, shared=is_group_folder):
@@ -370,7 +376,7 @@ class _DaemonStop:
             self._report_end(report, self._status, rig_text)
 
     def _report_end(self, report: StopReport, status: dict[str, Any], rig_text: str) -> None:
-        """Add to a report that no session is running any more, according to the status."""
+        """Add to a report that the daemon's session has ended, or that none was running."""
         series = status["series"]
         is_stopped_by_signal = self._reply["signalled"] and series is not None and series["stopped"]
         if status["state"] == "fault":
@@ -396,7 +402,10 @@ class _DaemonStop:
 
 
 class _SupervisorStop:
-    """Process that runs sessions, with its control processes, or an orphaned control process."""
+    """Stop of a process that runs sessions and of its control processes, by signals.
+
+    The process may also be a control process whose supervisor has ended.
+    """
 
     def __init__(self, process: RunningProcess, control_processes: list[RunningProcess]) -> None:
         self.process = process
@@ -413,7 +422,7 @@ class _SupervisorStop:
         self._is_control_stopped = False
 
     @property
-    def key(self) -> tuple[int, int]:
+    def identity(self) -> tuple[int, int]:
         """Process id and start time, which identify the process uniquely."""
         return self.process.pid, self._start_time
 
@@ -431,7 +440,7 @@ class _SupervisorStop:
 
     @property
     def _rig_of_command_line(self) -> str | None:
-        """Name of the rig from the command line, or None if it states the path of a profile."""
+        """Name of the rig by the command line; None if that states the path of a profile."""
         profile_option = _option_value(self._rigd_command, "--profile")
         if profile_option is None:
             return "sim" if self._is_foreground_command else None
@@ -444,7 +453,7 @@ class _SupervisorStop:
 
     @property
     def has_session(self) -> bool:
-        """Whether a session may be running or the torque be on."""
+        """Whether a session may be running, or the torque may be on."""
         if any(control_process.name != IDLE_NAME for control_process in self.controls):
             return True
         return self._is_foreground_command and not self.process.ignores(STOP_SIGNAL)
@@ -474,7 +483,7 @@ class _SupervisorStop:
         return not self.has_session and (has_obeyed or not self._is_signal_sent)
 
     def may_run_rig(self, rig: str) -> bool:
-        """Return whether the process may run a rig, given by its name in file names."""
+        """Return whether the process may be using a rig, given by its name in file names."""
         return self._rig is None or file_name(self._rig) == rig
 
     def send_due_signals(self, elapsed_s: float) -> None:
@@ -516,7 +525,7 @@ class _SupervisorStop:
             send_signal(process, start_ticks, signal_number)
 
     def report_to(self, report: StopReport, *, ended: bool, waited: bool) -> None:
-        """Add the result for this process to a report."""
+        """Add to a report whether the session of this process has ended."""
         if not waited and self._had_session:
             report.stopping.append(self.description)
         elif not ended:
@@ -594,7 +603,7 @@ def _option_value(arguments: Sequence[str], wanted_option: str) -> str | None:
 
 
 def _may_folder_belong_to(folder: Path, uid: int) -> bool:
-    """Return whether an unreadable folder, or its nearest readable parent, belongs to a user."""
+    """Return whether an unreadable folder may belong to a user, by its nearest readable parent."""
     for existing_path in (folder, *folder.parents):
         with suppress(OSError):
             return existing_path.stat().st_uid == uid

@@ -14,7 +14,7 @@ from rigd.runtime.addresses import address_files, answers, file_name, folder_fau
 from rigd.runtime.processes import listening_sockets
 
 GROUP_FOLDER = Path("/run/rigd")
-"""Folder for sockets of daemons that a group may use, since others cannot enter a user's folder."""
+"""Folder for sockets of daemons that a group may use: a user's own folder is closed to others."""
 SOCKET_SUFFIX = ".daemon"
 """Suffix of the file name of a daemon's socket."""
 _CREDENTIALS_FORMAT = struct.Struct("3i")
@@ -55,7 +55,7 @@ def peer_of(link: socket.socket) -> tuple[int, int]:
 
 
 def bind(path: Path, group: str | None) -> socket.socket:
-    """Return a new bound socket for the daemon, to which only this user or a group can connect.
+    """Return a new bound socket for the daemon; only this user or a group can connect to it.
 
     The caller must hold the lock of the rig, because the socket of a dead daemon is replaced.
 
@@ -128,13 +128,13 @@ def find(rig: str | None) -> Path:
     if not sockets:
         raise AddressError(f"No daemon {_not_found_reason(None)}rigd serve --profile NAME.")
     if len(sockets) > 1:
-        rigs = ", ".join(path.name.removesuffix(SOCKET_SUFFIX) for path in sockets)
-        raise AddressError(f"Several daemons are running ({rigs}); name one with --profile.")
+        rig_names = ", ".join(path.name.removesuffix(SOCKET_SUFFIX) for path in sockets)
+        raise AddressError(f"Several daemons are running ({rig_names}); name one with --profile.")
     return sockets[0]
 
 
 def _searched_folders() -> list[Path]:
-    """Return the folders to search for sockets of daemons, except for an unsafe group folder."""
+    """Return the folders that may contain sockets of daemons, without an unsafe group folder."""
     return (
         [runtime_folder()]
         if folder_fault(GROUP_FOLDER, shared=True)
@@ -143,7 +143,7 @@ def _searched_folders() -> list[Path]:
 
 
 def _not_found_reason(rig: str | None) -> str:
-    """Return the words after "No daemon" that state why no daemon is found, with the remedy.
+    """Return the end of the message "No daemon …": why none is found, and the remedy.
 
     `rig` is the rig's name as in file names, or None for any rig.
     """
@@ -196,7 +196,7 @@ def own_sockets() -> list[Path]:
 def peer_at(path: Path) -> tuple[int, int] | None:
     """Return process id and user id of the process that listens on a socket.
 
-    The result is None if the queue of the socket is full.
+    The result is None if the socket's queue of waiting connections is full.
 
     Parameters
     ----------

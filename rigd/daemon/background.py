@@ -27,7 +27,7 @@ from rigd.runtime import ignore as ignore_signals
 _JOB_TIMEOUT_S: Final = 50.0
 """Maximum time in seconds for a job, below the client's timeout so that the client gets a reply."""
 _LIGHT_RECORD_S: Final = 300.0
-"""Longest duration of a record in seconds whose planning takes half a second and 100 MB."""
+"""Duration in seconds of the longest record that is light to plan, in half a second and 100 MB."""
 
 Result = TypeVar("Result")
 Result_co = TypeVar("Result_co", covariant=True)
@@ -40,7 +40,7 @@ class BackgroundJob(Protocol[Result_co]):
     """Process that performs the job: only a `PREDICTION` may run during a session."""
 
     def perform(self) -> Result_co:
-        """Perform the job and return its result; a RigdError is reported to the client."""
+        """Perform the job and return its result; the client receives the text of a RigdError."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class CheckJob:
 
 @dataclass(frozen=True, slots=True)
 class PlanJob:
-    """Job that plans a series of sessions, a `rigd.runner.Series`."""
+    """Job that plans a series of sessions as a `rigd.runner.Series`."""
 
     worker: ClassVar[Worker] = PLAN
 
@@ -186,7 +186,7 @@ async def perform(job: BackgroundJob[Result]) -> Result:
         raise CommandError(f"No process can be started for it ({error.system_reason}).") from None
     try:
         await asyncio.to_thread(child.start, job)
-        performed = await asyncio.wait_for(child.receive(), _JOB_TIMEOUT_S)
+        performed_job = await asyncio.wait_for(child.receive(), _JOB_TIMEOUT_S)
     except TimeoutError:
         raise CommandError(f"It takes longer than {_JOB_TIMEOUT_S:g} s; check CPU load.") from None
     except ChildError:
@@ -194,15 +194,15 @@ async def perform(job: BackgroundJob[Result]) -> Result:
         raise CommandError(f"Its process ended with exit code {child.exit_code}.") from None
     finally:
         await asyncio.to_thread(child.stop)
-    assert isinstance(performed, JobPerformed)
-    if isinstance(performed.result, CommandError):
-        raise performed.result
-    job_result: Result = performed.result
+    assert isinstance(performed_job, JobPerformed)
+    if isinstance(performed_job.result, CommandError):
+        raise performed_job.result
+    job_result: Result = performed_job.result
     return job_result
 
 
 def main() -> None:
-    """Perform a job of the daemon, and send its result, or an error in place of the result."""
+    """Receive a job from the daemon, perform it, and send the daemon the result or an error."""
     ignore_signals()
     daemon = SupervisorConnection()
     job: BackgroundJob[object] = daemon.receive_job()

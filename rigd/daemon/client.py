@@ -1,4 +1,4 @@
-"""Client of the daemon: a blocking connection, and a stop that is repeated until confirmed."""
+"""Client side of the daemon's socket: a blocking connection, and requests to stop a session."""
 
 import json
 import os
@@ -59,8 +59,8 @@ class DaemonUnreachableError(FailureError):
     message
         Text for the operator.
     lost_process
-        Process id and user id of a daemon whose connection was lost, or None if the message is
-        complete without further examination.
+        Process id and user id of a daemon whose connection was lost; None if `message` needs no
+        report on the processes that it leaves.
     """
 
     def __init__(self, message: str, lost_process: tuple[int, int] | None = None) -> None:
@@ -68,9 +68,9 @@ class DaemonUnreachableError(FailureError):
         self._lost_process = lost_process
 
     def full_message(self) -> str:
-        """Return the text for the operator.
+        """Return the message for the operator; this may take up to 3 s.
 
-        If the connection was lost, it states which processes still run, after up to 3 s.
+        If the connection was lost, the message states which processes of the daemon still run.
         """
         return (
             str(self)
@@ -198,16 +198,16 @@ class Client:
         return self.request_unless_stopped(lambda: False, command, **fields)
 
     def request_unless_stopped(
-        self, stopped: Callable[[], bool], command: str, **fields: object
+        self, is_stop_requested: Callable[[], bool], command: str, **fields: object
     ) -> Document:
         """Send a request like :meth:`ask`, but cancel it if a stop is requested meanwhile.
 
         Parameters
         ----------
-        stopped
+        is_stop_requested
             Function that returns whether a stop is requested; called until the reply arrives.
         command
-            Name of a request in docs/control_socket.md that the request `stop` cancels.
+            Name of a request in docs/control_socket.md that a request `stop` cancels.
         **fields
             Further fields of the request.
 
@@ -226,7 +226,7 @@ class Client:
         deadline_s = time.monotonic() + min(_TOO_MANY_CLIENTS_TIMEOUT_S, self._reply_timeout_s)
         while True:
             try:
-                return self._request_once(command, fields, stopped)
+                return self._request_once(command, fields, is_stop_requested)
             except _TooManyClientsError:
                 if time.monotonic() > deadline_s:
                     raise
@@ -235,14 +235,14 @@ class Client:
                 self._connect()
 
     def _request_once(
-        self, command: str, fields: dict[str, object], stopped: Callable[[], bool]
+        self, command: str, fields: dict[str, object], is_stop_requested: Callable[[], bool]
     ) -> Document:
-        """Send a request once, and return its reply, or that to a stop sent after it."""
+        """Send a request once, and return its reply; after a stop, that to the request `stop`."""
         self.send(command, **fields)
         is_stop_sent = False
         deadline_s = time.monotonic() + self._reply_timeout_s
         while (remaining_s := deadline_s - time.monotonic()) > 0.0:
-            if stopped() and not is_stop_sent:
+            if is_stop_requested() and not is_stop_sent:
                 # It is sent on the same connection, because on another connection the stop might be
                 # executed before the request.
                 self.send("stop")
@@ -354,7 +354,9 @@ def _refusal_error(refusal_reply: Document) -> RefusedByDaemonError:
 
 
 def stop_session(path: Path) -> Document:
-    """Request a daemon to stop its session until it confirms, and also by a signal if it is slow.
+    """Stop the session of a daemon: repeat the request until it is confirmed.
+
+    If the confirmation takes long, the daemon is also sent the stop signal.
 
     Parameters
     ----------
@@ -452,9 +454,9 @@ def await_end(
 
 
 def describe_remaining_processes(pid: int, uid: int) -> str:
-    """Return text that states which processes of a lost daemon still run, with the remedy.
+    """Return a text on the processes of a lost daemon that still run, with the remedy.
 
-    The processes have some seconds to end before the text is made.
+    The function first gives the processes some seconds to end.
 
     Parameters
     ----------
@@ -501,7 +503,7 @@ def _is_process_running(pid: int) -> bool:
 
 
 def _sees_other_users() -> bool:
-    """Return whether this user sees processes of other users (mount option hidepid of /proc)."""
+    """Return whether /proc shows this user the processes of others (mount option hidepid)."""
     try:
         return bool(Path("/proc/1/cmdline").read_bytes())
     except OSError:
@@ -522,9 +524,9 @@ def _control_processes(pid: int) -> list[int]:
 
 
 def _signal_stop(pid: int) -> bool:
-    """Send the stop signal to a process if it has a handler; return whether it was sent.
+    """Send the stop signal to a process that has a handler for it; return whether it was sent.
 
-    The signal would kill a process without a handler.
+    A process without a handler would be killed by the signal.
     """
     process = read_process(pid)
     if process is None or not process.handles(STOP_SIGNAL):
@@ -558,7 +560,7 @@ def find_views(rig: str | None) -> list[LiveAddress]:
 
 
 def daemons() -> dict[str, bool]:
-    """Return the rigs with a running daemon: profile name → whether it has a live view."""
+    """Return the rigs with a running daemon: name of the rig → whether it has a live view."""
     statuses = (_status_of_daemon(daemon_socket) for daemon_socket in running())
     return {
         daemon_status["daemon"]["profile"]: daemon_status["daemon"]["live"]

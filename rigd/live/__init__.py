@@ -1,9 +1,10 @@
 """The live view: a process that shows the samples in Rerun without delaying other processes.
 
-The public interface is the viewer's window (`Viewer`, `FileWindow`), the page for browsers
-(`PageOfFile`), the running views (`LiveAddress`, `running`) and the jobs of the publisher
-(`LiveJob`, `LiveSession`). The publisher, `rigd.live.publisher`, only observes the rings, so it
-affects neither the loop nor the recorder. `rigd.view` has the drawings.
+The public interface is the windows (`Viewer` for a live view, `FileWindow` for a file), the page of
+a file for browsers (`PageOfFile`), the addresses of running views (module `address`) and the
+messages to the publisher (module `messages`). The publisher process, `rigd.live.publisher`, only
+observes the ring buffers, so it affects neither the loop nor the recorder. `rigd.view` has the
+functions that draw.
 """
 
 import lazy_loader as lazy

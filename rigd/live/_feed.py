@@ -31,7 +31,7 @@ It corresponds to 10 s at the publisher's 20 polls per second."""
 
 
 class DrawingStream:
-    """Sends what the live view draws of successive sessions to the present Rerun server.
+    """Sends the drawings of one session after another to the present Rerun server.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class DrawingStream:
     Attributes
     ----------
     connections
-        Number of connections so far; each one began with the drawings of the scene's frame.
+        Number of connections so far; each one began with the drawings of `Scene.frame`.
     stalled
         Whether the server has not accepted the last drawings yet.
     """
@@ -66,7 +66,7 @@ class DrawingStream:
         recording_id
             Identifier of the recording.
         frame_drawings
-            Function that returns the first drawings of each connection.
+            Function that returns the functions to draw first on each connection.
         """
         self._recording_id, self._frame = recording_id, frame_drawings
 
@@ -91,7 +91,7 @@ class DrawingStream:
         return self._stream is not None and not self.stalled
 
     def send(self, drawings: "Iterable[Drawing]") -> bool:
-        """Send drawings to the viewers, and return whether the server's connection still exists.
+        """Send drawings to the server, and return whether the connection to it still exists.
 
         If the server stalls, the SDK buffers the drawings until it recovers.
         """
@@ -103,7 +103,7 @@ class DrawingStream:
         return self._stream is not None
 
     def _has_recovered(self) -> bool:
-        """Return whether a stalled server accepts drawings again; kill it if it stalls too long."""
+        """Return whether a stalled server accepts drawings again; kill it if that takes long."""
         self._flush(_STALLED_FLUSH_TIMEOUT_S)
         if self.stalled:
             self._stalled_polls += 1
@@ -134,7 +134,7 @@ class DrawingStream:
         releases_resources = not any(
             closing_thread.is_alive() for closing_thread in self._closing_threads
         )
-        _in_background(_close_stream, [self._stream], releases_resources)
+        _start_thread(_close_stream, [self._stream], releases_resources)
         self._stream = None
 
     def _discard(self) -> None:
@@ -146,13 +146,13 @@ class DrawingStream:
                 for closing_thread in self._closing_threads
                 if closing_thread.is_alive()
             ]
-            self._closing_threads.append(_in_background(_close_stream, [self._stream], False))
+            self._closing_threads.append(_start_thread(_close_stream, [self._stream], False))
         self._stream = None
         self.stalled = False
         self._stalled_polls = 0
 
     def _connect(self) -> None:
-        """Connect to the present server, and send the drawings that every viewer needs first."""
+        """Connect to the present server, and send the first drawings of the session."""
         import rerun as rr
 
         server_address = self._server_program.address
@@ -173,10 +173,10 @@ class DrawingStream:
 
 
 class _StreamWithoutLayout:
-    """Stream that omits the layout, for viewers that have it already.
+    """Rerun stream that does not send the layout, for viewers that have it already.
 
-    It preserves changes of the layout by the operator. (Each blueprint also costs the SDK 2 MB and
-    two threads that it never releases.)
+    Changes of the layout by the operator are thus preserved. (Each layout that is sent also costs
+    the SDK 2 MB and two threads, which it never releases.)
     """
 
     def __init__(self, stream: "RecordingStream") -> None:
@@ -186,10 +186,10 @@ class _StreamWithoutLayout:
         return getattr(self._stream, name)
 
     def send_blueprint(self, *_: object, **__: object) -> None:
-        """Ignore the layout, so that the viewers keep theirs."""
+        """Send nothing, so that the layout of the viewers does not change."""
 
 
-def _in_background(function: Callable[..., None], *arguments: object) -> threading.Thread:
+def _start_thread(function: Callable[..., None], *arguments: object) -> threading.Thread:
     """Start a function in a daemon thread, and return the thread."""
     new_thread = threading.Thread(target=function, args=arguments, daemon=True)
     new_thread.start()

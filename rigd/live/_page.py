@@ -1,4 +1,4 @@
-"""Page of the live view for browsers: Rerun's web viewer on loopback, confined to this computer.
+"""Page of the live view for browsers: Rerun's web viewer, which loads from this computer only.
 
 Rerun's own page loads fonts from the internet and sends usage statistics there from the operator's
 browser. This module therefore serves the page with a policy that makes browsers load from this
@@ -37,7 +37,7 @@ _BLOCK_BYTES: Final = 65_536
 _REQUEST_TIMEOUT_S: Final = 10.0
 """Timeout in seconds of a browser's request and of Rerun's reply."""
 _POLL_PERIOD_S: Final = 0.1
-"""Period in seconds of the server's polls, and pause after a failed connection."""
+"""Interval in seconds of the server's polls, and pause after a failed connection."""
 _MAX_CONNECTION_S: Final = 60.0
 """Longest duration of a connection in seconds: the viewer has 40 MB, and a tunnel may be slow."""
 _MAX_CONNECTIONS: Final = 16
@@ -85,15 +85,15 @@ _RELOAD_SCRIPT: Final = """
 
 
 class ViewerPageServer:
-    """HTTP server of the live view's page for browsers on this computer, in separate threads.
+    """HTTP server, in threads of its own, of the live view's page for browsers on this computer.
 
     Parameters
     ----------
     port
         Port on loopback, or 0 if the system chooses one.
-    address
-        Function that returns the address of the present view, or None if there is none.
-    upstream
+    get_address
+        Function that returns the address of the present live view, or None if there is none.
+    get_rerun_port
         Function that returns the port on loopback at which Rerun itself serves the page, or 0.
 
     Attributes
@@ -110,10 +110,10 @@ class ViewerPageServer:
     def __init__(
         self,
         port: int,
-        address: Callable[[], LiveAddress | None],
-        upstream: Callable[[], int],
+        get_address: Callable[[], LiveAddress | None],
+        get_rerun_port: Callable[[], int],
     ) -> None:
-        self._server = _PageServer(port, address, upstream)
+        self._server = _PageServer(port, get_address, get_rerun_port)
         self.port = self._server.server_port
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(_POLL_PERIOD_S,), daemon=True
@@ -128,16 +128,16 @@ class ViewerPageServer:
 
 
 def serve_page(
-    address: Callable[[], LiveAddress | None], upstream: Callable[[], int]
+    get_address: Callable[[], LiveAddress | None], get_rerun_port: Callable[[], int]
 ) -> ViewerPageServer:
     """Start the page's server on :data:`PAGE_PORT`, or on a free port if that one is taken.
 
-    `address` and `upstream` are as for `ViewerPageServer`.
+    `get_address` and `get_rerun_port` are as for `ViewerPageServer`.
     """
     try:
-        return ViewerPageServer(PAGE_PORT, address, upstream)
+        return ViewerPageServer(PAGE_PORT, get_address, get_rerun_port)
     except OSError:
-        return ViewerPageServer(0, address, upstream)
+        return ViewerPageServer(0, get_address, get_rerun_port)
 
 
 class _PageServer(ThreadingHTTPServer):
@@ -149,15 +149,18 @@ class _PageServer(ThreadingHTTPServer):
     allow_reuse_address = True
 
     def __init__(
-        self, port: int, address: Callable[[], LiveAddress | None], upstream: Callable[[], int]
+        self,
+        port: int,
+        get_address: Callable[[], LiveAddress | None],
+        get_rerun_port: Callable[[], int],
     ) -> None:
-        self.address = address
-        self.upstream = upstream
+        self.get_address = get_address
+        self.get_rerun_port = get_rerun_port
         self.free_connections = threading.BoundedSemaphore(_MAX_CONNECTIONS)
         super().__init__((LOOPBACK, port), _PageHandler)
 
     def server_bind(self) -> None:
-        """Bind the socket without the base class's name resolution of the address."""
+        """Bind the socket, without resolving the host name as the base class does."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = LOOPBACK, self.socket.getsockname()[1]
 
@@ -188,17 +191,17 @@ class _PageServer(ThreadingHTTPServer):
             self.free_connections.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Ignore errors of browsers that disconnect."""
+        """Ignore the error if a browser disconnects."""
 
 
 class _PageHandler(BaseHTTPRequestHandler):
-    """Replies to the requests of browsers for the page and Rerun's files."""
+    """Replies to the requests of browsers for the page and for Rerun's files."""
 
     server: _PageServer
     timeout = _REQUEST_TIMEOUT_S
 
     def do_GET(self) -> None:
-        """Send the requested document, or refuse a request under another host name."""
+        """Send the requested document, or refuse the request if its host name is not permitted."""
         host_name = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
         if host_name in _PERMITTED_HOSTS:
             self._send_document()
@@ -211,7 +214,7 @@ class _PageHandler(BaseHTTPRequestHandler):
     def _send_document(self) -> None:
         """Send the requested document, a redirection, or an error."""
         url = urllib.parse.urlsplit(self.path)
-        document_name, address = url.path.lstrip("/"), self.server.address()
+        document_name, address = url.path.lstrip("/"), self.server.get_address()
         if document_name not in _SERVED_FILES:
             self._send_text(HTTPStatus.NOT_FOUND, "Not found.")
         elif address is None:
@@ -227,9 +230,9 @@ class _PageHandler(BaseHTTPRequestHandler):
             self._forward(document_name)
 
     def _forward(self, file_name: str) -> None:
-        """Send a file of Rerun's own page server, without links to other computers."""
+        """Send a file that Rerun's own page server provides, without links to other computers."""
         rerun_connection = http.client.HTTPConnection(
-            LOOPBACK, self.server.upstream(), timeout=_REQUEST_TIMEOUT_S
+            LOOPBACK, self.server.get_rerun_port(), timeout=_REQUEST_TIMEOUT_S
         )
         try:
             rerun_connection.request("GET", f"/{file_name}")
@@ -269,7 +272,7 @@ class _PageHandler(BaseHTTPRequestHandler):
         self.wfile.write(text.encode())
 
     def _send(self, body: bytes, content_type: str) -> None:
-        """Send a document of a content type that is not stored in caches."""
+        """Send a document with its content type; no cache may store it."""
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", content_type)
         self.send_header("Content-Length", str(len(body)))

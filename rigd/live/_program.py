@@ -140,7 +140,7 @@ class RerunProgram:
         self._process.wait()
 
     def _wait_for_log(self) -> None:
-        """Wait a moment for further log lines, or until the log of an ended program is complete."""
+        """Wait a moment for more log lines, or until an ended program's log is read to its end."""
         # After the end of the program the thread reads the log to its end.
         self._reader.join(timeout=_LOG_WAIT_S if self.running else _LAST_LOG_WAIT_S)
 

@@ -20,16 +20,16 @@ Records = TypeVar("Records")
 
 @dataclass(frozen=True, slots=True)
 class NewDrawings:
-    """Drawings of the records that were read from the rings in one call.
+    """Functions that draw the records that one call has read from the ring buffers.
 
     Attributes
     ----------
     notes
-        Drawings of events, which must not be dropped.
+        Functions that draw events, which must not be dropped.
     drawings
-        All other drawings.
+        All other functions.
     samples
-        Number of samples in the drawings that no earlier publisher has shown.
+        Number of the samples among the records that no earlier publisher has shown.
     """
 
     notes: "list[Drawing]"
@@ -38,7 +38,7 @@ class NewDrawings:
 
 
 class SessionRecordReader:
-    """Reads one session's records from the ring buffers, and turns them into drawings.
+    """Reads one session's records from the ring buffers, and provides functions that draw them.
 
     Records that are overwritten before they are read are counted; the writer never waits.
 
@@ -49,15 +49,15 @@ class SessionRecordReader:
     channels
         Shared memory of the rig's processes.
     seen_samples
-        Number of samples that an earlier publisher has shown, counted as `LiveSession.begins`.
-        Those that are still in the ring are read again for the scene.
+        Number of the first sample that no earlier publisher has shown, as in `LiveSession.begins`.
+        Earlier samples that are still in the ring are read again for the scene.
     last_response
         Frequency response of the last session of the same specimen, or None.
 
     Attributes
     ----------
     scene
-        Scene of the session, which makes the drawings.
+        Scene of the session, which provides the functions that draw.
     t_ns
         Time of the newest sample since the start of the session.
     read_duration_s
@@ -91,7 +91,7 @@ class SessionRecordReader:
 
     @property
     def next_index(self) -> int:
-        """Number of the next sample to read, counted as `LiveSession.begins`."""
+        """Number of the next sample to read; 0 is the first one ever written to the ring buffer."""
         return self._readers[SAMPLE].next_index
 
     def end(self, record_counts: Sequence[int]) -> None:
@@ -100,8 +100,8 @@ class SessionRecordReader:
             if topic in self._readers:
                 self._readers[topic].end = end
 
-    def read_new(self) -> NewDrawings:
-        """Read the new records, and return their drawings."""
+    def read_new_records(self) -> NewDrawings:
+        """Read the records since the last call, and return functions that draw them."""
         scene, ring_readers = self.scene, self._readers
         note_drawings: list[Drawing] = []
         signal_drawings: list[Drawing] = []
@@ -122,14 +122,14 @@ class SessionRecordReader:
 class _RingReader:
     """Reads one session's records from a ring buffer.
 
-    `first` is the number of the session's first record, `seen` that of the first record which no
-    earlier publisher has shown.
+    `first_record` is the number of the session's first record, `first_unshown` that of the first
+    record which no earlier publisher has shown.
     """
 
-    def __init__(self, ring: Ring, first: int, seen: int) -> None:
+    def __init__(self, ring: Ring, first_record: int, first_unshown: int) -> None:
         self._ring = ring
         # Overwritten records that an earlier publisher showed do not count as dropped.
-        self._observer = Observer(ring, max(first, min(seen, ring.oldest_index)))
+        self._observer = Observer(ring, max(first_record, min(first_unshown, ring.oldest_index)))
         self._damaged_records = 0
         self.end: int | None = None
 
@@ -140,7 +140,7 @@ class _RingReader:
 
     @property
     def next_index(self) -> int:
-        """Number of the next record to read."""
+        """Number of the next record to read; 0 is the first one ever written to the ring buffer."""
         return self._observer.next_index
 
     def records(self, decode: Callable[[bytes], Records]) -> Iterator[Records]:

@@ -19,7 +19,7 @@ GRPC_PORT: Final = 9876
 
 Viewers use it by default, and tunnels can forward it in advance."""
 _SERVER_MEMORY: Final = "16MiB"
-"""Size of the data that the server stores for viewers that connect late: about 80 s."""
+"""Size of the data that the server stores for viewers that connect late: about 80 s of signals."""
 _MAX_SESSIONS: Final = 20
 """Number of sessions after which a server is replaced.
 
@@ -33,7 +33,7 @@ _MIN_RESTART_INTERVAL_S: Final = 1.0
 
 
 class RerunServer:
-    """Rerun server that is restarted when it ends, with its announced address.
+    """Rerun server of the live view, which is restarted when it ends and announces its address.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class RerunServer:
         return False
 
     def accepts_connections(self) -> bool:
-        """Return whether the server accepts a connection; the SDK would wait 5 s for it."""
+        """Return whether the server accepts a connection now; the SDK itself would wait 5 s."""
         try:
             socket.create_connection((LOOPBACK, self._grpc_port), _CONNECT_TIMEOUT_S).close()
         except OSError:
@@ -120,7 +120,7 @@ class RerunServer:
         self._program.kill()
 
     def close(self) -> None:
-        """End the server and delete the file with its address."""
+        """End the server, and delete the file with its address."""
         self._program.kill()
         self._page.close()
         if self._announced_address is not None:
@@ -152,7 +152,7 @@ class RerunServer:
         )
 
     def _announce(self) -> None:
-        """Store the address of the server, and write it to its file."""
+        """Write the address of the new server to the address file, in which viewers find it."""
         self._grpc_port = self._program.grpc_port
         self.address = self._announced_address = LiveAddress.for_this_process(
             self._rig, self._grpc_port, self._page.port, time.time_ns()

@@ -19,14 +19,14 @@ It is enough for a session of some hours."""
 _START_TIMEOUT_S: Final = 30.0
 """Longest time in seconds for the start of a server."""
 _POLL_PERIOD_S: Final = 0.05
-"""Period in seconds in which the program's state is polled."""
+"""Interval in seconds at which the program's state is polled."""
 
 
 # File in a window or a browser
 
 
 class _RerunContext:
-    """Context manager that ends a running Rerun program when the context is left."""
+    """Running Rerun program, which is ended at the end of its context."""
 
     _program: RerunProgram
 
@@ -55,9 +55,9 @@ class _RerunContext:
 class _Window(_RerunContext):
     """Window of Rerun's viewer, which neither uses nor changes the user's settings of Rerun.
 
-    `content_options` are the command-line arguments for its first contents, `memory` is the limit
-    above which the oldest data are dropped, and `scratch` is a folder for files that Rerun leaves
-    when it is killed.
+    `content_options` are the command-line arguments that state what it shows first, `memory_limit`
+    is the limit above which the oldest data are dropped, and `scratch` is a folder for files that
+    Rerun leaves when it is killed.
     """
 
     def __init__(
@@ -245,7 +245,7 @@ class Viewer(_Window):
         return proxy_url(_LOOPBACK_NAMES[0], grpc_port) if grpc_port else ""
 
     def connect(self, address: LiveAddress) -> bool:
-        """Connect the window to a live view whose server was replaced, and return whether it did.
+        """Connect the window to a live view whose server was replaced; return whether it did so.
 
         The viewer connects to a URL only once, so it receives the URL with another name of this
         computer. Its earlier sessions are closed, because it would switch to the first of them.
@@ -271,7 +271,7 @@ class Viewer(_Window):
 
 
 def _switch_server(control_url: str, url: str, successes: list[bool]) -> None:
-    """Switch a viewer to another server, and append True to `successes` on success."""
+    """Switch a viewer to the server at `url`, and append True to `successes` on success."""
     from rerun.experimental import ViewerClient
 
     try:

@@ -1,6 +1,6 @@
 """Address of a running live view, stored in a small file of the user's runtime folder.
 
-The file of a killed process is recognised because the process does not exist any more.
+A file that a killed process has left is recognised, because that process no longer exists.
 """
 
 import os
@@ -127,7 +127,7 @@ def withdraw(address: LiveAddress) -> None:
 
 
 def find(rig: str) -> LiveAddress | None:
-    """Return the address of a rig's live view, or None if no view runs."""
+    """Return the address of a rig's live view, or None if the rig has no running view."""
     address = _read_address_file(_address_path(rig))
     return address if address is not None and address.alive else None
 

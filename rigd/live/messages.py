@@ -42,7 +42,7 @@ class LiveSession:
     recording_id
         Identifier of the session in viewers, also for a publisher that replaces this one.
     begins
-        Number of records in each ring before the session, in the order of
+        Number of records in each ring buffer before the session, in the order of
         :data:`rigd.engine.channels.TOPICS`.
     folder
         Folder of its file and of earlier sessions, or None if it is unknown.
@@ -77,7 +77,7 @@ class LiveSessionEnded:
     Attributes
     ----------
     ends
-        Number of records in each ring at the end of the session, counted as in
+        Number of records in each ring buffer at the end of the session, counted as in
         :attr:`LiveSession.begins`.
     outcome, reason
         Outcome of the session and its reason, or empty strings if they are unknown.

@@ -2,9 +2,9 @@
 
 It only observes the ring buffers with the loop's records, so it affects neither the loop nor the
 recorder. Samples that it cannot show in time are dropped and counted. If the server is slow, some
-seconds of samples are queued, and also events, which must not be dropped (`Backlog`). The
-computations of the view do not depend on what could be shown. The process ends when its standard
-input is closed, together with the server.
+seconds of samples are queued, and also events, which must not be dropped (`Backlog`). Results that
+are computed from the samples do not depend on what could be shown. When the standard input is
+closed, the process ends itself and the server.
 """
 
 import collections
@@ -52,14 +52,14 @@ if TYPE_CHECKING:
 
 
 _SEND_PERIOD_S: Final = 1 / 15
-"""Period in seconds in which drawings are sent during a session.
+"""Interval in seconds at which drawings are sent during a session.
 
-The picture is smooth at this period. A shorter one would cost more, since the cost grows with the
+The picture is smooth at this interval. A shorter one would cost more, since the cost grows with the
 number of messages."""
 _IDLE_PERIOD_S: Final = 1.0
-"""Period in seconds of the publisher between sessions."""
+"""Interval in seconds at which the publisher polls its server between sessions."""
 _CATCH_UP_S: Final = 0.2
-"""Seconds of samples in one reading from which the publisher does not pause before the next."""
+"""Duration in seconds of the samples read at once from which the next reading follows at once."""
 _MAX_QUEUED_S: Final = 10.0
 """Seconds of samples that are queued for a stalled server."""
 _WATCHDOG_TIMEOUT_S: Final = 20
@@ -113,7 +113,7 @@ class _Publisher:
         self._announced_server: int | None = None
 
     def serve(self) -> None:
-        """Show sessions until the supervisor has ended or closes the standard input."""
+        """Show sessions until the supervisor ends, or closes this process's standard input."""
         while self._parent.alive():
             _arm_watchdog()
             self._show_new_records()
@@ -136,11 +136,11 @@ class _Publisher:
 
     def linger(self, linger_s: float) -> None:
         """Keep the view open for `linger_s` seconds after the last session."""
-        earliest_end = time.monotonic() + (
+        earliest_end_s = time.monotonic() + (
             _LAST_MESSAGES_S if self._drawing_stream.connections else 0.0
         )
-        end = max(earliest_end, time.monotonic() + linger_s)
-        while time.monotonic() < (end if self._parent.alive() else earliest_end):
+        end_s = max(earliest_end_s, time.monotonic() + linger_s)
+        while time.monotonic() < (end_s if self._parent.alive() else earliest_end_s):
             _arm_watchdog()
             self._show_new_records()
             time.sleep(_SEND_PERIOD_S)
@@ -173,19 +173,19 @@ class _Publisher:
         self._parent.send(LiveSessionShown(session.recording_id))
 
     def _finish_session(self, end: LiveSessionEnded) -> None:
-        """Show the end of the present session, unless it has been shown already."""
+        """Show the end of the present session, unless it is shown already."""
         if self._shown_session is not None and not self._shown_session.has_ended:
             self._shown_session.finish(end)
             self._show_new_records()
 
     def _show_orphaned(self) -> None:
-        """Show a session whose supervisor has ended until its torque is off."""
+        """Show the present session, whose supervisor has ended, until its torque is off."""
         shown_session, shared_state = self._shown_session, self._channels.shared_state
         if shown_session is None or shown_session.has_ended:
             return
         shown_session.supervisor_lost = True
-        end = time.monotonic() + _MAX_ORPHANED_S
-        while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < end:
+        end_s = time.monotonic() + _MAX_ORPHANED_S
+        while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < end_s:
             _arm_watchdog()
             self._show_new_records()
             time.sleep(_SEND_PERIOD_S)
@@ -217,7 +217,7 @@ class _Publisher:
 
 
 class _ShownSession:
-    """Session that the live view shows, or showed last, with the drawings to be sent."""
+    """Session that the live view shows, or showed last, with the queue of drawings to be sent."""
 
     def __init__(
         self, session: LiveSession, channels: Channels, earlier_response: LastResponse | None
@@ -252,11 +252,11 @@ class _ShownSession:
         return self._dropped_before + dropped_samples
 
     def queue_new_records(self) -> None:
-        """Queue drawings of the new records or, after the session, of its quick look."""
+        """Queue the drawings of new records or, after the session, the text of its quick look."""
         if self.has_ended:
             self._add_quick_look()
             return
-        new_drawings = self.reader.read_new()
+        new_drawings = self.reader.read_new_records()
         queued_drawings = new_drawings.drawings
         now_s = time.monotonic()
         if self._health_reader.is_due(now_s):
@@ -322,10 +322,10 @@ class _ShownSession:
         )
 
     def send(self, drawing_stream: DrawingStream, *, connected: bool) -> None:
-        """Send the queued drawings.
+        """Send the queued drawings to the viewers.
 
-        After a new connection (`connected`) the frame has already been sent, which contains all
-        drawings that must not be dropped.
+        `connected` states that the connection is new. Then the stream has already sent all drawings
+        that must not be dropped.
         """
         if connected:
             self.backlog.drop_required()
@@ -355,7 +355,7 @@ Only beyond it the oldest of them are dropped."""
 
 
 class Backlog:
-    """Queue of what the live view still has to draw of a session.
+    """Queue of a session's drawings that the live view has not sent yet.
 
     Parameters
     ----------
@@ -406,7 +406,7 @@ class Backlog:
         self._required_drawings.extend(drawings)
 
     def drop_required(self) -> None:
-        """Remove the drawings of `put_required`; a new connection has received them already."""
+        """Remove the drawings that `put_required` queued; a new connection has received them."""
         self._required_drawings.clear()
 
     def take(self) -> "tuple[list[Drawing], int]":
@@ -484,7 +484,7 @@ _ACTIVITY_BANNERS: Final = {  # Banner for each activity of the rig
 
 
 class SessionStateReader:
-    """Derives the session's state, shown in the view's banner, from the processes' shared state.
+    """Derives the state of the session in the view's banner from the processes' shared memory.
 
     Parameters
     ----------
@@ -521,7 +521,7 @@ class SessionStateReader:
 
 
 POLL_S: Final = 0.25
-"""Period in seconds in which the rig's health is read."""
+"""Interval in seconds at which the rig's health is read."""
 _RATE_POLLS: Final = 4
 """Number of readings over which the loop's rate is measured."""
 
@@ -548,7 +548,7 @@ class HealthReader:
         return now_s >= self._next_reading_s
 
     def read(self, now_s: float, view_dropped: int) -> Health:
-        """Return the present health of the rig: missed ticks, load, errors and rate.
+        """Return the present health of the rig: missed ticks, bus load, errors and loop rate.
 
         Parameters
         ----------

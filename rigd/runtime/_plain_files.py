@@ -1,4 +1,4 @@
-"""Safe opening of files that users name, which may be pipes, devices or very large."""
+"""Safe opening of files whose names come from users: they may be pipes, devices or very large."""
 
 import errno
 import os
@@ -53,7 +53,7 @@ def read_plain_file(path: Path, max_bytes: int) -> bytes:
 
 
 def _open_regular_file(path: Path, max_bytes: int) -> int:
-    """Return a descriptor of a regular file; raise OSError for any other or too large file."""
+    """Open a file and return its descriptor; raise OSError if it is not regular or too large."""
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "its name contains a NUL character")
     fd = os.open(path, _OPEN_FLAGS)

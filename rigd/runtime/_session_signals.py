@@ -4,7 +4,8 @@ Ctrl-C, Ctrl-\, Ctrl-Z and the closing of a terminal send a signal to all proces
 and a service manager sends SIGTERM to all processes. The supervisor and the control process stop
 their session safely at each of these signals (`StopRequest`), because a suspended control process
 would leave its last torque on. The recorder and the live publisher ignore the signals (`ignore`),
-and are ended by the supervisor. The analyser, which runs on every system, does not import this.
+and are ended by the supervisor. The analyser, which runs on every system, does not import this
+module.
 """
 
 import contextlib
@@ -14,7 +15,7 @@ from contextlib import contextmanager
 from typing import Final
 
 STOP_SIGNAL: Final = signal.SIGUSR1
-"""Signal that requests a process to stop its sessions, after which a daemon continues to run.
+"""Signal that requests a process to stop its sessions; a daemon continues to run without them.
 
 The process table shows how each process reacts to the signal, and thus whether it may run sessions.
 The default action means that the process is starting, a handler that it may run a session, and an
@@ -29,10 +30,10 @@ _END_SIGNALS = (
 
 @contextmanager
 def signals_blocked() -> Iterator[None]:
-    """Block the signals that request an end in the context, for a process that is started there.
+    """Block, within this context, the signals that request an end.
 
-    The process inherits the block. It unblocks the signals by :meth:`StopRequest.catch` or
-    :func:`ignore` when it can handle them.
+    A process that is started in the context inherits the block. It unblocks the signals by
+    :meth:`StopRequest.catch` or :func:`ignore` when it can handle them.
     """
     previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, _END_SIGNALS)
     try:
@@ -49,7 +50,7 @@ def ignore() -> None:
 
 
 class StopRequest:
-    """Flag that states whether the operator has requested a stop, which signals can set.
+    """Flag that is set when the operator requests a stop, by a signal or by a command.
 
     Attributes
     ----------
@@ -64,7 +65,7 @@ class StopRequest:
         self.on_request: Callable[[], None] = lambda: None
 
     def catch(self) -> None:
-        """Make the signals that request an end set this flag, except for ignored ones (nohup)."""
+        """Make the signals that request an end set this flag, except ignored ones (nohup)."""
         for signal_number in _END_SIGNALS:
             if signal.getsignal(signal_number) != signal.SIG_IGN:
                 signal.signal(signal_number, lambda *_: self.request())

@@ -1,4 +1,4 @@
-"""Signals that request the end of a command, on every system: it ends by an exception."""
+"""Signals that request the end of a command: they raise an exception in it, on every system."""
 
 import contextlib
 import ctypes
@@ -37,23 +37,24 @@ def interrupt(signal_number: int, _frame: FrameType | None) -> NoReturn:
 def ignore_handled_signals() -> None:
     """Ignore all signals that have a handler, so that no Ctrl-C interrupts the final cleanup.
 
-    Otherwise Python would restore the default action of these signals before its cleanup has ended,
-    and a signal would end the process.
+    Otherwise Python would restore the default action of these signals during its cleanup, and a
+    signal would then end the process.
     """
     for signal_number in signal.valid_signals():
         if callable(signal.getsignal(signal_number)):
             signal.signal(signal_number, signal.SIG_IGN)
 
 
-def _repeat_dropped_signal(dropped: "sys.UnraisableHookArgs") -> None:
+def _repeat_dropped_signal(dropped_exception: "sys.UnraisableHookArgs") -> None:
     """Repeat a signal whose :class:`Interruption` Python dropped; installed as unraisable hook.
 
-    Python drops an exception in the finalizer of an object, which may run anywhere. An exception
-    raised here would be dropped, too. The signal is therefore sent again a little later.
+    Python drops an exception that is raised while an object's finalizer runs, which may be at any
+    time. An exception raised here would be dropped, too. The signal is therefore sent again a
+    little later.
     """
-    interruption = dropped.exc_value
+    interruption = dropped_exception.exc_value
     if not isinstance(interruption, Interruption):
-        sys.__unraisablehook__(dropped)
+        sys.__unraisablehook__(dropped_exception)
         return
     (signal_number,) = interruption.args
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal_number))
@@ -63,7 +64,7 @@ def _repeat_dropped_signal(dropped: "sys.UnraisableHookArgs") -> None:
 def signal_when_orphaned(signal_number: int) -> None:
     """Make the system send a signal to this process when its parent ends (Linux only).
 
-    A suspended process is also continued.
+    If this process is then suspended, it is also continued.
     """
     with contextlib.suppress(AttributeError):  # other systems have no such call
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal_number)

@@ -37,7 +37,7 @@ class UnsafeFolderError(FailureError):
 
 
 def runtime_folder() -> Path:
-    """Return this user's folder for sockets and address files, which a restart removes.
+    """Return this user's folder for sockets and address files, which a reboot removes.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def runtime_folder() -> Path:
 
 
 def folder_fault(folder: Path, *, shared: bool = False) -> str:
-    """Return text that states why other users can replace files in a runtime folder, or "" if not.
+    """Return the reason why other users could replace files in a runtime folder; "" if they cannot.
 
     Parameters
     ----------
@@ -80,8 +80,8 @@ def folder_fault(folder: Path, *, shared: bool = False) -> str:
                 f"{stat.S_IMODE(status.st_mode):04o}), who could replace the daemon's socket; run "
                 f"chmod go-w {path}, or set XDG_RUNTIME_DIR to a folder that only you can write to."
             )
-        owners = (0, os.getuid())
-        if path == folder and not shared and os.getuid() and status.st_uid not in owners:
+        trusted_uids = (0, os.getuid())
+        if path == folder and not shared and os.getuid() and status.st_uid not in trusted_uids:
             return (
                 f"The runtime folder {path} belongs to another user ({status.st_uid}); set "
                 "XDG_RUNTIME_DIR to a folder that is yours."
@@ -90,7 +90,7 @@ def folder_fault(folder: Path, *, shared: bool = False) -> str:
 
 
 def known_folders(uid: int | None) -> list[Path]:
-    """Return all folders that may be a user's runtime folder in some process environment.
+    """Return the folders that processes of a user may use as runtime folder.
 
     Parameters
     ----------
@@ -100,8 +100,8 @@ def known_folders(uid: int | None) -> list[Path]:
     Returns
     -------
     list of Path
-        Runtime folder by this process's environment, by the login session, and fallback folders
-        among temporary files. Some may not exist.
+        Runtime folder according to this process's environment, runtime folder of the login session,
+        and fallback folders in the folder for temporary files. Some may not exist.
     """
     base_folder = os.environ.get("XDG_RUNTIME_DIR")
     folders = [Path(base_folder) / "rigd"] if base_folder else []
@@ -115,14 +115,14 @@ def known_folders(uid: int | None) -> list[Path]:
     return sorted(set(folders))
 
 
-def _fallback_folders(base: Path, uid: int | None) -> list[Path]:
+def _fallback_folders(temporary_folder: Path, uid: int | None) -> list[Path]:
     """Return the fallback runtime folders of a user, or of all users if `uid` is None.
 
     They are sorted by user id and number. A folder that belongs to another user than its name
     states is left out.
     """
     numbered_folders = []
-    with suppress(OSError), os.scandir(base) as entries:
+    with suppress(OSError), os.scandir(temporary_folder) as entries:
         for entry in entries:
             name_match = _FALLBACK_FOLDER_NAME.fullmatch(entry.name)
             if name_match is None or uid not in (None, int(name_match[1])):
@@ -138,15 +138,15 @@ def _fallback_folders(base: Path, uid: int | None) -> list[Path]:
     return [folder_path for *_, folder_path in sorted(numbered_folders)]
 
 
-def _own_fallback_folder(base: Path) -> Path:
-    """Return the user's fallback runtime folder within `base`; create it if it does not exist.
+def _own_fallback_folder(temporary_folder: Path) -> Path:
+    """Return this user's fallback runtime folder, which is created if it does not exist.
 
-    A number is appended if another user has created a folder with the name. The numbered folder is
-    found again even after that other folder was removed.
+    A number is appended to the name if another user has created a folder of that name. Later calls
+    return the numbered folder, even if the other user's folder was removed.
     """
     uid = os.getuid()
-    own_folders = _fallback_folders(base, uid)
-    folder_path = own_folders[0] if own_folders else base / f"rigd-{uid}"
+    own_folders = _fallback_folders(temporary_folder, uid)
+    folder_path = own_folders[0] if own_folders else temporary_folder / f"rigd-{uid}"
     for number in itertools.count(1):
         with suppress(FileExistsError):
             folder_path.mkdir(mode=0o700)
@@ -155,7 +155,7 @@ def _own_fallback_folder(base: Path) -> Path:
             if folder_status.st_mode & 0o055 and not folder_status.st_mode & 0o022:
                 folder_path.chmod(0o700)
             return folder_path
-        folder_path = base / f"rigd-{uid}-{number}"
+        folder_path = temporary_folder / f"rigd-{uid}-{number}"
     raise AssertionError("never reached")
 
 
@@ -163,7 +163,7 @@ def _own_fallback_folder(base: Path) -> Path:
 
 
 def file_name(rig: str) -> str:
-    """Return a rig's name as used in file names, with ``-`` for all but letters and digits."""
+    """Return a rig's name for use in file names: only letters and digits, others become ``-``."""
     return "".join(c if c.isalnum() else "-" for c in rig).strip("-")
 
 
@@ -194,7 +194,7 @@ def announce(path: Path, address: Mapping[str, object]) -> None:
     path
         Path of the file; an existing file is replaced.
     address
-        Name → value that JSON can represent.
+        Fields of the address: name → value that JSON can represent.
 
     Raises
     ------
@@ -210,7 +210,7 @@ def announce(path: Path, address: Mapping[str, object]) -> None:
 
 
 def read_address(path: Path) -> dict[str, Any]:
-    """Return the address that `announce` wrote to a file, or an empty dictionary if invalid."""
+    """Return the address that `announce` wrote to a file; empty if the file is not valid."""
     try:
         # The file may be of any kind, even one that blocks on opening.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
@@ -222,7 +222,7 @@ def read_address(path: Path) -> dict[str, Any]:
 
 
 def answers(path: str | Path) -> bool:
-    """Return whether a process listens on a Unix socket."""
+    """Return whether a process listens on the Unix socket with a path."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe_socket:
         probe_socket.settimeout(_CONNECT_TIMEOUT_S)
         try:

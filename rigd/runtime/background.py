@@ -48,12 +48,16 @@ RUN_PROGRAM: Final = (
     "-c",
     "from rigd.runtime.background import run_program; run_program()",
 )
-"""First words of a command line that becomes another program. The process id of its parent follows,
-with which the system ends the program, and then the program's own command line."""
+"""First words of a command line that starts a program and ends it with its parent.
+
+The process id of the parent and the program's own command line follow them."""
 
 
 def run_program() -> None:
-    """Become the program of the command line (`RUN_PROGRAM`); it ends with its parent."""
+    """Replace this process by the program on the command line, and end it with its parent.
+
+    The command line begins with `RUN_PROGRAM`.
+    """
     die_with_parent(int(sys.argv[1]))
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the page ignores
     os.execv(sys.argv[2], sys.argv[2:])
@@ -72,7 +76,7 @@ def prefer_oom_kill(pid: int) -> None:
 
 
 def give_way(pid: int = 0) -> None:
-    """Let a process and its children run only while no other process needs the processor.
+    """Give a process and its children idle priority: they run while no other process needs to.
 
     Parameters
     ----------
@@ -86,7 +90,7 @@ def give_way(pid: int = 0) -> None:
 
 
 def processor_use(pid: int) -> tuple[bool, float] | None:
-    """Return whether a process is runnable, and the processor time that it has used.
+    """Return whether a process is runnable, and the processor time in s that it has used.
 
     Parameters
     ----------

@@ -14,14 +14,15 @@ ValueT = TypeVar("ValueT")
 
 
 class ComputationError(Exception):
-    """The copy of the process has ended without a value."""
+    """Raised if the copy of the process has ended without a value."""
 
 
 class ForkedComputation(Generic[ValueT]):
     """Computation that has been started in a copy of this process (fork).
 
-    A thread would not do: it would block the interpreter. The copy has the current thread only. As
-    a context manager it ends the copy if it still computes at the end of the context.
+    A copy is used because a thread would block the interpreter. Of the threads, the copy has only
+    the one that creates it. As a context manager, this object kills the copy if it is still
+    computing at the end of the context.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ class ForkedComputation(Generic[ValueT]):
         return self._wait(os.WNOHANG)
 
     def value(self) -> ValueT:
-        """Wait for the end of the computation, and return its value, once.
+        """Wait for the end of the computation, and return its value; can be called once only.
 
         Raises
         ------
@@ -76,7 +77,7 @@ class ForkedComputation(Generic[ValueT]):
         self._value_file.close()
 
     def _wait(self, options: int = 0) -> bool:
-        """Wait for the end of the copy, and return whether it has ended."""
+        """Call `os.waitpid` with `options` for the copy, and return whether the copy has ended."""
         if self._exit_status is None:
             process_id, exit_status = os.waitpid(self._process_id, options)
             if process_id:
@@ -88,8 +89,8 @@ class ForkedComputation(Generic[ValueT]):
 def computed_meanwhile(compute: Callable[[], ValueT]) -> Iterator[Callable[[], ValueT]]:
     """Compute a value in a copy of this process, if this computer has two processors for it.
 
-    If not, or if the copy fails, the value is computed here when it is requested. An error of the
-    computation is then raised there.
+    If not, or if the copy fails, this process computes the value when the caller requests it. An
+    error of the computation is raised by that request.
 
     Parameters
     ----------

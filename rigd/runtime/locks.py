@@ -19,7 +19,7 @@ _RIG_LOCK_PATTERN = re.compile(r"/(?:rigd-)?rig-([^/]*)\.lock(?: \(deleted\))?$"
 
 
 class LockHeldError(Exception):
-    """Raised if another program holds a lock file; its text describes that program."""
+    """Raised if another program holds a lock file; the message describes that program."""
 
 
 class LockFile:
@@ -28,7 +28,8 @@ class LockFile:
     Parameters
     ----------
     name
-        Name of the locked resource. All characters except letters and digits are equivalent.
+        Name of the locked resource. Names that differ only in other characters than letters and
+        digits are the same resource.
     for_all_users
         Whether the resource is common to all users of this computer, as hardware is. The file is
         then in ``/run/lock`` if that folder is writable. Otherwise it is in the user's runtime
@@ -57,7 +58,7 @@ class LockFile:
 
         Raises
         ------
-        HeldError
+        LockHeldError
             If another program holds the lock.
         OSError
             If the lock file cannot be created.
@@ -94,7 +95,7 @@ class LockFile:
 
 
 def _lock_descriptor(fd: int, *, exclusive: bool) -> None:
-    """Lock an open file without waiting; raise HeldError if another program holds it."""
+    """Lock an open file without waiting; raise LockHeldError if another program holds it."""
     try:
         fcntl.flock(fd, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except OSError:
@@ -105,9 +106,10 @@ def _lock_descriptor(fd: int, *, exclusive: bool) -> None:
 
 
 def _unnamed_holder_text(fd: int, stated_holder: str) -> str:
-    """Return text on a process that holds the lock but is not named in the lock file, else "".
+    """Return a text that names the process holding a lock; "" if the lock file already does.
 
-    Any user can write to the file, so its content may be wrong. The kernel's table is right.
+    Any user can write to the file, so its content `stated_holder` may be wrong. The kernel's table
+    is right.
     """
     lock_inode = os.fstat(fd).st_ino
     try:
@@ -124,7 +126,7 @@ def _unnamed_holder_text(fd: int, stated_holder: str) -> str:
 
 
 def _held_inodes() -> set[tuple[int, int]]:
-    """Return process id and inode of each file lock in the kernel's table."""
+    """Return the pairs (process id, inode of the locked file) of the kernel's table of locks."""
     # 1: FLOCK ADVISORY WRITE PID MAJOR:MINOR:INODE START END
     table_rows = [table_line.split() for table_line in _LOCK_TABLE.read_text("ascii").splitlines()]
     return {
@@ -247,7 +249,7 @@ def locked_rig(pid: int) -> str | None:
 
 
 def _open_rig_locks(pid: int) -> list[tuple[str, Path]]:
-    """Return the rig locks that a process has open: name of the rig, and path in /proc."""
+    """Return the lock files of rigs that a process has open: name of the rig, and path in /proc."""
     rig_locks = []
     with suppress(OSError):
         for fd_entry in Path("/proc", str(pid), "fd").iterdir():

@@ -1,7 +1,7 @@
 """The kernel's tables of running processes and of listening sockets.
 
-They show processes and sockets of the user even if these were started in another environment, with
-another runtime folder.
+They include the user's processes and sockets from other environments, which have another runtime
+folder.
 """
 
 import os
@@ -22,7 +22,7 @@ _LISTENING_FLAG: Final = 0x10000
 
 @dataclass(frozen=True, slots=True)
 class RunningProcess:
-    """Running process, as the kernel's process table described it when it was read."""
+    """Running process, with its state at the time when the kernel's process table was read."""
 
     pid: int
     """Process id."""
@@ -79,7 +79,7 @@ def read_processes() -> list[RunningProcess]:
 
 
 def read_process(pid: int) -> RunningProcess | None:
-    """Return the process with an id, or None if it has ended or this user cannot see it.
+    """Return the process with a process id; None if it has ended or this user cannot see it.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def read_process(pid: int) -> RunningProcess | None:
 
 
 def _parsed_process(pid: int, status: str, command: bytes) -> RunningProcess | None:
-    """Return a process from its files in /proc, or None if it has ended."""
+    """Return a process from the texts of its files in /proc, or None if it has ended."""
     status_rows = [status_line.partition(":\t") for status_line in status.split("\n")]
     status_fields = {
         key: field_value for key, _, field_value in reversed(status_rows)

@@ -1,8 +1,8 @@
-"""Display of a session in Rerun: its layout, and the drawing of samples, events and health.
+"""Display of a session in Rerun: layout of the window, and drawing of samples, events and health.
 
-The package offers the scene of a session (`Scene`), which turns records into functions that draw,
-recorded sessions and Rerun files (`draw_session`, `new_rrd_file`), and charts over frequency
-(`Chart`). Rerun takes half a second to import, so only the functions that need it import it.
+`Scene` turns the records of a session into functions that draw them, `draw_session` draws a
+recorded session, `rrd_file` writes Rerun files, and `Chart` is a chart over frequency or another
+quantity. Rerun takes half a second to import, so only the functions that need it import it.
 Viewers, servers and processes are in `rigd.live`.
 """
 

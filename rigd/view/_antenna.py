@@ -49,7 +49,7 @@ TOUCH_ENTITY: Final = f"{ANTENNA_ENTITY}/touch"
 ENLARGEMENT: Final = 2.0
 """Factor by which the motor angle and the beam's deflection are enlarged in the drawing.
 
-The reference paper's chirp turns the motor by 25 mrad, and at the first resonance the tip swings by
+The default chirp turns the motor by 25 mrad, and at the first resonance the tip swings by
 a third of the beam's length. With this factor the motor's motion is visible, and the tip's motion
 stays inside the drawing."""
 _UNSCALED_EXCITATIONS: Final = ("move", "touch")
@@ -63,23 +63,24 @@ TRAIL_S: Final = 0.5
 """Time for which each drawn beam line stays visible, so that the lines show the range of motion."""
 
 _SHAPE_HZ: Final = 100.0
-"""Rate at which the beam's deflection is computed, to find the largest deflection of the tip."""
+"""Rate at which the beam's deflection is computed, in hertz.
+
+It is higher than the rate of drawing, so that the largest deflection of the tip is not missed."""
 _LABEL_HZ: Final = 4.0
-"""Rate at which two drawings are sent: the label with the tip's deflection, and the trail of past
-lines."""
+"""Rate at which the label with the tip's deflection, and the trail of past lines, are sent."""
 _MAX_INTERPOLATED_GAP_S: Final = 10.0
 """Longest gap between samples over which the motor angle is interpolated."""
 _ASSUMED_DAMPING_RATIO: Final = 2e-3
 """Damping ratio of the first mode that is assumed if the profile states no damping.
 
-The lowest damping ratio in the reference paper is half as large."""
+It is twice the lowest damping ratio in the reference paper."""
 
 _STORED_LINES_S: Final = 30.0
-"""Time for which drawn beam lines are stored, so that a later estimate of a touch can be drawn."""
+"""Time for which drawn beam lines are stored: a touch is estimated later than it happens."""
 _ARROW_LENGTH_PER_N: Final = 0.2
 """Length of the arrow of a contact force per newton, in beam lengths."""
 _MAX_ARROW_LENGTH: Final = 0.4
-"""Upper limit of the length of a contact force's arrow, in beam lengths."""
+"""Largest length of a contact force's arrow, in beam lengths."""
 
 _HOUSING_COLOR: Color = (105, 110, 120)
 """Colour of the motor's housing."""
@@ -90,7 +91,7 @@ _TRAIL_COLOR: Color = (70, 115, 145)
 
 
 class Antenna:
-    """Drawing of the motor and of the antenna, which is a flexible beam, during one session.
+    """Motor and antenna (a flexible beam) of one session, which are drawn as they move.
 
     Parameters
     ----------
@@ -119,7 +120,7 @@ class Antenna:
         )
 
     def frame(self) -> list[Drawing]:
-        """Return the functions that draw the motor and set the styles of the moving lines."""
+        """Return functions that draw the motor and set the style of the beam's lines."""
         return static_drawings()
 
     def samples(self, samples: Records) -> list[Drawing]:
@@ -162,13 +163,13 @@ class Antenna:
         return drawings + label_drawings
 
     def touch(self, touch: Mapping[str, Any]) -> list[Drawing]:
-        """Return the function that draws a touch: its point, interval and force on the beam.
+        """Return the function that draws a touch: contact point with uncertainty, and force.
 
         Parameters
         ----------
         touch
-            Touch as in JSON documents. Nothing is drawn if its point or time is unknown, or if the
-            beam line at that time is not stored.
+            Estimated touch as a JSON object. The result is empty if its point or time is unknown,
+            or if the beam line at that time is not stored.
         """
         touch_position, touch_time = touch.get("x_m"), touch.get("time_s")
         stored_lines = list(self._shapes)
@@ -189,9 +190,16 @@ class Antenna:
         beam_line = (1 - time_fraction) * earlier_lines[1] + time_fraction * later_lines[1]
         displacement = later_lines[1] - earlier_lines[1]
         beam_positions = np.linspace(0.0, 1.0, len(beam_line))
-        x = np.array([touch_position["value"], *touch_position["interval_95"]]) / self._length_m
+        relative_positions = (
+            np.array([touch_position["value"], *touch_position["interval_95"]]) / self._length_m
+        )
         touch_points, displacements = (
-            np.column_stack([np.interp(x, beam_positions, coordinate) for coordinate in lines.T])
+            np.column_stack(
+                [
+                    np.interp(relative_positions, beam_positions, coordinate)
+                    for coordinate in lines.T
+                ]
+            )
             for lines in (beam_line, displacement)
         )
         touch_force = touch.get("force_n")
@@ -219,10 +227,10 @@ class Antenna:
         ]
 
     def _interpolate_to_ticks(self, samples: Records) -> Real:
-        """Return time (ns) and motor angle (rad) of every tick to the last sample, shape (n, 2).
+        """Return time (ns) and motor angle (rad) of all new ticks, shape (n, 2).
 
-        The first row is the tick after the previous sample. Ticks without a sample have
-        interpolated values.
+        The new ticks are those after the last sample of the previous call, to the last sample.
+        Ticks without a sample have interpolated values.
         """
         ticks = samples["tick"].astype(np.int64)
         times_and_angles = np.column_stack([samples["t_ns"], samples["angle_rad"]])
@@ -269,12 +277,12 @@ def view() -> "rrb.Spatial3DView":
 
 
 def static_drawings() -> list[Drawing]:
-    """Return functions that draw the motor and send the styles of the moving lines."""
+    """Return functions that draw the motor and set the style of the beam's lines."""
     return [_draw_motor, _draw_direction, _draw_styles]
 
 
 def enlarged_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray[np.float32]:
-    """Return the coordinates of the undeformed line and of the bent beam, drawn enlarged.
+    """Return the coordinates of the undeformed and of the bent beam, enlarged by `ENLARGEMENT`.
 
     Parameters
     ----------
@@ -282,12 +290,13 @@ def enlarged_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray
         Angle of the motor.
     deflection_per_length
         Deflection at evenly spaced points of the beam, shape (points,), relative to the undeformed
-        line, in beam lengths.
+        beam, in beam lengths.
 
     Returns
     -------
     lines
-        Coordinates x, y, z of the line and of the beam, shape (2, points, 3).
+        Coordinates x, y, z of the undeformed and of the bent beam, in beam lengths, shape
+        (2, points, 3).
     """
     x = np.linspace(0.0, 1.0, deflection_per_length.size)
     line_coordinates = np.zeros((2, x.size, 3), dtype=np.float32)
@@ -298,12 +307,14 @@ def enlarged_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray
 
 
 def unscaled_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray[np.float32]:
-    """Return the coordinates of the undeformed line and of the bent beam, true to scale.
+    """Return the coordinates of the undeformed and of the bent beam, true to scale.
+
+    Arguments and result are those of `enlarged_lines`.
 
     Parameters
     ----------
     angle_rad, deflection_per_length
-        As for `enlarged_lines`.
+        Angle of the motor, and deflection of the beam in beam lengths.
     """
     along_beam = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
     across_beam = np.array([-along_beam[1], along_beam[0], 0.0])
@@ -314,7 +325,11 @@ def unscaled_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray
 
 
 def tip_label(tip_m: float, *, to_scale: bool = False) -> str:
-    """Return the text with the tip's deflection in mm, rounded to two digits or to 0.1 mm."""
+    """Return a label such as "tip deflection ± 4.2 mm, drawn × 2".
+
+    The deflection is rounded to 0.1 mm, from 10 mm on to two significant digits. `to_scale` means
+    that the drawing is true to scale.
+    """
     tip_mm = 1e3 * tip_m
     mm_text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
     return (
@@ -323,19 +338,19 @@ def tip_label(tip_m: float, *, to_scale: bool = False) -> str:
 
 
 def touch_label(touch: Mapping[str, Any]) -> str:
-    """Return the label of a touch in the drawing: its number and its position on the beam.
+    """Return the label of a touch in the drawing: its number and its position on the beam in m.
 
     Parameters
     ----------
     touch
-        Touch as in JSON documents.
+        Estimated touch as a JSON object.
     """
     x_m = touch["x_m"]
     return f"touch {touch['number']}: {with_half_width(x_m['value'], x_m['interval_95'])} m"
 
 
 def _assumed_damping(beam: Beam) -> Damping:
-    """Return a small viscous damping for drawing, if the nominal damping is unknown."""
+    """Return the small viscous damping with which a beam of unknown damping is drawn."""
     first_mode_rad_s = float(undamped_frequencies_rad_s(beam, 1)[0])
     return Damping(zeta=2 * _ASSUMED_DAMPING_RATIO / first_mode_rad_s)
 
@@ -403,7 +418,7 @@ def _draw_direction(stream: "RecordingStream") -> None:
 
 
 def _draw_styles(stream: "RecordingStream") -> None:
-    """Send the colours and widths of the beam lines, and the position of the tip's label, once."""
+    """Send the constants of the drawing: colours and widths of the lines, position of the label."""
     import rerun as rr
 
     for entity, line_colors, line_widths in (
@@ -425,7 +440,7 @@ def _draw_styles(stream: "RecordingStream") -> None:
 
 
 def _draw_lines(stream: "RecordingStream", entity: str, timed_lines: Sequence[_TimedLines]) -> None:
-    """Send lines to a Rerun entity, each group of lines at its time."""
+    """Send the beam's lines at several times to a Rerun entity."""
     import rerun as rr
 
     t_ns = np.array([t_ns for t_ns, _ in timed_lines])
@@ -457,7 +472,7 @@ def _draw_touch(
     force_arrow: Real,
     label_text: str,
 ) -> None:
-    """Draw a touch from its time on: its point, its interval along the beam, and its force."""
+    """Draw a touch from its time on: contact point, its uncertainty along the beam, and force."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)

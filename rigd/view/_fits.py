@@ -1,7 +1,8 @@
-"""Fits of the record: modes over time with their shrinking intervals, and a table of the last fit.
+"""Display of a session's fits: modes over time with their shrinking intervals, and a table.
 
-During a session a new fit arrives every second, or with every segment of a search for a target
-precision. A recorded file contains only the last fit, which is shown as a table.
+During a session a new fit arrives every second or, if the session runs until a precision is
+reached, after every segment of its excitation. A session file contains only the last fit, which the
+table shows.
 """
 
 from collections.abc import Mapping
@@ -15,14 +16,14 @@ import numpy.typing as npt
 from rigd.estimates import Estimate, EstimatedMode, modes_from_json, unseen_modes
 from rigd.session import Validity
 from rigd.units import suffix_of, unit_of, with_percentage
-from rigd.view._session_info import plain
+from rigd.view._session_info import escape_markdown
 from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Plot, PlotCurve, Source, Values
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
 Fit = Mapping[str, Any]
-"""Fit of a session's record as in JSON documents (docs/online_fit.md)."""
+"""Fit of a model to a session's samples, as a JSON object (docs/online_fit.md)."""
 
 TABLE: Final = "/fit_table"
 """Entity path in Rerun of the table with the last fit."""
@@ -34,23 +35,23 @@ _MAX_FINDINGS: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class _Quantity:
-    """Frequency or damping ratio of a mode, as plotted over time: names, unit and factor."""
+    """Quantity of a mode that is plotted over time: frequency or damping ratio."""
 
     name: str
-    """Name of the quantity in the target precisions of a search."""
-    key: str
+    """Name of the quantity in a fit's list of target precisions."""
+    attribute_name: str
     """Name of the quantity among the attributes of an `EstimatedMode`."""
     suffix: str
-    """Suffix of the plot's component name in Rerun, which ends in the unit."""
+    """Unit as the suffix of the plot's component name in Rerun."""
     title: str
-    """Title of the plot, without the mode."""
+    """Title of the plot, without the number of the mode."""
     unit: str
     """Unit of the plotted values."""
     factor: float
     """Factor from the unit of the JSON document to the plotted unit."""
 
     def field(self, mode: int) -> str:
-        """Return the name of the field with this quantity of a mode in the record of a fit."""
+        """Return the name of the field that holds this quantity of a mode in `fit_record`."""
         return f"{self.name}_{mode}"
 
 
@@ -71,7 +72,7 @@ def fit_source(mode_count: int, *, with_target_std: bool) -> Source:
     mode_count
         Number of modes.
     with_target_std
-        Whether the session may have target precisions.
+        Whether to plot the limits that correspond to a requested precision.
     """
     plots = (
         _plot(quantity, n, with_target_std=with_target_std)
@@ -116,14 +117,14 @@ def _plot(quantity: _Quantity, mode_number: int, *, with_target_std: bool) -> Pl
 
 
 def fit_record(fit: Fit | None, mode_count: int) -> npt.NDArray[Any]:
-    """Return a fit as one record (1,) with time and modes, for the plots of `fit_source`.
+    """Return a fit as a structured array (1,) with time and modes, for the plots of `fit_source`.
 
-    Doubtful values and modes that are not visible in the samples are NaN.
+    The values of doubtful estimates, and of modes that the samples do not show, are NaN.
 
     Parameters
     ----------
     fit
-        Fit as in JSON documents; None if there is no fit yet.
+        Fit as a JSON object; None if there is no fit yet.
     mode_count
         Number of modes in the plots; further modes of the fit are omitted.
     """
@@ -138,11 +139,11 @@ def fit_record(fit: Fit | None, mode_count: int) -> npt.NDArray[Any]:
     fit_values["t_ns"] = round(1e9 * fit["duration_s"])
     target_stds = {
         (target_precision["quantity"], target_precision["mode"]): target_precision["asked_std"]
-        for target_precision in _targets(fit)
+        for target_precision in _target_precisions(fit)
     }
     for mode in modes_from_json(fit.get("modes")):
         for quantity in _QUANTITIES if mode.number <= mode_count else ():
-            estimate: Estimate = getattr(mode, quantity.key)
+            estimate: Estimate = getattr(mode, quantity.attribute_name)
             if not mode.shown or estimate.flag or estimate.interval_95 is None:
                 continue
             lower_limit, upper_limit = estimate.interval_95
@@ -163,10 +164,10 @@ def fit_record(fit: Fit | None, mode_count: int) -> npt.NDArray[Any]:
     return fit_values
 
 
-def _targets(fit: Fit) -> list[Mapping[str, Any]]:
-    """Return the standard deviations that a session is to reach, each with its estimate.
+def _target_precisions(fit: Fit) -> list[Mapping[str, Any]]:
+    """Return the requested precisions of a fit, each with the estimate and its present precision.
 
-    The list is empty if the session does not stop at a precision.
+    The list is empty if the session does not run until a precision is reached.
     """
     return list((fit.get("search") or {}).get("targets") or ())
 
@@ -175,33 +176,31 @@ def _targets(fit: Fit) -> list[Mapping[str, Any]]:
 
 
 def fit_table(fit: Fit | None) -> str:
-    """Return Markdown tables of a fit: requested and reached standard deviations, and values.
-
-    The values are those of the modes and of the parameters.
+    """Return a fit as Markdown: tables of requested precisions, modes and parameters, and findings.
 
     Parameters
     ----------
     fit
-        Fit as in JSON documents; None if there is no fit yet.
+        Fit as a JSON object; None if there is no fit yet.
     """
     if fit is None:
         return "No fit yet."
     search_document = fit.get("search") or {}
     paragraphs = []
     if search_document.get("reason"):
-        paragraphs.append(f"**{plain(search_document['reason'])}**")
-    target_precisions = _targets(fit)
+        paragraphs.append(f"**{escape_markdown(search_document['reason'])}**")
+    target_precisions = _target_precisions(fit)
     if target_precisions:
-        table_rows = [_target_row(parameter_item) for parameter_item in target_precisions]
+        table_rows = [_target_row(target_precision) for target_precision in target_precisions]
         paragraphs.append(
             _markdown_table("asked for", "value", "std", "asked std", table_rows=table_rows)
         )
     if not search_document.get("reason") and search_document.get("left_s") is not None:
         paragraphs.append(f"About **{search_document['left_s']:.0f} s** more.")
     if not search_document.get("reason") and search_document.get("piece"):
-        paragraphs.append(f"Excited now: {plain(str(search_document['piece']))}")
+        paragraphs.append(f"Excited now: {escape_markdown(str(search_document['piece']))}")
     if fit.get("problem"):
-        paragraphs.append(f"**After {fit['duration_s']:.1f} s:** {plain(fit['problem'])}")
+        paragraphs.append(f"**After {fit['duration_s']:.1f} s:** {escape_markdown(fit['problem'])}")
     else:
         paragraphs.append(
             f"**Fit of the first {fit['duration_s']:.1f} s** (± 95 %, statistical only)"
@@ -226,35 +225,37 @@ def fit_table(fit: Fit | None) -> str:
     ]
     if table_rows:
         paragraphs.append(_markdown_table("parameter", "value", table_rows=table_rows))
-    paragraphs += [plain(sentence) for sentence in fit.get("findings", ())[:_MAX_FINDINGS]]
+    paragraphs += [
+        escape_markdown(sentence) for sentence in fit.get("findings", ())[:_MAX_FINDINGS]
+    ]
     return "\n\n".join(paragraphs)
 
 
 def _markdown_table(*column_headings: str, table_rows: list[tuple[str, ...]]) -> str:
-    """Return a Markdown table with the given column heads and rows."""
+    """Return a Markdown table with the given column headings and rows."""
     table_lines = (column_headings, ("---",) * len(column_headings), *table_rows)
     return "\n".join(f"| {' | '.join(row_cells)} |" for row_cells in table_lines)
 
 
 def _target_row(target_precision: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a table row: name, value, reached and requested standard deviation of a quantity."""
+    """Return a table row: name, estimate, and its reached and requested standard deviation."""
     estimated_value, reached_std, target_std = (
         target_precision["value"],
         target_precision["std"],
         target_precision["asked_std"],
     )
     if estimated_value is None:
-        return plain(target_precision["name"]), "–", "–", "–"
+        return escape_markdown(target_precision["name"]), "–", "–", "–"
     if reached_std is None:
         return (
-            plain(target_precision["name"]),
+            escape_markdown(target_precision["name"]),
             f"{estimated_value:.4g}",
             "doubtful",
             with_percentage(target_std, estimated_value),
         )
     check_mark = " ✓" if reached_std <= target_std else ""
     return (
-        plain(target_precision["name"]),
+        escape_markdown(target_precision["name"]),
         f"{estimated_value:.4g}",
         f"**{with_percentage(reached_std, estimated_value)}**{check_mark}",
         with_percentage(target_std, estimated_value),
@@ -294,8 +295,8 @@ _SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸
 
 
 def _doubt_suffix(estimate: Estimate) -> str:
-    """Return the text appended to a doubtful estimate; empty for an estimate without a flag."""
-    return f" (doubtful: {plain(estimate.flag)})" if estimate.flag else ""
+    """Return the reason to doubt an estimate, as a text to append; empty if there is none."""
+    return f" (doubtful: {escape_markdown(estimate.flag)})" if estimate.flag else ""
 
 
 def send_table(stream: "RecordingStream", fit: Fit | None) -> None:

@@ -5,7 +5,7 @@ Rerun's plots have no axis titles: the title of the view and the legend state th
 Rerun fits an axis to its values, and labels multiples of a power of ten that are far enough apart.
 So ±0.06 would have a single label, 0. In such a case `Scale` adds the next multiple to the values
 as an invisible point, which extends the axis a little. The point has the time of an extreme value
-and leaves the plot with it. In the same way an axis gets the least length of its plot.
+and leaves the plot with it. Invisible points also extend an axis to the minimum length of its plot.
 """
 
 import collections
@@ -24,11 +24,11 @@ from rigd.view._fits import TABLE as FIT_TABLE
 from rigd.view._fits import fit_source
 from rigd.view._session_info import EVENTS_ENTITY, RECENT_EVENTS_ENTITY, SUMMARY_ENTITY
 from rigd.view.frequency_charts import (
+    CHART_SIZES,
     COHERENCE_ENTITY,
     MAGNITUDE_ENTITY,
     OVERVIEW_MAGNITUDE_ENTITY,
     PHASE_ENTITY,
-    SIZES,
     SPECTROGRAM_ENTITY,
 )
 from rigd.view.frequency_charts import SIZE as SPECTROGRAM_SIZE
@@ -46,12 +46,12 @@ WINDOW_S = 10.0
 The viewer's load grows with this range, not with the length of the session."""
 
 CLOSE_UP_S = 2.0
-"""Time range that the plots of the tab Signals show: short enough to resolve the oscillations."""
+"""Time range before the cursor in the tab Signals: short enough to resolve the oscillations."""
 
 HISTORY_S = 60.0
 """Time range before the cursor that plots of slow values show: a few values arrive per second."""
 
-WHOLE_S = 86_400.0
+WHOLE_SESSION_S = 86_400.0
 """Time range of plots that show the whole session: longer than any session.
 
 Their values arrive at most once per second."""
@@ -68,7 +68,7 @@ class TimeView:
     window_s
         Time range before the cursor that the plot shows.
     height
-        Height inside the axes, in points, in a window of 1280 × 800.
+        Height of the vertical axis, in points, in a window of 1280 × 800.
     """
 
     source: Source
@@ -77,7 +77,7 @@ class TimeView:
     height: float
 
     @property
-    def ticks(self) -> str:
+    def tick_component(self) -> str:
         """Component name in Rerun of the invisible points that extend the plot's vertical axis."""
         return f"{self.plot.component}_ticks_{self.window_s:g}_s"
 
@@ -123,7 +123,7 @@ TIME_VIEWS: Final = (*OVERVIEW_PLOTS, *SIGNALS, *HEALTH)
 TAB_TITLES = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
 """Titles of the tabs that every session has, in the window's order."""
 FIT_TAB_TITLE = "Fit"
-"""Title of the tab that follows the first one if the session's record is fitted."""
+"""Title of the second tab, which exists if the session's record is fitted."""
 _FIT_TAB_HEIGHT_PT: Final = 640.0
 """Total height of the plots in the tab Fit, in points."""
 _FIT_PLOT_MARGIN_PT: Final = 50.0
@@ -131,7 +131,7 @@ _FIT_PLOT_MARGIN_PT: Final = 50.0
 
 
 def fit_views(fit_plots: Source) -> tuple[TimeView, ...]:
-    """Return the plots of the tab Fit, with heights for their number.
+    """Return the plots of the tab Fit, with the height that their number leaves for each.
 
     Parameters
     ----------
@@ -140,7 +140,9 @@ def fit_views(fit_plots: Source) -> tuple[TimeView, ...]:
     """
     row_count = max(1, len(fit_plots.plots) // 2)
     plot_height_pt = _FIT_TAB_HEIGHT_PT / row_count - _FIT_PLOT_MARGIN_PT
-    return tuple(TimeView(fit_plots, plot, WHOLE_S, plot_height_pt) for plot in fit_plots.plots)
+    return tuple(
+        TimeView(fit_plots, plot, WHOLE_SESSION_S, plot_height_pt) for plot in fit_plots.plots
+    )
 
 
 def blueprint(
@@ -159,21 +161,21 @@ def blueprint(
         Number of modes whose fits are plotted over time. 0: only a table of the last fit. None: no
         tab Fit.
     with_target_std
-        Whether the session may have target precisions.
+        Whether to plot the limits that correspond to a requested precision.
     """
     import rerun.blueprint as rrb
 
     tab_contents = [
-        _overview(),
-        _signals(),
-        _frequency_response(),
-        _spectrogram(),
-        _health(absent_components),
-        _events(),
+        _overview_tab(),
+        _signals_tab(),
+        _frequency_response_tab(),
+        _spectrogram_tab(),
+        _health_tab(absent_components),
+        _events_tab(),
     ]
     tab_names = list(TAB_TITLES)
     if fit_modes is not None:
-        tab_contents.insert(1, _fit(fit_modes, with_target_std=with_target_std))
+        tab_contents.insert(1, _fit_tab(fit_modes, with_target_std=with_target_std))
         tab_names.insert(1, FIT_TAB_TITLE)
     for tab, name in zip(tab_contents, tab_names, strict=True):
         tab.name = name
@@ -185,7 +187,7 @@ def blueprint(
     )
 
 
-def _overview() -> "rrb.Container":
+def _overview_tab() -> "rrb.Container":
     """Return the contents of the tab Overview: state, gauges, antenna, plots and response."""
     import rerun.blueprint as rrb
 
@@ -198,7 +200,7 @@ def _overview() -> "rrb.Container":
                 chart_view(
                     "Frequency response: magnitude of torque over angle",
                     OVERVIEW_MAGNITUDE_ENTITY,
-                    SIZES[OVERVIEW_MAGNITUDE_ENTITY],
+                    CHART_SIZES[OVERVIEW_MAGNITUDE_ENTITY],
                 ),
                 rrb.Horizontal(antenna.view(), _recent_events()),
                 row_shares=[6, 5],
@@ -209,23 +211,27 @@ def _overview() -> "rrb.Container":
     )
 
 
-def _signals() -> "rrb.Container":
+def _signals_tab() -> "rrb.Container":
     """Return the contents of the tab Signals: plots of the samples of the last 2 s."""
     import rerun.blueprint as rrb
 
     return rrb.Grid(*map(_plot, SIGNALS), grid_columns=2)
 
 
-def _frequency_response() -> "rrb.Container":
+def _frequency_response_tab() -> "rrb.Container":
     """Return the contents of the tab with magnitude, phase and coherence."""
     return chart_page(
-        chart_view("Magnitude of torque over angle", MAGNITUDE_ENTITY, SIZES[MAGNITUDE_ENTITY]),
-        chart_view("Phase of torque over angle", PHASE_ENTITY, SIZES[PHASE_ENTITY]),
-        chart_view("Coherence of angle and torque", COHERENCE_ENTITY, SIZES[COHERENCE_ENTITY]),
+        chart_view(
+            "Magnitude of torque over angle", MAGNITUDE_ENTITY, CHART_SIZES[MAGNITUDE_ENTITY]
+        ),
+        chart_view("Phase of torque over angle", PHASE_ENTITY, CHART_SIZES[PHASE_ENTITY]),
+        chart_view(
+            "Coherence of angle and torque", COHERENCE_ENTITY, CHART_SIZES[COHERENCE_ENTITY]
+        ),
     )
 
 
-def _spectrogram() -> "rrb.Container":
+def _spectrogram_tab() -> "rrb.Container":
     """Return the contents of the tab with the spectrogram."""
     import rerun.blueprint as rrb
 
@@ -234,7 +240,7 @@ def _spectrogram() -> "rrb.Container":
     )
 
 
-def _health(absent_components: Collection[str]) -> "rrb.Container":
+def _health_tab(absent_components: Collection[str]) -> "rrb.Container":
     """Return the contents of the tab Health: plots of loop, bus and recorder, and a summary."""
     import rerun.blueprint as rrb
 
@@ -251,7 +257,7 @@ def _health(absent_components: Collection[str]) -> "rrb.Container":
     )
 
 
-def _fit(mode_count: int, *, with_target_std: bool) -> "rrb.Container":
+def _fit_tab(mode_count: int, *, with_target_std: bool) -> "rrb.Container":
     """Return the contents of the tab Fit: modes over time, and the table of the last fit."""
     import rerun.blueprint as rrb
 
@@ -268,7 +274,7 @@ def _fit(mode_count: int, *, with_target_std: bool) -> "rrb.Container":
     )
 
 
-def _events() -> "rrb.Container":
+def _events_tab() -> "rrb.Container":
     """Return the contents of the tab Events: the log of the session."""
     import rerun.blueprint as rrb
 
@@ -297,12 +303,12 @@ def _plot(time_view: TimeView) -> "rrb.TimeSeriesView":
         time_view.source.entity: line_style.visualizer(mappings=[_values_mapping(plot.component)])
     }
     if plot.span is None:
-        visualizers[time_view.source.ticks] = tick_style.visualizer(
-            mappings=[_values_mapping(time_view.ticks)]
+        visualizers[time_view.source.tick_entity] = tick_style.visualizer(
+            mappings=[_values_mapping(time_view.tick_component)]
         )
     start_boundary = (
         rrb.TimeRangeBoundary.absolute(seconds=0.0)
-        if time_view.window_s == WHOLE_S
+        if time_view.window_s == WHOLE_SESSION_S
         else rrb.TimeRangeBoundary.cursor_relative(seconds=-time_view.window_s)
     )
     end_boundary = rrb.TimeRangeBoundary.cursor_relative()
@@ -313,7 +319,7 @@ def _plot(time_view: TimeView) -> "rrb.TimeSeriesView":
         overrides=visualizers,
         # A single curve needs no legend. Intervals of fits are wide at first.
         plot_legend=rrb.PlotLegend(
-            corner="RightTop" if time_view.window_s == WHOLE_S else "LeftTop",
+            corner="RightTop" if time_view.window_s == WHOLE_SESSION_S else "LeftTop",
             visible=len(plot.curves) > 1,
         ),
         # The default is a minute around the cursor, half of it in the future.
@@ -415,7 +421,7 @@ AXIS_TO_RANGE_RATIO: Final = 1.1
 _EXTREMES_INTERVAL_NS: Final = 100_000_000
 """Length of the intervals, in nanoseconds, over which the extremes of the values are computed."""
 _MAX_VALUE_TO_AXIS_RATIO: Final = 1e9
-"""Ratio of the largest value to the least axis length above which Rerun alone chooses the axis."""
+"""Ratio of the largest value to the least axis length above which that length is ignored."""
 _MIN_LABEL_SPACING, _MAX_LABEL_SPACING = 1e-300, 1e300
 """Smallest and largest distance between axis labels, in the unit of the values, for which points
 are added.
@@ -426,18 +432,18 @@ _CurvePoint = tuple[int, float]
 
 
 class Scale:
-    """Tracker of the extremes of a source's plots, which adds invisible points for axis labels.
+    """Extreme values of a source's plots, from which invisible points for axis labels follow.
 
     Parameters
     ----------
     source
         Source of the plotted values.
     views
-        Views of the window. Those of other sources and those with fixed axes are ignored.
+        Plots of the window. Plots of other sources and plots with fixed axes are ignored.
     """
 
     def __init__(self, source: "Source", views: "Sequence[TimeView]") -> None:
-        self._entity = source.ticks
+        self._entity = source.tick_entity
         self._axes = [
             _AxisExtremes(time_view)
             for time_view in views
@@ -445,19 +451,19 @@ class Scale:
         ]
 
     def frame(self) -> list[Drawing]:
-        """Return the function that sends an empty first point of each axis to Rerun.
+        """Return the function that sends an empty first value of each axis's invisible points.
 
-        Without a point Rerun reports an error.
+        Without any value Rerun reports an error.
         """
-        empty_values = {axis.view.ticks: np.array([[np.nan]]) for axis in self._axes}
+        empty_values = {axis.view.tick_component: np.array([[np.nan]]) for axis in self._axes}
         start_ns = np.array([0])
         return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=empty_values)]
 
     def draw(self, t_ns: npt.NDArray[np.int64], plot_values: Mapping[str, Values]) -> list[Drawing]:
-        """Return functions that send the invisible points that the axes need for their labels.
+        """Return functions that send the invisible points that the axes need for new values.
 
-        The values have shape (n, k), by component, at times (n,). Values that are not finite are
-        ignored, as in Rerun.
+        `plot_values` has the values of each plot at the times `t_ns` (n,): component name → values
+        (n, curves). Values that are not finite are ignored, as in Rerun.
         """
         interval_indices = (t_ns - t_ns[0]) // _EXTREMES_INTERVAL_NS
         interval_starts = np.append(0, np.flatnonzero(np.diff(interval_indices)) + 1)
@@ -482,16 +488,18 @@ class Scale:
                     greatest_values[component_name],
                     strict=True,
                 )
-                for tick_point in axis_extremes.take(*interval_extremes)
+                for tick_point in axis_extremes.add(*interval_extremes)
             ]
             if tick_points:
-                drawings.append(self._tick_points_drawing(axis_extremes.view.ticks, tick_points))
+                drawings.append(
+                    self._tick_points_drawing(axis_extremes.view.tick_component, tick_points)
+                )
         return drawings
 
     def _tick_points_drawing(
         self, component_name: str, tick_points: Sequence[_CurvePoint]
     ) -> Drawing:
-        """Return the function that sends invisible points (time, value) of one axis."""
+        """Return the function that sends the invisible points (time, value) of one axis."""
         times_ns, tick_values = zip(*tick_points, strict=True)
         point_columns = {component_name: np.array(tick_values)[:, None]}
         return partial(
@@ -500,7 +508,7 @@ class Scale:
 
 
 class _AxisExtremes:
-    """Least and greatest plotted value in a time window, and the invisible points sent last."""
+    """Extremes of a plot in its time window, and the invisible points that were sent last."""
 
     def __init__(self, time_view: "TimeView") -> None:
         self.view = time_view
@@ -512,15 +520,15 @@ class _AxisExtremes:
         self._below: _CurvePoint | None = None
         self._above: _CurvePoint | None = None
 
-    def take(self, t_ns: int, least_value: float, greatest_value: float) -> list[_CurvePoint]:
-        """Add the least and greatest value of a time interval.
+    def add(self, t_ns: int, least_value: float, greatest_value: float) -> list[_CurvePoint]:
+        """Add the least and greatest value of a time interval, and return new invisible points.
 
-        Returns the invisible points (time, value) that the axis needs for its labels.
+        They are points (time, value) that the axis needs for its labels.
         """
         if not (math.isfinite(least_value) and math.isfinite(greatest_value)):
             return []
-        high_ns, greatest_value = self._greatest.take(t_ns, greatest_value)
-        low_ns, minus_low = self._least.take(t_ns, -least_value)
+        high_ns, greatest_value = self._greatest.add(t_ns, greatest_value)
+        low_ns, minus_low = self._least.add(t_ns, -least_value)
         value_below, value_above = missing_ticks(
             -minus_low, greatest_value, self.view.height, self.view.plot.min_span
         )
@@ -536,7 +544,7 @@ class _AxisExtremes:
         return new_points
 
     def _must_send(self, last_point: _CurvePoint | None, tick_value: float, t_ns: int) -> bool:
-        """Return True if an invisible point is new, has changed or leaves the time window."""
+        """Return whether an invisible point is new, has changed or is leaving the window."""
         return (
             last_point is None
             or last_point[1] != tick_value
@@ -552,7 +560,7 @@ class _RunningMaximum:
         # Each value is greater than all later ones.
         self._marks: collections.deque[_CurvePoint] = collections.deque()
 
-    def take(self, t_ns: int, newest_value: float) -> _CurvePoint:
+    def add(self, t_ns: int, newest_value: float) -> _CurvePoint:
         """Add the newest value; return time (ns) and value of the largest one in the window."""
         while self._marks and self._marks[-1][1] <= newest_value:
             self._marks.pop()
@@ -565,7 +573,7 @@ class _RunningMaximum:
 def missing_ticks(
     lowest_value: float, highest_value: float, height_pt: float, min_span: float = 0.0
 ) -> tuple[float | None, float | None]:
-    """Return the values to add to a plot so that its axis has two labels and its least length.
+    """Return the values to add to a plot so that its axis has two labels and spans `min_span`.
 
     Parameters
     ----------

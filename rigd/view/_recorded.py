@@ -38,13 +38,13 @@ Records = npt.NDArray[Any]
 """Structured array of samples or timings, shape (n,)."""
 
 _BLOCK_S: Final = 1.0
-"""Duration of the blocks of samples that are drawn together: the period of the charts."""
+"""Duration of the blocks of samples that are drawn together: the charts are updated as often."""
 _MAX_TICKS_PER_SAMPLE: Final = 10
 """Largest ratio of a record's length in ticks to its number of samples.
 
 Filling longer gaps would invent data and fill the disk."""
 _TOUCH_DRAWING_DELAY_S: Final = 0.2
-"""Time after a touch at which it is drawn, so that the antenna's lines around it exist."""
+"""Delay after a touch until it is drawn, so that the antenna's lines around its time exist."""
 _LAST_UTC_NS: Final = 2**63 - 1
 """Latest start of a session, in nanoseconds since 1970: the limit of a 64-bit integer."""
 _ATTACHMENTS_WITH_DAMPING: Final = ("specimen.toml", "profile.toml")
@@ -54,9 +54,9 @@ _ATTACHMENTS_WITH_DAMPING: Final = ("specimen.toml", "profile.toml")
 def describe_recorded_session(
     session: Session, tick_timings: Records | None = None, *, has_fit: bool = False
 ) -> SessionDescription:
-    """Return the description of a recorded session that its views need.
+    """Return the data of a recorded session that its display needs.
 
-    A stopped session is shown with its planned length, as it was live. If the file states no
+    A stopped session is shown with its planned length, as in the live view. If the file states no
     segments, the whole record counts as the sweep.
 
     Parameters
@@ -64,7 +64,7 @@ def describe_recorded_session(
     session
         Session as read from its file.
     tick_timings
-        Ages (n,) of the readings, of ``TIMING_DTYPE``; None if the file has none.
+        Ages of the devices' readings (n,), of ``TIMING_DTYPE``; None if the file has none.
     has_fit
         Whether the file contains a fit of the session's record (`rigd.session.fit_of`).
 
@@ -129,7 +129,7 @@ _PROFILE_KEYS_OF_LIMITS: Final = {
 
 
 def _stated_limits(profile_bytes: bytes) -> dict[str, float]:
-    """Return the positive limits that a profile of any version states, by gauge name."""
+    """Return the limits that a profile of any version states: gauge name → positive limit."""
     try:
         profile_table = parse_toml(decode_text(profile_bytes))
     except (UnicodeDecodeError, DocumentError):
@@ -143,7 +143,7 @@ def _stated_limits(profile_bytes: bytes) -> dict[str, float]:
 
 
 def _components_without_values(session: Session, tick_timings: Records | None) -> frozenset[str]:
-    """Return Rerun's names (components) of the plots for which a session has no values."""
+    """Return the component names in Rerun of the plots for which a session has no values."""
     absent_components = {plot.component for plot in HEALTH.plots if plot is not FAULTY_TICKS}
     if tick_timings is None or len(tick_timings) == 0:
         absent_components.add(AGES.component)
@@ -169,7 +169,7 @@ def draw_session(
     session
         Session to draw.
     tick_timings
-        Ages (n,) of the readings, of ``TIMING_DTYPE``; may be empty.
+        Ages of the devices' readings (n,), of ``TIMING_DTYPE``; may be empty.
     front_tabs
         Tabs to show before those of the live view.
     on_progress
@@ -240,7 +240,7 @@ def recorded_blueprint(
     absent_components: Collection[str] = (),
     fit_modes: int | None = None,
 ) -> "rrb.Blueprint":
-    """Return the layout of the live view for a recorded session, with playback from the start.
+    """Return the window's layout for a recorded session: that of the live view, playing from 0 s.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ def _number_in_range(
 
 
 def _notes(session: Session, touch_documents: Sequence[Mapping[str, Any]]) -> Iterator[Note]:
-    """Yield the log lines of a session, its touches and its outcome as notes for the views."""
+    """Yield the notes for the log of the window: events, touches and outcome of a session."""
     for session_event in session.events:
         yield Note(session_event.t_ns, session_event.level, session_event.message)
     for touch in touch_documents:
@@ -289,7 +289,7 @@ def _notes(session: Session, touch_documents: Sequence[Mapping[str, Any]]) -> It
 
 
 def _touches(session: Session) -> list[dict[str, Any]]:
-    """Return the session's touches with an estimated time within the record, in order of time."""
+    """Return the touches whose estimated time is within the record, in order of time."""
     record_end_s = 1e-9 * int(session.samples["t_ns"][-1])
     touches_with_time = [
         touch for touch in touches_of(session.outcome) if touch["time_s"] is not None
@@ -301,7 +301,7 @@ def _touches(session: Session) -> list[dict[str, Any]]:
 
 
 def _count_faulty_ticks(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:
-    """Return the number of missed, late and lost ticks since the tick `last_tick`, shape (3,)."""
+    """Return the numbers of missed, late and lost ticks after the tick `last_tick`, shape (3,)."""
     gap_ticks = np.diff(samples["tick"].astype(np.int64), prepend=last_tick) - 1
     status_bits = samples["status"]
     lost_ticks = np.where(status_bits & Status.AFTER_LOST, gap_ticks, 0)

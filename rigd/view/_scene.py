@@ -1,4 +1,4 @@
-"""Scene of one session: turns records, events and health into functions that draw in Rerun."""
+"""Scene of a session, which turns records, events and health into functions that draw in Rerun."""
 
 import collections
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +21,7 @@ from rigd.view._session_info import (
     SessionDescription,
     health_record,
     send_note,
-    send_recent,
+    send_recent_notes,
     send_summary,
 )
 from rigd.view.banner import BannerState, preparing
@@ -53,7 +53,7 @@ _MAX_STORED_NOTES: Final = 200
 
 
 class Scene:
-    """Scene of one session: computes its displays and returns the functions that draw them.
+    """Display of one session: receives its data, and returns functions that draw them in Rerun.
 
     The scene itself sends nothing, so that a stalled viewer cannot disturb its computations.
 
@@ -119,7 +119,7 @@ class Scene:
 
     @property
     def last_response(self) -> LastResponse | None:
-        """Frequency response of this session so far, to compare a later session with."""
+        """Frequency response of this session so far, for comparison with a later one, or None."""
         return self.response_charts.as_last_response(self._session)
 
     def frame(self) -> list[Drawing]:
@@ -144,12 +144,12 @@ class Scene:
     def samples(self, samples: Records) -> list[Drawing]:
         """Return functions that draw new samples (n,) of ``SAMPLE_DTYPE`` in all views.
 
-        The samples are in order. Gaps are allowed.
+        The samples are in order of time, and may have gaps.
         """
         return self._draw_samples(self._samples.add(samples))
 
     def timings(self, tick_timings: Records) -> list[Drawing]:
-        """Return functions that plot the ages of the devices' readings (n,), ``TIMING_DTYPE``."""
+        """Return functions that plot the ages of the devices' readings (n,) of ``TIMING_DTYPE``."""
         return self._draw_timings(self._timings.add(tick_timings))
 
     def events(self, session_notes: Sequence[Note]) -> list[Drawing]:
@@ -163,9 +163,9 @@ class Scene:
         ]
 
     def touches(self, touch_documents: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Return functions that draw touches of the beam (JSON documents).
+        """Return functions that draw estimated touches of the beam, given as JSON objects.
 
-        A touch replaces an earlier estimate with the same number.
+        An estimate replaces an earlier one of the touch with the same number.
         """
         drawings_of_touches = {
             touch_document["number"]: self._antenna.touch(touch_document)
@@ -177,7 +177,7 @@ class Scene:
         ]
 
     def fit(self, fit_document: Mapping[str, Any]) -> list[Drawing]:
-        """Return functions that draw a fit (JSON document) of the record so far."""
+        """Return functions that draw a fit of the record so far, given as a JSON object."""
         self._fit = fit_document
         self._fits.append(fit_record(fit_document, self._session.fit_modes or 0))
         return self._draw_fits(self._fits[-1])
@@ -198,7 +198,7 @@ class Scene:
         return self._draw_banner()
 
     def health(self, t_ns: int, health_reading: Health) -> list[Drawing]:
-        """Return functions that draw the condition of loop, recorder, disk and bus at one time.
+        """Return functions that draw the health of loop, recorder, disk and bus at a time.
 
         Parameters
         ----------
@@ -217,7 +217,7 @@ class Scene:
         return drawings
 
     def finish(self) -> list[Drawing]:
-        """Return functions that draw the last samples and the final charts."""
+        """Return functions that draw the samples still in the buffer, and the final charts."""
         return [
             *self._draw_samples(self._samples.take_remaining()),
             *self._draw_timings(self._timings.take_remaining()),
@@ -225,7 +225,7 @@ class Scene:
         ]
 
     def _draw_fits(self, fit_records: Records) -> list[Drawing]:
-        """Return functions that draw records of fits and the table of the last fit."""
+        """Return functions that plot the fits over time and show the table of the last one."""
         if self._session.fit_modes is None:
             return []
         record_source = self._fit_source
@@ -233,7 +233,7 @@ class Scene:
         return [*plot_drawings, partial(send_table, fit=self._fit)]
 
     def _draw_samples(self, samples: Records | None) -> list[Drawing]:
-        """Return functions that draw a block of samples; none if no block is complete."""
+        """Return functions that draw a block of samples; none if `samples` is None."""
         if samples is None:
             return []
         self._t_ns = int(samples["t_ns"][-1])
@@ -277,10 +277,10 @@ class Scene:
 
     def _draw_recent_events(self, t_ns: int) -> Drawing:
         """Return the function that draws the newest events as a document."""
-        return partial(send_recent, t_ns=t_ns, notes=tuple(self._notes))
+        return partial(send_recent_notes, t_ns=t_ns, notes=tuple(self._notes))
 
     def _draw_timings(self, tick_timings: Records | None) -> list[Drawing]:
-        """Return functions that plot the ages of readings; none if no block of them is complete."""
+        """Return functions that plot the ages of readings; none if `tick_timings` is None."""
         return [] if tick_timings is None else self._plot(READINGS, tick_timings)
 
     def _plot(self, record_source: Source, records: Records) -> list[Drawing]:
@@ -317,7 +317,7 @@ def _gauge_with_larger_value(gauge: Gauge, earlier_gauge: Gauge | None) -> Gauge
 
 
 class _PeriodicTimer:
-    """Timer in session time: a call with the time in ns returns True once per period."""
+    """Timer in session time: a call with the present time in ns returns True once per period."""
 
     def __init__(self, period_s: float) -> None:
         self._period_ns = round(1e9 * period_s)
@@ -331,14 +331,14 @@ class _PeriodicTimer:
 
 
 class _BlockBuffer:
-    """Buffer that combines small blocks of records with a field ``tick`` into larger blocks."""
+    """Buffer that combines small blocks of samples or timings into larger blocks."""
 
     def __init__(self, rate_hz: float) -> None:
         self._ticks = max(1, round(_MIN_BLOCK_S * rate_hz))
         self._parts: list[Records] = []
 
     def add(self, new_records: Records) -> Records | None:
-        """Add records (n,); return all buffered records once they span a block, else None."""
+        """Add records (n,); return all buffered records once they span a block, otherwise None."""
         if len(new_records) == 0:
             return None
         self._parts.append(new_records)

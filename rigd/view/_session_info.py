@@ -1,4 +1,4 @@
-"""Description of a session for its views, and its log lines, health and summary in Rerun."""
+"""Description of a session that its display needs, and its log, health and summary in Rerun."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields
@@ -33,7 +33,7 @@ _LEVEL_PREFIXES: Final = {"warning": "⚠ ", "error": "⚠ **ERROR** ", "fatal":
 
 @dataclass(frozen=True, slots=True)
 class SessionDescription:
-    """Description of a session that its views need: length, beam, limits and excitation.
+    """Data of a session that its display needs: length, beam, limits and excitation.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ def linear_sweep_band_hz(
     Parameters
     ----------
     excitation_kind, excitation_parameters
-        Name of the excitation and its parameters, as numbers or as texts of a session file.
+        Name of the excitation, and its parameters: name → number, or text as in a session file.
     """
     if excitation_kind != "chirp":
         return None
@@ -178,7 +178,7 @@ class Health:
     Attributes
     ----------
     missed_ticks
-        Number of ticks that the loop missed since the start of the session.
+        Number of ticks since the start of the session that the loop missed.
     late_ticks
         Number of ticks since the start whose wake-up was late, without the missed ones.
     lost_ticks
@@ -216,7 +216,7 @@ HEALTH_DTYPE: Final = np.dtype([("t_ns", "<i8")] + [(each.name, "<f8") for each 
 
 
 def health_record(t_ns: int, health: Health) -> npt.NDArray[Any]:
-    """Return a health reading as an array (1,) of ``HEALTH_DTYPE``."""
+    """Return a health reading as a structured array (1,) of ``HEALTH_DTYPE``."""
     health_values = (
         np.nan if health_value is None else health_value for health_value in astuple(health)
     )
@@ -247,7 +247,7 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
     stream.log(EVENTS_ENTITY, rr.TextLog(wrapped_text, level=_RERUN_LEVELS.get(note.level, "INFO")))
 
 
-def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -> None:
+def send_recent_notes(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -> None:
     """Send the newest lines of the session's log to Rerun as a document with wrapped lines.
 
     `notes` are in order of time.
@@ -259,14 +259,16 @@ def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -
     for log_note in reversed(notes[-_MAX_RECENT_EVENTS:]):
         time_s = max(0.0, 1e-9 * log_note.t_ns)  # the first event may come a tick early
         level_prefix = _LEVEL_PREFIXES.get(log_note.level, "")
-        document_lines.append(f"**{time_s:.1f} s** {level_prefix}{plain(log_note.message)}")
+        document_lines.append(
+            f"**{time_s:.1f} s** {level_prefix}{escape_markdown(log_note.message)}"
+        )
     stream.log(
         RECENT_EVENTS_ENTITY,
         rr.TextDocument("\n\n".join(document_lines), media_type=rr.MediaType.MARKDOWN),
     )
 
 
-def plain(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Return a text with Markdown's special characters escaped.
 
     Parameters

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rigd.gauges import WARNING_FRACTION, Gauge
-from rigd.view._session_info import plain
+from rigd.view._session_info import escape_markdown
 from rigd.view.chart import LABEL_DROP
 from rigd.view.plots import GREEN, GREY, ORANGE, RED, SKY_BLUE, TIMELINE, Color
 
@@ -131,14 +131,16 @@ def banner(session: "SessionDescription", state: BannerState, t_ns: int, health:
     banner_lines = [heading]
     if state.reason:
         banner_lines.append(
-            f"**{plain(state.reason)}**" if state.color == RED else plain(state.reason)
+            f"**{escape_markdown(state.reason)}**"
+            if state.color == RED
+            else escape_markdown(state.reason)
         )
     if not state.over and health.missed_ticks:
         missed_percent = 100.0 * health.missed_ticks / max(1e-9 * t_ns * session.rate_hz, 1.0)
         banner_lines.append(
             f"Computer overloaded: {health.missed_ticks:.0f} ticks missed ({missed_percent:.2g} %)."
         )
-    excitation_text = f"**{plain(session.excitation or 'session')}**"
+    excitation_text = f"**{escape_markdown(session.excitation or 'session')}**"
     if session.sweep_hz is not None:
         start_hz, stop_hz = session.sweep_hz
         back_sweep_text = "" if session.back is None else f" → {start_hz:g}"
@@ -147,8 +149,8 @@ def banner(session: "SessionDescription", state: BannerState, t_ns: int, health:
     if not state.over and (frequency_hz := session.frequency_hz(sweep_tick)) is not None:
         excitation_text += f", now **{frequency_hz:.3g} Hz**"
     if session.specimen:
-        excitation_text += f", specimen **{plain(session.specimen)}**"
-    banner_lines.append(f"{excitation_text}, session {plain(session.name)}")
+        excitation_text += f", specimen **{escape_markdown(session.specimen)}**"
+    banner_lines.append(f"{excitation_text}, session {escape_markdown(session.name)}")
     return "\n\n".join(banner_lines)
 
 
@@ -183,7 +185,7 @@ def send_banner(
 
 # Values with their limits
 
-SIZE: Final = (700.0, 132.0)
+GAUGES_SIZE: Final = (700.0, 132.0)
 """Width and height of the canvas with the gauges, in points."""
 _BAND_HEIGHT_PT: Final = 14.0
 """Height of the coloured band above the gauges, in points."""
@@ -283,7 +285,7 @@ def send_values(
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    canvas_width, _ = SIZE
+    canvas_width, _ = GAUGES_SIZE
     bar_lines, bar_colors, bar_radii = (
         [[[0.0, 8.0], [canvas_width, 8.0]]],
         [state.color],
@@ -326,7 +328,7 @@ def views() -> "tuple[rrb.View, rrb.View]":
     """Return Rerun's views of the session's state and of the gauges."""
     import rerun.blueprint as rrb
 
-    canvas_width, canvas_height = SIZE
+    canvas_width, canvas_height = GAUGES_SIZE
     return (
         rrb.TextDocumentView(name="State", origin=STATE_ENTITY),
         rrb.Spatial2DView(

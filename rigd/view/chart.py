@@ -1,8 +1,8 @@
 """Charts whose horizontal axis is not time, drawn on a canvas.
 
-Rerun plots over time only. A two-dimensional view shows a canvas of any size with a fixed aspect
-ratio. Each chart therefore has the size in points of its view in a window of 1280 × 800, and is
-scaled with the view. The size of text does not change with the scale.
+Rerun plots over time only, but its two-dimensional view shows a canvas of any size with a fixed
+aspect ratio. The canvas of a chart has the size in points that its view has in a window of
+1280 × 800, and is scaled with the view. The size of text does not change with the scale.
 """
 
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ class Axis:
     logarithmic: bool = False
 
     def fraction(self, axis_values: npt.ArrayLike) -> Real:
-        """Return positions on the axis, from 0 (first value) to 1 (last value), clipped."""
+        """Return the positions of values on the axis, from 0 (first) to 1 (last), clipped."""
         axis_positions, axis_start, axis_end = (
             np.asarray(axis_values, dtype=np.float64),
             self.first,
@@ -211,7 +211,7 @@ class Chart:
         dotted: bool = False,
         curve_order: int = 0,
     ) -> None:
-        """Draw a curve as separate lines, one through each strip of points (n, 2).
+        """Draw a curve that may have gaps: one line through the points (n, 2) of each strip.
 
         Parameters
         ----------
@@ -308,7 +308,7 @@ class Chart:
     def move_shade(
         self, stream: "RecordingStream", shade_name: str, first_x: float, last_x: float
     ) -> None:
-        """Move a shaded area so that it lies between two values of the horizontal axis.
+        """Move a shaded area between two values of the horizontal axis.
 
         Parameters
         ----------
@@ -430,7 +430,7 @@ class Chart:
         )
 
     def _legend_positions(self) -> list[tuple[LegendEntry, float, float]]:
-        """Return the legend's entries with positions above the frame, aligned to the right."""
+        """Return the legend's entries with positions (x, y) above the frame, right-aligned."""
         _, frame_top, right_edge, _ = self.frame
         placed_entries = []
         x = right_edge
@@ -442,7 +442,7 @@ class Chart:
 
 
 def tick_text(tick_value: float) -> str:
-    """Return a number as the text of a tick label, with a true minus sign."""
+    """Return a number as the text of a tick label, with a minus sign instead of a hyphen."""
     return f"{tick_value + 0.0:.9g}".replace("-", "−")  # adding turns −0 into 0
 
 

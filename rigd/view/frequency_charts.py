@@ -1,4 +1,4 @@
-"""Charts over frequency: the growing frequency response with the nominal model, spectrogram."""
+"""Charts of a session's frequency response so far, with the nominal model, and spectrogram."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -42,7 +42,7 @@ PHASE_ENTITY: Final = "/frequency_response/phase"
 """Entity path in Rerun of the phase's chart."""
 COHERENCE_ENTITY: Final = "/frequency_response/coherence"
 """Entity path in Rerun of the coherence's chart."""
-SIZES: Final = {
+CHART_SIZES: Final = {
     OVERVIEW_MAGNITUDE_ENTITY: (690.0, 285.0),
     MAGNITUDE_ENTITY: (1280.0, 374.0),
     PHASE_ENTITY: (640.0, 274.0),
@@ -64,7 +64,7 @@ NOT_ESTIMATED_ENTRY: Final = LegendEntry("not estimated", GREY, is_area=True)
 """Legend entry of the frequency bands that the reference has not excited so far."""
 
 NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
-"""Text in the coherence chart before the second segment, which the coherence needs."""
+"""Text in the coherence chart of a running session before the end of the second segment."""
 NO_COHERENCE: Final = "Of a single segment there is no coherence"
 """Text in the coherence chart of a finished response from a single segment."""
 
@@ -111,16 +111,16 @@ class LastResponse:
 
 @dataclass(frozen=True, slots=True)
 class _ResponseCurve:
-    """Measured curve in one chart of the frequency response."""
+    """Measured magnitude, phase or coherence over frequency, and the chart that contains it."""
 
     chart: Chart
     """Chart that contains the curve."""
     key: LegendEntry
     """Label and style of the curve."""
     values: Callable[["FrequencyResponse"], Real]
-    """Function from an estimated response to the values of the curve."""
+    """Function that returns the curve's values for an estimated response."""
     from_complex: Callable[[Complex], Real] | None = None
-    """Function from complex values to the values of the curve; None for the coherence."""
+    """Function that returns the curve's values for a complex response; None for the coherence."""
 
 
 class ResponseCharts:
@@ -204,7 +204,7 @@ class ResponseCharts:
         self._note = NO_COHERENCE_YET
 
     def chart(self, entity_path: str) -> Chart:
-        """Return the chart with a given entity path."""
+        """Return the chart with a given entity path in Rerun."""
         return next(
             response_curve.chart
             for response_curve in self._response_curves
@@ -297,9 +297,9 @@ class ResponseCharts:
         self.chart(COHERENCE_ENTITY).draw_note(stream, self._note, COHERENCE_ENTRY.color)
 
     def as_last_response(self, session: "SessionDescription") -> LastResponse | None:
-        """Return the newest frequency response for comparison with a later session.
+        """Return the newest frequency response, for comparison with a later session.
 
-        It is None before the first estimate.
+        The result is None before the first estimate.
 
         Parameters
         ----------
@@ -314,7 +314,7 @@ class ResponseCharts:
 def _last_response_curves(
     last_response: LastResponse, response_curves: "Sequence[_ResponseCurve]"
 ) -> dict[str, Sequence[Real]]:
-    """Return the curves of an earlier session's response, by the entity path of their chart."""
+    """Return the curves of an earlier session's response: entity path of the chart → strips."""
     decimation = response_decimation(last_response.frequency_hz)
     return {
         response_curve.chart.entity: decimation.strips(
@@ -336,7 +336,7 @@ def _phase_deg(response: "FrequencyResponse") -> Real:
 
 
 def _coherence(response: "FrequencyResponse") -> Real:
-    """Return the coherence of an estimated response; NaN if there is none."""
+    """Return the coherence of an estimated response; NaN if it comes from a single segment."""
     if response.coherence is None:
         return np.full(response.frequency_hz.shape, np.nan)
     return response.coherence
@@ -394,8 +394,8 @@ def response_chart(
 
 
 def _chart(entity_path: str, vertical_axis: Axis, *legend_entries: LegendEntry) -> Chart:
-    """Return a chart of the frequency response, with a legend entry for bands without estimate."""
-    chart_size = SIZES[entity_path]
+    """Return a chart of the frequency response, with "not estimated" in the legend if it fits."""
+    chart_size = CHART_SIZES[entity_path]
     if (
         LAST_SESSION_ENTRY not in legend_entries or chart_size[0] > _MAX_WIDTH_FOR_FOUR_ENTRIES
     ):  # there is room for another entry
@@ -421,7 +421,7 @@ In longer sessions, a column shows the highest level of several time windows."""
 
 _COLOR_BAR_WIDTH = 28.0
 """Width of the colour bar, in points."""
-_BAR_MARGIN = 120.0
+_COLOR_BAR_MARGIN = 120.0
 """Margin for the colour bar and its labels, in points."""
 
 
@@ -458,7 +458,7 @@ class SpectrogramChart:
             canvas_height,
             Axis("Time since the start of the session (s)", 0.0, end_s, steps(0.0, end_s, 15)),
             Axis("Frequency (Hz)", 0.0, end_hz, steps(0.0, end_hz, 8)),
-            right=_BAR_MARGIN,
+            right=_COLOR_BAR_MARGIN,
         )
         self._bar = Chart(
             f"{SPECTROGRAM_ENTITY}/bar",
@@ -477,7 +477,7 @@ class SpectrogramChart:
     def image(self) -> npt.NDArray[np.uint8]:
         """Levels of the spectrogram so far as bytes (0–255), shape (frequencies, times).
 
-        The first row is that of the highest frequency.
+        The first row belongs to the highest frequency.
         """
         return self._image[:, : self._filled]
 
@@ -523,7 +523,7 @@ class SpectrogramChart:
 def _position_image(
     stream: "RecordingStream", entity_path: str, image_corners: Real, image_shape: tuple[int, ...]
 ) -> None:
-    """Send the position and colour map of an image of levels (0–255).
+    """Send the position and the colour map of an image to Rerun.
 
     `image_corners` contains the bottom left and the top right corner on the canvas, shape (2, 2).
     `image_shape` contains the number of rows and columns.

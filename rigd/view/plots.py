@@ -109,14 +109,14 @@ class Source:
         Entity path of all values in Rerun. The plots have the same entity, because the cost of
         sending depends on the number of entities.
     plots
-        Plots that each record has values for.
+        Plots; each record has values for all of them.
     """
 
     entity: str
     plots: tuple[Plot, ...]
 
     @property
-    def ticks(self) -> str:
+    def tick_entity(self) -> str:
         """Entity path in Rerun of the invisible points that extend the plots' axes."""
         return f"{self.entity}/ticks"
 
@@ -176,10 +176,10 @@ def _column(component_name: str, component_values: Values) -> "ComponentColumn":
     )
 
 
-def _axes(field_pattern: str, axis_symbol: str, unit: str) -> tuple[PlotCurve, ...]:
-    """Return the curves of one signal of the sensor, one for each axis x, y and z.
+def _axis_curves(field_pattern: str, axis_symbol: str, unit: str) -> tuple[PlotCurve, ...]:
+    """Return the curves of the sensor's forces or torques along the axes x, y and z.
 
-    `field_pattern` is the name of the samples' fields, such as ``f{}_n``, with {} for the axis.
+    `field_pattern` is the name of the samples' fields, such as ``f{}_n``, where {} is the axis.
     """
     return tuple(
         PlotCurve(
@@ -229,10 +229,10 @@ TORQUE_COMMAND = Plot(
     min_span=0.1,
 )
 """Plot of the torque that the motor is commanded to apply."""
-FORCES = Plot("forces_n", "Forces at the sensor (N)", _axes("f{}_n", "F", "N"), min_span=1.0)
+FORCES = Plot("forces_n", "Forces at the sensor (N)", _axis_curves("f{}_n", "F", "N"), min_span=1.0)
 """Plot of the three forces at the sensor."""
 TORQUES = Plot(
-    "torques_nm", "Torques at the sensor (N·m)", _axes("t{}_nm", "T", "N·m"), min_span=0.1
+    "torques_nm", "Torques at the sensor (N·m)", _axis_curves("t{}_nm", "T", "N·m"), min_span=0.1
 )
 """Plot of the three torques at the sensor."""
 LOOP = Plot(
@@ -284,7 +284,7 @@ BACKLOG = Plot(
     ),
     min_span=100.0,
 )
-"""Plot of samples that the recorder has not written yet and that the viewer dropped."""
+"""Plot of two numbers of samples: not yet written by the recorder, and dropped by the viewer."""
 BUS_LOAD = Plot(
     "bus_load_percent",
     "Bus load (%)",

@@ -29,7 +29,7 @@ _OS_ERROR_PATTERN: Final = re.compile(r"os error (\d+)")
 
 
 def without_rerun_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return an environment without Rerun's variables, such as ``RERUN=off``."""
+    """Return environment variables without those that affect Rerun, such as ``RERUN=off``."""
     return {
         variable_name: variable_value
         for variable_name, variable_value in environment.items()
@@ -49,7 +49,7 @@ def prepare_sdk_environment() -> None:
 
 
 class RrdFileError(FailureError):
-    """Error: a Rerun file cannot be written, or a file is not a Rerun file."""
+    """Raised if a Rerun file cannot be written, or a file is not a Rerun file."""
 
 
 @contextlib.contextmanager
@@ -123,7 +123,7 @@ def check_rrd_file(path: Path) -> None:
 
 @contextlib.contextmanager
 def _translate_write_errors(path: Path, temporary_path: Path) -> Iterator[None]:
-    """Raise RrdFileError within the context instead of errors from writing a file."""
+    """Turn errors from writing a Rerun file within this context into RrdFileError."""
     try:
         yield
     except FileExistsError:
@@ -133,17 +133,17 @@ def _translate_write_errors(path: Path, temporary_path: Path) -> Iterator[None]:
     except OSError as error:
         raise RrdFileError(f"{path} cannot be written: {error.strerror}.") from None
     except RuntimeError as error:  # from the SDK
-        error_number = _OS_ERROR_PATTERN.search(str(error))
+        number_match = _OS_ERROR_PATTERN.search(str(error))
         cause = (
-            os.strerror(int(error_number[1]))
-            if error_number
+            os.strerror(int(number_match[1]))
+            if number_match
             else _reason_of_write_failure(temporary_path)
         )
         raise RrdFileError(f"{path} cannot be written: {cause}.") from None
 
 
 def _reason_of_write_failure(temporary_path: Path) -> str:
-    """Return why the operating system refuses to append to a file, by an attempt.
+    """Return the reason for which the operating system refuses to append to a file, by a trial.
 
     Rerun's SDK may not report the reason.
     """

@@ -4,7 +4,7 @@ It uses only the daemon's public control socket (docs/control_socket.md) and rea
 Loop, recorder and daemon do not depend on it. `run_page` is its program. `_server` has the routes,
 `_access` the permissions, and `_link` the connection to the daemon. `_live` sends messages to the
 open pages, `_signals` prepares the signals, and `_library` serves sessions, downloads and reports.
-The page itself is in `static`.
+Folder `static` has the page itself.
 """
 
 import lazy_loader as lazy

@@ -1,4 +1,4 @@
-"""Program of the page's process, which the daemon starts."""
+"""Program of the process that serves the operator's page, which the daemon starts."""
 
 from rigd.web import run_page
 

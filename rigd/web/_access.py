@@ -1,6 +1,6 @@
 """Access control of the page: permissions to read and to act, and protection from other pages.
 
-Any user of the port may read; acting requires the token of the printed address. Any page on the
+Any user of this computer may read; acting requires the token in the printed URL. Any page on the
 internet can resolve its own name to loopback (DNS rebinding) and send requests there. Requests
 therefore need a name of this computer as Host, the same origin, and a header that no form can send,
 and there are no cross-origin permissions.
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
-LIVE: Final = "/api/live"
-"""Path of the WebSocket with the live messages."""
-ICON: Final = "/favicon.ico"
-"""Path of the page's icon, which any page may load."""
+LIVE_PATH: Final = "/api/live"
+"""URL path of the WebSocket with the live messages."""
+ICON_PATH: Final = "/favicon.ico"
+"""URL path of the page's icon, which any page may load."""
 _PERMITTED_HOSTS: Final = frozenset({"127.0.0.1", "localhost"})
 """Host names under which the page may be requested."""
 _ACTION_HEADER: Final = "X-Rigd"
@@ -39,7 +39,7 @@ _BODY_TIMEOUT_S: Final = 5.0
 _FIRST_REQUEST_TIMEOUT_S: Final = 10.0
 """Timeout in seconds for the first request of a connection."""
 _POLL_PERIOD_S: Final = 0.5
-"""Period in seconds in which silent connections are closed."""
+"""Interval in seconds at which silent connections are closed."""
 _MAX_CONNECTIONS: Final = 96
 """Largest number of connections; beyond it the oldest ones without an open page are closed."""
 
@@ -77,7 +77,7 @@ _SECURITY_HEADERS: Final = {  # Security headers of all responses
 
 
 class WebAccess:
-    """Checks the origin of each request and its permission to act.
+    """Checks where each request comes from, and whether it may act on the rig.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class WebAccess:
 
     @web.middleware
     async def check_and_respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Return the response of a permitted request, or a refusal or an error as JSON."""
+        """Return the response to a permitted request; otherwise a refusal or an error as JSON."""
         try:
             request_refusal = _refusal_of_other_pages(request)
             response = await handler(request) if request_refusal is None else request_refusal
@@ -109,7 +109,7 @@ class WebAccess:
             response.headers.setdefault(header_name, header_value)
 
     def may_act(self, request: web.Request) -> bool:
-        """Return whether a request has the token that permits it to act."""
+        """Return whether a request has the token, and thus may act on the rig."""
         auth_scheme, _, given_token = request.headers.get("Authorization", "").partition(" ")
         return auth_scheme == "Bearer" and hmac.compare_digest(
             given_token.encode(errors="surrogateescape"), self._token
@@ -148,14 +148,14 @@ async def read_json_object(request: web.Request) -> dict[str, Any]:
         If the body is no JSON object, or does not arrive in time.
     """
     try:
-        body_value = json.loads(await asyncio.wait_for(request.read(), _BODY_TIMEOUT_S))
+        request_object = json.loads(await asyncio.wait_for(request.read(), _BODY_TIMEOUT_S))
     except TimeoutError:
         raise web.HTTPRequestTimeout(reason="The request did not come to its end.") from None
     except (ValueError, RecursionError):
-        body_value = None
-    if not isinstance(body_value, dict):
+        request_object = None
+    if not isinstance(request_object, dict):
         raise web.HTTPBadRequest(reason="The request is not a JSON object.")
-    return body_value
+    return request_object
 
 
 def refusal_response(status: int, text: str) -> web.Response:
@@ -172,7 +172,7 @@ def refusal_response(status: int, text: str) -> web.Response:
 
 
 def _refusal_of_other_pages(request: web.Request) -> web.Response | None:
-    """Return the refusal of a request that this server's own page would not send, or None."""
+    """Return the refusal of a request from another page; None if it is from this server's page."""
     host_name = request.headers.get("Host", "")
     # The port may differ because of a tunnel, but the name must be local.
     if _host_name_of(host_name) not in _PERMITTED_HOSTS:
@@ -182,7 +182,7 @@ def _refusal_of_other_pages(request: web.Request) -> web.Response | None:
         return refusal_response(403, "Requests from other pages are refused.")
     # A sandboxed report counts as another origin, and its browser requests the icon.
     fetch_site = request.headers.get("Sec-Fetch-Site", "same-origin")
-    if fetch_site not in ("same-origin", "none") and request.path != ICON:
+    if fetch_site not in ("same-origin", "none") and request.path != ICON_PATH:
         return refusal_response(403, "Requests from other pages are refused.")
     if request.method not in ("GET", "HEAD", "POST"):
         return refusal_response(405, "Only GET, HEAD and POST are answered.")
@@ -196,7 +196,7 @@ def _refusal_of_other_pages(request: web.Request) -> web.Response | None:
 
 
 def _host_name_of(host_header: str) -> str:
-    """Return the name in a Host header, or "" unless it has only a name and a port."""
+    """Return the host name in a Host header; "" if the header has more than a name and a port."""
     try:
         parsed_url = urlsplit(f"//{host_header}")
         port_number = parsed_url.port
@@ -216,11 +216,11 @@ class Connections:
 
     Attributes
     ----------
-    serving
-        Server of the connections; it must be set before the first connection.
+    http_server
+        HTTP server of the connections; it must be set before the first connection.
     """
 
-    serving: web.Server
+    http_server: web.Server
 
     def __init__(self) -> None:
         self._first_request_deadlines: dict[RequestHandler, float] = {}
@@ -228,44 +228,44 @@ class Connections:
         self._pages: set[RequestHandler] = set()
         """Connections of open pages."""
 
-    def close_silent(self) -> None:
-        """Close connections that have sent no request in time, now and periodically."""
-        now_s, open_connections = time.monotonic(), set(self.serving.connections)
+    def close_silent_connections(self) -> None:
+        """Close connections that have sent no request in time; repeat that periodically."""
+        now_s, open_connections = time.monotonic(), set(self.http_server.connections)
         self._first_request_deadlines = {
-            handler: end_s
-            for handler, end_s in self._first_request_deadlines.items()
+            handler: deadline_s
+            for handler, deadline_s in self._first_request_deadlines.items()
             if handler in open_connections
         }
-        for request_handler, end_s in self._first_request_deadlines.items():
-            if end_s < now_s and request_handler.transport is not None:
+        for request_handler, deadline_s in self._first_request_deadlines.items():
+            if deadline_s < now_s and request_handler.transport is not None:
                 request_handler.transport.abort()
-        asyncio.get_running_loop().call_later(_POLL_PERIOD_S, self.close_silent)
+        asyncio.get_running_loop().call_later(_POLL_PERIOD_S, self.close_silent_connections)
 
     def accept_connection(self) -> asyncio.Protocol:
-        """Return the handler of a new connection, and close old connections if there are too many.
+        """Return the handler of a new connection; if there are too many, close the oldest ones.
 
         Connections of open pages are not closed.
         """
         open_connections = [
             (handler, handler.transport)
-            for handler in self.serving.connections
+            for handler in self.http_server.connections
             if handler.transport is not None and not handler.transport.is_closing()
         ]
-        too_many = max(0, len(open_connections) - _MAX_CONNECTIONS + 1)
+        excess_count = max(0, len(open_connections) - _MAX_CONNECTIONS + 1)
         # The newest client may want to stop the rig.
         for old_transport in [
             handler[1] for handler in open_connections if handler[0] not in self._pages
-        ][:too_many]:
+        ][:excess_count]:
             old_transport.abort()
-        request_handler = self.serving()
+        request_handler = self.http_server()
         self._first_request_deadlines[request_handler] = time.monotonic() + _FIRST_REQUEST_TIMEOUT_S
         return request_handler
 
     @web.middleware
     async def register_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Register the first request of a connection, and the connections of open pages."""
+        """Register that a connection has sent a request, and whether it belongs to an open page."""
         self._first_request_deadlines.pop(request.protocol, None)
-        if request.path != LIVE:
+        if request.path != LIVE_PATH:
             return await handler(request)
         self._pages.add(request.protocol)
         try:

@@ -1,6 +1,6 @@
-"""Queue of the page's jobs: reports, campaigns and exports by `analyze`, at idle priority.
+"""Queue of the page's jobs: runs of `analyze` for reports, campaigns and exports, at idle priority.
 
-Jobs are suspended while a session runs, and end with the page's process, however it ends.
+Jobs are suspended while a session runs. They end with the page's process, even if it is killed.
 """
 
 import asyncio
@@ -18,9 +18,9 @@ Document = dict[str, Any]
 MAX_JOBS: Final = 16
 """Largest number of waiting jobs."""
 _POLL_PERIOD_S: Final = 0.2
-"""Period in seconds in which waiting jobs are polled."""
+"""Interval in seconds at which waiting jobs are polled."""
 _RUNNING_POLL_PERIOD_S: Final = 0.05
-"""Period in seconds in which the running job is polled."""
+"""Interval in seconds at which the running job is polled."""
 _MAX_STDERR_BYTES: Final = 1000
 """Number of bytes at the end of a failed job's standard error that are reported."""
 _MAX_STDERR_LINES: Final = 3
@@ -28,7 +28,7 @@ _MAX_STDERR_LINES: Final = 3
 
 
 class JobError(Exception):
-    """A job was refused or has failed; the message is for the operator."""
+    """Raised if a job is refused or has failed; the message is for the operator."""
 
 
 @dataclass(slots=True)
@@ -41,10 +41,10 @@ class AnalysisJob:
     """Kind of the job: ``report``, ``campaign`` or ``export``."""
     arguments: Sequence[str]
     """Arguments of `analyze`."""
-    id: str = ""
+    session_name: str = ""
     """Name of the job's session, or "" for several sessions."""
-    address: str = ""
-    """URL path at which the result is served."""
+    result_url: str = ""
+    """URL path at which this server provides the result; "" for an export."""
     state: str = "waiting"
     """State of the job: ``waiting``, ``running``, ``done`` or ``failed``."""
     error: str = ""
@@ -60,10 +60,10 @@ class AnalysisJob:
             "type": "job",
             "number": self.number,
             "kind": self.kind,
-            "id": self.id,
+            "id": self.session_name,
             "state": self.state,
             "error": self.error,
-            "address": self.address if self.state == "done" else "",
+            "address": self.result_url if self.state == "done" else "",
         }
 
 
@@ -75,7 +75,7 @@ class Jobs:
     folder
         Folder of the sessions and working directory of the jobs.
     publish
-        Function that receives the state of a job after each change.
+        Function that is called with the state of a job after each change.
 
     Attributes
     ----------
@@ -92,19 +92,19 @@ class Jobs:
         self._count = 0
 
     @property
-    def addresses(self) -> set[str]:
+    def result_urls(self) -> set[str]:
         """URL paths of the results of waiting and running jobs."""
-        return {job.address for job in self._unfinished.values()}
+        return {job.result_url for job in self._unfinished.values()}
 
     def put(
-        self, kind: str, arguments: Sequence[str], session: str = "", address: str = ""
+        self, kind: str, arguments: Sequence[str], session_name: str = "", result_url: str = ""
     ) -> AnalysisJob:
         """Queue a run of the program `analyze`, and return it as a job.
 
         Parameters
         ----------
-        kind, arguments, session, address
-            Kind, arguments, session and URL path of the job: see `AnalysisJob`.
+        kind, arguments, session_name, result_url
+            Kind, arguments, session and URL path of the result: see `AnalysisJob`.
 
         Raises
         ------
@@ -112,7 +112,7 @@ class Jobs:
             If too many jobs are waiting.
         """
         self._count += 1
-        job = AnalysisJob(self._count, kind, arguments, session, address)
+        job = AnalysisJob(self._count, kind, arguments, session_name, result_url)
         try:
             self._queue.put_nowait(job)
         except asyncio.QueueFull:
@@ -156,7 +156,7 @@ class Jobs:
             del self._unfinished[job.number]
 
     def _publish_state(self, job: AnalysisJob) -> None:
-        """Send a job's state to the open pages, except that of an export to another format."""
+        """Send a job's state to the open pages, unless the job exports a session for a download."""
         if job.kind != "export":
             self._publish(job.document())
 

@@ -1,6 +1,6 @@
 """Routes for recorded sessions: their list, quick looks, reports and downloads.
 
-The name of a session is the stem of its file. No address of the page contains a path.
+The name of a session is the stem of its file. No URL of this server contains the path of a file.
 """
 
 import asyncio
@@ -36,11 +36,11 @@ _EXPORT_SUFFIXES: Final = {"mat": ".mat", "uff": ".uff"}
 _REPORT_FILE_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 """Pattern of the names of a report's files."""
 _SESSION_RUNS_MESSAGE: Final = "A session runs; files are converted when it has ended."
-"""Message that refuses a conversion."""
+"""Message that refuses to convert a file."""
 
 
 class Library:
-    """Serves the sessions in one folder to the page, and no other files.
+    """Serves the sessions of one folder to the page, but no other files of the computer.
 
     Parameters
     ----------
@@ -91,9 +91,9 @@ class Library:
         return list(dict.fromkeys(row.specimen for row in await self.rows() if row.specimen))
 
     async def last_response(self, specimen: str, excluded_session: str) -> Document | None:
-        """Return the frequency response of a specimen's last session, as a message to the pages.
+        """Return the message with the frequency response of a specimen's last session.
 
-        It is None if there is none.
+        The result is None if there is none.
 
         Parameters
         ----------
@@ -114,8 +114,8 @@ class Library:
         if newest_pair is None:
             return None
         document_path, quick_look = newest_pair
-        description = {"type": "last", "path": str(document_path), "specimen": specimen}
-        return {**quick_look["response"], **description, "id": document_path.stem}
+        message_fields = {"type": "last", "path": str(document_path), "specimen": specimen}
+        return {**quick_look["response"], **message_fields, "id": document_path.stem}
 
     # Rows
 
@@ -147,13 +147,13 @@ class Library:
 
     async def _send_responses(self, request: web.Request) -> web.Response:
         """Send fitted models and measured responses of several sessions for comparison."""
-        ids = [
+        session_ids = [
             session_name for session_name in request.query.get("ids", "").split(",") if session_name
         ]
-        if not 1 <= len(ids) <= _MAX_RESPONSES:
+        if not 1 <= len(session_ids) <= _MAX_RESPONSES:
             return refusal_response(400, f"ids: name 1 to {_MAX_RESPONSES} sessions.")
         responses, error_texts = [], []
-        for session_name in ids:
+        for session_name in session_ids:
             quick_look = self._read_quick_look(self._session_path(session_name).stem)
             if quick_look is None or quick_look["response"] is None:
                 error_texts.append(
@@ -171,7 +171,7 @@ class Library:
     # Downloads
 
     async def _send_file(self, request: web.Request) -> web.StreamResponse:
-        """Send a session file, converted if another format is requested."""
+        """Send a session file, or the session converted into another format."""
         session_path = self._requested_session(request)
         file_ending = request.match_info["ending"]
         if file_ending == "mcap":
@@ -187,8 +187,10 @@ class Library:
             )
         async with self._exporting:
             with tempfile.TemporaryDirectory(prefix="rigd-page-") as temporary_folder:
-                out = Path(temporary_folder) / f"{session_path.stem}{_EXPORT_SUFFIXES[file_ending]}"
-                arguments = ("export", "record", str(session_path), str(out))
+                export_path = (
+                    Path(temporary_folder) / f"{session_path.stem}{_EXPORT_SUFFIXES[file_ending]}"
+                )
+                arguments = ("export", "record", str(session_path), str(export_path))
                 try:
                     job = self._jobs.put("export", arguments, session_path.stem)
                 except JobError as error:
@@ -199,12 +201,14 @@ class Library:
                 if job.error:
                     return refusal_response(409, job.error)
                 # The open file can be sent after its folder is deleted.
-                return web.Response(body=out.open("rb"), headers=_download_headers(out.name))
+                return web.Response(
+                    body=export_path.open("rb"), headers=_download_headers(export_path.name)
+                )
 
     # Reports
 
     async def _send_report(self, request: web.Request) -> web.StreamResponse:
-        """Send a file of a session's report."""
+        """Send one file of the analysis report of a session."""
         session_path = self._requested_session(request)
         session_row = next(
             (row for row in await self.rows() if row.path.name == session_path.name), None
@@ -216,14 +220,14 @@ class Library:
         )
 
     async def _send_campaign_report(self, request: web.Request) -> web.StreamResponse:
-        """Send a file of a campaign's report."""
+        """Send one file of the analysis report of a campaign."""
         report_folder = self._path_in_folder(request.match_info["name"])
         if not report_folder.name.startswith("campaign.report"):
             return refusal_response(404, "There is no such campaign.")
         return self._report_file(report_folder, request.match_info.get("file", REPORT_PAGE))
 
     def _report_file(self, report_folder: Path, file_name: str) -> web.StreamResponse:
-        """Return the response with a file of a report, or a refusal.
+        """Return the HTTP response with a file of a report, or a refusal.
 
         Only regular files in the report's folder are served.
         """
@@ -239,34 +243,34 @@ class Library:
         if not self._access.may_act(request):
             return refusal_response(403, "Making a report needs the token of the printed address.")
         session_path = self._requested_session(request)
-        report_address = f"/api/sessions/{session_path.stem}/report/"
-        return self._queue_job("report", [str(session_path)], session_path.stem, report_address)
+        report_url = f"/api/sessions/{session_path.stem}/report/"
+        return self._queue_job("report", [str(session_path)], session_path.stem, report_url)
 
     async def _make_campaign(self, request: web.Request) -> web.Response:
         """Queue the job that writes one analysis report on several sessions."""
         if not self._access.may_act(request):
             return refusal_response(403, "A campaign needs the token of the printed address.")
         request_object = await read_json_object(request)
-        ids = request_object.get("ids")
+        session_ids = request_object.get("ids")
         if (
-            not isinstance(ids, list)
-            or not 2 <= len(ids) <= _MAX_CAMPAIGN_SESSIONS
-            or not all(isinstance(session_name, str) for session_name in ids)
+            not isinstance(session_ids, list)
+            or not 2 <= len(session_ids) <= _MAX_CAMPAIGN_SESSIONS
+            or not all(isinstance(session_name, str) for session_name in session_ids)
         ):
             return refusal_response(400, f"ids: name 2 to {_MAX_CAMPAIGN_SESSIONS} sessions.")
         paths = sorted(
-            {str(self._session_path(session_name)) for session_name in ids}
+            {str(self._session_path(session_name)) for session_name in session_ids}
         )  # in the order of recording
         report_folder = self._unused_folder("campaign.report")
         arguments = [*paths, "--jobs", "1", "--report", str(report_folder)]
         return self._queue_job("campaign", arguments, "", _campaign_url_path(report_folder))
 
     def _queue_job(
-        self, job_kind: str, arguments: list[str], session_name: str, report_address: str
+        self, job_kind: str, arguments: list[str], session_name: str, report_url: str
     ) -> web.Response:
-        """Queue a job, and return the response with its number or a refusal."""
+        """Queue a job, and return the HTTP response: its number, or a refusal."""
         try:
-            job = self._jobs.put(job_kind, arguments, session_name, report_address)
+            job = self._jobs.put(job_kind, arguments, session_name, report_url)
         except JobError as error:
             return refusal_response(409, str(error))
         return web.json_response({"ok": True, "job": job.number}, status=202)
@@ -274,7 +278,7 @@ class Library:
     def _unused_folder(self, folder_name: str) -> Path:
         """Return the path of a new folder that no queued campaign will create either."""
         folder_number, folder_path = 1, self._folder / folder_name
-        while folder_path.exists() or _campaign_url_path(folder_path) in self._jobs.addresses:
+        while folder_path.exists() or _campaign_url_path(folder_path) in self._jobs.result_urls:
             folder_number += 1
             folder_path = self._folder / f"{folder_name}-{folder_number}"
         return folder_path

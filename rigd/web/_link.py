@@ -13,13 +13,13 @@ Document = dict[str, Any]
 _Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 _STATUS_PERIOD_S: Final = 1.0
-"""Period in seconds of status requests while signals arrive."""
+"""Interval in seconds of status requests while signals arrive."""
 _STATUS_PERIOD_WITHOUT_SIGNALS_S: Final = 0.4
-"""Period in seconds of status requests while no signals arrive."""
+"""Interval in seconds of status requests while no signals arrive."""
 _SILENCE_TIMEOUT_S: Final = 0.85
 """Seconds without a message after which the daemon is reported as silent."""
 _MIN_CHECK_PERIOD_S: Final = 0.1
-"""Shortest period in seconds in which silence is checked."""
+"""Shortest interval in seconds between checks for silence of the daemon."""
 _RECONNECT_PAUSE_S: Final = 0.5
 """Pause in seconds before a lost connection is opened again."""
 _CONNECT_TIMEOUT_S: Final = 5.0
@@ -35,11 +35,11 @@ _CROWDED_PAUSE_S: Final = 0.1
 
 
 class DaemonError(Exception):
-    """The daemon does not reply to a request; the message is for the operator."""
+    """Raised if the daemon does not reply to a request; the message is for the operator."""
 
 
 class BusyError(Exception):
-    """A request was not sent to the daemon; the message is for the operator."""
+    """Raised if a request is not sent because another one, or a stop, has precedence."""
 
 
 class DaemonLink:
@@ -85,7 +85,7 @@ class DaemonLink:
             await asyncio.sleep(_RECONNECT_PAUSE_S)
 
     def request_status(self) -> None:
-        """Request the daemon's status now instead of at the next period, since it has changed."""
+        """Request the daemon's status at once instead of with the next poll, as it has changed."""
         self._status_requested.set()
 
     def register_stop(self) -> None:
@@ -95,8 +95,8 @@ class DaemonLink:
     async def send_request(self, request: Document) -> Document:
         """Send a request to the daemon, and return its reply.
 
-        The connection that started a series remains open until the end of the series, and with it
-        the control of the rig. Further requests that need control use the same connection.
+        The connection that started a series controls the rig, and remains open until the end of the
+        series. Further requests that need control use the same connection.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class DaemonLink:
         Raises
         ------
         BusyError
-            If another request is pending, or a stop came before this one was sent.
+            If another request is pending, or a stop was requested before this request was sent.
         DaemonError
             If there is no reply.
         """
@@ -140,7 +140,7 @@ class DaemonLink:
     async def _send_on_new_connection(self, request: Document) -> Document:
         """Send a request on a new connection, and return the reply.
 
-        It is repeated while the daemon has too many clients.
+        The request is repeated while the daemon has too many clients.
         """
         stop_count = self._stop_count
         for attempt_number in range(_CROWDED_ATTEMPTS):
@@ -189,7 +189,7 @@ class DaemonLink:
             writer.close()
 
     def _process_message(self, json_line: bytes) -> None:
-        """Decode a line of the daemon, and pass events and status replies to `on_message`."""
+        """Decode a line that the daemon sent; pass it to `on_message` if an event or a status."""
         if not json_line:
             raise DaemonError(_NO_DAEMON_MESSAGE)
         self._last_received_s, self._silent = time.monotonic(), False
@@ -204,7 +204,7 @@ class DaemonLink:
             self._on_message(message)
 
     async def _report_silence(self) -> None:
-        """Report the daemon as silent if it sends no message in time, until cancelled."""
+        """Report whenever the daemon sends no message in time; run until cancelled."""
         while True:
             remaining_s = self._last_received_s + _SILENCE_TIMEOUT_S - time.monotonic()
             if remaining_s <= 0.0 and not self._silent:
@@ -213,7 +213,7 @@ class DaemonLink:
             await asyncio.sleep(max(remaining_s, _MIN_CHECK_PERIOD_S))
 
     async def _poll_status(self, writer: asyncio.StreamWriter) -> None:
-        """Request the daemon's status periodically, until cancelled."""
+        """Request the daemon's status periodically; run until cancelled."""
         while True:
             writer.write(b'{"command": "status"}\n')
             self._status_requested.clear()
@@ -226,7 +226,7 @@ class DaemonLink:
                 await asyncio.wait_for(self._status_requested.wait(), pause_s)
 
     def _register_end(self, series_number: float) -> None:
-        """Register the end of a series, and release control unless a request is pending."""
+        """Register the end of a series, and release the rig unless a request is pending."""
         self._last_ended_series = series_number
         if not self._request_lock.locked():
             self._release_control()

@@ -1,4 +1,4 @@
-"""Messages to the open pages; each page has its own queue, so that a slow one delays no other."""
+"""Messages to the open pages, each of which has its own queue: a slow page delays no other."""
 
 import asyncio
 import json
@@ -72,7 +72,7 @@ class OpenPage:
     async def stop_on_request(
         self, stop_requested: asyncio.Event, stop: Callable[[], Awaitable[Document]]
     ) -> None:
-        """Stop the session whenever the page requests it, and send the result to the page.
+        """Stop the session whenever the page requests it, and send the page the result.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class Pages:
                 open_page.put(message_text)
 
     def log(self, level: str, log_text: str) -> None:
-        """Send a log line to all open pages, and store it for pages that open later."""
+        """Send a line of the log to all open pages, and store it for pages that open later."""
         log_event = {"type": "event", "utc_ns": time.time_ns(), "level": level, "text": log_text}
         self._events.append(log_event)
         self.send(log_event)

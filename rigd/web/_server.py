@@ -23,7 +23,14 @@ from rigd.runner.quick_looks import QuickLook
 from rigd.runtime import ignore
 from rigd.sweep_response import sweep_ticks
 from rigd.units import UNITS
-from rigd.web._access import ICON, LIVE, Connections, WebAccess, read_json_object, refusal_response
+from rigd.web._access import (
+    ICON_PATH,
+    LIVE_PATH,
+    Connections,
+    WebAccess,
+    read_json_object,
+    refusal_response,
+)
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
 from rigd.web._link import BusyError, DaemonError, DaemonLink
@@ -43,9 +50,9 @@ _MAX_REQUEST_BYTES: Final = 65_536
 _KEEP_ALIVE_S: Final = 15.0
 """Seconds for which an idle connection remains open."""
 _LINGERING_TIME_S: Final = 1.0
-"""Seconds for which the server reads the remaining data of a request before it disconnects."""
+"""Seconds for which the server reads what remains of a request before it disconnects."""
 _RESPONSE_PERIOD_S: Final = 1.0
-"""Period in seconds in which the frequency response of a running session is sent."""
+"""Interval in seconds at which the frequency response of a running session is sent."""
 _LAST_MESSAGES_S: Final = 0.3
 """Seconds for the last messages to reach the pages before the process ends."""
 _SESSION_STATES: Final = ("running", "stopping")
@@ -62,7 +69,7 @@ class OperatorPageServer:
     Parameters
     ----------
     job
-        Data of the rig that the daemon sent: see `rigd.daemon._page`.
+        Data of the rig that the daemon sends at the start: see `rigd.daemon._page`.
 
     Attributes
     ----------
@@ -102,8 +109,8 @@ class OperatorPageServer:
             [
                 web.get("/", self._static_file),
                 web.get("/static/{name}", self._static_file),
-                web.get(ICON, self._static_file),
-                web.get(LIVE, self._live_messages),
+                web.get(ICON_PATH, self._static_file),
+                web.get(LIVE_PATH, self._live_messages),
                 web.post("/api/command", self._forward_command),
                 *self._library.routes(),
             ]
@@ -117,7 +124,7 @@ class OperatorPageServer:
         )
 
     def end(self, reason: str) -> None:
-        """Send the open pages a message that this server ends, with the reason."""
+        """Inform the open pages that this server ends, with the reason."""
         self._report_loss(reason)
 
     # Requests
@@ -131,7 +138,9 @@ class OperatorPageServer:
         if not _STATIC_NAME.fullmatch(file_name) or not file_path.is_file():
             return refusal_response(404, "There is no such file.")
         icon_headers = {"Cross-Origin-Resource-Policy": "cross-origin"}
-        return web.FileResponse(file_path, headers=icon_headers if request.path == ICON else None)
+        return web.FileResponse(
+            file_path, headers=icon_headers if request.path == ICON_PATH else None
+        )
 
     async def _live_messages(self, request: web.Request) -> web.StreamResponse:
         """Send live messages to a page until it is closed."""
@@ -152,7 +161,7 @@ class OperatorPageServer:
                 self._lost_message,
                 self._status,
                 self._gauges_message,
-                self._envelopes.last(),
+                self._envelopes.stored_message(),
             ),
             *(self._nominal_response, self._last_response, self._shown),
         )
@@ -185,13 +194,13 @@ class OperatorPageServer:
         return web.json_response(daemon_reply, status=http_status)
 
     async def _stop(self) -> Document:
-        """Stop the daemon's session, if necessary by a signal, and return the reply."""
+        """Stop the daemon's session, if necessary by a signal, and return the daemon's reply."""
         self._link.register_stop()
         event_loop = asyncio.get_running_loop()
         return await event_loop.run_in_executor(self._stopping, stop_session, self._socket)
 
     async def _stop_for_page(self) -> Document:
-        """Stop the daemon's session, and return the reply or the reason of a failure."""
+        """Stop the daemon's session, and return the result as a message to the page."""
         try:
             return await self._stop()
         except (DaemonUnreachableError, RefusedByDaemonError) as error:
@@ -202,7 +211,7 @@ class OperatorPageServer:
     # Messages of the daemon
 
     def _process_message(self, message: Document) -> None:
-        """Send the content of a daemon's message to the open pages, and update the page's state."""
+        """Process a message of the daemon: update the stored state, and inform the open pages."""
         if self._lost_message is not None:
             self._lost_message = None
             self._link.request_status()
@@ -227,7 +236,7 @@ class OperatorPageServer:
                 self.pages.log("info", "\n".join(QuickLook.from_event(message).lines))
 
     def _process_status(self, status: Document) -> None:
-        """Send the daemon's status to the open pages, and prepare for a new session."""
+        """Send the daemon's status to the open pages, and prepare for a session that has begun."""
         self._status = {"type": "status", **status}
         self._jobs.paused = status["state"] in _SESSION_STATES
         session_series = status["series"]
@@ -256,10 +265,10 @@ class OperatorPageServer:
             )
         self.pages.send(self._nominal_response)  # the pages then clear the other responses
         specimen_name = str(session_series["notes"].get("specimen", ""))
-        self._start_search(self._find_last(specimen_name, Path(session_path).stem))
+        self._start_search(self._send_last_response(specimen_name, Path(session_path).stem))
 
     def _nominal_message(self, beam_document: Document) -> Document:
-        """Return the message with the nominal frequency response of a job's or plan's beam."""
+        """Return the message with the nominal frequency response of a beam with its damping."""
         beam, damping = Beam(**beam_document["beam"]), Damping(**beam_document["damping"])
         return nominal_document(beam, damping, self._job["tool_inertia_kg_m2"])
 
@@ -280,7 +289,7 @@ class OperatorPageServer:
             self.pages.send(self._gauges_message)
 
     def _report_loss(self, reason: str) -> None:
-        """Report to the open pages that the daemon cannot be reached, with the reason."""
+        """Inform the open pages that the daemon cannot be reached, with the reason."""
         if self._lost_message is None or self._lost_message["reason"] != reason:
             self._lost_message = {"type": "lost", "reason": reason}
             self.pages.send(self._lost_message)
@@ -296,7 +305,7 @@ class OperatorPageServer:
                 self.pages.send(shown_response)
 
     def _start_search(self, search: Awaitable[None]) -> None:
-        """Start a search in the recorded sessions without waiting for it."""
+        """Start a search in the recorded sessions, without waiting for its end."""
         search_task = asyncio.ensure_future(search)
         self._searches.add(search_task)
         search_task.add_done_callback(self._searches.discard)
@@ -307,8 +316,11 @@ class OperatorPageServer:
             recorded_specimens = await self._library.specimens()
             self._specimens = list(dict.fromkeys([*recorded_specimens, *specimen_files()]))
 
-    async def _find_last(self, specimen: str, excluded_session: str) -> None:
-        """Send the response of the last session of a specimen, except one, to the open pages."""
+    async def _send_last_response(self, specimen: str, excluded_session: str) -> None:
+        """Send the open pages the frequency response of a specimen's last session.
+
+        The session `excluded_session` does not count as the last one.
+        """
         with suppress(OSError, ValueError):
             self._last_response = await self._library.last_response(specimen, excluded_session)
             self.pages.send(self._last_response)
@@ -348,7 +360,7 @@ def run_page() -> None:
 async def _serve_until_end(daemon: SupervisorConnection, job: Document) -> None:
     """Serve the page of a job until the daemon ends or the server fails."""
     try:
-        page_server, _, listening_server = await open_page(job)
+        page_server, _, listening_server = await start_page_server(job)
     except OSError as error:
         daemon.send(ProcessFailed(f"port {job['port']} cannot be had: {error.strerror}"))
         return
@@ -369,8 +381,10 @@ async def _serve_until_end(daemon: SupervisorConnection, job: Document) -> None:
     os._exit(1 if has_failed else 0)
 
 
-async def open_page(job: Document) -> tuple[OperatorPageServer, web.AppRunner, asyncio.Server]:
-    """Start listening on the port of a job, or on a free port if the job permits it.
+async def start_page_server(
+    job: Document,
+) -> tuple[OperatorPageServer, web.AppRunner, asyncio.Server]:
+    """Start the page's server on the port of a job, or on a free port if the job permits it.
 
     Parameters
     ----------
@@ -401,7 +415,7 @@ async def open_page(job: Document) -> tuple[OperatorPageServer, web.AppRunner, a
     )
     await app_runner.setup()
     assert app_runner.server is not None
-    connections.serving = app_runner.server
+    connections.http_server = app_runner.server
     event_loop = asyncio.get_running_loop()
     try:
         listening_server = await event_loop.create_server(
@@ -413,7 +427,7 @@ async def open_page(job: Document) -> tuple[OperatorPageServer, web.AppRunner, a
         listening_server = await event_loop.create_server(
             connections.accept_connection, _LOOPBACK, 0
         )
-    connections.close_silent()
+    connections.close_silent_connections()
     return page_server, app_runner, listening_server
 
 

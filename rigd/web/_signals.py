@@ -24,13 +24,13 @@ ENVELOPE_POINT_S: Final = 0.05
 _STORED_DURATION_S: Final = 10.0
 """Seconds of the envelopes that are stored for new pages."""
 _BIN_STEP: Final = 4
-"""Step between the shown frequency bins of `analyze` (1/160 Hz).
+"""Factor by which the shown frequencies are farther apart than those of `analyze` (1/160 Hz).
 
-There are still two bins per resolution of a segment."""
+There are still two frequencies per resolution of a segment."""
 _DECIMALS: Final = 6
 """Number of decimals of the envelopes."""
 _BLOCKS_PER_UPDATE: Final = 20
-"""Number of blocks that are passed to the estimate together."""
+"""Number of blocks of signals that are passed to the frequency response together."""
 _SIGNAL_NAMES: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
 """Names of the signals in a block, in the order of its rows."""
 _SAMPLE_TYPE: Final = np.dtype(  # Type of the samples that the frequency response is estimated from
@@ -46,7 +46,7 @@ _SAMPLE_TYPE: Final = np.dtype(  # Type of the samples that the frequency respon
 
 @dataclass(frozen=True, slots=True)
 class PageSignalBlock:
-    """Block of the daemon's signals at consecutive ticks."""
+    """Signals at consecutive ticks, as received from the daemon."""
 
     first_tick: int
     """Number of the block's first tick."""
@@ -57,7 +57,7 @@ class PageSignalBlock:
 
     @classmethod
     def from_event(cls, event: Mapping[str, Any]) -> "PageSignalBlock":
-        """Decode the block of signals in the daemon's event ``signals``."""
+        """Return the block of signals that an event ``signals`` of the daemon contains."""
         signal_bytes = b"".join(
             base64.b64decode(event[signal_name]) for signal_name in _SIGNAL_NAMES
         )
@@ -90,7 +90,7 @@ class SignalEnvelopes:
         """Tick that is expected next."""
 
     def feed(self, signal_block: PageSignalBlock) -> Document | None:
-        """Add a block; return the message with the envelope points it completes, or None."""
+        """Add a block of signals; return the message with new envelope points, or None."""
         ticks_per_point = max(1, round(ENVELOPE_POINT_S * signal_block.rate_hz))
         signal_values = signal_block.values
         missing_ticks = signal_block.first_tick - self._next_tick
@@ -119,8 +119,8 @@ class SignalEnvelopes:
         self._points.extend(points)
         return _envelope_message(first_point, points)
 
-    def last(self) -> Document | None:
-        """Return the message with all stored points for a new page, or None if there are none."""
+    def stored_message(self) -> Document | None:
+        """Return the message for a new page with all stored points, or None if there are none."""
         stored_points = list(self._points)
         return (
             _envelope_message(self._next_point - len(stored_points), stored_points)
@@ -130,7 +130,7 @@ class SignalEnvelopes:
 
 
 def _envelope_message(first_index: int, points: list[tuple[float | None, ...]]) -> Document:
-    """Return the message with points of the envelopes, the first of which has `first_index`."""
+    """Return the message with points of the envelopes; `first_index` numbers the first of them."""
     column_names = (
         *("angle_min", "angle_max", "reference_min", "reference_max"),
         *("torque_min", "torque_max"),
@@ -190,7 +190,7 @@ class SessionResponse:
             self._feed_sweep()
 
     def _feed_sweep(self) -> None:
-        """Pass the queued blocks to the estimate; many of them cost about as much as one."""
+        """Pass the queued blocks to the estimate together, which costs about as much as one."""
         if not self._queued_blocks:
             return
         signal_values = np.concatenate(

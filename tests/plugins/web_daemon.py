@@ -17,7 +17,7 @@ import warm_start
 from processes import eventually
 
 from rigd.daemon import page_address
-from rigd.daemon._page import _job
+from rigd.daemon._page import _page_job
 from rigd.profile import load_profile
 from rigd.web import _access, _jobs, _library, _live, _server
 
@@ -120,7 +120,11 @@ class Served(Requests):
         self.folder = folder
         self.daemon = FakeDaemon()
         self._path = path
-        self._job = _job(profile, folder, path) | {"token": TOKEN, "port": 0, "any_port": False}
+        self._job = _page_job(profile, folder, path) | {
+            "token": TOKEN,
+            "port": 0,
+            "any_port": False,
+        }
         self._thread = threading.Thread(target=self._work)
         self._ready = threading.Event()
         self._thread.start()
@@ -133,7 +137,7 @@ class Served(Requests):
         self.loop = asyncio.get_running_loop()
         self._end = asyncio.Event()
         behind = await asyncio.start_unix_server(self.daemon.serve, self._path)
-        self.server, runner, listening = await _server.open_page(self._job)
+        self.server, runner, listening = await _server.start_page_server(self._job)
         self.port = _server.port_of(listening)
         running = asyncio.create_task(self.server.run())
         while self.server._status is None:

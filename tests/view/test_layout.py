@@ -6,8 +6,8 @@ import pytest
 
 from rigd.view import Scene, plots
 from rigd.view.banner import GAUGES_ENTITY
-from rigd.view.banner import SIZE as VALUES_SIZE
-from rigd.view.frequency_charts import SIZES
+from rigd.view.banner import GAUGES_SIZE as VALUES_SIZE
+from rigd.view.frequency_charts import CHART_SIZES
 from rigd.view.plots import TIMELINE
 
 pytestmark = pytest.mark.process
@@ -56,7 +56,7 @@ def test_every_plot_has_a_view_with_all_its_curves(time_series):
     seen = set()
     for view, visualizer in time_series:
         source = sources[view.origin]
-        assert {*view.visualizer_overrides} <= {source.entity, source.ticks}
+        assert {*view.visualizer_overrides} <= {source.entity, source.tick_entity}
         assert view.contents == list(view.visualizer_overrides)
         (mapping,) = visualizer.mappings
         (plot,) = [p for p in source.plots if p.component == mapping.source_component]
@@ -124,7 +124,7 @@ def test_charts_fill_their_views(tabs):
         for view in views
         if view.class_identifier == "2D"
     }
-    sizes = {**SIZES, GAUGES_ENTITY: VALUES_SIZE}
+    sizes = {**CHART_SIZES, GAUGES_ENTITY: VALUES_SIZE}
     assert charts.keys() == {*sizes, "/spectrogram"}
     for entity, (width, height) in sizes.items():
         bounds = charts[entity].properties["VisualBounds2D"].as_component_batches()

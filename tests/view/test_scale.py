@@ -69,9 +69,9 @@ def test_axes_hold_two_labels_at_every_moment_and_forget(make_samples, shown):
         block = samples[i : i + BLOCK]
         drawings += scale.draw(block["t_ns"], SIGNALS.columns(block))
     view = view_of(COUPLING_TORQUE, CLOSE_UP_S)
-    ticks = shown(drawings)[SIGNALS.ticks]
-    tick_ns = np.array(ticks.times_ns[view.ticks])
-    tick_values = np.array(ticks.values[view.ticks])[:, 0]
+    ticks = shown(drawings)[SIGNALS.tick_entity]
+    tick_ns = np.array(ticks.times_ns[view.tick_component])
+    tick_values = np.array(ticks.values[view.tick_component])[:, 0]
     fills, free = [], []
     for end in range(2 * RATE_HZ, n + 1, BLOCK):
         now_ns = samples["t_ns"][end - 1]
@@ -111,8 +111,8 @@ def test_it_makes_no_difference_how_much_comes_at_a_time(make_samples, shown):
         for i in range(0, len(samples), block):
             part = samples[i : i + block]
             drawings += scale.draw(part["t_ns"], SIGNALS.columns(part))
-        name = view_of(COUPLING_TORQUE, CLOSE_UP_S).ticks
-        found = shown(drawings)[SIGNALS.ticks]
+        name = view_of(COUPLING_TORQUE, CLOSE_UP_S).tick_component
+        found = shown(drawings)[SIGNALS.tick_entity]
         return found.times_ns[name], found.values[name]
 
     assert ticks(100) == ticks(1000)
@@ -123,7 +123,9 @@ def test_every_view_is_sent_its_ticks_at_once_or_it_complains(shown):
     drawings = [d for s in (SIGNALS, READINGS, HEALTH) for d in Scale(s, TIME_VIEWS).frame()]
     found = shown(drawings)
     for view in TIME_VIEWS:
-        assert (view.ticks in found[view.source.ticks].values) == (view.plot.span is None)
+        assert (view.tick_component in found[view.source.tick_entity].values) == (
+            view.plot.span is None
+        )
 
 
 def test_values_that_are_none_are_passed_over(make_samples):

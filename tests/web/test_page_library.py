@@ -288,7 +288,7 @@ def test_a_job_ends_with_the_page(tmp_path, state, end):
 def test_what_became_of_a_job_is_told(jobs):
     async def scenario():
         jobs.paused = False
-        done = jobs.put("campaign", ["pass"], address="/api/campaign/x/")
+        done = jobs.put("campaign", ["pass"], result_url="/api/campaign/x/")
         failed = jobs.put("report", ["import sys; sys.exit('too short')"], "b", "/there")
         await failed.done.wait()
         assert done.done.is_set()

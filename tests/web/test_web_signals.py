@@ -42,7 +42,9 @@ def test_strips_are_the_extremes_of_each_point_in_whatever_pieces_they_come(piec
     greatest = np.concatenate([each["torque_max"] for each in told])
     np.testing.assert_allclose(least, angle.reshape(8, 50).min(axis=1), atol=1e-6)
     np.testing.assert_allclose(greatest, (-angle).reshape(8, 50).max(axis=1), atol=1e-6)
-    assert strips.last()["angle_min"] == [value for each in told for value in each["angle_min"]]
+    assert strips.stored_message()["angle_min"] == [
+        value for each in told for value in each["angle_min"]
+    ]
 
 
 def test_what_is_missed_is_no_point_and_what_comes_after_has_its_own_time():
@@ -58,12 +60,12 @@ def test_a_new_session_begins_anew_and_only_10_s_are_kept():
     strips = SignalEnvelopes()
     for first in range(0, 15_000, 500):
         strips.feed(block(first, np.ones(500)))
-    last = strips.last()
+    last = strips.stored_message()
     assert len(last["angle_min"]) == 200
     assert last["t0_s"] == pytest.approx(5.0)
     told = strips.feed(block(0, np.zeros(50)))
     assert told["t0_s"] == 0.0
-    assert strips.last() == told
+    assert strips.stored_message() == told
 
 
 @pytest.fixture(scope="module")
