@@ -46,7 +46,7 @@ def covariance_of_unknowns(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the covariance of those unknowns that the data determine.
 
-    It has the shape (k, k) and is 0 in rows and columns of the other unknowns. Return also a mask
+    The covariance, shape (k, k), is 0 in rows and columns of the other unknowns. Return also a mask
     of the determined unknowns, shape (k,). `jacobian`, shape (k, K), are the derivatives of the
     whitened residual by the unknowns, and `residual_variance` is the variance of real and imaginary
     parts of that residual.
