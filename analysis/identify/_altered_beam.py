@@ -105,13 +105,8 @@ class Alteration:
     def from_nominal(cls, nominal: Plant, tilt_deg: float | None = None) -> Alteration:
         """Return the alteration of the beam that the session file states: tip mass and tilt.
 
-        Parameters
-        ----------
-        nominal : Plant
-            Rig and specimen as the file states them.
-        tilt_deg : float, optional
-            Angle between the beam at rest and the horizontal, positive if the tip is lower than
-            the root.
+        The angle between the beam at rest and the horizontal is positive if the tip is lower than
+        the root; None counts as 0.
         """
         mass_kg = nominal.tip_mass_kg
         return cls(

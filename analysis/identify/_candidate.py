@@ -20,12 +20,8 @@ become the best one, however exactly its minimum is found."""
 def deviance(cost: float, value_count: int) -> float:
     """Return the deviance, ``-2 ln`` of the likelihood plus a constant, for noise of unknown level.
 
-    Parameters
-    ----------
-    cost : float
-        Sum of squares of the whitened residual.
-    value_count : int
-        Number of real values of the record.
+    `cost` is the sum of squares of the whitened residual, and `value_count` the number of real
+    values of the record.
     """
     return value_count * math.log(cost / value_count)
 
@@ -33,14 +29,7 @@ def deviance(cost: float, value_count: int) -> float:
 def bic(cost: float, value_count: int, parameter_count: int) -> float:
     """Return the Bayesian information criterion of a fit.
 
-    Parameters
-    ----------
-    cost : float
-        Sum of squares of the whitened residual.
-    value_count : int
-        Number of real values of the record.
-    parameter_count : int
-        Number of fitted parameters.
+    The cost and the number of values are as for `deviance`.
     """
     return deviance(cost, value_count) + parameter_count * math.log(value_count)
 

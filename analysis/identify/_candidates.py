@@ -149,18 +149,9 @@ class CandidateSet:
         """Refit candidates that were fitted to the beginning of a record to the longer record.
 
         Each descent starts from the earlier estimate of the candidate. Return None if the residual
-        of the first candidate exceeds the noise: then a full search is needed.
-
-        Parameters
-        ----------
-        earlier_candidates : sequence of Candidate
-            Earlier candidates by rising BIC.
-        measurement : Measurement
-            Longer record.
-        fixed : tuple of str
-            Settings that stay at the values the file states.
-        band_hz : tuple of float
-            First and last frequency compared.
+        of the first candidate exceeds the noise: then a full search is needed. The earlier
+        candidates are in the order of rising BIC. Settings in `fixed` stay at the values the file
+        states.
 
         Raises
         ------
@@ -450,13 +441,9 @@ class CandidateSet:
         A damping whose order is at the limit of its range acts as an inertia or a stiffness. It
         counts as missing, too.
 
-        Returns
-        -------
-        fit : RecordFit
-            Fit with both dampings; the candidate's own fit if no damping or both are missing.
-        bounded : bool
-            Whether the best coefficient of the added damping is negative. The coefficient is then
-            set to one standard deviation, and the fit is not a minimum.
+        Return also whether the best coefficient of the added damping is negative. The coefficient
+        is then set to one standard deviation, and the fit is not a minimum. If no damping or both
+        are missing, the fit is the candidate's own.
         """
         structure, own_fit = candidate.structure, candidate.fit
         absent_dampings = [

@@ -81,12 +81,8 @@ class RecordedImpact:
         """Return the free decays of all modes after the impact, shape (d, n).
 
         The rows come in pairs: a real decay of unit amplitude, and this decay multiplied by the
-        time in seconds since the impact. The second row allows for a small error of the pole.
-
-        Parameters
-        ----------
-        time_s : ndarray, shape (n,)
-            Times since the record's first tick.
+        time in seconds since the impact. The second row allows for a small error of the pole. The n
+        times are relative to the record's first tick.
         """
         since_s = time_s - self.start_s
         has_begun = since_s > -_START_TOLERANCE_S
@@ -101,21 +97,11 @@ class RecordedImpact:
         return np.array(decay_rows).reshape(len(decay_rows), time_s.size)
 
     def unit_torques(self, time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
-        """Return the time series by which the unknown amplitudes of the impact are multiplied.
+        """Return the time series, shape (c, n), that multiply the unknown amplitudes of the impact.
 
         The sum of the products is the torque of the impact. The rows are the free decays, then a
-        single sample of 1 for each sample of the contact.
-
-        Parameters
-        ----------
-        time_s : ndarray, shape (n,)
-            Times of the samples, since the record's first tick.
-        rate_hz : float
-            Sampling rate of these samples.
-
-        Returns
-        -------
-        ndarray, shape (c, n)
+        single sample of 1 for each sample of the contact. The times of the n samples are relative
+        to the record's first tick.
         """
         half_period_s = 0.5 / rate_hz
         in_contact = (time_s > self.start_s - half_period_s) & (time_s < self.end_s - half_period_s)
@@ -129,14 +115,8 @@ class RecordedImpact:
     ) -> NDArray[np.float64]:
         """Return the estimated torque of the impact in N·m at given times, shape (n,).
 
-        Parameters
-        ----------
-        time_s : ndarray, shape (n,)
-            Times since the record's first tick.
-        grid_s : ndarray, shape (m,)
-            Times of the samples for which `sizes` was estimated.
-        rate_hz : float
-            Sampling rate of these samples.
+        The times are relative to the record's first tick. `grid_s` and `rate_hz` are the times and
+        the sampling rate of the samples for which `sizes` was estimated.
         """
         if not self.sizes:
             return np.zeros(time_s.size)

@@ -37,16 +37,9 @@ def findings(
 ) -> tuple[Finding, ...]:
     """Return the effects found in a record that a linear damped beam does not explain.
 
-    If a sign or unit of the record is wrong, only findings that need no model are returned.
-
-    Parameters
-    ----------
-    candidate_set : CandidateSet
-        Candidates for the record.
-    forces : tuple of NonlinearForce
-        Significant nonlinear forces.
-    harmonics : tuple of Harmonic
-        Residual at multiples of the sweep's frequency.
+    If a sign or unit of the record is wrong, only findings that need no model are returned. All
+    `forces` are significant, and `harmonics` are the residual at multiples of the sweep's
+    frequency.
     """
     measurement = candidate_set.comparison.measurement
     model_independent = (

@@ -114,17 +114,8 @@ def refit_with_air_drag(candidate_set: CandidateSet) -> CandidateSet:
     """Refit all candidates with air drag, if that explains the record better.
 
     To first order, the spectrum of a small drag predicts by how much drag reduces the cost of each
-    of a few structures. Drag is fitted only if one of them could then become the best candidate.
-
-    Parameters
-    ----------
-    candidate_set : CandidateSet
-        Candidates without drag.
-
-    Returns
-    -------
-    CandidateSet
-        `candidate_set` if drag does not improve it; else the candidates with drag, by rising BIC.
+    of a few structures. Drag is fitted only if one of them could then become the best candidate. If
+    drag does not improve the candidates, `candidate_set` itself is returned.
     """
     return (
         _refit_with_drag(candidate_set) if _drag_may_improve_fit(candidate_set) else candidate_set

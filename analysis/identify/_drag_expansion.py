@@ -91,26 +91,11 @@ class DragExpansion:
     ) -> tuple[Complex, Complex]:
         """Return the change of the drag torque if another beam replaces this one.
 
-        Its derivatives by the unknowns of the other beam are returned as well.
-
-        Parameters
-        ----------
-        plant : Plant
-            Rig with the other beam.
-        poles : sequence of Pole
-            Poles of the other beam, differentiated by the unknowns.
-        parameter_names : sequence of str
-            Names of the parameters, as in `Unknowns`.
-        parameter_slopes : ndarray, shape (len(parameter_names), k)
-            Derivatives of the parameters by the unknowns, with density over stiffness and stiffness
-            as logarithms.
-
-        Returns
-        -------
-        torque_change : ndarray of complex, shape (K,)
-            Spectrum of the change of the torque, in the band.
-        torque_jacobian : ndarray of complex, shape (k, K)
-            Derivatives of the change by the unknowns.
+        The spectrum of the change in the band, shape (K,), is returned with its derivatives by the
+        k unknowns of the other beam, shape (k, K). `plant` is the rig with the other beam, and
+        `poles` are the poles of that beam, differentiated by its unknowns. `parameter_slopes`,
+        shape (len(parameter_names), k), are the derivatives of the parameters by the unknowns, with
+        density over stiffness and stiffness as logarithms.
         """
         derivative_spectra = [self.ln_density_derivative]
         own_density, other_density = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
@@ -142,14 +127,7 @@ class DragExpansion:
         """Return the change of the drag torque due to the poles of another beam.
 
         The spectrum of the change, shape (K,), is returned with its derivatives by the unknowns,
-        shape (unknown_count, K).
-
-        Parameters
-        ----------
-        poles : sequence of Pole
-            Poles of another beam, differentiated by the unknowns.
-        unknown_count : int
-            Number of unknowns.
+        shape (unknown_count, K). The poles are differentiated by the unknowns.
         """
         change = np.zeros(self.delay_derivative.size, dtype=np.complex128)
         jacobian = np.zeros((unknown_count, change.size), dtype=np.complex128)
@@ -177,11 +155,8 @@ class DragExpansion:
         ``gamma s^lambda`` is not linear in lambda, and a fit with insignificant external damping
         may reach any order.
 
-        Returns
-        -------
-        list of ndarray, shape (2, 3)
-            For each mode the difference as ``c_0 + c_1 s``. The rows are c_0 and c_1, each with its
-            derivatives by gamma and lambda.
+        For each mode, the difference is ``c_0 + c_1 s``. The rows of an array of shape (2, 3) are
+        c_0 and c_1, each with its derivatives by gamma and lambda.
         """
         own_damping, other_damping = self.plant.damping, plant.damping
         linear_terms = []
@@ -207,15 +182,9 @@ class DragExpansion:
     ) -> tuple[Complex, Complex]:
         """Return the change of one mode's torque with its pole, without the first-order part.
 
-        The spectrum has the shape (K,). It is returned with its derivatives by the real and
-        the imaginary part of the pole, shape (2, K).
-
-        Parameters
-        ----------
-        mode_number : int
-            Number of the mode.
-        own_pole, other_pole : complex
-            Upper pole of the mode on this beam, and that on the other beam, in rad/s.
+        The spectrum has the shape (K,). It is returned with its derivatives by the real and the
+        imaginary part of the pole, shape (2, K). The upper poles of the mode on this beam and on
+        the other beam are in rad/s.
         """
         s, torque_spectrum = self.response.s, self.response.modal_torque(mode_number)
         pole_step = other_pole - own_pole

@@ -30,14 +30,8 @@ def angle_without_alternating_counts(
 ) -> NDArray[np.float64]:
     """Return the angle in rad with alternating readings at rest replaced by their mean, shape (n,).
 
-    Only readings under a constant reference are replaced.
-
-    Parameters
-    ----------
-    angle_rad : ndarray, shape (n,)
-        Angle that the encoder read at each tick.
-    reference_rad : ndarray, shape (n,), or None
-        Reference of the motor's controller; None without a controller.
+    Only readings under a constant reference are replaced. The reference of the motor's controller
+    is None without a controller.
     """
     if reference_rad is None:
         return angle_rad

@@ -124,10 +124,7 @@ class CauseFit:
 def explanations(test: UniformBeamTest) -> tuple[CauseFit, ...]:
     """Return fits of the causes that each alone explain the modes, by falling p-value.
 
-    Parameters
-    ----------
-    test : UniformBeamTest
-        Test that refused the plain uniform beam.
+    The test has refused the plain uniform beam.
     """
     problem, best_beam = test.problem, test.unknowns
     if problem is None:
@@ -234,16 +231,9 @@ def _descend_with_tolerances(
 class _CauseSearch:
     """Search for the parameters of beam and cause, with one tolerance of the modal constants.
 
-    Parameters
-    ----------
-    problem : UniformBeamProblem
-        Modal constants of the record and the beam to compare with them.
-    cause : Cause
-        Cause that is added to the beam.
-    x : ndarray, shape (7,)
-        Unknowns of the beam without the cause. An absent damping stays absent.
-    tolerance : float
-        Standard deviation of every constant, in addition to the uncertainty of the record.
+    `x`, shape (7,), are the unknowns of the beam without the cause; an absent damping stays absent.
+    The tolerance is a standard deviation of every constant, in addition to the uncertainty of the
+    record.
     """
 
     def __init__(
@@ -399,14 +389,8 @@ def finding(
 ) -> Finding:
     """Return the finding that names possible causes of modes deviating from a uniform beam.
 
-    Parameters
-    ----------
-    test : UniformBeamTest
-        Test that refused the plain uniform beam.
-    causes : sequence of CauseFit
-        Causes from `explanations`.
-    stiffness_step : StiffnessStep, optional
-        Step of the stiffness during the record, from `best_stiffness_step`.
+    The test has refused the plain uniform beam. The causes are those of `explanations`, and the
+    step of the stiffness is that of `best_stiffness_step`.
     """
     cause_phrases = [cause_fit.phrase for cause_fit in causes]
     if stiffness_step is not None and stiffness_step.is_significant:

@@ -90,17 +90,8 @@ _INTERVAL_PATTERN: Final = re.compile(r" \((?:[^()]*; 95 %|± [^()]*)\)")
 def with_doubt(finding: Finding, reason: str) -> Finding:
     """Return a finding whose sentence says that it is not established, for a given reason.
 
-    Parameters
-    ----------
-    finding : Finding
-        Finding to be marked.
-    reason : str
-        Reason why it is not established.
-
-    Returns
-    -------
-    Finding
-        Finding without interval; unchanged if its kind is one of `MODEL_INDEPENDENT_KINDS`.
+    The returned finding has no interval. A finding whose kind is one of `MODEL_INDEPENDENT_KINDS`
+    is returned unchanged.
 
     Examples
     --------

@@ -162,17 +162,7 @@ def refit_record(
     """Fit one structure, starting from a plant that explained an earlier part of the record.
 
     Return None if the residual is more than noise, or contains a hum: then a full search is needed.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        Longer record.
-    unknowns : Unknowns
-        Unknowns of the structure.
-    plant : Plant
-        Plant that explained the earlier part.
-    band_hz : tuple of float
-        First and last frequency compared.
+    `measurement` is the longer record, and `band_hz` the band that is compared.
 
     Raises
     ------
@@ -280,14 +270,8 @@ def _update_coherent_angle(descent: Descent, whole_angle: Comparison) -> Descent
 def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) -> RecordFit:
     """Return the fit at a minimum of the cost: parameters, uncertainties, modes and residual.
 
-    Parameters
-    ----------
-    objective : Objective
-        Least-squares problem of the record.
-    x : ndarray, shape (k,)
-        Unknowns at the minimum.
-    noise : NoiseSpectrum
-        Noise spectrum under which the minimum was found.
+    `x`, shape (k,), are the unknowns at the minimum, which was found under the noise spectrum
+    `noise`.
     """
     unknowns, comparison = objective.unknowns, objective.comparison
     linearisation = objective.linearise(x)

@@ -88,23 +88,8 @@ def find_hum_near_modes(
 ) -> tuple[Hum, ...]:
     """Return the hum found near each mode, including the hum that has already been removed.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        Record, reduced to the band.
-    plant : Plant
-        Current estimate.
-    poles : tuple of Pole
-        Poles of the plant.
-    noise : NoiseSpectrum
-        Noise spectrum of the record.
-    decaying_nm : ndarray, shape (samples,)
-        Torque of the estimated free decay. Part of it may be the hum, so it is not subtracted.
-
-    Returns
-    -------
-    tuple of Hum
-        At most one hum per mode.
+    There is at most one hum per mode. `decaying_nm` is the torque of the estimated free decay. Part
+    of it may be the hum, so it is not subtracted.
     """
     predicted_nm, _ = comparison.prediction.torque(plant)
     measured_nm = comparison.torque_nm[comparison.retained] + comparison.hum_nm
@@ -156,15 +141,9 @@ class _HumBlocks:
     ) -> Hum | None:
         """Return a sinusoid in the residual that is steady over the record, or None.
 
-        Parameters
-        ----------
-        residual_nm, predicted_nm, free_decay_nm : ndarray, shape (samples,)
-            Torque in N·m: residual, prediction, and estimated free decay.
-        range_hz : tuple of float
-            Lowest and highest frequency of the search.
-        noise_variance : float
-            Variance of one sample of noise that is as strong as the noise near these frequencies,
-            in N²·m².
+        The torques have the shape (samples,), and `range_hz` is the range of the search.
+        `noise_variance` is the variance in N²·m² of one sample of noise that is as strong as the
+        noise near these frequencies.
         """
         if not len(self.block_indices):
             return None

@@ -59,15 +59,8 @@ def reference_coherent_part(
     The response is estimated by windowed correlations (R. B. Blackman and J. W. Tukey, Bell System
     Technical Journal 37 (1958) 185-282): at each frequency by least squares over its neighbours.
 
-    Parameters
-    ----------
-    angle_rad, reference_rad : ndarray, shape (n,)
-        Measured angle and reference of the motor, both assumed to be 0 before the record.
-    rate_hz : float
-        Sampling rate.
-    torque_nm : ndarray, shape (n,), optional
-        Torque on the motor without noise. It is a second input, since it may ring in bands narrower
-        than the smoothing of the response.
+    Angle and reference are assumed to be 0 before the record. The torque on the motor without noise
+    is a second input, since it may ring in bands narrower than the smoothing of the response.
     """
     return_to_zero = 0.5 * (
         1 + np.cos(np.linspace(0, np.pi, round(_RETURN_TO_ZERO_S * rate_hz) + 1)[1:])

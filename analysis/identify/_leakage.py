@@ -36,16 +36,8 @@ _HARMLESS_LEAKAGE_RATIO: Final = 0.3
 def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit) -> NoiseSpectrum:
     """Return the noise without the bins into which disturbances beyond the band leak.
 
-    The disturbances are added to the lines of the noise.
-
-    Parameters
-    ----------
-    noise : NoiseSpectrum
-        Estimated noise.
-    comparison : Comparison
-        Record, reduced to the band.
-    fit : RecordFit
-        Best fit under that noise: its torque is subtracted.
+    The disturbances are added to the lines of the noise. `fit` is the best fit under the estimated
+    noise; its torque is subtracted.
     """
     rate_hz, samples = comparison.decimation.rate_hz, comparison.samples
     end_hz = float(comparison.frequency_hz[-1])

@@ -259,16 +259,9 @@ def fit_modes(
 ) -> ModalFit | None:
     """Return the modal model fitted to a record; None if no mode is in the band or significant.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        Record, reduced to the band.
-    noise : NoiseSpectrum
-        First estimate; bins that it excludes stay excluded.
-    starts : sequence of (int, float, float)
-        Mode number, approximate frequency (Hz) and approximate damping ratio of each mode.
-    torque_spectra : ndarray of complex, shape (c, K), optional
-        Torque spectra of known form and unknown amplitude, as for `Objective`.
+    `noise` is a first estimate; bins that it excludes stay excluded. `starts` are the mode number,
+    approximate frequency in Hz and approximate damping ratio of each mode. `torque_spectra`, shape
+    (c, K), are of known form and unknown amplitude, as for `Objective`.
     """
     search = _ModalSearch.starting_at(comparison, noise, starts, torque_spectra)
     if search is None:
@@ -281,14 +274,7 @@ def modes_with_poles(
 ) -> ModalFit | None:
     """Return the modal model with given poles and the best residues, without a search.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        Record, reduced to the band.
-    noise : NoiseSpectrum
-        Noise of the record.
-    poles : sequence of (int, float, float)
-        Mode number, frequency (Hz) and damping ratio of each mode.
+    A pole is given by mode number, frequency in Hz and damping ratio.
     """
     search = _ModalSearch.starting_at(comparison, noise, poles)
     return None if search is None else search.fit()

@@ -37,19 +37,10 @@ _NO_CONSTANTS: Final = (math.nan,) * len(MODE_CONSTANT_NAMES)
 class BeamVibration:
     """Poles and residues of n modes of a beam.
 
-    Parameters
-    ----------
-    parameters : sequence of float
-        Values of `analysis.identify.uniform_beam.PARAMETERS`, those in `LOGARITHMIC_PARAMETERS` as
-        logarithms.
-    terms : ModeTerms
-        Galerkin coefficients of the modes.
-    length_m : float
-        Length of the beam.
-    lags : sequence of (float, float)
-        Lags of the torque channel as in `rigd.beam.Plant.lags`.
-    near_rad_s : sequence of complex
-        Approximate poles.
+    `parameters` are the values of `analysis.identify.uniform_beam.PARAMETERS`, those in
+    `LOGARITHMIC_PARAMETERS` as logarithms, and `terms` the Galerkin coefficients of the modes.
+    `lags` are the lags of the torque channel as in `rigd.beam.Plant.lags`, and `near_rad_s`
+    approximate poles.
     """
 
     __slots__ = ("_modes",)

@@ -138,16 +138,9 @@ class ModelCheck:
     ) -> tuple[Finding, ...]:
         """Return all findings, with the doubtful ones marked as not established.
 
-        Parameters
-        ----------
-        headline : Headline
-            Reported numbers.
-        effect_findings : tuple of Finding
-            Findings on effects that are fitted with the modes, and on causes of deviations.
-        change_findings : tuple of Finding
-            Findings on changes along the record, which state their certainty themselves.
-        stiffness_step : StiffnessStep or None
-            Step of the stiffness in time that may explain the residual.
+        `effect_findings` are on effects that are fitted with the modes, and on causes of
+        deviations. `change_findings` are on changes along the record; they state their certainty
+        themselves. `stiffness_step` may explain the residual.
         """
         if self.contradicts_file:
             return tuple(finding for finding in self.findings if finding.kind in _CHANNEL_KINDS)

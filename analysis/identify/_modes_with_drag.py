@@ -101,12 +101,8 @@ class ModesWithDrag:
     ) -> ModalFit | None:
         """Return the modes fitted with this drag and another effect, or None if none is visible.
 
-        Parameters
-        ----------
-        candidate_set : CandidateSet
-            Candidates without drag.
-        effect_spectrum : ndarray of complex, shape (K,)
-            Torque spectrum of the other effect in N·m per unit of its size.
+        The candidates are those without drag. `effect_spectrum`, shape (K,), is the torque of the
+        other effect in N·m per unit of its size.
         """
         return fit_modes(
             self.comparison,
@@ -141,16 +137,9 @@ def fit_modes_with_drag(
     Drag does not matter if the record excludes that of a thin wire, or if it hardly makes a damping
     ratio less certain.
 
-    Parameters
-    ----------
-    candidate_set : CandidateSet
-        Candidates without drag.
-    modal_fit : ModalFit
-        Modes fitted without drag.
-    drag_spectrum : ndarray of complex, shape (K,)
-        Torque spectrum of a small drag on a beam with these modes, in N·m per metre of C_D d.
-    max_computations : int
-        Maximum number of computations of the drag torque.
+    Candidates and modes are those without drag. `drag_spectrum`, shape (K,), is the torque of a
+    small drag on a beam with these modes, in N·m per metre of C_D d. The drag torque is computed at
+    most `max_computations` times.
     """
     without_drag = candidate_set.comparison.use_whole_angle()
     whole_angle_fit: ModalFit | None = modal_fit
@@ -219,10 +208,7 @@ def _remaining_change_m(estimates_m: Sequence[float]) -> float:
 def modes_that_drag_changes(modal_fit: ModalFit, with_drag: ModalFit) -> tuple[int, ...]:
     """Return the numbers of the modes whose damping ratio drag changes by more than chance would.
 
-    Parameters
-    ----------
-    modal_fit, with_drag : ModalFit
-        Modes of the same record without and with drag.
+    `modal_fit` has the modes of the same record without drag.
     """
     changed_numbers = []
     for mode_number in set(modal_fit.visible) & set(with_drag.visible):

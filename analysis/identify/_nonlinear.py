@@ -91,15 +91,7 @@ class NonlinearTerm:
 
 
 class NonlinearForceSpectra:
-    """Computation of the torque spectra of nonlinear restoring forces of unit size on single modes.
-
-    Parameters
-    ----------
-    comparison : Comparison
-        Record, reduced to the band.
-    plant : Plant
-        Linear plant.
-    """
+    """Computation of torque spectra of nonlinear restoring forces of unit size on single modes."""
 
     __slots__ = ("_comparison", "_inertia_and_external", "_plant", "_s", "_samples", "_transform")
 
@@ -120,15 +112,8 @@ class NonlinearForceSpectra:
     ) -> NDArray[np.complex128]:
         """Return the torque spectrum of a nonlinear force per unit of its size, in N·m, shape (K,).
 
-        It is not finite if the repeated substitution diverges: the force is then too large.
-
-        Parameters
-        ----------
-        term : NonlinearTerm
-            Kind and mode of the force.
-        force_size : float
-            Size e of the force for which the motion of the mode is computed; 0 for the first
-            order.
+        It is not finite if the repeated substitution diverges: the force is then too large. The
+        motion of the mode is computed for a force of size `force_size`, and to first order for 0.
         """
         k, damped_stiffness = self._modal_stiffness(term.mode)
         dynamic_stiffness = self._inertia_and_external + damped_stiffness

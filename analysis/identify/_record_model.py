@@ -185,12 +185,7 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
 def add_further_effects(model: RecordModel, band_hz: tuple[float, float]) -> RecordModel:
     """Add large effects if small ones do not explain the record, and fit the candidates with them.
 
-    Parameters
-    ----------
-    model : RecordModel
-        Model of `fit_linear_model`.
-    band_hz : tuple of float
-        First and last frequency of the comparison.
+    `model` is the result of `fit_linear_model`.
     """
     is_large = model.small_effect is not None and model.small_effect.is_large
     if model.explains_record and not is_large:
@@ -236,16 +231,8 @@ def fit_drag_with_modes(
 ) -> tuple[ModesWithDrag | None, tuple[int, ...]]:
     """Return the modes fitted with drag if these explain the record, else None.
 
-    Return also the modes whose damping ratio depends on a drag that is not accepted.
-
-    Parameters
-    ----------
-    candidate_set : CandidateSet
-        Candidates without drag.
-    modal_fit : ModalFit
-        Modes fitted without drag.
-    max_computations : int
-        Maximum number of computations of the drag torque.
+    Return also the modes whose damping ratio depends on a drag that is not accepted. Candidates and
+    modes are those without drag. The drag torque is computed at most `max_computations` times.
     """
     modes_with_drag = fit_modes_with_drag(
         candidate_set,

@@ -212,10 +212,7 @@ class Refit:
     ) -> NDArray[np.float64]:
         """Return the first-order reduction of the cost by each torque spectrum alone, shape (c,).
 
-        Parameters
-        ----------
-        torque_spectra : ndarray of complex, shape (c, K)
-            Torque spectra of unknown size.
+        The spectra, shape (c, K), are of unknown size.
         """
         unexplained_spectra, residual = self.unexplained_spectra(torque_spectra)
         correlation = (unexplained_spectra.conj() @ residual).real

@@ -48,13 +48,6 @@ def resonance_shift(coarse_response: CoarseResponse, unknowns: Unknowns) -> NDAr
     """Return the shift of the unknowns that aligns the resonances with the record, (k,).
 
     If a resonance is off by more than its width, no descent finds it.
-
-    Parameters
-    ----------
-    coarse_response : CoarseResponse
-        Some points of the frequency response of the record.
-    unknowns : Unknowns
-        Unknowns of the structure.
     """
     moderate_damping_start = unknowns.start(
         np.array([_SCAN_DAMPING[parameter_name] for parameter_name in unknowns.structure.free])
@@ -126,12 +119,7 @@ class CoarseResponse:
     def whitened(self, noise: NoiseSpectrum, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
         """Return the measured response with the weights for another noise spectrum.
 
-        Parameters
-        ----------
-        noise : NoiseSpectrum
-            Noise of the torque.
-        frequency_hz : ndarray, shape (K,)
-            Frequencies of the bins of the noise spectrum.
+        `frequency_hz`, shape (K,), are the frequencies of the bins of the noise spectrum.
         """
         noise_weight = np.interp(self._frequency_hz, frequency_hz, noise.weight**2)
         whitened_response = copy(self)
@@ -303,14 +291,8 @@ class Descent:
     ) -> Descent:
         """Descend to the local minimum under a noise spectrum.
 
-        Parameters
-        ----------
-        noise : NoiseSpectrum
-            Noise that weights the residual.
-        tolerance : float
-            Relative tolerance of the sum of squares.
-        hopeless : tuple of int and float, optional
-            Number of evaluations and cost above which `descend` gives up.
+        `tolerance` is relative to the sum of squares. `hopeless` is the number of evaluations and
+        the cost above which `descend` gives up.
         """
         descent_steps = StepRule.for_unknowns(self.objective.unknowns)
         objective, minimum = self.objective.minimum(
@@ -438,13 +420,6 @@ class StructureSearch:
         Under another noise spectrum another minimum may be the lowest. So all minima are compared
         again on the coarse response, which is cheap, and the best few are refined on the whole
         record.
-
-        Parameters
-        ----------
-        noise : NoiseSpectrum
-            Noise that weights the residual.
-        known_descent : Descent, optional
-            Descent at a known minimum.
         """
         whitened_response = self.coarse_response.whitened(
             noise, self.objective.comparison.frequency_hz

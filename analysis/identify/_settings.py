@@ -23,11 +23,5 @@ the age of the torque relative to the angle, and the inertia between torque sens
 
 
 def free_settings(fixed: Collection[Setting]) -> tuple[Setting, ...]:
-    """Return the names of the `SETTINGS` that are not fixed, in the order of `SETTINGS`.
-
-    Parameters
-    ----------
-    fixed : collection of str
-        Names of the fixed settings.
-    """
+    """Return the names of the `SETTINGS` that are not fixed, in the order of `SETTINGS`."""
     return tuple(setting_name for setting_name in SETTINGS if setting_name not in fixed)

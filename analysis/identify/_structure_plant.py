@@ -52,14 +52,9 @@ class StructurePlant(Plant):
     ) -> NDArray[np.complex128]:
         """Return the transforms of the torque and its derivatives, like `ResponseGrid.evaluate`.
 
-        Parameters
-        ----------
-        s : ndarray of complex, shape (n,)
-            Laplace variable in rad/s, not 0.
-        wrt : sequence of str
-            Names of k parameters of the structure, or of settings as `gradient_name` has them.
-        angle_spectrum : ndarray of complex, shape (n,)
-            Transform of the motor angle.
+        `s`, shape (n,), is the Laplace variable in rad/s, not 0, and `angle_spectrum` the transform
+        of the motor angle. `wrt` names parameters of the structure, or settings as `gradient_name`
+        has them.
         """
         s_squared = s * s
         at = self.rigid_clamp_response(s)

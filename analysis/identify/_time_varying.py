@@ -507,15 +507,8 @@ def is_single_change_established(
 ) -> bool:
     """Return whether the record establishes exactly one change as its explanation.
 
-    A change with time is never established by one sweep: it may depend on frequency instead.
-    Backlash may be established.
-
-    Parameters
-    ----------
-    equivalent_changes : tuple of TemporalChange
-        Changes that explain the record best or equally well.
-    is_single_sweep : bool
-        Whether the excitation is a single sweep.
+    `equivalent_changes` explain the record best or equally well. A change with time is never
+    established by one sweep: it may depend on frequency instead. Backlash may be established.
     """
     if len(equivalent_changes) != 1 or not equivalent_changes[0].is_certain:
         return False
@@ -527,12 +520,7 @@ def temporal_change_findings(
 ) -> Iterator[Finding]:
     """Yield a finding on each change along the record.
 
-    Parameters
-    ----------
-    equivalent_changes : tuple of TemporalChange
-        Changes that explain the record best or equally well.
-    is_single_sweep : bool
-        Whether the excitation is a single sweep.
+    `equivalent_changes` explain the record best or equally well.
     """
     for change in equivalent_changes:
         finding = _established_finding(change)

@@ -46,21 +46,10 @@ def covariance_of_unknowns(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the covariance of those unknowns that the data determine.
 
-    Parameters
-    ----------
-    jacobian : ndarray of complex, shape (k, K)
-        Derivatives of the whitened residual by the unknowns.
-    residual_variance : float
-        Variance of real and imaginary parts of the whitened residual.
-    at_bound : ndarray of bool, shape (k,)
-        True for unknowns at a bound.
-
-    Returns
-    -------
-    covariance : ndarray, shape (k, k)
-        Covariance of the unknowns, 0 in rows and columns of those that are not determined.
-    is_determined : ndarray of bool, shape (k,)
-        True for unknowns that the data determine.
+    The covariance, shape (k, k), is 0 in rows and columns of the other unknowns. Return also a mask
+    of the determined unknowns, shape (k,). `jacobian`, shape (k, K), are the derivatives of the
+    whitened residual by the unknowns, and `residual_variance` is the variance of real and imaginary
+    parts of that residual.
     """
     hessian_matrix = (jacobian.conj() @ jacobian.T).real
     hessian_scale = np.sqrt(np.diag(hessian_matrix))
@@ -101,20 +90,8 @@ def parameter_uncertainty(
 ) -> ParameterUncertainty:
     """Return standard deviations and intervals of the plant parameters at a minimum.
 
-    They follow from the covariance of the unknowns.
-
-    Parameters
-    ----------
-    unknowns : Unknowns
-        Unknowns of the fitted structure.
-    x : ndarray, shape (k,)
-        Unknowns at the minimum.
-    at_bound : ndarray of bool, shape (k,)
-        True for unknowns that rest on a bound at the minimum.
-    unknown_covariance : ndarray, shape (k, k)
-        Covariance of the unknowns, 0 in rows and columns of those that are not determined.
-    is_determined : ndarray of bool, shape (k,)
-        True for unknowns that the data determine.
+    They follow from the covariance of the unknowns, shape (k, k), which is 0 in rows and columns of
+    unknowns that are not determined. `x`, `at_bound` and `is_determined` have the shape (k,).
     """
     parameter_slopes = unknowns.estimates_by_unknowns(x)
     parameter_covariance = parameter_slopes @ unknown_covariance @ parameter_slopes.T
@@ -195,14 +172,7 @@ def interval_from_zero(estimated_value: float, std: float) -> tuple[float, float
 
     It is the non-negative part of the symmetric interval. So it begins at 0 if the estimate is
     within 1.96 standard deviations of 0. It covers a true value of 0 in 97.5 % of all records,
-    other true values in 95 to 97.5 %.
-
-    Parameters
-    ----------
-    estimated_value : float
-        Estimate, not negative.
-    std : float
-        Standard deviation without the bound at 0.
+    other true values in 95 to 97.5 %. `std` is the standard deviation without the bound at 0.
     """
     half_width = NORMAL_95 * std
     return max(estimated_value - half_width, 0.0), estimated_value + half_width
@@ -277,12 +247,8 @@ def pivot_loss_factor(
 def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[ModeEstimate, ...]:
     """Return frequencies and damping ratios of the modes, with standard deviations (delta method).
 
-    Parameters
-    ----------
-    poles : sequence of Pole
-        Poles with their derivatives by the unknowns. An over-damped mode has both of its poles.
-    covariance : ndarray, shape (k, k)
-        Covariance of the unknowns.
+    The covariance, shape (k, k), is that of the unknowns by which the poles are differentiated. An
+    over-damped mode has both of its poles.
     """
     mode_estimates = []
     for mode_number in dict.fromkeys(pole.mode for pole in poles):

@@ -50,20 +50,7 @@ def indices_of_record_fit(
     """Return MSE, WMSE and MD of a whole-record fit against two measured responses.
 
     These are Welch's estimate and the ratio of the whole record's Fourier transforms, in the band
-    of the Welch fits.
-
-    Parameters
-    ----------
-    fit : RecordFit
-        Whole-record fit.
-    welch_analysis : WelchAnalysis
-        Welch fits of the same record.
-
-    Returns
-    -------
-    welch, whole_record : dict
-        Distances of the fit from Welch's estimate, and from the ratio of transforms: ``mse`` and
-        ``wmse`` in (N·m/rad)², ``md`` in N·m/rad.
+    of the Welch fits. Both have the keys ``mse`` and ``wmse`` in (N·m/rad)², and ``md`` in N·m/rad.
     """
     record = welch_analysis.record
     # The delay stated in the file has been removed from the responses.
@@ -106,12 +93,7 @@ def _fit_indices(
 def response_fit_percent(welch_analysis: WelchAnalysis, model: FittedModel) -> float:
     """Return how well a Welch fit reproduces the measured response, in percent (100 % = exact).
 
-    Parameters
-    ----------
-    welch_analysis : WelchAnalysis
-        Welch fits of a record.
-    model : FittedModel
-        One of the analysis's fitted models.
+    `model` is one of the fitted models of `welch_analysis`.
     """
     measured_frf = welch_analysis.response.response
     is_finite = np.isfinite(measured_frf)
@@ -128,17 +110,15 @@ def record_entries(
 ) -> dict[str, Any]:
     """Return the entries of the JSON document for one whole record.
 
-    Returns
-    -------
-    dict
-        ``headline``: reported estimates with flags. ``fits`` and ``modes``: lists of objects like
-        those of the Welch fits, with ``estimator`` "record". ``records``: one object with verdict,
-        noise, hum, and response and loss factors with their 95 % bands. Numbers may have NumPy's
-        types or be infinite or NaN (see `finite`). Values that are not reported are flagged instead
-        of omitted: ``withheld`` of a fit names the parameters that the data do not support,
-        ``visible`` of a mode states whether the record shows it. ``indices`` are distances from
-        Welch's response, as for the paper's fits, and ``indices_whole_record`` are distances from
-        the ratio of the whole record's transforms.
+    ``headline``: reported estimates with flags. ``fits`` and ``modes``: lists of objects like those
+    of the Welch fits, with ``estimator`` "record". ``records``: one object with verdict, noise,
+    hum, and response and loss factors with their 95 % bands. Numbers may have NumPy's types or be
+    infinite or NaN (see `finite`).
+
+    Values that are not reported are flagged instead of omitted: ``withheld`` of a fit names the
+    parameters that the data do not support, ``visible`` of a mode states whether the record shows
+    it. ``indices`` are distances from Welch's response, as for the paper's fits, and
+    ``indices_whole_record`` are distances from the ratio of the whole record's transforms.
     """
     fit_keys = [
         (

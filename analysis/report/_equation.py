@@ -241,11 +241,8 @@ def _conjugate_variable(variable_letter: str) -> Formula:
 def equations(whole_record: WholeRecord) -> tuple[Formula, ...]:
     """Return the equations of a record's models: modal model, if there is one, and beam.
 
-    Returns
-    -------
-    tuple of Formula
-        Modal model, if there is one; measured response of a beam; Eq. 25 of the reference paper;
-        beta in Eq. 25. They contain only the damping terms of the reported structure.
+    The beam's equations are those of its measured response, Eq. 25 of the reference paper, and beta
+    in Eq. 25. Only the damping terms of the reported structure are in them.
     """
     modal_equations = () if whole_record.headline.modal is None else (_modal_equation(),)
     return (

@@ -236,12 +236,7 @@ _INDEX_UNITS: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
 def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str] = ()) -> Table:
     """Return the table of the parameters and indices of all Welch fits of a record.
 
-    Parameters
-    ----------
-    analysis : WelchAnalysis
-        Welch fits of a record.
-    unsupported_orders : collection of str
-        Orders of damping that the whole record does not support. They have a mark in the table.
+    Orders of damping that the whole record does not support have a mark in the table.
     """
     fits = [model.fit for model in analysis.models]
     return Table.from_rows(

@@ -123,13 +123,8 @@ def exact_condition_text(campaign: CampaignResult) -> str:
 def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None = None) -> Table:
     """Return the table of pooled estimates: the reported one first, then by increasing BIC.
 
-    Parameters
-    ----------
-    campaign : CampaignResult
-        Results of all sessions.
-    only_estimate : PooledEstimate, optional
-        Estimate to show. Without it, as in the files, all estimates are in the table, followed by
-        the structures that are not pooled, without values.
+    With `only_estimate` the table shows no other. Without it, as in the files, all estimates are in
+    the table, followed by the structures that are not pooled, without values.
     """
     unsupported_orders = campaign.verdict.withheld_orders if campaign.verdict else frozenset[str]()
     homogeneity, headline = campaign.homogeneity, campaign.headline

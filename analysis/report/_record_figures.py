@@ -244,21 +244,11 @@ def loss_figure(
 ) -> Figure:
     """Draw internal, external and total loss factor, and twice the damping ratio of each mode.
 
-    Parameters
-    ----------
-    mode_estimates : sequence of ModeEstimate
-        Modes to draw as points.
-    loss_model : FittedPlant or None
-        Beam whose loss factors are drawn; None if no beam explains the losses, then without curves.
-    axis_hz : tuple of float
-        Lowest and highest frequency of the axis, positive.
-    supported_hz : tuple of float or None
-        Frequency band in which the data support the curves, which are drawn only there. None if the
-        data do not support the curves at any frequency.
-    unsupported_orders : collection of str
-        Orders that the data do not support. If there is one, the total is not split into its parts.
-    flagged_modes : collection of int
-        Numbers of the modes whose damping ratio is flagged. Their points are hollow.
+    The modes are points, hollow for those whose damping ratio is flagged. The loss factors are
+    those of `loss_model`, drawn only in the band `supported_hz`. There are no curves if `loss_model`
+    is None, because no beam explains the losses, or `supported_hz` is None, because the data do not
+    support the curves at any frequency. If the data do not support one of the orders, the total is
+    not split into its parts. The frequencies of the axis are positive.
     """
     figure = style.new_figure(9.0, 3.6)
     axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))
@@ -395,15 +385,7 @@ A short record has fewer independent values."""
 
 
 def residual_figure(model: ShownModel, analysis: RecordAnalysis) -> Figure:
-    """Draw the spectrum, cumulative periodogram and power over time of a model's residual.
-
-    Parameters
-    ----------
-    model : ShownModel
-        Model of the record, with its whitened residual.
-    analysis : RecordAnalysis
-        Analysis of the record, with the noise and the bins of the model's residual.
-    """
+    """Draw the spectrum, cumulative periodogram and power over time of a model's residual."""
     figure = style.new_figure(9.0, 4.8)
     grid = figure.add_gridspec(
         2, 2, left=0.085, right=0.985, top=0.94, bottom=0.095, hspace=0.45, wspace=0.19,
@@ -503,14 +485,11 @@ def residual_power(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the whitened residual's power in intervals of the record; it is 1 for pure noise.
 
-    The envelope of the whitened residual is the inverse transform of its spectrum in the band.
-    K frequency bins give K independent values over the record.
+    Return the time of the middle of each interval, in seconds since the first compared sample, and
+    the mean power in the interval, both of the shape (intervals,).
 
-    Returns
-    -------
-    times_s, power : ndarray, shape (intervals,)
-        Time of the middle of each interval since the first compared sample, and mean power in the
-        interval.
+    The envelope of the whitened residual is the inverse transform of its spectrum in the band. K
+    frequency bins give K independent values over the record.
     """
     bin_spacing_hz = float(analysis.frequency_hz[1] - analysis.frequency_hz[0])
     bin_count = residual.size

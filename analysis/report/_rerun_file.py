@@ -187,14 +187,7 @@ def model_legend_entries(weightings: tuple[str, ...]) -> dict[str, LegendEntry]:
 def draw_welch_fits(analysis: WelchAnalysis, tables_markdown: str, stream: RecordingStream) -> None:
     """Send the charts and tables of the Welch fits to Rerun, visible at any time of the session.
 
-    Parameters
-    ----------
-    analysis
-        Welch fits of the session.
-    tables_markdown
-        Tables of the fits as plain text.
-    stream
-        Recording to draw into.
+    The tables are plain text.
     """
     for fit_page in welch_pages(analysis):
         _draw_page(fit_page, stream)
@@ -540,16 +533,7 @@ def draw_record(
 ) -> None:
     """Send the results of the whole record to Rerun: verdict, response, and torque over time.
 
-    Parameters
-    ----------
-    whole_record
-        Whole record with its fits.
-    torque
-        Measured torque, and the torque of the displayed model.
-    tables_markdown
-        Tables of the record as plain text.
-    stream
-        Recording to draw into.
+    `torque` is the measured torque and that of the displayed model. The tables are plain text.
     """
     verdict_sentences = [
         *(f"**{sentence}**" for sentence in damping_sentences(whole_record.headline)),

@@ -146,16 +146,8 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
 def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figure:
     """Draw the angle, the measured and modelled torque, and the difference of the torques.
 
-    Panels below enlarge the torques and their difference at each mode.
-
-    Parameters
-    ----------
-    record : Record
-        Record of angle and torque.
-    model : ShownModel
-        Model of the torque; each of its modes has an enlarged panel.
-    highest_hz : float
-        Highest frequency of the fit's band.
+    Panels below enlarge the torques and their difference at each mode of the model. `highest_hz` is
+    the highest frequency of the fit's band.
     """
     shown_torque = torque_in_band(record, model.transfer, highest_hz)
     record_of_fitted_beam = replace(record, beam=model.beam.plant.beam)

@@ -175,13 +175,8 @@ def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str
 def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
     """Return a figure as the bytes of a PNG, SVG or PDF file; call it within `figure_style`.
 
-    Parameters
-    ----------
-    figure : Figure
-        Figure to render.
-    file_format : {"png", "svg", "pdf"}
-        Format of the file. SVG contains text as text, and the same identifiers each time. PDF
-        embeds TrueType fonts, as journals require.
+    SVG contains text as text, and the same identifiers each time. PDF embeds TrueType fonts, as
+    journals require.
     """
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
@@ -208,17 +203,7 @@ def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
 def save(figure: Figure, path: Path) -> bytes:
     """Write a figure in the format of the file's suffix; call it within `figure_style`.
 
-    Parameters
-    ----------
-    figure : Figure
-        Figure to write.
-    path : Path
-        New file, with the suffix of a figure format.
-
-    Returns
-    -------
-    bytes
-        Content of the file.
+    Return the content of the file.
 
     Raises
     ------
@@ -284,22 +269,9 @@ def save_pictures(
 ) -> list[Picture]:
     """Draw figures, write each in several formats, and return them for a page.
 
-    Parameters
-    ----------
-    illustrations : sequence of Illustration
-        Figures, whose names differ.
-    folder : Path
-        Folder of the files.
-    formats : collection of str
-        Formats of the files.
-    on_step : callable, optional
-        Function that is called after each figure with a short text.
-
-    Returns
-    -------
-    list of Picture
-        Each figure as an SVG image, which can be searched and is sharp on paper. It is a PNG image
-        if SVG was not among the formats, or if the SVG image is large.
+    The names of the figures differ. After each figure, `on_step` is called with a short text. A
+    picture is an SVG image, which can be searched and is sharp on paper. It is a PNG image if SVG
+    was not among the formats, or if the SVG image is large.
 
     Raises
     ------
@@ -377,21 +349,8 @@ def envelope(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Decimate a line to the smallest and the largest y in each of equal intervals of x.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n,)
-        Increasing values; positive if `logarithmic`.
-    y : ndarray, shape (n,)
-        Values of the line.
-    interval_count : int
-        Number of intervals.
-    logarithmic : bool
-        Whether the intervals are equal in log x, for a logarithmic axis.
-
-    Returns
-    -------
-    x, y : ndarray, shape (m,)
-        Decimated line; the line itself if it has at most two points per interval.
+    The values of x increase. If `logarithmic`, for a logarithmic axis, x is positive and the
+    intervals are equal in log x. A line of at most two points per interval is returned as it is.
     """
     if len(x) <= 2 * interval_count:
         return x, y

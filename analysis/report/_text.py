@@ -244,12 +244,7 @@ def damping_sentences(headline: Headline) -> tuple[str, ...]:
 
     Modes that are not visible are omitted. The tuple is empty if no number is a property of the
     antenna. If the model does not explain the whole record, the damping ratios are stated with this
-    reservation and without intervals.
-
-    Returns
-    -------
-    tuple of str
-        Sentences with 95 % intervals in brackets.
+    reservation and without intervals. The 95 % intervals are in brackets.
     """
     damping_texts = []
     if any(mode.damping_ratio.flag == CONTRADICTED_FILE_REASON for mode in headline.modes):

@@ -61,15 +61,7 @@ def touch_illustrations(sessions: Sequence[SessionTouches]) -> Iterator[Illustra
 
 
 def touch_figure(touch: Touch, estimate: TouchEstimate) -> Figure:
-    """Draw the likelihood of the contact point, the innovations and the contact force of a touch.
-
-    Parameters
-    ----------
-    touch : Touch
-        Detected touch.
-    estimate : TouchEstimate
-        Estimate of this touch.
-    """
+    """Draw the likelihood of the contact point, and innovations and contact force of a touch."""
     channel_count = estimate.channels
     figure = style.new_figure(9.0, 4.6)
     grid = figure.add_gridspec(1, 2, left=0.075, right=0.985, top=0.94, bottom=0.1, wspace=0.2)
@@ -148,10 +140,7 @@ def _draw_innovations(
 def map_figure(session_touches: Sequence[SessionTouches]) -> Figure:
     """Draw the points of contact of all sessions as seen from above.
 
-    Parameters
-    ----------
-    session_touches : sequence of SessionTouches
-        Sessions with at least one contact point.
+    Each session has at least one contact point.
     """
     contact_points_m = np.array(
         [t.point_m for session in session_touches for t in session.touches if t.point_m is not None]

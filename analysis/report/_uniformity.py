@@ -50,10 +50,7 @@ def _deviations(uniformity_test: UniformBeamTest) -> NDArray[np.float64]:
 def uniformity_figure(uniformity_test: UniformBeamTest) -> Figure:
     """Draw the deviations of the modal constants from those of a uniform beam, by mode.
 
-    Parameters
-    ----------
-    uniformity_test : UniformBeamTest
-        Result of the test, with at least one degree of freedom.
+    The test has at least one degree of freedom.
     """
     constant_deviations, std = (
         _deviations(uniformity_test),

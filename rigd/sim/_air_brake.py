@@ -42,13 +42,8 @@ They are the weights of the third-order Adams-Bashforth method."""
 class AirBrake:
     """Drag of still air on a simulated beam: its force, and its effect on motor and beam.
 
-    Parameters
-    ----------
-    beam, damping, realisation
-        Beam, its damping and its realisation, whose first oscillating poles belong to the first
-        modes.
-    drag_m
-        Drag coefficient times diameter of the beam in m, ``C_D d``.
+    The first oscillating poles of the realisation belong to the first modes. `drag_m` is the drag
+    coefficient times the diameter of the beam in m, ``C_D d``.
 
     Attributes
     ----------
@@ -117,13 +112,9 @@ class AirBrake:
     def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
         """Return the model of motor and beam, extended by the effect of the drag on the modes.
 
-        Returns
-        -------
-        model
-            Model with two more states per mode, whose torque acts on the shaft.
-        force_input
-            Matrix that gives the derivative of the state from the drag force per metre at the
-            points, shape (n, points).
+        The model has two more states per mode, whose torque acts on the shaft. Return also the
+        matrix that gives the derivative of the state from the drag force per metre at the points,
+        shape (n, points).
         """
         n, added_state_count = model.b.size, 2 * self._poles.size
         a = np.zeros((n + added_state_count, n + added_state_count))
@@ -159,10 +150,8 @@ class AirBrake:
     def update_force(self, speed_m_s: Real) -> tuple[float, float]:
         """Compute and store the drag force for given speeds in m/s; return its immediate effect.
 
-        Returns
-        -------
-        torque_nm, shear_n : float
-            Change of the beam's torque and shear by the force before it has moved any mode.
+        The effect is the change of the beam's torque in N·m and shear in N by the force before it
+        has moved any mode.
         """
         self._newest = (self._newest + 1) % 3
         force_n_per_m = self._forces[self._newest]

@@ -321,17 +321,9 @@ class SimulatedSensor:
 
     The wrench is the smallest one whose projections are the coupling torque (with hum) and the base
     shear; crosstalk is added to it. If the sensor streams, the wrench read is the output of the
-    decimating filter for the last readings.
-
-    Parameters
-    ----------
-    plant, sensor, simulation
-        Plant to measure, parameters of the sensor, and its noise and imperfections.
-    rate_hz
-        Number of readings per second, which determines the phase of the hum.
-    weights
-        Weights of the last readings in the decimating filter, oldest first. A single weight means
-        that a reading is taken on request.
+    decimating filter for the last readings. `rate_hz` is the number of readings per second, which
+    determines the phase of the hum. `weights` are those of the last readings in the decimating
+    filter, oldest first. A single weight means that a reading is taken on request.
 
     Attributes
     ----------

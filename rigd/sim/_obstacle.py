@@ -62,14 +62,7 @@ _CONTACT_ITERATIONS = 3
 class AttachedObstacles:
     """Obstacles and impacts that act on the beam of the simulated plant.
 
-    Parameters
-    ----------
-    beam, damping, realisation
-        Beam, its damping and its realisation.
-    bodies
-        Obstacles and impacts.
-    period_s
-        Duration of a step of the plant in seconds.
+    `period_s` is the duration of a step of the plant.
 
     Attributes
     ----------
@@ -154,12 +147,8 @@ class AttachedObstacles:
     def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
         """Return the model of motor and beam, extended by the effect of forces on the beam.
 
-        Returns
-        -------
-        model
-            Model with additional states for each force, whose torque acts on the shaft.
-        force_input
-            Derivative of the state by each force, per N, shape (n, bodies).
+        The model has additional states for each force, whose torque acts on the shaft. Return also
+        the derivative of the state by each force, per N, shape (n, bodies).
         """
         body_count, states_per_body = self._positions_m.size, self._b.size
         n, added_state_count = model.b.size, body_count * states_per_body
@@ -204,14 +193,9 @@ class AttachedObstacles:
     ) -> "SubstepMatrices":
         """Compute the matrices for the substeps of a period, for a free or a locked motor.
 
-        Parameters
-        ----------
-        model, force_input
-            As `extended_model` returns them.
-        holding_torque, switch_s, angle_instant_s, torque_instant_s
-            As for :func:`rigd.sim._step._step_matrix`.
-        friction_effect
-            Effect of 1 N·m of friction in the previous period on the state, shape (n,).
+        `model` and `force_input` are those of `extended_model`. `friction_effect`, shape (n,), is
+        the effect of 1 N·m of friction in the previous period on the state. The other arguments are
+        as for :func:`rigd.sim._step._step_matrix`.
         """
         substep_count, substep_s, body_count = (
             self.substeps,
@@ -298,13 +282,8 @@ class AttachedObstacles:
     def cannot_touch(self, displacement_m: Real, time_s: float) -> bool:
         """Return whether no obstacle and no impact can act on the beam during a period.
 
-        Parameters
-        ----------
-        displacement_m
-            Beam's displacement in m at each body at the end of the period if no force acts, shape
-            (bodies,).
-        time_s
-            Time in seconds at the start of the period.
+        `displacement_m`, shape (bodies,), is the beam's displacement at each body at the end of the
+        period if no force acts, and `time_s` the start of the period.
         """
         end_s = time_s + self._period_s
         start_displacement_m = self._start_displacement_m = self._displacement_m
@@ -340,20 +319,10 @@ class AttachedObstacles:
     ) -> Real:
         """Return the forces in N of obstacles and impacts on the beam in each substep of a period.
 
-        Parameters
-        ----------
-        substep_matrices
-            Matrices for the substeps, of the free or the locked motor.
-        free_displacement_m
-            Beam's displacement in m at each body at the end of each substep if no force acts, shape
-            (substeps, bodies).
-        time_s
-            Time in seconds at the start of the period.
-
-        Returns
-        -------
-        (substeps, bodies)
-            Forces in N, positive in the direction of increasing angles.
+        The forces have the shape (substeps, bodies) and are positive in the direction of increasing
+        angles. The matrices are those of the free or the locked motor. `free_displacement_m`, shape
+        (substeps, bodies), is the beam's displacement at each body at the end of each substep if no
+        force acts, and `time_s` the start of the period.
         """
         substep_count, substep_s = self.substeps, self._substep_s
         force_kernel = substep_matrices.displacement_kernel
@@ -478,19 +447,8 @@ class AttachedObstacles:
     def adopt_states(self, old_state: Real, old_obstacles: "AttachedObstacles | None") -> Real:
         """Take over the state of a plant with fewer obstacles; return the state with all of them.
 
-        The obstacles that have acted so far come first among these obstacles.
-
-        Parameters
-        ----------
-        old_state
-            State of the plant with the obstacles that have acted so far.
-        old_obstacles
-            Obstacles that have acted so far; None if there were none.
-
-        Returns
-        -------
-        ndarray
-            State of the plant with these obstacles.
+        The obstacles that have acted so far come first among these obstacles. `old_state` is the
+        state of the plant with `old_obstacles`, which are None if there were none.
         """
         states_per_body = self._b.size
         old_states_per_body = 0 if old_obstacles is None else old_obstacles._b.size

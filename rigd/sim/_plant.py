@@ -607,13 +607,8 @@ class GrowingDelayLine:
     """Delay line of readings whose delay grows, for a sensor whose clock differs from the loop's.
 
     Between ticks the reading is interpolated by a cubic through the four nearest readings.
-
-    Parameters
-    ----------
-    periods
-        Initial delay in ticks.
-    growth
-        Increase of the delay per tick, in ticks; not negative.
+    `periods` is the initial delay in ticks, and `growth` its increase per tick, in ticks and not
+    negative.
     """
 
     __slots__ = ("_age", "_growth", "_readings")

@@ -11,13 +11,7 @@ _RANDOM_STREAM = 1
 
 
 def scatters_between_sessions(rig: RigParameters) -> bool:
-    """Return whether the simulated beam varies between sessions.
-
-    Parameters
-    ----------
-    rig
-        Parameters of the rig.
-    """
+    """Return whether the simulated beam varies between sessions."""
     return any(_scatter_percentages(rig))
 
 

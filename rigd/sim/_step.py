@@ -44,14 +44,8 @@ def beam_and_coupled_models(
 ) -> tuple[Realisation, CoupledModel, CoupledModel]:
     """Return the realisation of the beam, and the models of the beam on a free and a locked shaft.
 
-    Parameters
-    ----------
-    parameters
-        Parameters of the rig, with the beam that is simulated.
-    simulation
-        Tip mass, clamp compliance and sensor filter of the simulated rig.
-    modes_of
-        As for :func:`rigd.beam.realisation.realise`.
+    The beam of `parameters` is simulated, with tip mass, clamp compliance and sensor filter of
+    `simulation`. `modes_of` is as for :func:`rigd.beam.realisation.realise`.
     """
     plant = Plant(
         parameters.beam,
@@ -88,21 +82,12 @@ def free_and_locked_steps(
 ) -> tuple[Real, Real, Real]:
     """Return the step matrices for a free and a locked shaft, and the effect of 1 N·m of friction.
 
+    The matrices have the shape (n + 8, n + 3), and the effect has the shape (n + 8,). `instants`
+    are `switch_s`, `angle_instant_s` and `torque_instant_s` of `_step_matrix`.
+
     The friction of a period is known only after the period's step, from the speed reached without
     friction. The outputs are then corrected at once, and the state by the last column of the next
     step's matrix.
-
-    Parameters
-    ----------
-    free_model, locked_model
-        Models of motor and beam.
-    period_s, instants
-        As for `_step_matrix`.
-
-    Returns
-    -------
-    free_matrix, locked_matrix : (n + 8, n + 3)
-    friction_effect : (n + 8,)
     """
     n = free_model.b.size
     free_matrix = _step_matrix(free_model, locked_model.sensor_torque, period_s, *instants)
@@ -123,24 +108,11 @@ def drifted_step_arrays(
 ) -> tuple[Real, Real, Real, Real]:
     """Return matrices and effects of a step for a beam whose bending stiffness has drifted.
 
-    Parameters
-    ----------
-    stiffness_ratio
-        Bending stiffness divided by that at the start of the drift.
-    parameters, simulation
-        As for `beam_and_coupled_models`, at the start of the drift.
-    initial_realisation
-        Realisation of the beam at the start of the drift.
-    period_s, instants
-        As for `_step_matrix`.
-
-    Returns
-    -------
-    free_matrix, locked_matrix : (n + 8, n + 3)
-    friction_effects : (8,)
-        Effect of 1 N·m of friction on the outputs.
-    effects_per_torque : (2,)
-        Immediate effect of the motor's torque on torque and shear of the sensor.
+    Return the matrices for a free and a locked shaft, shape (n + 8, n + 3), the effect of 1 N·m of
+    friction on the outputs, shape (8,), and the immediate effect of the motor's torque on torque
+    and shear of the sensor, shape (2,). `stiffness_ratio` is relative to the start of the drift, to
+    which `parameters`, `simulation` and `initial_realisation` belong. `instants` are as for
+    `free_and_locked_steps`.
 
     Raises
     ------
@@ -175,13 +147,7 @@ def drifted_step_arrays(
 
 
 def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
-    """Split a delay into a number of whole periods and a remainder in seconds.
-
-    Parameters
-    ----------
-    delay_s, period_s
-        Delay and duration of a period in seconds.
-    """
+    """Split a delay into a number of whole periods and a remainder in seconds."""
     whole_periods = int(delay_s / period_s + _SAME_INSTANT_PERIODS)
     remainder_s = delay_s - whole_periods * period_s
     return whole_periods, remainder_s if remainder_s > _SAME_INSTANT_PERIODS * period_s else 0.0
@@ -197,25 +163,11 @@ def _step_matrix(
 ) -> Real:
     """Return the matrix of a step of the plant, which lasts one period.
 
-    It maps [state, motor torque before and after its change] to [state, outputs].
-
-    Parameters
-    ----------
-    model
-        Model of motor and beam.
-    holding_torque
-        Row that gives the sensor torque on a shaft that does not accelerate from the state, shape
-        (n,).
-    period_s
-        Duration of the step in seconds.
-    switch_s
-        Time in seconds from the start of the step at which the motor's torque changes.
-    angle_instant_s, torque_instant_s
-        Times in seconds from the start of the step at which angle and torque are sensed.
-
-    Returns
-    -------
-    (n + 8, n + 2)
+    The matrix, shape (n + 8, n + 2), maps [state, motor torque before and after its change] to
+    [state, outputs]. The row `holding_torque`, shape (n,), gives from the state the sensor torque
+    on a shaft that does not accelerate. Counted from the start of the step, the motor's torque
+    changes at `switch_s`, and angle and torque are sensed at `angle_instant_s` and
+    `torque_instant_s`.
     """
 
     @cache
@@ -282,18 +234,9 @@ def constant_force_effect(
 ) -> Real:
     """Return the effect of a drag force, constant over a period, on the next state and outputs.
 
-    Parameters
-    ----------
-    model
-        Model of motor and beam.
-    force_input
-        Derivative of the state by the force per metre at the points of the beam, shape (n, points).
-    holding_torque, period_s, angle_instant_s, torque_instant_s
-        As for `_step_matrix`.
-
-    Returns
-    -------
-    (n + 8, points)
+    The effect has the shape (n + 8, points). `force_input`, shape (n, points), is the derivative of
+    the state by the force per metre at the points of the beam. The other arguments are as for
+    `_step_matrix`.
     """
 
     def state_at(instant_s: float) -> Real:

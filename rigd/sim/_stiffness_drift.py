@@ -31,17 +31,9 @@ _LARGEST_INTERPOLATION_ERROR = 1e-10
 class StiffnessDrift:
     """Step matrices that depend on the beam's bending stiffness, interpolated for the present time.
 
-    Parameters
-    ----------
-    rate_per_s
-        Relative change of the stiffness per second; not 0.
-    period_s
-        Duration of a step in seconds.
-    highest_mode_rad_s
-        Largest natural frequency of the modelled modes in rad/s.
-    arrays_at
-        Function that returns the arrays for a stiffness, which is given relative to the initial
-        one.
+    `rate_per_s` is the relative change of the stiffness per second, not 0, `period_s` the duration
+    of a step, and `highest_mode_rad_s` the largest natural frequency of the modelled modes.
+    `arrays_at` returns the arrays for a stiffness relative to the initial one.
 
     Attributes
     ----------
@@ -99,17 +91,9 @@ class StiffnessDrift:
         self._drift_fraction_per_period = abs(rate_per_s) * period_s / LARGEST_DRIFT
 
     def refresh_if_due(self, periods: int) -> bool:
-        """Update the step matrices for the coming periods if an update is due.
+        """Update the step matrices for the coming periods if due; return whether they have changed.
 
-        Parameters
-        ----------
-        periods
-            Number of periods since the drift began; call this method in every period.
-
-        Returns
-        -------
-        bool
-            Whether the arrays have changed.
+        Call this method in every period, with the number of periods since the drift began.
         """
         if periods < 0 or periods % self._periods_per_update:
             return False
@@ -130,14 +114,8 @@ def with_modal_displacements(
 ) -> CoupledModel:
     """Return a coupled model with displacements and speeds of the modes as its states.
 
-    Parameters
-    ----------
-    model
-        Model of motor and beam, with the states of the realisation after angle and speed.
-    beam_realisation
-        Realisation of the beam.
-    initial_realisation
-        Realisation at the start of the drift, which defines the units of the displacements.
+    The states of `model` after angle and speed are those of `beam_realisation`.
+    `initial_realisation`, at the start of the drift, defines the units of the displacements.
     """
     n, beam_state_count = model.b.size, beam_realisation.b.size
     from_displacements = np.eye(n)

@@ -64,7 +64,7 @@ Below it some loads are not distinguishable in single precision."""
 class Calibration:
     """Calibration of an ATI sensor: matrix, units and identity.
 
-    Parameters
+    Attributes
     ----------
     serial_number, part_number, date, family
         Texts as stored in the sensor; empty if it has none.

@@ -117,12 +117,7 @@ class _FrameReceiver:
 class GaugePolls:
     """Polls that the control loop sends to a NETCANOEM box, and the pairing of their replies.
 
-    Parameters
-    ----------
-    frame
-        Raw CAN frame of the poll.
-    name
-        Name of the sensor, for messages.
+    `frame` is the raw CAN frame of a poll; the sensor's name is for messages.
 
     Attributes
     ----------

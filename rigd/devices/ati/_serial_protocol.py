@@ -239,10 +239,7 @@ class RecordStream:
     def start(self, *, aligned: bool) -> None:
         """Discard the stored bytes and search for the first record; the counts continue.
 
-        Parameters
-        ----------
-        aligned
-            Whether the next byte is probably the first byte of a record.
+        With `aligned`, the next byte is probably the first byte of a record.
         """
         self._stored_bytes = b""
         self._expected_offset = 0 if aligned else None

@@ -32,12 +32,7 @@ _READ_SIZE = 65_536
 def describe_adapter_delay(gap_s: float, port: str) -> str:
     """Return the message that a USB adapter delays records, with the remedy.
 
-    Parameters
-    ----------
-    gap_s
-        Time between two blocks of records in seconds.
-    port
-        File name of the port.
+    `gap_s` is the time between two blocks of records.
     """
     adapter_name = Path(os.path.realpath(port)).name
     if not adapter_name.startswith("ttyUSB"):
@@ -52,14 +47,8 @@ def describe_adapter_delay(gap_s: float, port: str) -> str:
 class SerialLine:
     """Open serial port: 8 data bits, even parity, one stop bit; locked against other processes.
 
-    Parameters
-    ----------
-    port
-        File name of the port.
-    baud
-        Bit rate in bit/s; any rate that the adapter supports.
-    device
-        Name of the device at the other end, for messages.
+    `port` is a file name, and `baud` any bit rate in bit/s that the adapter supports. `device` is
+    the name of the device at the other end, for messages.
 
     Attributes
     ----------
@@ -165,10 +154,7 @@ class SerialLine:
     def drain(self, quiet_s: float, limit_s: float) -> bool:
         """Discard received bytes until the line has been silent for `quiet_s`.
 
-        Returns
-        -------
-        bool
-            Whether the line became silent before `limit_s` had passed.
+        Return whether the line became silent before `limit_s` had passed.
         """
         now_s = time.monotonic()
         last_received_s, end_s = now_s, now_s + limit_s
@@ -249,15 +235,6 @@ class SerialSetup:
 
     Every method raises `DeviceError` if the line has failed, or the sensor does not answer or
     answers wrongly.
-
-    Parameters
-    ----------
-    line
-        Open serial line to the sensor.
-    settings
-        Settings of the sensor.
-    name
-        Name of the sensor, for messages.
     """
 
     def __init__(self, line: SerialLine, settings: AtiSerial, name: str) -> None:

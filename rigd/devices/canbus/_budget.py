@@ -166,10 +166,7 @@ class BusLoad:
 def frame_bits(data_length: int) -> int:
     """Return the number of bits of a CAN frame with an 11-bit identifier, without stuff bits.
 
-    Parameters
-    ----------
-    data_length
-        Number of data bytes, 0 to 8.
+    There are 0 to 8 bytes of data.
     """
     return FRAME_BITS + 8 * data_length
 

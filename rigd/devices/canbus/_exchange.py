@@ -359,12 +359,8 @@ class CanExchange:
 class BusLock:
     """Lock that prevents other programs from using a CAN bus while this one has it open.
 
-    Parameters
-    ----------
-    bus
-        Channel of the bus, or socket of a simulated bus.
-    simulated
-        Whether the bus is simulated; the lock then concerns only processes of the same user.
+    `bus` is the channel of the bus, or the socket of a simulated bus, whose lock concerns only
+    processes of the same user.
     """
 
     def __init__(self, bus: str, *, simulated: bool) -> None:

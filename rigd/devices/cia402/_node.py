@@ -34,14 +34,8 @@ _TOGGLE_BIT = 0x80
 class ReceivedFrames:
     """Latest contents of the frames received from the drive.
 
-    Frames of the wrong length are only counted.
-
-    Parameters
-    ----------
-    name
-        Name of the drive, for messages.
-    sto_error_code
-        Error code of the drive's emergency message for a dropped STO; 0 if it sends none.
+    Frames of the wrong length are only counted. The drive's name is for messages. `sto_error_code`
+    is the error code of the drive's emergency message for a dropped STO; 0 if it sends none.
 
     Attributes
     ----------
@@ -209,14 +203,8 @@ _EMERGENCY_TIMEOUT_NS = 5_000_000
 class Node:
     """Connection to the CANopen node of a drive that has been set up.
 
-    Parameters
-    ----------
-    rig
-        Parameters with the sections ``cia402`` and ``acquisition``.
-    exchange
-        Started exchange, which delivers the drive's frames to the inbox.
-    frames, inbox
-        Prepared frames to the drive, and contents of the frames received from it.
+    The profile needs the sections ``cia402`` and ``acquisition``. The exchange has been started and
+    delivers the drive's frames to `inbox`; `frames` are the prepared frames to the drive.
 
     Attributes
     ----------
@@ -257,10 +245,7 @@ class Node:
     def go_operational(self, *, has_heartbeat: bool = True) -> None:
         """Start the drive's CANopen node and wait for the heartbeat that confirms it.
 
-        Parameters
-        ----------
-        has_heartbeat
-            Whether the drive sends a heartbeat; if not, its first TPDO has to confirm the start.
+        The first TPDO of a drive that sends no heartbeat has to confirm the start.
 
         Raises
         ------

@@ -147,12 +147,7 @@ _SDO_READ_REPLY: Final = 0x40
 class NodeFrames:
     """Prepared CAN frames to one drive (16 bytes each), and identifiers of the drive's frames.
 
-    Parameters
-    ----------
-    node_id
-        Node number of the drive.
-    host_node_id
-        Node number of this computer.
+    `node_id` is the drive's node number, and `host_node_id` that of this computer.
 
     Attributes
     ----------

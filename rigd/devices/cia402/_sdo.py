@@ -122,14 +122,7 @@ class _Receiver(MessageListener):
 class SdoAccess:
     """Context manager that reads and writes one drive's objects by SDO.
 
-    Parameters
-    ----------
-    port
-        Open port; no other code receives from it meanwhile.
-    node_id
-        Node number of the drive.
-    name
-        Name of the drive, for messages.
+    No other code receives from the open port meanwhile. The drive's name is for messages.
     """
 
     def __init__(self, port: CanPort, node_id: int, name: str) -> None:
@@ -188,10 +181,7 @@ class SdoAccess:
     def load_eds(self, path: str) -> tuple[int, int]:
         """Load the objects' data types from a drive's EDS file; return vendor and product code.
 
-        Returns
-        -------
-        tuple of int
-            Vendor and product number in the file; 0 for a number that it does not state.
+        A number that the file does not state is 0.
 
         Raises
         ------

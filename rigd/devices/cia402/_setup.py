@@ -114,19 +114,7 @@ class DriveCapabilities:
 def set_up_drive(port: CanPort, rig: RigParameters, drive_name: str) -> DriveCapabilities:
     """Verify and configure the drive by SDO; the drive stays pre-operational and disabled.
 
-    Parameters
-    ----------
-    port
-        Open port; no other code receives from it meanwhile.
-    rig
-        Parameters with a section ``cia402``.
-    drive_name
-        Name of the drive, for messages.
-
-    Returns
-    -------
-    DriveCapabilities
-        Identity and capabilities of the drive.
+    No other code receives from the open port meanwhile. The profile needs a section ``cia402``.
 
     Raises
     ------
@@ -227,16 +215,7 @@ def _check_identity(
 class _DriveConfiguration:
     """Set-up of one disabled drive by SDO, which collects the objects that the drive lacks.
 
-    Parameters
-    ----------
-    sdo
-        SDO access to the drive.
-    settings
-        Settings of the drive in the profile.
-    name
-        Name of the drive, for messages.
-    required
-        Required values of the drive's objects, by index and sub-index.
+    `required` are the required values of the drive's objects, by index and sub-index.
     """
 
     def __init__(
@@ -251,14 +230,8 @@ class _DriveConfiguration:
     def set_object(self, row: Requirement, required: int | None = None) -> bool:
         """Set an object to a value, unless it has that value; return whether the object exists.
 
-        A write-only object is written and not read back, if `MAY_BE_WRITE_ONLY` lists it.
-
-        Parameters
-        ----------
-        row
-            Requirement on the object.
-        required
-            Value to set; None: the required value that the constructor was given.
+        A write-only object is written and not read back, if `MAY_BE_WRITE_ONLY` lists it. If
+        `required` is None, the value is the one that the constructor was given for the object.
 
         Raises
         ------
@@ -449,10 +422,7 @@ class _DriveConfiguration:
     def configure_watchdog(self) -> Watchdog:
         """Set up the watchdog by which the drive monitors this computer, and the drive's heartbeat.
 
-        Returns
-        -------
-        Watchdog
-            Kind of watchdog that is active.
+        Return the kind of watchdog that is active.
         """
         settings, sdo = self._settings, self._sdo
         deadline_object = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
@@ -574,17 +544,10 @@ class _DriveConfiguration:
     ) -> None:
         """Map objects into a PDO and enable it; nothing is written if the PDO already is as needed.
 
-        Parameters
-        ----------
-        communication
-            Index of the PDO's communication parameters; the index of its mapping is 0x200 higher.
-        flags
-            Additional bits of the PDO's COB-ID.
-        entries
-            Mapping entries of the objects that the PDO carries.
-        parameters
-            Required values of further communication parameters by sub-index; a parameter that the
-            drive does not have is skipped.
+        `communication` is the index of the PDO's communication parameters; the index of its mapping
+        is 0x200 higher. `flags` are additional bits of the PDO's COB-ID, and `entries` the mapping
+        entries of the objects that it carries. `parameters` are the required values of further
+        communication parameters by sub-index; a parameter that the drive does not have is skipped.
         """
         sdo, mapping_index = self._sdo, communication + 0x200
         can_id = self._required_values[communication, 1] | flags

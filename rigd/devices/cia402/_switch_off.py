@@ -43,23 +43,10 @@ _PRESS_STO_ADVICE = (
 def reset_fault(port: CanPort, rig: RigParameters, drive_name: str) -> str | None:
     """Switch the drive off, reset its fault, and check that it can get ready to switch on.
 
-    The motor has no torque at any time. The drive is left pre-operational and disabled. Its
-    monitoring of this computer's heartbeat is cleared only after its statusword has shown that it
-    is off.
-
-    Parameters
-    ----------
-    port
-        Open port; no other code receives from it meanwhile.
-    rig
-        Parameters with a section ``cia402``.
-    drive_name
-        Name of the drive, for messages.
-
-    Returns
-    -------
-    str or None
-        Description of the fault; None if the drive was not in fault.
+    Return the description of the fault; None if the drive was not in fault. The motor has no torque
+    at any time. The drive is left pre-operational and disabled. Its monitoring of this computer's
+    heartbeat is cleared only after its statusword has shown that it is off. No other code receives
+    from the open port meanwhile. The profile needs a section ``cia402``.
 
     Raises
     ------

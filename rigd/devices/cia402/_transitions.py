@@ -36,12 +36,7 @@ _CHECK_BUS_ADVICE: Final = "check the bus cable, its termination, and what else 
 def operation_left_error(drive_name: str, statusword: int) -> DeviceError:
     """Return the error for a drive that has left operation enabled without a command.
 
-    Parameters
-    ----------
-    drive_name
-        Name of the drive, for messages.
-    statusword
-        Last statusword, which shows no fault; no emergency message explains it either.
+    The last statusword shows no fault, and no emergency message explains it either.
     """
     present_state = drive_state(statusword)
     transition_text = (
@@ -85,16 +80,9 @@ class TorqueFollowingCheck:
     the torque is compared with the last two commands. If the drive measures its torque, the torque
     follows the command with a first-order lag; the commands are then filtered by the same lag.
 
-    Parameters
-    ----------
-    name
-        Name of the drive, for messages.
-    tolerance_percent
-        Tolerance in percent of the rated torque; 0 disables the comparison.
-    response_s
-        Time constant of the lag in seconds; 0 for a drive that reports the commanded torque.
-    period_s
-        Time between two commands in seconds.
+    A tolerance of 0 disables the comparison; otherwise it is in percent of the rated torque.
+    `response_s` is the time constant of the lag; 0 for a drive that reports the commanded torque.
+    `period_s` is the time between two commands.
 
     Attributes
     ----------
@@ -178,12 +166,7 @@ class StopRequestedError(Exception):
 def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
     """Bring the drive to operation enabled; send RPDO, SYNC and heartbeat once a period.
 
-    Parameters
-    ----------
-    node
-        The drive's node.
-    stop
-        Called once a period; True aborts the transition.
+    `stop` is called once a period; True aborts the transition.
 
     Raises
     ------
@@ -227,11 +210,8 @@ def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
 def switch_off(node: Node) -> bool:
     """Zero the torque and disable the drive; return whether it is off. Never raises.
 
-    Returns
-    -------
-    bool
-        Whether the drive's statusword has shown that it is off. If not, the command to stop its
-        node has been sent.
+    The drive is off if its statusword has shown it. If not, the command to stop its node has been
+    sent.
     """
     if _switch_off_by_pdo(node):
         return True

@@ -66,25 +66,15 @@ _FIRST_FIRMWARE_WITH_DIAGNOSTICS = (3, 8)
 class AtiCanNode:
     """Simulated NETCANOEM box with a sensor, on the simulated CAN bus.
 
-    Parameters
-    ----------
-    rig
-        Parameters of the rig with a section ``ati_can``: base, serial number (FT12345 if empty) and
-        calibration.
-    simulated_rig
-        Simulated rig, whose sensor takes one reading per request.
-    send
-        Function that sends a reply with identifier and data.
-    log
-        Function that is called as ``log("sensor", what, **values)`` when the box is configured or
-        reset.
-    firmware
-        Major, minor and build number of the firmware; before 3.7 the box reports neither counts per
-        unit nor units.
-    calibrations
-        Indices of the calibrations in the box; None: only that of the profile.
-    counts_per_unit
-        Counts per N and per N·m; 1 000 000 each with a firmware before 3.7.
+    The profile needs a section ``ati_can``: base, serial number (FT12345 if empty) and calibration.
+    The sensor of the simulated rig takes one reading per request. `send` sends a reply with
+    identifier and data. ``log("sensor", what, **values)`` is called when the box is configured or
+    reset.
+
+    `firmware` is the major, minor and build number; before 3.7 the box reports neither counts per
+    unit nor units. `calibrations` are the indices of the calibrations in the box; None: only that
+    of the profile. `counts_per_unit` are the counts per N and per N·m; 1 000 000 each with a
+    firmware before 3.7.
 
     Attributes
     ----------

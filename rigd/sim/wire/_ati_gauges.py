@@ -45,14 +45,8 @@ class AtiGauges:
     """Six strain gauges that a wrench loads, and the matrix that computes it from their counts.
 
     The counts are ``round(M⁻¹ · (wrench · counts per unit)) + bias``, with the calibration matrix M
-    in single precision, as it is transmitted. They saturate at 16 bits.
-
-    Parameters
-    ----------
-    sensor
-        Sensor whose range determines the gauges' sensitivity.
-    counts_per_unit
-        Counts per N and per N·m, which scale the matrix.
+    in single precision, as it is transmitted. They saturate at 16 bits. The range of `sensor`
+    determines the gauges' sensitivity.
 
     Attributes
     ----------
@@ -93,18 +87,10 @@ class AtiGauges:
     def read(
         self, wrenches: Sequence[Wrench], saturated_gauge: int | None = None
     ) -> NDArray[np.int16]:
-        """Return the counts of gauges 0 to 5 under each wrench.
+        """Return the counts of gauges 0 to 5 under each wrench, shape (n, 6).
 
-        Parameters
-        ----------
-        wrenches
-            Wrenches: fx, fy, fz in N, tx, ty, tz in N·m.
-        saturated_gauge
-            Number of a gauge that reads ±32767, with the sign of its reading; or None.
-
-        Returns
-        -------
-        (n, 6) int16
+        A wrench is fx, fy, fz in N and tx, ty, tz in N·m. A saturated gauge reads ±32767, with the
+        sign of its reading.
         """
         gauge_counts: NDArray[np.float64] = np.array(wrenches) @ self._counts_per_wrench
         np.rint(gauge_counts, out=gauge_counts)

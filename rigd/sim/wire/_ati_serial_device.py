@@ -102,20 +102,11 @@ _unpack_register_range = Struct(">2H").unpack
 class AtiSerialDevice:
     """Simulated Digital F/T sensor at the end of a serial line.
 
-    Parameters
-    ----------
-    rig
-        Parameters of the rig with a section ``ati_serial``: serial number (FT12345 if empty),
-        number of the filled calibration block (the fifteen others read 0xFFFF), and the baud
-        register after power-up.
-    simulated_rig
-        Simulated rig, whose sensor measures. The stream sends the readings that the sensor has
-        taken in a period, and takes none itself.
-    write
-        Function that sends the bytes of an answer, or the records of one period.
-    log
-        Function that is called as ``log("sensor", what, **values)`` when the sensor is configured,
-        starts or stops.
+    The profile needs a section ``ati_serial``: serial number (FT12345 if empty), number of the
+    filled calibration block (the fifteen others read 0xFFFF), and the baud register after power-up.
+    The stream sends the readings that the sensor of the simulated rig has taken in a period, and
+    takes none itself. `write` sends the bytes of an answer, or the records of one period.
+    ``log("sensor", what, **values)`` is called when the sensor is configured, starts or stops.
 
     Attributes
     ----------
@@ -399,11 +390,8 @@ def _next_request(received_bytes: bytes) -> tuple[bytes | None, bytes]:
     Every byte that could be the address is tried. So noise before a request is skipped without
     loss, even noise that resembles the start of another request.
 
-    Returns
-    -------
-    request, rest
-        Request with its checksum, or None if there is none. Bytes after the request, or from the
-        first position at which a request may have begun.
+    The request includes its checksum and is None if there is none. The remaining bytes are those
+    after the request, or from the first position at which a request may have begun.
     """
     possible_start = len(received_bytes)
     request_start = received_bytes.find(_ADDRESS)

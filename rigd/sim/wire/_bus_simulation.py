@@ -49,14 +49,8 @@ class WallClock:
 
     A SYNC belongs to the nearest tick, at most half a period away. If none has arrived half a
     period after a tick, the tick passes without SYNC. The grid follows the mean phase of the last
-    SYNCs, so that it does not need to know when the host's loop started.
-
-    Parameters
-    ----------
-    period_ns
-        Duration of a period in nanoseconds.
-    now_ns
-        Time of tick 0 in nanoseconds, on a monotonic clock.
+    SYNCs, so that it does not need to know when the host's loop started. `now_ns` is the time of
+    tick 0 on a monotonic clock.
 
     Attributes
     ----------
@@ -108,14 +102,8 @@ class LockStep:
 
     The clock does not wait for ever. Five seconds after the last SYNC, or at once if no client is
     connected any more, time continues by the wall clock, so that a drive notices a dead host. Time
-    also runs by the wall clock before the first SYNC.
-
-    Parameters
-    ----------
-    period_ns
-        Duration of a period in nanoseconds.
-    now_ns
-        Present time in nanoseconds, on a monotonic clock.
+    also runs by the wall clock before the first SYNC. `now_ns` is the present time on a monotonic
+    clock.
     """
 
     is_idle = True
@@ -224,23 +212,11 @@ class _AttributeOverride:
 class BusSimulation:
     """Simulated rig with its lines, which transfers frames between host and nodes.
 
-    Parameters
-    ----------
-    rig, simulated_rig
-        Parameters of the rig, and simulated plant with its devices.
-    lock_step
-        Whether each SYNC advances the rig by one period, instead of wall time.
-    now_ns
-        Present time in nanoseconds, on a monotonic clock.
-    send
-        Function that sends a frame to the hosts on the CAN bus; its second argument is the host
-        that sent the frame, or None for a node.
-    write
-        Function that sends bytes to the host on the serial line.
-    cut, mend
-        Functions that interrupt and reconnect the "bus" or the line of the "sensor".
-    log
-        Log of the events, whose time this class sets.
+    In lock-step each SYNC advances the rig by one period, instead of wall time. `now_ns` is the
+    present time on a monotonic clock. `send` sends a frame to the hosts on the CAN bus; its second
+    argument is the host that sent the frame, or None for a node. `write` sends bytes to the host on
+    the serial line. `cut` and `mend` interrupt and reconnect the "bus" or the line of the "sensor".
+    This class sets the time of `log`.
 
     Attributes
     ----------

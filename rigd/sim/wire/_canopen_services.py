@@ -26,14 +26,8 @@ _ERROR_HISTORY_LENGTH = 8
 class EmergencyMessages:
     """Emergency messages of a node: active errors and error history.
 
-    Parameters
-    ----------
-    objects
-        Dictionary to which the objects 1001, 1003 and 1014 are added.
-    node_id
-        Node number.
-    send
-        Function that sends an emergency message with identifier and data.
+    The objects 1001, 1003 and 1014 are added to the dictionary `objects`. `send` sends an emergency
+    message with identifier and data.
 
     Attributes
     ----------
@@ -64,19 +58,8 @@ class EmergencyMessages:
     def report(self, error_code: int, register_bits: int, vendor_bytes: bytes = b"") -> bool:
         """Register an error and send its emergency message, unless the error is active already.
 
-        Parameters
-        ----------
-        error_code
-            Error code.
-        register_bits
-            Bits of the error in the error register; the generic bit is added.
-        vendor_bytes
-            Up to five vendor-specific bytes of the message.
-
-        Returns
-        -------
-        bool
-            Whether the error was not active before.
+        Return whether the error was not active before. The generic bit is added to the bits of the
+        error in the error register. There are up to five vendor-specific bytes.
         """
         if error_code in self.active_errors:
             return False
@@ -212,14 +195,8 @@ def add_heartbeat_monitors(
 ) -> list[HeartbeatMonitor]:
     """Add object 1016 to a dictionary, and return the heartbeat monitors of its entries.
 
-    Parameters
-    ----------
-    objects
-        Dictionary to which the object is added.
-    monitor_count
-        Number of nodes that can be monitored; with 0 the object is not added.
-    on_restart
-        Function that is called after an entry was set, which restarts its monitoring.
+    The object is not added if `monitor_count`, the number of nodes that can be monitored, is 0.
+    `on_restart` is called after an entry was set, which restarts its monitoring.
     """
     monitor_entries = {sub: Entry("I") for sub in range(1, monitor_count + 1)}
     monitors = [HeartbeatMonitor(monitor_entry) for monitor_entry in monitor_entries.values()]
@@ -276,23 +253,15 @@ def is_free_id(can_id: int) -> bool:
 class Pdo:
     """PDO of a node: its communication and mapping parameters.
 
-    Parameters
-    ----------
-    objects
-        Dictionary to which the parameters are added, and which contains the mapped objects.
-    communication, mapping
-        Indices of the parameters, such as 1400 and 1600.
-    direction
-        "r" (received) or "t" (transmitted), which the `Entry.mapping` of mapped objects must
-        contain.
-    cob_id
-        COB-ID at power-on, with or without `COB_ID_DISABLED_BIT`.
-    default_mapping
-        Mapping at power-on; each entry is index << 16 | sub-index << 8 | bits.
-    slots
-        Largest number of mapped objects.
-    on_change
-        Function that is called after identifier, type or mapping have changed.
+    The parameters are added to the dictionary `objects`, which contains the mapped objects.
+    `communication` and `mapping` are the indices of the parameters, such as 1400 and 1600.
+    `direction` is "r" (received) or "t" (transmitted), which the `Entry.mapping` of mapped objects
+    must contain.
+
+    `cob_id` and `default_mapping` are the values at power-on: the COB-ID with or without
+    `COB_ID_DISABLED_BIT`, and for each mapped object index << 16 | sub-index << 8 | bits. `slots`
+    is the largest number of mapped objects. `on_change` is called after identifier, type or mapping
+    have changed.
 
     Attributes
     ----------

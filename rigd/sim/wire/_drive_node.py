@@ -100,26 +100,16 @@ class DriveNode:
     The class is single-threaded: it acts only within `receive` and `tick`. It boots in the first of
     these calls.
 
-    Parameters
-    ----------
-    rig
-        Parameters of the rig with a section [cia402].
-    simulated_rig
-        Simulated rig whose plant the drive moves and measures.
-    advance
-        Function that advances the simulated rig to this SYNC. It is called at each valid SYNC, in
-        every state, frozen or not, because simulated time goes on.
-    send
-        Function that sends a frame with identifier and data.
-    log
-        Function that logs an event, with the source "drive", the event and values by name. It
-        records the torque: event "torque" with torque_nm and enabled at every change of either.
-    sync_timeout_s
-        Time in seconds without a SYNC after which a drive in operation goes to fault; by default
-        `SYNC_TIMEOUT_PERIODS` SYNC periods.
-    file
-        Device file of the drive to simulate. The drive then has exactly the objects of this file,
-        with their types, access rights, limits and values at power-on.
+    The profile needs a section [cia402]. The drive moves and measures the plant of `simulated_rig`.
+    `advance` advances the simulated rig to the present SYNC. It is called at each valid SYNC, in
+    every state, frozen or not, because simulated time goes on. `send` sends a frame with identifier
+    and data.
+    `log` logs an event, with the source "drive", the event and values by name. It records the
+    torque: event "torque" with torque_nm and enabled at every change of either.
+
+    `sync_timeout_s` is the time without a SYNC after which a drive in operation goes to fault; by
+    default `SYNC_TIMEOUT_PERIODS` SYNC periods. With a device file, the drive has exactly the
+    objects of this file, with their types, access rights, limits and values at power-on.
 
     Attributes
     ----------
@@ -271,10 +261,7 @@ class DriveNode:
     def tick(self, now_s: float) -> None:
         """Advance the simulated drive in time: watchdogs, heartbeat, ramps, event-driven PDOs.
 
-        Parameters
-        ----------
-        now_s
-            Simulated time in seconds; it advances by at most a millisecond per call.
+        Simulated time advances by at most a millisecond per call.
         """
         self._now_s = now_s
         if self._nmt is Nmt.INITIALISING:

@@ -69,18 +69,11 @@ _POWERED_STATES = (
 class PdsStateMachine:
     """State machine of the power drive system (CiA 402).
 
-    Parameters
-    ----------
-    quick_stop_option, fault_option
-        Entries of the objects 605A and 605E.
-    on_state_change
-        Function that is called after each change with the previous state; `state` is the new one.
-    may_switch_on
-        Function that returns whether the drive may leave switch on disabled.
-    may_enable
-        Function that returns whether operation may be enabled.
-    may_reset
-        Function that returns whether a fault may be reset, because no cause persists.
+    `quick_stop_option` and `fault_option` are the entries of the objects 605A and 605E.
+    `on_state_change` is called after each change with the previous state; `state` is the new one.
+    `may_switch_on` returns whether the drive may leave switch on disabled, `may_enable` whether
+    operation may be enabled, and `may_reset` whether a fault may be reset, because no cause
+    persists.
 
     Attributes
     ----------

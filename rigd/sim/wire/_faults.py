@@ -250,12 +250,8 @@ def parse_fault(spec: str) -> Fault:
 def disturbance_of(fault: Fault, now_s: float) -> Disturbance:
     """Return the obstacle or impact that a fault describes, beginning at `now_s`.
 
-    Parameters
-    ----------
-    fault
-        Fault of a kind in `DISTURBANCE_KINDS`.
-    now_s
-        Time in seconds since the drive was first enabled.
+    The fault is of a kind in `DISTURBANCE_KINDS`. `now_s` is the time since the drive was first
+    enabled.
     """
     assignments = [f"{key}={key_value}" for key, key_value in fault.values.items() if key != "for"]
     if fault.kind == "knock":
@@ -319,16 +315,8 @@ class _ActiveFault:
 class FaultyLine:
     """Line from one sender to all receivers, on which faults act.
 
-    Parameters
-    ----------
-    sender
-        Name of the sender, for the log.
-    deliver
-        Function that delivers a frame to the receivers.
-    postpone
-        Function that calls another function after a delay in seconds.
-    log
-        Function that logs each frame on which a fault acts.
+    The sender's name is for the log. `postpone` calls a function after a delay in seconds. `log`
+    logs each frame on which a fault acts.
     """
 
     def __init__(
@@ -417,12 +405,7 @@ _UNSHOWN_EVENTS = ("torque", "sdo write", *LINE_KINDS)
 class EventLog:
     """Log of events with simulated time, in a file of JSON lines and on the terminal.
 
-    Parameters
-    ----------
-    path
-        Path of the new file of JSON lines; None: no file.
-    quiet
-        Whether nothing is shown on the terminal.
+    `path` is a new file; None: no file. With `quiet` nothing is shown on the terminal.
 
     Attributes
     ----------

@@ -88,17 +88,9 @@ class _LinkConnection:
 class VirtualBus:
     """Simulated CAN bus on a Unix socket.
 
-    Parameters
-    ----------
-    path
-        Path of the socket.
-    handlers
-        Handlers of the event loop by file descriptor, which this class updates.
-    on_frames
-        Function that processes the frames that a client sends.
-    on_clients
-        Function that is called with a text and the number of clients when one connects or
-        disconnects.
+    This class updates `handlers`, the handlers of the event loop by file descriptor. `on_frames`
+    processes the frames that a client sends. `on_clients` is called with a text and the number of
+    clients when one connects or disconnects.
 
     Attributes
     ----------
@@ -208,12 +200,8 @@ class VirtualBus:
 class VirtualCan:
     """CAN bus that the kernel simulates (vcan).
 
-    Parameters
-    ----------
-    channel
-        Name of the interface.
-    handlers, on_frames
-        As for :class:`VirtualBus`.
+    `channel` is the name of the interface. `handlers` and `on_frames` are as for
+    :class:`VirtualBus`.
 
     Raises
     ------
@@ -397,14 +385,9 @@ class PtyLine:
     While the other end is not open, sent bytes are lost, as on a real line. A terminal with a
     closed end is always "readable", so it is polled from time to time instead.
 
-    Parameters
-    ----------
-    handlers
-        Handlers of the event loop by file descriptor, which this class updates.
-    on_bytes
-        Function that processes the bytes that the host sends.
-    on_open
-        Function that is called with True or False when the host opens or closes the port.
+    This class updates `handlers`, the handlers of the event loop by file descriptor. `on_bytes`
+    processes the bytes that the host sends. `on_open` is called with True or False when the host
+    opens or closes the port.
 
     Attributes
     ----------

@@ -92,7 +92,7 @@ class EntryDescription:
 class Entry:
     """One sub-index of an object: an integer, or bytes.
 
-    Parameters
+    Attributes
     ----------
     kind
         Letter of :mod:`struct` for the number ("b", "B", "h", "H", "i", "I", "q", "Q"), or "s" for
@@ -144,14 +144,9 @@ class Entry:
     def adopt_description(self, description: EntryDescription, default: int | None) -> None:
         """Take over type, access, mapping and limits from a device's file.
 
-        The functions that read the value, check it and react to it remain.
-
-        Parameters
-        ----------
-        description
-            Description in the file, which like this entry must be an integer's.
-        default
-            New value at power-on; None leaves it unchanged.
+        The entry must be an integer's, like its description in the file. The functions that read
+        the value, check it and react to it remain. `default` is the new value at power-on; None
+        leaves it unchanged.
         """
         if self.read_value is not None and description.kind != self.kind:
             self.read_value = partial(
@@ -279,14 +274,8 @@ class ObjectDictionary:
         """Restrict the dictionary to the entries in a device's file, with the file's descriptions.
 
         Entries that are integers in dictionary and file retain their functions. All other entries
-        of the file only store values.
-
-        Parameters
-        ----------
-        file
-            Descriptions in the file, by index and sub-index.
-        unchanged_indices
-            Indices whose values at power-on remain unchanged.
+        of the file only store values. The entries of `file` are by index and sub-index. Objects
+        with an index in `unchanged_indices` retain their values at power-on.
         """
         previous_entries, self._entries = self._entries, {}
         self._indices.clear()
@@ -401,15 +390,8 @@ _SEGMENT_SIZE = 7
 class SdoServer:
     """SDO server of a node, for one client.
 
-    Parameters
-    ----------
-    objects
-        Dictionary whose objects are read and written.
-    reply
-        Function that sends the eight bytes of a reply.
-    after_write
-        Function that is called after each write with index, sub-index and the value: an integer, or
-        bytes in hexadecimal.
+    `reply` sends the eight bytes of a reply. `after_write` is called after each write with index,
+    sub-index and the value: an integer, or bytes in hexadecimal.
     """
 
     def __init__(

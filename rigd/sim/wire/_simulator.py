@@ -145,14 +145,8 @@ _MAX_REQUEST_BYTES = 65_536
 class ControlSocket:
     """Unix socket on which other processes send requests, served by the event loop.
 
-    Parameters
-    ----------
-    path
-        Path of the Unix socket.
-    handlers
-        Handlers of the event loop by file descriptor, which this class updates.
-    answer
-        Function that returns the reply to a request.
+    This class updates `handlers`, the handlers of the event loop by file descriptor. `answer`
+    returns the reply to a request.
     """
 
     def __init__(self, path: Path, handlers: Handlers, answer: RequestHandler) -> None:
