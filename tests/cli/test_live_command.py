@@ -200,7 +200,7 @@ def test_view_is_found_through_the_daemon_without_its_file(
     assert rigd_here("live", "--web").returncode == 1
 
 
-def test_error_names_a_daemon_whose_view_has_not_begun(rigd_here, monkeypatch):
+def test_error_names_a_daemon_with_a_pending_view(rigd_here, monkeypatch):
     monkeypatch.setattr("rigd.daemon.client.daemons", lambda: {"sim": True})
     done = rigd_here("live")
     assert done.returncode == 1

@@ -42,7 +42,7 @@ def profile_from_answers(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("start_from", ["antenna_can", further("antenna_serial")])
 @pytest.mark.parametrize("name", [WITH_TORQUE[0], *map(further, WITH_TORQUE[1:])])
-def test_new_profile_loads_and_has_the_values_of_the_file(new_profile, tmp_path, name, start_from):
+def test_new_profile_has_the_values_of_the_file(new_profile, tmp_path, name, start_from):
     done = new_profile(eds_path(name), "--from", start_from)
     assert done.returncode == 0, done.stderr
     assert "my_rig.toml: written." in done.stdout
@@ -352,9 +352,7 @@ def test_copy_finds_the_eds_file_of_its_drive(rigd_here, user_folder, tmp_path):
     assert copy.rig.cia402.eds == str(tmp_path / "rig" / "drive.eds")
 
 
-def test_no_copy_under_another_name_if_the_text_cannot_be_changed(
-    rigd_here, user_folder, tmp_path, sim_toml
-):
+def test_no_renamed_copy_of_an_unusual_text(rigd_here, user_folder, tmp_path, sim_toml):
     (tmp_path / "odd.toml").write_text(sim_toml.replace('name = "sim"', '"name" = "sim"'))
     done = rigd_here("profiles", "copy", "odd.toml", "even")
     assert done.returncode == 2
@@ -362,7 +360,7 @@ def test_no_copy_under_another_name_if_the_text_cannot_be_changed(
     assert not user_folder.exists()
 
 
-def test_a_user_without_a_home_copies_into_the_working_folder(rigd_here, monkeypatch):
+def test_copy_into_the_working_folder_without_a_home(rigd_here, monkeypatch):
     def no_home():
         raise RuntimeError("Could not determine home directory.")
 

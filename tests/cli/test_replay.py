@@ -431,14 +431,16 @@ def test_error_if_the_start_time_is_too_late(write_session_file):
 
 @pytest.mark.further  # as the full disk of a session is
 def test_full_disk_is_reported_and_leaves_no_file(short_session, tmp_path):
-    def little_room():
+    def limit_file_size():
         resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 
-    done = run("replay", short_session, "--save", "out.rrd", cwd=tmp_path, preexec_fn=little_room)
+    done = run(
+        "replay", short_session, "--save", "out.rrd", cwd=tmp_path, preexec_fn=limit_file_size
+    )
     assert_error(done, 1, "out.rrd cannot be written: File too large")
     temporary = os.environ | {"TMPDIR": str(tmp_path)}
     done = run(
-        "replay", short_session, "--web", cwd=tmp_path, preexec_fn=little_room, env=temporary
+        "replay", short_session, "--web", cwd=tmp_path, preexec_fn=limit_file_size, env=temporary
     )
     assert_error(done, 1, ".rrd cannot be written: File too large")
     assert list(tmp_path.iterdir()) == []
@@ -589,15 +591,15 @@ def test_another_port_if_the_first_is_taken(rerun_program, recording, tmp_path, 
 
 
 @pytest.mark.further  # as tests/live/test_live_window.py
-@pytest.mark.parametrize("way", ["window", "browser"])
-def test_viewer_shows_the_recording(rerun_program, recording, tmp_path, way):
+@pytest.mark.parametrize("client_kind", ["window", "browser"])
+def test_viewer_shows_the_recording(rerun_program, recording, tmp_path, client_kind):
     """In Rerun's own viewer, without a screen: opened as the window is, and as browsers do."""
     from rerun.experimental import ViewerClient
 
     from rigd.live import FileWindow, PageOfFile, Viewer
 
     headless = ("--headless", "--window-size", "960x600")
-    if way == "window":
+    if client_kind == "window":
         program, page = FileWindow(recording, tmp_path, headless).program, None
     else:
         page = PageOfFile(recording, tmp_path)

@@ -472,7 +472,7 @@ def test_sessions_of_the_same_second_have_different_names(start_rigd, tmp_path):
 
 
 @pytest.mark.further  # as tests/session
-def test_file_name_that_is_no_text_is_stored_escaped(rigd, tmp_path):
+def test_undecodable_file_name_is_stored_escaped(rigd, tmp_path):
     name = os.fsdecode(b"f\xff.csv")
     (tmp_path / name).write_text("angle_rad\n" + "0.0\n" * 100)
     done = subprocess.run(

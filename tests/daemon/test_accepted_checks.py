@@ -80,7 +80,7 @@ def test_accept_is_a_list_of_short_names(accept):
         parse_request(json.dumps(line).encode())
 
 
-def test_unknown_values_are_a_fault_that_names_them(operate, profile):
+def test_fault_names_unknown_values(operate, profile):
     unknown = replace(profile.rig.motor, peak_torque_nm=nan)
     object.__setattr__(profile, "rig", replace(profile.rig, motor=unknown))
     operated = operate().open()

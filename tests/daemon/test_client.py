@@ -161,7 +161,7 @@ def test_unresponsive_daemon_gets_a_signal_without_claim_of_success(
 
 
 @pytest.mark.process
-def test_no_signal_to_a_process_that_does_not_handle_it(path, unresponsive_daemon, short_timeouts):
+def test_no_signal_to_a_process_without_handler(path, unresponsive_daemon, short_timeouts):
     process = unresponsive_daemon(handles=False)
     with pytest.raises(DaemonUnreachableError) as raised:
         stop_session(path)

@@ -123,7 +123,7 @@ def control_process():
     return next(process["pid"] for process in processes if process["name"] == "control")
 
 
-def test_commands_without_a_daemon_name_the_command_that_starts_one(runtime_folder, run_here):
+def test_commands_without_a_daemon_name_rigd_serve(runtime_folder, run_here):
     for command in (("status",), ("start", "hold")):
         code, out, err = run_here(*command)
         assert (code, out) == (1, "")
@@ -233,7 +233,7 @@ def test_a_record_is_fitted_while_it_is_recorded(serve, run_command, run_here):
     assert fit["text"][0] in out
 
 
-def test_session_survives_its_client_and_ends_with_a_stop_or_its_daemon(serve, stop_here, rigd):
+def test_session_ends_with_a_stop_or_its_daemon(serve, stop_here, rigd):
     daemon = serve()
     client = rigd("start", "hold", *LONG, "--repeat", "3")
     until(recording, daemon)

@@ -85,16 +85,16 @@ def make_machine(operate):
                 drive.offset_rad = 0.0
 
         def request(self, command, **fields):
-            before, seen = self.operated.state, len(self.operated.events)
-            answer = self.operated.request(command, **fields)
+            before, event_count = self.operated.state, len(self.operated.events)
+            reply = self.operated.request(command, **fields)
             self.settle()
-            states = [e for e in self.operated.events[seen:] if e["event"] == "state"]
+            states = [e for e in self.operated.events[event_count:] if e["event"] == "state"]
             if before == "fault" and command != "reset":
-                assert isinstance(answer, CommandError) or command == "stop"
+                assert isinstance(reply, CommandError) or command == "stop"
                 assert states == []
             if before != "fault":
                 assert all(event["from"] != "fault" for event in states)
-            return answer
+            return reply
 
         @rule(
             incident=st.sampled_from((None, *INCIDENTS)),
@@ -107,8 +107,8 @@ def make_machine(operate):
             highest = self.world.highest_nm
             self.world.highest_nm = 0.0
             ready = self.operated.state == "ready" and not self.operated.rig.zero_lost
-            answer = self.request("start", **sessions(ms / 1000), repeat=repeat)
-            assert isinstance(answer, CommandError) != ready
+            reply = self.request("start", **sessions(ms / 1000), repeat=repeat)
+            assert isinstance(reply, CommandError) != ready
             if not ready:
                 assert self.world.highest_nm == 0.0
             elif incident is None:
@@ -132,9 +132,9 @@ def make_machine(operate):
         def reset(self, absent):
             fault = self.operated.state == "fault"
             self.world.absent = absent
-            answer = self.request("reset")
+            reply = self.request("reset")
             self.world.absent = False
-            if isinstance(answer, CommandError):
+            if isinstance(reply, CommandError):
                 assert absent or not fault
             else:
                 assert self.operated.state == "ready"

@@ -51,7 +51,7 @@ def test_report_of_a_fit_is_bounded(reported_series):
     assert status_of_fit(reported_series, {}) == {}
 
 
-def test_each_fit_is_an_event_and_the_last_is_in_the_status(reported_series):
+def test_fits_in_events_and_status(reported_series):
     series, reporter, events = reported_series
     assert series.as_document()["fit"] is None
     row = LogEvent(0, "info", "  8.0 s 0.910 ± 0.010 %", notable=True)

@@ -37,9 +37,9 @@ def start(program):
     )
 
 
-def test_no_wait_for_a_terminal_that_reads_nothing():
+def test_no_wait_for_an_unread_terminal():
     process = start(FLOOD)
-    assert process.stdout.read() == "through\n"  # and nobody reads the log
+    assert process.stdout.read() == "through\n"  # although the log is not read
     assert process.wait(300.0) == 0
     process.communicate()
 

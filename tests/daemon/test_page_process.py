@@ -77,7 +77,7 @@ def test_user_finds_the_page_until_the_daemon_ends(serve, runtime_folder):
     assert not file.exists()
 
 
-def test_killed_page_restarts_at_its_address_a_limited_number_of_times(serve, monkeypatch):
+def test_restarts_of_a_killed_page_are_limited(serve, monkeypatch):
     monkeypatch.setattr(_page, "PAGE", replace(PAGE, restarts=1))
     page = serve()
     address = wait_for_address()

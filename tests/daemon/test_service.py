@@ -91,7 +91,7 @@ def test_file_has_specimen_metadata_and_predictions(operated, tmp_path, monkeypa
 
 
 @pytest.mark.further  # as tests/excitation/test_move_sessions.py
-def test_move_starts_at_the_current_angle_and_stays_at_its_end(operated):
+def test_move_from_the_current_angle(operated):
     brief = {"rest_s": 0.1, "ring_down_s": 0.1}
     reply = operated.request("start", excitation="move", parameters={"angle_rad": 0.05, **brief})
     assert "to 0.05 rad" in reply["plan"]["sweep"]
@@ -198,7 +198,7 @@ def test_only_reset_leaves_a_fault(operated):
     assert operated.last["sessions"][0]["outcome"] == "complete"
 
 
-def test_limit_violation_is_a_fault_and_reset_retains_the_zero(operated):
+def test_reset_after_a_limit_violation_retains_the_zero(operated):
     operated.request("zero")
     operated.world.countdown, operated.world.then = 500, fall_silent
     operated.request("start", **SHORT)
@@ -300,7 +300,7 @@ def test_fault_after_a_stop_request_is_a_fault(operated):
     assert operated.last["sessions"][0]["outcome"] == "fault"
 
 
-def test_death_of_the_recorder_is_reported_with_the_stored_part(operated):
+def test_report_of_a_dead_recorder_names_the_partial_file(operated):
     operated.world.countdown = 1500
     operated.world.then = lambda _: operated.rig._group.recorder.kill()
     operated.request("start", excitation="hold", parameters={"duration_s": 5.0})
@@ -418,7 +418,7 @@ def test_request_waits_for_the_connection_of_the_devices(operate):
     assert operated.state == "ready"
 
 
-def test_stop_cancels_a_start_that_waits_for_devices(operate):
+def test_stop_cancels_a_waiting_start(operate):
     operated = operate()
     line = json.dumps({"command": "start", **SHORT}).encode()
 

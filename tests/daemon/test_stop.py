@@ -179,7 +179,7 @@ OTHER = os.getuid() + 1
             RUN,
             {"ignored_signals": 1 << STOP_SIGNAL - 1, "handled_signals": 0},
             None,
-        ),  # a quick look is left
+        ),  # only a quick look remains
         (("python3", "-m", "rigd", "identify", "motor"), {}, STOP_SIGNAL),
         (
             ("python3", "rigd", "identify", "motor", "--from", "a.mcap"),
@@ -208,7 +208,7 @@ def test_only_processes_with_sessions_get_a_signal(
 
 
 @pytest.mark.process
-def test_no_signal_to_a_process_named_by_a_forged_command_line(stop_here, bystander):
+def test_no_signal_by_a_forged_command_line(stop_here, bystander):
     process, row = bystander
     forged = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE, text=True)
     try:
@@ -224,7 +224,7 @@ def test_no_signal_to_a_process_named_by_a_forged_command_line(stop_here, bystan
 
 
 @pytest.mark.process
-@pytest.mark.further  # as in this process, from other users and environments; benchmarks/bench_stop
+@pytest.mark.further  # as in this process, for other users and environments; benchmarks/bench_stop
 @pytest.mark.parametrize("situation", SITUATIONS)
 def test_stop_from_other_users_and_environments(situation):
     if not can_isolate():

@@ -148,7 +148,7 @@ def test_invalid_addresses_are_ignored(address, wrong):
 
 
 @pytest.mark.parametrize("text", [b"", b"[" * 100_000, b"[1]", b"7", b"\xff", b" " * 10_000])
-def test_files_that_are_no_documents_are_ignored(address, text):
+def test_invalid_documents_are_ignored(address, text):
     announce(address)
     (file,) = files()
     file.write_bytes(text)

@@ -72,12 +72,12 @@ def test_overwritten_samples_are_counted(start_producer):
     shown.queue_new_records()
     # An observer reads half of a ring.
     assert producer.dropped == producer.tick - 500
-    seen = producer.channels.shared_state[StateField.LIVE_SAMPLES_SEEN]
-    assert seen == producer.tick - 500  # the others wait to be sent
+    seen_count = producer.channels.shared_state[StateField.LIVE_SAMPLES_SEEN]
+    assert seen_count == producer.tick - 500  # the others wait to be sent
     assert producer.refused == 0
 
 
-def test_health_of_the_shared_state_in_units_of_the_view(channels):
+def test_health_in_units_of_the_view(channels):
     shared_state = channels.shared_state
     for word, value in {
         StateField.GO: 1,

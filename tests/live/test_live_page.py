@@ -14,7 +14,7 @@ from rigd.live._page import ViewerPageServer, confine_to_loopback
 pytestmark = pytest.mark.process
 
 
-def test_page_has_the_viewer_and_loads_only_from_this_computer(received):
+def test_page_loads_only_from_this_computer(received):
     address, answers = received["address"], received["page"]
     answer, _ = answers["/"]
     assert answer.status == 302

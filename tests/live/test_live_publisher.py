@@ -180,7 +180,7 @@ def test_publisher_remains_for_the_requested_time(start_publisher):
 
 
 @pytest.mark.further  # as when killed
-def test_publisher_ends_with_its_parent_though_its_input_is_open(producer, send, receive_message):
+def test_publisher_ends_with_its_parent(producer, send, receive_message):
     middle = subprocess.Popen(
         [
             sys.executable,

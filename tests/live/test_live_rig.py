@@ -70,7 +70,7 @@ def run(rig, order):
     return run
 
 
-def test_view_of_a_series_has_every_sample_and_is_restarted(rig, run, save):
+def test_view_of_a_series_is_complete_and_restarted(rig, run, save):
     first, (message, *_) = run("first")
     view = rig.status().live_view
     assert message == f"Live view: {view.viewer_url}"
@@ -219,7 +219,7 @@ def test_starting_view_has_a_longer_timeout(is_ready, timeout_s):
     assert group.silent_s == pytest.approx(timeout_s, abs=0.5)
 
 
-def test_stop_is_not_delayed_by_a_view_that_does_not_begin(order):
+def test_stop_is_not_delayed_by_a_missing_view(order):
     group, stop, polls = IdleGroup(), StopRequest(), []
 
     def poll():

@@ -57,8 +57,8 @@ def test_viewer_follows_the_newest_samples_and_another_server(publisher, viewer,
     os.kill(publisher.server_pid, signal.SIGKILL)
     address = publisher.next_address()
     assert eventually(lambda: viewer.connect(address)), "while it is busy, it is asked again"
-    then_s = publisher.producer.tick * 1e-3
-    assert eventually(lambda: shown_s() > then_s)
+    before_s = publisher.producer.tick * 1e-3
+    assert eventually(lambda: shown_s() > before_s)
     assert eventually(current)
     assert publisher.producer.refused == 0
 

@@ -171,7 +171,7 @@ def test_flagged_value_is_not_reached(bench):
 
 
 @pytest.mark.further  # as one never certain
-def test_search_gives_up_on_a_doubtful_record_with_its_findings(bench):
+def test_search_gives_up_on_a_doubtful_record(bench):
     ends = []
     while not ends:
         messages = bench.plan(ON_THE_WAY, flag="part of the record is unexplained")
@@ -207,7 +207,7 @@ def test_ticks_held_after_a_segment_do_not_shift_it(bench, insufficient_segments
     assert segments["piece_2"][0] == end - 1700 + 2050
 
 
-def test_planned_segment_that_did_not_begin_is_omitted(bench, insufficient_segments):
+def test_planned_segment_without_a_start_is_omitted(bench, insufficient_segments):
     assert bench.search.has_last_segment_begun(0)
     bench.plan(ON_THE_WAY)
     due_tick = bench.search.due_tick
@@ -227,7 +227,7 @@ def test_scan_without_information_is_repeated_then_given_up(bench):
     assert (end.reached, end.reason) == (False, "Given up: Nothing is excited yet.")
 
 
-def test_search_gives_up_at_once_if_no_fit_is_possible(bench, insufficient_segments):
+def test_search_gives_up_without_a_possible_fit(bench, insufficient_segments):
     bench.plan(ON_THE_WAY)
     (end,) = bench.problem("The angle is missing for 16 ms.")
     assert (end.reached, end.reason) == (False, "Given up: The angle is missing for 16 ms.")
@@ -306,7 +306,7 @@ def test_flagged_target_is_never_reached(profile, sufficient_segments):
     assert "damping of mode 2: part of the record is unexplained" in ends[0].reason
 
 
-def test_modes_of_a_nonuniform_beam_are_excited_at_their_frequencies(profile):
+def test_excitation_of_modes_of_a_nonuniform_beam(profile):
     """Each mode has its own stiffness, and the design drives it at its frequency."""
     bench = SearchBench(profile, "damping 2:0.1%", at_most_s=40.0)
     document = answer(profile, bench.search.due_tick, ON_THE_WAY)

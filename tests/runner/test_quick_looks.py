@@ -159,7 +159,7 @@ def test_processor_use_of_a_process():
         idle.kill()
 
 
-def test_no_wait_for_the_end_of_a_killed_quick_look(queue, tmp_path, monkeypatch):
+def test_no_wait_for_a_killed_quick_look(queue, tmp_path, monkeypatch):
     monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.05)
     # As on a busy computer, it does not end in time; the timer kills it if the test fails.
     monkeypatch.setattr(ChildProcess, "kill", lambda _: None)

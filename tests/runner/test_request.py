@@ -23,7 +23,7 @@ def metadata_of():
     return make
 
 
-def test_serial_number_of_a_sensor_that_has_one(metadata_of):
+def test_serial_number_of_the_sensor_if_known(metadata_of):
     assert metadata_of({"serial_number": "FT12345"})["sensor_serial_number"] == "FT12345"
     assert "sensor_serial_number" not in metadata_of({"device": "simulated force-torque sensor"})
 

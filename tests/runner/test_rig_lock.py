@@ -9,7 +9,7 @@ import pytest
 from rigd.runtime.locks import RigBusyError, RigLock
 
 
-def test_error_names_the_program_that_has_the_rig(runtime_folder):
+def test_error_names_the_holder_of_the_rig(runtime_folder):
     with RigLock("antenna", "rigd serve", hardware=False):
         with pytest.raises(RigBusyError, match=rf"rigd serve, process {os.getpid()}"):
             RigLock("antenna", "rigd run", hardware=False).acquire()

@@ -154,7 +154,7 @@ class FakeQuickLookQueue:
 
 
 @pytest.mark.process
-def test_quick_look_is_suspended_in_a_session_and_awaited_between_two(make_series):
+def test_quick_look_is_suspended_during_a_session(make_series):
     listener = RecordingListener()
 
     class WatchedRig(Rig):

@@ -98,7 +98,7 @@ def test_ticks_missed_between_two_reads_are_in_the_second(reader, channels):
     assert (block.first_tick, block.count) == (9000, 10)
 
 
-def test_new_record_starts_a_new_block_and_long_blocks_are_split(reader, channels):
+def test_new_records_and_long_blocks_are_separate_blocks(reader, channels):
     put(channels, [5, 6, 7])
     put(channels, range(3000))
     blocks = reader.take(channels)
@@ -115,7 +115,7 @@ def test_no_old_samples_after_a_pause(reader, channels, clock):
     assert block.first_tick == 100
 
 
-def test_gauges_ten_times_a_second_have_the_peaks_of_all_ticks(reader, channels, clock):
+def test_gauges_have_the_peaks_of_all_ticks(reader, channels, clock):
     angles_rad = []
     for first in range(0, 200, 50):
         put(channels, range(first, first + 50), 0.3 if first == 50 else 0.1)

@@ -44,7 +44,7 @@ def test_stop_does_not_wait_for_the_touch_process():
 @pytest.mark.parametrize(
     ("messages", "words"), [([TouchReady()], []), ([], ["was not ready within 0 s. Touches are"])]
 )
-def test_session_waits_until_the_touch_process_is_ready_or_late(monkeypatch, messages, words):
+def test_session_waits_for_the_touch_process(monkeypatch, messages, words):
     monkeypatch.setattr(TouchClient, "worker", replace(TOUCH, start_timeout_s=0.0))
     touches = make_client(lambda _: messages)
     touches.await_ready(lambda: True)

@@ -40,7 +40,7 @@ def test_description_of_hardware_and_simulation(profile, runtime_folder):
 
 
 @pytest.mark.process
-def test_no_hardware_motion_with_a_simulated_rig_elsewhere(
+def test_no_hardware_motion_with_a_simulation_elsewhere(
     profile, start_simulator, runtime_folder, monkeypatch, tmp_path
 ):
     """As with sudo, cron or ssh, which have another runtime folder or none."""
@@ -55,7 +55,7 @@ def test_no_hardware_motion_with_a_simulated_rig_elsewhere(
     assert load_rig(profile)[1] is ActuationTarget.HARDWARE
 
 
-def test_no_hardware_motion_with_a_simulated_rig_of_another_user(profile, runtime_folder):
+def test_no_hardware_motion_with_a_simulation_of_another_user(profile, runtime_folder):
     name = profile.stem
     with listening(runtime_folder / "elsewhere" / f"{name}.control") as path:
         if os.getuid():

@@ -288,7 +288,7 @@ def test_other_pages_cannot_read_the_live_signals(served, headers):
     assert status == 403
 
 
-def test_page_that_sends_a_frame_is_disconnected(served):
+def test_page_is_disconnected_if_it_sends_a_frame(served):
     lines = [f"GET /api/live HTTP/1.1\r\nHost: 127.0.0.1:{served.port}"]
     lines += [f"{name}: {value}" for name, value in handshake().items()]
     # A frame of 16 MB, according to its head.

@@ -187,7 +187,7 @@ def state_of(pid):
         return "gone"
 
 
-def test_job_is_suspended_during_a_session_and_has_low_priority(jobs, tmp_path):
+def test_job_is_suspended_during_a_session(jobs, tmp_path):
     program = (
         "import os, pathlib, time\n"
         "while os.sched_getscheduler(0) != os.SCHED_IDLE: time.sleep(0.01)\n"
@@ -279,8 +279,8 @@ def test_job_ends_with_the_page(tmp_path, state, end):
             page.kill()
         page.communicate(timeout=60.0)
         # Workers that run detect the end of their parent themselves.
-        gone = pids if state == "suspended" else pids[:1]
-        assert eventually(lambda: {state_of(pid) for pid in gone} <= {"Z", "gone"}, within_s=10.0)
+        ended = pids if state == "suspended" else pids[:1]
+        assert eventually(lambda: {state_of(pid) for pid in ended} <= {"Z", "gone"}, within_s=10.0)
     finally:
         page.kill()
         page.wait()
@@ -315,7 +315,7 @@ def test_number_of_waiting_jobs_is_limited(jobs):
     run(jobs, scenario)
 
 
-def test_a_report_and_a_campaign_are_queued_with_the_token(
+def test_report_and_campaign_are_queued_with_the_token(
     served, two_sessions, monkeypatch, run_instead
 ):
     run_instead("pass")

@@ -266,7 +266,7 @@ def test_lost_daemon_is_reported_within_a_second(served, pages):
     assert gone_s < 1.0
 
 
-def test_only_a_page_that_does_not_read_is_dropped(served, pages, replace_in_page):
+def test_only_the_stalled_page_is_dropped(served, pages, replace_in_page):
     replace_in_page(most_waiting=20)
     stopped = served.connect()
     stopped.sendall(
@@ -369,14 +369,14 @@ def end_series(served, series):
 
 @pytest.mark.usefixtures("cleared_daemon")
 def test_started_session_has_control_until_its_series_ends(served, pages):
-    held = []
+    connections = []
 
     async def scenario(session):
         async with open_live_page(served, session) as (socket, following):
             served.daemon.replies["start"] = {"series": 1}
             await command(session, command="start", excitation="chirp")
             await command(session, command="reset")
-            held.append(served.daemon.connected - {following})
+            connections.append(served.daemon.connected - {following})
             end_series(served, 1)
             await until(socket, "series")
             while served.daemon.connected != {following}:
@@ -385,7 +385,7 @@ def test_started_session_has_control_until_its_series_ends(served, pages):
             return following
 
     following = pages.run(scenario)
-    assert [len(each) for each in held] == [1]
+    assert [len(each) for each in connections] == [1]
     assert eventually(lambda: served.daemon.connected == {following})
 
 
@@ -404,7 +404,7 @@ def test_request_is_sent_once_if_a_series_ends_meanwhile(served, pages, delay_re
             await until(socket, "series")
             release()
             answer = await starting
-            # The new series keeps control, until it ends.
+            # The new series has control until it ends.
             holding = served.daemon.connected - {following}
             end_series(served, 2)
             await until(socket, "series")
@@ -437,7 +437,7 @@ def test_request_with_lost_reply_is_not_repeated(served, pages, delay_reply):
 
 
 @pytest.mark.usefixtures("cleared_daemon")
-def test_control_is_released_if_the_series_ends_before_its_reply(served, pages, delay_reply):
+def test_control_is_released_if_the_series_ends_early(served, pages, delay_reply):
     served.daemon.replies["start"] = {"series": 1}
 
     async def scenario(session):
@@ -480,8 +480,8 @@ def test_stop_does_not_wait_for_lists_of_sessions(served, pages, replace_in_page
             for answer in await asyncio.gather(*listings):
                 answer.release()
 
-    together, (status, _) = pages.run(scenario)
-    assert (together, status) == (1, 200)
+    concurrent, (status, _) = pages.run(scenario)
+    assert (concurrent, status) == (1, 200)
 
 
 @pytest.mark.usefixtures("cleared_daemon")

@@ -52,7 +52,7 @@ STATES = [
 ]
 
 
-def test_each_state_and_a_failed_stop_are_shown_within_a_second(server, page, open_page):
+def test_states_and_failed_stops_are_shown_within_a_second(server, page, open_page):
     for message, word, reason, tone in STATES:
         server.send(message)
         expect_text(page, "#state-word", word)
@@ -168,7 +168,7 @@ def test_without_the_token_the_page_can_only_read_and_stop(server, open_page):
 
 
 @pytest.mark.further
-def test_the_token_stays_with_the_tab_and_leaves_the_address(page, server):
+def test_token_stays_in_the_tab_but_not_the_address(page, server):
     assert TOKEN not in page.url
     page.reload()
     expect(page.locator("#state-word")).to_have_text("READY")
