@@ -150,7 +150,7 @@ session.with_suffix(".look.json").write_text(json.dumps(look))
 
 
 @pytest.fixture
-def brief_looks(tmp_path_factory, monkeypatch):
+def brief_quick_looks(tmp_path_factory, monkeypatch):
     """Have quick looks made, by a program that takes no time; returns its file, to be changed."""
     folder = tmp_path_factory.mktemp("brief") / "analysis"
     folder.mkdir()

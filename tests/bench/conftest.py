@@ -1,4 +1,4 @@
-"""Measurements made up by the tests, and a programme whose loop and cyclictest stand in."""
+"""Fake measurements, and a benchmark with a fake loop and a fake cyclictest."""
 
 from types import SimpleNamespace
 
@@ -26,29 +26,29 @@ GRANTED = {"memory": "locked", "cpu": "0", "scheduling": "SCHED_FIFO 80"}
 
 
 CYCLICTEST = """#!/bin/sh
-echo "$@" >> "$0.asked"
-cat "$0.fails" >&2 && exit 1
-cat "$0.says"
+echo "$@" >> "$0.calls"
+cat "$0.errors" >&2 && exit 1
+cat "$0.output"
 """
-"""Says what the test has written beside it, or fails with what the test has written."""
+"""Prints the output or fails with the errors that the test has written next to it."""
 
 
 @pytest.fixture
 def cyclictest(tmp_path, monkeypatch):
-    """A program in the place of cyclictest, which measures 10 µs at each of 1000 wake-ups."""
+    """A fake cyclictest, which measures 10 µs at each of 1000 wake-ups."""
     program = tmp_path / "cyclictest"
     program.write_text(CYCLICTEST)
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    told = {name: program.with_suffix(f".{name}") for name in ("asked", "fails", "says")}
-    made = SimpleNamespace(program=program, **told)
-    made.says.write_text("000010 001000\n")
+    paths = {name: program.with_suffix(f".{name}") for name in ("calls", "errors", "output")}
+    made = SimpleNamespace(program=program, **paths)
+    made.output.write_text("000010 001000\n")
     return made
 
 
 @pytest.fixture
 def computer(monkeypatch, measured, cyclictest):
-    """Stands in for the loop: holds rates up to one, and notes what it ran."""
+    """A fake loop, which holds rates up to a limit and records its calls."""
 
     class Computer:
         holds_hz = 4000.0
@@ -59,11 +59,11 @@ def computer(monkeypatch, measured, cyclictest):
             self.ran = []
             self.profiles = []
 
-        def loop(self, name, profile, seconds, look, *, live=False):
+        def loop(self, name, profile, seconds, poll, *, live=False):
             rate_hz = profile.rig.rate_hz
             self.ran.append((name, rate_hz, live))
             self.profiles.append(profile)
-            look()
+            poll()
             holds = rate_hz <= self.holds_hz
             if holds and self.unlucky:
                 self.unlucky -= 1
@@ -79,7 +79,7 @@ def computer(monkeypatch, measured, cyclictest):
 
 @pytest.fixture
 def bench(computer):
-    told = []
+    progress = []
 
     def run(rate_hz=1000.0):
         program = Bench(
@@ -87,9 +87,9 @@ def bench(computer):
             rate_hz=rate_hz,
             seconds=10.0,
             spin_us=0.0,
-            on_progress=lambda what, left_s: told.append((what, left_s)),
+            on_progress=lambda step, left_s: progress.append((step, left_s)),
         )
         return program.run()
 
-    run.told = told
+    run.progress = progress
     return run

@@ -1,4 +1,4 @@
-"""``rigd bench`` as the operator calls it."""
+"""``rigd bench`` from the command line."""
 
 import json
 
@@ -13,14 +13,14 @@ from rigd.runtime.locks import RigLock
 
 @pytest.fixture
 def bench(monkeypatch, measured):
-    """The command, with results made up."""
-    asked = []
+    """The command, with fake results."""
+    calls = []
 
-    class MadeUp:
+    class FakeBench:
         fails = ""
 
         def __init__(self, profile, **options):
-            asked.append((profile.name, options))
+            calls.append((profile.name, options))
             self.profile = profile
 
         def run(self):
@@ -32,13 +32,13 @@ def bench(monkeypatch, measured):
             results.search.append(measured())
             return results
 
-    monkeypatch.setattr("rigd.bench.Bench", MadeUp)
+    monkeypatch.setattr("rigd.bench.Bench", FakeBench)
     made = CliRunner()
 
     def run(*arguments):
         return made.invoke(app, ["bench", *arguments])
 
-    run.asked, run.made_up = asked, MadeUp
+    run.calls, run.fake_bench = calls, FakeBench
     return run
 
 
@@ -46,34 +46,34 @@ def test_the_report_ends_with_a_verdict(bench):
     done = bench("--rate", "2000", "--seconds", "5", "--spin-us", "50")
     assert done.exit_code == 0, done.output
     assert done.stdout.splitlines()[-1].startswith("This computer holds 1000 Hz")
-    ((name, options),) = bench.asked
+    ((name, options),) = bench.calls
     assert name == "sim"
     assert (options["rate_hz"], options["seconds"], options["spin_us"]) == (2000.0, 5.0, 50.0)
 
 
-def test_a_document_is_all_there_is_on_standard_output(bench):
+def test_standard_output_is_only_the_document(bench):
     done = bench("--json")
     assert json.loads(done.stdout)["highest_rate_hz"] == 1000.0
 
 
 def test_a_failure_is_one_sentence(bench):
-    bench.made_up.fails = "There is no shared memory."
+    bench.fake_bench.fails = "There is no shared memory."
     done = bench()
     assert done.exit_code == 1
     assert "Error: There is no shared memory." in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_it_does_not_run_beside_a_session(bench):
+def test_bench_is_refused_during_a_session(bench):
     with RigLock("sim", "rigd run", hardware=False):
         done = bench()
     assert done.exit_code == 1
     assert "in use" in done.stderr
-    assert not bench.asked
+    assert not bench.calls
 
 
 @pytest.mark.parametrize("wrong", [("--rate", "20"), ("--seconds", "0"), ("--profile", "nobody")])
 def test_wrong_use_is_refused(bench, wrong):
     done = bench(*wrong)
     assert done.exit_code == 2
-    assert not bench.asked
+    assert not bench.calls

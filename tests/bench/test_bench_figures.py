@@ -1,4 +1,4 @@
-"""From samples and the kernel's accounts to figures and a histogram."""
+"""Statistics and a histogram from samples and the kernel's accounting."""
 
 import mmap
 import os
@@ -30,7 +30,7 @@ def samples(ticks, lateness_ns, work_ns=1000):
     return made
 
 
-def test_a_wake_up_after_missed_ticks_is_late_by_them_too():
+def test_latency_of_a_wake_up_includes_missed_ticks():
     late_us = wake_ups_us(samples([0, 1, 5, 6], [10_000, 20_000, 300_000, 0]), 1000.0)
     np.testing.assert_allclose(late_us, [10.0, 20.0, 3300.0, 0.0])
 
@@ -46,7 +46,7 @@ def test_scheduled_ticks_are_recorded_or_missed():
     assert (found.missed, found.held) == (7, pytest.approx(0.3))
 
 
-def test_ticks_that_pass_in_a_stall_are_told_apart():
+def test_ticks_missed_in_a_stall_are_counted_separately():
     ticks = [0, 1, 32, 33, 35, 36]
     found = record_measurement(
         "a",
@@ -67,7 +67,7 @@ def test_percentiles_are_numpys():
     assert astuple(found) == pytest.approx((500.0, 900.0, 990.0, 999.0, 1000.0))
 
 
-def test_rounds_together_count_every_tick(measured):
+def test_pooled_rounds_count_every_tick(measured):
     both = pool_measurements("both", [measured(held=0.5, cpu=4.0), measured(cpu=6.0)])
     assert (both.scheduled, both.missed) == (3000, 1000)
     assert both.lateness_us.size == 2000
@@ -75,7 +75,7 @@ def test_rounds_together_count_every_tick(measured):
 
 
 def results_of(*measurements):
-    """Results with one round for each measurement, which is its cyclictest as well."""
+    """Return results with one round for each measurement, which is also its cyclictest."""
     rounds = [(one, replace(one, name="cyclictest")) for one in measurements]
     first = measurements[0]
     made = Results("sim", 1000.0, 1.0, 0.0, {"cpu": "0"}, (0.5, 0.4, 0.3), rounds=rounds)
@@ -100,7 +100,7 @@ def test_every_delay_is_in_one_bin(delays_us):
         assert count == sum(low <= delay < high for delay in delays_us)
 
 
-def test_the_histogram_shows_what_is_rare_and_leaves_out_what_is_empty():
+def test_histogram_shows_rare_delays_and_omits_empty_bins():
     ours, theirs = loop_of([30.0] * 9999 + [700.0]), loop_of([12.0] * 100, "cyclictest")
     results = results_of(ours)
     results.rounds = [(ours, theirs)]
@@ -115,7 +115,7 @@ def test_the_histogram_shows_what_is_rare_and_leaves_out_what_is_empty():
     assert len(lines) == 1 + 6
 
 
-def test_the_account_of_a_process_is_read_whatever_its_name(tmp_path):
+def test_process_usage_with_special_characters_in_the_name(tmp_path):
     folder = tmp_path / "42"
     folder.mkdir()
     (folder / "stat").write_text("42 (a) b (c) S 1 2 3 4 5 6 700 8 11 10 1 2 3\n")
@@ -124,7 +124,7 @@ def test_the_account_of_a_process_is_read_whatever_its_name(tmp_path):
     assert (usage.cpu_s, usage.page_faults) == (2.5, 711)
 
 
-def test_usage_is_taken_between_looks_at_a_running_record():
+def test_usage_is_that_of_the_running_record():
     meter = UsageMeter(os.getpid())
     meter.sample(Phase.TARING)
     assert meter.cpu_percent is None
@@ -141,7 +141,7 @@ def test_usage_is_taken_between_looks_at_a_running_record():
     assert meter.page_faults == faults
 
 
-def test_a_process_that_is_gone_leaves_no_usage(monkeypatch):
+def test_no_usage_of_an_ended_process(monkeypatch):
     monkeypatch.setattr(
         "rigd.bench.measure.process_usage", lambda pid: process_usage(pid, Path("/nowhere"))
     )

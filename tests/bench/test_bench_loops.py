@@ -1,4 +1,4 @@
-"""The loop is measured in the processes of a real session, for as short as it can be."""
+"""The loop is measured in the processes of a real session, as short as possible."""
 
 import os
 from contextlib import nullcontext
@@ -30,26 +30,26 @@ def assert_accounted(found):
 
 
 def raised_priority():
-    policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK  # which nobody can take back
+    policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK  # which cannot be reset
     return policy, os.getpriority(os.PRIO_PROCESS, 0), os.sched_getaffinity(0)
 
 
 @pytest.mark.further  # as one with a file
-def test_the_loop_alone_is_measured_without_a_file(profile):
-    looks = []
+def test_loop_alone_is_measured_without_a_file(profile):
+    polls = []
     before = raised_priority()
-    assert_accounted(loops.run_alone("alone", profile, SECONDS, lambda: looks.append(1)))
-    assert looks
+    assert_accounted(loops.run_alone("alone", profile, SECONDS, lambda: polls.append(1)))
+    assert polls
     assert raised_priority() == before
 
 
-def test_a_session_is_measured_and_its_file_goes(profile, tmp_path, monkeypatch):
+def test_session_is_measured_and_its_file_removed(profile, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert_accounted(loops.run_session("session", profile, SECONDS, lambda: None))
     assert not list(tmp_path.glob("rigd-bench-*"))
 
 
-def test_a_loop_that_fails_is_told(profile, monkeypatch):
+def test_failure_of_a_loop_is_reported(profile, monkeypatch):
     def no_memory(**_):
         raise OSError("no shared memory")
 
@@ -58,7 +58,7 @@ def test_a_loop_that_fails_is_told(profile, monkeypatch):
         loops.run_alone("alone", profile, SECONDS, lambda: None)
 
 
-def test_a_session_that_is_not_complete_is_no_measurement(profile, monkeypatch):
+def test_incomplete_session_is_no_measurement(profile, monkeypatch):
     reason = "The drive does not answer."
     result = SessionResult(None, "fault", reason, 150, 10, 0, 0, 0, fault=True)
     rig = SimpleNamespace(run=lambda *_: result)
@@ -70,7 +70,7 @@ def test_a_session_that_is_not_complete_is_no_measurement(profile, monkeypatch):
         loops.run_session("session", profile, SECONDS, lambda: None)
 
 
-def test_the_stranger_is_gone_afterwards():
+def test_busy_program_is_ended():
     with loops.busy_program(os.sched_getaffinity(0)) as pid:
         assert Path(f"/proc/{pid}").exists()
     assert not Path(f"/proc/{pid}").exists()

@@ -1,4 +1,4 @@
-"""The order of the measurements, the search for the highest rate, and what is told of them."""
+"""The order of the measurements, the search for the highest rate, and their report."""
 
 import json
 from dataclasses import replace
@@ -11,24 +11,24 @@ from rigd.engine.realtime import REFUSED
 from rigd.profile import load_profile
 
 
-def test_loop_and_cyclictest_take_turns(bench, computer):
+def test_loop_and_cyclictest_alternate(bench, computer):
     results = bench()
-    told = [what for what, _ in bench.told[:6]]
-    assert told == ["loop alone", "cyclictest"] * 3
+    steps = [step for step, _ in bench.progress[:6]]
+    assert steps == ["loop alone", "cyclictest"] * 3
     assert [name for name, *_ in computer.ran[:3]] == ["loop alone"] * 3
     assert len(results.rounds) == 3
     assert results.ratios() == (3.0, 3.0)
     assert results.alone.scheduled == 3000
 
 
-def test_sessions_come_with_more_and_more_beside_them(bench):
+def test_order_of_the_sessions(bench):
     results = bench()
     names = [one.name for one in results.sessions]
     assert names == ["with recorder", "with recorder and live view", "… and load on other cores"]
 
 
 @pytest.mark.parametrize("holds_hz", [1000.0, 4000.0])
-def test_the_highest_rate_is_looked_for_upwards(bench, computer, holds_hz):
+def test_search_for_the_highest_rate_goes_upwards(bench, computer, holds_hz):
     computer.holds_hz = holds_hz
     results = bench()
     assert results.highest_rate_hz == holds_hz
@@ -36,20 +36,20 @@ def test_the_highest_rate_is_looked_for_upwards(bench, computer, holds_hz):
     assert f"holds {holds_hz:g} Hz" in "\n".join(report_lines(results))
 
 
-def test_where_the_rate_itself_does_not_hold_lower_ones_are_tried(bench, computer):
+def test_lower_rates_are_tried_if_the_first_fails(bench, computer):
     computer.holds_hz = 300.0
     results = bench()
     assert [one.rate_hz for one in results.search] == [1000.0, 500.0, 250.0]
     assert results.highest_rate_hz == 250.0
 
 
-def test_a_rate_has_a_second_try(bench, computer):
+def test_failed_rate_is_tried_again(bench, computer):
     computer.unlucky = 4  # the rounds, and one session of the three
     assert bench().highest_rate_hz == 4000.0
 
 
-def test_stalls_do_not_stop_the_search_and_are_told(bench, computer, measured, monkeypatch):
-    def stalling(name, profile, seconds, look, *, live=False):
+def test_search_continues_after_stalls_and_reports_them(bench, computer, measured, monkeypatch):
+    def stalling(name, profile, seconds, poll, *, live=False):
         rate_hz = profile.rig.rate_hz
         found = measured(name, rate_hz=rate_hz, held=1.0 if rate_hz <= 2000.0 else 0.9)
         found.lateness_us[0] = 30_010.0
@@ -63,7 +63,7 @@ def test_stalls_do_not_stop_the_search_and_are_told(bench, computer, measured, m
     assert "would hold 2000 Hz" in "\n".join(report_lines(results))
 
 
-def test_the_search_ends_where_nothing_holds(bench, computer):
+def test_search_ends_if_no_rate_holds(bench, computer):
     computer.holds_hz = 0.0
     results = bench()
     assert results.highest_rate_hz is None
@@ -71,7 +71,7 @@ def test_the_search_ends_where_nothing_holds(bench, computer):
     assert "holds none" in "\n".join(report_lines(results))
 
 
-def test_the_search_ends_where_everything_holds(bench, computer):
+def test_search_ends_if_every_rate_holds(bench, computer):
     computer.holds_hz = 1e9
     assert bench().highest_rate_hz == 16_000.0
 
@@ -79,14 +79,14 @@ def test_the_search_ends_where_everything_holds(bench, computer):
 def test_the_time_left_only_shrinks(bench, monkeypatch):
     monkeypatch.setattr("rigd.bench._program.time.monotonic", lambda: 5.0)
     bench()
-    left = [left_s for _, left_s in bench.told]
+    left = [left_s for _, left_s in bench.progress]
     assert all(later <= earlier for earlier, later in pairwise(left))
     assert left[0] > 100.0
 
 
 @pytest.mark.parametrize("installed", [True, False])
-def test_without_cyclictest_the_rest_is_measured(bench, cyclictest, monkeypatch, installed):
-    cyclictest.fails.write_text("it is gone\n")
+def test_measurement_without_cyclictest(bench, cyclictest, monkeypatch, installed):
+    cyclictest.errors.write_text("it is gone\n")
     if not installed:
         monkeypatch.setenv("PATH", "/nowhere")
     results = bench()
@@ -97,23 +97,23 @@ def test_without_cyclictest_the_rest_is_measured(bench, cyclictest, monkeypatch,
     assert as_json(results)["ratio_to_cyclictest"] is None
 
 
-def test_cyclictest_runs_with_no_more_rights_than_the_loop(bench, computer, cyclictest):
+def test_cyclictest_runs_with_the_rights_of_the_loop(bench, computer, cyclictest):
     computer.granted["scheduling"] = f"{REFUSED}not permitted"
     results = bench()
-    asked = cyclictest.asked.read_text().splitlines()
-    assert len(asked) == 3
-    assert all({"--priority=0", "--interval=1000"} <= set(line.split()) for line in asked)
+    calls = cyclictest.calls.read_text().splitlines()
+    assert len(calls) == 3
+    assert all({"--priority=0", "--interval=1000"} <= set(line.split()) for line in calls)
     assert "Not granted: scheduling" in "\n".join(report_lines(results))
 
 
-def test_what_the_computer_itself_misses_is_told(bench, computer, cyclictest):
-    cyclictest.says.write_text("002500 000010\n000010 000990\n")
+def test_misses_of_the_computer_itself_are_reported(bench, computer, cyclictest):
+    cyclictest.output.write_text("002500 000010\n000010 000990\n")
     computer.holds_hz = 500.0
     results = bench()
     assert "this is due to the computer itself" in "\n".join(report_lines(results))
 
 
-def test_the_document_is_plain_json(bench):
+def test_document_is_plain_json(bench):
     document = json.loads(json.dumps(as_json(bench())))
     assert document["highest_rate_hz"] == 4000.0
     assert document["ratio_to_cyclictest"] == {"p50": 3.0, "p99": 3.0}
@@ -134,7 +134,7 @@ def test_the_table_has_a_row_for_each(bench):
         assert name in text
 
 
-def test_the_neighbour_works_beside_the_loop(monkeypatch):
+def test_cores_without_the_loop(monkeypatch):
     monkeypatch.setattr("rigd.bench._program.os.sched_getaffinity", lambda _: {0, 1, 2})
     assert cores_without_loop({"cpu": "2"}) == {0, 1}
     assert cores_without_loop({"cpu": "2, isolated"}) == {0, 1}
@@ -143,7 +143,7 @@ def test_the_neighbour_works_beside_the_loop(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["sim", "antenna_can", "antenna_serial"])
-def test_no_profile_leads_to_its_hardware(computer, name):
+def test_no_profile_uses_its_hardware(computer, name):
     Bench(
         load_profile(name), rate_hz=2000.0, seconds=10.0, spin_us=50.0, on_progress=lambda *_: None
     ).run()

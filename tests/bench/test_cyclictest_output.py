@@ -1,4 +1,4 @@
-"""What cyclictest prints, as figures; and what becomes of one that cannot be run."""
+"""Statistics of cyclictest's output, and failures of cyclictest."""
 
 import numpy as np
 import pytest
@@ -23,14 +23,14 @@ OUTPUT = """\
 """
 
 
-def measured(bench, cyclictest, output, rate_hz=1000.0):
-    """The measurement of the first round, of a cyclictest with this output."""
-    cyclictest.says.write_text(output)
+def measure(bench, cyclictest, output, rate_hz=1000.0):
+    """Return the measurement of the first round with this output of cyclictest."""
+    cyclictest.output.write_text(output)
     return bench(rate_hz).rounds[0][1]
 
 
 def test_every_wake_up_of_the_histogram_counts(bench, cyclictest):
-    found = measured(bench, cyclictest, OUTPUT)
+    found = measure(bench, cyclictest, OUTPUT)
     delays_us, counts = np.unique(found.lateness_us, return_counts=True)
     assert dict(zip(delays_us, counts, strict=True)) == {
         17.0: 300,
@@ -42,41 +42,41 @@ def test_every_wake_up_of_the_histogram_counts(bench, cyclictest):
     assert found.work_us.size == 0
 
 
-def test_whole_periods_of_delay_are_ticks_that_a_loop_would_have_missed(bench, cyclictest):
-    found = measured(bench, cyclictest, OUTPUT)
+def test_delays_of_whole_periods_count_as_missed_ticks(bench, cyclictest):
+    found = measure(bench, cyclictest, OUTPUT)
     assert found.missed == 2 * 2 + 61
     assert found.scheduled == 504 + found.missed
-    assert measured(bench, cyclictest, OUTPUT, 2000.0).missed == 1 + 2 * 4 + 122
+    assert measure(bench, cyclictest, OUTPUT, 2000.0).missed == 1 + 2 * 4 + 122
 
 
 @pytest.mark.parametrize("output", ["", "# Histogram\n", "FATAL: no\n"])
 def test_output_without_a_histogram_is_an_error(bench, cyclictest, output):
-    cyclictest.says.write_text(output)
+    cyclictest.output.write_text(output)
     results = bench()
     assert results.peer is None
     assert "no histogram" in results.no_peer
 
 
-def test_it_runs_as_the_loop_does(bench, cyclictest):
-    found = measured(bench, cyclictest, "000005 000010\n", 2000.0)
+def test_options_equal_those_of_the_loop(bench, cyclictest):
+    found = measure(bench, cyclictest, "000005 000010\n", 2000.0)
     assert found.scheduled == 10
-    asked = cyclictest.asked.read_text().split()
-    assert {"--affinity=0", "--priority=80", "--policy=fifo", "--interval=500"} <= set(asked)
-    assert "--loops=20000" in asked
+    options = cyclictest.calls.read_text().split()
+    assert {"--affinity=0", "--priority=80", "--policy=fifo", "--interval=500"} <= set(options)
+    assert "--loops=20000" in options
 
 
-def test_without_a_priority_it_is_an_ordinary_process(bench, computer, cyclictest):
+def test_ordinary_scheduling_without_a_priority(bench, computer, cyclictest):
     del computer.granted["scheduling"]
     bench()
-    assert {"--policy=other", "--priority=0"} <= set(cyclictest.asked.read_text().split())
+    assert {"--policy=other", "--priority=0"} <= set(cyclictest.calls.read_text().split())
 
 
-def test_what_it_complains_of_is_told(bench, cyclictest):
-    cyclictest.fails.write_text("first\nFATAL: not permitted\n")
+def test_error_of_cyclictest_is_reported(bench, cyclictest):
+    cyclictest.errors.write_text("first\nFATAL: not permitted\n")
     assert bench().no_peer == "FATAL: not permitted"
 
 
-def test_one_that_hangs_is_given_up(bench, cyclictest, monkeypatch):
+def test_timeout_of_cyclictest(bench, cyclictest, monkeypatch):
     cyclictest.program.write_text("#!/bin/sh\nexec sleep 60\n")
     monkeypatch.setattr(
         "rigd.bench._cyclictest._TIMEOUT_MARGIN_S", -9.9

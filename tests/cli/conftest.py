@@ -11,15 +11,15 @@ from rigd.runtime import StopRequest
 
 @pytest.fixture
 def patient(write_profile):
-    """The simulated rig, for sessions in real time on a machine that may stand still."""
+    """The simulated rig, for sessions in real time on a machine that may stall."""
     return write_profile("sim", patient=True)
 
 
 @pytest.fixture(scope="session")
 def run_patched(made_once):
-    """Run `rigd run` once for all workers, with processes that are copies of this one.
+    """Run `rigd run` once for all workers, with patched processes that are copies of this one.
 
-    They have what is patched by name. Returned are exit code, standard output and standard error.
+    The function returns exit code, standard output and standard error.
     """
 
     def run(name, command, patches, *extra_processes):
@@ -31,8 +31,8 @@ def run_patched(made_once):
                 patch.setattr("rigd.cli.run.start_processes", lambda **_: (StopRequest(), group))
                 patch.setattr("rigd.runtime.ignore", lambda **_: None)  # of the test runner
                 done = CliRunner().invoke(app, ["run", *command, "--output", str(folder)])
-            told = [done.exit_code, done.stdout, done.stderr]
-            (folder / "told.json").write_text(json.dumps(told))
+            printed = [done.exit_code, done.stdout, done.stderr]
+            (folder / "told.json").write_text(json.dumps(printed))
 
         return json.loads((made_once(name, make) / "told.json").read_text())
 

@@ -1,4 +1,4 @@
-"""Ctrl-C ends `rigd` with 130 wherever in Python's own doings it arrives."""
+"""Ctrl-C ends `rigd` with 130 wherever in Python's own code it arrives."""
 
 import contextlib
 import json
@@ -13,13 +13,13 @@ from rigd.runner import ProcessGroup
 from rigd.runtime import StopRequest
 
 DURING = {
-    # What defines a dataclass or a named tuple is an `exec` of text.
+    # Dataclasses and named tuples are defined by an `exec` of text.
     "code made from text": (
         "import rigd.cli.live\n"
         "rigd.cli.live.has_screen = lambda: exec(\n"
         "    'import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(10)')\n"
     ),
-    # What is raised there is dropped, and objects end anywhere.
+    # Exceptions raised there are dropped, and objects end anywhere.
     "an object that ends": (
         "import os, signal, time, weakref\n"
         "import rigd.cli.live\n"
@@ -54,8 +54,8 @@ DURING = {
 
 
 @pytest.fixture
-def stop(tmp_path):
-    """Run a command that is stopped in the middle of something; returns the completed process."""
+def run_interrupted(tmp_path):
+    """Run a command that is interrupted during an operation; return the completed process."""
 
     def run(before, *command, **options):
         (tmp_path / "stopped.py").write_text(before + "from rigd.__main__ import main\nmain()\n")
@@ -74,31 +74,31 @@ def stop(tmp_path):
 
 @pytest.mark.process
 @pytest.mark.parametrize("before", DURING.values(), ids=DURING.keys())
-def test_ctrl_c_ends_with_130(stop, before):
-    done = stop(before, "replay", "seen.rrd", stderr=subprocess.PIPE)
+def test_ctrl_c_ends_with_130(run_interrupted, before):
+    done = run_interrupted(before, "replay", "seen.rrd", stderr=subprocess.PIPE)
     assert (done.returncode, done.stdout) == (130, "")
     assert "Traceback" not in done.stderr
 
 
 @pytest.mark.process
-def test_before_anything_began_it_says_so(stop):
-    done = stop(DURING["imports"], "run", "hold", stderr=subprocess.PIPE)
+def test_stop_before_anything_began(run_interrupted):
+    done = run_interrupted(DURING["imports"], "run", "hold", stderr=subprocess.PIPE)
     assert (done.returncode, done.stderr) == (130, "Stopped before anything began.\n")
 
 
 @pytest.mark.process
-def test_nobody_who_hears_that_is_waited_for(stop):
-    heard, told = os.pipe()
-    os.set_blocking(told, False)
+def test_no_wait_for_a_reader_of_standard_error(run_interrupted):
+    read_end, write_end = os.pipe()
+    os.set_blocking(write_end, False)
     try:
-        while os.write(told, bytes(4096)):
+        while os.write(write_end, bytes(4096)):
             pass
     except BlockingIOError:
-        os.set_blocking(told, True)
-    assert stop(DURING["imports"], "run", "hold", stderr=told).returncode == 130
-    os.close(heard)
-    assert stop(DURING["imports"], "run", "hold", stderr=told).returncode == 130
-    os.close(told)
+        os.set_blocking(write_end, True)
+    assert run_interrupted(DURING["imports"], "run", "hold", stderr=write_end).returncode == 130
+    os.close(read_end)
+    assert run_interrupted(DURING["imports"], "run", "hold", stderr=write_end).returncode == 130
+    os.close(write_end)
 
 
 def interrupt(**_):
@@ -106,7 +106,7 @@ def interrupt(**_):
 
 
 @pytest.mark.parametrize("command", [("run", "hold"), ("identify", "motor")])
-def test_before_a_session_s_processes_are_started_it_says_so(rigd_here, monkeypatch, command):
+def test_stop_before_the_processes_of_a_session(rigd_here, monkeypatch, command):
     monkeypatch.setattr(f"rigd.cli.{command[0]}.start_processes", interrupt)
     done = rigd_here(*command)
     assert (done.returncode, done.stdout) == (130, "")
@@ -114,19 +114,19 @@ def test_before_a_session_s_processes_are_started_it_says_so(rigd_here, monkeypa
 
 
 @pytest.fixture
-def stopped_early(monkeypatch, rigd_here):
-    """Run a command whose stop was asked for before it connected anything."""
-    stop = StopRequest()
-    stop.requested = True
+def run_stopped_early(monkeypatch, rigd_here):
+    """Run a command whose stop is requested before it connects anything."""
+    request = StopRequest()
+    request.requested = True
     for command in ("run", "identify"):
         monkeypatch.setattr(
-            f"rigd.cli.{command}.start_processes", lambda **_: (stop, contextlib.nullcontext())
+            f"rigd.cli.{command}.start_processes", lambda **_: (request, contextlib.nullcontext())
         )
     return rigd_here
 
 
-def test_before_the_devices_are_connected_it_says_that_there_is_no_record(stopped_early, tmp_path):
-    done = stopped_early("run", "hold", "--fast", "--json")
+def test_stop_before_the_devices_are_connected(run_stopped_early, tmp_path):
+    done = run_stopped_early("run", "hold", "--fast", "--json")
     assert done.returncode == 130
     assert json.loads(done.stdout) == {"sessions": []}
     *_, last = done.stderr.splitlines()
@@ -134,14 +134,14 @@ def test_before_the_devices_are_connected_it_says_that_there_is_no_record(stoppe
     assert not list(tmp_path.glob("sessions/*"))
 
 
-def test_so_does_identify(stopped_early):
-    done = stopped_early("identify", "motor", "--fast")
+def test_stop_of_identify_before_the_devices_are_connected(run_stopped_early):
+    done = run_stopped_early("identify", "motor", "--fast")
     assert done.returncode == 130
     assert done.stderr.count("Stopped: no record. Stopped by the operator") == 1
 
 
 class StopAfterOne(StopRequest):
-    """A stop that comes as soon as the file of a session is there."""
+    """A stop that comes as soon as the file of a session exists."""
 
     requested = property(
         lambda _: any(Path("sessions").glob("*.mcap")), lambda *_: None, doc="Whether it came."
@@ -151,7 +151,7 @@ class StopAfterOne(StopRequest):
 @pytest.mark.process
 @pytest.mark.usefixtures("children_copied")
 @pytest.mark.parametrize("repeat", [1, 3])
-def test_a_stop_between_two_sessions_is_told(rigd_here, monkeypatch, repeat):
+def test_stop_between_two_sessions_is_reported(rigd_here, monkeypatch, repeat):
     monkeypatch.setattr(
         "rigd.cli.run.start_processes", lambda **_: (StopAfterOne(), ProcessGroup(live=False))
     )

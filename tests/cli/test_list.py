@@ -11,8 +11,8 @@ from rigd.cli.app import app
 
 
 @pytest.fixture
-def listed(tmp_path, monkeypatch):
-    """Run `rigd list` in Tokyo; returns its result."""
+def run_list(tmp_path, monkeypatch):
+    """Run `rigd list` in the time zone of Tokyo; return its result."""
     monkeypatch.setenv("TZ", "Asia/Tokyo")
     time.tzset()
     monkeypatch.chdir(tmp_path)
@@ -42,26 +42,26 @@ def sessions(record_briefly, write_quick_look, write_report):
 
 
 @pytest.mark.usefixtures("sessions")
-def test_the_newest_come_first_with_their_modes_and_problems(listed):
-    told = listed(".").stdout.splitlines()
-    assert [line.split("  ")[0] for line in told[:4]] == [
+def test_newest_first_with_modes_and_problems(run_list):
+    lines = run_list(".").stdout.splitlines()
+    assert [line.split("  ")[0] for line in lines[:4]] == [
         "date", "2023-11-17 07:13", "2023-11-16 19:13", "2023-11-15 07:13"
     ]  # fmt: skip
-    assert [cell.strip() for cell in told[2].split("  ") if cell.strip()][1:] == [
+    assert [cell.strip() for cell in lines[2].split("  ") if cell.strip()][1:] == [
         "second.mcap", "antenna 3", "chirp", "stopped", "2.57 Hz 0.905 %, 16.3 Hz 0.5 %",
         "0.6 rad, error ≤ 12 %", "no (p = 2e-18)", "report",
     ]  # fmt: skip
-    assert "unknown" in told[3]  # of the look at the first session, which states no slope
-    assert "unknown" not in told[1] + told[2]
-    assert "text.mcap" in told[4]
-    assert told[5].startswith("text.mcap: ")
-    assert "is not an MCAP file" in told[5]
+    assert "unknown" in lines[3]  # the quick look of the first session states no slope
+    assert "unknown" not in lines[1] + lines[2]
+    assert "text.mcap" in lines[4]
+    assert lines[5].startswith("text.mcap: ")
+    assert "is not an MCAP file" in lines[5]
 
 
 @pytest.mark.usefixtures("sessions")
-def test_the_trend_says_which_changes_are_beyond_the_intervals(listed):
-    told = listed(".", "--specimen", "antenna 3", "--trend").stdout.splitlines()
-    first, second = told[1:3]
+def test_trend_marks_changes_beyond_the_intervals(run_list):
+    lines = run_list(".", "--specimen", "antenna 3", "--trend").stdout.splitlines()
+    first, second = lines[1:3]
     assert first.startswith("2023-11-15 07:13  2.6000 ± 0.0020 ")
     assert "-1.2 % *" in second
     assert "-0.55 % " in second
@@ -69,14 +69,14 @@ def test_the_trend_says_which_changes_are_beyond_the_intervals(listed):
     assert first.index("●") > second.index("●")
     assert "unknown" in first
     assert "0.6 rad, error ≤ 12 %" in second
-    assert told[4].startswith("mode 2")
-    assert "*" not in "".join(told[4:7])
+    assert lines[4].startswith("mode 2")
+    assert "*" not in "".join(lines[4:7])
 
 
 @pytest.mark.usefixtures("sessions")
-def test_a_trend_is_of_one_specimen(listed, write_quick_look, record_briefly):
+def test_a_trend_is_of_one_specimen(run_list, write_quick_look, record_briefly):
     write_quick_look(record_briefly("fourth", day=3), mode(9.0))
-    refused = listed(".", "--trend")
+    refused = run_list(".", "--trend")
     assert refused.exit_code == 2
     assert "--specimen" in refused.stderr
     assert "'antenna 3'" in refused.stderr
@@ -84,15 +84,15 @@ def test_a_trend_is_of_one_specimen(listed, write_quick_look, record_briefly):
 
 
 @pytest.mark.usefixtures("sessions")
-def test_json_has_rows_and_trends(listed):
-    told = json.loads(listed(".", "--specimen", "antenna 3", "--trend", "--json").stdout)
-    assert [row["id"] for row in told["sessions"]] == ["second", "first"]
-    assert told["sessions"][0]["report"].endswith("second.report/report.html")
-    change = told["trends"][0]["points"][1]["frequency_change"]
+def test_json_has_rows_and_trends(run_list):
+    document = json.loads(run_list(".", "--specimen", "antenna 3", "--trend", "--json").stdout)
+    assert [row["id"] for row in document["sessions"]] == ["second", "first"]
+    assert document["sessions"][0]["report"].endswith("second.report/report.html")
+    change = document["trends"][0]["points"][1]["frequency_change"]
     assert change == {"difference": pytest.approx(-0.03), "significant": True}
 
 
-def test_specimens_are_listed_with_their_beams_and_problems(listed, tmp_path):
+def test_specimens_are_listed_with_their_beams_and_problems(run_list, tmp_path):
     folder = tmp_path / "specimens"
     folder.mkdir()
     beam = "[beam]\n" + "".join(
@@ -103,25 +103,25 @@ def test_specimens_are_listed_with_their_beams_and_problems(listed, tmp_path):
     )  # fmt: skip
     (folder / "antenna 4.toml").write_text(f"note = 'steel'\n{beam}")
     (folder / "broken.toml").write_text("[beam]")
-    told = CliRunner().invoke(app, ["specimens"]).stdout.splitlines()
-    assert told == [
+    lines = CliRunner().invoke(app, ["specimens"]).stdout.splitlines()
+    assert lines == [
         "antenna 4: 0.95 m, 0.0047 kg/m, 0.09 N·m², steel (specimens/antenna 4.toml)",
         "broken: cannot be used: specimens/broken.toml: section [beam] is missing.",
     ]
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "expected"),
     [
         (["--meta", "temperature_c"], "--meta 'temperature_c': must be NAME=VALUE"),
         (["--meta", "batch=1", "--meta", "batch=2"], "--meta 'batch=2': is given twice"),
         (["--meta", "temperature_c=21,4"], "temperature_c = '21,4' is not a finite number"),
     ],
 )
-def test_metadata_that_cannot_be_stored_is_refused_before_anything_starts(options, told):
+def test_invalid_metadata_is_refused_before_the_start(options, expected):
     refused = CliRunner().invoke(app, ["run", "hold", *options])
     assert refused.exit_code == 2
-    assert told in refused.stderr
+    assert expected in refused.stderr
 
 
 def test_completion_of_the_shell_can_be_installed():
@@ -130,21 +130,21 @@ def test_completion_of_the_shell_can_be_installed():
     assert completed.stdout.split() == ["run"]
 
 
-def test_folders_stand_together_and_one_that_is_not_there_is_told(listed, record_briefly, tmp_path):
+def test_several_folders_and_an_error_for_a_missing_one(run_list, record_briefly, tmp_path):
     path = record_briefly("first")
     other = tmp_path / "other"
     other.mkdir()
     path.rename(other / "late.mcap")
     record_briefly("second", day=1)
-    told = listed(".", "other").stdout.splitlines()
-    assert [line.split()[2] for line in told[1:]] == ["second.mcap", "late.mcap"]
-    missing = listed("sessions")
+    lines = run_list(".", "other").stdout.splitlines()
+    assert [line.split()[2] for line in lines[1:]] == ["second.mcap", "late.mcap"]
+    missing = run_list("sessions")
     assert missing.exit_code == 2
     assert "sessions: the folder cannot be listed" in missing.stderr
-    first = listed()
+    first = run_list()
     assert first.exit_code == 0
     assert first.stdout.startswith("No sessions yet: ")
     assert "rigd run chirp --fast" in first.stdout
-    assert json.loads(listed("--json").stdout) == {"sessions": []}
+    assert json.loads(run_list("--json").stdout) == {"sessions": []}
     (tmp_path / "sessions").mkdir()
-    assert listed().stdout == "No sessions.\n"
+    assert run_list().stdout == "No sessions.\n"

@@ -1,4 +1,4 @@
-"""``rigd live``: which view it finds, what it says where there is none, how it opens a window."""
+"""``rigd live``: the view it finds, its message without one, and its window."""
 
 import json
 import sys
@@ -18,15 +18,15 @@ exit $CODE
 
 
 @pytest.fixture(autouse=True)
-def nobody_else(runtime_folder, monkeypatch):
-    """No live view of somebody else's is found, and there is no screen."""
+def no_other_views(runtime_folder, monkeypatch):
+    """Hide other live views and the screen."""
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
 
 @pytest.fixture
-def view(nobody_else):
-    """A live view of the rig sim, as far as can be told from outside."""
+def view(no_other_views):
+    """A live view of the rig sim, as it appears from outside."""
     address = LiveAddress.for_this_process("sim", grpc_port=9876, page_port=9090, server=1)
     announce(address)
     return address
@@ -34,7 +34,7 @@ def view(nobody_else):
 
 @pytest.fixture
 def fake_viewer(tmp_path, monkeypatch):
-    """Have a script take the place of Rerun's program; returns what it saw."""
+    """Replace Rerun's program by a script; return its arguments or environment."""
     monkeypatch.delitem(sys.modules, "rerun_cli", raising=False)
     package = tmp_path / "packages" / "rerun_cli"
     package.mkdir(parents=True)
@@ -45,10 +45,10 @@ def fake_viewer(tmp_path, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":no-such-screen")
     monkeypatch.setenv("SEEN", str(tmp_path / "seen"))
     monkeypatch.setenv("CODE", "0")
-    return lambda what: (tmp_path / f"seen.{what}").read_text()
+    return lambda name: (tmp_path / f"seen.{name}").read_text()
 
 
-def test_without_a_view_it_says_how_to_get_one(rigd_here):
+def test_error_without_a_view_names_the_commands(rigd_here):
     done = rigd_here("live")
     assert done.returncode == 1
     assert done.stdout == ""
@@ -60,26 +60,26 @@ def test_without_a_view_it_says_how_to_get_one(rigd_here):
     assert "rigd serve --profile antenna_can --live" in done.stderr
 
 
-def test_a_profile_that_there_is_not_is_wrong_use(rigd_here):
+def test_unknown_profile_is_wrong_use(rigd_here):
     done = rigd_here("live", "--profile", "antena_can")
     assert done.returncode == 2
     assert "There is no profile 'antena_can'" in done.stderr
 
 
-def test_the_address_for_a_browser_is_all_that_standard_output_gets(rigd_here, view):
+def test_standard_output_is_only_the_address_for_a_browser(rigd_here, view):
     done = rigd_here("live", "--web")
     assert (done.returncode, done.stdout) == (0, "http://127.0.0.1:9090\n")
     assert "ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 " in done.stderr
 
 
-def test_without_a_screen_it_says_what_to_do_instead(rigd_here, view):
+def test_error_without_a_screen_names_alternatives(rigd_here, view):
     done = rigd_here("live")
     assert done.returncode == 1
     for word in ("DISPLAY", "rigd live --web", "ssh -L 9090:127.0.0.1:9090"):
         assert word in done.stderr
 
 
-def test_of_several_views_one_has_to_be_named(rigd_here, view, write_profile):
+def test_one_of_several_views_must_be_named(rigd_here, view, write_profile):
     announce(replace(view, rig="second", page_port=1234))
     done = rigd_here("live", "--web")
     assert done.returncode == 1
@@ -89,7 +89,7 @@ def test_of_several_views_one_has_to_be_named(rigd_here, view, write_profile):
     assert rigd_here("live", "--web", "--profile", file).stdout == "http://127.0.0.1:1234\n"
 
 
-def test_it_waits_if_it_is_to(rigd_here, nobody_else, monkeypatch):
+def test_wait_for_a_view(rigd_here, no_other_views, monkeypatch):
     address = LiveAddress.for_this_process("sim", grpc_port=9876, page_port=9090, server=1)
     monkeypatch.setattr("time.sleep", lambda _: announce(address))  # while it waits
     done = rigd_here("live", "--web", "--wait")
@@ -98,7 +98,7 @@ def test_it_waits_if_it_is_to(rigd_here, nobody_else, monkeypatch):
 
 
 @pytest.mark.process
-def test_the_window_keeps_to_this_computer_and_leaves_the_users_settings_alone(
+def test_window_is_local_and_does_not_change_user_settings(
     rigd_here, view, fake_viewer, runtime_folder
 ):
     done = rigd_here("live")
@@ -115,9 +115,7 @@ def test_the_window_keeps_to_this_computer_and_leaves_the_users_settings_alone(
 
 
 @pytest.mark.process
-def test_a_window_that_cannot_be_opened_is_told_in_a_sentence(
-    rigd_here, view, fake_viewer, monkeypatch
-):
+def test_error_if_no_window_can_be_opened(rigd_here, view, fake_viewer, monkeypatch):
     monkeypatch.setenv("CODE", "3")
     done = rigd_here("live")
     assert done.returncode == 1
@@ -126,10 +124,8 @@ def test_a_window_that_cannot_be_opened_is_told_in_a_sentence(
 
 
 @pytest.mark.process
-def test_a_computer_that_cannot_draw_is_told_which_package_it_lacks(
-    rigd_here, view, fake_viewer, monkeypatch
-):
-    # As Rerun says it, with the backtrace that follows: longer than what is kept of its log.
+def test_error_names_the_package_missing_for_drawing(rigd_here, view, fake_viewer, monkeypatch):
+    # As Rerun prints it, with its backtrace: longer than the stored part of its log.
     frames = "".join(f"{frame:4}: rerun::main\n" for frame in range(6, 25))
     monkeypatch.setenv(
         "SAID", f"thread 'main' panicked at 'Failed to get render context'\n{frames}"
@@ -144,10 +140,10 @@ def test_a_computer_that_cannot_draw_is_told_which_package_it_lacks(
 
 
 class Window:
-    """Stands in for the viewer: open for some looks, then closed by the user."""
+    """A fake viewer: open for some polls, then closed by the user."""
 
-    def __init__(self, looks: int) -> None:
-        self._looks = looks
+    def __init__(self, polls: int) -> None:
+        self._polls = polls
         self.connected = []
         self.closed = False
 
@@ -156,33 +152,33 @@ class Window:
 
     @property
     def exit_code(self):
-        self._looks -= 1
-        return None if self._looks >= 0 else 0
+        self._polls -= 1
+        return None if self._polls >= 0 else 0
 
     def connect(self, view) -> bool:
         self.connected.append(view.server)
         return len(self.connected) != 2  # once it is too busy
 
 
-def test_the_window_goes_on_to_whatever_takes_the_place_of_its_view(rigd_here, view, monkeypatch):
+def test_window_reconnects_to_later_views(rigd_here, view, monkeypatch):
     second, third = replace(view, server=2), replace(view, server=3, grpc_port=1234)
     there = iter([[view], [view], [view], [second], [], [], [third], [third], [third]])
     monkeypatch.setattr("rigd.daemon.client.find_views", lambda rig: next(there))
     monkeypatch.setattr("time.sleep", lambda _: None)
     monkeypatch.setattr("rigd.cli.live.has_screen", lambda: True)
-    window = Window(looks=8)
+    window = Window(polls=8)
     monkeypatch.setattr("rigd.live.Viewer", lambda *_: window)
     done = rigd_here("live")
     assert (done.returncode, window.closed) == (0, True)
     assert window.connected == [2, 3, 3]
-    said = done.stderr
-    assert said.count("has ended; the window stays open and shows the next one") == 1
-    assert said.count("The live view of sim has restarted.") == 2
+    printed = done.stderr
+    assert printed.count("has ended; the window stays open and shows the next one") == 1
+    assert printed.count("The live view of sim has restarted.") == 2
 
 
 @pytest.mark.process
 @pytest.mark.further  # as through its files
-def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read(
+def test_view_is_found_through_the_daemon_without_its_file(
     rigd, rigd_here, start_rigd, runtime_folder
 ):
     serve = start_rigd("serve", "--profile", "sim", "--live", "--fast")
@@ -191,12 +187,12 @@ def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read
     ports = json.loads(file.read_text())
     file.unlink()
 
-    def told():
+    def live_view():
         status = rigd_here("status", "--json")
         return status.returncode == 0 and (json.loads(status.stdout)["rig"] or {}).get("live_view")
 
-    assert eventually(told)
-    assert told()["url"] == f"http://127.0.0.1:{ports['page_port']}"
+    assert eventually(live_view)
+    assert live_view()["url"] == f"http://127.0.0.1:{ports['page_port']}"
     done = rigd_here("live", "--web")
     assert done.stdout == f"http://127.0.0.1:{ports['page_port']}\n"
     serve.terminate()
@@ -204,7 +200,7 @@ def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read
     assert rigd_here("live", "--web").returncode == 1
 
 
-def test_a_daemon_whose_view_is_about_to_begin_is_named(rigd_here, monkeypatch):
+def test_error_names_a_daemon_with_a_pending_view(rigd_here, monkeypatch):
     monkeypatch.setattr("rigd.daemon.client.daemons", lambda: {"sim": True})
     done = rigd_here("live")
     assert done.returncode == 1
@@ -214,7 +210,7 @@ def test_a_daemon_whose_view_is_about_to_begin_is_named(rigd_here, monkeypatch):
 
 @pytest.mark.process
 @pytest.mark.further  # as one whose view is about to begin
-def test_a_daemon_that_was_started_without_a_view_is_named(rigd_here, start_rigd):
+def test_error_names_a_daemon_without_a_view(rigd_here, start_rigd):
     serve = start_rigd("serve", "--profile", "sim", "--fast")
     assert eventually(lambda: rigd_here("status").returncode == 0)
     done = rigd_here("live")

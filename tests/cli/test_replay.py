@@ -1,4 +1,4 @@
-"""`rigd replay`: what is shown of a file is what was seen live, and what the file holds."""
+"""`rigd replay` shows the content of a file as in the live view."""
 
 import importlib.util
 import io
@@ -47,8 +47,8 @@ def run(*arguments, **options):
     )
 
 
-def refused(done, code, *words):
-    """Check a message of one or two sentences that says what is wrong, and nothing else."""
+def assert_error(done, code, *words):
+    """Check that the only output is a message of one or two sentences."""
     assert done.returncode == code, done.stdout + done.stderr
     assert done.stdout == ""
     (line,) = done.stderr.splitlines()
@@ -70,7 +70,7 @@ def columns(batches: list, *names: str) -> dict[str, np.ndarray]:
 
 
 def rows(batches: list, name: str) -> list[tuple[int, list]]:
-    """Return times in ns and values of a component of which each row has another number."""
+    """Return times in ns and values of a component whose rows have different lengths."""
     found = []
     for batch in batches:
         if {"session_time", name} <= set(batch.schema.names):
@@ -80,8 +80,8 @@ def rows(batches: list, name: str) -> list[tuple[int, list]]:
 
 
 @pytest.fixture(scope="module")
-def chirp(made_once, short_chirps):
-    """A chirp of 20 s to 50 Hz, and what `--save` made of it."""
+def chirp_recording(made_once, short_chirps):
+    """A chirp of 20 s to 50 Hz, and its recording by `--save`."""
     path = short_chirps[0]
 
     def make(folder):
@@ -96,7 +96,7 @@ def chirp(made_once, short_chirps):
 
 
 @pytest.fixture(scope="module")
-def short(tmp_path_factory):
+def short_session(tmp_path_factory):
     """A session of 5 s."""
     folder = tmp_path_factory.mktemp("short")
     done = run("run", "chirp", *QUICK, "--json", "--output", ".", cwd=folder)
@@ -106,15 +106,15 @@ def short(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def recording(short):
-    """What `--save` makes of the short session."""
-    path = short.with_suffix(".rrd")
-    assert run("replay", short, "--save", path).returncode == 0
+def recording(short_session):
+    """The recording by `--save` of the short session."""
+    path = short_session.with_suffix(".rrd")
+    assert run("replay", short_session, "--save", path).returncode == 0
     return path
 
 
-def test_every_sample_is_shown_in_the_units_of_the_plots(chirp):
-    session, found, _ = chirp
+def test_every_sample_is_shown_in_units_of_the_plots(chirp_recording):
+    session, found, _ = chirp_recording
     samples = session.samples
     shown = columns(
         found["/signals"],
@@ -134,15 +134,15 @@ def test_every_sample_is_shown_in_the_units_of_the_plots(chirp):
         assert np.array_equal(shown[name], np.column_stack([samples[f] for f in fields]))
 
 
-def test_the_frequency_response_grows_with_the_sweep(chirp):
-    session, found, _ = chirp
+def test_frequency_response_grows_with_the_sweep(chirp_recording):
+    session, found, _ = chirp_recording
     chart = ResponseCharts(describe_recorded_session(session)).chart(MAGNITUDE_ENTITY)
     left, _, right, _ = chart.frame
     first_hz, last_hz = chart.x.first, chart.x.last
     drawn = rows(found[f"{MAGNITUDE_ENTITY}/measured"], "LineStrips2D:strips")
     assert len({t_ns for t_ns, _ in drawn}) > 15  # once a second
     for time_s, least_hz, most_hz in ((0.5, 0.0, 0.0), (8.5, 17.0, 19.0), (15.5, 34.5, 36.5)):
-        # What a viewer shows at that time is the last that was drawn before.
+        # At that time a viewer shows the last drawing before it.
         strips = [strips for t_ns, strips in drawn if t_ns <= 1e9 * time_s][-1]
         if most_hz == 0.0:
             assert not strips
@@ -153,15 +153,15 @@ def test_the_frequency_response_grows_with_the_sweep(chirp):
         assert least_hz < reached_hz < most_hz
 
 
-def test_the_last_frequency_response_is_that_of_analyze(chirp):
-    session, found, _ = chirp
+def test_last_frequency_response_is_that_of_analyze(chirp_recording):
+    session, found, _ = chirp_recording
     chart = ResponseCharts(describe_recorded_session(session)).chart(MAGNITUDE_ENTITY)
     left, top, right, bottom = chart.frame
     # All of it, coherent or not.
     *_, (_, strips) = rows(found[f"{MAGNITUDE_ENTITY}/uncertain"], "LineStrips2D:strips")
     points = np.concatenate([np.asarray(strip, dtype=np.float64) for strip in strips])
-    share = (points[:, 0] - left) / (right - left)
-    frequency_hz = chart.x.first * (chart.x.last / chart.x.first) ** share
+    fraction = (points[:, 0] - left) / (right - left)
+    frequency_hz = chart.x.first * (chart.x.last / chart.x.first) ** fraction
     level = (bottom - points[:, 1]) / (bottom - top)
     measured_db = chart.y.first + level * (chart.y.last - chart.y.first)
     reference, _ = estimate(load_record(session.path), WelchSettings())
@@ -173,8 +173,8 @@ def test_the_last_frequency_response_is_that_of_analyze(chirp):
     assert np.abs(measured_db[inside] - expected_db).max() < 0.0864  # 1 %
 
 
-def test_the_antenna_moves_and_the_spectrogram_grows(chirp):
-    _, found, _ = chirp
+def test_the_antenna_moves_and_the_spectrogram_grows(chirp_recording):
+    _, found, _ = chirp_recording
     beam = columns(found["/antenna/beam"], "LineStrips3D:strips")["t_ns"] * 1e-9
     assert beam[-1] == pytest.approx(21.5, abs=0.06)
     assert np.diff(beam) == pytest.approx(0.05, abs=1e-6)
@@ -184,14 +184,14 @@ def test_the_antenna_moves_and_the_spectrogram_grows(chirp):
     assert sizes[-1] > 40 * sizes[0]
 
 
-def test_the_log_has_the_events_and_the_outcome(chirp):
-    session, found, _ = chirp
+def test_the_log_has_the_events_and_the_outcome(chirp_recording):
+    session, found, _ = chirp_recording
     texts = [text for _, (text,) in rows(found["/events"], "TextLog:text")]
     assert [event.message for event in session.events] == texts[: len(session.events)]
     assert texts[-1] == "Outcome: complete."
 
 
-SHOWN_OF_A_SIMULATION = {
+SIMULATION_TITLES = {
     "Antenna",
     "Coherence of angle and torque",
     "Coupling torque, tared (N·m)",
@@ -214,11 +214,11 @@ SHOWN_OF_A_SIMULATION = {
 """Titles of a session under the virtual clock."""
 
 
-def test_it_is_played_from_its_start_in_the_layout_of_the_live_view(chirp):
+def test_recording_plays_from_its_start_in_the_live_layout(chirp_recording):
     from rerun.blueprint.components import PlayState
     from rerun.chunk import RrdReader
 
-    session, found, path = chirp
+    session, found, path = chirp_recording
     reader = RrdReader(path)
     (layout,) = reader.blueprints()
     parts: dict[str, list] = {}
@@ -230,8 +230,8 @@ def test_it_is_played_from_its_start_in_the_layout_of_the_live_view(chirp):
     assert parts["TimePanelBlueprint:play_state"] == [[PlayState.Playing.value]]
     assert parts["TimePanelBlueprint:timeline"] == [["session_time"]]
     titles = {title for row in parts["ViewBlueprint:display_name"] for title in row or ()}
-    # Of the processes a file knows nothing, nor of real time if there was none.
-    assert titles == SHOWN_OF_A_SIMULATION
+    # A file has neither processes nor, if there was none, real time.
+    assert titles == SIMULATION_TITLES
     texts = [text for _, (text,) in rows(found["/state"], "TextDocument:text")]
     assert all(text.startswith("# Recorded: COMPLETE") for text in texts)
     assert "now **" in texts[len(texts) // 2]
@@ -245,8 +245,8 @@ def test_it_is_played_from_its_start_in_the_layout_of_the_live_view(chirp):
     assert starts_ns[-1][-1] == session.start_utc_ns
 
 
-def test_ages_are_a_plot_if_a_real_rig_states_them(write):
-    path = write("ages.mcap", np.arange(10))
+def test_plot_of_ages_for_a_real_rig(write_session_file):
+    path = write_session_file("ages.mcap", np.arange(10))
     session, timings = read_session(path), read_timings(path)
     samples = session.samples.copy()
     samples["work_ns"] = 1000  # in simulated time there is none
@@ -256,7 +256,7 @@ def test_ages_are_a_plot_if_a_real_rig_states_them(write):
         assert AGES.component in describe_recorded_session(of_a_rig, without).absent
 
 
-LEAST = {
+MINIMAL_METADATA = {
     "rate_hz": "1000.0",
     "beam_length_m": "0.98",
     "beam_density_kg_per_m": "4.7e-3",
@@ -265,28 +265,28 @@ LEAST = {
 
 
 @pytest.fixture
-def write(tmp_path):
-    """Write a session that is not the rig's, of a motor that sways."""
+def write_session_file(tmp_path):
+    """Write a session of a swaying motor, not made by the rig."""
 
     def session(
         name, ticks, status=(), metadata=None, segments=None, outcome=None, profile=None
     ) -> Path:
         block = bytearray(len(ticks) * SAMPLE_SIZE)
         status = [0] * len(ticks) if len(status) == 0 else status
-        for place, (tick, bits) in enumerate(zip(ticks, status, strict=True)):
+        for index, (tick, bits) in enumerate(zip(ticks, status, strict=True)):
             angle_rad = 0.02 * np.sin(6.0 * tick / 1000)
             pack_sample_into(
-                block, place * SAMPLE_SIZE, int(tick) * 1_000_000, int(tick), angle_rad, angle_rad,
+                block, index * SAMPLE_SIZE, int(tick) * 1_000_000, int(tick), angle_rad, angle_rad,
                 0.0, -0.01 * angle_rad, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, int(bits), 0, 0,
             )  # fmt: skip
         writer = SessionWriter(tmp_path / name)
         attachments = {} if profile is None else {"profile.toml": profile}
-        writer.begin(10**18, LEAST | (metadata or {}), segments or {}, attachments)
+        writer.begin(10**18, MINIMAL_METADATA | (metadata or {}), segments or {}, attachments)
         writer.write_samples(block)
         ages = bytearray(len(ticks) * TIMING_SIZE)
-        for place, tick in enumerate(ticks):
-            age_s = 1e-6 * (place % 100)
-            pack_timing_into(ages, place * TIMING_SIZE, int(tick) * 1_000_000, tick, age_s, -age_s)
+        for index, tick in enumerate(ticks):
+            age_s = 1e-6 * (index % 100)
+            pack_timing_into(ages, index * TIMING_SIZE, int(tick) * 1_000_000, tick, age_s, -age_s)
         writer.write_timings(ages)
         return writer.close(outcome or {})
 
@@ -294,8 +294,8 @@ def write(tmp_path):
 
 
 @pytest.fixture
-def saved(rigd_here):
-    """Return what `--save` makes of a session."""
+def save_recording(rigd_here):
+    """Return the batches of the recording by `--save`."""
 
     def save(path: Path) -> dict[str, list]:
         out = path.with_suffix(".rrd")
@@ -306,13 +306,13 @@ def saved(rigd_here):
     return save
 
 
-def test_missing_and_late_ticks_are_counted_as_the_file_tells_them(write, saved):
+def test_counts_of_missing_and_late_ticks(write_session_file, save_recording):
     ticks = np.concatenate([np.arange(100, 1500), np.arange(1510, 2500), np.arange(2504, 4000)])
     status = np.zeros(ticks.size, int)
     status[[0, 1400]] = Status.AFTER_MISSED
     status[1400 + 990] = Status.AFTER_LOST
     status[500:520] = Status.LATE
-    found = saved(write("gaps.mcap", ticks, status))
+    found = save_recording(write_session_file("gaps.mcap", ticks, status))
     shown = columns(found["/health"], "faulty_ticks")
     by_second = dict(zip(shown["t_ns"] // 10**9, shown["faulty_ticks"].tolist(), strict=True))
     assert by_second == {
@@ -324,9 +324,9 @@ def test_missing_and_late_ticks_are_counted_as_the_file_tells_them(write, saved)
     assert len(columns(found["/signals"], "angle_mrad")["t_ns"]) == ticks.size
 
 
-def test_a_file_with_the_least_there_may_be_is_shown_without_a_model(write, saved):
+def test_minimal_file_is_shown_without_a_model(write_session_file, save_recording):
     ticks = np.arange(2000)
-    found = saved(write("least.mcap", ticks))
+    found = save_recording(write_session_file("least.mcap", ticks))
     assert f"{MAGNITUDE_ENTITY}/model" not in found
     assert f"{MAGNITUDE_ENTITY}/measured" in found
     assert len(columns(found["/antenna/beam"], "LineStrips3D:strips")["t_ns"]) == 40
@@ -336,127 +336,150 @@ def test_a_file_with_the_least_there_may_be_is_shown_without_a_model(write, save
     assert ages["ages_ms"] == pytest.approx(np.column_stack([age_ms, -age_ms]))
 
 
-def test_a_session_that_was_stopped_ends_with_the_reason(write, saved):
-    path = write(
+def test_stopped_session_ends_with_the_reason(write_session_file, save_recording):
+    path = write_session_file(
         "stopped.mcap",
         np.arange(700),
         segments={"rest": (0, 500), "sweep": (500, 20_500)},
         outcome={"outcome": "fault", "reason": "The drive does not answer."},
     )
-    found = saved(path)
+    found = save_recording(path)
     (event,) = rows(found["/events"], "TextLog:text")
     assert event == (699_000_000, ["Outcome: fault. The drive does not answer."])
     (level,) = rows(found["/events"], "TextLog:level")
     assert level[1] == ["ERROR"]
-    # As it was live: of what was planned, this much had come.
+    # As in the live view: the recorded part of the planned time.
     *_, (_, (state,)) = rows(found["/summary"], "TextDocument:text")
     assert "1 of 20 s" in state
 
 
-def test_wrong_use_is_told(rigd_here, short_chirps, tmp_path):
-    short = short_chirps[0]
+def test_errors_of_wrong_use(rigd_here, short_chirps, tmp_path):
+    session_path = short_chirps[0]
     taken = tmp_path / "taken.rrd"
     taken.write_bytes(b"mine")
-    refused(
-        rigd_here("replay", short, "--save", taken), 2, "taken.rrd exists", "nothing is overwritten"
+    assert_error(
+        rigd_here("replay", session_path, "--save", taken),
+        2,
+        "taken.rrd exists",
+        "nothing is overwritten",
     )
     assert taken.read_bytes() == b"mine"
-    refused(rigd_here("replay", short, "--save", tmp_path / "a.txt"), 2, "--save", ".rrd")
-    refused(rigd_here("replay", short, "--save", tmp_path / "a.rrd", "--web"), 2, "--web")
-    refused(rigd_here("replay", taken, "--save", tmp_path / "a.rrd"), 2, "already")
+    assert_error(
+        rigd_here("replay", session_path, "--save", tmp_path / "a.txt"), 2, "--save", ".rrd"
+    )
+    assert_error(
+        rigd_here("replay", session_path, "--save", tmp_path / "a.rrd", "--web"), 2, "--web"
+    )
+    assert_error(rigd_here("replay", taken, "--save", tmp_path / "a.rrd"), 2, "already")
     assert not (tmp_path / "a.rrd").exists()
 
 
-def test_files_that_cannot_be_shown_are_told(rigd_here, short_chirps, write, tmp_path):
-    short = short_chirps[0]
+def test_errors_of_unusable_files(rigd_here, short_chirps, write_session_file, tmp_path):
+    session_path = short_chirps[0]
     out = ("--save", tmp_path / "out.rrd")
-    refused(rigd_here("replay", tmp_path / "none.mcap", *out), 1, "none.mcap cannot be read")
+    assert_error(rigd_here("replay", tmp_path / "none.mcap", *out), 1, "none.mcap cannot be read")
     torn = tmp_path / "torn.mcap.part"
-    torn.write_bytes(short.read_bytes()[:-3000])
-    refused(rigd_here("replay", torn, *out), 1, "torn.mcap.part is incomplete", "`rigd recover ")
-    refused(rigd_here("replay", write("empty.mcap", []), *out), 1, "no samples were recorded")
-    sparse = write("sparse.mcap", np.arange(100) * 1000)
-    refused(rigd_here("replay", sparse, *out), 1, "only 100 of the 99001 ticks")
-    still = write("still.mcap", np.arange(100), metadata={"beam_length_m": "0"})
-    refused(rigd_here("replay", still, *out), 1, "beam_length_m is 0 m")
-    quick = write("quick.mcap", np.arange(100), metadata={"rate_hz": "1e9"})
-    refused(rigd_here("replay", quick, *out), 1, "rate_hz is 1e+09 Hz, but must be from 1 to")
+    torn.write_bytes(session_path.read_bytes()[:-3000])
+    assert_error(
+        rigd_here("replay", torn, *out), 1, "torn.mcap.part is incomplete", "`rigd recover "
+    )
+    assert_error(
+        rigd_here("replay", write_session_file("empty.mcap", []), *out),
+        1,
+        "no samples were recorded",
+    )
+    sparse = write_session_file("sparse.mcap", np.arange(100) * 1000)
+    assert_error(rigd_here("replay", sparse, *out), 1, "only 100 of the 99001 ticks")
+    still = write_session_file("still.mcap", np.arange(100), metadata={"beam_length_m": "0"})
+    assert_error(rigd_here("replay", still, *out), 1, "beam_length_m is 0 m")
+    quick = write_session_file("quick.mcap", np.arange(100), metadata={"rate_hz": "1e9"})
+    assert_error(rigd_here("replay", quick, *out), 1, "rate_hz is 1e+09 Hz, but must be from 1 to")
     false = tmp_path / "false.rrd"
     false.write_text("no recording")
-    refused(rigd_here("replay", false, "--web"), 1, "is not a Rerun recording")
-    refused(rigd_here("replay", tmp_path / "none.rrd", "--web"), 1, "none.rrd cannot be read")
+    assert_error(rigd_here("replay", false, "--web"), 1, "is not a Rerun recording")
+    assert_error(rigd_here("replay", tmp_path / "none.rrd", "--web"), 1, "none.rrd cannot be read")
     os.mkfifo(tmp_path / "pipe.rrd")
-    refused(rigd_here("replay", tmp_path / "pipe.rrd", "--web"), 1, "pipe.rrd is not a file")
+    assert_error(rigd_here("replay", tmp_path / "pipe.rrd", "--web"), 1, "pipe.rrd is not a file")
     long = tmp_path / f"{'x' * 300}.rrd"
-    refused(rigd_here("replay", short, "--save", long), 2, "cannot be written: File name too long")
+    assert_error(
+        rigd_here("replay", session_path, "--save", long),
+        2,
+        "cannot be written: File name too long",
+    )
     assert not (tmp_path / "out.rrd").exists()
 
 
-def test_what_is_set_for_programs_of_ones_own_is_no_matter(rigd_here, write, tmp_path, monkeypatch):
+def test_rerun_variables_of_the_environment_are_ignored(
+    rigd_here, write_session_file, tmp_path, monkeypatch
+):
     monkeypatch.setenv("RERUN", "off")
     monkeypatch.setenv("_RERUN_TEST_FORCE_SAVE", str(tmp_path / "elsewhere.rrd"))
     monkeypatch.setenv("RERUN_FLUSH_NUM_BYTES", "one")
     out = tmp_path / f"{'x' * 250}.rrd"  # as long as a name can be
-    done = rigd_here("replay", write("brief.mcap", np.arange(700)), "--save", out)
+    done = rigd_here("replay", write_session_file("brief.mcap", np.arange(700)), "--save", out)
     assert done.returncode == 0, done.stderr
     assert batches(out)["/signals"]
     assert not (tmp_path / "elsewhere.rrd").exists()
 
 
-def test_a_start_after_all_times_is_told(write):
-    path = write("late.mcap", np.arange(700))
+def test_error_if_the_start_time_is_too_late(write_session_file):
+    path = write_session_file("late.mcap", np.arange(700))
     late = replace(read_session(path), start_utc_ns=2**63)
     with pytest.raises(SessionError, match="start_utc_ns is 9223372036854775808 ns, after"):
         draw_session(None, late, read_timings(path))
 
 
 @pytest.mark.further  # as the full disk of a session is
-def test_a_full_disk_is_told_and_leaves_nothing_behind(short, tmp_path):
-    def little_room():
+def test_full_disk_is_reported_and_leaves_no_file(short_session, tmp_path):
+    def limit_file_size():
         resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 
-    done = run("replay", short, "--save", "out.rrd", cwd=tmp_path, preexec_fn=little_room)
-    refused(done, 1, "out.rrd cannot be written: File too large")
+    done = run(
+        "replay", short_session, "--save", "out.rrd", cwd=tmp_path, preexec_fn=limit_file_size
+    )
+    assert_error(done, 1, "out.rrd cannot be written: File too large")
     temporary = os.environ | {"TMPDIR": str(tmp_path)}
-    done = run("replay", short, "--web", cwd=tmp_path, preexec_fn=little_room, env=temporary)
-    refused(done, 1, ".rrd cannot be written: File too large")
+    done = run(
+        "replay", short_session, "--web", cwd=tmp_path, preexec_fn=limit_file_size, env=temporary
+    )
+    assert_error(done, 1, ".rrd cannot be written: File too large")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("delay_s", "appears"), [(-1.0, True), (600.0, False)])
-def test_progress_appears_when_it_takes_long(
-    rigd_here, write, monkeypatch, tmp_path, delay_s, appears
+def test_progress_appears_after_a_delay(
+    rigd_here, write_session_file, monkeypatch, tmp_path, delay_s, appears
 ):
     monkeypatch.setattr("rigd.cli.options._PROGRESS_DELAY_S", delay_s)
     monkeypatch.setenv("FORCE_COLOR", "1")
-    path = write("brief.mcap", np.arange(700))
+    path = write_session_file("brief.mcap", np.arange(700))
     done = rigd_here("replay", path, "--save", tmp_path / "out.rrd")
     assert done.returncode == 0, done.stderr
     assert (path.name in done.stderr.partition("open it with")[0]) == appears
 
 
-def test_without_a_screen_it_says_what_else_there_is(rigd_here, write, monkeypatch):
-    session = write("brief.mcap", np.arange(700))
+def test_error_without_a_screen_names_alternatives(rigd_here, write_session_file, monkeypatch):
+    session = write_session_file("brief.mcap", np.arange(700))
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    refused(rigd_here("replay", session), 1, "no screen", "--web", "--save")
+    assert_error(rigd_here("replay", session), 1, "no screen", "--web", "--save")
     for name in ("nonsense.txt", "nonsense.rrd"):
         nonsense = session.with_name(name)
         nonsense.write_text("hello")
-        refused(rigd_here("replay", nonsense), 1, str(nonsense), "Give a")
-        refused(rigd_here("replay", f"{nonsense}.gone.mcap"), 1, "No such file")
+        assert_error(rigd_here("replay", nonsense), 1, str(nonsense), "Give a")
+        assert_error(rigd_here("replay", f"{nonsense}.gone.mcap"), 1, "No such file")
     seen = session.with_name("seen.rrd")
     seen.write_bytes(b"RRF2")
     recording = rigd_here("replay", seen)
-    refused(recording, 1, "no screen", "--web")
+    assert_error(recording, 1, "no screen", "--web")
     assert "--save" not in recording.stderr
 
 
 @pytest.mark.further  # as that of a live view
-def test_a_window_that_cannot_be_opened_is_told(rerun_program, short, tmp_path):
+def test_error_if_no_window_can_be_opened(rerun_program, short_session, tmp_path):
     environment = {k: v for k, v in os.environ.items() if k != "WAYLAND_DISPLAY"}
     environment |= {"DISPLAY": ":48123", "TMPDIR": str(tmp_path)}
-    done = run("replay", short, env=environment, timeout=300)
+    done = run("replay", short_session, env=environment, timeout=300)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert "--web shows the same in a browser" in done.stderr.splitlines()[-1]
@@ -476,10 +499,10 @@ def rerun_program():
 
 
 @pytest.fixture
-def served(rerun_program, short, tmp_path):
-    """`rigd replay --web` of the short session, from when it has told its address."""
+def served(rerun_program, short_session, tmp_path):
+    """`rigd replay --web` of the short session, once it has printed its address."""
     process = subprocess.Popen(
-        [RIGD, "replay", short, "--web"],
+        [RIGD, "replay", short_session, "--web"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -492,7 +515,7 @@ def served(rerun_program, short, tmp_path):
 
 
 @pytest.mark.further  # as tests/live/test_live_page.py
-def test_a_browser_is_served_on_loopback_until_it_is_ended(served, tmp_path):
+def test_page_is_served_on_loopback_until_ended(served, tmp_path):
     process, address = served
     assert address.startswith("http://127.0.0.1:"), process.stderr.read()
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
@@ -505,8 +528,8 @@ def test_a_browser_is_served_on_loopback_until_it_is_ended(served, tmp_path):
     assert {end.addresses[0] for end in ends} == {LOOPBACK}
     (folder,) = tmp_path.iterdir()
     assert [path.suffix for path in folder.iterdir()] == [".rrd"]
-    said = process.stderr.readline()
-    assert "is shown there until Ctrl-C. From another computer: ssh -L " in said
+    printed = process.stderr.readline()
+    assert "is shown there until Ctrl-C. From another computer: ssh -L " in printed
     process.send_signal(signal.SIGTERM)
     process.communicate(timeout=300.0)
     assert process.returncode == 130
@@ -515,23 +538,23 @@ def test_a_browser_is_served_on_loopback_until_it_is_ended(served, tmp_path):
 
 
 @pytest.mark.further  # as that of a live view
-def test_a_server_that_dies_is_told(served, tmp_path):
+def test_death_of_the_server_is_reported(served, tmp_path):
     process, _ = served
     (server,) = children(process.pid)
     os.kill(server, signal.SIGKILL)
-    _, said = process.communicate(timeout=300.0)
+    _, printed = process.communicate(timeout=300.0)
     assert process.returncode == 1
-    assert said.splitlines()[-1].startswith("Error: The Rerun server ended: ")
+    assert printed.splitlines()[-1].startswith("Error: The Rerun server ended: ")
     assert list(tmp_path.iterdir()) == []
 
 
 COLORS = {
     "Motor angle (mrad)": [ORANGE, SKY_BLUE],
     "Coupling torque, tared (N·m)": [GREEN],
-    "Values and limits": [SKY_BLUE, GREEN],  # it was complete, and near no limit
+    "Values and limits": [SKY_BLUE, GREEN],  # the session was complete, and near no limit
     "Frequency response: magnitude of torque over angle": [SKY_BLUE, ORANGE, GREY],
 }
-"""Views of the first tab → what is to be seen in them."""
+"""Views of the first tab → expected colours."""
 
 
 def count(image: np.ndarray, color: tuple[int, int, int]) -> int:
@@ -540,8 +563,8 @@ def count(image: np.ndarray, color: tuple[int, int, int]) -> int:
     return int(np.count_nonzero(np.all(distance < 12.0, axis=-1)))
 
 
-def unseen(viewer, colors: dict) -> list:
-    """Return which colours are not seen in the views of the tab in front."""
+def missing_colors(viewer, colors: dict) -> list:
+    """Return the colours that are missing in the views of the front tab."""
     missing = {(name, color) for name in colors for color in colors[name]}
     for view in viewer.get_state().views:
         assert view.reports == []
@@ -556,9 +579,7 @@ def unseen(viewer, colors: dict) -> list:
 
 
 @pytest.mark.further  # as the live view's
-def test_a_port_that_somebody_takes_first_is_not_insisted_on(
-    rerun_program, recording, tmp_path, monkeypatch
-):
+def test_another_port_if_the_first_is_taken(rerun_program, recording, tmp_path, monkeypatch):
     from rigd.live import PageOfFile
 
     with socket.create_server(("127.0.0.1", 0)) as other:
@@ -570,15 +591,15 @@ def test_a_port_that_somebody_takes_first_is_not_insisted_on(
 
 
 @pytest.mark.further  # as tests/live/test_live_window.py
-@pytest.mark.parametrize("way", ["window", "browser"])
-def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
+@pytest.mark.parametrize("client_kind", ["window", "browser"])
+def test_viewer_shows_the_recording(rerun_program, recording, tmp_path, client_kind):
     """In Rerun's own viewer, without a screen: opened as the window is, and as browsers do."""
     from rerun.experimental import ViewerClient
 
     from rigd.live import FileWindow, PageOfFile, Viewer
 
     headless = ("--headless", "--window-size", "960x600")
-    if way == "window":
+    if client_kind == "window":
         program, page = FileWindow(recording, tmp_path, headless).program, None
     else:
         page = PageOfFile(recording, tmp_path)
@@ -602,7 +623,7 @@ def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
                 try:
                     state = viewer.get_state()
                 except ConnectionError:
-                    # It listens before it draws, which this computer may be unable to.
+                    # It listens before it draws, and drawing may fail on this computer.
                     eventually(lambda: not program.running)
                     viewer_ended(program)
                 ends = [line.end for r in state.recordings for line in r.timelines if line.end]
@@ -610,8 +631,8 @@ def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
 
             assert eventually(loaded, every_s=0.1)  # for each answer it draws everything
             viewer.set_time("session_time", duration=4.4, play_state="paused")
-            seen = eventually(lambda: not unseen(viewer, COLORS), every_s=0.1)
-            assert seen, unseen(viewer, COLORS)
+            complete = eventually(lambda: not missing_colors(viewer, COLORS), every_s=0.1)
+            assert complete, missing_colors(viewer, COLORS)
             if page is None:
                 ends = {end.addresses[0] for end in listeners(program.pid)}
                 assert ends == {LOOPBACK}
@@ -622,7 +643,7 @@ def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
 
 
 @pytest.mark.skipif(shutil.which("Xvfb") is None, reason="there is no Xvfb to open a window in")
-def test_a_window_is_closed_with_the_command(rerun_program, short, tmp_path):
+def test_window_is_closed_with_the_command(rerun_program, short_session, tmp_path):
     screen = subprocess.Popen(
         ["Xvfb", "-displayfd", "1", "-screen", "0", "800x600x24", "-nolisten", "tcp"],
         stdout=subprocess.PIPE,
@@ -633,14 +654,17 @@ def test_a_window_is_closed_with_the_command(rerun_program, short, tmp_path):
         display = screen.stdout.readline().strip()
         environment = {k: v for k, v in os.environ.items() if k != "WAYLAND_DISPLAY"}
         process = subprocess.Popen(
-            [RIGD, "replay", short],
+            [RIGD, "replay", short_session],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             env=environment | {"DISPLAY": f":{display}", "TMPDIR": str(tmp_path)},
         )
-        said = process.stderr.readline()
-        assert said == f"{short.name} is shown; close the window, or press Ctrl-C, to end.\n"
+        printed = process.stderr.readline()
+        assert (
+            printed
+            == f"{short_session.name} is shown; close the window, or press Ctrl-C, to end.\n"
+        )
         (viewer,) = children(process.pid)
         assert eventually(lambda: process.poll() is not None or listeners(viewer))
         if process.poll() is not None:

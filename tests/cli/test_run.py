@@ -37,13 +37,13 @@ RIGD = Path(sys.executable).parent / "rigd"
 SHORT = ("--duration", "2", "--rest", "0.2", "--ring-down", "0.3", "--stop-hz", "10")
 
 
-def the_session(done):
+def only_session(done):
     assert done.returncode == 0, done.stdout + done.stderr
     (session,) = json.loads(done.stdout)["sessions"]
     return session
 
 
-def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(paper_session):
+def test_reference_chirp_is_complete_and_excites_three_modes(paper_session):
     path, session = paper_session
     assert session["outcome"] == "complete"
     assert session["scheduled"] == session["recorded"] == 136_000
@@ -88,7 +88,7 @@ def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(paper_s
     ("arguments", "ticks"),
     [
         further(("hold", "--duration", "1", "--rest", "0.5"), 1500),
-        pytest.param(  # runs in tests/docs/test_readme.py as well
+        pytest.param(  # also runs in tests/docs/test_readme.py
             ("step", "--duration", "1", "--rest", "0.5", "--ring-down", "0.5"),
             2000,
             marks=pytest.mark.slow,
@@ -101,53 +101,53 @@ def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(paper_s
     ],
 )  # fmt: skip
 def test_every_excitation_runs(rigd, tmp_path, arguments, ticks):
-    session = the_session(rigd("run", *arguments, "--fast", "--json"))
+    session = only_session(rigd("run", *arguments, "--fast", "--json"))
     assert session["recorded"] == ticks
     record = read_session(tmp_path / session["path"])
     assert record.metadata["excitation"] == arguments[0]
 
 
 @pytest.mark.further  # as tests/runner/test_quick_looks.py
-def test_each_session_gets_a_quick_look(rigd, tmp_path, brief_looks):
+def test_each_session_has_a_quick_look(rigd, tmp_path, brief_quick_looks):
     (tmp_path / "analysis").mkdir()
     (tmp_path / "analysis" / "__init__.py").write_text("raise SystemExit('the wrong one')")
     lengths = ("--duration", "1", "--rest", "0.2")
     done = rigd("run", "hold", "--fast", "--json", "--repeat", "2", *lengths)
     assert done.returncode == 0, done.stderr
     for session in json.loads(done.stdout)["sessions"]:
-        look = json.loads((tmp_path / session["look"]).read_text())
-        assert look["file"] == Path(session["path"]).name
-        assert "\n".join(look["text"]) in done.stderr
-    session = the_session(rigd("run", "hold", "--fast", "--json", "--no-look", *lengths))
+        quick_look = json.loads((tmp_path / session["look"]).read_text())
+        assert quick_look["file"] == Path(session["path"]).name
+        assert "\n".join(quick_look["text"]) in done.stderr
+    session = only_session(rigd("run", "hold", "--fast", "--json", "--no-look", *lengths))
     assert session["look"] is None
 
 
-def test_ctrl_c_skips_a_quick_look_and_stops_nothing(start_rigd, monkeypatch, brief_looks):
-    brief_looks.write_text("import time; time.sleep(600)\n")
+def test_ctrl_c_skips_only_the_quick_look(start_rigd, monkeypatch, brief_quick_looks):
+    brief_quick_looks.write_text("import time; time.sleep(600)\n")
     monkeypatch.delenv("PYTHONPATH")
     options = ("--fast", "--duration", "1", "--json")
-    process = start_rigd("run", "hold", *options, packages=brief_looks.parents[1])
-    while "Ctrl-C skips it" not in (said := process.stderr.readline()):
-        assert said
-    look = child_running(process.pid, "analysis.quick_look")
+    process = start_rigd("run", "hold", *options, packages=brief_quick_looks.parents[1])
+    while "Ctrl-C skips it" not in (line := process.stderr.readline()):
+        assert line
+    quick_look = child_running(process.pid, "analysis.quick_look")
     to_all(process, signal.SIGINT)
-    session = the_session(finished(process))
+    session = only_session(wait_for_end(process))
     assert session["outcome"] == "complete"
     assert session["look"] is None
-    assert has_ended(look)
+    assert has_ended(quick_look)
 
 
-def finished(process):
+def wait_for_end(process):
     output, errors = process.communicate(timeout=300)
     return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
 
 
 @pytest.mark.further  # as tests/excitation and the engine
-def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
+def test_reference_from_a_file_is_followed(rigd, tmp_path):
     (tmp_path / "reference.csv").write_text(
         "time_s,angle_rad\n" + "".join(f"{t / 100},{0.01 * (t / 100)}\n" for t in range(201))
     )
-    session = the_session(rigd("run", "file", "reference.csv", "--fast", "--json"))
+    session = only_session(rigd("run", "file", "reference.csv", "--fast", "--json"))
     record = read_session(tmp_path / session["path"])
     first, end = record.segments["sweep"]
     sweep = record.samples["angle_reference_rad"][first:end]
@@ -156,22 +156,22 @@ def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
 
 
 @pytest.mark.fit
-@pytest.mark.further  # as identify/test_knock.py, of records without a motor that turns with it
-def test_a_loud_knock_is_named_though_the_motor_turns_with_it(rigd, tmp_path):
-    """In mid-sweep, on the tip: the beam rings louder than the motor drives it, for half of it."""
+@pytest.mark.further  # as identify/test_knock.py, with records of a motor at rest
+def test_loud_impact_is_identified_while_the_motor_turns(rigd, tmp_path):
+    """In mid-sweep, on the tip: for half of the sweep the beam rings louder than it is driven."""
     rigd(
         *("run", "chirp", "--duration", "20", "--stop-hz", "50", "--seed", "5", "--fast"),
         *("--obstacle", "x=0.98,force=0.5,duration=0.01,at=10", "--no-look"),
         *("--output", str(tmp_path)),
     )
     [path] = tmp_path.glob("*.mcap")
-    told = select(load(path))
-    assert told.verdict.adequate
-    [finding] = told.verdict.findings
+    result = select(load(path))
+    assert result.verdict.adequate
+    [finding] = result.verdict.findings
     assert finding.kind == "knock"
-    assert all(mode.damping_ratio.flag is None for mode in told.headline.modes)
+    assert all(mode.damping_ratio.flag is None for mode in result.headline.modes)
     rig = load_profile("sim").rig
-    for mode, true in zip(told.headline.modes, modes(rig.beam, rig.damping, 3), strict=True):
+    for mode, true in zip(result.headline.modes, modes(rig.beam, rig.damping, 3), strict=True):
         for quantity, value in (
             (mode.frequency_hz, true.frequency_hz),
             (mode.damping_ratio, true.damping_ratio),
@@ -179,8 +179,8 @@ def test_a_loud_knock_is_named_though_the_motor_turns_with_it(rigd, tmp_path):
             assert abs(quantity.value - value) < 4 * quantity.std
 
 
-@pytest.mark.further  # as test_touch.py has it
-def test_an_obstacle_is_met_and_stands_in_the_file(rigd, tmp_path):
+@pytest.mark.further  # as test_touch.py
+def test_contact_with_an_obstacle_and_its_metadata(rigd, tmp_path):
     options = ("step", "--amplitude", "0.05", "--duration", "1", "--rest", "0.2", "--fast")
     obstacle = "x=0.62,angle=0.02,stiffness=3000"
     sessions = []
@@ -202,7 +202,7 @@ def test_an_obstacle_is_met_and_stands_in_the_file(rigd, tmp_path):
 
 
 @pytest.mark.further  # as in the engine
-def test_a_series_is_reproduced_by_its_seed_and_its_sessions_differ(rigd, tmp_path):
+def test_series_is_reproducible_by_its_seed(rigd, tmp_path):
     def series():
         options = ("--seed", "5", "--repeat", "2", "--note", "a series", *SHORT)
         sessions = json.loads(rigd("run", "chirp", "--fast", "--json", *options).stdout)["sessions"]
@@ -219,20 +219,20 @@ def test_a_series_is_reproduced_by_its_seed_and_its_sessions_differ(rigd, tmp_pa
         assert np.array_equal(first.samples, second.samples)
 
 
-@pytest.mark.further  # as the sessions below that are stopped
-def test_real_time_keeps_its_books(rigd, patient, tmp_path):
+@pytest.mark.further  # as the stopped sessions below
+def test_counts_of_a_session_in_real_time(rigd, patient, tmp_path):
     lengths = ("--duration", "0.5", "--rest", "0.1", "--ring-down", "0.1")
-    session = the_session(rigd("run", "chirp", "--json", "--profile", patient, *lengths))
+    session = only_session(rigd("run", "chirp", "--json", "--profile", patient, *lengths))
     assert session["scheduled"] == 700
     assert session["lost"] == 0
     assert session["recorded"] + session["missed"] == 700
     record = read_session(tmp_path / session["path"])
     assert len(record.samples) == session["recorded"]
-    keeps_real_time(record, session)
+    check_real_time(record, session)
 
 
-def keeps_real_time(record, session):
-    """Check that a record was made in real time, and that its counts are those of its samples."""
+def check_real_time(record, session):
+    """Check that a record was made in real time, and that its counts agree with its samples."""
     began_s = 1e-9 * (record.samples["t_ns"] + record.samples["lateness_ns"].astype(int))
     rate_hz = (len(began_s) - 1) / (began_s[-1] - began_s[0])
     assert float(record.outcome["true_rate_hz"]) == pytest.approx(rate_hz, rel=0.01)
@@ -242,7 +242,7 @@ def keeps_real_time(record, session):
 
 
 def to_all(process, number):
-    """As a terminal or a service manager does: the whole process group gets it."""
+    """Signal the whole process group, as a terminal or a service manager does."""
     os.killpg(process.pid, number)
 
 
@@ -250,7 +250,7 @@ def to_one(process, number):
     process.send_signal(number)
 
 
-def recorded(folder, size=10_000, timeout_s=60.0):
+def wait_for_record(folder, size=10_000, timeout_s=60.0):
     """Wait until a session is being recorded in a folder; return its file."""
 
     def grown():
@@ -274,18 +274,18 @@ def recorded(folder, size=10_000, timeout_s=60.0):
         pytest.param(to_one, ("SIGHUP", "SIGQUIT", "SIGTSTP"), marks=pytest.mark.slow),
     ],
 )
-def test_every_stop_leaves_the_torque_off_and_a_complete_file(
+def test_every_stop_switches_off_and_completes_the_file(
     start_rigd, write_profile, tmp_path, send, interrupts
 ):
     running = {}
-    for name in interrupts:  # all at once: what takes time is waiting
+    for name in interrupts:  # all at once: most of the time is waiting
         (tmp_path / name).mkdir()
         values = {"name": f'"{name}"', "realtime.priority": "0"}
         profile = write_profile("sim", values, patient=True)
         options = ("--json", "--duration", "60", "--profile", profile)
         running[name] = start_rigd("run", "chirp", *options, folder=tmp_path / name)
     for name in interrupts:
-        recorded(tmp_path / name)
+        wait_for_record(tmp_path / name)
     for _ in range(3):  # an impatient operator presses again
         for name, process in running.items():
             send(process, signal.Signals[name])
@@ -301,7 +301,7 @@ def test_every_stop_leaves_the_torque_off_and_a_complete_file(
         assert session["lost"] == 0
         record = read_session(folder / session["path"])
         assert len(record.samples) == session["recorded"]
-        keeps_real_time(record, session)
+        check_real_time(record, session)
         assert record.outcome["outcome"] == "stopped"
         last = record.samples[-1]
         assert last["torque_command_nm"] == 0.0
@@ -317,7 +317,7 @@ def test_a_stop_before_the_record_leaves_no_file(start_rigd, write_profile, tmp_
         folder.mkdir()
         values = {"name": f'"{number}"', "session.tare_s": "60"}
         profile = write_profile("sim", values, patient=True)
-        with ignored(signal.SIGINT):  # by the interpreter's own start, which would end as it likes
+        with ignored(signal.SIGINT):  # by the interpreter's own start, which would end differently
             process = start_rigd("run", "chirp", "--json", "--profile", profile, folder=folder)
         running.append((folder, process))
     for number, (_, process) in enumerate(running):  # each in another part of its start
@@ -329,14 +329,14 @@ def test_a_stop_before_the_record_leaves_no_file(start_rigd, write_profile, tmp_
         assert process.returncode == 130, errors
         assert "Traceback" not in errors
         assert not list(folder.glob("sessions/*"))
-        if output:  # it had come as far as to have something to say
+        if output:  # it had begun to plan sessions
             for session in json.loads(output)["sessions"]:
                 assert session["path"] is None
                 assert session["scheduled"] == 0
 
 
 @pytest.mark.further  # as in tests/runner
-def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
+def test_stopped_series_retains_its_sessions(start_rigd, tmp_path):
     process = start_rigd("run", "chirp", "--json", "--fast", "--repeat", "50", *SHORT)
     assert eventually(lambda: len(list(tmp_path.glob("sessions/*.mcap"))) >= 2)
     to_all(process, signal.SIGINT)
@@ -352,13 +352,13 @@ def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
 
 
 @pytest.mark.further  # as tests/runner/test_rig.py
-def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, tmp_path):
+def test_hanging_control_process_is_killed_at_a_stop(start_rigd, patient, tmp_path):
     process = start_rigd("run", "chirp", "--json", "--duration", "60", "--profile", patient)
-    recorded(tmp_path)
+    wait_for_record(tmp_path)
     os.kill(child_running(process.pid, "rigd.engine.control_process"), signal.SIGSTOP)
     to_one(process, signal.SIGINT)
     output, errors = process.communicate(timeout=300)
-    assert process.returncode == 1, errors  # a fault is one, whatever was asked for
+    assert process.returncode == 1, errors  # a fault, although a stop was requested
     (session,) = json.loads(output)["sessions"]
     assert session["outcome"] == "fault"
     assert "was killed" in session["reason"]
@@ -367,9 +367,9 @@ def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, t
 
 
 @pytest.mark.further  # as tests/runner/test_rig.py and tests/recovery/test_advice.py
-def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, tmp_path):
+def test_file_created_meanwhile_is_not_overwritten(start_rigd, patient, tmp_path):
     process = start_rigd("run", "hold", "--duration", "3", "--rest", "0", "--profile", patient)
-    part = recorded(tmp_path, 1000)  # before, its name is only being tried
+    part = wait_for_record(tmp_path, 1000)  # before that, its name is only being tried
     part.with_suffix("").write_text("somebody else's")
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 1
@@ -389,7 +389,7 @@ def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, t
 )
 def test_a_killed_process_ends_the_session_safely(start_rigd, patient, tmp_path, victim, words):
     process = start_rigd("run", "chirp", "--duration", "60", "--profile", patient)
-    recorded(tmp_path)
+    wait_for_record(tmp_path)
     os.kill(child_running(process.pid, victim), signal.SIGKILL)
     output, errors = process.communicate(timeout=300)
     assert process.returncode == 1, (output, errors)
@@ -406,16 +406,16 @@ def test_a_killed_process_ends_the_session_safely(start_rigd, patient, tmp_path,
         assert "recorder process was killed" in output + errors
 
 
-@pytest.mark.further  # as where its folder goes
-def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, patient, tmp_path):
+@pytest.mark.further  # as with a moved folder
+def test_failed_series_reports_the_earlier_sessions(start_rigd, patient, tmp_path):
     options = ("--json", "--duration", "2", "--rest", "0", "--repeat", "30", "--profile", patient)
     process = start_rigd("run", "hold", *options)
     assert eventually(lambda: list(tmp_path.glob("sessions/*-01.mcap")))
-    # One that has already made its file whole is not missed, and this test may have stood still.
+    # One that has completed its file is not missed, and this test may have been suspended.
     while process.poll() is None:
         with contextlib.suppress(AssertionError, ProcessLookupError):  # between two sessions
             recorder = child_running(process.pid, "rigd.engine.recorder")
-            recorded(tmp_path, 1000, timeout_s=10.0)
+            wait_for_record(tmp_path, 1000, timeout_s=10.0)
             os.kill(recorder, signal.SIGKILL)
         time.sleep(0.2)
     output, errors = process.communicate(timeout=300)
@@ -431,8 +431,8 @@ def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, patient, 
     assert part.name in errors
 
 
-class FolderGoes(StopRequest):
-    """A stop that never comes; the folder of the sessions goes once there is one."""
+class FolderMoves(StopRequest):
+    """A stop that never comes; the folder of the sessions is moved once there is one."""
 
     @property
     def requested(self):
@@ -447,8 +447,8 @@ class FolderGoes(StopRequest):
 
 
 @pytest.mark.usefixtures("children_copied")
-def test_a_series_whose_folder_goes_tells_of_those_before(rigd_here, monkeypatch):
-    processes = FolderGoes(), ProcessGroup(live=False)
+def test_series_without_its_folder_reports_the_earlier_sessions(rigd_here, monkeypatch):
+    processes = FolderMoves(), ProcessGroup(live=False)
     monkeypatch.setattr("rigd.cli.run.start_processes", lambda **_: processes)
     brief = ("--duration", "0.3", "--rest", "0", "--fast", "--no-look")
     done = rigd_here("run", "hold", *brief, "--repeat", "3", "--json")
@@ -459,7 +459,7 @@ def test_a_series_whose_folder_goes_tells_of_those_before(rigd_here, monkeypatch
 
 
 @pytest.mark.further  # as names that are taken
-def test_sessions_of_the_same_second_get_names_of_their_own(start_rigd, tmp_path):
+def test_sessions_of_the_same_second_have_different_names(start_rigd, tmp_path):
     options = ("hold", "--duration", "1", "--fast", "--json")
     processes = [start_rigd("run", *options) for _ in range(2)]
     paths = set()
@@ -472,18 +472,18 @@ def test_sessions_of_the_same_second_get_names_of_their_own(start_rigd, tmp_path
 
 
 @pytest.mark.further  # as tests/session
-def test_a_file_s_name_that_is_no_text_is_written_as_well_as_it_can_be(rigd, tmp_path):
+def test_undecodable_file_name_is_stored_escaped(rigd, tmp_path):
     name = os.fsdecode(b"f\xff.csv")
     (tmp_path / name).write_text("angle_rad\n" + "0.0\n" * 100)
     done = subprocess.run(
         [RIGD, "run", "file", name, "--fast", "--json"],
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
-    path = tmp_path / the_session(done)["path"]
+    path = tmp_path / only_session(done)["path"]
     assert read_session(path).metadata["file"] == r"f\udcff.csv"
 
 
-def test_a_beam_that_cannot_be_simulated_is_refused_in_one_sentence(rigd, write_profile, tmp_path):
+def test_error_if_the_beam_cannot_be_simulated(rigd, write_profile, tmp_path):
     values = {"simulation.density_ratio": "1000.0", "simulation.stiffness_ratio": "1e-3"}
     profile = write_profile("sim", values)
     done = rigd("run", "hold", "--profile", str(profile), "--fast", "--output", str(tmp_path))
@@ -494,7 +494,7 @@ def test_a_beam_that_cannot_be_simulated_is_refused_in_one_sentence(rigd, write_
 
 
 def test_a_session_needs_neither_descriptors_nor_scipy(tmp_path):
-    """Scipy would add 0.15 s of processor time to every start; what is found first here ends."""
+    """Scipy would add 0.15 s of processor time to every start; the module found here exits."""
     (tmp_path / "scipy.py").write_text("raise SystemExit('scipy was imported')\n")
     done = subprocess.run(
         ["sh", "-c", f"exec {RIGD} run hold --duration 1 --fast --output out <&- >&- 2>&-"],
@@ -508,14 +508,14 @@ def test_a_session_needs_neither_descriptors_nor_scipy(tmp_path):
 
 
 @pytest.mark.further  # as tests/daemon/test_log.py
-def test_a_terminal_that_was_stopped_does_not_stop_the_supervisor(patient, tmp_path):
+def test_suspended_terminal_does_not_stop_the_supervisor(patient, tmp_path):
     master, slave = os.openpty()
     process = subprocess.Popen(
         [RIGD, "run", "hold", "--duration", "2", "--rest", "0", "--profile", patient, "--json"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=slave, text=True,
     )  # fmt: skip
     try:
-        recorded(tmp_path, 1000)
+        wait_for_record(tmp_path, 1000)
         termios.tcflow(slave, termios.TCOOFF)  # Ctrl-S
         assert eventually(lambda: list(tmp_path.glob("sessions/*.mcap")))
     finally:
@@ -529,7 +529,7 @@ def test_a_terminal_that_was_stopped_does_not_stop_the_supervisor(patient, tmp_p
 
 def test_a_dead_supervisor_ends_the_session_safely(start_rigd, patient, tmp_path):
     process = start_rigd("run", "chirp", "--duration", "60", "--profile", patient)
-    recorded(tmp_path)
+    wait_for_record(tmp_path)
     control = child_running(process.pid, "rigd.engine.control_process")
     process.kill()
     process.wait()
@@ -544,9 +544,7 @@ def test_a_dead_supervisor_ends_the_session_safely(start_rigd, patient, tmp_path
 
 
 @pytest.mark.further  # as below, and tests/excitation/test_signals.py
-def test_a_chirp_there_and_back_begins_as_a_plain_one_and_so_does_its_welch_estimate(
-    short_chirps, tmp_path
-):
+def test_chirp_there_and_back_begins_as_a_plain_chirp(short_chirps, tmp_path):
     """With the seed of the plain chirp: equal to the last bit up to the turn."""
     command = [RIGD, "run", "chirp", "--there-and-back", "--duration", "20", "--rest", "0.5"]
     command += ["--ring-down", "1", "--seed", "3", "--fast", "--no-look", "--output", tmp_path]
@@ -572,8 +570,8 @@ def test_a_chirp_there_and_back_begins_as_a_plain_one_and_so_does_its_welch_esti
     assert np.abs(np.diff(reference[20_400:20_600])).max() < 0.025 * 2 * np.pi * 50 / 1000
 
 
-def test_the_welch_estimate_of_a_chirp_there_and_back_is_that_of_its_way_there(short_chirps):
-    """Of half of a plain chirp, then: what comes behind it is no matter."""
+def test_welch_estimate_there_and_back_uses_the_way_there(short_chirps):
+    """The estimate is that of half of a plain chirp, whatever follows."""
     session = read_session(short_chirps[0])
     planned = {"sweep": (500, 20_500), "there": (500, 10_500), "back": (10_500, 20_500)}
     stated = {**session.metadata, "duration_s": "10.0", "stop_hz": "25.0"}
@@ -588,7 +586,7 @@ def test_the_welch_estimate_of_a_chirp_there_and_back_is_that_of_its_way_there(s
     assert welch_exclusion_reason(both) is None
 
 
-def test_a_chirp_there_and_back_that_is_stopped_on_its_way_back_keeps_its_welch_estimate(
+def test_welch_estimate_of_a_chirp_stopped_on_its_way_back(
     short_chirps,
 ):
     """Half of the way back: the plan is longer than the record, as of any stopped session."""

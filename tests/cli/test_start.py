@@ -1,4 +1,4 @@
-"""`rigd start` as it follows a series, by the events of a daemon that is none."""
+"""`rigd start` follows a series, by the events of a fake daemon."""
 
 import json
 import os
@@ -16,20 +16,20 @@ from cases import further
 from rigd.cli import start
 from rigd.daemon.address import socket_path
 
-DONE = {
+COMPLETE = {
     "event": "session", "part": None, "outcome": "complete", "reason": "", "scheduled": 1200,
     "recorded": 1200, "missed": 0, "late": 0, "lost": 0, "stale_angles": 0, "stale_wrenches": 0,
 }  # fmt: skip
 
 
 def process_at(link):
-    """Number of the process at the other end of a socket."""
+    """Return the PID of the process at the other end of a socket."""
     size = struct.calcsize("3i")
     return struct.unpack("3i", link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))[0]
 
 
 class Client:
-    """Has events to tell, and presses Ctrl-C where there is a number of times."""
+    """Returns events; a number among them stands for so many presses of Ctrl-C."""
 
     def __init__(self, interrupts, *events):
         self.interrupts = interrupts
@@ -49,17 +49,17 @@ class Client:
 
 @pytest.fixture
 def follow(monkeypatch):
-    """Follow series 7; returns what it comes to, and what was done with lines of progress."""
+    """Follow series 7; return its end, the calls of progress lines, and the commands sent."""
 
     def run(*events, quick_looks=True):
-        done = []
+        calls = []
 
         class Line:
             def __init__(self):
-                done.append("new")
+                calls.append("new")
 
             def __getattr__(self, name):
-                return lambda *what, **_: done.append((name, *what[:1]))
+                return lambda *arguments, **_: calls.append((name, *arguments[:1]))
 
         monkeypatch.setattr("rigd.runner.ProgressLine", Line)
         interrupts = start._Interrupts()
@@ -70,7 +70,7 @@ def follow(monkeypatch):
             )
         except typer.Exit as ending:
             ended = ending.exit_code
-        return ended, done, client.sent
+        return ended, calls, client.sent
 
     return run
 
@@ -81,7 +81,7 @@ def progress(session):
 
 
 def session(number):
-    return DONE | {"number": number, "path": f"out/{number}.mcap"}
+    return COMPLETE | {"number": number, "path": f"out/{number}.mcap"}
 
 
 def series(*numbers):
@@ -89,38 +89,40 @@ def series(*numbers):
     return {"event": "series", "series": 7, "sessions": sessions}
 
 
-def look(number, text="Quick look"):
+def quick_look(number, text="Quick look"):
     content = {"text": [text]}
     return {"event": "quick_look", "path": f"out/{number}.mcap", "look": content, "error": ""}
 
 
-def test_no_bar_is_drawn_after_a_session_before_the_next(follow):
+def test_no_bar_between_two_sessions(follow):
     events = (progress(1), session(1), progress(1), progress(2), session(2), progress(2))
-    _, done, _ = follow(*events, series(1, 2), quick_looks=False)
-    updates = [each[0] for each in done if each[0] == "update"]
+    _, calls, _ = follow(*events, series(1, 2), quick_looks=False)
+    updates = [each[0] for each in calls if each[0] == "update"]
     assert len(updates) == 2
-    first = done.index(("write_message", "Complete: 1200 of 1200 samples, 0 missed, 0 late."))
-    assert done[first + 1 : first + 4] == [("close",), "new", ("update", done[first + 3][1])]
-    assert done[-1] == ("close",)
+    first = calls.index(("write_message", "Complete: 1200 of 1200 samples, 0 missed, 0 late."))
+    assert calls[first + 1 : first + 4] == [("close",), "new", ("update", calls[first + 3][1])]
+    assert calls[-1] == ("close",)
 
 
-def test_the_last_quick_look_is_waited_for(follow):
-    other = look(9)  # of somebody else's session
-    ended, done, _ = follow(session(1), look(1), session(2), series(1, 2), other, look(2, "Last"))
+def test_wait_for_the_last_quick_look(follow):
+    other = quick_look(9)  # of another session
+    ended, calls, _ = follow(
+        session(1), quick_look(1), session(2), series(1, 2), other, quick_look(2, "Last")
+    )
     assert [each["look"] for each in ended["sessions"]] == [
         "out/1.look.json",
         "out/2.look.json",
     ]
-    said = [each[1] for each in done if each[0] == "write_message"]
-    assert said[-2:] == ["Quick look at the session; Ctrl-C skips it.", "Last"]
-    assert said.count("Quick look") == 1
+    messages = [each[1] for each in calls if each[0] == "write_message"]
+    assert messages[-2:] == ["Quick look at the session; Ctrl-C skips it.", "Last"]
+    assert messages.count("Quick look") == 1
 
 
-def test_a_quick_look_that_does_not_follow_is_not_waited_for(follow):
+def test_no_wait_if_no_quick_look_follows(follow):
     first, second = (session(k) | {"look_follows": k == 1} for k in (1, 2))
-    ended, done, _ = follow(first, look(1), second, series(1, 2))
+    ended, calls, _ = follow(first, quick_look(1), second, series(1, 2))
     assert [each["look"] for each in ended["sessions"]] == ["out/1.look.json", None]
-    assert not any("Ctrl-C skips it" in each[1] for each in done if each[0] == "write_message")
+    assert not any("Ctrl-C skips it" in each[1] for each in calls if each[0] == "write_message")
 
 
 @pytest.mark.parametrize("interrupts", [(), (1,)])  # the session was stopped by a first one
@@ -130,34 +132,34 @@ def test_ctrl_c_skips_the_quick_look(follow, interrupts):
     assert sent == ["stop"] * len(interrupts)
 
 
-def test_a_second_ctrl_c_in_a_session_leaves_it_to_the_daemon(follow):
+def test_second_ctrl_c_leaves_the_session_to_the_daemon(follow):
     ended, _, sent = follow(1, 1)
     assert (ended, sent) == (130, ["stop"])
 
 
-def test_what_is_notable_is_told_and_the_fit_is_in_the_document(follow):
-    told = [
+def test_notable_messages_are_printed_and_the_fit_is_returned(follow):
+    events = [
         {"event": "message", "level": "info", "text": text, "notable": notable}
         for text, notable in (("  8.0 s 0.910 ± 0.010 %", True), ("Next: mode 1.", False))
     ]
-    told.append({"event": "message", "level": "error", "text": "Fault: no record.", "session": 1})
+    events.append({"event": "message", "level": "error", "text": "Fault: no record.", "session": 1})
     fit = {"duration_s": 9.5, "modes": []}
-    ended, done, _ = follow(
-        *told, session(1) | {"fit": fit}, session(2), series(1, 2), quick_looks=False
+    ended, calls, _ = follow(
+        *events, session(1) | {"fit": fit}, session(2), series(1, 2), quick_looks=False
     )
-    said = [each[1] for each in done if each[0] == "write_message"]
-    assert said[0] == "  8.0 s 0.910 ± 0.010 %"
-    assert not any("Next" in each for each in said)
-    assert not any("Fault" in each for each in said)  # the session's own event tells it
+    messages = [each[1] for each in calls if each[0] == "write_message"]
+    assert messages[0] == "  8.0 s 0.910 ± 0.010 %"
+    assert not any("Next" in each for each in messages)
+    assert not any("Fault" in each for each in messages)  # the session's own event has it
     assert [each.get("fit") for each in ended["sessions"]] == [fit, None]
 
 
 @pytest.fixture
 def interrupting_daemon(runtime_folder):
-    """A daemon that keeps a start waiting, and presses Ctrl-C once it has it; what it heard."""
+    """A daemon that leaves a start without reply and sends Ctrl-C; yields received commands."""
     path = socket_path("sim")
     path.parent.mkdir(exist_ok=True)
-    heard = []
+    received = []
     listener = socket.create_server(str(path), family=socket.AF_UNIX)
 
     def serve():
@@ -169,17 +171,17 @@ def interrupting_daemon(runtime_folder):
             with link, link.makefile("rw") as file:
                 for line in file:
                     command = json.loads(line)["command"]
-                    heard.append(command)
+                    received.append(command)
                     if command == "start":
                         os.kill(process_at(link), signal.SIGINT)
                         continue
-                    told = {"daemon": {"what_moves": "No hardware."}, "stopping": False}
-                    file.write(json.dumps({"reply": command, "ok": True, **told}) + "\n")
+                    status = {"daemon": {"what_moves": "No hardware."}, "stopping": False}
+                    file.write(json.dumps({"reply": command, "ok": True, **status}) + "\n")
                     file.flush()
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
-    yield heard
+    yield received
     listener.shutdown(socket.SHUT_RDWR)  # which wakes the thread
     thread.join(10.0)
     listener.close()
@@ -187,14 +189,14 @@ def interrupting_daemon(runtime_folder):
 
 @pytest.mark.process
 @pytest.mark.parametrize("options", [(), further(("--detach",))])
-def test_ctrl_c_cancels_a_start_that_waits(interrupting_daemon, options):
-    done = warm_start.run(
+def test_ctrl_c_cancels_a_waiting_start(interrupting_daemon, options):
+    completed = warm_start.run(
         [sys.executable, "-m", "rigd", "start", "hold", "--profile", "sim", *options],
         check=False,
         capture_output=True,
         text=True,
         timeout=50.0,
     )
-    assert (done.returncode, done.stdout) == (130, "")
-    assert done.stderr == "No hardware.\nStopped before the session began.\n"
+    assert (completed.returncode, completed.stdout) == (130, "")
+    assert completed.stderr == "No hardware.\nStopped before the session began.\n"
     assert interrupting_daemon[-2:] == ["start", "stop"]

@@ -1,4 +1,4 @@
-"""What commands import before they know what is asked for, and numpy's threads."""
+"""Imports of commands before their options are known, and numpy's threads."""
 
 import os
 import subprocess
@@ -39,7 +39,7 @@ importlib.import_module("{module}").main()
         ("analysis.__main__", ["/dev/null"]),
     ],
 )
-def test_numpy_finds_the_threads_limited_when_it_is_imported(module, arguments):
+def test_threads_are_limited_before_numpy_is_imported(module, arguments):
     code = PROGRAM.format(variables=SINGLE_THREADED.items(), module=module, arguments=arguments)
     code = code.replace("dict_items(", "set(")
     # The tests' own environment forbids them.
@@ -52,32 +52,32 @@ def test_numpy_finds_the_threads_limited_when_it_is_imported(module, arguments):
     assert run.stdout == "True\n", run.stderr
 
 
-def test_help_needs_no_arrays():
+def test_help_imports_no_numpy():
     code = (
         "import sys; from rigd.cli.app import app; "
         "print([name for name in ('numpy', 'scipy', 'pydantic', 'rerun') if name in sys.modules])"
     )
 
-    told = subprocess.check_output([sys.executable, "-c", code], text=True)
+    printed = subprocess.check_output([sys.executable, "-c", code], text=True)
 
-    assert told == "[]\n"
+    assert printed == "[]\n"
 
 
-def test_the_processes_of_a_rig_are_started_before_numpy_is_imported():
+def test_processes_of_a_rig_start_before_numpy_is_imported():
     code = "import sys; from rigd.runner import ProcessGroup; print('numpy' in sys.modules)"
 
-    told = subprocess.check_output([sys.executable, "-c", code], text=True)
+    printed = subprocess.check_output([sys.executable, "-c", code], text=True)
 
-    assert told == "False\n"
+    assert printed == "False\n"
 
 
-def test_a_status_imports_no_parser_of_options(runtime_folder):
+def test_status_imports_no_parser_of_options(runtime_folder):
     code = (
         "import sys; sys.argv = ['rigd', 'status']; from rigd.__main__ import main\n"
         "try: main()\nexcept SystemExit as end: print(end.code)\n"
         "print([name for name in ('numpy', 'pydantic', 'typer') if name in sys.modules])"
     )
 
-    told = subprocess.check_output([sys.executable, "-c", code], text=True)
+    printed = subprocess.check_output([sys.executable, "-c", code], text=True)
 
-    assert told == "1\n[]\n"
+    assert printed == "1\n[]\n"

@@ -1,4 +1,4 @@
-"""Lists of commands: no summary is cut to fit its line of 80 characters."""
+"""Lists of commands: no summary is truncated to its line of 80 characters."""
 
 import pytest
 import typer
@@ -16,10 +16,10 @@ import rigd.cli.app
         (analysis.cli.app.app, ["export"]),
     ],
 )
-def test_no_summary_is_cut(app, arguments):
-    told = CliRunner().invoke(app, [*arguments, "--help"], terminal_width=80)
+def test_no_summary_is_truncated(app, arguments):
+    result = CliRunner().invoke(app, [*arguments, "--help"], terminal_width=80)
 
-    _, commands = told.stdout.split("--help ", 1)
+    _, commands = result.stdout.split("--help ", 1)
     lines = commands.splitlines()[1:]
     summaries = [line.split(maxsplit=1)[1] for line in lines if line.startswith("  ")]
     assert summaries
@@ -27,11 +27,11 @@ def test_no_summary_is_cut(app, arguments):
     assert not [summary for summary in summaries if summary.endswith("...")]
 
 
-def test_every_command_of_rigd_stands_in_one_section():
-    told = CliRunner().invoke(rigd.cli.app.app, ["--help"], terminal_width=80).stdout
+def test_every_command_is_in_one_section():
+    printed = CliRunner().invoke(rigd.cli.app.app, ["--help"], terminal_width=80).stdout
 
-    names = [line.split()[0] for line in told.splitlines() if line.startswith("  ")]
+    names = [line.split()[0] for line in printed.splitlines() if line.startswith("  ")]
     commands = typer.main.get_command(rigd.cli.app.app).commands
     assert {*commands} <= {*names}
     assert all(names.count(name) == 1 for name in commands)
-    assert "Other commands" not in told
+    assert "Other commands" not in printed

@@ -28,10 +28,10 @@ def touches_of(done):
 
 
 @pytest.fixture(scope="module")
-def touched(run_patched):
+def touch_session(run_patched):
     """Two passes against an obstacle: standard error, session, touches, record.
 
-    With a third of the positions the estimator is prepared in less time.
+    With a third of the positions, the preparation of the estimator takes less time.
     """
     command = ["touch", "0.6", "--passes", "2", "--fast", "--json", "--no-look", *QUICK]
     command += ["--obstacle", OBSTACLE]
@@ -41,8 +41,8 @@ def touched(run_patched):
     return errors, session, touches, read_session(session["path"])
 
 
-def test_each_pass_tells_where_the_obstacle_is(touched):
-    _, _, touches, _ = touched
+def test_each_pass_locates_the_obstacle(touch_session):
+    _, _, touches, _ = touch_session
     assert [touch["number"] for touch in touches] == [1, 2]
     for touch in touches:
         low, high = touch["x_m"]["interval_95"]
@@ -53,8 +53,8 @@ def test_each_pass_tells_where_the_obstacle_is(touched):
         assert touch["model"] == "profile"
 
 
-def test_the_file_has_the_detections_and_the_estimates(touched):
-    _, _, touches, record = touched
+def test_the_file_has_the_detections_and_the_estimates(touch_session):
+    _, _, touches, record = touch_session
     status, tick = record.samples["status"], record.samples["tick"]
     marked = tick[(status & Status.TOUCHED) != 0]
     assert marked.size == 2
@@ -73,8 +73,8 @@ def test_the_file_has_the_detections_and_the_estimates(touched):
     assert any("Touch detected" in event.message for event in record.events)
 
 
-def test_the_motor_brakes_at_once_and_goes_back(touched):
-    _, _, _, record = touched
+def test_motor_brakes_at_once_and_returns(touch_session):
+    _, _, _, record = touch_session
     samples = record.samples
     for at in np.flatnonzero((samples["status"] & Status.TOUCHED) != 0):
         after = samples["angle_rad"][at + 150 : at + 350]
@@ -84,22 +84,22 @@ def test_the_motor_brakes_at_once_and_goes_back(touched):
     assert abs(samples["angle_rad"][-1]) < 2e-3
 
 
-def test_the_operator_is_told(touched):
-    said, _, touches, _ = touched
-    assert "goes to 0.6 rad at 1 rad/s, 2 times, brakes within" in said
+def test_touches_are_printed(touch_session):
+    printed, _, touches, _ = touch_session
+    assert "goes to 0.6 rad at 1 rad/s, 2 times, brakes within" in printed
     x = touches[1]["x_m"]
-    assert f"Touch 2: {x['value']:.3f}"[:13] in said
+    assert f"Touch 2: {x['value']:.3f}"[:13] in printed
 
 
 @pytest.mark.further  # as the detector of tests/touch
-def test_where_nothing_stands_nothing_is_found(rigd):
+def test_no_touch_without_an_obstacle(rigd):
     command = ("run", "touch", "0.4", "--speed", "2", "--fast", "--json", "--no-look")
     _, touches = touches_of(rigd(*command, *QUICK))
     assert touches == []
 
 
 @pytest.mark.further  # as in tests/engine
-def test_an_obstacle_that_appears_on_the_way_back_stops_the_session(rigd, tmp_path):
+def test_obstacle_on_the_way_back_stops_the_session(rigd, tmp_path):
     # The way back begins after some 0.5 + 0.3 + 0.6 + 0.4 s of record, and half a second of holding
     # before; the obstacle stops a beam that turns in the negative direction.
     obstacle = "x=0.6,angle=0.2,stiffness=3000,side=-1,from=2.5"
@@ -114,7 +114,7 @@ def test_an_obstacle_that_appears_on_the_way_back_stops_the_session(rigd, tmp_pa
 
 
 @pytest.mark.further  # as in tests/engine, without processes
-def test_too_great_a_force_is_a_fault(rigd):
+def test_excessive_force_is_a_fault(rigd):
     command = ("run", "touch", "0.6", "--speed", "2", "--fast", "--json", "--no-look", *QUICK)
     done = rigd(*command, "--force-limit", "0.3", "--obstacle", OBSTACLE)
     assert done.returncode == 1
@@ -124,7 +124,7 @@ def test_too_great_a_force_is_a_fault(rigd):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "expected"),
     [
         further(("0", "--fast"), "angle_rad = 0 rad is where the motor stands"),
         further(("0.5", "--speed", "0"), "speed_rad_s = 0 rad/s must be more than 0 rad/s"),
@@ -133,7 +133,7 @@ def test_too_great_a_force_is_a_fault(rigd):
         further(("0.5", "--model", "none.json"), "none.json"),
     ],
 )
-def test_wrong_options_are_refused(rigd, arguments, said):
+def test_wrong_options_are_refused(rigd, arguments, expected):
     done = rigd("run", "touch", *arguments, "--fast", "--no-look")
     assert done.returncode == 2
-    assert said in done.stderr
+    assert expected in done.stderr

@@ -1,4 +1,4 @@
-"""`rigd run until`, from the command line to the session file and what `analyze` says of it."""
+"""`rigd run until`, from the command line to the session file and its result by `analyze`."""
 
 import json
 import os
@@ -24,32 +24,34 @@ from rigd.session import read_session
 pytestmark = pytest.mark.process
 
 RIGD = Path(sys.executable).parent / "rigd"
-ASKED = 0.1
+TARGET = 0.1
 SEEDED = ("--fast", "--seed", "1")
 LONG = ("run", "until", "--damping", "0.05%", "--at-most", "600", "--json", "--no-look", *SEEDED)
 ROW = re.compile(r" *\d+\.\d s 0\.")
-"""Row of the table of what is asked for."""
+"""Row of the table of targets."""
 
 
 @pytest.fixture(scope="module")
-def done(made_once, write_profile_in):
-    """A session that went on until the damping was known to 10 %: exit code, errors, result.
+def fitted_session(made_once, write_profile_in):
+    """A session until the damping was known to 10 %: exit code, errors, result.
 
     Its sensor is quieter than the shipped one, so that the first fit of all damping structures is
-    enough. Where the operator works there are files that have names of modules.
+    enough. The working folder has files with names of modules.
     """
 
     def make(folder):
         profile = write_profile_in(folder, "sim", {"simulation.torque_noise_nm": "1.0e-3"})
         for name in ("analysis", "random", "rigd"):
             (folder / f"{name}.py").write_text("raise SystemExit('of the operator')")
-        command = [RIGD, "run", "until", "--damping", f"{100 * ASKED}%", "--at-most", "60"]
+        command = [RIGD, "run", "until", "--damping", f"{100 * TARGET}%", "--at-most", "60"]
         command += ["--fast", "--seed", "1", "--json", "--no-look", "--output", folder]
         command += ["--profile", profile]
-        done = subprocess.run(
+        completed = subprocess.run(
             command, capture_output=True, text=True, check=False, timeout=400, cwd=folder
         )
-        (folder / "told.json").write_text(json.dumps([done.returncode, done.stdout, done.stderr]))
+        (folder / "told.json").write_text(
+            json.dumps([completed.returncode, completed.stdout, completed.stderr])
+        )
 
     code, output, errors = json.loads((made_once("until", make) / "told.json").read_text())
     assert output, errors
@@ -58,15 +60,15 @@ def done(made_once, write_profile_in):
 
 
 @pytest.fixture(scope="module")
-def record(done):
-    return read_session(done[2]["path"])
+def record(fitted_session):
+    return read_session(fitted_session[2]["path"])
 
 
 @pytest.fixture(scope="module")
 def search(run_patched):
     """Search until the damping is known to 1 %, by an estimator that knows the beam.
 
-    Returns a function of the estimator's class; its value is exit code, errors, result.
+    The function takes the estimator's class and returns exit code, errors, result.
     """
 
     def search(estimator):
@@ -81,24 +83,24 @@ def search(run_patched):
 
 
 @pytest.fixture(scope="module")
-def searched(search):
+def search_result(search):
     return search("KnownBeamEstimator")
 
 
 @pytest.fixture(scope="module")
-def searched_record(searched):
-    return read_session(searched[2]["path"])
+def search_record(search_result):
+    return read_session(search_result[2]["path"])
 
 
-def test_a_search_ends_when_it_is_reached(searched, searched_record):
-    code, errors, session = searched
+def test_search_ends_at_its_target(search_result, search_record):
+    code, errors, session = search_result
     assert code == 0, errors
     assert (session["outcome"], session["reason"], session["lost"]) == ("complete", "", 0)
     assert session["scheduled"] == session["recorded"] + session["missed"] <= 20_000
     fit = session["fit"]
     assert fit["search"]["reached"]
     assert fit["search"]["asked"] == ["damping to 1 %"]
-    assert json.loads(searched_record.outcome["fit"]) == fit
+    assert json.loads(search_record.outcome["fit"]) == fit
     assert "Reached: damping of mode 1" in errors
     assert errors.count("± one standard deviation") == 1
     decided_s = [float(row.split()[0]) for row in errors.splitlines() if ROW.match(row)]
@@ -107,8 +109,8 @@ def test_a_search_ends_when_it_is_reached(searched, searched_record):
 
 
 @pytest.mark.further  # as above with an estimator, and tests/analysis/test_online.py
-def test_it_ends_when_the_precision_is_reached(done):
-    code, errors, session = done
+def test_search_with_fits_ends_at_its_target(fitted_session):
+    code, errors, session = fitted_session
     assert code == 0, errors
     assert (session["outcome"], session["reason"]) == ("complete", "")
     assert session["scheduled"] == session["recorded"] + session["missed"] <= 60_000
@@ -120,7 +122,7 @@ def test_it_ends_when_the_precision_is_reached(done):
     for mode in fit["modes"]:
         damping = mode["damping_ratio"]
         assert damping["flag"] is None
-        assert damping["std"] <= ASKED * damping["value"]
+        assert damping["std"] <= TARGET * damping["value"]
     assert "Reached: damping of mode 1" in errors
     assert errors.count("± one standard deviation") == 1
     decided_s = [float(row.split()[0]) for row in errors.splitlines() if ROW.match(row)]
@@ -128,23 +130,25 @@ def test_it_ends_when_the_precision_is_reached(done):
 
 
 @pytest.mark.further
-def test_analyze_says_of_the_file_what_the_session_said_last(done, record):
-    told = whole_record(load_record(record.path)).headline
-    fit = done[2]["fit"]
+def test_analyze_agrees_with_the_last_fit_of_the_session(fitted_session, record):
+    headline = whole_record(load_record(record.path)).headline
+    fit = fitted_session[2]["fit"]
     assert json.loads(record.outcome["fit"]) == fit
-    for mode, live in zip(told.modes, fit["modes"], strict=True):
+    for mode, live in zip(headline.modes, fit["modes"], strict=True):
         for quantity in ("frequency_hz", "damping_ratio"):
             assert getattr(mode, quantity).as_json() == live[quantity]
-    for name, quantity in told.parameters.items():
+    for name, quantity in headline.parameters.items():
         assert quantity.as_json() == fit["parameters"][name]
 
 
 @pytest.mark.further
-def test_the_numbers_are_those_of_the_simulated_beam(done):
+def test_estimates_agree_with_the_simulated_beam(fitted_session):
     from rigd.beam import modes
 
     rig = load_profile("sim").rig
-    for mode, true in zip(done[2]["fit"]["modes"], modes(rig.beam, rig.damping, 3), strict=True):
+    for mode, true in zip(
+        fitted_session[2]["fit"]["modes"], modes(rig.beam, rig.damping, 3), strict=True
+    ):
         for key, value in (
             ("frequency_hz", true.frequency_hz),
             ("damping_ratio", true.damping_ratio),
@@ -152,32 +156,32 @@ def test_the_numbers_are_those_of_the_simulated_beam(done):
             assert abs(mode[key]["value"] - value) < 4 * mode[key]["std"]
 
 
-def test_segments_name_what_was_played(searched, searched_record):
-    segments = dict(searched_record.segments)
-    ticks = searched[2]["scheduled"]
+def test_segments_name_the_planned_parts(search_result, search_record):
+    segments = dict(search_record.segments)
+    ticks = search_result[2]["scheduled"]
     assert segments.pop("rest") == (0, 1000)
     assert segments.pop("sweep") == (1000, ticks)
     assert segments.pop("scan") == (1000, 6000)
-    pieces = searched[2]["fit"]["search"]["pieces"]
-    assert pieces
-    assert list(segments) == [f"piece_{number + 1}" for number in range(len(pieces))]
+    planned_segments = search_result[2]["fit"]["search"]["pieces"]
+    assert planned_segments
+    assert list(segments) == [f"piece_{number + 1}" for number in range(len(planned_segments))]
     ends = [6000]
-    for (first, end), piece in zip(segments.values(), pieces, strict=True):
+    for (first, end), planned_segment in zip(segments.values(), planned_segments, strict=True):
         assert ends[-1] <= first < end <= ticks
-        assert end - first == round(1000 * piece["duration_s"])
+        assert end - first == round(1000 * planned_segment["duration_s"])
         ends.append(end)
 
 
-def test_the_file_is_described_by_its_modes(rigd_here, searched_record):
-    told = rigd_here("info", searched_record.path).stdout
-    assert told.count("\nfit ") == 3
-    assert "mode 1: 2.5" in told
-    assert "covariance" not in told
+def test_info_lists_the_modes_of_the_file(rigd_here, search_record):
+    printed = rigd_here("info", search_record.path).stdout
+    assert printed.count("\nfit ") == 3
+    assert "mode 1: 2.5" in printed
+    assert "covariance" not in printed
 
 
-def test_pieces_join_at_rest(searched_record):
-    """At the joints: no step in angle, speed or acceleration beside those of the pieces."""
-    record = searched_record
+def test_segments_join_at_rest(search_record):
+    """At the joints: no step in angle, speed or acceleration except those of the segments."""
+    record = search_record
     reference_rad = record.samples["angle_reference_rad"]
     relative_rad = reference_rad - reference_rad[0]
     speed = np.gradient(relative_rad, 1e-3)
@@ -190,15 +194,15 @@ def test_pieces_join_at_rest(searched_record):
         assert np.abs(acceleration[near]).max(initial=0.0) < 0.02 * np.abs(acceleration).max()
 
 
-def test_the_free_end_stays_within_small_slopes(searched_record):
+def test_free_end_has_small_slopes(search_record):
     profile = load_profile("sim")
-    angle_rad = searched_record.samples["angle_rad"]
+    angle_rad = search_record.samples["angle_rad"]
     slope_rad = tip_motion(profile.plant, angle_rad, profile.rig.rate_hz).slope_rad
     assert 0.5 * SMALL_SLOPE_RAD < slope_rad < SMALL_SLOPE_RAD
 
 
 @pytest.mark.further  # as tests/runner, without processes
-def test_what_is_not_reached_in_its_time_is_said(rigd, tmp_path):
+def test_unreached_target_is_reported(rigd, tmp_path):
     options = ("--damping", "0.01%", "--at-most", "8", *SEEDED, "--json", "--no-look")
     run = rigd("run", "until", *options)
     assert run.returncode == 1, run.stderr
@@ -222,14 +226,14 @@ def test_what_is_not_reached_in_its_time_is_said(rigd, tmp_path):
         (("--damping", "1%", "--tip-slope", "0"), ("tip_slope_rad",)),
     ],
 )
-def test_what_makes_no_sense_is_refused(rigd_here, options, words):
-    done = rigd_here("run", "until", "--fast", *options)
-    assert done.returncode == 2, done.stdout + done.stderr
+def test_invalid_options_are_refused(rigd_here, options, words):
+    completed = rigd_here("run", "until", "--fast", *options)
+    assert completed.returncode == 2, completed.stdout + completed.stderr
     for word in words:
-        assert word in done.stdout + done.stderr
+        assert word in completed.stdout + completed.stderr
 
 
-def test_a_lost_planner_leaves_what_was_recorded(search):
+def test_lost_planner_leaves_the_record(search):
     code, errors, session = search("KilledEstimator")
     assert code == 1, errors
     assert "Traceback" not in errors
@@ -244,7 +248,7 @@ def test_a_lost_planner_leaves_what_was_recorded(search):
 @pytest.mark.parametrize(
     "number", [further(signal.SIGKILL), pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)]
 )
-def test_a_lost_planner_ends_the_session_with_what_was_recorded(start_rigd, tmp_path, number):
+def test_lost_planner_ends_the_session_with_its_record(start_rigd, tmp_path, number):
     process = start_rigd(*LONG)
     for line in process.stderr:
         if ROW.match(line):
@@ -263,8 +267,8 @@ def test_a_lost_planner_ends_the_session_with_what_was_recorded(start_rigd, tmp_
     assert end == session["scheduled"]
 
 
-@pytest.mark.further  # as test_run.py has it of other sessions
-def test_a_stop_ends_it_at_once(start_rigd):
+@pytest.mark.further  # as for other sessions in test_run.py
+def test_stop_ends_a_search_at_once(start_rigd):
     process = start_rigd(*LONG)
     for line in process.stderr:
         if ROW.match(line):
@@ -280,8 +284,8 @@ def test_a_stop_ends_it_at_once(start_rigd):
 
 
 @pytest.mark.further  # as other sessions do
-def test_real_time_keeps_its_books(rigd, patient, tmp_path):
-    """On a computer that stands still for long there are gaps, with which nothing can be fitted."""
+def test_counts_of_a_search_in_real_time(rigd, patient, tmp_path):
+    """If the computer stalls for long there are gaps, and no fit is possible."""
     options = ("--damping", "10%", "--at-most", "20", "--json", "--no-look", "--profile", patient)
     run = rigd("run", "until", *options)
     assert run.returncode in (0, 1), run.stderr
@@ -295,24 +299,24 @@ def test_real_time_keeps_its_books(rigd, patient, tmp_path):
 
 
 @pytest.mark.further  # as tests/daemon/test_fits.py and test_online.py
-def test_a_chirp_is_fitted_while_it_runs(rigd, tmp_path):
+def test_chirp_is_fitted_while_it_runs(rigd, tmp_path):
     lengths = ("--duration", "8", "--ring-down", "1", "--start-hz", "0.5", "--seed", "1")
     run = rigd("run", "chirp", "--fast", "--json", "--no-look", "--watch-fit", *lengths)
     assert run.returncode == 0, run.stderr
     (session,) = json.loads(run.stdout)["sessions"]
     assert "mode 1: 2.5" in run.stderr
     assert "search" not in session["fit"]
-    told = whole_record(load_record(tmp_path / session["path"])).headline
-    assert told.modes[0].damping_ratio.as_json() == session["fit"]["modes"][0]["damping_ratio"]
+    headline = whole_record(load_record(tmp_path / session["path"])).headline
+    assert headline.modes[0].damping_ratio.as_json() == session["fit"]["modes"][0]["damping_ratio"]
 
 
-@pytest.mark.further  # as tests/recovery/test_recovery_disk.py has it of other sessions
-def test_a_full_disk_ends_it_with_its_reason(start_rigd, tmp_path):
+@pytest.mark.further  # as for other sessions in tests/recovery/test_recovery_disk.py
+def test_full_disk_ends_a_search_with_its_reason(start_rigd, tmp_path):
     process = start_rigd(*LONG)
     for line in process.stderr:
         if ROW.match(line):
             break
-    # What is written already is more than that: the next write fails, as on a full disk.
+    # The file is already larger: the next write fails, as on a full disk.
     recorder = child_running(process.pid, "rigd.engine.recorder")
     resource.prlimit(recorder, resource.RLIMIT_FSIZE, (20_000, 20_000))
     output, errors = process.communicate(timeout=300)
@@ -325,8 +329,8 @@ def test_a_full_disk_ends_it_with_its_reason(start_rigd, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_limit_ends_it_as_any_session(rigd, tmp_path):
-    """From 7 s on the beam stands in a wall, which throws it."""
+def test_limit_violation_ends_a_search(rigd, tmp_path):
+    """From 7 s on the beam is within a wall, which throws it."""
     wall = "x=0.9,angle=-1,side=1,from=7"
     options = ("--damping", "0.01%", "--at-most", "30", *SEEDED, "--json", "--no-look")
     run = rigd("run", "until", *options, "--obstacle", wall)

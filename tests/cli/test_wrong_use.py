@@ -1,4 +1,4 @@
-"""What an operator can get wrong: one or two sentences, an exit code, nothing broken."""
+"""Errors of an operator: one or two sentences, an exit code, no damage."""
 
 import contextlib
 import errno
@@ -42,14 +42,14 @@ def assert_refused(done, code, *words):
     assert len(text) < 1500
 
 
-TELLING = ("missing key", "millimetres", "no source", "unstable loop", "not TOML")
-"""Those that `make test` has; tests/profile has the others without the command."""
+UNMARKED = ("missing key", "millimetres", "no source", "unstable loop", "not TOML")
+"""Cases that `make test` has; tests/profile has the others without the command."""
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        pytest.param(change, id=name) if name in TELLING else further(change, id=name)
+        pytest.param(change, id=name) if name in UNMARKED else further(change, id=name)
         for name, change in PROFILE_CHANGES.items()
     ],
 )
@@ -88,28 +88,26 @@ def test_a_bad_profile_is_refused(rigd_here, tmp_path, change):
         further(("--obstacle", "x=1.5,angle=1"), ("beyond the tip", "0.98 m")),
     ],
 )
-def test_an_absurd_option_is_refused(rigd_here, tmp_path, arguments, words):
+def test_invalid_option_is_refused(rigd_here, tmp_path, arguments, words):
     (tmp_path / "taken").write_text("a file")
     assert_refused(rigd_here("run", "chirp", "--fast", *arguments), 2, *words)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["taken"]
 
 
 @pytest.mark.parametrize("percent", ["11", further("-1"), further("nan")])
-def test_an_absurd_uniformity_of_a_search_is_refused(rigd_here, tmp_path, percent):
+def test_invalid_uniformity_of_a_search_is_refused(rigd_here, tmp_path, percent):
     done = rigd_here("run", "until", "--fast", "--zeta", "5%", "--uniformity", percent)
     assert_refused(done, 2, f"uniformity_percent = {percent} % must lie between 0 and 10 %")
     assert not list(tmp_path.glob("sessions/*"))
 
 
-def test_ten_times_the_amplitude_is_refused_before_anything_moves_unless_forced(
-    rigd_here, tmp_path
-):
+def test_excessive_torque_is_refused_before_motion(rigd_here, tmp_path):
     done = rigd_here("run", "chirp", "--fast", "--amplitude", "0.25")
     assert_refused(done, 2, "torque", "0.9 N·m", "peak_torque_nm")
     assert not (tmp_path / "sessions").exists()
 
 
-def test_what_a_limit_forbids_cannot_be_forced(rigd_here, tmp_path):
+def test_limits_cannot_be_forced(rigd_here, tmp_path):
     done = rigd_here("run", "chirp", "--fast", "--force", "--amplitude", "3", "--stop-hz", "1")
     assert_refused(done, 2, "angle", "limits.angle_rad")
     assert not (tmp_path / "sessions").exists()
@@ -118,7 +116,7 @@ def test_what_a_limit_forbids_cannot_be_forced(rigd_here, tmp_path):
 @pytest.mark.parametrize(
     "content", [None, b"", b"time,angle\n", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" * 2]
 )
-def test_info_on_what_is_no_session_file(rigd_here, tmp_path, content):
+def test_info_on_other_files(rigd_here, tmp_path, content):
     path = tmp_path / "broken.mcap"
     if content is not None:
         path.write_bytes(content)
@@ -127,7 +125,7 @@ def test_info_on_what_is_no_session_file(rigd_here, tmp_path, content):
         assert path.read_bytes() == content
 
 
-def test_a_plain_word_in_the_wrong_place_is_explained(rigd_here, tmp_path):
+def test_error_in_a_reference_file_names_its_line(rigd_here, tmp_path):
     (tmp_path / "reference.csv").write_text("time_s,angle_rad\n0,0\n1,0,1\n")
     assert_refused(rigd_here("run", "file", "reference.csv", "--fast"), 2, "line 3 has 3 cells")
 
@@ -154,7 +152,7 @@ run_command(refuse)
         (OSError(errno.ENOSPC, "No space left on device"), ("the output cannot be written (No",)),
     ],
 )
-def test_what_the_system_refuses_is_told_as_what_it_is(error, words):
+def test_errors_of_the_system_are_explained(error, words):
     done = subprocess.run(
         [sys.executable, "-c", REFUSING, *map(str, error.args), *filter(None, [error.filename])],
         capture_output=True,
@@ -165,7 +163,7 @@ def test_what_the_system_refuses_is_told_as_what_it_is(error, words):
     assert ("output" in done.stderr) == (error.errno == errno.ENOSPC)
 
 
-def test_both_commands_say_which_version_they_are(rigd_here):
+def test_version_of_both_commands(rigd_here):
     import rigd
     from analysis.cli.app import app
 
@@ -177,15 +175,17 @@ def test_predicted_peaks_of_a_tiny_motion_are_numbers(rigd_here, monkeypatch):
     from rigd.runtime import StopRequest
 
     stop = StopRequest()
-    stop.requested = True  # told is what is planned, and nothing is run
+    stop.requested = True  # the plan is printed, and nothing is run
     monkeypatch.setattr(
         "rigd.cli.run.start_processes", lambda **_: (stop, contextlib.nullcontext())
     )
     options = ("--amplitude", "1e-6", "--stop-hz", "1", "--duration", "5", "--ring-down", "0")
-    told = rigd_here("run", "chirp", "--fast", *options).stdout
-    angle, speed, torque = map(float, re.findall(r"(?:angle|speed|torque) (\S+) \S+ \(limit", told))
+    printed = rigd_here("run", "chirp", "--fast", *options).stdout
+    angle, speed, torque = map(
+        float, re.findall(r"(?:angle|speed|torque) (\S+) \S+ \(limit", printed)
+    )
     assert 0.9e-6 < angle < 1.1e-6
     assert 1e-6 < speed < 1e-5
     assert torque > 0.0
-    told = rigd_here("run", "chirp", "--fast", *options, "--there-and-back").stdout
-    assert "and back, 5 s each way, record of 11 s" in told
+    printed = rigd_here("run", "chirp", "--fast", *options, "--there-and-back").stdout
+    assert "and back, 5 s each way, record of 11 s" in printed

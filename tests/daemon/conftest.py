@@ -26,7 +26,7 @@ def profile(write_profile):
 def operate(profile, tmp_path, monkeypatch, children_copied):
     """Make a service on a rig of threads, not connected yet; its jobs are copies of this process.
 
-    These have no limit of memory, of which this process has more, and do not wait for others.
+    The copies have no memory limit, which this process exceeds, and normal priority.
     """
     run_processes_as_threads(monkeypatch)
     monkeypatch.setattr("rigd.engine._session_sequence._SETTLING_S", 0.1)
@@ -43,7 +43,7 @@ def operate(profile, tmp_path, monkeypatch, children_copied):
         if operated.loop.is_closed():
             continue
         if operated.state in ("running", "stopping"):
-            operated.rig._group.control.kill()  # of a test that has failed: nobody waits for it
+            operated.rig._group.control.kill()  # after a failed test, which left it running
         operated.close()
 
 
@@ -55,9 +55,9 @@ def operated(operate):
 
 @pytest.fixture
 def stop_here(runtime_folder, rigd_here, monkeypatch):
-    """Run `rigd stop` in this process; it finds only what this test has started.
+    """Run `rigd stop` in this process; it finds only processes of this test.
 
-    `table` takes the place of the process table.
+    `table` replaces the process table.
     """
 
     def own_processes():

@@ -1,4 +1,4 @@
-"""What `rigd check` refuses on paper, asked of the daemon: refused, accepted by name, recorded."""
+"""Failed rows of `rigd check` in the daemon: refused, accepted by name, recorded."""
 
 import json
 from dataclasses import replace
@@ -19,7 +19,7 @@ ROW = "travel_missed_ticks"
 
 @pytest.fixture
 def profile(profile):
-    """A rig whose worst travel is beyond its stop: as a wired drive has it, in this process."""
+    """A rig whose worst travel is beyond its stop, as with a wired drive, in this process."""
     rig = replace(profile.rig, cia402=load_profile("antenna_can").rig.cia402)
     limits = replace(
         load_profile("antenna_can").limits, missed_ticks_in_a_row=400, missed_percent=99.0
@@ -27,22 +27,22 @@ def profile(profile):
     return replace(profile, rig=rig, limits=limits)
 
 
-def test_a_failed_row_refuses_a_start_and_is_shown_before(operated):
-    (shown,) = operated.ask("status")["daemon"]["failed_checks"]
+def test_failed_row_is_shown_and_refuses_a_start(operated):
+    (shown,) = operated.request("status")["daemon"]["failed_checks"]
     assert (shown["name"], shown["acceptable"], shown["accepted"]) == (ROW, True, False)
     assert "of 400 missed ticks (limits.missed_ticks_in_a_row)" in shown["text"]
-    refused = operated.ask("start", **SHORT)
+    refused = operated.request("start", **SHORT)
     assert isinstance(refused, CommandError)
     assert not refused.wrong_use  # the profile is to be another
     assert str(refused).endswith(f"To accept it for one session: --accept {ROW}.")
-    plan = operated.ask("predict", **SHORT)["plan"]
+    plan = operated.request("predict", **SHORT)["plan"]
     assert ROW in plan["refused"]
     assert operated.world.highest_nm == 0.0
     assert operated.state == "ready"
 
 
-def test_an_accepted_row_is_in_the_file_and_holds_for_one_start(operated):
-    plan = operated.ask("start", **SHORT, accept=[ROW], repeat=2)["plan"]
+def test_accepted_row_is_recorded_and_valid_for_one_start(operated):
+    plan = operated.request("start", **SHORT, accept=[ROW], repeat=2)["plan"]
     assert plan["refused"] is None
     assert [each["accepted"] for each in plan["failed_checks"]] == [True]
     assert [each["outcome"] for each in operated.last["sessions"]] == ["complete", "complete"]
@@ -53,20 +53,20 @@ def test_an_accepted_row_is_in_the_file_and_holds_for_one_start(operated):
         assert event.level == "warning"
         assert event.message.startswith("Accepted by the operator, though rigd check fails:")
         assert "limits.missed_ticks_in_a_row" in event.message
-    assert isinstance(operated.ask("start", **SHORT), CommandError)
+    assert isinstance(operated.request("start", **SHORT), CommandError)
 
 
-def test_a_row_that_is_none_or_has_no_failure(operated):
-    refused = operated.ask("start", **SHORT, accept=["travel"])
+def test_unknown_and_passed_rows_cannot_be_accepted(operated):
+    refused = operated.request("start", **SHORT, accept=["travel"])
     assert refused.wrong_use
     assert str(refused) == (
         "--accept travel: no row of rigd check has that name; those that can be accepted are eds, "
         f"travel_loop_fails, travel_no_angle, travel_encoder_fails, {ROW}."
     )
-    refused = operated.ask("start", **SHORT, accept=[ROW, "loop_stability"])
+    refused = operated.request("start", **SHORT, accept=[ROW, "loop_stability"])
     assert refused.wrong_use
     assert "cannot be accepted: the shaft could not be held" in str(refused)
-    needless = operated.ask("start", **SHORT, accept=[ROW, "travel_no_angle"])["plan"]
+    needless = operated.request("start", **SHORT, accept=[ROW, "travel_no_angle"])["plan"]
     assert needless["refused"] is None
     assert needless["warnings"][0] == (
         "--accept travel_no_angle: it did not fail; nothing was accepted."
@@ -80,18 +80,18 @@ def test_accept_is_a_list_of_short_names(accept):
         parse_request(json.dumps(line).encode())
 
 
-def test_a_rig_with_unknown_values_is_in_fault_and_names_them(operate, profile):
+def test_fault_names_unknown_values(operate, profile):
     unknown = replace(profile.rig.motor, peak_torque_nm=nan)
     object.__setattr__(profile, "rig", replace(profile.rig, motor=unknown))
     operated = operate().open()
-    status = operated.ask("status")
+    status = operated.request("status")
     assert (status["state"], status["rig"]) == ("fault", None)
     assert "motor.peak_torque_nm is unknown; enter its value" in status["reason"]
     failed = {each["name"]: each for each in status["daemon"]["failed_checks"]}
     assert not failed["unknown_values"]["acceptable"]
     for command, fields in (("start", SHORT), ("zero", {}), ("tare", {})):
-        assert isinstance(operated.ask(command, **fields), CommandError)
-    assert "motor.peak_torque_nm" in str(operated.ask("predict", **SHORT))
-    assert "motor.peak_torque_nm" in str(operated.ask("reset"))
+        assert isinstance(operated.request(command, **fields), CommandError)
+    assert "motor.peak_torque_nm" in str(operated.request("predict", **SHORT))
+    assert "motor.peak_torque_nm" in str(operated.request("reset"))
     assert operated.state == "fault"
     assert operated.world.drives == []

@@ -1,4 +1,4 @@
-"""What a client does about a daemon that is crowded, suspended, or gone."""
+"""A client of a daemon that has too many clients, is suspended, or has ended."""
 
 import json
 import os
@@ -31,11 +31,11 @@ def path(runtime_folder):
 
 
 @pytest.fixture
-def answer(path):
-    """Answer the first line of each connection; None: close without a word."""
+def start_answering(path):
+    """Answer the first line of each connection; None: close without a reply."""
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
-    heard = []
+    received = []
 
     def begin(*replies):
         listener.listen(5)
@@ -47,48 +47,48 @@ def answer(path):
                 except OSError:  # the test is over
                     return
                 with link, link.makefile("rw") as file:
-                    heard.append(json.loads(file.readline()))
+                    received.append(json.loads(file.readline()))
                     if reply is not None:
                         file.write(json.dumps(reply) + "\n")
                         file.flush()
 
         threading.Thread(target=work, daemon=True).start()
-        return heard
+        return received
 
     yield begin
-    listener.shutdown(socket.SHUT_RDWR)  # which wakes whoever waits for somebody to come
+    listener.shutdown(socket.SHUT_RDWR)  # which wakes the thread that accepts connections
     listener.close()
 
 
-def test_whoever_is_turned_away_asks_again(path, answer):
-    heard = answer(CROWDED, CROWDED, {"reply": "status", "ok": True})
+def test_client_repeats_a_request_after_too_many_clients(path, start_answering):
+    received = start_answering(CROWDED, CROWDED, {"reply": "status", "ok": True})
     with Client(path) as client:
         assert client.ask("status")["ok"]
-    assert [request["command"] for request in heard] == ["status"] * 3
+    assert [request["command"] for request in received] == ["status"] * 3
 
 
-def test_whoever_is_turned_away_for_long_is_told(path, answer, monkeypatch):
+def test_too_many_clients_is_reported_after_a_timeout(path, start_answering, monkeypatch):
     monkeypatch.setattr(client_module, "_TOO_MANY_CLIENTS_TIMEOUT_S", 0.0)
-    answer(CROWDED, CROWDED)
+    start_answering(CROWDED, CROWDED)
     with Client(path) as client, pytest.raises(RefusedByDaemonError, match="too many"):
         client.ask("start")
 
 
-def test_a_refusal_is_not_asked_again(path, answer):
-    heard = answer(CROWDED | {"crowded": False}, {"reply": "tare", "ok": True})
+def test_refused_request_is_not_repeated(path, start_answering):
+    received = start_answering(CROWDED | {"crowded": False}, {"reply": "tare", "ok": True})
     with Client(path) as client, pytest.raises(RefusedByDaemonError, match="too many"):
         client.ask("tare")
-    assert len(heard) == 1
+    assert len(received) == 1
 
 
-def test_a_stop_is_asked_for_until_it_is_answered(path, answer):
-    heard = answer(None, CROWDED, None, {"reply": "stop", "ok": True, "stopping": True})
-    told = stop_session(path)
-    assert (told["stopping"], told["signalled"]) == (True, False)
-    assert [request["command"] for request in heard] == ["stop"] * 4
+def test_stop_is_repeated_until_it_is_answered(path, start_answering):
+    received = start_answering(None, CROWDED, None, {"reply": "stop", "ok": True, "stopping": True})
+    reply = stop_session(path)
+    assert (reply["stopping"], reply["signalled"]) == (True, False)
+    assert [request["command"] for request in received] == ["stop"] * 4
 
 
-def test_a_full_queue_is_not_waited_for_for_ever(path):
+def test_wait_for_a_full_queue_is_limited(path):
     with socket.socket(socket.AF_UNIX) as listener, socket.socket(socket.AF_UNIX) as first:
         listener.bind(str(path))
         listener.listen(0)
@@ -97,7 +97,7 @@ def test_a_full_queue_is_not_waited_for_for_ever(path):
             Client(path, connect_s=0.05)
 
 
-DEAF = """
+UNRESPONSIVE_PROGRAM = """
 import signal, socket, sys, time
 link = socket.socket(socket.AF_UNIX)
 link.bind(sys.argv[1])
@@ -110,12 +110,16 @@ time.sleep(60.0)
 
 
 @pytest.fixture
-def deaf(path):
-    """A daemon whose socket nobody serves; without `handles`, one that knows no signal either."""
+def unresponsive_daemon(path):
+    """A daemon whose socket nobody serves; without `handles`, its signal is ignored too."""
     started = []
 
     def start(*, handles=True):
-        code = DEAF if handles else DEAF.replace("signal.signal(", "(lambda *_: None)(")
+        code = (
+            UNRESPONSIVE_PROGRAM
+            if handles
+            else UNRESPONSIVE_PROGRAM.replace("signal.signal(", "(lambda *_: None)(")
+        )
         process = subprocess.Popen(
             [sys.executable, "-c", code, path], stdout=subprocess.PIPE, text=True
         )
@@ -130,8 +134,8 @@ def deaf(path):
 
 
 @pytest.fixture
-def impatient(monkeypatch):
-    """Nobody is waited for as long as a daemon may take that lacks processor time."""
+def short_timeouts(monkeypatch):
+    """Set time-outs shorter than a daemon without processor time would need."""
     for name, time_s in (
         ("_STOP_TIMEOUT_S", 0.2),
         ("_FIRST_STOP_REPLY_TIMEOUT_S", 0.05),
@@ -142,21 +146,23 @@ def impatient(monkeypatch):
 
 
 @pytest.mark.process
-def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(path, deaf, impatient):
-    process = deaf()
+def test_unresponsive_daemon_gets_a_signal_without_claim_of_success(
+    path, unresponsive_daemon, short_timeouts
+):
+    process = unresponsive_daemon()
     with pytest.raises(DaemonUnreachableError) as raised:
         stop_session(path)
     assert process.stdout.readline() == "asked to stop\n"
-    said = raised.value.full_message()
-    assert f"process {process.pid}" in said
-    assert STOP_SIGNAL.name in said
-    assert "may still be running" in said
-    assert "STO" in said
+    message = raised.value.full_message()
+    assert f"process {process.pid}" in message
+    assert STOP_SIGNAL.name in message
+    assert "may still be running" in message
+    assert "STO" in message
 
 
 @pytest.mark.process
-def test_a_process_that_does_not_know_the_signal_is_not_ended_by_it(path, deaf, impatient):
-    process = deaf(handles=False)
+def test_no_signal_to_a_process_without_handler(path, unresponsive_daemon, short_timeouts):
+    process = unresponsive_daemon(handles=False)
     with pytest.raises(DaemonUnreachableError) as raised:
         stop_session(path)
     assert process.poll() is None
@@ -164,7 +170,7 @@ def test_a_process_that_does_not_know_the_signal_is_not_ended_by_it(path, deaf, 
 
 
 @pytest.fixture
-def ended():
+def ended_pid():
     """The number of a process that has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
@@ -172,23 +178,23 @@ def ended():
 
 
 @pytest.mark.process
-def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
+def test_remaining_processes_of_a_dead_daemon_are_reported(ended_pid, monkeypatch):
     assert (
         "Its control process, which alone moves the motor, has ended"
-        in client_module.describe_remaining_processes(ended, os.getuid())
+        in client_module.describe_remaining_processes(ended_pid, os.getuid())
     )
     monkeypatch.setattr(client_module, "_PROCESS_END_TIMEOUT_S", 0.3)
     control = subprocess.Popen(
-        [sys.executable, "-m", "rigd.engine.control_process", str(ended)],
+        [sys.executable, "-m", "rigd.engine.control_process", str(ended_pid)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
     try:
         while not Path(f"/proc/{control.pid}/cmdline").read_bytes():
             time.sleep(0.001)  # its program is being loaded, and has no arguments yet
-        said = client_module.describe_remaining_processes(ended, os.getuid())
-        assert f"control process {control.pid} still runs" in said
-        assert "STO" in said
+        message = client_module.describe_remaining_processes(ended_pid, os.getuid())
+        assert f"control process {control.pid} still runs" in message
+        assert "STO" in message
     finally:
         control.kill()
         control.communicate()
@@ -198,7 +204,7 @@ def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
 
 
 @pytest.mark.process
-def test_a_process_that_is_dead_but_not_buried_is_gone():
+def test_zombie_process_counts_as_ended():
     process = subprocess.Popen([sys.executable, "-c", ""])
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
     assert "The daemon is gone." in client_module.describe_remaining_processes(
@@ -214,7 +220,7 @@ def test_a_process_that_is_dead_but_not_buried_is_gone():
         {"state": "ready", "doing": "planning", "series": {"running": True, "stopped": True}},
     ],
 )
-def test_the_end_is_waited_for_until_it_is_seen(path, last):
+def test_await_end_waits_for_the_last_state(path, last):
     states = [
         {"state": "running", "series": {"running": True}},
         {"state": "stopping", "series": {"running": True}},
@@ -241,8 +247,8 @@ def test_the_end_is_waited_for_until_it_is_seen(path, last):
     listener.close()
 
 
-def test_an_end_that_a_crowd_or_a_silent_daemon_hides_is_not_told(path, monkeypatch):
-    """Not seen is not seen: neither that the session has ended, nor that it goes on."""
+def test_await_end_claims_nothing_without_a_status(path, monkeypatch):
+    """The client reports neither that the session has ended nor that it continues."""
     monkeypatch.setattr(client_module, "_RETRY_PAUSE_S", 0.01)
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
@@ -259,9 +265,9 @@ def test_an_end_that_a_crowd_or_a_silent_daemon_hides_is_not_told(path, monkeypa
                     with link:
                         link.sendall(json.dumps(full).encode() + b"\n")
                 else:
-                    kept.append(link)
+                    links.append(link)
 
-    kept = []
+    links = []
     threading.Thread(target=work, daemon=True).start()
     began_s = time.monotonic()
     assert await_end(path, 0.1) is None

@@ -1,4 +1,4 @@
-"""The daemon's socket: who may use it, and clients that harm nobody whatever they do."""
+"""The daemon's socket: access rights, and clients that misbehave."""
 
 import asyncio
 import base64
@@ -41,11 +41,11 @@ class Link:
         await self.writer.drain()
 
     async def next(self):
-        """The next line, or None at the end."""
+        """Return the next message, or None at the end."""
         line = await asyncio.wait_for(self.reader.readline(), 60.0)
         return json.loads(line) if line else None
 
-    async def ask(self, document):
+    async def request(self, document):
         await self.send(document)
         while "reply" not in (message := await self.next()):
             pass
@@ -77,7 +77,7 @@ class Served:
             await asyncio.sleep(0.002)
 
     def run(self, scenario):
-        """Run a scenario against it, and end it as the daemon does."""
+        """Run a scenario with the server, and end it as the daemon does."""
 
         async def whole():
             self.server.serve(self.operated.service)
@@ -104,31 +104,31 @@ def descriptors():
 def test_commands_and_events(served):
     async def scenario(served):
         listener, operator = await served.connect(), await served.connect()
-        assert await listener.ask({"command": "watch", "id": 3}) == {
+        assert await listener.request({"command": "watch", "id": 3}) == {
             "reply": "watch", "ok": True, "id": 3,
         }  # fmt: skip
-        status = await operator.ask({"command": "status"})
+        status = await operator.request({"command": "status"})
         assert status["state"] == "ready"
         short = LONG | {"repeat": 2, "parameters": LONG["parameters"] | {"duration_s": 0.3}}
-        assert (await operator.ask(short))["plan"]["record_s"] == 0.3
+        assert (await operator.request(short))["plan"]["record_s"] == 0.3
         events = []
         while not events or events[-1]["event"] != "series":
             events.append(await listener.next())
         assert [e["to"] for e in events if e["event"] == "state"] == ["running", "ready"]
         assert sum(e["event"] == "session" for e in events) == 2
         assert len(events[-1]["sessions"]) == 2
-        refused = await listener.ask({"command": "tare"})
+        refused = await listener.request({"command": "tare"})
         assert not refused["ok"]
         assert f"process {os.getpid()}" in refused["error"]
         await operator.close()
-        while (await listener.ask({"command": "status"}))["controller"] is not None:
+        while (await listener.request({"command": "status"}))["controller"] is not None:
             pass
-        assert (await listener.ask({"command": "tare"}))["ok"]
+        assert (await listener.request({"command": "tare"}))["ok"]
 
     served.run(scenario)
 
 
-def test_one_that_shuts_its_side_down_is_answered_and_let_go(served):
+def test_client_with_closed_write_side_is_answered_and_disconnected(served):
     async def scenario(served):
         link = await served.connect()
         await link.send(b'{"command":"tare"}\n{"command":"status"}')
@@ -140,12 +140,12 @@ def test_one_that_shuts_its_side_down_is_answered_and_let_go(served):
     served.run(scenario)
 
 
-def test_nothing_that_clients_do_harms_a_running_session(served, monkeypatch):
+def test_misbehaving_clients_do_not_harm_a_running_session(served, monkeypatch):
     monkeypatch.setattr(server, "_MAX_UNREAD_BYTES", 65_536)
 
     async def scenario(served):
         operator = await served.connect()
-        assert (await operator.ask(LONG))["ok"]
+        assert (await operator.request(LONG))["ok"]
         await operator.close()
 
         rude = await served.connect()
@@ -167,18 +167,18 @@ def test_nothing_that_clients_do_harms_a_running_session(served, monkeypatch):
         assert (await flood.next())["reply"] == "status"
 
         slow = await served.connect()
-        assert (await slow.ask({"command": "watch"}))["ok"]
+        assert (await slow.request({"command": "watch"}))["ok"]
         for _ in range(2000):
             served.server.publish({"event": "message", "text": "x" * 1000})
         await asyncio.sleep(0.01)
         assert all(not client.is_subscribed for client in served.server._clients)
 
-        status = await (await served.connect()).ask({"command": "status"})
+        status = await (await served.connect()).request({"command": "status"})
         assert status["state"] == "running"
         assert [s["outcome"] for s in status["series"]["sessions"]] == (
             ["complete"] * len(status["series"]["sessions"])
         )
-        assert (await (await served.connect()).ask({"command": "stop"}))["stopping"]
+        assert (await (await served.connect()).request({"command": "stop"}))["stopping"]
         await served.until("ready")
 
     served.run(scenario)
@@ -194,12 +194,12 @@ async def join_queue(link, path):
             await asyncio.sleep(0.001)
 
 
-def test_hundreds_of_connections_leave_room_for_a_stop(served):
+def test_stop_succeeds_among_hundreds_of_connections(served):
     async def scenario(served):
         operator = await served.connect()
-        assert (await operator.ask(LONG))["ok"]
+        assert (await operator.request(LONG))["ok"]
         before = descriptors()
-        told = most = 0
+        refusals = most = 0
         for _ in range(4):
             links = [
                 socket.socket(socket.AF_UNIX) for _ in range(server.MAX_PENDING_CONNECTIONS + 10)
@@ -212,41 +212,41 @@ def test_hundreds_of_connections_leave_room_for_a_stop(served):
             await asyncio.sleep(0.01)
             assert len(served.server._clients) <= server.MAX_CLIENTS
             assert len(served.server._pending_connections) <= server.MAX_PENDING_CONNECTIONS
-            # Some are on their way out, and a session has its files.
+            # Some connections are closing, and a session has its files.
             most = max(most, descriptors() - len(links))
             for link in links:
                 with contextlib.suppress(BlockingIOError):
-                    told += b"too many clients" in link.recv(1000)
+                    refusals += b"too many clients" in link.recv(1000)
                 link.close()
-        assert told > 0
+        assert refusals > 0
         assert most <= before + server.MAX_PENDING_CONNECTIONS + server.MAX_CLIENTS
-        assert (await operator.ask({"command": "status"}))["state"] == "running"
-        assert (await (await served.connect()).ask({"command": "stop"}))["stopping"]
+        assert (await operator.request({"command": "status"}))["state"] == "running"
+        assert (await (await served.connect()).request({"command": "stop"}))["stopping"]
         await served.until("ready")
         assert served.operated.service.controller is not None
 
     served.run(scenario)
 
 
-def test_a_stop_is_obeyed_where_there_is_no_room_left(served, monkeypatch):
+def test_stop_is_executed_beyond_the_limit_of_clients(served, monkeypatch):
     monkeypatch.setattr(server, "MAX_CLIENTS", 5)
 
     async def scenario(served):
-        assert (await (await served.connect()).ask(LONG))["ok"]
+        assert (await (await served.connect()).request(LONG))["ok"]
         watchers = [await served.connect() for _ in range(4)]
-        assert (await watchers[0].ask({"command": "watch"}))["ok"]
+        assert (await watchers[0].request({"command": "watch"}))["ok"]
         for listener in watchers[1:]:
-            assert (await listener.ask({"command": "watch"}))["ok"]
-        refused = await (await served.connect()).ask({"command": "status"})
+            assert (await listener.request({"command": "watch"}))["ok"]
+        refused = await (await served.connect()).request({"command": "status"})
         assert (refused["ok"], refused["crowded"]) == (False, True)
-        told = await (await served.connect()).ask({"command": "stop", "id": 7})
-        assert (told["stopping"], told["id"]) == (True, 7)
+        reply = await (await served.connect()).request({"command": "stop", "id": 7})
+        assert (reply["stopping"], reply["id"]) == (True, 7)
         await served.until("ready")
 
     served.run(scenario)
 
 
-def test_the_crowd_of_one_process_pushes_out_nobody_else(served, monkeypatch):
+def test_connections_of_one_process_displace_no_other(served, monkeypatch):
     """The connection of another process is the oldest, and stays."""
     crowd = []
 
@@ -271,25 +271,25 @@ def test_the_crowd_of_one_process_pushes_out_nobody_else(served, monkeypatch):
         await asyncio.sleep(0.05)
         assert len(served.server._pending_connections) == server.MAX_PENDING_CONNECTIONS
         assert b"too many clients" in crowd[0].recv(1000)
-        assert (await slow.ask(b'"status"}\n'))["state"] == "ready"
+        assert (await slow.request(b'"status"}\n'))["state"] == "ready"
         for link in crowd:
             link.close()
 
     served.run(scenario)
 
 
-def test_there_is_room_for_those_who_ask_beside_those_who_watch(served):
+def test_subscribers_leave_connections_for_requests(served):
     async def scenario(served):
         watchers = [await served.connect() for _ in range(server.MAX_CLIENTS)]
-        replies = [await listener.ask({"command": "watch"}) for listener in watchers]
+        replies = [await listener.request({"command": "watch"}) for listener in watchers]
         assert sum(reply["ok"] for reply in replies) == server.MAX_SUBSCRIBERS
-        assert (await (await served.connect()).ask({"command": "status"}))["ok"]
+        assert (await (await served.connect()).request({"command": "status"}))["ok"]
 
     served.run(scenario)
 
 
-@pytest.mark.parametrize("says_stop", [False, True])
-def test_without_descriptors_clients_are_turned_away_but_a_stop_is_obeyed(served, says_stop):
+@pytest.mark.parametrize("is_stop", [False, True])
+def test_without_descriptors_only_a_stop_is_executed(served, is_stop):
     async def scenario(served):
         link = socket.socket(socket.AF_UNIX)
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -300,17 +300,17 @@ def test_without_descriptors_clients_are_turned_away_but_a_stop_is_obeyed(served
                 while True:
                     fill.append(os.open(os.devnull, os.O_RDONLY))
             link.connect(str(served.path))
-            link.sendall(b'{"command":"%s"}\n' % (b"stop" if says_stop else b"status"))
+            link.sendall(b'{"command":"%s"}\n' % (b"stop" if is_stop else b"status"))
             await asyncio.sleep(0.05)
         finally:
             for fd in fill:
                 os.close(fd)
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
         link.settimeout(10.0)
-        told = json.loads(link.recv(1000))
+        reply = json.loads(link.recv(1000))
         link.close()
-        assert "stopping" in told if says_stop else "too many clients" in told["error"]
-        assert (await (await served.connect()).ask({"command": "status"}))["ok"]
+        assert "stopping" in reply if is_stop else "too many clients" in reply["error"]
+        assert (await (await served.connect()).request({"command": "status"}))["ok"]
 
     served.run(scenario)
 
@@ -319,7 +319,7 @@ def mode(path):
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def test_the_socket_is_the_user_s_own(runtime_folder):
+def test_socket_belongs_to_its_user(runtime_folder):
     path = socket_path("my rig/2")
     assert path.parent == runtime_folder / "rigd"
     listener = address.bind(path, None)
@@ -335,7 +335,7 @@ def test_the_socket_is_the_user_s_own(runtime_folder):
         assert not answers(path)
 
 
-def test_a_group_may_use_it_if_asked_for(runtime_folder):
+def test_socket_of_a_group(runtime_folder):
     group = grp.getgrgid(os.getgid()).gr_name
     common = runtime_folder / "common"
     path = socket_path("sim", common)
@@ -357,7 +357,7 @@ def test_a_group_may_use_it_if_asked_for(runtime_folder):
         address.bind(path, "nobody-has-this-group")
 
 
-def test_a_folder_that_there_cannot_be_is_refused_with_the_remedy(tmp_path):
+def test_error_with_remedy_for_an_impossible_folder(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(AddressError, match="XDG_RUNTIME_DIR"):
         address.bind(tmp_path / "file" / "sim.daemon", None)
@@ -391,18 +391,18 @@ def test_daemons_are_found(runtime_folder, monkeypatch):
         assert isinstance(find("one"), Path)
 
 
-def test_signals_go_to_those_who_asked_for_them(served, monkeypatch):
+def test_signals_are_sent_to_their_subscribers_only(served, monkeypatch):
     monkeypatch.setattr(signal_blocks, "_ABANDONED_AFTER_S", 1e9)  # however slow the computer is
 
     async def scenario(served):
-        telling = asyncio.create_task(served.operated.service.stream_signals())
-        plain, listener = await served.connect(), await served.connect()
-        await plain.ask({"command": "watch"})
-        await listener.ask({"command": "watch", "signals": True})
+        streaming = asyncio.create_task(served.operated.service.stream_signals())
+        other, listener = await served.connect(), await served.connect()
+        await other.request({"command": "watch"})
+        await listener.request({"command": "watch", "signals": True})
         await served.connect()
         event = await listener.next()
         assert (event["event"], event["count"]) == ("signals", 0)
-        await plain.ask(LONG | {"repeat": 1, "parameters": LONG["parameters"]})
+        await other.request(LONG | {"repeat": 1, "parameters": LONG["parameters"]})
         events = []
         while not events or events[-1]["event"] != "series":
             events.append(await listener.next())
@@ -419,13 +419,13 @@ def test_signals_go_to_those_who_asked_for_them(served, monkeypatch):
         gauges = [block["gauges"] for block in blocks if block["gauges"] is not None]
         assert all(each["angle"]["unit"] == "rad" for each in gauges)  # ten times a second
         assert all(len(json.dumps(event)) < 65_536 for event in events)
-        seen = []
-        while not seen or seen[-1]["event"] != "series":
-            seen.append(await plain.next())
-        assert all(event["event"] != "signals" for event in seen)
+        other_events = []
+        while not other_events or other_events[-1]["event"] != "series":
+            other_events.append(await other.next())
+        assert all(event["event"] != "signals" for event in other_events)
         await listener.close()
-        await plain.ask({"command": "status"})
+        await other.request({"command": "status"})
         assert served.operated.service._signal_watchers == set()
-        telling.cancel()
+        streaming.cancel()
 
     served.run(scenario)

@@ -26,7 +26,7 @@ LONG = ("--duration", "100", "--rest", "0.2")
 
 @pytest.fixture
 def rigd(runtime_folder, tmp_path):
-    """Start `rigd`; what still runs at the end is killed."""
+    """Start `rigd`; processes that still run at the end are killed."""
     started = []
 
     def start(*arguments):
@@ -50,8 +50,8 @@ def rigd(runtime_folder, tmp_path):
 
 
 @pytest.fixture
-def ask(rigd):
-    """Run a command to its end; returns exit code, standard output and standard error."""
+def run_command(rigd):
+    """Run a command to its end; return exit code, standard output and standard error."""
 
     def run(*arguments):
         process = rigd(*arguments)
@@ -62,8 +62,8 @@ def ask(rigd):
 
 
 @pytest.fixture
-def ask_here(rigd_here):
-    """The same within this process, which costs less; the daemon is a process all the same."""
+def run_here(rigd_here):
+    """Run a command within this process, which costs less than `run_command`."""
 
     def run(*arguments):
         done = rigd_here(*arguments)
@@ -123,34 +123,34 @@ def control_process():
     return next(process["pid"] for process in processes if process["name"] == "control")
 
 
-def test_without_a_daemon_every_command_says_how_to_start_one(runtime_folder, ask_here):
+def test_commands_without_a_daemon_name_rigd_serve(runtime_folder, run_here):
     for command in (("status",), ("start", "hold")):
-        code, out, err = ask_here(*command)
+        code, out, err = run_here(*command)
         assert (code, out) == (1, "")
         assert "rigd serve --profile" in err
 
 
-def test_watching_needs_a_terminal(ask):
-    code, out, err = ask("status", "--watch")
+def test_watching_needs_a_terminal(run_command):
+    code, out, err = run_command("status", "--watch")
     assert (code, out) == (2, "")
     assert "terminal" in err
 
 
-def test_what_cannot_be_served_is_refused_at_once(ask, ask_here, profile, tmp_path):
+def test_invalid_options_of_serve_are_refused_at_once(run_command, run_here, profile, tmp_path):
     (tmp_path / "file").touch()
-    for run, *options in ((ask_here, "--output", "file/out"), (ask, "--group", "")):
+    for run, *options in ((run_here, "--output", "file/out"), (run_command, "--group", "")):
         code, out, err = run("serve", "--profile", profile, *options)
         assert (code, out) == (2, "")
         assert options[0] in err
         assert "Traceback" not in err
 
 
-def test_a_day_with_the_daemon(serve, ask, ask_here, profile, tmp_path):
+def test_a_day_with_the_daemon(serve, run_command, run_here, profile, tmp_path):
     for name in ("analysis", "random", "rigd"):  # the operator's own, not the modules
         (tmp_path / f"{name}.py").write_text("raise SystemExit('of the operator')")
     daemon = serve("--fast")
-    code, out, err = ask("start", "chirp", *SHORT, "--stop-hz", "10", "--repeat", "2", "--json",
-                         "--operator", "Ada")  # fmt: skip
+    code, out, err = run_command("start", "chirp", *SHORT, "--stop-hz", "10", "--repeat", "2",
+                                 "--json", "--operator", "Ada")  # fmt: skip
     assert code == 0
     assert err.startswith("No hardware: sim is simulated (in this process).\n")
     sessions = json.loads(out)["sessions"]
@@ -161,81 +161,79 @@ def test_a_day_with_the_daemon(serve, ask, ask_here, profile, tmp_path):
     assert record.metadata["series"] == "2 of 2"
     assert Path(sessions[0]["path"]).parent == tmp_path / "out"
 
-    code, out, err = ask_here("start", "step", "--amplitude", "3")
+    code, out, err = run_here("start", "step", "--amplitude", "3")
     assert (code, out) == (2, "")
     assert "lower the amplitude" in err
-    code, out, err = ask_here("start", "chirp", "--amplitude", "nan")
+    code, out, err = run_here("start", "chirp", "--amplitude", "nan")
     assert code == 2
-    code, out, _ = ask("status")
+    code, out, _ = run_command("status")
     assert code == 0
     assert "ready since" in out
-    code, out, _ = ask_here("tare", "--json")
+    code, out, _ = run_here("tare", "--json")
     assert "torque_std_nm" in json.loads(out)
-    code, out, _ = ask_here("zero", "--profile", "sim")
+    code, out, _ = run_here("zero", "--profile", "sim")
     assert code == 0
-    code, out, err = ask_here("reset")
+    code, out, err = run_here("reset")
     assert code == 1
     assert "nothing to reset" in err
 
-    code, _, err = ask("serve", "--profile", profile)
+    code, _, err = run_command("serve", "--profile", profile)
     assert code == 1
     assert "rigd serve, process" in err
-    code, _, err = ask_here("run", "hold", "--profile", profile, "--fast", *SHORT)
+    code, _, err = run_here("run", "hold", "--profile", profile, "--fast", *SHORT)
     assert code == 1
     assert "rigd start" in err
 
     os.kill(control_process(), signal.SIGKILL)
     until(lambda: request("status")["state"] == "fault")
-    code, _, err = ask_here("start", "hold", *SHORT)
+    code, _, err = run_here("start", "hold", *SHORT)
     assert code == 1
     assert "killed by signal 9" in err
-    code, out, _ = ask("reset")
+    code, out, _ = run_command("reset")
     assert code == 0
     assert "rigd zero" in out  # it was set before, and is lost
     assert request("status")["state"] == "ready"
 
     daemon.send_signal(signal.SIGTERM)
-    _, said = daemon.communicate(timeout=300.0)
+    _, log = daemon.communicate(timeout=300.0)
     assert daemon.returncode == 0
-    assert "state: ready -> running: chirp was started, 2 sessions" in said
+    assert "state: ready -> running: chirp was started, 2 sessions" in log
     assert not socket_path("sim").exists()
 
 
 @pytest.mark.further  # as tests/runner/test_quick_looks.py
-def test_each_session_of_a_daemon_gets_a_quick_look(serve, ask, brief_looks):
+def test_each_session_has_a_quick_look(serve, run_command, brief_quick_looks):
     daemon = serve("--fast")
     assert request("status")["daemon"]["quick_looks"] is True
-    code, out, err = ask("start", "chirp", *SHORT, "--repeat", "2", "--json")
+    code, out, err = run_command("start", "chirp", *SHORT, "--repeat", "2", "--json")
     assert code == 0, err
     for session in json.loads(out)["sessions"]:
-        look = json.loads(Path(session["look"]).read_text())
-        assert look["file"] == Path(session["path"]).name
-        assert "\n".join(look["text"]) in err
+        quick_look = json.loads(Path(session["look"]).read_text())
+        assert quick_look["file"] == Path(session["path"]).name
+        assert "\n".join(quick_look["text"]) in err
     assert request("status")["series"]["sessions"] == json.loads(out)["sessions"]
     daemon.send_signal(signal.SIGTERM)
-    _, said = daemon.communicate(timeout=300.0)
-    assert f"INFO {look['text'][0]}" in said
+    _, log = daemon.communicate(timeout=300.0)
+    assert f"INFO {quick_look['text'][0]}" in log
 
 
 @pytest.mark.further  # as test_fits.py
-def test_a_record_is_fitted_while_it_is_recorded(serve, ask, ask_here):
+def test_a_record_is_fitted_while_it_is_recorded(serve, run_command, run_here):
     serve("--fast")
     swept = ("--start-hz", "0.5", "--duration", "5", "--rest", "0.5", "--ring-down", "1")
-    code, out, err = ask("start", "chirp", *swept, "--watch-fit", "--json")
+    code, out, err = run_command("start", "chirp", *swept, "--watch-fit", "--json")
     assert code == 0, err
     (session,) = json.loads(out)["sessions"]
     assert [mode["mode"] for mode in session["fit"]["modes"] if mode["shown"]][:2] == [1, 2]
-    told = request("status")["series"]["fit"]
-    assert told["duration_s"] == session["fit"]["duration_s"] == 6.5
-    assert "\n".join(told["text"]) in err
-    code, out, _ = ask_here("status")
+    fit = request("status")["series"]["fit"]
+    assert fit["duration_s"] == session["fit"]["duration_s"] == 6.5
+    assert "\n".join(fit["text"]) in err
+    code, out, _ = run_here("status")
     assert code == 0
-    assert told["text"][0] in out
+    assert fit["text"][0] in out
 
 
-def test_a_session_survives_its_client_and_ends_by_a_stop_or_with_its_daemon(
-    serve, stop_here, rigd
-):
+def test_session_ends_with_a_stop_or_its_daemon(serve, stop_here, rigd):
     daemon = serve()
     client = rigd("start", "hold", *LONG, "--repeat", "3")
     until(recording, daemon)
@@ -257,9 +255,9 @@ def test_a_session_survives_its_client_and_ends_by_a_stop_or_with_its_daemon(
     until(recording, daemon)
     control = control_process()
     os.killpg(daemon.pid, signal.SIGINT)
-    _, said = daemon.communicate(timeout=300.0)
+    _, log = daemon.communicate(timeout=300.0)
     assert daemon.returncode == 130
-    assert "stopping -> ready" in said
+    assert "stopping -> ready" in log
     out, _ = client.communicate(timeout=300.0)
     assert client.returncode == 130
     assert json.loads(out)["sessions"][0]["outcome"] == "stopped"
@@ -268,7 +266,7 @@ def test_a_session_survives_its_client_and_ends_by_a_stop_or_with_its_daemon(
 
 
 @pytest.mark.further  # as by a stop that is waited for
-def test_a_session_ends_by_every_other_way_of_stopping_it(serve, stop_here, rigd):
+def test_other_ways_to_stop_a_session(serve, stop_here, rigd):
     daemon = serve()
     client = rigd("start", "hold", *LONG)
     until(recording, daemon)
@@ -314,7 +312,7 @@ while True:
 
 
 @pytest.mark.further  # as test_control_socket.py
-def test_a_crowd_at_the_socket_keeps_nobody_from_a_stop(serve, rigd, ask, stop_here):
+def test_stop_succeeds_among_many_clients(serve, rigd, run_command, stop_here):
     daemon = serve()
     client = rigd("start", "hold", *LONG)
     until(recording, daemon)
@@ -323,7 +321,7 @@ def test_a_crowd_at_the_socket_keeps_nobody_from_a_stop(serve, rigd, ask, stop_h
         for kind in ("silent", "half", "close")
     ]
     try:
-        code, out, err = ask("status", "--json")
+        code, out, err = run_command("status", "--json")
         assert code == 0, err
         assert json.loads(out)["state"] == "running"
         code, out, err = stop_here()

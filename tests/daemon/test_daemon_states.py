@@ -42,11 +42,11 @@ def recorder_dies(operated, drive):
     operated.rig._group.recorder.kill()
 
 
-def stop_is_asked_for(operated, drive):
+def stop_is_requested(operated, drive):
     operated.meanwhile("stop")
 
 
-def everything_is_asked_for(operated, drive):
+def everything_is_requested(operated, drive):
     for command in ("tare", "zero", "reset"):
         assert isinstance(operated.meanwhile(command), CommandError)
     assert isinstance(operated.meanwhile("start", **sessions(0.3)), CommandError)
@@ -61,8 +61,8 @@ INCIDENTS = (
     limit_is_violated,
     control_dies,
     recorder_dies,
-    stop_is_asked_for,
-    everything_is_asked_for,
+    stop_is_requested,
+    everything_is_requested,
     client_leaves,
 )
 
@@ -73,7 +73,7 @@ def make_machine(operate):
             super().__init__()
             self.operated = operate().open()
             self.world = self.operated.world
-            self.reset_asked = False
+            self.reset_requested = False
 
         def arrange(self, incident, when):
             self.world.countdown = when
@@ -84,17 +84,17 @@ def make_machine(operate):
             for drive in self.world.drives:
                 drive.offset_rad = 0.0
 
-        def ask(self, command, **fields):
-            before, seen = self.operated.state, len(self.operated.events)
-            answer = self.operated.ask(command, **fields)
+        def request(self, command, **fields):
+            before, event_count = self.operated.state, len(self.operated.events)
+            reply = self.operated.request(command, **fields)
             self.settle()
-            states = [e for e in self.operated.events[seen:] if e["event"] == "state"]
+            states = [e for e in self.operated.events[event_count:] if e["event"] == "state"]
             if before == "fault" and command != "reset":
-                assert isinstance(answer, CommandError) or command == "stop"
+                assert isinstance(reply, CommandError) or command == "stop"
                 assert states == []
             if before != "fault":
                 assert all(event["from"] != "fault" for event in states)
-            return answer
+            return reply
 
         @rule(
             incident=st.sampled_from((None, *INCIDENTS)),
@@ -107,8 +107,8 @@ def make_machine(operate):
             highest = self.world.highest_nm
             self.world.highest_nm = 0.0
             ready = self.operated.state == "ready" and not self.operated.rig.zero_lost
-            answer = self.ask("start", **sessions(ms / 1000), repeat=repeat)
-            assert isinstance(answer, CommandError) != ready
+            reply = self.request("start", **sessions(ms / 1000), repeat=repeat)
+            assert isinstance(reply, CommandError) != ready
             if not ready:
                 assert self.world.highest_nm == 0.0
             elif incident is None:
@@ -125,28 +125,28 @@ def make_machine(operate):
         def measure(self, command, incident, when):
             self.arrange(incident, when)
             before = self.world.highest_nm
-            self.ask(command)
+            self.request(command)
             assert self.world.highest_nm == before
 
         @rule(absent=st.booleans())
         def reset(self, absent):
             fault = self.operated.state == "fault"
             self.world.absent = absent
-            answer = self.ask("reset")
+            reply = self.request("reset")
             self.world.absent = False
-            if isinstance(answer, CommandError):
+            if isinstance(reply, CommandError):
                 assert absent or not fault
             else:
                 assert self.operated.state == "ready"
 
         @rule()
         def stop(self):
-            assert self.ask("stop") == {"stopping": False}
+            assert self.request("stop") == {"stopping": False}
 
         @rule()
         def another_client_comes(self):
             self.operated.peer = Peer(self.operated.peer.number + 1, 300, 0)
-            assert isinstance(self.ask("tare"), dict) == (
+            assert isinstance(self.request("tare"), dict) == (
                 self.operated.service.controller == self.operated.peer
                 and self.operated.state == "ready"
             )
@@ -183,7 +183,7 @@ def make_machine(operate):
 
 
 @pytest.mark.parametrize("sequences", [6, further(25)])
-def test_no_sequence_of_commands_and_faults_reaches_torque_outside_a_session(operate, sequences):
+def test_no_sequence_of_commands_and_faults_reaches_torque(operate, sequences):
     run_state_machine_as_test(
         make_machine(operate),
         settings=settings(
@@ -206,18 +206,18 @@ def test_no_sequence_of_commands_and_faults_reaches_torque_outside_a_session(ope
         ((DaemonState.FAULT,), DaemonState.STOPPING),
     ],
 )
-def test_what_leads_nowhere(path, wrong):
-    told = []
-    machine = DaemonStateMachine(told.append)
+def test_illegal_transitions(path, wrong):
+    transitions = []
+    machine = DaemonStateMachine(transitions.append)
     for state in path:
         machine.change_to(state, "test")
     with pytest.raises(IllegalTransitionError):
         machine.change_to(wrong, "test")
     assert machine.state is (path[-1] if path else DaemonState.IDLE)
-    assert len(told) == len(path)
+    assert len(transitions) == len(path)
 
 
-def test_the_history_is_bounded_and_knows_since_when():
+def test_history_is_bounded_and_has_times():
     clock = iter(range(10_000))
     machine = DaemonStateMachine(utc_ns=lambda: next(clock))
     assert machine.since_utc_ns == 0

@@ -1,4 +1,4 @@
-"""Requests to the daemon that are made to take its memory or time: it stays as it was."""
+"""Requests that are made to exhaust the daemon's memory or time."""
 
 import contextlib
 import json
@@ -30,16 +30,16 @@ def daemon(runtime_folder, write_profile, tmp_path):
     )
     try:
         assert eventually(lambda: answers(socket_path("sim")))
-        assert eventually(lambda: ask({"command": "status"})["state"] == "ready")
+        assert eventually(lambda: send_request({"command": "status"})["state"] == "ready")
         yield process
     finally:
         process.terminate()
         process.wait(60)
 
 
-def ask(request):
-    """Send a line, of bytes as they are; return the reply, None where the link is closed."""
-    line = request if isinstance(request, bytes) else json.dumps(request).encode()
+def send_request(document):
+    """Send a line (bytes unchanged); return the reply, or None if the link is closed."""
+    line = document if isinstance(document, bytes) else json.dumps(document).encode()
     with socket.socket(socket.AF_UNIX) as link:
         link.settimeout(60)
         link.connect(str(socket_path("sim")))
@@ -72,7 +72,7 @@ LINES = (
 
 
 def files(folder):
-    """Yield requests that name files: a pipe, what never ends, a long reference out of range."""
+    """Yield requests that name files: a pipe, an endless one, a long reference out of range."""
     pipe, heavy = folder / "pipe", folder / "heavy.csv"
     os.mkfifo(pipe)
     heavy.write_bytes(b"0.5\n" * 400_000)
@@ -80,14 +80,14 @@ def files(folder):
         yield {"command": "start", "excitation": kind, "parameters": {"path": str(path)}}
 
 
-@pytest.mark.further  # what it refuses is tried one by one in tests/daemon and tests/recovery
-def test_its_memory_stays_and_it_answers_others(daemon, tmp_path):
+@pytest.mark.further  # tests/daemon and tests/recovery test the refusals one by one
+def test_memory_is_bounded_and_other_clients_are_answered(daemon, tmp_path):
     requests = list(files(tmp_path))
     for line in LINES:
-        ask(line)
-    held, _ = megabytes(daemon)
+        send_request(line)
+    before, _ = megabytes(daemon)
     for line in LINES * 5:
-        reply = ask(line)
+        reply = send_request(line)
         assert reply is None or not reply["ok"]
     crowd = [socket.socket(socket.AF_UNIX) for _ in range(100)]
     for link in crowd:
@@ -102,10 +102,10 @@ def test_its_memory_stays_and_it_answers_others(daemon, tmp_path):
         for request in requests:
             busy.sendall(json.dumps(request).encode() + b"\n")
             # While it plans, another client is answered.
-            assert ask({"command": "status"})["ok"]
+            assert send_request({"command": "status"})["ok"]
             reply = json.loads(busy.makefile("rb").readline())
             assert not reply["ok"]
             assert len(json.dumps(reply)) < 10_000
     after, most = megabytes(daemon)
-    assert after < held + MOST_GROWTH_MB
-    assert most < held + 2 * MOST_GROWTH_MB
+    assert after < before + MOST_GROWTH_MB
+    assert most < before + 2 * MOST_GROWTH_MB

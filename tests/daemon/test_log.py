@@ -1,4 +1,4 @@
-"""The daemon's log never keeps the daemon."""
+"""The daemon's log never delays the daemon."""
 
 import subprocess
 import sys
@@ -37,15 +37,15 @@ def start(program):
     )
 
 
-def test_a_terminal_that_takes_nothing_is_not_waited_for():
+def test_no_wait_for_an_unread_terminal():
     process = start(FLOOD)
-    assert process.stdout.read() == "through\n"  # and nobody reads the log
+    assert process.stdout.read() == "through\n"  # although the log is not read
     assert process.wait(300.0) == 0
     process.communicate()
 
 
-def test_every_line_is_there_at_the_end():
+def test_every_line_is_written_at_the_end():
     process = start(A_FEW)
-    _, said = process.communicate(timeout=300.0)
-    lines = said.splitlines()
+    _, stderr = process.communicate(timeout=300.0)
+    lines = stderr.splitlines()
     assert [line.rsplit("WARNING ")[1] for line in lines] == [f"line {n}" for n in range(5)]

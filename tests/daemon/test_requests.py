@@ -1,4 +1,4 @@
-"""Requests from anybody: understood or refused by a message that names what is wrong."""
+"""Requests from any client: parsed, or refused by a message that names the error."""
 
 import inspect
 import json
@@ -24,7 +24,7 @@ def test_plain_commands(command):
     assert (request.command, request.id) == (command, 7)
 
 
-def test_a_start_has_the_parameters_of_its_excitation():
+def test_start_has_the_parameters_of_its_excitation():
     request = parse(START | {"parameters": {"amplitude_rad": 1, "stop_hz": 20.5}, "repeat": 3})
     assert isinstance(request, StartRequest)
     assert request.parameters == {"amplitude_rad": 1.0, "stop_hz": 20.5}
@@ -35,14 +35,14 @@ def test_a_start_has_the_parameters_of_its_excitation():
     assert request.parameters == {"path": Path("/data/reference.csv")}
 
 
-def test_a_chirp_there_and_back_is_asked_for_by_a_whole_number():
+def test_there_and_back_is_a_whole_number():
     parameters = {"there_and_back": 1, "duration_s": 60.0}
     assert parse(START | {"excitation": "chirp", "parameters": parameters}).parameters == parameters
     with pytest.raises(RequestError, match=r"there_and_back = 1\.5 is not a whole number"):
         parse(START | {"excitation": "chirp", "parameters": {"there_and_back": 1.5}})
 
 
-def test_a_precision_is_asked_for_in_words():
+def test_target_precision_is_a_text():
     parameters = {"targets": "damping 1%; alpha 0.03", "at_most_s": 60.0}
     assert parse(START | {"excitation": "until", "parameters": parameters}).parameters == parameters
     assert parse(START | {"watch_fit": True}).watch_fit
@@ -51,7 +51,7 @@ def test_a_precision_is_asked_for_in_words():
     assert not parse(START).watch_fit
 
 
-def test_a_prediction_is_asked_for_as_a_start_is():
+def test_predict_has_the_fields_of_a_start():
     request = parse(START | {"command": "predict", "parameters": {"stop_hz": 20}, "force": True})
     assert (request.parameters, request.force) == ({"stop_hz": 20.0}, True)
     assert not request.controlling
@@ -59,7 +59,7 @@ def test_a_prediction_is_asked_for_as_a_start_is():
         parse(START | {"command": "predict", "parameters": {"wobble": 1}})
 
 
-def test_who_watches_asks_for_signals_or_not():
+def test_watch_with_and_without_signals():
     assert not parse({"command": "watch"}).signals
     assert parse({"command": "watch", "signals": True}).signals
     with pytest.raises(RequestError, match="signals"):
@@ -88,7 +88,7 @@ def test_who_watches_asks_for_signals_or_not():
         (b'{"command": "status", "id": "' + b"x" * 65 + b'"}', "at most 64"),
     ],
 )
-def test_what_is_no_request_is_refused_by_name(line, named):
+def test_error_names_the_defect_of_a_request(line, named):
     with pytest.raises(RequestError, match=named):
         parse_request(line)
 
@@ -131,12 +131,12 @@ def test_what_is_no_request_is_refused_by_name(line, named):
         ({"force": "yes"}, "force"),
     ],
 )
-def test_a_start_that_is_wrong_is_refused_by_name(fields, named):
+def test_error_names_the_wrong_field_of_a_start(fields, named):
     with pytest.raises(RequestError, match=named):
         parse(START | fields)
 
 
-def test_notes_are_metadata_by_the_keys_of_the_file():
+def test_notes_as_metadata_of_the_file():
     meta = {"temperature_c": 21, "humidity_percent": "40", "batch": "B 7"}
     request = parse(START | {"notes": {"operator": "Ada", "note": "", "meta": meta}})
     assert request.notes.as_metadata() == {
@@ -152,7 +152,7 @@ def test_an_overflowing_number_is_refused():
         )
 
 
-def test_a_refusal_says_whose_request_it_was():
+def test_refusal_has_the_id_of_the_request():
     with pytest.raises(RequestError) as refused:
         parse({"command": "fire", "id": "mine"})
     assert refused.value.request_id == "mine"
@@ -161,7 +161,7 @@ def test_a_refusal_says_whose_request_it_was():
 @settings(max_examples=100)
 @given(st.binary(max_size=300))
 @example(b'{"command": "status"}')
-def test_no_bytes_break_it(line):
+def test_any_bytes_are_parsed_or_refused(line):
     try:
         parse_request(line)
     except RequestError as error:
@@ -182,7 +182,7 @@ NAMES = sorted({name for make in KINDS.values() for name in inspect.signature(ma
     parameters=st.dictionaries(st.sampled_from(NAMES), JSON | st.floats(-10.0, 100.0), max_size=4),
     more=st.dictionaries(st.sampled_from(["repeat", "notes", "force", "id"]), JSON, max_size=2),
 )
-def test_whatever_a_start_asks_for_is_made_or_refused(kind, parameters, more):
+def test_any_start_is_made_or_refused(kind, parameters, more):
     line = json.dumps(
         {"command": "start", "excitation": kind, "parameters": parameters, **more}
     ).encode()

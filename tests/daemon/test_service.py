@@ -1,4 +1,4 @@
-"""The daemon's logic on a rig in this process: commands, states, control, and what goes wrong."""
+"""The daemon's logic on a rig in this process: commands, states, control, and failures."""
 
 import asyncio
 import json
@@ -34,9 +34,9 @@ def transitions(operated):
     return [(e["from"], e["to"]) for e in operated.events if e["event"] == "state"]
 
 
-def test_a_session_goes_from_ready_over_running_to_ready(operated, tmp_path):
+def test_session_runs_from_ready_to_ready(operated, tmp_path):
     assert operated.state == "ready"
-    reply = operated.ask("start", **SHORT, notes={"operator": "Ada"})
+    reply = operated.request("start", **SHORT, notes={"operator": "Ada"})
     assert reply["plan"]["record_s"] == 0.3
     assert operated.state == "ready"
     assert transitions(operated) == [("idle", "ready"), ("ready", "running"), ("running", "ready")]
@@ -63,14 +63,12 @@ gamma = { value = 5.0e-2, source = "assumed" }
 """
 
 
-def test_specimen_metadata_and_predictions_of_a_start_stand_in_the_file(
-    operated, tmp_path, monkeypatch
-):
+def test_file_has_specimen_metadata_and_predictions(operated, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "specimens").mkdir()
     (tmp_path / "specimens" / "antenna 4.toml").write_text(SPECIMEN)
     notes = {"specimen": "antenna 4", "meta": {"temperature_c": 21.4, "batch": "7"}}
-    plan = operated.ask("start", **SHORT, notes=notes)["plan"]
+    plan = operated.request("start", **SHORT, notes=notes)["plan"]
     assert "length 0.95 m (profile: 0.98)" in plan["specimen_in_words"]
     session = read_session(operated.last["sessions"][0]["path"])
     metadata = session.metadata
@@ -81,138 +79,138 @@ def test_specimen_metadata_and_predictions_of_a_start_stand_in_the_file(
     assert session.number("limit_torque_nm") == plan["limits"]["torque_nm"]
     assert session.attachments["specimen.toml"].decode() == SPECIMEN
     assert describe_recorded_session(session).damping.zeta == 8e-5
-    # The next one that names none has the profile's beam again.
-    operated.ask("start", **SHORT)
+    # The next start names no specimen and has the profile's beam again.
+    operated.request("start", **SHORT)
     session = read_session(operated.last["sessions"][0]["path"])
     assert session.metadata["beam_length_m"] == "0.98"
     assert "specimen.toml" not in session.attachments
     assert describe_recorded_session(session).damping.zeta == 7.1e-5
     (tmp_path / "specimens" / "antenna 4.toml").write_text("[beam]")
-    refused = operated.ask("start", **SHORT, notes=notes)
+    refused = operated.request("start", **SHORT, notes=notes)
     assert str(refused) == "specimens/antenna 4.toml: section [beam] is missing."
     assert refused.wrong_use
 
 
 @pytest.mark.further  # as tests/excitation/test_move_sessions.py
-def test_a_move_starts_where_the_motor_stands_and_stays_where_it_went(operated):
+def test_move_from_the_current_angle(operated):
     brief = {"rest_s": 0.1, "ring_down_s": 0.1}
-    reply = operated.ask("start", excitation="move", parameters={"angle_rad": 0.05, **brief})
+    reply = operated.request("start", excitation="move", parameters={"angle_rad": 0.05, **brief})
     assert "to 0.05 rad" in reply["plan"]["sweep"]
     assert operated.last["sessions"][0]["outcome"] == "complete"
-    reply = operated.ask("start", excitation="move", parameters={"by_rad": -0.08, **brief})
+    reply = operated.request("start", excitation="move", parameters={"by_rad": -0.08, **brief})
     assert reply["plan"]["parameters"]["by_rad"] == pytest.approx(-0.08)
     assert reply["plan"]["parameters"]["angle_rad"] == pytest.approx(-0.03, abs=1e-3)
     session = read_session(operated.last["sessions"][0]["path"])
     assert session.samples["angle_rad"][0] == pytest.approx(0.05, abs=1e-3)
-    refused = operated.ask("start", excitation="move", parameters={"angle_rad": -0.03, **brief})
+    refused = operated.request("start", excitation="move", parameters={"angle_rad": -0.03, **brief})
     assert "already" in str(refused)
     assert refused.wrong_use
-    predicted = operated.ask("predict", excitation="move", parameters={"by_rad": 0.1, **brief})
+    predicted = operated.request("predict", excitation="move", parameters={"by_rad": 0.1, **brief})
     assert predicted["plan"]["parameters"]["angle_rad"] == pytest.approx(0.07, abs=1e-3)
     assert predicted["largest_amplitude_rad"] is None
 
 
-def test_a_series_runs_on_one_connection_and_stops_at_the_first_that_fails(operated):
-    operated.ask("start", **SHORT, repeat=2)
+def test_series_uses_one_connection_and_stops_at_first_failure(operated):
+    operated.request("start", **SHORT, repeat=2)
     assert [s["outcome"] for s in operated.last["sessions"]] == ["complete", "complete"]
     assert len(operated.world.drives) == 1
     operated.world.countdown, operated.world.then = 1560, fail
-    operated.ask("start", **SHORT, repeat=3)
+    operated.request("start", **SHORT, repeat=3)
     assert [s["outcome"] for s in operated.last["sessions"]] == ["complete", "fault"]
     assert operated.last["failed"]
     assert operated.state == "fault"
     assert "The drive is gone." in operated.service.status()["reason"]
 
 
-def test_a_stop_may_come_from_anybody_and_ends_the_series(operated):
+def test_any_client_can_stop_the_series(operated):
     def stop(drive):
         reply = operated.meanwhile("stop")
         assert reply == {"stopping": True}
         assert operated.state == "stopping"
 
     operated.world.countdown, operated.world.then = 500, stop
-    operated.ask("start", **SHORT, repeat=5)
+    operated.request("start", **SHORT, repeat=5)
     (session,) = operated.last["sessions"]
     assert session["outcome"] == "stopped"
     assert operated.last["stopped"]
     assert not operated.last["failed"]
     assert operated.state == "ready"
     assert ("stopping", "ready") in transitions(operated)
-    assert operated.ask("stop", peer=OTHER) == {"stopping": False}
+    assert operated.request("stop", peer=OTHER) == {"stopping": False}
 
 
-def test_what_a_state_does_not_allow_is_refused(operated):
+def test_commands_not_allowed_in_a_state_are_refused(operated):
     refused = []
 
-    def ask_everything(drive):
+    def request_everything(drive):
         for command, fields in (("start", SHORT), ("tare", {}), ("zero", {}), ("reset", {})):
             refused.append(operated.meanwhile(command, **fields))
 
-    operated.world.countdown, operated.world.then = 500, ask_everything
-    operated.ask("start", **SHORT)
+    operated.world.countdown, operated.world.then = 500, request_everything
+    operated.request("start", **SHORT)
     assert len(refused) == 4
     assert all(isinstance(error, CommandError) for error in refused)
     assert all("running" in str(error) for error in refused)
     assert operated.last["sessions"][0]["outcome"] == "complete"
-    assert isinstance(operated.ask("reset"), CommandError)
+    assert isinstance(operated.request("reset"), CommandError)
 
 
 def test_control_belongs_to_one_client_until_it_leaves(operated):
-    operated.ask("tare")
-    refusal = operated.ask("start", peer=OTHER, **SHORT)
+    operated.request("tare")
+    refusal = operated.request("start", peer=OTHER, **SHORT)
     assert "controlled by process 100 of" in str(refusal)
     assert operated.service.status()["controller"]["pid"] == 100
-    assert operated.ask("status", peer=OTHER)["state"] == "ready"
+    assert operated.request("status", peer=OTHER)["state"] == "ready"
     operated.service.release(OTHER)
-    assert isinstance(operated.ask("zero", peer=OTHER), CommandError)
+    assert isinstance(operated.request("zero", peer=OTHER), CommandError)
     operated.service.release(operated.peer)
-    assert "moved_rad" in operated.ask("zero", peer=OTHER)
+    assert "moved_rad" in operated.request("zero", peer=OTHER)
 
 
-def test_a_client_that_leaves_stops_nothing(operated):
+def test_disconnecting_client_stops_nothing(operated):
     def leave(drive):
         operated.service.release(operated.peer)
 
     operated.world.countdown, operated.world.then = 500, leave
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     assert operated.last["sessions"][0]["outcome"] == "complete"
 
 
 def test_tare_and_zero_without_torque(operated):
-    tare = operated.ask("tare")
+    tare = operated.request("tare")
     assert set(tare["mean"]) == {"fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm"}
-    assert operated.ask("zero")["moved_rad"] == pytest.approx(0.0, abs=1e-3)
+    assert operated.request("zero")["moved_rad"] == pytest.approx(0.0, abs=1e-3)
     assert operated.world.highest_nm == 0.0
 
 
 def test_only_reset_leaves_a_fault(operated):
     operated.world.countdown, operated.world.then = 500, fail
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     assert operated.state == "fault"
     for command, fields in (("start", SHORT), ("tare", {}), ("zero", {})):
-        refusal = operated.ask(command, **fields)
+        refusal = operated.request(command, **fields)
         assert "rigd reset" in str(refusal)
     operated.watch()
     assert operated.state == "fault"
-    operated.ask("reset")
+    operated.request("reset")
     assert operated.state == "ready"
     assert transitions(operated)[-2:] == [("fault", "idle"), ("idle", "ready")]
-    _, *printed = re.findall(r"(\w+) → (\w+)", printed_status(operated.ask("status")))
+    _, *printed = re.findall(r"(\w+) → (\w+)", printed_status(operated.request("status")))
     assert printed == transitions(operated)[-4:]
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     assert operated.last["sessions"][0]["outcome"] == "complete"
 
 
-def test_a_limit_that_ends_a_session_is_a_fault_and_the_zero_survives_its_reset(operated):
-    operated.ask("zero")
+def test_reset_after_a_limit_violation_retains_the_zero(operated):
+    operated.request("zero")
     operated.world.countdown, operated.world.then = 500, fall_silent
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     assert operated.state == "fault"
     assert operated.rig.connected
     operated.world.drives[0].inner.angle_stale = False
-    assert operated.ask("reset") == {"zero_lost": False}
+    assert operated.request("reset") == {"zero_lost": False}
     assert transitions(operated)[-1] == ("fault", "ready")
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     assert operated.last["sessions"][0]["outcome"] == "complete"
 
 
@@ -221,68 +219,68 @@ def slip(drive):
 
 
 @pytest.mark.parametrize("when", ["ready", further("session")])
-def test_an_encoder_that_jumps_makes_the_zero_void(operated, when):
-    """And the limits with it: nothing is started until there is another zero."""
-    operated.ask("zero")
-    if when == "ready":  # no time passes under the virtual clock until something is asked for
+def test_encoder_jump_makes_the_zero_void(operated, when):
+    """The limits are void too: nothing starts until the zero is set again."""
+    operated.request("zero")
+    if when == "ready":  # no time passes under the virtual clock until the next request
         slip(operated.world.drives[0])
     else:
         operated.world.countdown, operated.world.then = 1150, slip
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     assert operated.state == "fault"
     assert "encoder" in operated.last["reason"]
     assert "0.56 rad" in operated.last["reason"]
     assert "the zero" in operated.last["reason"]
-    assert "rigd reset" in str(operated.ask("start", **SHORT))
-    assert operated.ask("reset") == {"zero_lost": True}
-    refusal = operated.ask("start", **SHORT)
+    assert "rigd reset" in str(operated.request("start", **SHORT))
+    assert operated.request("reset") == {"zero_lost": True}
+    refusal = operated.request("start", **SHORT)
     assert isinstance(refusal, CommandError)
     assert "rigd zero" in str(refusal)
-    operated.ask("zero")
-    operated.ask("start", **SHORT)
+    operated.request("zero")
+    operated.request("start", **SHORT)
     assert operated.last["sessions"][0]["outcome"] == "complete"
 
 
-def test_an_encoder_that_jumps_before_the_zero_is_set_is_told(operated):
+def test_encoder_jump_before_the_zero_is_reported(operated):
     slip(operated.world.drives[0])
-    assert "The encoder jumped by 0.56 rad" in str(operated.ask("zero"))
+    assert "The encoder jumped by 0.56 rad" in str(operated.request("zero"))
     assert operated.state == "fault"
 
 
-def test_a_zero_that_was_lost_has_to_be_set_before_the_next_session(operated):
-    operated.ask("zero")
+def test_lost_zero_must_be_set_before_the_next_session(operated):
+    operated.request("zero")
     operated.world.countdown, operated.world.then = 500, fail
-    operated.ask("start", **SHORT)
-    assert operated.ask("reset") == {"zero_lost": True}
-    assert "rigd zero" in str(operated.ask("start", **SHORT))
+    operated.request("start", **SHORT)
+    assert operated.request("reset") == {"zero_lost": True}
+    assert "rigd zero" in str(operated.request("start", **SHORT))
     assert operated.service.status()["zero_lost"]
-    operated.ask("zero")
-    operated.ask("start", **SHORT)
+    operated.request("zero")
+    operated.request("start", **SHORT)
     assert operated.last["sessions"][0]["outcome"] == "complete"
 
 
-def test_a_rig_that_cannot_be_connected_is_a_fault_until_it_can(operate):
+def test_failed_connection_is_a_fault_until_reset(operate):
     operated = operate()
     operated.world.absent = True
     operated.open()
     assert operated.state == "fault"
-    assert "does not answer" in str(operated.ask("reset"))
+    assert "does not answer" in str(operated.request("reset"))
     assert operated.state == "fault"
     operated.world.absent = False
-    operated.ask("reset")
+    operated.request("reset")
     assert operated.state == "ready"
 
 
-def test_the_hardware_does_not_take_the_place_of_a_simulation(operated):
+def test_reset_does_not_replace_simulation_by_hardware(operated):
     operated.world.countdown, operated.world.then = 500, fail
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     operated.moving = ActuationTarget.HARDWARE
-    assert "restart the daemon" in str(operated.ask("reset"))
+    assert "restart the daemon" in str(operated.request("reset"))
     assert operated.state == "fault"
     assert len(operated.world.drives) == 1
 
 
-def test_a_control_process_that_dies_between_sessions_is_a_fault(operated):
+def test_death_of_control_process_between_sessions_is_a_fault(operated):
     operated.rig._group.control.kill()
     for _ in range(100):
         operated.watch()
@@ -292,23 +290,23 @@ def test_a_control_process_that_dies_between_sessions_is_a_fault(operated):
     assert "killed by signal 9" in operated.service.status()["reason"]
 
 
-def test_a_fault_is_one_though_a_stop_was_asked_for(operated):
+def test_fault_after_a_stop_request_is_a_fault(operated):
     def stop_and_jump(drive):
         operated.meanwhile("stop")
         drive.offset_rad = 3.0
 
     operated.world.countdown, operated.world.then = 1500, stop_and_jump
-    operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
+    operated.request("start", excitation="hold", parameters={"duration_s": 5.0})
     assert operated.last["stopped"]
     assert operated.last["failed"]
     assert operated.state == "fault"
     assert operated.last["sessions"][0]["outcome"] == "fault"
 
 
-def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
+def test_report_of_a_dead_recorder_names_the_partial_file(operated):
     operated.world.countdown = 1500
     operated.world.then = lambda _: operated.rig._group.recorder.kill()
-    operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
+    operated.request("start", excitation="hold", parameters={"duration_s": 5.0})
     assert operated.state == "fault"
     for words in ("killed by signal 9", "drive is disabled", "rigd recover"):
         assert words in operated.last["reason"]
@@ -316,11 +314,11 @@ def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
     assert (session["outcome"], session["path"], session["recorded"]) == ("fault", None, None)
     assert session["part"].endswith(".mcap.part")
     assert session["scheduled"] > 0
-    (told,) = (event for event in operated.events if event["event"] == "session")
-    assert told.items() >= session.items()
+    (event_of_session,) = (event for event in operated.events if event["event"] == "session")
+    assert event_of_session.items() >= session.items()
 
 
-def test_a_drive_that_does_not_show_itself_off_is_told_whatever_else_has_failed(operated):
+def test_doubt_about_disabled_drive_is_reported_with_other_failures(operated):
     doubt = "Drive: it does not show that it is off; check that it is, by its STO if need be."
 
     def fail_both(drive):
@@ -328,7 +326,7 @@ def test_a_drive_that_does_not_show_itself_off_is_told_whatever_else_has_failed(
         operated.rig._group.recorder.kill()
 
     operated.world.countdown, operated.world.then = 1500, fail_both
-    operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
+    operated.request("start", excitation="hold", parameters={"duration_s": 5.0})
     assert operated.state == "fault"
     reason = operated.last["reason"]
     for words in ("killed by signal 9", doubt, "rigd recover"):
@@ -336,8 +334,8 @@ def test_a_drive_that_does_not_show_itself_off_is_told_whatever_else_has_failed(
     assert "is disabled" not in reason
 
 
-def test_what_the_limits_forbid_is_refused_before_anything_moves(operated):
-    refusal = operated.ask(
+def test_start_beyond_the_limits_is_refused_before_motion(operated):
+    refusal = operated.request(
         "start", excitation="step", parameters={"amplitude_rad": 3.0, "duration_s": 1.0}
     )
     assert refusal.wrong_use
@@ -347,69 +345,71 @@ def test_what_the_limits_forbid_is_refused_before_anything_moves(operated):
 
 
 @pytest.mark.parametrize("name", ["missing.csv", "/dev/zero"])
-def test_only_plain_files_are_read(operated, tmp_path, name):
-    refusal = operated.ask("start", excitation="file", parameters={"path": str(tmp_path / name)})
+def test_only_regular_files_are_read(operated, tmp_path, name):
+    refusal = operated.request(
+        "start", excitation="file", parameters={"path": str(tmp_path / name)}
+    )
     assert refusal.wrong_use
     assert name in str(refusal)
 
 
-def test_a_disk_without_room_for_a_file_is_refused(operated, tmp_path):
+def test_start_is_refused_if_no_file_can_be_created(operated, tmp_path):
     (tmp_path / "out").write_text("in the way")
-    refusal = operated.ask("start", **SHORT)
+    refusal = operated.request("start", **SHORT)
     assert "cannot be created" in str(refusal)
     assert not refusal.wrong_use  # the same request may succeed later
     assert operated.state == "ready"
 
 
-def test_a_folder_that_cannot_be_written_any_more_ends_the_series_as_a_fault(operated, tmp_path):
+def test_unwritable_folder_ends_the_series_as_a_fault(operated, tmp_path):
     def take_away(drive):
         (tmp_path / "out").rename(tmp_path / "gone")
         (tmp_path / "out").write_text("in the way")
 
     operated.world.countdown, operated.world.then = 1250, take_away
-    operated.ask("start", **SHORT, repeat=2)
+    operated.request("start", **SHORT, repeat=2)
     assert operated.last["failed"]
     assert operated.world.drives[0].safe
 
 
-def test_what_nobody_foresaw_ends_with_everything_off(operated, monkeypatch):
-    def break_(*_):
+def test_unexpected_error_ends_with_everything_off(operated, monkeypatch):
+    def raise_error(*_):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(operated.rig, "run", break_)
-    operated.ask("start", **SHORT)
+    monkeypatch.setattr(operated.rig, "run", raise_error)
+    operated.request("start", **SHORT)
     assert operated.state == "fault"
     assert not operated.rig.connected
     assert "ZeroDivisionError" in operated.last["reason"]
 
 
-def test_signals_that_cannot_be_told_do_not_keep_a_session_from_its_end(operated, monkeypatch):
+def test_session_completes_though_its_signals_fail(operated, monkeypatch):
     monkeypatch.setattr(operated.rig, "signals", lambda: 1 / 0)
     operated.service._signal_watchers.add(operated.peer)
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     assert operated.state == "ready"
     assert operated.last["sessions"][0]["outcome"] == "complete"
 
 
-def test_what_nobody_foresaw_in_connecting_is_a_fault_that_can_be_reset(operate, monkeypatch):
-    def break_(*_, **__):
+def test_unexpected_error_while_connecting_can_be_reset(operate, monkeypatch):
+    def raise_error(*_, **__):
         raise ZeroDivisionError
 
     operated = operate()
     with monkeypatch.context() as broken:
-        broken.setattr(operated.rig, "connect", break_)
+        broken.setattr(operated.rig, "connect", raise_error)
         operated.open()
         assert operated.state == "fault"
-        assert "ZeroDivisionError" in str(operated.ask("reset"))
+        assert "ZeroDivisionError" in str(operated.request("reset"))
     assert operated.state == "fault"
-    operated.ask("reset")
+    operated.request("reset")
     assert operated.state == "ready"
 
 
-def test_a_request_waits_until_the_devices_of_a_new_daemon_are_connected(operate):
+def test_request_waits_for_the_connection_of_the_devices(operate):
     operated = operate()
 
-    async def ask():
+    async def request_zero():
         opening = asyncio.create_task(operated.service.open())
         await asyncio.sleep(0)
         assert operated.service.status()["doing"] == "connecting"
@@ -417,15 +417,15 @@ def test_a_request_waits_until_the_devices_of_a_new_daemon_are_connected(operate
         await opening
         return reply
 
-    assert "moved_rad" in operated.loop.run_until_complete(ask())
+    assert "moved_rad" in operated.loop.run_until_complete(request_zero())
     assert operated.state == "ready"
 
 
-def test_a_start_that_waits_for_the_devices_is_stopped_by_a_stop(operate):
+def test_stop_cancels_a_waiting_start(operate):
     operated = operate()
     line = json.dumps({"command": "start", **SHORT}).encode()
 
-    async def ask():
+    async def start_and_stop():
         opening = asyncio.create_task(operated.service.open())
         await asyncio.sleep(0)
         started = asyncio.create_task(operated.service.execute(parse_request(line), operated.peer))
@@ -435,21 +435,21 @@ def test_a_start_that_waits_for_the_devices_is_stopped_by_a_stop(operate):
             await started
         await opening
 
-    operated.loop.run_until_complete(ask())
+    operated.loop.run_until_complete(start_and_stop())
     assert operated.state == "ready"
     assert operated.world.highest_nm == 0.0
 
 
-def test_a_process_that_cannot_be_started_is_a_fault_that_can_be_reset(operated, monkeypatch):
-    assert operated.ask("start", **SHORT)["series"] == 1
+def test_failed_start_of_a_process_can_be_reset(operated, monkeypatch):
+    assert operated.request("start", **SHORT)["series"] == 1
     group = operated.rig._group
     with monkeypatch.context() as broken:
         broken.setattr(type(group), "_start", refuse_to_start)
-        operated.ask("start", **SHORT)
+        operated.request("start", **SHORT)
     assert operated.state == "fault"
     assert "cannot be started" in operated.last["reason"]
-    operated.ask("reset")
-    operated.ask("start", **SHORT)
+    operated.request("reset")
+    operated.request("start", **SHORT)
     assert operated.state == "ready"
 
 
@@ -457,9 +457,9 @@ def refuse_to_start(*_):
     raise ChildError("The recorder process cannot be started.")
 
 
-def test_a_reset_does_not_connect_what_is_being_closed(operated):
+def test_reset_does_not_connect_a_closing_rig(operated):
     operated.world.countdown, operated.world.then = 500, fail
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     assert operated.state == "fault"
 
     async def both():
@@ -473,13 +473,13 @@ def test_a_reset_does_not_connect_what_is_being_closed(operated):
     assert not operated.rig.connected
 
 
-def test_a_session_whose_daemon_hears_nobody_is_given_no_sign_of_life(operated, monkeypatch):
-    heard = iter([True, True, False])
-    monkeypatch.setattr(operated.service, "_can_receive_stop", lambda: next(heard, False))
+def test_no_supervisor_beat_while_no_stop_can_be_received(operated, monkeypatch):
+    can_receive = iter([True, True, False])
+    monkeypatch.setattr(operated.service, "_can_receive_stop", lambda: next(can_receive, False))
     beats = []
     operated.world.countdown = 500
     operated.world.then = lambda _: beats.append(shared_state(operated)[StateField.SUPERVISOR_BEAT])
-    operated.ask("start", **SHORT, repeat=2)
+    operated.request("start", **SHORT, repeat=2)
     assert shared_state(operated)[StateField.SUPERVISOR_BEAT] == beats[0]
     assert len(operated.last["sessions"]) == 1
     assert "does not respond" in operated.last["reason"]
@@ -497,27 +497,27 @@ def test_the_end_of_the_daemon_stops_a_session_safely(operated):
     def close():
         closed.append(operated.loop.create_task(operated.service.close("it ends")))
 
-    operated.ask("start", excitation="hold", parameters={"duration_s": 60.0}, repeat=3)
+    operated.request("start", excitation="hold", parameters={"duration_s": 60.0}, repeat=3)
     operated.loop.run_until_complete(closed[0])
     (session,) = operated.last["sessions"]
     assert session["outcome"] == "stopped"
     assert operated.state == "idle"
     assert not operated.rig.connected
     assert operated.world.drives[0].safe
-    assert "shut down" in str(operated.ask("reset"))
+    assert "shut down" in str(operated.request("reset"))
 
 
-def test_status_tells_of_progress_processes_and_topics(operated):
-    seen = []
+def test_status_has_progress_processes_and_topics(operated):
+    statuses = []
 
-    def look(drive):
+    def record_status(drive):
         operated.service.poll_status()
-        seen.append(operated.service.status())
+        statuses.append(operated.service.status())
 
     operated.service.poll_status()  # from now on it sees the samples
-    operated.world.countdown, operated.world.then = 500, look
-    operated.ask("start", **SHORT)
-    (status,) = seen
+    operated.world.countdown, operated.world.then = 500, record_status
+    operated.request("start", **SHORT)
+    (status,) = statuses
     assert status["state"] == "running"
     assert status["progress"]["phase"] == status["progress"]["activity"] == "running"
     assert 0 < status["progress"]["tick"] < status["progress"]["total"] == 300
@@ -542,78 +542,78 @@ def test_status_tells_of_progress_processes_and_topics(operated):
     assert any(event["event"] == "progress" for event in operated.events)
 
 
-def test_while_the_drive_is_off_a_session_is_not_said_to_run(operated):
-    seen = []
+def test_session_is_preparing_while_the_drive_is_off(operated):
+    statuses = []
 
-    def look(drive):
+    def record_status(drive):
         assert not drive.enabled
         operated.service.poll_status()
-        seen.append(operated.service.status())
+        statuses.append(operated.service.status())
 
-    operated.world.countdown, operated.world.then = 100, look
-    operated.ask("start", **SHORT)
-    (status,) = seen
+    operated.world.countdown, operated.world.then = 100, record_status
+    operated.request("start", **SHORT)
+    (status,) = statuses
     assert (status["state"], status["progress"]["phase"]) == ("running", "taring")
     assert status["progress"]["activity"] == "preparing"
     assert shown_status(status)["state"].strip().startswith("preparing since ")
 
 
-def test_a_refused_start_leaves_the_last_series_as_it_was(operated):
+def test_refused_start_retains_the_last_series(operated):
     assert operated.service.status()["series"] is None
-    assert isinstance(operated.ask("start", **TOO_FAR), CommandError)
+    assert isinstance(operated.request("start", **TOO_FAR), CommandError)
     assert operated.service.status()["series"] is None
-    operated.ask("start", **SHORT, repeat=2)
+    operated.request("start", **SHORT, repeat=2)
     last = operated.service.status()["series"]
     assert len(last["sessions"]) == 2
-    assert isinstance(operated.ask("start", **TOO_FAR), CommandError)
+    assert isinstance(operated.request("start", **TOO_FAR), CommandError)
     assert operated.service.status()["series"] == last
 
 
 TOO_FAR = {"excitation": "chirp", "parameters": {"amplitude_rad": 9.0}}
 
 
-def test_the_log_tells_of_refusals_and_results(operated, caplog):
+def test_log_has_refusals_and_results(operated, caplog):
     caplog.set_level("INFO", "rigd.serve")
-    operated.ask("start", **TOO_FAR)
-    operated.ask("reset")
-    operated.ask("tare", peer=OTHER)
-    operated.ask("start", **SHORT)
-    told = [record.getMessage() for record in caplog.records]
-    refused = [line for line in told if ": refused: " in line]
+    operated.request("start", **TOO_FAR)
+    operated.request("reset")
+    operated.request("tare", peer=OTHER)
+    operated.request("start", **SHORT)
+    messages = [record.getMessage() for record in caplog.records]
+    refused = [line for line in messages if ": refused: " in line]
     assert [line.partition(":")[0] for line in refused] == ["start", "reset", "tare"]
     assert "amplitude_rad = 9" in refused[0]
     assert "is controlled by" in refused[2]
-    (result,) = [line for line in told if "samples" in line]
+    (result,) = [line for line in messages if "samples" in line]
     path = operated.last["sessions"][0]["path"]
     assert result == (
         f"series 2: session 1 of 1, {path}: Complete: 300 of 300 samples, 0 missed, 0 late."
     )
 
 
-def test_the_log_tells_of_warnings(operated, caplog):
+def test_log_has_warnings(operated, caplog):
     caplog.set_level("INFO", "rigd.serve")
 
     def doubt(drive):
         drive.health = lambda: LineHealth(doubt="Angles are old.")
 
     operated.world.countdown, operated.world.then = 500, doubt
-    operated.ask("start", **SHORT)
-    (told,) = [r for r in caplog.records if r.getMessage() == "series 1: Angles are old."]
-    assert told.levelname == "WARNING"
+    operated.request("start", **SHORT)
+    (record,) = [r for r in caplog.records if r.getMessage() == "series 1: Angles are old."]
+    assert record.levelname == "WARNING"
 
 
-def test_a_reset_that_fails_does_not_lose_what_was_to_be_reset(operated, caplog):
+def test_failed_reset_retains_the_first_reason(operated, caplog):
     operated.world.countdown, operated.world.then = 500, fail
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     first = operated.service.status()["reason"]
     operated.world.absent = True
     for _ in range(2):  # not longer each time
-        assert str(operated.ask("reset")) == "The drive does not answer."
+        assert str(operated.request("reset")) == "The drive does not answer."
         assert operated.service.status()["reason"] == (
             f"The drive does not answer. Not reset: {first}"
         )
     operated.world.absent = False
-    operated.ask("reset")
+    operated.request("reset")
     operated.world.countdown, operated.world.then = 500, fail
-    operated.ask("start", **SHORT)
+    operated.request("start", **SHORT)
     assert operated.service.status()["reason"] == first

@@ -1,4 +1,4 @@
-"""`rigd stop` finds what runs, and says that it has ended only where that was seen."""
+"""`rigd stop` finds running sessions, and reports an end only if it was observed."""
 
 import json
 import os
@@ -31,7 +31,7 @@ def control_of(pid):
     return None
 
 
-def test_where_nothing_runs_it_says_where_it_looked(stop_here, runtime_folder):
+def test_without_a_session_the_searched_places_are_named(stop_here, runtime_folder):
     code, out, err = stop_here()
     assert (code, err) == (0, "")
     assert out.startswith("No session is running. Searched: the process table")
@@ -39,7 +39,7 @@ def test_where_nothing_runs_it_says_where_it_looked(stop_here, runtime_folder):
 
 
 @pytest.mark.process
-def test_a_session_in_the_foreground_is_stopped_from_another_folder(
+def test_foreground_session_is_stopped_from_another_folder(
     stop_here, start_rigd, monkeypatch, write_profile, tmp_path
 ):
     elsewhere = tmp_path / "elsewhere"
@@ -62,7 +62,7 @@ def test_a_session_in_the_foreground_is_stopped_from_another_folder(
 
 
 class Impostor:
-    """A thread that listens in place of a daemon, and says what a daemon would."""
+    """A thread that listens in place of a daemon and replies as a daemon would."""
 
     def __init__(self, path):
         path.unlink(missing_ok=True)
@@ -120,7 +120,7 @@ def test_an_impostor_on_the_socket_is_not_believed(
     daemon.terminate()
 
 
-def test_a_folder_that_others_can_write_to_is_no_proof(stop_here, runtime_folder):
+def test_no_proof_from_a_folder_writable_by_others(stop_here, runtime_folder):
     runtime_folder.chmod(0o770)
     impostor = Impostor(runtime_folder / "sim.daemon")
     code, out, err = stop_here()
@@ -130,7 +130,7 @@ def test_a_folder_that_others_can_write_to_is_no_proof(stop_here, runtime_folder
     assert "Whether another session runs is not known" in err
 
 
-def test_without_a_process_table_it_is_not_sure(stop_here):
+def test_error_without_a_process_table(stop_here):
     def no_table():
         raise FileNotFoundError(2, "no such table")
 
@@ -179,7 +179,7 @@ OTHER = os.getuid() + 1
             RUN,
             {"ignored_signals": 1 << STOP_SIGNAL - 1, "handled_signals": 0},
             None,
-        ),  # a quick look is left
+        ),  # only a quick look remains
         (("python3", "-m", "rigd", "identify", "motor"), {}, STOP_SIGNAL),
         (
             ("python3", "rigd", "identify", "motor", "--from", "a.mcap"),
@@ -195,7 +195,9 @@ OTHER = os.getuid() + 1
         ),
     ],
 )
-def test_only_what_runs_sessions_gets_a_signal(stop_here, bystander, command, changes, expected):
+def test_only_processes_with_sessions_get_a_signal(
+    stop_here, bystander, command, changes, expected
+):
     process, row = bystander
     stop_here("--no-wait", table=lambda: [replace(row, command=command, **changes)])
     if expected is None:
@@ -206,7 +208,7 @@ def test_only_what_runs_sessions_gets_a_signal(stop_here, bystander, command, ch
 
 
 @pytest.mark.process
-def test_a_process_that_a_forged_command_line_names_gets_no_signal(stop_here, bystander):
+def test_no_signal_by_a_forged_command_line(stop_here, bystander):
     process, row = bystander
     forged = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE, text=True)
     try:
@@ -222,9 +224,9 @@ def test_a_process_that_a_forged_command_line_names_gets_no_signal(stop_here, by
 
 
 @pytest.mark.process
-@pytest.mark.further  # as in this process, from other users and environments; benchmarks/bench_stop
+@pytest.mark.further  # as in this process, for other users and environments; benchmarks/bench_stop
 @pytest.mark.parametrize("situation", SITUATIONS)
-def test_it_stops_wherever_it_is_called(situation):
+def test_stop_from_other_users_and_environments(situation):
     if not can_isolate():
         pytest.skip("needs root, and namespaces of its own (unshare)")
     import stop_scenarios

@@ -1,8 +1,8 @@
-"""Hours of rig time under the virtual clock: what grows, and is every tick accounted for?
+"""Hours of rig time under the virtual clock: growth of processes, and counts of all ticks.
 
-`rigd run chirp --fast --repeat N` is one supervisor with one control process. Whenever a session
-file is finished it is checked and deleted, and the memory and the descriptors of every process are
-noted. After the first minute none of them may grow by 2 % or more.
+`rigd run chirp --fast --repeat N` is one supervisor with one control process. Each finished session
+file is checked and deleted, and the memory and the descriptors of every process are recorded.
+After the first minute none of them may grow by 2 % or more.
 
     python tests/endurance/run_campaign.py --hours 12
     python tests/endurance/run_campaign.py --minutes 60
@@ -29,42 +29,42 @@ BIN = Path(sys.executable).parent
 RATE_HZ = 1000
 MODULES = {"rigd.engine.control_process": "control", "rigd.engine.recorder": "recorder"}
 
-_LOOK_S = 0.05
+_POLL_S = 0.05
 _ENDLESS_HOURS = 500.0
-"""Rig time: more than any hour of the clock comes to."""
+"""Rig time: more than passes in any real campaign."""
 WARM_UP = 0.2
-"""Part of the sessions that is left out: what is imported late, and what a heap settles to."""
+"""Fraction of the sessions that is omitted: late imports, and convergence of the heap."""
 ENOUGH = 100
-"""Sessions from which on a trend is judged."""
+"""Least number of sessions for a trend."""
 FLAT_KB = 2048
-"""Growth over the whole campaign that is accepted: `rigd run` remembers what came of its
-sessions, some 3 kB each, to tell it at its end."""
+"""Accepted growth over the whole campaign: `rigd run` stores the results of its sessions, some
+3 kB each, and prints them at its end."""
 FLAT_DESCRIPTORS = 1
-"""Likewise: between two sessions one or two are open that a look in mid-session does not see."""
+"""Accepted growth of descriptors: one or two are open only between two sessions."""
 
 
 _PAGE_KB = os.sysconf("SC_PAGE_SIZE") // 1024
 
-SETTLED_S = 60.0
-"""After which no process may grow any more."""
+STEADY_AFTER_S = 60.0
+"""Time after which no process may grow any more."""
 MOST_GROWTH = 0.02
 
 
 @dataclass(frozen=True)
-class Look:
-    """What a process holds."""
+class ProcessUsage:
+    """Memory and descriptors of a process."""
 
     resident_kb: int
-    """Its own and what it shares."""
+    """Own and shared memory."""
     private_kb: int
-    """Its own alone: what a leak would add to."""
+    """Own memory only, to which a leak would add."""
     descriptors: int
     shared_kb: int
     """Shared memory behind its descriptors."""
 
     @classmethod
-    def at(cls, pid: int) -> "Look | None":
-        """Look at a process, or return None if it has just ended."""
+    def at(cls, pid: int) -> "ProcessUsage | None":
+        """Read the usage of a process, or return None if it has just ended."""
         try:
             lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
             sizes = {line.split(":")[0]: int(line.split()[1]) for line in lines}
@@ -76,11 +76,11 @@ class Look:
         return cls(sizes["Rss"], private_kb, len(descriptors), shared_kb)
 
     @classmethod
-    def in_passing(cls, pid: int) -> "Look | None":
-        """Look at size and descriptors only, which does not stall a process in real time.
+    def in_passing(cls, pid: int) -> "ProcessUsage | None":
+        """Read size and descriptors only, which does not stall a process in real time.
 
-        The kernel holds a process's memory map while it writes the whole account of it: a loop that
-        asks for memory then waits for whoever reads that account, and for who is before them.
+        The kernel locks a process's memory map while it writes the full account of it: a loop that
+        allocates memory then waits for all readers of that account.
         """
         try:
             pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
@@ -90,78 +90,78 @@ class Look:
         return cls(pages * _PAGE_KB, 0, descriptors, 0)
 
     @classmethod
-    def least(cls, looks: "list[Look]") -> "Look":
-        """Return the least of each: what is taken for a while only does not count."""
-        return cls(*map(min, zip(*map(astuple, looks), strict=True)))
+    def least(cls, usages: "list[ProcessUsage]") -> "ProcessUsage":
+        """Return the minimum of each field: temporary use does not count."""
+        return cls(*map(min, zip(*map(astuple, usages), strict=True)))
 
 
 @dataclass(frozen=True)
 class Growth:
-    """How far a number has grown since the first minute."""
+    """Growth of a number since the first minute."""
 
     first: float
-    """Median of the first fifth of what came after it."""
+    """Median of the first fifth after that minute."""
     last: float
     """Median of the last fifth."""
 
     @classmethod
     def of(cls, times_s: list[float], values: list[int]) -> "Growth | None":
         """Compare the beginning and the end of a series; None if it is too short for that."""
-        settled = [v for t_s, v in zip(times_s, values, strict=True) if t_s >= SETTLED_S]
-        fifth = len(settled) // 5
+        steady = [v for t_s, v in zip(times_s, values, strict=True) if t_s >= STEADY_AFTER_S]
+        fifth = len(steady) // 5
         if not fifth:
             return None
-        return cls(statistics.median(settled[:fifth]), statistics.median(settled[-fifth:]))
+        return cls(statistics.median(steady[:fifth]), statistics.median(steady[-fifth:]))
 
     @property
-    def share(self) -> float:
-        """Growth over what it was."""
+    def fraction(self) -> float:
+        """Growth relative to the first value."""
         return self.last / self.first - 1.0 if self.first else float(self.last > 0.0)
 
     @property
     def too_much(self) -> bool:
         """Whether it has grown."""
-        return self.share >= MOST_GROWTH
+        return self.fraction >= MOST_GROWTH
 
 
-def growth_table(series: dict[str, list[tuple[float, Look]]], complaints: list[str]) -> str:
-    """Return how memory and descriptors of processes have grown, and complain of what has.
+def growth_table(series: dict[str, list[tuple[float, ProcessUsage]]], complaints: list[str]) -> str:
+    """Return a table of the growth of processes, and add a complaint for each that is too large.
 
     Parameters
     ----------
     series
-        By process: when it was looked at, in s since the start, and what was seen.
+        By process: times of the readings, in s since the start, and the readings.
     complaints
-        To be added to.
+        List to which complaints are added.
     """
     lines = [f"{'since the first minute':24} {'at first':>10} {'at last':>10} {'growth':>8}"]
-    for name, looks in series.items():
-        for what, field in (("resident, kB", "resident_kb"), ("descriptors", "descriptors")):
-            values = [getattr(look, field) for _, look in looks]
-            growth = Growth.of([t_s for t_s, _ in looks], values)
+    for name, usages in series.items():
+        for label, field in (("resident, kB", "resident_kb"), ("descriptors", "descriptors")):
+            values = [getattr(usage, field) for _, usage in usages]
+            growth = Growth.of([t_s for t_s, _ in usages], values)
             if growth is None:
                 complaints.append(f"{name}: too few looks to say whether it grows")
                 break
-            label = f"{name} {what}"
+            row = f"{name} {label}"
             lines.append(
-                f"{label:24} {growth.first:10.0f} {growth.last:10.0f} {100 * growth.share:+7.2f} %"
+                f"{row:24} {growth.first:10.0f} {growth.last:10.0f} {100 * growth.fraction:+7.2f} %"
             )
             if growth.too_much:
-                complaints.append(f"{label} grew by {100 * growth.share:.1f} %")
+                complaints.append(f"{row} grew by {100 * growth.fraction:.1f} %")
     return "\n".join(lines)
 
 
 def _shared_kb(descriptor: Path) -> int:
-    """Return what lies in shared memory behind a descriptor in /proc."""
+    """Return the size of the shared memory of a descriptor in /proc."""
     try:
-        shared = str(descriptor.readlink()).startswith("/dev/shm/")
-        return descriptor.stat().st_blocks // 2 if shared else 0
+        is_shared = str(descriptor.readlink()).startswith("/dev/shm/")
+        return descriptor.stat().st_blocks // 2 if is_shared else 0
     except OSError:
-        return 0  # closed meanwhile, as the one with which it was found
+        return 0  # closed meanwhile
 
 
 def processes(supervisor: int) -> dict[str, int]:
-    """Return the processes of a rig by what they are."""
+    """Return the processes of a rig by their names."""
     found = {"supervisor": supervisor}
     children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
     for child in children:
@@ -176,9 +176,9 @@ def processes(supervisor: int) -> dict[str, int]:
 
 
 def check(path: Path, *, ended: bool = False) -> tuple[int, str]:
-    """Return the ticks of a session file, and what is wrong with it, or nothing.
+    """Return the ticks of a session file, and its error or an empty text.
 
-    One in which the campaign was `ended` may have been stopped.
+    If the campaign was `ended`, the session may have been stopped.
     """
     session = read_session(path)
     outcome, ticks = session.outcome or {}, session.samples["tick"].astype(np.int64)
@@ -194,32 +194,37 @@ def check(path: Path, *, ended: bool = False) -> tuple[int, str]:
 
 @dataclass(frozen=True)
 class Trend:
-    """How a series of numbers, one per session, develops after the warm-up."""
+    """Trend of a series of numbers, one per session, after the warm-up."""
 
     first: float
     """Median of the first third."""
     last: float
     """Median of the last third."""
     slope: float
-    """Per session, of the straight line through the medians of blocks."""
+    """Slope per session of the straight line through the medians of blocks."""
     uncertainty: float
     """Uncertainty of the slope, one standard deviation."""
 
     @classmethod
     def of(cls, values: list[int]) -> "Trend":
-        """Fit a line to the medians of ten blocks: single looks in mid-session scatter."""
-        kept = values[round(WARM_UP * len(values)) :]
-        third = max(1, len(kept) // 3)
-        blocks = [b for b in np.array_split(np.array(kept, float), 10) if len(b)]
+        """Fit a line to the medians of ten blocks: single readings in mid-session scatter."""
+        after_warm_up = values[round(WARM_UP * len(values)) :]
+        third = max(1, len(after_warm_up) // 3)
+        blocks = [b for b in np.array_split(np.array(after_warm_up, float), 10) if len(b)]
         medians = np.array([np.median(block) for block in blocks])
-        places = np.cumsum([len(block) for block in blocks]) - len(blocks[0]) / 2
+        positions = np.cumsum([len(block) for block in blocks]) - len(blocks[0]) / 2
         slope, uncertainty = 0.0, float("inf")
         if len(medians) > 2:
-            away = places - places.mean()
-            slope = float(away @ medians / (away @ away))
-            rest = medians - medians.mean() - slope * away
-            uncertainty = float(np.sqrt(rest @ rest / (len(rest) - 2) / (away @ away)))
-        first, last = statistics.median(kept[:third]), statistics.median(kept[-third:])
+            centred = positions - positions.mean()
+            slope = float(centred @ medians / (centred @ centred))
+            residual = medians - medians.mean() - slope * centred
+            uncertainty = float(
+                np.sqrt(residual @ residual / (len(residual) - 2) / (centred @ centred))
+            )
+        first, last = (
+            statistics.median(after_warm_up[:third]),
+            statistics.median(after_warm_up[-third:]),
+        )
         return cls(first, last, slope, uncertainty)
 
     def grows(self, sessions: int, flat: float) -> bool:
@@ -229,29 +234,36 @@ class Trend:
 
 
 class Campaign:
-    """One `rigd run --repeat`, and what was seen of it.
+    """One `rigd run --repeat`, and its readings.
 
-    With `minutes` it is ended after that time, and has more sessions than it comes to.
+    With `minutes` it is ended after that time, before its last session.
     """
 
     def __init__(
         self, sessions: int, duration_s: float, folder: Path, minutes: float | None = None
     ) -> None:
         self.sessions = sessions
-        self.seen: dict[str, list[tuple[float, Look]]] = {"supervisor": [], "control": []}
-        """When, in s since the start, each process that lasts held how much."""
+        self.usage_over_time: dict[str, list[tuple[float, ProcessUsage]]] = {
+            "supervisor": [],
+            "control": [],
+        }
+        """Times in s since the start and readings of each lasting process."""
         self._began_s = time.monotonic()
         self._end_s = None if minutes is None else self._began_s + 60.0 * minutes
         self._ended = False
-        self.looks: dict[str, list[Look]] = {"supervisor": [], "control": [], "recorder": []}
-        """The least that each process held in the course of each session."""
-        self._fresh: dict[str, list[Look]] = {name: [] for name in self.looks}
+        self.usages: dict[str, list[ProcessUsage]] = {
+            "supervisor": [],
+            "control": [],
+            "recorder": [],
+        }
+        """The minimum reading of each process in each session."""
+        self._fresh: dict[str, list[ProcessUsage]] = {name: [] for name in self.usages}
         self.complaints: list[str] = []
         self.ticks = 0
         self.files = 0
         self._folder = folder
         arguments = ["chirp", "--profile", "sim", "--fast", "--duration", duration_s, "--json"]
-        self._said = (folder / "said.txt").open("w+", encoding="utf-8")
+        self._stderr = (folder / "said.txt").open("w+", encoding="utf-8")
         self._process = subprocess.Popen(
             [
                 *(BIN / "rigd", "run", *map(str, arguments), "--no-look"),
@@ -259,54 +271,54 @@ class Campaign:
             ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            stderr=self._said,
+            stderr=self._stderr,
             env={**os.environ, "XDG_RUNTIME_DIR": str(folder)},
         )
 
     def follow(self) -> Iterator[int]:
-        """Attend to the files as they come; yields their number."""
+        """Process the files as they come; yield their number."""
         while True:
             ended = self._process.poll() is not None
             if self._end_s is not None and not self._ended and time.monotonic() > self._end_s:
                 self._ended = True
                 self._process.send_signal(signal.SIGINT)
             if not ended:
-                self._look()
+                self._read_usages()
             for path in sorted((self._folder / "sessions").glob("*.mcap")):
-                self._note()
-                self._take(path)
+                self._store_usage()
+                self._check_file(path)
                 yield self.files
             if ended:
                 break
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         if self._process.returncode != (130 if self._ended else 0):
-            said = Path(self._said.name).read_text("utf-8").strip().rsplit("\n", 1)[-1]
-            self.complaints.append(f"exit code {self._process.returncode}: {said}")
+            last_line = Path(self._stderr.name).read_text("utf-8").strip().rsplit("\n", 1)[-1]
+            self.complaints.append(f"exit code {self._process.returncode}: {last_line}")
         if self.files != self.sessions and not self._ended:
             self.complaints.append(f"{self.files} files of {self.sessions}")
 
     def close(self) -> None:
-        """End it, if it has not ended."""
+        """End the process if it still runs."""
         self._process.terminate()
         self._process.wait()
-        self._said.close()
+        self._stderr.close()
 
-    def _look(self) -> None:
+    def _read_usages(self) -> None:
         for name, pid in processes(self._process.pid).items():
-            look = Look.at(pid)
-            if look is not None:
-                self._fresh[name].append(look)
+            usage = ProcessUsage.at(pid)
+            if usage is not None:
+                self._fresh[name].append(usage)
 
-    def _note(self) -> None:
-        for name, looks in self._fresh.items():
-            if looks and self.files < self.sessions - 1:  # in the last one they end
-                self.looks[name].append(Look.least(looks))
-                if name in self.seen:
+    def _store_usage(self) -> None:
+        for name, usages in self._fresh.items():
+            if usages and self.files < self.sessions - 1:  # the processes end in the last one
+                self.usages[name].append(ProcessUsage.least(usages))
+                if name in self.usage_over_time:
                     passed_s = time.monotonic() - self._began_s
-                    self.seen[name].append((passed_s, self.looks[name][-1]))
-            looks.clear()
+                    self.usage_over_time[name].append((passed_s, self.usages[name][-1]))
+            usages.clear()
 
-    def _take(self, path: Path) -> None:
+    def _check_file(self, path: Path) -> None:
         ticks, wrong = check(path, ended=self._ended)
         if wrong:
             self.complaints.append(f"{path.name}: {wrong}")
@@ -335,8 +347,8 @@ def main() -> int:
         campaign.close()
         shutil.rmtree(folder, ignore_errors=True)
     print(report(campaign))  # noqa: T201
-    if time.monotonic() - started_s > 2 * SETTLED_S:
-        print(growth_table(campaign.seen, campaign.complaints))  # noqa: T201
+    if time.monotonic() - started_s > 2 * STEADY_AFTER_S:
+        print(growth_table(campaign.usage_over_time, campaign.complaints))  # noqa: T201
     for complaint in campaign.complaints:
         print(f"WRONG {complaint}")  # noqa: T201
     hours = campaign.ticks / RATE_HZ / 3600
@@ -346,21 +358,21 @@ def main() -> int:
 
 
 def _progress(campaign: Campaign, passed_s: float) -> str:
-    latest = {name: looks[-1] for name, looks in campaign.looks.items() if looks}
+    latest = {name: usages[-1] for name, usages in campaign.usages.items() if usages}
     sizes = ", ".join(
-        f"{name} {look.private_kb / 1024:.1f} MB {look.descriptors} fds"
-        for name, look in latest.items()
+        f"{name} {usage.private_kb / 1024:.1f} MB {usage.descriptors} fds"
+        for name, usage in latest.items()
     )
     return f"{passed_s:5.0f} s  {campaign.files:4} sessions  {sizes}"
 
 
 def report(campaign: Campaign) -> str:
-    """Return the table of what each process holds, and note what grows."""
+    """Return the table of the usage of each process, and add complaints of growth."""
     lines = [f"{'':22}  first third  last third  slope a session    a campaign"]
     series = {
-        f"{name} {what}": [getattr(look, field) for look in looks]
-        for name, looks in campaign.looks.items()
-        for what, field in (
+        f"{name} {label}": [getattr(usage, field) for usage in usages]
+        for name, usages in campaign.usages.items()
+        for label, field in (
             ("private, kB", "private_kb"),
             ("resident, kB", "resident_kb"),
             ("shared, kB", "shared_kb"),

@@ -1,10 +1,10 @@
-"""The daemon in real time with live view and page, both read all the time: what grows?
+"""The daemon in real time with live view and page, both read all the time: growth of processes.
 
-`rigd serve --live` runs one chirp after the other; somebody reads the stream of its live view, and
-the page that `rigd live --web` names is fetched every second. After the first minute no process of
-ours may grow by 2 % or more, in memory or in descriptors, and every tick has to be accounted for.
-Rerun's server keeps the layout of every session for good, some 0.4 MB each; it is replaced after
-twenty, so what is asked of it is a ceiling.
+`rigd serve --live` runs one chirp after the other; the stream of its live view is read, and the
+page that `rigd live --web` names is fetched every second. After the first minute no process of
+ours may grow by 2 % or more, in memory or in descriptors, and every tick has to be counted.
+Rerun's server stores the layout of every session, some 0.4 MB each; it is replaced after
+twenty, so its memory only has a ceiling.
 
     python tests/endurance/run_served.py --minutes 15
 """
@@ -22,8 +22,8 @@ import time
 import urllib.request
 from pathlib import Path
 
-from run_campaign import Look, growth_table
-from run_starved import judge
+from run_campaign import ProcessUsage, growth_table
+from run_starved import evaluate
 from run_viewers import Reading, children
 
 from rigd.live.address import running
@@ -35,18 +35,18 @@ NAMES = {
     "rigd.engine.control_process": "control",
     "rigd.live.publisher": "live",
 }
-"""Processes that last as long as the daemon does; a recorder is another one in each session."""
+"""Processes that last as long as the daemon; each session has a recorder of its own."""
 SERVER_CEILING_KB = 110 * 1024
-"""What Rerun's server may take before it is replaced: 16 MiB for late viewers, with what keeping
-them costs, and the layouts of twenty sessions."""
+"""Largest memory of Rerun's server before it is replaced: 16 MiB for late viewers with their
+overhead, and the layouts of twenty sessions."""
 _READY_S = 60.0
-_LOOK_S = 1.0
-_BETWEEN_S = 6.0
-"""What a session takes beside its record."""
+_POLL_S = 1.0
+_OVERHEAD_S = 6.0
+"""Time of a session in addition to its record."""
 
 
 class Page:
-    """Somebody who loads the page of the live view again and again."""
+    """A client that loads the page of the live view again and again."""
 
     def __init__(self, address: str) -> None:
         self.loaded = 0
@@ -66,13 +66,13 @@ class Page:
                 self.failed += 1
 
     def close(self) -> None:
-        """Leave it."""
+        """End the client."""
         self._halt.set()
         self._thread.join()
 
 
-def lasting(supervisor: int) -> dict[str, int]:
-    """Return the processes of the daemon that last, by what they are."""
+def lasting_processes(supervisor: int) -> dict[str, int]:
+    """Return the lasting processes of the daemon by their names."""
     found = {"supervisor": supervisor}
     for child in children(supervisor):
         with contextlib.suppress(OSError):
@@ -89,7 +89,7 @@ def await_ready() -> None:
     Raises
     ------
     TimeoutError
-        If it is not in time.
+        If it is not ready in time.
     """
     deadline = time.monotonic() + _READY_S
     while time.monotonic() < deadline:
@@ -103,16 +103,16 @@ def await_ready() -> None:
 
 
 def follow(minutes: float, seconds: float, folder: Path) -> list[str]:
-    """Run the daemon and its readers; print what was seen, and return what is wrong."""
+    """Run the daemon and its readers; print the results, and return complaints."""
     complaints: list[str] = []
-    looks: dict[str, list[tuple[float, Look]]] = {}
-    number = max(1, int(60.0 * minutes / (seconds + _BETWEEN_S)))
-    out, said = folder / "out.json", folder / "said.txt"
+    usages: dict[str, list[tuple[float, ProcessUsage]]] = {}
+    number = max(1, int(60.0 * minutes / (seconds + _OVERHEAD_S)))
+    out, stderr_path = folder / "out.json", folder / "said.txt"
     chirps = ["chirp", "--repeat", str(number), "--duration", f"{seconds:g}", *OPTIONS]
     reading, page = Reading(), None
     with contextlib.ExitStack() as ending:
         log = ending.enter_context((folder / "serve.txt").open("w"))
-        stdout, stderr = (ending.enter_context(path.open("w")) for path in (out, said))
+        stdout, stderr = (ending.enter_context(path.open("w")) for path in (out, stderr_path))
         serve = [
             RIGD,
             "serve",
@@ -131,22 +131,22 @@ def follow(minutes: float, seconds: float, folder: Path) -> list[str]:
         began_s = time.monotonic()
         client = subprocess.Popen([RIGD, "start", *chirps], stdout=stdout, stderr=stderr)
         while client.poll() is None:
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
             if views := [each for each in running() if each.rig == RIG]:
-                reading.look(views[0], time.monotonic())
+                reading.update(views[0], time.monotonic())
                 if page is None:
                     named = subprocess.run(
                         [RIGD, "live", "--web"], capture_output=True, text=True, check=True
                     )
                     page = Page(named.stdout.strip())
                     ending.callback(page.close)
-            for name, pid in lasting(daemon.pid).items():
-                look = Look.in_passing(pid)
-                if look is not None:
-                    looks.setdefault(name, []).append((time.monotonic() - began_s, look))
+            for name, pid in lasting_processes(daemon.pid).items():
+                usage = ProcessUsage.in_passing(pid)
+                if usage is not None:
+                    usages.setdefault(name, []).append((time.monotonic() - began_s, usage))
         connected = reading.connected
     outcomes = [
-        judge(result, said.read_text("utf-8"), live=True)
+        evaluate(result, stderr_path.read_text("utf-8"), live=True)
         for result in json.loads(out.read_text("utf-8") or '{"sessions": []}')["sessions"]
     ]
     for outcome in outcomes:
@@ -160,8 +160,8 @@ def follow(minutes: float, seconds: float, folder: Path) -> list[str]:
         complaints.append("nobody read the live view and its page")
     else:
         print(f"page loaded {page.loaded} times, {page.failed} times not")  # noqa: T201
-    server_kb = max((look.resident_kb for _, look in looks.pop("server", [])), default=0)
-    print(growth_table(looks, complaints))  # noqa: T201
+    server_kb = max((usage.resident_kb for _, usage in usages.pop("server", [])), default=0)
+    print(growth_table(usages, complaints))  # noqa: T201
     print(f"Rerun's server: at most {server_kb / 1024:.0f} MB")  # noqa: T201
     if server_kb > SERVER_CEILING_KB:
         complaints.append(f"Rerun's server took {server_kb / 1024:.0f} MB")

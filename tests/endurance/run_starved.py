@@ -1,9 +1,9 @@
-"""Sessions in real time beside programs that take all of the processor: does one end for that?
+"""Sessions in real time with programs that use all processor time: does a session end for it?
 
-Busy programs run at the ordinary priority, as many as are asked for. Beside them one chirp follows
-the other, in turn without a live view and with one that somebody reads. A session may miss ticks,
-and end by them: then they are counted, and named as what ended it. None may end because its
-supervisor did not get on.
+The requested number of busy programs runs at the ordinary priority. Meanwhile chirps run one after
+the other, alternately without a live view and with one that is read. A session may miss ticks, and
+end by them: then they are counted, and named as the reason. No session may end because its
+supervisor was too late.
 
     python tests/endurance/run_starved.py --minutes 10 --busy 4
 """
@@ -31,14 +31,14 @@ from rigd.session import read_session
 RIGD = Path(sys.executable).parent / "rigd"
 RIG = "sim"
 OPTIONS = ("--rest", "0.2", "--ring-down", "0.2", "--amplitude", "0.01", "--json")
-_LOOK_S = 0.2
-_BEYOND_S = 300.0
-"""What a session takes beside its record, on a computer as busy as this one."""
+_POLL_S = 0.2
+_OVERHEAD_S = 300.0
+"""Time of a session in addition to its record, on a computer as busy as this one."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one session."""
+    """Result of one session."""
 
     live: bool
     outcome: str
@@ -59,30 +59,32 @@ class Outcome:
         )
 
 
-def judge(result: dict[str, object], said: str, *, live: bool) -> Outcome:
-    """Say what came of a session, by what the command told and by its file.
+def evaluate(result: dict[str, object], stderr: str, *, live: bool) -> Outcome:
+    """Return the result of a session, from the command's output and its file.
 
     Parameters
     ----------
     result
         Result of the session, from the command's JSON.
-    said
-        What the command wrote for the operator.
+    stderr
+        Messages of the command to the operator.
     live
         Whether it had a live view.
     """
     complaints = []
     outcome, reason = str(result["outcome"]), str(result["reason"])
     granted = "unknown"
-    if "upervis" in reason or "Traceback" in said:
+    if "upervis" in reason or "Traceback" in stderr:
         complaints.append("ended for the supervisor's sake")
     elif outcome != "complete" and not ("missed ticks" in reason or OVERLOADED_ADVICE in reason):
         complaints.append("what ended it does not name the computer")
     if result["path"]:
         session = read_session(str(result["path"]))
         granted = session.metadata.get("realtime_supervisor_scheduling", "ordinary")
-        ticks, told = session.samples["tick"].astype(np.int64), session.outcome or {}
-        counts = {key: int(told[key]) for key in ("scheduled", "recorded", "missed", "lost")}
+        ticks, file_outcome = session.samples["tick"].astype(np.int64), session.outcome or {}
+        counts = {
+            key: int(file_outcome[key]) for key in ("scheduled", "recorded", "missed", "lost")
+        }
         gaps = counts["scheduled"] - len(ticks)
         if counts["recorded"] != len(ticks) or gaps != counts["missed"] + counts["lost"]:
             complaints.append(f"{len(ticks)} samples of {counts}")
@@ -111,7 +113,7 @@ def judge(result: dict[str, object], said: str, *, live: bool) -> Outcome:
 
 @contextmanager
 def busy(programs: int) -> Iterator[None]:
-    """Have so many programs compute at the ordinary priority."""
+    """Run a number of busy programs at the ordinary priority."""
     command = [sys.executable, "-c", "while True: pass"]
     running = [subprocess.Popen(command) for _ in range(programs)]
     try:
@@ -123,33 +125,33 @@ def busy(programs: int) -> Iterator[None]:
 
 
 def run(seconds: float, folder: Path, *, live: bool) -> Outcome:
-    """Run one session, with somebody who reads its live view if it has one."""
+    """Run one session, and read its live view if it has one."""
     viewer = Reading()
     arguments = ["chirp", "--profile", RIG, "--duration", f"{seconds:g}", *OPTIONS]
     arguments += ["--output", str(folder / "sessions"), *(("--live",) if live else ())]
-    out, said = folder / "out.json", folder / "said.txt"
-    with out.open("w") as stdout, said.open("w") as stderr:
+    out, stderr_path = folder / "out.json", folder / "said.txt"
+    with out.open("w") as stdout, stderr_path.open("w") as stderr:
         process = subprocess.Popen(
             [RIGD, "run", *arguments, "--no-look"], stdout=stdout, stderr=stderr
         )
-        deadline = time.monotonic() + seconds + _BEYOND_S
+        deadline = time.monotonic() + seconds + _OVERHEAD_S
         try:
             while process.poll() is None and time.monotonic() < deadline:
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
                 views = [each for each in running() if each.rig == RIG] if live else []
                 if views:
-                    viewer.look(views[0], time.monotonic())
+                    viewer.update(views[0], time.monotonic())
         finally:
             viewer.close()
             if process.poll() is None:
                 process.terminate()
                 process.wait()
-    text = said.read_text("utf-8")
+    text = stderr_path.read_text("utf-8")
     sessions = json.loads(out.read_text("utf-8") or "{}").get("sessions")
     if not sessions:
         last = text.strip().rsplit("\n", 1)[-1]
         return Outcome(live, "none", last, 0, 0, 0, 0, "unknown", ("no session",))
-    outcome = judge(sessions[0], text, live=live)
+    outcome = evaluate(sessions[0], text, live=live)
     for path in (folder / "sessions").iterdir():
         path.unlink()
     return outcome
@@ -177,7 +179,7 @@ def main() -> int:
 
 
 def summary(outcomes: list[Outcome]) -> str:
-    """Return what all of them came to."""
+    """Return a summary of all sessions."""
     scheduled = sum(outcome.scheduled for outcome in outcomes)
     missed = sum(outcome.missed for outcome in outcomes)
     return (

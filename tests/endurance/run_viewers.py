@@ -1,8 +1,8 @@
-"""Sessions in real time beside viewers that are absent, frozen or killed: does anything notice?
+"""Sessions in real time with viewers that are absent, frozen or killed: is the session affected?
 
-For each kind of viewer a chirp is run at 1 kHz, and one without a live view to compare with. The
-memory of publisher and server is looked at all the time; then the ticks that were missed are
-counted, of all and of those that did not pass while the computer itself stood still.
+For each kind of viewer a chirp is run at 1 kHz, and one without a live view for comparison. The
+memory of publisher and server is polled all the time; then the missed ticks are counted, with and
+without those that passed in stalls of the computer itself.
 
     python tests/endurance/run_viewers.py --minutes 10
 """
@@ -30,13 +30,13 @@ RATE_HZ = 1000
 RIG = "sim"
 MOST_MB = 200.0
 OPTIONS = ("--amplitude", "0.005", "--start-hz", "0.5", "--rest", "0", "--ring-down", "0")
-_LOOK_S = 0.5
+_POLL_S = 0.5
 
 
 class Nobody:
-    """No viewer is there."""
+    """No viewer."""
 
-    def look(self, address: LiveAddress, now_s: float) -> None:
+    def update(self, address: LiveAddress, now_s: float) -> None:
         """Do nothing."""
 
     def close(self) -> None:
@@ -44,15 +44,15 @@ class Nobody:
 
 
 class Frozen:
-    """A viewer that is stopped a while after it began, and never goes on."""
+    """A viewer that is suspended a while after its start, and never resumed."""
 
     def __init__(self) -> None:
         self._viewer: Viewer | None = None
         self._frozen = False
         self._began_s = 0.0
 
-    def look(self, address: LiveAddress, now_s: float) -> None:
-        """Start it, and freeze it."""
+    def update(self, address: LiveAddress, now_s: float) -> None:
+        """Start the viewer, and suspend it later."""
         if self._viewer is None:
             self._viewer, self._began_s = _viewer(address), now_s
         elif not self._frozen and now_s > self._began_s + 5.0:
@@ -61,13 +61,13 @@ class Frozen:
             self._frozen = True
 
     def close(self) -> None:
-        """End it."""
+        """End the viewer."""
         if self._viewer is not None:
             self._viewer.close()
 
 
 class Killed:
-    """A viewer that is killed every 20 s, and another one comes."""
+    """A viewer that is killed and replaced every 20 s."""
 
     EVERY_S = 20.0
 
@@ -75,8 +75,8 @@ class Killed:
         self._viewer: Viewer | None = None
         self._due_s = 0.0
 
-    def look(self, address: LiveAddress, now_s: float) -> None:
-        """Kill it, start another one."""
+    def update(self, address: LiveAddress, now_s: float) -> None:
+        """Kill the viewer when it is due, and start another one."""
         if now_s < self._due_s:
             return
         self.close()
@@ -84,20 +84,20 @@ class Killed:
         self._due_s = now_s + self.EVERY_S
 
     def close(self) -> None:
-        """Kill it."""
+        """Kill the viewer."""
         if self._viewer is not None:
             self._viewer.close()
 
 
 class Reading:
-    """Somebody who reads all that comes, as fast as it does, and shows nothing of it."""
+    """A reader of all data, as fast as it comes, which shows nothing."""
 
     def __init__(self) -> None:
         self._program: RerunProgram | None = None
         self._server = 0
 
-    def look(self, address: LiveAddress, now_s: float) -> None:
-        """Connect, and again whenever the live view is another one or the connection has ended."""
+    def update(self, address: LiveAddress, now_s: float) -> None:
+        """Connect, and reconnect if the live view is another one or the connection has ended."""
         gone = self._program is None or not self._program.running
         if not gone and address.server == self._server:
             return
@@ -107,11 +107,11 @@ class Reading:
 
     @property
     def connected(self) -> bool:
-        """Whether it is there."""
+        """Whether it is connected."""
         return self._program is not None and self._program.running
 
     def close(self) -> None:
-        """Let go."""
+        """Disconnect."""
         if self._program is not None:
             self._program.kill()
             self._program = None
@@ -122,7 +122,7 @@ KINDS = {"none": Nobody, "reading": Reading, "frozen": Frozen, "killed": Killed}
 
 @dataclass
 class Outcome:
-    """What came of one session."""
+    """Result of one session."""
 
     name: str
     missed: int
@@ -145,7 +145,7 @@ class Outcome:
 
 
 def run(name: str, seconds: float) -> Outcome:
-    """Run a session beside one kind of viewer; without a live view for any other name."""
+    """Run a session with one kind of viewer, or without a live view for any other name."""
     live = ("--live",) if name in KINDS else ()
     viewer = KINDS.get(name, Nobody)()
     publisher_mb = server_mb = 0.0
@@ -155,9 +155,9 @@ def run(name: str, seconds: float) -> Outcome:
     ):
         try:
             while process.poll() is None:
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
                 for address in [each for each in running() if each.rig == RIG]:
-                    viewer.look(address, time.monotonic())
+                    viewer.update(address, time.monotonic())
                     publisher_mb = max(publisher_mb, resident_mb(address.pid))
                     server_mb = max(server_mb, *map(resident_mb, children(address.pid)), 0.0)
         finally:
@@ -193,7 +193,7 @@ def session(*options: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def children(pid: int) -> list[int]:
-    """Return the processes that a process has started, by whichever of its threads."""
+    """Return the child processes of a process, of all its threads."""
     found: list[int] = []
     try:
         for task in Path(f"/proc/{pid}/task").iterdir():
@@ -204,7 +204,7 @@ def children(pid: int) -> list[int]:
 
 
 def resident_mb(pid: int) -> float:
-    """Return the memory that a process has in use, 0 if it has just ended."""
+    """Return the resident memory of a process, 0 if it has just ended."""
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     except (OSError, IndexError):
@@ -218,7 +218,7 @@ def _viewer(address: LiveAddress) -> Viewer:
 
 
 def main() -> None:
-    """Run one after the other; end with 1 if a bound is exceeded."""
+    """Run all sessions; exit with 1 if a bound is exceeded."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=10.0)
     seconds = 60.0 * parser.parse_args().minutes

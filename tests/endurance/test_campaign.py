@@ -1,4 +1,4 @@
-"""A short campaign of ``run_campaign.py``'s kind, and that it would notice what grows."""
+"""A short campaign as of ``run_campaign.py``, and its detection of growth."""
 
 import gc
 import importlib.util
@@ -34,37 +34,37 @@ def campaign():
 
 @pytest.mark.process
 @pytest.mark.further  # at length
-def test_sessions_on_one_connection_leave_nothing_behind(campaign, tmp_path):
+def test_sessions_on_one_connection_leave_no_memory_and_descriptors(campaign, tmp_path):
     profile = load_shipped("sim")
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
     group = ProcessGroup(live=False)
     control = group[CONTROL].pid
     rig = Rig(profile, fast=True, group=group)
-    looks = []
-    gc.collect()  # of other tests in this process: it would free what counts here
+    usages = []
+    gc.collect()  # garbage of other tests in this process, which would be freed during the test
     try:
         rig.connect()
         for number in range(6):
             path = tmp_path / f"{number}.mcap"
             rig.run(SessionOrder(profile, excitation, path), StopRequest(), lambda *_: None)
             assert campaign.check(path) == (1200, "")
-            looks.append([campaign.Look.at(pid) for pid in (os.getpid(), control)])
+            usages.append([campaign.ProcessUsage.at(pid) for pid in (os.getpid(), control)])
     finally:
         rig.disconnect()
-    for warm, last in zip(looks[1], looks[-1], strict=True):
+    for warm, last in zip(usages[1], usages[-1], strict=True):
         assert last.descriptors <= warm.descriptors
         assert last.shared_kb <= warm.shared_kb
         assert last.private_kb - warm.private_kb < COARSE_KB
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_a_slow_leak_is_told_from_noise(campaign):
+def test_slow_leak_is_distinguished_from_noise(campaign):
     chooser = random.Random(1)
     noise = [30_000 + round(chooser.gauss(0.0, 2_000.0)) for _ in range(300)]
     leaking = [value + 20 * number for number, value in enumerate(noise)]
-    settled = [30_000 - 15_000 // (1 + number) for number in range(300)]
+    converging = [30_000 - 15_000 // (1 + number) for number in range(300)]
     assert not campaign.Trend.of(noise).grows(300, campaign.FLAT_KB)
-    assert not campaign.Trend.of(settled).grows(300, campaign.FLAT_KB)
+    assert not campaign.Trend.of(converging).grows(300, campaign.FLAT_KB)
     trend = campaign.Trend.of(leaking)
     assert trend.grows(300, campaign.FLAT_KB)
     assert trend.slope == pytest.approx(20.0, abs=5.0)

@@ -1,4 +1,4 @@
-"""That the long runs would notice what they are for: growth, and a session ended by starvation."""
+"""Detection by the long runs of growth and of sessions that end by starvation."""
 
 import importlib
 import sys
@@ -19,10 +19,10 @@ def load(monkeypatch):
         sys.modules.pop(name, None)
 
 
-def looks(campaign, resident_kb):
-    """One a second, for four minutes."""
+def usages(campaign, resident_kb):
+    """Return one reading a second, for four minutes."""
     return [
-        (float(t_s), campaign.Look(round(resident_kb(t_s)), 1000, 20, 0))
+        (float(t_s), campaign.ProcessUsage(round(resident_kb(t_s)), 1000, 20, 0))
         for t_s in range(round(4 * MINUTE_S))
     ]
 
@@ -40,7 +40,7 @@ def looks(campaign, resident_kb):
 def test_growth_after_the_first_minute_is_a_complaint(load, resident_kb, grows):
     campaign = load("run_campaign")
     complaints = []
-    table = campaign.growth_table({"live": looks(campaign, resident_kb)}, complaints)
+    table = campaign.growth_table({"live": usages(campaign, resident_kb)}, complaints)
     assert "live resident, kB" in table
     assert bool(complaints) == grows
     assert not grows or "live resident, kB grew by" in complaints[0]
@@ -48,16 +48,18 @@ def test_growth_after_the_first_minute_is_a_complaint(load, resident_kb, grows):
 
 def test_one_more_descriptor_is_a_complaint(load):
     campaign = load("run_campaign")
-    seen = [(float(t_s), campaign.Look(1000, 1000, 20 + (t_s > 150), 0)) for t_s in range(240)]
+    usage_over_time = [
+        (float(t_s), campaign.ProcessUsage(1000, 1000, 20 + (t_s > 150), 0)) for t_s in range(240)
+    ]
     complaints = []
-    campaign.growth_table({"control": seen}, complaints)
+    campaign.growth_table({"control": usage_over_time}, complaints)
     assert complaints == ["control descriptors grew by 5.0 %"]
 
 
-def test_who_was_hardly_looked_at_is_a_complaint(load):
+def test_too_few_readings_are_a_complaint(load):
     campaign = load("run_campaign")
     complaints = []
-    campaign.growth_table({"live": [(1.0, campaign.Look(1, 1, 1, 0))]}, complaints)
+    campaign.growth_table({"live": [(1.0, campaign.ProcessUsage(1, 1, 1, 0))]}, complaints)
     assert complaints == ["live: too few looks to say whether it grows"]
 
 
@@ -83,8 +85,8 @@ RESULT = {"path": None, "scheduled": 0, "recorded": 0, "missed": 0, "late": 0, "
         ),
     ],
 )
-def test_what_ends_a_session_on_a_busy_computer_has_to_name_it(load, reason, complaint):
-    outcome = load("run_starved").judge(
+def test_reason_on_a_busy_computer_must_name_it(load, reason, complaint):
+    outcome = load("run_starved").evaluate(
         RESULT | {"outcome": "fault", "reason": reason}, "", live=False
     )
     assert complaint in "; ".join(outcome.complaints)
@@ -93,9 +95,7 @@ def test_what_ends_a_session_on_a_busy_computer_has_to_name_it(load, reason, com
 
 @pytest.mark.process
 @pytest.mark.slow  # in `make test` all sessions in real time run beside other workers
-def test_a_session_beside_busy_programs_is_supervised_in_time(
-    load, tmp_path, monkeypatch, write_profile
-):
+def test_supervision_is_in_time_with_busy_programs(load, tmp_path, monkeypatch, write_profile):
     starved = load("run_starved")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(starved, "RIG", str(write_profile("sim", patient=True)))

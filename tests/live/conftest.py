@@ -30,20 +30,20 @@ BEAM = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
 
 
 def descriptors() -> list[int]:
-    """Return shared memory for every ring, the board and the reference."""
+    """Return shared memory for every ring, the shared state and the reference."""
     return [shared_memory_fd() for _ in (*TOPICS, "board", "reference")]
 
 
 @pytest.fixture
 def channels():
-    """The memory of a rig at 1 kHz, to which nobody writes."""
+    """The memory of a rig at 1 kHz, without a writer."""
     made = create_channels(1000.0, descriptors())
     yield made
     made.close()
 
 
 class Producer(threading.Thread):
-    """Writes plausible records at 1 kHz, like the control loop, and never waits for anybody.
+    """Writes plausible records at 1 kHz, like the control loop, and never waits.
 
     `speed` makes more of them in the same time: kernels buffer seconds of samples for a server
     that does not read.
@@ -83,8 +83,8 @@ class Producer(threading.Thread):
         self._halt.set()
         self.join()
 
-    def go_on(self, ticks: int) -> None:
-        """Write more once it has been stopped."""
+    def write_more(self, ticks: int) -> None:
+        """Write more records after the end of the thread."""
         for _ in range(ticks):
             self._write()
             self.channels.samples.discard()
@@ -126,7 +126,7 @@ def measured_rad(t_s):
 class Publisher:
     """``python -m rigd.live.publisher``, as the supervisor starts it, showing one session.
 
-    `first` is what it is to do before anything else.
+    `first` is code to execute before anything else.
     """
 
     def __init__(
@@ -149,9 +149,9 @@ class Publisher:
         self._job = LiveJob("rig under test", producer.channels.specs, linger_s)
 
     def begin(self) -> None:
-        """Set it to work, and have it show a session with all that was ever written."""
+        """Send the job, and have it show a session with all records written so far."""
         self.send(self._job)
-        self.answer = self._hear(LiveAddress)
+        self.answer = self._receive(LiveAddress)
         if isinstance(self.answer, LiveAddress):
             self.show()
 
@@ -162,17 +162,17 @@ class Publisher:
         folder: Path | None = None,
         **members: object,
     ) -> None:
-        """Have it show a session; `begins` says how many records were written before it."""
+        """Have it show a session; `begins` has the number of records of each ring before it."""
         begins = begins or (0,) * len(TOPICS)
         ticks = 120_000
         description = SessionDescription(
             name, RATE_HZ, ticks, (0, ticks), BEAM, Damping(zeta=1e-3), **members
         )
         self.send(LiveSession(description, f"recording of {name}", begins, folder))
-        self._hear(LiveSessionShown)
+        self._receive(LiveSessionShown)
 
     def finish(self, outcome: str = "stopped", reason: str = "The test is over.") -> None:
-        """Tell it that the session is over."""
+        """Send the end of the session."""
         ends = tuple(ring.written_count for ring in self.producer.channels.rings)
         self.send(LiveSessionEnded(ends, outcome, reason))
 
@@ -185,8 +185,8 @@ class Publisher:
         return self.answer
 
     def next_address(self) -> LiveAddress:
-        """Wait for word of another server, which is that of :attr:`address` from now on."""
-        self.answer = self._hear(LiveAddress)
+        """Wait for the address of another server, which is :attr:`address` from now on."""
+        self.answer = self._receive(LiveAddress)
         return self.address
 
     @property
@@ -208,7 +208,7 @@ class Publisher:
         return pid
 
     def end(self) -> tuple[int, str, str]:
-        """Close its input; return its exit code and what else it wrote."""
+        """Close its input; return exit code, standard output and standard error."""
         self.process.stdin.close()
         self.process.wait(300.0)
         return (
@@ -223,8 +223,8 @@ class Publisher:
         for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
             pipe.close()
 
-    def _hear(self, kind: type) -> object:
-        """Return its next message of a kind, or why it fails."""
+    def _receive(self, kind: type) -> object:
+        """Return its next message of a kind, or of its failure."""
         while True:
             message = self._messages.next(300.0)
             assert message is not None, "the publisher does not answer"
@@ -238,7 +238,7 @@ def send_message(pipe, message: object) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def rerun_runs():
+def rerun_installed():
     try:
         subprocess.run([program(), "--version"], check=True, capture_output=True)
     except (ImportError, OSError, subprocess.CalledProcessError) as error:
@@ -253,12 +253,12 @@ def program() -> Path:
 
 
 @pytest.fixture(scope="session")
-def rerun_program(rerun_runs):
+def rerun_program(rerun_installed):
     return program()
 
 
 def get_page(port: int, path: str, host: str | None = None):
-    """Ask the publisher's page server, as a browser does."""
+    """Request a page of the publisher's server, as a browser does."""
     link = http.client.HTTPConnection("127.0.0.1", port, timeout=30.0)
     try:
         link.request("GET", path, headers={} if host is None else {"Host": host})
@@ -274,7 +274,7 @@ def get():
 
 
 def channels_running(channels) -> None:
-    """Have the torque on, until the publisher has shown that."""
+    """Set the phase to running, and wait until the publisher has shown it."""
     shared_state = channels.shared_state
     shared_state[StateField.PHASE] = Phase.RUNNING
     beat = shared_state[StateField.LIVE_BEAT]
@@ -282,7 +282,7 @@ def channels_running(channels) -> None:
 
 
 class Columns:
-    """What Rerun received of a recording: by entity and component, times in ns and values."""
+    """The received part of a recording: times in ns and values by entity and component."""
 
     def __init__(self, application_id: str, chunks) -> None:
         self.application_id = application_id
@@ -327,30 +327,30 @@ class Saver:
         )
 
     def has_begun(self) -> bool:
-        """Whether something that counts has come: more than the frame of a picture, some 100 kB."""
+        """Whether data has come: more than the frame of a picture, some 100 kB."""
         return self._path.exists() and self._path.stat().st_size > 300_000
 
     def has_all(self) -> bool:
-        """Whether nothing more comes: what is on its way when the server goes is lost."""
+        """Whether no more data comes: data on its way is lost when the server ends."""
         if not self.has_begun():
             return False
         size = self._path.stat().st_size
-        for _ in range(15):  # looked at often, as a sleep may be one of the machine
+        for _ in range(15):  # polled often, as the machine may sleep during one pause
             time.sleep(0.1)
-            if self._path.stat().st_size != size or self._anybody_at_work():
+            if self._path.stat().st_size != size or self._is_active():
                 return False
         return True
 
-    def _anybody_at_work(self) -> bool:
-        """Whether some of those through whom it comes runs, or would if there were a processor."""
+    def _is_active(self) -> bool:
+        """Whether a process of the view runs, or would if a processor were free."""
         pids = (self._publisher, *children(self._publisher), self._process.pid)
         tasks = [task for pid in pids for task in Path(f"/proc/{pid}/task").iterdir()]
         return any(state_of(task) == "R" for task in tasks)
 
     def recordings(self) -> dict[str, Columns]:
-        """Return each recording by its id, once the server has gone away.
+        """Return each recording by its id, after the end of the server.
 
-        In which order they come is Rerun's affair.
+        Their order depends on Rerun.
         """
         from rerun.chunk import RrdReader
 
@@ -383,9 +383,9 @@ def save(rerun_program, tmp_path):
 
 @pytest.fixture
 def receive(save):
-    """Have what a publisher shows from now on saved.
+    """Save what a publisher shows from now on.
 
-    What that returns ends the session and the publisher, and gives each recording by its id.
+    The returned function ends session and publisher, and returns each recording by its id.
     """
 
     def begin(publisher):
@@ -406,25 +406,25 @@ def receive(save):
 
 @pytest.fixture(scope="session")
 def received(rerun_program, tmp_path_factory):
-    """What Rerun received of two sessions that one publisher showed, by the end of each.
+    """Received recordings of two sessions of one publisher, by the end of each.
 
-    One ended in a fault; of the other the supervisor was lost. With the number of ticks in them,
-    the address of the view, and what a browser got of its page.
+    One ended in a fault, the other with the loss of the supervisor. Also the number of ticks,
+    the address of the view, and the responses of its page.
     """
-    patience = "from rigd.live import publisher as p; p._MAX_QUEUED_S = 60.0"
+    long_timeout = "from rigd.live import publisher as p; p._MAX_QUEUED_S = 60.0"
     with contextlib.ExitStack() as stack:
         producer = Producer(capacity=64_000)
         stack.callback(producer.close)
         producer.start()
-        publisher = Publisher(producer, first=f"{patience}; p._MAX_ORPHANED_S = 0.5")
+        publisher = Publisher(producer, first=f"{long_timeout}; p._MAX_ORPHANED_S = 0.5")
         stack.callback(publisher.close)
         publisher.begin()
         path = tmp_path_factory.mktemp("received") / "sessions.rrd"
         saver = Saver(rerun_program, publisher.address, path)
         stack.callback(saver.close)
         address = publisher.address
-        place = f"/?{address.viewer_url.split('?')[1]}"
-        paths = ("/", place, "/re_viewer_bg.wasm", "/re_viewer.js", "/live.json")
+        viewer_path = f"/?{address.viewer_url.split('?')[1]}"
+        paths = ("/", viewer_path, "/re_viewer_bg.wasm", "/re_viewer.js", "/live.json")
         absent = ("/etc/passwd", "/../x", "/version")
         page = {path: get_page(address.page_port, path) for path in (*paths, *absent)}
         channels_running(producer.channels)
@@ -495,9 +495,9 @@ def start_publisher(producer):
 
 @pytest.fixture
 def own_port():
-    """What has a publisher prefer a port that no other test's wants, and that nobody is given.
+    """Code by which a publisher prefers a port that no other test uses.
 
-    When its server is replaced, Rerun's own may have gone to a publisher of another test.
+    When its server is replaced, Rerun's default port may belong to a publisher of another test.
     """
     port = 20_000 + os.getpid() % 10_000
     return f"from rigd.live import _server as outlet; outlet.GRPC_PORT = {port}"
@@ -509,8 +509,8 @@ def publisher(start_publisher):
 
 
 @pytest.fixture
-def unhurried(start_producer, start_publisher):
-    """A publisher that leaves nothing out, although the machine may stand still for a minute."""
+def publisher_without_drops(start_producer, start_publisher):
+    """A publisher that drops nothing, even if the machine stalls for a minute."""
     return start_publisher(
         start_producer(capacity=64_000),
         first="from rigd.live import publisher; publisher._MAX_QUEUED_S = 60.0",

@@ -1,4 +1,4 @@
-"""The file by which a live view is found, and the ports that it stands for."""
+"""The file by which a live view is found, and its ports."""
 
 import json
 import os
@@ -30,14 +30,14 @@ def files():
 
 
 @pytest.fixture
-def ended():
-    """The process id of a process that was."""
+def ended_pid():
+    """The process id of a process that has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     return process.pid
 
 
-def test_it_is_found_by_the_rigs_name_as_long_as_it_is_there(address):
+def test_view_is_found_by_the_name_of_the_rig(address):
     assert find("antenna can") is None
     announce(address)
     announce(second := replace(address, server=2))
@@ -51,7 +51,7 @@ def test_it_is_found_by_the_rigs_name_as_long_as_it_is_there(address):
     assert files() == []
 
 
-def test_it_is_for_this_user_only(address):
+def test_file_is_private_to_its_user(address):
     before = os.umask(0o000)
     announce(address)
     os.umask(before)
@@ -61,16 +61,16 @@ def test_it_is_for_this_user_only(address):
     assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
 
 
-def test_what_a_dead_process_left_is_no_live_view(address, ended):
-    announce(replace(address, pid=ended))
-    announce(replace(address, rig="reborn", born=address.born - 1))  # the number is used again
+def test_file_of_an_ended_process_is_no_live_view(address, ended_pid):
+    announce(replace(address, pid=ended_pid))
+    announce(replace(address, rig="reborn", born=address.born - 1))  # the id is used again
     assert len(files()) == 2
     assert running() == []
     announce(address)
     assert running() == [address], "a new one takes its place"
 
 
-def test_a_process_that_has_not_been_waited_for_has_ended_all_the_same(address):
+def test_zombie_process_has_no_live_view(address):
     wait = "import sys; sys.stdin.read()"
     with subprocess.Popen([sys.executable, "-c", wait], stdin=subprocess.PIPE) as process:
         fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
@@ -81,14 +81,14 @@ def test_a_process_that_has_not_been_waited_for_has_ended_all_the_same(address):
         assert eventually(lambda: running() == [])
 
 
-def test_only_its_own_file_is_taken_away(address, ended):
+def test_withdraw_removes_only_its_own_file(address, ended_pid):
     announce(address)
-    withdraw(replace(address, pid=ended))
+    withdraw(replace(address, pid=ended_pid))
     assert find("antenna can") == address
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", json.dumps({"rig": "x", "more": 1})])
-def test_a_file_that_is_none_of_ours_is_passed_over(address, text):
+def test_files_of_others_are_ignored(address, text):
     announce(address)
     (file,) = files()
     file.write_text(text)
@@ -97,7 +97,7 @@ def test_a_file_that_is_none_of_ours_is_passed_over(address, text):
     assert file.exists()
 
 
-def test_a_server_that_does_not_start_is_told_in_a_sentence(runtime_folder, tmp_path, monkeypatch):
+def test_error_message_if_the_server_does_not_start(runtime_folder, tmp_path, monkeypatch):
     program = tmp_path / "rerun"
     program.write_text("#!/bin/sh\necho no such option >&2\nexit 2\n")
     program.chmod(0o755)
@@ -109,18 +109,18 @@ def test_a_server_that_does_not_start_is_told_in_a_sentence(runtime_folder, tmp_
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
-def test_a_port_on_which_somebody_listens_is_not_taken(host):
+def test_port_in_use_is_not_free(host):
     with socket.create_server((host, 0)) as taken:
         assert free_port(taken.getsockname()[1]) == 0
 
 
-def test_a_port_whose_last_connections_are_still_closing_is_free():
+def test_port_with_closing_connections_is_free():
     with socket.create_server(("127.0.0.1", 0)) as server:
-        place = server.getsockname()
-        with socket.create_connection(place) as client:
-            server.accept()[0].close()  # the end that closes first is the one that waits
+        address_of_server = server.getsockname()
+        with socket.create_connection(address_of_server) as client:
+            server.accept()[0].close()  # the end that closes first is in TIME_WAIT
             assert client.recv(1) == b""
-    assert free_port(place[1]) == place[1]
+    assert free_port(address_of_server[1]) == address_of_server[1]
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_a_port_whose_last_connections_are_still_closing_is_free():
         {"colour": "red"},
     ],
 )
-def test_what_is_no_address_is_not_believed(address, wrong):
+def test_invalid_addresses_are_ignored(address, wrong):
     announce(address)
     (file,) = files()
     file.write_text(json.dumps(json.loads(file.read_text()) | wrong))
@@ -148,14 +148,14 @@ def test_what_is_no_address_is_not_believed(address, wrong):
 
 
 @pytest.mark.parametrize("text", [b"", b"[" * 100_000, b"[1]", b"7", b"\xff", b" " * 10_000])
-def test_what_no_address_can_be_is_none(address, text):
+def test_invalid_documents_are_ignored(address, text):
     announce(address)
     (file,) = files()
     file.write_bytes(text)
     assert running() == []
 
 
-def test_nobody_waits_for_who_never_writes(address):
+def test_pipe_in_place_of_a_file_does_not_block(address):
     announce(address)
     (file,) = files()
     os.mkfifo(file.with_name("live-sim.json"))

@@ -1,4 +1,4 @@
-"""What waits for a server that stalls, and what the board tells of the rig's health."""
+"""The queue for a stalled server, and the rig's health in the shared state."""
 
 from functools import partial
 
@@ -23,7 +23,7 @@ def names(drawings):
     return [draw() for draw in drawings]
 
 
-def test_everything_goes_out_in_order_and_once():
+def test_drawings_are_sent_once_and_in_order():
     backlog = Backlog(max_samples=100)
     assert not backlog
     backlog.put([drawing("a"), drawing("b")], 50)
@@ -36,7 +36,7 @@ def test_everything_goes_out_in_order_and_once():
     assert backlog.dropped == 0
 
 
-def test_the_oldest_samples_make_room_and_are_counted():
+def test_oldest_samples_are_dropped_and_counted():
     backlog = Backlog(max_samples=100)
     backlog.put_required([drawing("note")])
     for number in range(5):
@@ -46,14 +46,14 @@ def test_the_oldest_samples_make_room_and_are_counted():
     assert (names(drawings), samples) == (["note", "3", "4"], 80)
 
 
-def test_the_newest_stay_however_many_they_are():
+def test_newest_samples_are_never_dropped():
     backlog = Backlog(max_samples=100)
     backlog.put([drawing("old")], 10)
     backlog.put([drawing("new")], 500)
     assert (backlog.dropped, backlog.take()[1]) == (10, 500)
 
 
-def test_what_a_new_connection_is_given_anyway_is_not_sent_twice():
+def test_required_drawings_can_be_dropped():
     backlog = Backlog(max_samples=100)
     backlog.put_required([drawing("note")])
     backlog.put([drawing("a")], 1)
@@ -61,23 +61,23 @@ def test_what_a_new_connection_is_given_anyway_is_not_sent_twice():
     assert names(backlog.take()[0]) == ["a"]
 
 
-def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer):
+def test_overwritten_samples_are_counted(start_producer):
     producer = start_producer(capacity=1000)
     producer.stop()
-    producer.go_on(3000)
+    producer.write_more(3000)
     beam = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
     description = SessionDescription("late", 1000.0, 10, (0, 10), beam, None)
     session = LiveSession(description, "id", (0,) * len(TOPICS))
     shown = publisher._ShownSession(session, producer.channels, None)
     shown.queue_new_records()
-    # An observer reads half of what a ring has.
+    # An observer reads half of a ring.
     assert producer.dropped == producer.tick - 500
-    seen = producer.channels.shared_state[StateField.LIVE_SAMPLES_SEEN]
-    assert seen == producer.tick - 500  # as many wait to be sent
+    seen_count = producer.channels.shared_state[StateField.LIVE_SAMPLES_SEEN]
+    assert seen_count == producer.tick - 500  # the others wait to be sent
     assert producer.refused == 0
 
 
-def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
+def test_health_in_units_of_the_view(channels):
     shared_state = channels.shared_state
     for word, value in {
         StateField.GO: 1,
@@ -99,7 +99,7 @@ def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
     assert (health.bus_errors, health.sensor_status) == (4, 0x8001)
 
 
-def test_vitals_of_what_there_is_not_are_not_known(channels):
+def test_absent_values_of_health_are_unknown(channels):
     for word in (StateField.BUS_LOAD_PPM, StateField.BUS_ERRORS, StateField.SENSOR_STATUS):
         channels.shared_state[word] = -1
     health = HealthReader(channels).read(0.0, view_dropped=0)
@@ -108,27 +108,27 @@ def test_vitals_of_what_there_is_not_are_not_known(channels):
     assert health.rate_hz is None
 
 
-def test_counts_of_the_session_before_are_not_taken_for_this_ones(channels):
+def test_counts_of_the_session_before_are_ignored(channels):
     channels.shared_state[StateField.MISSED] = 5
-    vitals = HealthReader(channels)
-    assert vitals.read(0.0, view_dropped=0).missed_ticks == 0
+    reader = HealthReader(channels)
+    assert reader.read(0.0, view_dropped=0).missed_ticks == 0
     channels.shared_state[StateField.GO] = 1
-    assert vitals.read(1.0, view_dropped=0).missed_ticks == 5
+    assert reader.read(1.0, view_dropped=0).missed_ticks == 5
 
 
-def test_the_rate_is_that_of_the_last_second(channels):
-    vitals, shared_state = HealthReader(channels), channels.shared_state
+def test_rate_is_that_of_the_last_second(channels):
+    reader, shared_state = HealthReader(channels), channels.shared_state
     shared_state[StateField.GO] = 1
     rates = []
-    for look in range(20):
-        now_s = look * POLL_S
-        assert vitals.is_due(now_s)
+    for poll in range(20):
+        now_s = poll * POLL_S
+        assert reader.is_due(now_s)
         shared_state[StateField.SCHEDULED] = round(
-            1000 * now_s if look < 10 else 1250 + 500 * now_s
+            1000 * now_s if poll < 10 else 1250 + 500 * now_s
         )
-        rates.append(vitals.read(now_s, view_dropped=0).rate_hz)
-        assert not vitals.is_due(now_s + 0.9 * POLL_S)
+        rates.append(reader.read(now_s, view_dropped=0).rate_hz)
+        assert not reader.is_due(now_s + 0.9 * POLL_S)
     assert rates[9] == pytest.approx(1000.0, abs=2.0)
     assert rates[-1] == pytest.approx(500.0, abs=2.0)
     shared_state[StateField.SCHEDULED] = 10
-    assert vitals.read(6.0, view_dropped=0).rate_hz is None, "another session has begun"
+    assert reader.read(6.0, view_dropped=0).rate_hz is None, "another session has begun"

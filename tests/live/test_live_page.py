@@ -1,4 +1,4 @@
-"""The page for browsers: Rerun's own, but nothing of it is loaded from another computer."""
+"""The page for browsers: Rerun's own, but nothing is loaded from another computer."""
 
 import json
 import os
@@ -14,11 +14,11 @@ from rigd.live._page import ViewerPageServer, confine_to_loopback
 pytestmark = pytest.mark.process
 
 
-def test_a_browser_gets_the_viewer_and_is_kept_on_this_computer(received):
+def test_page_loads_only_from_this_computer(received):
     address, answers = received["address"], received["page"]
     answer, _ = answers["/"]
     assert answer.status == 302
-    # Relative, for those that come through a tunnel from another port.
+    # Relative, for browsers that connect through a tunnel from another port.
     assert answer.headers["Location"] == "/?" + address.viewer_url.split("?")[1]
 
     answer, body = answers[answer.headers["Location"]]
@@ -48,34 +48,34 @@ def test_a_browser_gets_the_viewer_and_is_kept_on_this_computer(received):
         assert answers[path][0].status == 404
 
 
-def test_links_to_other_computers_are_left_out():
+def test_links_to_other_computers_are_removed():
     page = (
         '<head><link rel="icon" href="favicon.ico" /><link rel="preconnect"\n'
         ' href="https://fonts.example" crossorigin /></head><body>x</body>'
     )
-    kept = confine_to_loopback(page)
-    assert 'href="favicon.ico"' in kept
-    assert "fonts.example" not in kept
-    assert kept.count("live.json") == 1
+    confined = confine_to_loopback(page)
+    assert 'href="favicon.ico"' in confined
+    assert "fonts.example" not in confined
+    assert confined.count("live.json") == 1
 
 
 @pytest.fixture
 def page():
-    """A page of nothing."""
+    """A page server without content."""
     server = ViewerPageServer(0, lambda: None, lambda: 0)
     yield server
     server.close()
 
 
-def test_a_page_of_another_name_reads_nothing(page, get):
-    """Whose name was made to lead to this computer."""
+def test_requests_with_another_host_name_are_refused(page, get):
+    """As with a name that was made to resolve to this computer."""
     assert get(page.port, "/live.json", "evil.example")[0].status == 403
     assert get(page.port, "/live.json", f"evil.example:{page.port}")[0].status == 403
-    for host in ("127.0.0.1", "localhost", "localhost:12345"):  # of whatever port the tunnel has
+    for host in ("127.0.0.1", "localhost", "localhost:12345"):  # with any port of a tunnel
         assert get(page.port, "/live.json", host)[0].status == 503
 
 
-def test_who_only_connects_takes_but_the_room_there_is(monkeypatch):
+def test_idle_connections_are_limited(monkeypatch):
     monkeypatch.setattr("rigd.live._page._MAX_CONNECTIONS", 2)
     before = threading.active_count()
     page = ViewerPageServer(0, lambda: None, lambda: 0)
@@ -84,7 +84,7 @@ def test_who_only_connects_takes_but_the_room_there_is(monkeypatch):
         for connection in idle[2:]:
             connection.settimeout(30.0)
             assert connection.recv(1) == b""
-        # Beside the server's own, one for each connection and one for its time.
+        # Besides the server's own thread, one for each connection and one for its time-out.
         assert threading.active_count() <= before + 1 + 2 * 2
     finally:
         for connection in idle:
@@ -92,16 +92,16 @@ def test_who_only_connects_takes_but_the_room_there_is(monkeypatch):
         page.close()
 
 
-def test_a_connection_does_not_last_for_ever(monkeypatch, page):
+def test_duration_of_a_connection_is_limited(monkeypatch, page):
     monkeypatch.setattr("rigd.live._page._MAX_CONNECTION_S", 0.2)
     with socket.create_connection(("127.0.0.1", page.port), 30.0) as connection:
-        connection.sendall(b"GET / HTTP/1.0\r\n")  # the end of it never comes
+        connection.sendall(b"GET / HTTP/1.0\r\n")  # its end never comes
         assert connection.recv(1) == b""
 
 
-def test_a_page_that_is_closed_leaves_no_socket_and_no_thread_at_work(page):
-    place = f"0100007F:{page.port:04X}"  # as /proc/net/tcp writes it
-    assert place in {end.local for end in sockets(os.getpid())}
+def test_closed_page_leaves_no_socket_and_thread(page):
+    local_address = f"0100007F:{page.port:04X}"  # as /proc/net/tcp writes it
+    assert local_address in {end.local for end in sockets(os.getpid())}
     page.close()
-    assert place not in {end.local for end in sockets(os.getpid())}
+    assert local_address not in {end.local for end in sockets(os.getpid())}
     assert not [t for t in threading.enumerate() if "serve_forever" in t.name]

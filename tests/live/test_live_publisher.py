@@ -1,4 +1,4 @@
-"""The publisher as the supervisor sees it: one line, loopback only, and never in the way."""
+"""The publisher from the supervisor's side: one message, loopback only, and no delay."""
 
 import json
 import os
@@ -27,7 +27,7 @@ from rigd.live.publisher import RerunError, main
 pytestmark = pytest.mark.process
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
-IMPATIENT = "from rigd.live import publisher; publisher._MAX_QUEUED_S = 1.0"
+SHORT_QUEUE = "from rigd.live import publisher; publisher._MAX_QUEUED_S = 1.0"
 
 
 def fetch(url: str):
@@ -49,13 +49,13 @@ def accepts(port: int) -> bool:
     return True
 
 
-def test_every_record_arrives_in_the_units_of_the_plots(received):
+def test_every_record_arrives_in_units_of_the_plots(received):
     columns = received["fault"]
     assert columns.application_id == "rigd"
     time_ns, angle_mrad = columns("/signals", "angle_mrad")
     time_s = time_ns * 1e-9
     assert len(time_ns) > 500
-    assert time_ns[-1] == (received["ticks"] - 1) * 1_000_000  # up to the last that was made
+    assert time_ns[-1] == (received["ticks"] - 1) * 1_000_000  # up to the last one written
     assert np.all(np.diff(time_ns) == 1_000_000)  # none missing, none twice
     reference = 0.025 * np.sin(2.0 * np.pi * (0.5 * time_s + 0.1 * time_s**2))
     assert angle_mrad[:, 0] == pytest.approx(1e3 * reference, abs=1e-9)
@@ -79,7 +79,7 @@ def test_every_record_arrives_in_the_units_of_the_plots(received):
 
 
 @pytest.mark.further  # as in tests/view
-def test_fits_are_drawn_where_their_samples_end_and_told_among_the_events(publisher, save):
+def test_fits_are_in_the_plots_and_events(publisher, save):
     publisher.show("fitted", fit_modes=2, excitation="until")
     saver = save(publisher.address)
     fits = online_fit(0.4, 2.0), online_fit(0.8)
@@ -91,7 +91,7 @@ def test_fits_are_drawn_where_their_samples_end_and_told_among_the_events(publis
     assert eventually(saver.has_all)
     publisher.end()
     columns = saver.recordings()["recording of fitted"]
-    # A connection that comes in between gets them again.
+    # A connection that comes in between receives them again.
     time_ns, damping = columns("/fits", "damping_1_percent")
     last = damping[np.argmax(time_ns)]
     assert set(time_ns.tolist()) >= {400_000_000, 800_000_000}
@@ -101,16 +101,16 @@ def test_fits_are_drawn_where_their_samples_end_and_told_among_the_events(publis
 
 
 @pytest.mark.further  # as a fit is
-def test_the_quick_look_is_added_to_the_events(publisher, save, tmp_path):
+def test_quick_look_is_added_to_the_events(publisher, save, tmp_path):
     publisher.show("looked at", folder=tmp_path)
     saver = save(publisher.address)
     assert eventually(saver.has_begun)
     publisher.producer.stop()
     publisher.finish()
-    look = {"version": 1, "text": ["Quick look at it", "  mode 1\x1b[31m"]}
-    (tmp_path / "looked at.look.json.new").write_text(json.dumps(look))
+    quick_look = {"version": 1, "text": ["Quick look at it", "  mode 1\x1b[31m"]}
+    (tmp_path / "looked at.look.json.new").write_text(json.dumps(quick_look))
     (tmp_path / "looked at.look.json.new").rename(tmp_path / "looked at.look.json")
-    time.sleep(1.5)  # it is looked for once a second
+    time.sleep(1.5)  # the file is polled once a second
     assert eventually(saver.has_all)
     publisher.end()
     _, lines = saver.recordings()["recording of looked at"]("/events", "TextLog:text")
@@ -118,18 +118,18 @@ def test_the_quick_look_is_added_to_the_events(publisher, save, tmp_path):
 
 
 @pytest.mark.parametrize("at_once", [further(False), True])
-def test_two_rigs_have_a_view_each_on_loopback_and_leave_no_server(
+def test_two_rigs_have_separate_views_and_leave_no_server(
     publisher, start_producer, start_publisher, at_once
 ):
     assert_on_loopback(publisher)
     own = publisher.ports
-    # The port was free when it was looked at, and taken a moment later.
+    # The port was free when it was checked, and taken a moment later.
     race = f"outlet.free_port = lambda _: {publisher.address.grpc_port}" if at_once else "pass"
     first = f"from rigd.live import _server as outlet; {race}"
     other = start_publisher(start_producer(), first=first)
     assert not other.ports & own
     assert all(accepts(port) for port in other.ports | own)
-    # One that is killed leaves no server, and the other its own.
+    # A killed publisher leaves no server, and the other one has its own.
     server = publisher.server_pid
     publisher.process.kill()
     assert eventually(lambda: has_ended(server))
@@ -138,7 +138,7 @@ def test_two_rigs_have_a_view_each_on_loopback_and_leave_no_server(
 
 
 def assert_on_loopback(publisher):
-    """Assert that the view is where its first line says, and that nothing is open beyond."""
+    """Assert that the view is at its announced address, and that nothing else is open."""
     address = publisher.address
     assert (address.rig, address.pid) == ("rig under test", publisher.process.pid)
     assert find("rig under test") == address
@@ -146,13 +146,13 @@ def assert_on_loopback(publisher):
     pids = publisher.process.pid, publisher.server_pid
     listening = {end.local for pid in pids for end in listeners(pid)}
     assert {f"{LOOPBACK}:{port:04X}" for port in publisher.ports} <= listening
-    assert len(listening) == 3  # the third is where the server has the page's files
+    assert len(listening) == 3  # the third is that of the page's files on the server
     addresses = {address for pid in pids for end in sockets(pid) for address in end.addresses}
     assert addresses == {LOOPBACK, "00000000"}  # the latter is the far end of a listening socket
 
 
 def assert_ends_with_its_input(publisher):
-    """Assert that an interrupt, which is the supervisor's business, does not end a publisher."""
+    """Assert that an interrupt, which the supervisor handles, does not end a publisher."""
     server = publisher.server_pid
     for number in (signal.SIGINT, signal.SIGTERM):
         os.kill(publisher.process.pid, number)
@@ -168,7 +168,7 @@ def assert_ends_with_its_input(publisher):
 
 
 @pytest.mark.slow
-def test_stays_open_for_as_long_as_asked(start_publisher):
+def test_publisher_remains_for_the_requested_time(start_publisher):
     publisher = start_publisher(linger_s=2.5)
     began_s = time.monotonic()
     publisher.process.stdin.close()
@@ -180,7 +180,7 @@ def test_stays_open_for_as_long_as_asked(start_publisher):
 
 
 @pytest.mark.further  # as when killed
-def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send, receive_message):
+def test_publisher_ends_with_its_parent(producer, send, receive_message):
     middle = subprocess.Popen(
         [
             sys.executable,
@@ -204,23 +204,23 @@ def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send, r
     assert find("orphan") is None, "what it left behind is told from a live view"
 
 
-@pytest.mark.further  # as a publisher that stands still
-def test_a_frozen_server_is_waited_for_by_nobody(start_producer, start_publisher):
+@pytest.mark.further  # as a suspended publisher
+def test_no_wait_for_a_frozen_server(start_producer, start_publisher):
     producer = start_producer(speed=8.0)
-    publisher = start_publisher(producer, first=IMPATIENT)
+    publisher = start_publisher(producer, first=SHORT_QUEUE)
     server = publisher.server_pid
     os.kill(server, signal.SIGSTOP)
     assert eventually(lambda: publisher.dropped > 1000), "what cannot be shown is counted"
     os.kill(server, signal.SIGCONT)
     dropped = -1
 
-    def goes_on() -> bool:
+    def count_is_constant() -> bool:
         nonlocal dropped
         before, dropped = dropped, publisher.dropped
         time.sleep(0.3)
         return dropped == before
 
-    assert eventually(goes_on)
+    assert eventually(count_is_constant)
     os.kill(server, signal.SIGSTOP)
     assert eventually(lambda: publisher.dropped > dropped + 500)
     code, more, _ = publisher.end()
@@ -230,7 +230,7 @@ def test_a_frozen_server_is_waited_for_by_nobody(start_producer, start_publisher
 
 
 @pytest.mark.slow
-def test_a_server_that_stays_frozen_is_replaced(start_producer, start_publisher, receive, own_port):
+def test_frozen_server_is_replaced(start_producer, start_publisher, receive, own_port):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(
         producer,
@@ -250,19 +250,15 @@ def test_a_server_that_stays_frozen_is_replaced(start_producer, start_publisher,
 
 
 @pytest.mark.slow
-def test_a_frozen_server_that_is_killed_is_replaced(
-    start_producer, start_publisher, receive, own_port
-):
+def test_killed_frozen_server_is_replaced(start_producer, start_publisher, receive, own_port):
     producer = start_producer(speed=8.0)
-    publisher = start_publisher(producer, first=f"{IMPATIENT}; {own_port}")
+    publisher = start_publisher(producer, first=f"{SHORT_QUEUE}; {own_port}")
     os.kill(publisher.server_pid, signal.SIGSTOP)
     assert eventually(lambda: publisher.dropped > 0)
     assert_replaced_when_killed(publisher, receive)
 
 
-def test_a_server_that_is_killed_or_has_seen_many_sessions_is_replaced(
-    start_publisher, receive, own_port
-):
+def test_server_is_replaced_after_a_kill_or_many_sessions(start_publisher, receive, own_port):
     publisher = start_publisher(first=f"{own_port}; outlet._MAX_SESSIONS = 2")
     first = publisher.address
     begins = tuple(ring.written_count for ring in publisher.producer.channels.rings)
@@ -275,7 +271,7 @@ def test_a_server_that_is_killed_or_has_seen_many_sessions_is_replaced(
 
 
 def assert_replaced_when_killed(publisher, receive):
-    """Kill the server; viewers find another one, with all samples from then on."""
+    """Kill the server; check that viewers find another one, with all later samples."""
     producer, server, ports = publisher.producer, publisher.server_pid, publisher.ports
     os.kill(server, signal.SIGKILL)
     killed_ns = producer.tick * 1_000_000
@@ -289,7 +285,7 @@ def assert_replaced_when_killed(publisher, receive):
 
 
 @pytest.mark.further  # as test_live_backlog.py
-def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer, start_publisher):
+def test_overwritten_samples_are_counted(start_producer, start_publisher):
     producer = start_producer(capacity=1000, speed=8.0)
     publisher = start_publisher(producer)
     os.kill(publisher.process.pid, signal.SIGSTOP)
@@ -302,7 +298,7 @@ def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer, star
 
 
 @pytest.mark.slow
-def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, start_publisher):
+def test_second_publisher_counts_only_samples_not_shown(start_producer, start_publisher):
     producer = start_producer(capacity=4000)
     first = start_publisher(producer)
     shared_state = producer.channels.shared_state
@@ -312,7 +308,7 @@ def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, star
     before = producer.dropped
     first.process.kill()
     first.process.wait()
-    producer.go_on(3000)
+    producer.write_more(3000)
     second = start_publisher(producer)
     assert eventually(lambda: shared_state[StateField.LIVE_SAMPLES_SEEN] == producer.tick)
     # An observer reads half of what a ring has; the half before it is gone.
@@ -327,7 +323,7 @@ def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, star
     ],
 )
 @pytest.mark.further  # as test_live_address.py
-def test_a_server_that_does_not_start_is_told_in_a_sentence(
+def test_error_message_if_the_server_does_not_start(
     start_publisher, tmp_path, script, mode, sentence
 ):
     package = tmp_path / "rerun_cli"
@@ -341,7 +337,7 @@ def test_a_server_that_does_not_start_is_told_in_a_sentence(
     assert publisher.end() == (1, "", "")
 
 
-def test_the_supervisor_is_told_why_there_is_no_view(monkeypatch):
+def test_supervisor_receives_the_reason_without_a_view(monkeypatch):
     sent = []
     job = SimpleNamespace(channels=None, rig="sim")
     parent = SimpleNamespace(receive_job=lambda: job, send=sent.append)
@@ -359,7 +355,7 @@ def test_the_supervisor_is_told_why_there_is_no_view(monkeypatch):
     assert sent == [ProcessFailed("The Rerun server ended.")]
 
 
-def test_no_job_means_no_work():
+def test_publisher_ends_without_a_job():
     publisher = subprocess.run(
         [sys.executable, "-m", "rigd.live.publisher", str(os.getpid())],
         stdin=subprocess.DEVNULL,

@@ -1,4 +1,4 @@
-"""The live view of a rig from the supervisor's side: begun once, found, replaced, given up."""
+"""The live view of a rig from the supervisor's side: start, address, restarts, and their limit."""
 
 import os
 import resource
@@ -30,7 +30,7 @@ def profile(write_profile):
 
 @pytest.fixture
 def rig(children_copied, profile, runtime_folder, monkeypatch):
-    # How long its start takes is the machine's affair: what is asked for is what it shows then.
+    # The duration of the start depends on the machine, and is not tested here.
     monkeypatch.setattr(live_view, "_ADDRESS_TIMEOUT_S", 60.0)
     monkeypatch.setattr(live_view, "_SHOW_TIMEOUT_S", 60.0)
     rig = Rig(profile, fast=True, live=True)
@@ -54,30 +54,30 @@ def order(profile, tmp_path):
 
 @pytest.fixture
 def run(rig, order):
-    """Run a session under the virtual clock; returns its result and what the operator was told."""
+    """Run a session under the virtual clock; return its result and its messages."""
 
     def run(name: str, duration_s: float = 1.0, meanwhile=lambda progress: None, stop=None):
-        given = order(name, duration_s)
+        session_order = order(name, duration_s)
         stop = stop or StopRequest()
-        told = [rig.show(given, stop)]
+        messages = [rig.show(session_order, stop)]
 
         def watch(progress, events) -> None:
-            told.extend(event.message for event in events)
+            messages.extend(event.message for event in events)
             meanwhile(progress)
 
-        return rig.run(given, stop, watch), told
+        return rig.run(session_order, stop, watch), messages
 
     return run
 
 
-def test_a_series_has_one_view_which_gets_every_sample_and_is_replaced_when_it_dies(rig, run, save):
-    first, (told, *_) = run("first")
+def test_view_of_a_series_is_complete_and_restarted(rig, run, save):
+    first, (message, *_) = run("first")
     view = rig.status().live_view
-    assert told == f"Live view: {view.viewer_url}"
+    assert message == f"Live view: {view.viewer_url}"
     assert view == find("sim")
     saver = save(view)
-    second, (told, *_) = run("second")
-    assert told == f"Live view: {view.viewer_url}"
+    second, (message, *_) = run("second")
+    assert message == f"Live view: {view.viewer_url}"
     assert rig.status().live_view == view, "the same process, and the same server"
     assert (first.live_dropped, second.live_dropped) == (0, 0)
     assert eventually(saver.has_all)
@@ -88,9 +88,9 @@ def test_a_series_has_one_view_which_gets_every_sample_and_is_replaced_when_it_d
         return rig.status().live_view.pid != view.pid
 
     assert eventually(replaced)
-    third, told = run("third", 0.1)
-    assert told[0].startswith("Live view: http://127.0.0.1:")
-    assert "The live process was killed by signal 9. It is restarted" in "\n".join(told)
+    third, messages = run("third", 0.1)
+    assert messages[0].startswith("Live view: http://127.0.0.1:")
+    assert "The live process was killed by signal 9. It is restarted" in "\n".join(messages)
     assert (third.outcome, third.live_dropped) == ("complete", 0)
     rig.disconnect()
     assert find("sim") is None
@@ -106,7 +106,7 @@ def test_a_series_has_one_view_which_gets_every_sample_and_is_replaced_when_it_d
 
 
 @pytest.mark.further  # as test_live_backlog.py
-def test_the_counts_of_one_session_are_not_shown_in_the_next(rig, run, order):
+def test_counts_of_a_session_are_not_shown_in_the_next(rig, run, order):
     run("first")
     shared_state = rig._group.channels.shared_state
     assert shared_state[StateField.GO]
@@ -115,7 +115,7 @@ def test_the_counts_of_one_session_are_not_shown_in_the_next(rig, run, order):
 
 
 @pytest.mark.further  # as a fault in test_live_state.py
-def test_how_a_session_ended_is_shown(rig, run, save):
+def test_outcome_of_a_session_is_shown(rig, run, save):
     stop_at = StopRequest()
 
     def stop(progress) -> None:
@@ -138,11 +138,11 @@ def test_how_a_session_ended_is_shown(rig, run, save):
 
 
 @pytest.mark.further  # as a fault in test_live_state.py
-def test_a_full_disk_is_shown_as_a_fault_with_its_reason(rig, run, save):
+def test_full_disk_is_shown_as_a_fault_with_its_reason(rig, run, save):
     run("before", 0.5)
     saver = save(rig.status().live_view)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    # The recorder alone writes a file, and is started with the session.
+    # Only the recorder writes a file, and it is started with the session.
     resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard))
     try:
         with pytest.raises(SessionFailedError, match="cannot be written"):
@@ -151,15 +151,15 @@ def test_a_full_disk_is_shown_as_a_fault_with_its_reason(rig, run, save):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert eventually(saver.has_all)
     rig.disconnect()
-    said = [
+    banners = [
         columns.sent("/state", "TextDocument:text")[1][-1][0]
         for columns in saver.recordings().values()
     ]
-    assert [text for text in said if text.startswith("# FAULT") and "cannot be written" in text]
+    assert [text for text in banners if text.startswith("# FAULT") and "cannot be written" in text]
 
 
 @pytest.mark.slow
-def test_a_view_that_dies_again_and_again_is_given_up_and_the_session_is_not(rig, run):
+def test_repeatedly_killed_view_is_given_up_without_the_session(rig, run):
     killed = set()
     stop = StopRequest()
     given_up_at = None
@@ -175,31 +175,31 @@ def test_a_view_that_dies_again_and_again_is_given_up_and_the_session_is_not(rig
             if progress.tick > given_up_at + 5000:
                 stop.request()
 
-    result, told = run("watched", 2000.0, kill, stop)  # for as long as it takes
+    result, messages = run("watched", 2000.0, kill, stop)  # for as long as it takes
     assert len(killed) == 4
-    assert sum("It is restarted" in text for text in told) == 3
-    assert sum("It is not restarted" in text for text in told) == 1
+    assert sum("It is restarted" in text for text in messages) == 3
+    assert sum("It is not restarted" in text for text in messages) == 1
     assert result.outcome == "stopped"
     assert result.recorded == result.scheduled > given_up_at + 5000
-    _, told = run("next")
-    assert told[0].startswith("Live view: "), "a new session is a new chance"
+    _, messages = run("next")
+    assert messages[0].startswith("Live view: "), "a new session is a new chance"
 
 
-class StillGroup:
-    """A group whose publisher is there and says and does nothing."""
+class IdleGroup:
+    """A group whose publisher exists and does nothing."""
 
     def __init__(self):
         self.channels = SimpleNamespace(specs=None, rings=())
         self.started = 0
         self.silent_s = 0.0
-        self.asked = lambda: None
+        self.on_poll = lambda: None
 
     def idle_process(self, process):
         self.started += 1
 
     def __getitem__(self, process):
         return SimpleNamespace(
-            messages=lambda timeout_s: self.asked() or [],
+            messages=lambda timeout_s: self.on_poll() or [],
             kill=lambda: None,
             send=lambda message: None,
         )
@@ -208,26 +208,26 @@ class StillGroup:
         return self.silent_s
 
 
-@pytest.mark.parametrize(("heard", "patience_s"), [(False, 60.0), (True, 5.0)])
-def test_one_that_is_only_starting_has_time_on_a_busy_computer(heard, patience_s):
-    group = StillGroup()
+@pytest.mark.parametrize(("is_ready", "timeout_s"), [(False, 60.0), (True, 5.0)])
+def test_starting_view_has_a_longer_timeout(is_ready, timeout_s):
+    group = IdleGroup()
     view = live_view.LiveViewClient(group, "rig")
-    view._is_ready = heard
+    view._is_ready = is_ready
     while group.started == 1:
         group.silent_s += 0.1
         view.check()
-    assert group.silent_s == pytest.approx(patience_s, abs=0.5)
+    assert group.silent_s == pytest.approx(timeout_s, abs=0.5)
 
 
-def test_a_view_that_does_not_begin_holds_no_stop_up(order):
-    group, stop, asked = StillGroup(), StopRequest(), []
+def test_stop_is_not_delayed_by_a_missing_view(order):
+    group, stop, polls = IdleGroup(), StopRequest(), []
 
-    def ask():
-        asked.append(1)
-        if len(asked) == 3:
+    def poll():
+        polls.append(1)
+        if len(polls) == 3:
             stop.request()
 
-    group.asked = ask
+    group.on_poll = poll
     view = live_view.LiveViewClient(group, "rig")
     assert view.show(order("held up"), stop).startswith("The live view is still starting")
-    assert len(asked) == 4  # once more for what it shows
+    assert len(polls) == 4  # once more for what it shows

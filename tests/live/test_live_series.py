@@ -1,4 +1,4 @@
-"""One publisher for all sessions of a rig: a recording for each, and nothing that adds up."""
+"""One publisher for all sessions of a rig: a recording for each, and no accumulation."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.process
 def run_session(publisher, name: str) -> tuple[int, int]:
     """Make the producer's next quarter of a second a separate session.
 
-    Returns with which sample it began, and how many there were when it was over.
+    Return its first sample, and the number of samples at its end.
     """
     producer = publisher.producer
     begins = tuple(ring.written_count for ring in producer.channels.rings)
@@ -35,8 +35,8 @@ def threads(pid: int) -> int:
 
 
 @pytest.mark.further  # as of a rig's series
-def test_every_session_is_a_recording_with_its_own_samples(unhurried, receive):
-    publisher = unhurried
+def test_each_session_is_a_recording_with_its_own_samples(publisher_without_drops, receive):
+    publisher = publisher_without_drops
     received = receive(publisher)
     publisher.finish()
     bounds = {f"recording of {name}": run_session(publisher, name) for name in ("second", "third")}
@@ -50,9 +50,9 @@ def test_every_session_is_a_recording_with_its_own_samples(unhurried, receive):
 
 
 @pytest.mark.further  # at length
-def test_sessions_leave_nothing_behind(publisher):
+def test_sessions_leave_no_memory_and_threads(publisher):
     publisher.finish()
-    for number in range(4):  # what is made once, and kept
+    for number in range(4):  # objects that are made once, and stored
         run_session(publisher, f"early {number}")
     pid, server = publisher.process.pid, publisher.server_pid
     before_mb, before = resident_mb(pid), threads(pid)
@@ -64,7 +64,7 @@ def test_sessions_leave_nothing_behind(publisher):
 
 
 @pytest.mark.slow
-def test_a_session_that_begins_while_the_server_is_frozen_is_shown_when_it_goes_on(
+def test_session_begun_with_a_frozen_server_is_shown_later(
     start_producer, start_publisher, receive
 ):
     producer = start_producer(speed=8.0)
@@ -79,12 +79,12 @@ def test_a_session_that_begins_while_the_server_is_frozen_is_shown_when_it_goes_
     os.kill(server, signal.SIGCONT)
     dropped = -1
 
-    def goes_on() -> bool:
+    def count_is_constant() -> bool:
         nonlocal dropped
         before, dropped = dropped, publisher.dropped
         time.sleep(0.3)
         return dropped == before
 
-    assert eventually(goes_on)
+    assert eventually(count_is_constant)
     columns = receive(publisher)()["recording of next"]
     assert columns("/signals", "angle_mrad")[0].size > 100

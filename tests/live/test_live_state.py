@@ -1,4 +1,4 @@
-"""The overview says within a second in which state a session is, and why."""
+"""The overview shows the state of a session and its reason within a second."""
 
 import json
 import time
@@ -27,10 +27,10 @@ from rigd.view.frequency_charts import LastResponse
 pytestmark = pytest.mark.process
 
 PERIOD_S = 1 / 15
-"""Between two looks at the board, of a publisher that shows a session."""
+"""Period at which a publisher with a session reads the shared state."""
 
 
-def test_the_board_tells_every_state_of_a_session(channels):
+def test_every_state_of_a_session_in_the_shared_state(channels):
     shared_state, states = channels.shared_state, SessionStateReader(channels)
 
     def state(**words):
@@ -49,7 +49,7 @@ def test_the_board_tells_every_state_of_a_session(channels):
     assert state(PHASE=Phase.OFF) == FINISHING
 
 
-def test_a_supervisor_that_hangs_is_told_within_a_second(channels):
+def test_hanging_supervisor_is_reported_within_a_second(channels):
     shared_state, states, now_s = channels.shared_state, SessionStateReader(channels), 100.0
     shared_state[StateField.GO], shared_state[StateField.PHASE] = 1, Phase.RUNNING
     for _ in range(100):
@@ -67,40 +67,40 @@ def test_a_supervisor_that_hangs_is_told_within_a_second(channels):
         now_s += PERIOD_S
         state = states.read(now_s)
     assert state == SUPERVISOR_SILENT_TORQUE_OFF
-    shared_state[StateField.GO] = 0  # before a record nobody need be there at once
+    shared_state[StateField.GO] = 0  # before a record the supervisor may be silent
     assert states.read(now_s + PERIOD_S) == preparing()
 
 
 def words(columns) -> list[str]:
-    """Return the headings of the banner, in the order in which they came."""
+    """Return the headings of the banner, in the order of their times."""
     _, texts = columns.sent("/state", "TextDocument:text")
     found = [text.split("\n")[0].removeprefix("# ").split(" · ")[0] for (text,) in texts]
     return [word for i, word in enumerate(found) if i == 0 or word != found[i - 1]]
 
 
 def first_sent_s(columns, word: str) -> float:
-    sent_s, texts = columns.sent("/state", "TextDocument:text")
-    return min(s for s, (text,) in zip(sent_s, texts, strict=True) if text.startswith(f"# {word}"))
+    times_s, texts = columns.sent("/state", "TextDocument:text")
+    return min(s for s, (text,) in zip(times_s, texts, strict=True) if text.startswith(f"# {word}"))
 
 
-@pytest.mark.further  # as by the board, and in what is received
+@pytest.mark.further  # as by the shared state, and in the received recordings
 def test_running_and_fault_are_shown_within_a_second(publisher, producer, receive):
-    shared_state, told_s = producer.channels.shared_state, {"RUNNING": [], "FAULT": []}
+    shared_state, sent_s = producer.channels.shared_state, {"RUNNING": [], "FAULT": []}
     received = receive(publisher)
-    for number in range(3):  # what else happens on this computer only makes it slower
+    for number in range(3):  # other load on this computer only makes it slower
         begins = tuple(ring.written_count for ring in producer.channels.rings)
         publisher.show(f"session {number}", begins)
-        told_s["RUNNING"].append(time.time())
+        sent_s["RUNNING"].append(time.time())
         shared_state[StateField.PHASE] = Phase.RUNNING
         time.sleep(0.5)
-        told_s["FAULT"].append(time.time())
+        sent_s["FAULT"].append(time.time())
         publisher.finish("fault", "The drive was lost.")
         time.sleep(0.3)
     recordings = received()
-    for word, times_s in told_s.items():
+    for word, times_s in sent_s.items():
         delays_s = [
-            first_sent_s(recordings[f"recording of session {number}"], word) - told
-            for number, told in enumerate(times_s)
+            first_sent_s(recordings[f"recording of session {number}"], word) - event_s
+            for number, event_s in enumerate(times_s)
         ]
         assert min(delays_s) < 1.0, (word, delays_s)
     shown = recordings["recording of session 0"]
@@ -109,7 +109,7 @@ def test_running_and_fault_are_shown_within_a_second(publisher, producer, receiv
     assert "The drive was lost." in texts[-1][0]
 
 
-def test_the_end_of_a_session_is_shown_with_its_reason(received):
+def test_end_of_a_session_is_shown_with_its_reason(received):
     shown = received["fault"]
     assert words(shown)[-2:] == ["RUNNING", "FAULT"]
     _, texts = shown.sent("/state", "TextDocument:text")
@@ -124,12 +124,12 @@ def assert_supervisor_lost(columns, *, off):
     assert lines[-1][0].startswith("The supervising process ended")
 
 
-def test_a_lost_supervisor_is_named(received):
+def test_lost_supervisor_is_reported(received):
     assert_supervisor_lost(received["lost"], off=False)
 
 
 @pytest.mark.further
-def test_a_lost_supervisor_is_named_with_the_torque_off(producer, start_publisher, save):
+def test_lost_supervisor_is_reported_with_the_torque_off(producer, start_publisher, save):
     publisher = start_publisher(
         first="from rigd.live import publisher as p; p._MAX_ORPHANED_S = 0.5"
     )
@@ -146,7 +146,7 @@ def test_a_lost_supervisor_is_named_with_the_torque_off(producer, start_publishe
 # Response of the last session
 
 
-def look(folder: Path, name: str, specimen: str | None, magnitude: float = 2.0) -> None:
+def write_quick_look(folder: Path, name: str, specimen: str | None, magnitude: float = 2.0) -> None:
     response = {
         "frequency_hz": [1.0, 2.0], "magnitude": [magnitude, 1.0], "phase_rad": [np.pi, 0.0]
     }  # fmt: skip
@@ -156,11 +156,11 @@ def look(folder: Path, name: str, specimen: str | None, magnitude: float = 2.0) 
     (folder / f"{name}.look.json").write_text(text)
 
 
-def own(session: str, specimen: str) -> LastResponse:
+def computed_response(session: str, specimen: str) -> LastResponse:
     return LastResponse(session, specimen, np.array([1.0]), np.array([5.0 + 0j]))
 
 
-def asked(folder: Path | None, specimen: str) -> LiveSession:
+def live_session(folder: Path | None, specimen: str) -> LiveSession:
     beam = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
     description = SessionDescription(
         "20261122-120000-chirp", 1000.0, 10, (0, 10), beam, None, specimen=specimen
@@ -168,24 +168,27 @@ def asked(folder: Path | None, specimen: str) -> LiveSession:
     return LiveSession(description, "id", (0,), folder)
 
 
-def test_the_newest_quick_look_of_the_specimen_is_taken(tmp_path):
-    look(tmp_path, "20261122-100000-chirp", "A", magnitude=1.0)
-    look(tmp_path, "20261122-110000-chirp", "A", magnitude=3.0)
-    look(tmp_path, "20261122-113000-chirp", "B")
-    look(tmp_path, "20261122-114000-chirp", None)
+def test_newest_quick_look_of_the_specimen_is_used(tmp_path):
+    write_quick_look(tmp_path, "20261122-100000-chirp", "A", magnitude=1.0)
+    write_quick_look(tmp_path, "20261122-110000-chirp", "A", magnitude=3.0)
+    write_quick_look(tmp_path, "20261122-113000-chirp", "B")
+    write_quick_look(tmp_path, "20261122-114000-chirp", None)
     (tmp_path / "20261122-115000-chirp.look.json").write_text("{")
-    found = last_response(asked(tmp_path, "A"), None)
+    found = last_response(live_session(tmp_path, "A"), None)
     assert found.session == "20261122-110000-chirp"
     assert found.frequency_hz.tolist() == [1.0, 2.0]
     assert found.response == pytest.approx([-3.0, 1.0])
-    assert last_response(asked(tmp_path, ""), None).session == "20261122-114000-chirp"
-    assert last_response(asked(tmp_path, "C"), None) is None
+    assert last_response(live_session(tmp_path, ""), None).session == "20261122-114000-chirp"
+    assert last_response(live_session(tmp_path, "C"), None) is None
 
 
-def test_what_the_view_computed_itself_stands_in_for_a_look_that_is_not_there_yet(tmp_path):
-    look(tmp_path, "20261122-100000-chirp", "A")
-    later, earlier = own("20261122-113000-chirp", "A"), own("20261122-090000-chirp", "A")
-    assert last_response(asked(tmp_path, "A"), later) is later
-    assert last_response(asked(tmp_path, "A"), earlier).session == "20261122-100000-chirp"
-    assert last_response(asked(None, "A"), earlier) is earlier
-    assert last_response(asked(None, "B"), later) is None
+def test_computed_response_replaces_a_missing_quick_look(tmp_path):
+    write_quick_look(tmp_path, "20261122-100000-chirp", "A")
+    later, earlier = (
+        computed_response("20261122-113000-chirp", "A"),
+        computed_response("20261122-090000-chirp", "A"),
+    )
+    assert last_response(live_session(tmp_path, "A"), later) is later
+    assert last_response(live_session(tmp_path, "A"), earlier).session == "20261122-100000-chirp"
+    assert last_response(live_session(None, "A"), earlier) is earlier
+    assert last_response(live_session(None, "B"), later) is None

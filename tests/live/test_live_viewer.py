@@ -25,10 +25,10 @@ def viewer(publisher, tmp_path):
 
 @pytest.fixture
 def shown_s(viewer):
-    """The time up to which it shows the recording that is in front."""
+    """Time up to which the viewer shows the recording in front."""
     from rerun.experimental import ViewerClient
 
-    def ask() -> float:
+    def read_time_s() -> float:
         if viewer.exit_code is not None:
             viewer_ended(viewer)
         try:
@@ -38,43 +38,43 @@ def shown_s(viewer):
         front = [r for r in state.recordings if r.store_id == state.active_recording]
         return (front[0].current_time or 0) * 1e-9 if front else 0.0
 
-    return ask
+    return read_time_s
 
 
 @pytest.fixture
 def current(publisher, shown_s):
-    """Whether it shows what has just come."""
+    """Whether the viewer shows the newest samples."""
     return lambda: shown_s() > publisher.producer.tick * 1e-3 - 1.5
 
 
-def test_it_shows_the_newest_also_of_another_server(publisher, viewer, shown_s, current):
+def test_viewer_follows_the_newest_samples_and_another_server(publisher, viewer, shown_s, current):
     assert eventually(lambda: shown_s() > 0.5)
     assert eventually(current)
     addresses = {address for end in sockets(viewer.pid) for address in end.addresses}
     assert addresses == {"0100007F", "00000000"}, "127.0.0.1, and the far end of a listening socket"
 
-    # When the server is another one, it is brought back to the same session.
+    # After a change of the server, it reconnects to the same session.
     os.kill(publisher.server_pid, signal.SIGKILL)
     address = publisher.next_address()
     assert eventually(lambda: viewer.connect(address)), "while it is busy, it is asked again"
-    then_s = publisher.producer.tick * 1e-3
-    assert eventually(lambda: shown_s() > then_s)
+    before_s = publisher.producer.tick * 1e-3
+    assert eventually(lambda: shown_s() > before_s)
     assert eventually(current)
     assert publisher.producer.refused == 0
 
 
 @pytest.mark.further  # as viewers that are no window, in test_live_publisher.py
-def test_it_keeps_up_when_it_stood_still_and_through_sessions(publisher, viewer, shown_s, current):
+def test_viewer_catches_up_after_a_stall_and_across_sessions(publisher, viewer, shown_s, current):
     assert eventually(lambda: shown_s() > 1.0)
 
-    # A window that stands still holds nobody up, and catches up.
+    # A suspended window delays nothing, and catches up.
     os.kill(viewer.pid, signal.SIGSTOP)
     until = publisher.producer.tick + 1000
     assert eventually(lambda: publisher.producer.tick > until)
     os.kill(viewer.pid, signal.SIGCONT)
     assert eventually(current)
 
-    # Sessions follow each other in it.
+    # It shows sessions one after the other.
     publisher.finish()
     begins = tuple(ring.written_count for ring in publisher.producer.channels.rings)
     publisher.show("second", begins)
@@ -87,11 +87,11 @@ def test_it_keeps_up_when_it_stood_still_and_through_sessions(publisher, viewer,
     [("VK_DRIVER_FILES",), ("VK_DRIVER_FILES", "__EGL_VENDOR_LIBRARY_FILENAMES")],
     ids=["OpenGL alone", "neither Vulkan nor OpenGL"],
 )
-def test_a_computer_without_vulkan_is_told_which_package_it_lacks(tmp_path, monkeypatch, absent):
+def test_error_without_vulkan_names_the_missing_package(tmp_path, monkeypatch, absent):
     for variable in absent:
         monkeypatch.setenv(variable, "/nonexistent")
-    nobody = LiveAddress.for_this_process("sim", grpc_port=9, page_port=9, server=1)
-    window = Viewer(nobody, tmp_path, ("--headless", "--window-size", "320x200"))
+    unused_address = LiveAddress.for_this_process("sim", grpc_port=9, page_port=9, server=1)
+    window = Viewer(unused_address, tmp_path, ("--headless", "--window-size", "320x200"))
     try:
         assert eventually(lambda: window.exit_code is not None)
     finally:
@@ -103,9 +103,7 @@ def test_a_computer_without_vulkan_is_told_which_package_it_lacks(tmp_path, monk
 
 
 @pytest.mark.further  # as a server that is killed
-def test_a_window_that_does_not_answer_is_waited_for_by_nobody(
-    publisher, viewer, shown_s, monkeypatch
-):
+def test_wait_for_an_unresponsive_window_is_limited(publisher, viewer, shown_s, monkeypatch):
     assert eventually(lambda: shown_s() > 0.5)
     monkeypatch.setattr("rigd.live._viewer._SWITCH_TIMEOUT_S", 0.5)
     os.kill(viewer.pid, signal.SIGSTOP)

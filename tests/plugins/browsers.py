@@ -1,4 +1,4 @@
-"""A headless Chromium for tests of pages, and a page in it that must not complain."""
+"""A headless Chromium for tests of pages, and a page in it that must log no error."""
 
 import re
 import shutil
@@ -7,9 +7,9 @@ import pytest
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PATIENCE_MS = 15_000
-"""For what only takes long on a computer that is overloaded; what is to be quick is timed."""
+"""For waits that are long on an overloaded computer only; fast responses are timed."""
 _REFUSED = r"status of 40[39]"
-"""Chromium logs what a server refuses, which the page shows."""
+"""Chromium logs refusals of a server, which the page shows."""
 
 
 @pytest.fixture(scope="module")  # while it is open, its thread cannot run another event loop
@@ -35,9 +35,9 @@ def desktop(browser):
 
 @pytest.fixture
 def open_page(desktop):
-    """Open a page of an address; at the end none may have made an error or asked elsewhere.
+    """Open a page of an address; none may log an error or send requests to other servers.
 
-    `open_page.complaints` has what browser and page complained of.
+    `open_page.complaints` has the errors of browser and page.
     """
     pages, complaints = [], []
 
@@ -47,17 +47,17 @@ def open_page(desktop):
         if width != 1280:
             page.set_viewport_size({"width": width, "height": 844})
 
-        def hear(told):
-            if told.type == "error" and not re.search(_REFUSED, told.text):
-                complaints.append(told.text)
+        def on_console(message):
+            if message.type == "error" and not re.search(_REFUSED, message.text):
+                complaints.append(message.text)
 
-        def watch(request):
+        def on_request(request):
             if request.url.split("/")[2] != address.split("/")[2]:
                 complaints.append(f"asked for {request.url}")
 
         page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("console", hear)
-        page.on("request", watch)
+        page.on("console", on_console)
+        page.on("request", on_request)
         page.goto(address)
         return page
 

@@ -72,29 +72,29 @@ def status(state="ready", **members):
     }  # fmt: skip
 
 
-def progress(share, total_s=136.0, **members):
+def progress(fraction, total_s=136.0, **members):
     total = round(1000 * total_s)
     return {
         "type": "progress", "session": 1, "repeat": 1, "phase": "running",
-        "tick": round(share * total), "total": total, "percent": 100 * share,
-        "time_left_s": total_s * (1 - share), "missed": 0, "late": 3, "lost": 0, **members,
+        "tick": round(fraction * total), "total": total, "percent": 100 * fraction,
+        "time_left_s": total_s * (1 - fraction), "missed": 0, "late": 3, "lost": 0, **members,
     }  # fmt: skip
 
 
-def gauges(share=0.4, frequency_hz=12.3):
+def gauges(fraction=0.4, frequency_hz=12.3):
     limits = {
         "angle": (0.5, "rad"), "velocity": (10.0, "rad/s"), "tracking_error": (0.05, "rad"),
         "torque_command": (60.0, "N·m"), "i2t": (0.5, "N·m"),
         **dict.fromkeys(("fx", "fy", "fz"), (20.0, "N")),
         **dict.fromkeys(("tx", "ty", "tz"), (1.0, "N·m")),
     }  # fmt: skip
-    shares = [share * (0.35 + 0.65 * math.cos(k) ** 2) for k in range(len(limits))]
-    shares[0] = share
+    fractions = [fraction * (0.35 + 0.65 * math.cos(k) ** 2) for k in range(len(limits))]
+    fractions[0] = fraction
     return {
         "type": "gauges", "frequency_hz": frequency_hz,
         **{
-            name: {"value": part * limit, "limit": limit, "unit": unit, "fraction": part}
-            for (name, (limit, unit)), part in zip(limits.items(), shares, strict=True)
+            name: {"value": each * limit, "limit": limit, "unit": unit, "fraction": each}
+            for (name, (limit, unit)), each in zip(limits.items(), fractions, strict=True)
         },
     }  # fmt: skip
 
@@ -173,7 +173,7 @@ def job(state, **members):
     }  # fmt: skip
 
 
-LOOK = {
+QUICK_LOOK = {
     "version": 1, "modes": MODES, "coherence": {"mean": 0.981, "low_bands": [[4.0, 4.4]]},
     "flags": ["Damping of mode 3 is uncertain: near the end of the band."],
     "against_last": {
@@ -199,23 +199,23 @@ PLAN = {
 
 
 class FakeWebServer:
-    """Serves the page in its own thread; a test says what is told and what is answered.
+    """Serves the page in its own thread; a test sets its messages and replies.
 
     Attributes
     ----------
     greeting
-        Messages that every page gets when it connects.
+        Messages sent to every page when it connects.
     replies
-        Answers to commands by their names; others are granted. None: there is no answer.
-    asked
-        Requests that came: name of the command, and whether the token was right.
+        Replies to commands by their names; others succeed. None: no reply.
+    commands
+        Received requests: name of the command, and whether the token was right.
     """
 
     def __init__(self):
         self.greeting = [hello(), status()]
         self.replies = {"predict": {"plan": PLAN, "largest_amplitude_rad": 0.02867}}
         self.sessions = [session(k) for k in range(3)]
-        self.asked = []
+        self.commands = []
         self.requests = []
         self._pages = set()
         self._listening = threading.Event()
@@ -227,9 +227,9 @@ class FakeWebServer:
     def address(self):
         return f"http://127.0.0.1:{self.port}/"
 
-    def tell(self, *messages):
+    def send(self, *messages):
         """Send messages to every page, and wait until they are sent."""
-        asyncio.run_coroutine_threadsafe(self._tell(messages), self._loop).result(30.0)
+        asyncio.run_coroutine_threadsafe(self._send(messages), self._loop).result(30.0)
 
     def hang_up(self):
         """Close the connections of all pages."""
@@ -240,7 +240,7 @@ class FakeWebServer:
             self._loop.call_soon_threadsafe(self._ending.set)
             self._thread.join(30.0)
 
-    async def _tell(self, messages):
+    async def _send(self, messages):
         for page in list(self._pages):
             for message in messages:
                 await page.send_json(message)
@@ -261,7 +261,7 @@ class FakeWebServer:
         app.router.add_get("/api/live", self._live)
         app.router.add_post("/api/command", self._command)
         app.router.add_get("/api/sessions", self._list)
-        app.router.add_get("/api/sessions/{id}/look", self._look)
+        app.router.add_get("/api/sessions/{id}/look", self._quick_look)
         app.router.add_get("/api/sessions/{id}/file.mat", self._never)
         app.router.add_post("/api/sessions/{id}/report", self._job)
         app.router.add_post("/api/campaign", self._job)
@@ -286,10 +286,12 @@ class FakeWebServer:
         for message in self.greeting:
             await page.send_json(message)
         self._pages.add(page)
-        async for said in page:
-            self.asked.append((said.data, False))
-            if said.data in self.replies and self.replies[said.data] is not None:
-                await page.send_json({"type": said.data, "ok": True, **self.replies[said.data]})
+        async for message in page:
+            self.commands.append((message.data, False))
+            if message.data in self.replies and self.replies[message.data] is not None:
+                await page.send_json(
+                    {"type": message.data, "ok": True, **self.replies[message.data]}
+                )
         self._pages.discard(page)
         return page
 
@@ -297,7 +299,7 @@ class FakeWebServer:
         body = await request.json()
         right = request.headers.get("Authorization") == f"Bearer {TOKEN}"
         assert request.headers["X-Rigd"] == "1"
-        self.asked.append((body["command"], right))
+        self.commands.append((body["command"], right))
         self.requests.append(body)
         reply = {"ok": True, **self.replies.get(body["command"], {})}
         return web.json_response(reply, status=200 if reply["ok"] else 409)
@@ -308,17 +310,17 @@ class FakeWebServer:
         limit = int(request.query["limit"])
         return web.json_response({"total": len(found), "sessions": found[:limit]})
 
-    async def _look(self, request):
-        return web.json_response(LOOK)
+    async def _quick_look(self, request):
+        return web.json_response(QUICK_LOOK)
 
     async def _never(self, request):
-        self.asked.append(("file", False))
+        self.commands.append(("file", False))
         await self._ending.wait()
         return web.Response()
 
     async def _job(self, request):
-        self.asked.append((request.path, "Authorization" in request.headers))
-        await self._tell([job("running", kind=request.path.split("/")[-1])])
+        self.commands.append((request.path, "Authorization" in request.headers))
+        await self._send([job("running", kind=request.path.split("/")[-1])])
         return web.json_response({"ok": True, "job": 1}, status=202)
 
     async def _frf(self, request):

@@ -1,4 +1,4 @@
-"""Tests that look at what Rerun's viewer draws, on computers where it can draw nothing."""
+"""Tests of drawings by Rerun's viewer, on computers where it cannot draw."""
 
 import re
 from typing import NoReturn, Protocol
@@ -28,8 +28,8 @@ def viewer_ended(viewer: ControlEnded) -> NoReturn:
     pytest.fail(viewer.last_log_lines)
 
 
-def viewer_said(log: str) -> NoReturn:
-    """Likewise, of a viewer whose log somebody else has."""
+def viewer_ended_with_log(log: str) -> NoReturn:
+    """End a test by the log of a viewer that has ended: skipped or failed, as above."""
     if _WITHOUT_GRAPHICS.search(log):
         pytest.skip(NO_GRAPHICS)
     pytest.fail(log)

@@ -14,12 +14,12 @@ ON_THE_WAY, CERTAIN = 0.03, 0.001
 _NAMES = ("zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "bending_stiffness_n_m2")
 
 
-def answer(profile, tick, share, flag=None, with_air_drag=False):
-    """Return what the fit answers where every number has a share of itself as its deviation."""
+def answer(profile, tick, relative_std, flag=None, with_air_drag=False):
+    """Return the answer of the fit whose values all have this relative standard deviation."""
     beam, damping = profile.rig.beam, profile.rig.damping
 
     def quantity(value):
-        std = share * value
+        std = relative_std * value
         ends = [value - 2 * std, value + 2 * std]
         return {"value": value, "std": std, "interval_95": ends, "flag": flag}
 
@@ -75,8 +75,8 @@ class KnownBeamEstimator:
 
     def estimate(self, tick, *, whole, from_last):
         self._estimates += 1
-        share = ON_THE_WAY if self._estimates == 1 else CERTAIN
-        document = answer(self._profile, min(tick, self._samples), share)
+        relative_std = ON_THE_WAY if self._estimates == 1 else CERTAIN
+        document = answer(self._profile, min(tick, self._samples), relative_std)
         document["duration_s"] = document["tick"] / self._rate_hz
         return SimpleNamespace(as_json=lambda: document)
 

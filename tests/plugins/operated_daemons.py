@@ -292,8 +292,8 @@ class Operated:
     def state(self):
         return self.service.state
 
-    def ask(self, command, *, peer=None, **fields):
-        """Have a request obeyed to its end; returns the reply, or the refusal."""
+    def request(self, command, *, peer=None, **fields):
+        """Execute a request to its end; return the reply or the refusal."""
         return self.loop.run_until_complete(self.handle(command, peer=peer, **fields))
 
     async def handle(self, command, *, peer=None, **fields):
@@ -308,7 +308,7 @@ class Operated:
         return reply
 
     def meanwhile(self, command, **fields):
-        """Ask from another thread, while a session runs."""
+        """Make a request from another thread, while a session runs."""
         line = json.dumps({"command": command, **fields}).encode()
         handled = self.service.execute(parse_request(line), self.peer)
         try:

@@ -1,4 +1,4 @@
-"""The page's server before a daemon that only notes what it is asked, and the real daemon."""
+"""The page's server in front of a daemon that only records requests, and the real daemon."""
 
 import asyncio
 import contextlib
@@ -39,10 +39,10 @@ STATUS = {
 
 
 class FakeDaemon:
-    """A socket that answers as the daemon does, and obeys nothing."""
+    """A socket that answers as the daemon does, and executes nothing."""
 
     def __init__(self):
-        self.asked = []
+        self.requests = []
         self.status = dict(STATUS)
         self.replies = {}
         self.delays = {}
@@ -53,7 +53,7 @@ class FakeDaemon:
 
     @property
     def acted(self):
-        return [each for each in self.asked if each["command"] in ACTING]
+        return [each for each in self.requests if each["command"] in ACTING]
 
     async def serve(self, reader, writer):
         self.connected.add(writer)
@@ -61,7 +61,7 @@ class FakeDaemon:
             while line := await reader.readline():
                 request = json.loads(line)
                 command = request["command"]
-                self.asked.append(request)
+                self.requests.append(request)
                 if command == "watch":
                     self.watchers.append(writer)
                 if self.silent:
@@ -69,28 +69,28 @@ class FakeDaemon:
                 if command in self.delays:
                     await self.delays[command].wait()
                 reply = {"reply": command, "ok": True} | self.replies.get(command, {})
-                self.say(writer, self.status | reply if command == "status" else reply)
+                self._send(writer, self.status | reply if command == "status" else reply)
         self.connected.discard(writer)
         writer.close()
 
-    def say(self, writer, document):
+    def _send(self, writer, document):
         writer.write(json.dumps(document).encode() + b"\n")
 
     def publish(self, event):
         for writer in self.watchers:
-            self.say(writer, event)
+            self._send(writer, event)
 
 
 class Requests:
     """Requests to a page's server, byte by byte; it has a `port`."""
 
-    patience_s = 30.0
+    timeout_s = 30.0
 
     def connect(self):
-        return socket.create_connection(("127.0.0.1", self.port), self.patience_s)
+        return socket.create_connection(("127.0.0.1", self.port), self.timeout_s)
 
     def send(self, data):
-        """Send bytes; returns what is answered, to the end of the connection or of the answer."""
+        """Send bytes; return the answer, to the end of the connection or of the answer."""
         with self.connect() as link:
             with contextlib.suppress(ConnectionError):  # it may be closed before all is sent
                 for block in [data] if isinstance(data, bytes) else data:
@@ -101,8 +101,8 @@ class Requests:
                     answer += block
             return answer
 
-    def ask(self, method, target, headers=(), body=b""):
-        """Send a request; returns its status and what comes with it."""
+    def request(self, method, target, headers=(), body=b""):
+        """Send a request; return status, head and body of the answer."""
         given = {"Host": f"127.0.0.1:{self.port}", "Connection": "close"} | dict(headers)
         if body:
             given.setdefault("Content-Length", str(len(body)))
@@ -154,7 +154,7 @@ class Served(Requests):
         await runner.cleanup()
 
     def call(self, function, *arguments):
-        """Have a function called in the server's thread."""
+        """Call a function in the server's thread."""
         self.loop.call_soon_threadsafe(function, *arguments)
 
     def close(self):
@@ -178,15 +178,15 @@ def rig_with_page(write_profile_in, folder, *options):
     name = f"page-{os.getpid()}-{time.monotonic_ns()}"
     profile = write_profile_in(folder, "sim", {"name": f'"{name}"'}, patient=True)
     command = [_RIGD, "serve", "--profile", profile, "--output", folder / "out", "--web", *options]
-    told = folder / "serve.txt"
+    log_path = folder / "serve.txt"
     environment = {name: value for name, value in os.environ.items() if name != "RIGD_NO_LOOK"}
-    with told.open("w") as said:
+    with log_path.open("w") as log:
         process = warm_start.start(
-            command, stdout=said, stderr=said, start_new_session=True, env=environment
+            command, stdout=log, stderr=log, start_new_session=True, env=environment
         )
     try:
         address = eventually(lambda: page_address(name), within_s=60.0)
-        assert address, told.read_text()
+        assert address, log_path.read_text()
         yield Rig(process, name, folder / "out", address)
     finally:
         process.send_signal(signal.SIGCONT)
@@ -236,7 +236,7 @@ def replace_in_page(monkeypatch):
 
 @pytest.fixture
 def run_instead(replace_in_page, monkeypatch, tmp_path):
-    """Have jobs run Python code in place of `analyze`: that of their first argument, or the one."""
+    """Have jobs run Python code in place of `analyze`: their first argument or the code given."""
 
     def run_instead(code="exec(sys.argv.pop(1))", **parts):
         (tmp_path / "stand_in.py").write_text(f"import sys\n{code}\n")
@@ -247,6 +247,6 @@ def run_instead(replace_in_page, monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def hurried(replace_in_page):
-    """Who says nothing is let go soon."""
+def short_timeouts(replace_in_page):
+    """Disconnect silent clients soon."""
     replace_in_page(silent_s=0.05, read_s=0.05)

@@ -1,4 +1,4 @@
-"""Of which sessions the live view shows fits, and of how many modes."""
+"""Sessions whose fits the live view shows, and the number of modes."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from rigd.runner.request import SessionOrder
         ("until", {"targets": "damping 1%"}, False, 3),
     ],
 )
-def test_plots_are_of_the_modes_that_are_expected_in_the_band(kind, parameters, watch_fit, modes):
+def test_plotted_modes_are_those_expected_in_the_band(kind, parameters, watch_fit, modes):
     profile = load_shipped("sim")
     excitation = make_excitation(kind, parameters, profile.rig.rate_hz)
     order = SessionOrder(profile, excitation, Path("a.mcap"), watch_fit=watch_fit)

@@ -1,4 +1,4 @@
-"""What a search is said to have come to, once the whole record is fitted."""
+"""The result of a search after the fit of the whole record."""
 
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -15,7 +15,7 @@ REACHED = SearchEnded(True, "Reached: damping of mode 1 0.009, standard deviatio
 NOT_REACHED = SearchEnded(False, "Not reached within 20 s (--at-most).", {})
 
 
-def of_whole_record(std: float, *, final: bool = True) -> FitReport:
+def fit_of_record(std: float, *, final: bool = True) -> FitReport:
     damping = {"value": 0.01, "std": std, "flag": None}
     mode = {
         "mode": 1,
@@ -38,8 +38,8 @@ def of_whole_record(std: float, *, final: bool = True) -> FitReport:
 )
 def test_reason_and_result_agree(ended, std, reached, reason):
     group = MagicMock()
-    told = [each for each in (ended, of_whole_record(std)) if each is not None]
-    group.__getitem__().messages.return_value = told
+    messages = [each for each in (ended, fit_of_record(std)) if each is not None]
+    group.__getitem__().messages.return_value = messages
     search = SimpleNamespace(targets=(parse_target("damping", "1%"),))
     fit = FitClient(group, MagicMock(), MagicMock(), search)
     fit.begin(MagicMock())
@@ -50,13 +50,13 @@ def test_reason_and_result_agree(ended, std, reached, reason):
 
 
 STOPPED = {StateField.STOP: StopReason.OPERATOR}
-ON_THE_WAY = of_whole_record(0.9e-4, final=False)
+ON_THE_WAY = fit_of_record(0.9e-4, final=False)
 FAILED = FitReport({"problem": "The sensor stands still.", "modes": [], "text": []}, final=True)
-NOT_A_NUMBER = of_whole_record(float("nan"))
+NOT_A_NUMBER = fit_of_record(float("nan"))
 
 
 @pytest.mark.parametrize(
-    ("told", "board", "reached", "words"),
+    ("messages", "state", "reached", "words"),
     [
         ((REACHED, ON_THE_WAY), STOPPED, None,
          ("Reached on the way. Not known", "A stop skipped the fit", "Last estimate: damping of")),
@@ -70,18 +70,20 @@ NOT_A_NUMBER = of_whole_record(float("nan"))
         ((REACHED, NOT_A_NUMBER), {}, False, ("not by the whole record. So far: damping of mode",)),
     ],
 )  # fmt: skip
-def test_no_answer_of_the_whole_record_is_not_a_no(told, board, reached, words, monkeypatch):
+def test_result_is_unknown_without_a_fit_of_the_record(
+    messages, state, reached, words, monkeypatch
+):
     monkeypatch.setattr("rigd.runner._online_fit._STOPPED_FIT_TIMEOUT_S", 0.0)
     group = MagicMock()
-    group.channels.shared_state.__getitem__.side_effect = lambda word: board.get(word, 0)
+    group.channels.shared_state.__getitem__.side_effect = lambda word: state.get(word, 0)
 
-    def messages(_):
-        for message in told:
+    def read_messages(_):
+        for message in messages:
             if isinstance(message, ChildError):
                 raise message
             yield message
 
-    group.__getitem__().messages.side_effect = messages
+    group.__getitem__().messages.side_effect = read_messages
     search = SimpleNamespace(targets=(parse_target("damping", "1%"),))
     fit = FitClient(group, MagicMock(), MagicMock(), search)
     fit.begin(MagicMock())

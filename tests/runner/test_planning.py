@@ -1,4 +1,4 @@
-"""What a session will do, predicted and judged before anything moves."""
+"""Prediction of a session and its check against limits before motion."""
 
 from dataclasses import replace
 
@@ -20,14 +20,14 @@ from rigd.runner.planning import (
 )
 
 
-def test_the_papers_chirp_stays_within_the_shipped_limits(profile):
+def test_reference_chirp_is_within_the_shipped_limits(profile):
     plan = plan_session(profile, chirp(rate_hz=1000.0))
     assert plan.warnings == ()
     assert plan.prediction.peak_torque_nm == pytest.approx(0.41, abs=0.01)
     assert plan.prediction.peak_angle_rad == pytest.approx(0.025, rel=0.01)
 
 
-def test_the_papers_chirp_is_no_small_deflection(profile):
+def test_tip_deflection_of_the_reference_chirp_is_large(profile):
     """36 % of the length at mode 1, and 0.6 rad at mode 2; a tenth of it is."""
     plan = plan_session(profile, chirp(rate_hz=1000.0))
     tip = plan.prediction.tip
@@ -44,7 +44,7 @@ def test_the_papers_chirp_is_no_small_deflection(profile):
     assert "small" not in small.tip_in_words
 
 
-def test_slopes_count_and_not_the_deflection_alone(profile):
+def test_slope_limits_the_linear_model_at_small_deflection(profile):
     """Above mode 1 the tip deflects by 6 % of the length, and slopes by 0.3 rad."""
     excitation = chirp(rate_hz=1000.0, amplitude_rad=0.0125, start_hz=8.0)
     plan = plan_session(profile, excitation)
@@ -65,7 +65,7 @@ def test_ten_times_the_amplitude_saturates_and_may_be_forced(profile):
     assert not any("--force" in warning for warning in plan.warnings)
 
 
-def test_predicted_saturation_is_what_the_controller_does(profile):
+def test_predicted_saturation_is_that_of_the_controller(profile):
     """A step just below and just above the limit, tick by tick on the reference's jump."""
     model = profile.loop_model()
     gains = design_pid(2e-3, 0.02, 80.0)
@@ -89,7 +89,7 @@ def test_predicted_saturation_is_what_the_controller_does(profile):
         ),
     ],
 )
-def test_the_largest_amplitude_passes_and_a_little_more_does_not(profile, make, force):
+def test_largest_amplitude_is_accepted_and_a_larger_one_refused(profile, make, force):
     profile = with_tip_slope(profile, 10.0)
     largest_rad = largest_amplitude(profile, make(4.0), force=force)
     assert largest_amplitude(profile, make(1e-3), force=force) == pytest.approx(
@@ -100,7 +100,7 @@ def test_the_largest_amplitude_passes_and_a_little_more_does_not(profile, make, 
         plan_session(profile, make(1.011 * largest_rad), force=force)
 
 
-def test_what_has_no_amplitude_has_no_largest(profile, tmp_path):
+def test_no_largest_amplitude_without_an_amplitude(profile, tmp_path):
     path = tmp_path / "reference.csv"
     path.write_text("0\n3.0\n")
     far = from_csv(path, rate_hz=1000.0, ring_down_s=1.0)
@@ -110,7 +110,7 @@ def test_what_has_no_amplitude_has_no_largest(profile, tmp_path):
 
 
 @pytest.mark.parametrize("projection", [(0.0,) * 6, None])
-def test_a_search_whose_contact_force_is_not_known_is_warned_of(profile, projection):
+def test_warning_if_the_contact_force_is_unknown(profile, projection):
     sensor = profile.rig.sensor
     if projection is not None:
         sensor = replace(sensor, shear_projection=projection)
@@ -120,13 +120,13 @@ def test_a_search_whose_contact_force_is_not_known_is_warned_of(profile, project
 
 
 @pytest.mark.parametrize(
-    ("start_hz", "said"),
+    ("start_hz", "expected"),
     [(60.0, "sweeps down from 60 to 50 Hz"), (0.05, "sweeps from 0.05 to 50 Hz")],
 )
-def test_a_plan_says_which_way_a_chirp_sweeps(profile, start_hz, said):
+def test_plan_states_the_direction_of_a_chirp(profile, start_hz, expected):
     excitation = chirp(rate_hz=1000.0, start_hz=start_hz, duration_s=1.0, amplitude_rad=1e-3)
     document = plan_document(profile, excitation, plan_session(profile, excitation))
-    assert next(plan_lines(document)) == f"chirp on {profile.name}, {said}, record of 17 s."
+    assert next(plan_lines(document)) == f"chirp on {profile.name}, {expected}, record of 17 s."
 
 
 def test_angle_speed_and_tracking_can_never_be_forced(profile):
@@ -161,7 +161,7 @@ def test_the_sensor_s_range_bounds_the_coupling_torque(profile, projection):
             assert plan_session(narrow, excitation).warnings == ()
 
 
-def test_a_prediction_that_is_no_number_is_refused(profile, monkeypatch):
+def test_nan_prediction_is_refused(profile, monkeypatch):
     broken = replace(
         predict(close_loop(profile.loop_model()), chirp(rate_hz=1000.0, duration_s=1.0)),
         peak_angle_rad=float("nan"),

@@ -1,4 +1,4 @@
-"""What a search for a precision decides, estimate by estimate."""
+"""Decisions of a search for a precision, estimate by estimate."""
 
 import re
 
@@ -29,8 +29,8 @@ def profile():
     return load_profile("sim")
 
 
-class Bench:
-    """A search with what it writes to, and no process."""
+class SearchBench:
+    """A search with its outputs, without processes."""
 
     def __init__(self, profile, targets="damping 1%", at_most_s=60.0):
         self.profile = profile
@@ -43,8 +43,8 @@ class Bench:
         self.writer = ReferenceWriter(spec, self.shared_state)
         self.search = ExcitationPlanner(excitation.search, profile, self.writer)
 
-    def told(self, share, held=0, before=None, **more):
-        document = answer(self.profile, self.search.due_tick + held, share, **more)
+    def plan(self, relative_std, held=0, before=None, **more):
+        document = answer(self.profile, self.search.due_tick + held, relative_std, **more)
         return list(self.search.plan_next(document, held, held if before is None else before))
 
     def problem(self, text="Nothing is excited yet."):
@@ -52,21 +52,18 @@ class Bench:
 
 
 def test_a_search_may_state_the_uniformity_of_the_beam():
-    def stated(**given):
+    def uniformity_percent(**given):
         excitation = until(rate_hz=RATE_HZ, targets="alpha 0.01", **given)
         return excitation.parameters.get("uniformity_percent")
 
-    assert (stated(), stated(uniformity_percent=0.0)) == (None, 0.0)
+    assert (uniformity_percent(), uniformity_percent(uniformity_percent=0.0)) == (None, 0.0)
     for wrong in (-1.0, 10.1, np.nan):
         with pytest.raises(ExcitationError, match=r"uniformity_percent = \S+ % must lie between"):
-            stated(uniformity_percent=wrong)
+            uniformity_percent(uniformity_percent=wrong)
 
 
-def designed_at_once(monkeypatch, std):
-    """Pieces of a second of rest, in place of a design that takes its time.
-
-    Return the list of options with which each is asked for.
-    """
+def use_rest_segments(monkeypatch, std):
+    """Replace the slow design by segments of a second of rest; return the options of each call."""
     rest, planned = np.zeros(RATE_HZ), []
 
     def design(estimate, angle_rad, targets, rig, time_left_s, **options):
@@ -82,30 +79,30 @@ def designed_at_once(monkeypatch, std):
 
 
 @pytest.fixture
-def quick_pieces(monkeypatch):
-    """None of them is expected to suffice."""
-    designed_at_once(monkeypatch, std=1.0)
+def insufficient_segments(monkeypatch):
+    """Make rest segments that are never expected to suffice."""
+    use_rest_segments(monkeypatch, std=1.0)
 
 
 @pytest.fixture
-def quick_pauses(monkeypatch):
-    """What is planned is always expected to suffice."""
-    designed_at_once(monkeypatch, std=0.01)
+def sufficient_segments(monkeypatch):
+    """Make rest segments that are always expected to suffice."""
+    use_rest_segments(monkeypatch, std=0.01)
 
 
 @pytest.fixture
 def bench(profile):
-    return Bench(profile)
+    return SearchBench(profile)
 
 
-def test_a_piece_follows_where_more_is_to_be_known(bench):
+def test_next_segment_follows_an_uncertain_estimate(bench):
     planned = bench.writer.ticks
     assert bench.search.due_tick == planned - 500  # the end of the scan, not that of the pause
-    fit, piece = bench.told(ON_THE_WAY)
+    fit, segment = bench.plan(ON_THE_WAY)
     assert isinstance(fit, FitReport)
-    assert isinstance(piece, PlannedSegment)
+    assert isinstance(segment, PlannedSegment)
     assert bench.search.due_tick == planned
-    assert bench.writer.ticks - planned == round(RATE_HZ * piece.document["duration_s"])
+    assert bench.writer.ticks - planned == round(RATE_HZ * segment.document["duration_s"])
     assert bench.shared_state[StateField.PLANNED] == bench.writer.ticks
     assert not bench.search.may_be_last
     heads, row = fit.document["text"]
@@ -113,33 +110,33 @@ def test_a_piece_follows_where_more_is_to_be_known(bench):
     assert row.startswith("  6.0 s 0.9")
 
 
-def test_air_drag_is_told_from_damping_by_two_amplitudes(bench, monkeypatch):
-    planned = designed_at_once(monkeypatch, std=1.0)
+def test_two_amplitudes_distinguish_air_drag_from_damping(bench, monkeypatch):
+    planned = use_rest_segments(monkeypatch, std=1.0)
     for with_air_drag in (False, False, *8 * (True,)):
-        bench.told(ON_THE_WAY, with_air_drag=with_air_drag)
+        bench.plan(ON_THE_WAY, with_air_drag=with_air_drag)
     fractions = [options["limit_fraction"] for options in planned]
     reduced = fractions[3]
     assert 0.3 < reduced < 0.5
     assert fractions == [1.0, 1.0, *2 * (reduced, reduced, 1.0, reduced)]
 
 
-def test_a_value_below_its_uncertainty_does_not_put_a_relative_precision_out_of_reach(profile):
+def test_ratio_of_a_value_below_its_uncertainty(profile):
     [estimate] = target_estimates(answer(profile, 0, 50.0), [parse_target("damping", "1:10%")])
     assert estimate.ratio == pytest.approx(10.0)
 
 
-def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench, monkeypatch):
-    """Only after a pause, and a fit of every structure, does anything count as reached."""
-    designed_at_once(monkeypatch, std=1.0)
-    bench.told(ON_THE_WAY)
-    designed_at_once(monkeypatch, std=0.01)
+def test_certain_estimate_is_confirmed_with_all_structures(bench, monkeypatch):
+    """A target counts as reached only after a pause and a fit of every structure."""
+    use_rest_segments(monkeypatch, std=1.0)
+    bench.plan(ON_THE_WAY)
+    use_rest_segments(monkeypatch, std=0.01)
     planned = bench.writer.ticks
     while not bench.search.may_be_last:
-        *_, last = bench.told(CERTAIN)
+        *_, last = bench.plan(CERTAIN)
         assert bench.writer.ticks < 60 * RATE_HZ
     assert isinstance(last, FitReport | PlannedSegment)
     assert bench.search.due_tick == bench.writer.ticks >= planned + 500
-    _, end = bench.told(CERTAIN)
+    _, end = bench.plan(CERTAIN)
     assert isinstance(end, SearchEnded)
     assert end.reached
     assert end.reason.startswith("Reached: damping of mode 1 0.00")
@@ -148,51 +145,49 @@ def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench, monke
     assert bench.search.due_tick is None
 
 
-def test_before_the_first_judgement_all_structures_are_fitted_to_what_there_is(
-    profile, quick_pauses
-):
-    """So that it has a start; later ones have that of the one before."""
-    bench = Bench(profile)
+def test_all_structures_are_fitted_before_the_first_judgement(profile, sufficient_segments):
+    """The early fit gives a start; later fits start from the one before."""
+    bench = SearchBench(profile)
     assert not bench.search.needs_early_fit
-    bench.told(CERTAIN)
+    bench.plan(CERTAIN)
     assert bench.search.may_be_last
     assert bench.search.needs_early_fit
-    bench.told(CERTAIN, flag="part of the record is unexplained")
+    bench.plan(CERTAIN, flag="part of the record is unexplained")
     while not bench.search.may_be_last:
-        bench.told(CERTAIN)
+        bench.plan(CERTAIN)
     assert not bench.search.needs_early_fit
-    bench.told(CERTAIN)
+    bench.plan(CERTAIN)
     assert bench.search.due_tick is None
     assert not bench.search.needs_early_fit
 
 
 @pytest.mark.further  # as a doubtful record
-def test_a_doubted_number_is_not_reached(bench):
+def test_flagged_value_is_not_reached(bench):
     while not bench.search.may_be_last:
-        bench.told(CERTAIN)
-    fit, *more = bench.told(CERTAIN, flag="part of the record is unexplained")
+        bench.plan(CERTAIN)
+    fit, *more = bench.plan(CERTAIN, flag="part of the record is unexplained")
     assert not any(isinstance(message, SearchEnded) for message in more)
     assert {target["std"] for target in fit.document["search"]["targets"]} == {None}
 
 
 @pytest.mark.further  # as one never certain
-def test_a_record_that_stays_doubtful_is_given_up_with_its_findings(bench):
+def test_search_gives_up_on_a_doubtful_record(bench):
     ends = []
     while not ends:
-        told = bench.told(ON_THE_WAY, flag="part of the record is unexplained")
-        ends = [message for message in told if isinstance(message, SearchEnded)]
+        messages = bench.plan(ON_THE_WAY, flag="part of the record is unexplained")
+        ends = [message for message in messages if isinstance(message, SearchEnded)]
         assert bench.writer.ticks < 50 * RATE_HZ
     assert not ends[0].reached
     assert ends[0].reason == (
         "The record is doubtful: part of the record is unexplained. Something struck the beam. "
         "Record a chirp instead: rigd run chirp."
     )
-    assert told[0].document["text"][-1].count("doubtful") == 3
+    assert messages[0].document["text"][-1].count("doubtful") == 3
 
 
-def test_ticks_that_were_held_shift_what_follows(bench, quick_pieces):
-    bench.told(ON_THE_WAY)
-    bench.told(ON_THE_WAY, held=300)
+def test_held_ticks_shift_the_next_segments(bench, insufficient_segments):
+    bench.plan(ON_THE_WAY)
+    bench.plan(ON_THE_WAY, held=300)
     end = bench.search.end_of_record(9000, 300, bench.writer.ticks)
     first, last = end.segments["piece_1"]
     assert first == 6800
@@ -200,10 +195,10 @@ def test_ticks_that_were_held_shift_what_follows(bench, quick_pieces):
     assert not end.reached
 
 
-def test_ticks_that_were_held_after_a_piece_do_not_shift_it(bench, quick_pieces):
-    """As where a decision takes longer than what is planned: the scan was played at once."""
-    bench.told(ON_THE_WAY, held=1200, before=0)
-    bench.told(ON_THE_WAY, held=2000, before=1700)
+def test_ticks_held_after_a_segment_do_not_shift_it(bench, insufficient_segments):
+    """As if a decision takes longer than the planned segment: the scan began at once."""
+    bench.plan(ON_THE_WAY, held=1200, before=0)
+    bench.plan(ON_THE_WAY, held=2000, before=1700)
     segments = bench.search.end_of_record(14000, 2050, bench.writer.ticks).segments
     assert segments["scan"] == (1000, 6000)
     assert segments["sweep"][0] == 1000
@@ -212,17 +207,17 @@ def test_ticks_that_were_held_after_a_piece_do_not_shift_it(bench, quick_pieces)
     assert segments["piece_2"][0] == end - 1700 + 2050
 
 
-def test_a_piece_that_was_not_begun_is_no_segment(bench, quick_pieces):
+def test_planned_segment_without_a_start_is_omitted(bench, insufficient_segments):
     assert bench.search.has_last_segment_begun(0)
-    bench.told(ON_THE_WAY)
-    place = bench.search.due_tick
+    bench.plan(ON_THE_WAY)
+    due_tick = bench.search.due_tick
     assert bench.search.has_last_segment_begun(bench.writer.ticks)
     assert not bench.search.has_last_segment_begun(0)
-    segments = bench.search.end_of_record(place + 400, 0, 0).segments
+    segments = bench.search.end_of_record(due_tick + 400, 0, 0).segments
     assert segments.keys() == {"scan", "sweep"}
 
 
-def test_a_scan_that_told_nothing_is_repeated_and_then_given_up(bench):
+def test_scan_without_information_is_repeated_then_given_up(bench):
     planned = bench.writer.ticks
     for number in (1, 2):
         (message,) = bench.problem()
@@ -232,57 +227,57 @@ def test_a_scan_that_told_nothing_is_repeated_and_then_given_up(bench):
     assert (end.reached, end.reason) == (False, "Given up: Nothing is excited yet.")
 
 
-def test_a_record_that_cannot_be_fitted_any_more_is_given_up_at_once(bench, quick_pieces):
-    bench.told(ON_THE_WAY)
+def test_search_gives_up_without_a_possible_fit(bench, insufficient_segments):
+    bench.plan(ON_THE_WAY)
     (end,) = bench.problem("The angle is missing for 16 ms.")
     assert (end.reached, end.reason) == (False, "Given up: The angle is missing for 16 ms.")
 
 
-def test_the_time_that_is_allowed_is_kept(profile, quick_pieces):
-    bench = Bench(profile, "damping 0.01%", at_most_s=12.0)
+def test_search_ends_within_the_allowed_time(profile, insufficient_segments):
+    bench = SearchBench(profile, "damping 0.01%", at_most_s=12.0)
     ends = []
     while not ends:
-        ends = [m for m in bench.told(ON_THE_WAY) if isinstance(m, SearchEnded)]
+        ends = [m for m in bench.plan(ON_THE_WAY) if isinstance(m, SearchEnded)]
         assert bench.writer.ticks <= 12 * RATE_HZ
     assert not ends[0].reached
     assert "--at-most" in ends[0].reason
 
 
 @pytest.mark.parametrize("over_ticks", [-1, 0, 700])
-def test_a_decision_that_took_long_may_leave_no_time(profile, quick_pieces, over_ticks):
-    """The angle was held before the last piece, so that it ends with the record, or after it."""
-    bench = Bench(profile, "damping 0.01%", at_most_s=12.0)
-    bench.told(ON_THE_WAY)
+def test_slow_decision_may_leave_no_time(profile, insufficient_segments, over_ticks):
+    """The angle was held before the last segment, which ends with the record or after it."""
+    bench = SearchBench(profile, "damping 0.01%", at_most_s=12.0)
+    bench.plan(ON_THE_WAY)
     held = 12 * RATE_HZ - bench.writer.ticks + over_ticks
-    told = bench.told(ON_THE_WAY, held=held)
+    messages = bench.plan(ON_THE_WAY, held=held)
     if over_ticks < 0:
         assert bench.search.may_be_last
         assert bench.writer.ticks + held == 12 * RATE_HZ
     else:
-        assert isinstance(told[-1], SearchEnded)
-        assert told[-1].reason == "Not reached within 12 s (--at-most)."
+        assert isinstance(messages[-1], SearchEnded)
+        assert messages[-1].reason == "Not reached within 12 s (--at-most)."
 
 
 @pytest.mark.parametrize(
     ("ratio_of_std", "reason"),
     [(0.98, "it would take about"), (0.999, "it would take more than a day")],
 )
-def test_what_goes_too_slowly_is_out_of_reach(profile, quick_pieces, ratio_of_std, reason):
-    """The information grows by so little that an hour would not do: the reason has a remedy."""
-    bench = Bench(profile, "damping 0.1%", at_most_s=60.0)
-    share, ends = ON_THE_WAY, []
+def test_slow_progress_is_out_of_reach(profile, insufficient_segments, ratio_of_std, reason):
+    """The information grows so slowly that an hour would not suffice; the reason states it."""
+    bench = SearchBench(profile, "damping 0.1%", at_most_s=60.0)
+    relative_std, ends = ON_THE_WAY, []
     while not ends:
-        messages = bench.told(share)
+        messages = bench.plan(relative_std)
         ends = [m for m in messages if isinstance(m, SearchEnded)]
-        share *= ratio_of_std
+        relative_std *= ratio_of_std
     assert ends[0].reason.startswith(f"Out of reach: {reason}")
     assert (messages[0].document["search"]["left_s"] is None) == ("day" in reason)
     assert bench.writer.ticks < 40 * RATE_HZ
 
 
-def test_damping_that_is_absent_cannot_be_told(profile, monkeypatch):
+def test_absent_damping_is_out_of_reach(profile, monkeypatch):
     monkeypatch.setattr("rigd.runner._precision_search._MAX_UNREACHABLE_FORECASTS", 1)
-    bench = Bench(profile, "zeta 15%")
+    bench = SearchBench(profile, "zeta 15%")
     ends = []
     while not ends:
         document = answer(profile, bench.search.due_tick, ON_THE_WAY)
@@ -294,7 +289,7 @@ def test_damping_that_is_absent_cannot_be_told(profile, monkeypatch):
     assert ends[0].reason.startswith("Out of reach: internal damping is absent")
 
 
-def test_an_absent_mode_is_not_stated(profile):
+def test_absent_mode_has_no_estimate(profile):
     (found,) = target_estimates(answer(profile, 1, CERTAIN), [parse_target("damping", "7:1%")])
     assert found.ratio == np.inf
     assert estimates_text([found]) == "damping of mode 7: no such mode was found in the band"
@@ -303,69 +298,70 @@ def test_an_absent_mode_is_not_stated(profile):
     assert estimates_text([found]) == "frequency of any mode: no such mode was found in the band"
 
 
-def test_a_flag_on_what_is_asked_never_counts_as_reached(profile, quick_pauses):
-    """However precise; after some judgements the search says why and ends."""
-    bench = Bench(profile, "damping 1%")
+def test_flagged_target_is_never_reached(profile, sufficient_segments):
+    """However precise; after some judgements the search ends with the reason."""
+    bench = SearchBench(profile, "damping 1%")
     ends = []
     while not ends:
         document = answer(profile, bench.search.due_tick, CERTAIN)
         damping = document["modes"][1]["damping_ratio"]
         damping["flag"] = "part of the record is unexplained"
-        told = list(bench.search.plan_next(document, 0, 0))
-        ends = [m for m in told if isinstance(m, SearchEnded)]
+        messages = list(bench.search.plan_next(document, 0, 0))
+        ends = [m for m in messages if isinstance(m, SearchEnded)]
     assert not ends[0].reached
     assert "damping of mode 2: part of the record is unexplained" in ends[0].reason
 
 
-def test_modes_that_are_not_those_of_a_uniform_beam_are_excited_where_they_are(profile):
-    """Each by a stiffness of its own: the design drives them at their frequencies."""
-    bench = Bench(profile, "damping 2:0.1%", at_most_s=40.0)
+def test_excitation_of_modes_of_a_nonuniform_beam(profile):
+    """Each mode has its own stiffness, and the design drives it at its frequency."""
+    bench = SearchBench(profile, "damping 2:0.1%", at_most_s=40.0)
     document = answer(profile, bench.search.due_tick, ON_THE_WAY)
     document["plant"]["stiffness_offsets"] = [0.04, 0.0]
-    *_, piece = bench.search.plan_next(document, 0, 0)
+    *_, segment = bench.search.plan_next(document, 0, 0)
     bands_hz = [
-        (float(low) + float(high)) / 2 for low, high in re.findall(r"([\d.]+)–([\d.]+)", piece.name)
+        (float(low) + float(high)) / 2
+        for low, high in re.findall(r"([\d.]+)–([\d.]+)", segment.name)
     ]
     assert pytest.approx(16.01 * np.sqrt(1.04), abs=0.06) in bands_hz
 
 
-def test_deviations_are_designed_for_as_fits_state_them(profile, monkeypatch):
-    """A fit that states more than the design expects needs more information."""
-    planned = designed_at_once(monkeypatch, std=1.0)
-    for share in (0.01, 0.02):
-        bench = Bench(profile, "damping 1:0.2%")
-        *_, piece = bench.told(share)
-        (target,), (one,) = planned[-1]["targets"], piece.document["expected"]
-        # What the design is asked for is told as fits state it: of its deviation of 0.1.
+def test_design_uses_the_deviations_of_the_fits(profile, monkeypatch):
+    """A fit with larger deviations than the design expects needs more information."""
+    planned = use_rest_segments(monkeypatch, std=1.0)
+    for relative_std in (0.01, 0.02):
+        bench = SearchBench(profile, "damping 1:0.2%")
+        *_, segment = bench.plan(relative_std)
+        (target,), (one,) = planned[-1]["targets"], segment.document["expected"]
+        # The requested deviation is reported on the scale of the fits: 0.1 of the design's.
         assert target.std * one["asked_std"] / 0.1 == pytest.approx(0.002)
     less, more = (each["targets"][0].std for each in planned)
     assert less > 1.1 * more
 
 
-def parameter_floor(targets, **given):
+def make_search(targets, **given):
     rig = RigPreview(load_profile("sim"))
     return until(rate_hz=RATE_HZ, targets=targets, rig=rig, **given)
 
 
 @pytest.mark.parametrize("targets", ["alpha 0.002", "lambda 0.01", "damping 1%; gamma 1%"])
-def test_a_precision_below_what_the_geometry_leaves_is_refused(targets):
-    """Before anything moves, with the floor; of an exactly uniform beam it can be reached."""
+def test_precision_below_the_floor_of_the_geometry_is_refused(targets):
+    """Refused before motion, with the floor; an exactly uniform beam has none."""
     with pytest.raises(ExcitationError, match="is below the floor of") as refused:
-        parameter_floor(targets)
+        make_search(targets)
     for word in ("uniformity_percent", "--uniformity 0", "--damping", "120 s"):
         assert word in str(refused.value)
     assert "damping to 1 %" not in str(refused.value)
-    assert parameter_floor(targets, uniformity_percent=0.0).search.targets
+    assert make_search(targets, uniformity_percent=0.0).search.targets
 
 
-def test_what_the_geometry_leaves_may_be_asked(profile):
+def test_precision_above_the_floor_is_accepted(profile):
     for targets in ("alpha 0.03; lambda 0.1", "damping 0.01%; frequency 0.0001%"):
-        assert parameter_floor(targets).search.targets
+        assert make_search(targets).search.targets
     with pytest.raises(ExcitationError, match="by 1 %"):
-        parameter_floor("alpha 0.03", uniformity_percent=1.0)
+        make_search("alpha 0.03", uniformity_percent=1.0)
 
 
-def test_modes_above_the_band_are_not_asked_for(profile):
+def test_modes_above_the_band_are_no_targets(profile):
     document = answer(profile, 1, CERTAIN)
     document["modes"][2]["frequency_hz"]["value"] = 51.0
     document["modes"][2]["shown"] = False
@@ -373,10 +369,10 @@ def test_modes_above_the_band_are_not_asked_for(profile):
     assert [each.mode for each in found] == [1, 2]
 
 
-def test_an_absolute_deviation_is_not_a_share(profile):
+def test_absolute_and_relative_targets(profile):
     targets = [parse_target("frequency", "1:0.002Hz"), parse_target("damping", "2:1%")]
     found = frequency, damping = target_estimates(answer(profile, 1, 0.02), targets)
-    told = [(each["name"], each["quantity"], each["mode"]) for each in targets_json(found)]
-    assert told == [("frequency of mode 1", "frequency", 1), ("damping of mode 2", "damping", 2)]
+    names = [(each["name"], each["quantity"], each["mode"]) for each in targets_json(found)]
+    assert names == [("frequency of mode 1", "frequency", 1), ("damping of mode 2", "damping", 2)]
     assert frequency.target_std == 0.002
     assert damping.ratio == pytest.approx(2.0)

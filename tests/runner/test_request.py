@@ -1,4 +1,4 @@
-"""Metadata of a session file: what the rig, the program and the request say of it."""
+"""Metadata of a session file: from the rig, the program and the request."""
 
 import subprocess
 from pathlib import Path
@@ -23,7 +23,7 @@ def metadata_of():
     return make
 
 
-def test_the_sensors_serial_number_is_told_if_it_tells_one(metadata_of):
+def test_serial_number_of_the_sensor_if_known(metadata_of):
     assert metadata_of({"serial_number": "FT12345"})["sensor_serial_number"] == "FT12345"
     assert "sensor_serial_number" not in metadata_of({"device": "simulated force-torque sensor"})
 
@@ -35,11 +35,11 @@ def test_the_commit_is_that_of_the_checkout(metadata_of):
         pytest.skip("this is not a checkout")
     command = ["git", "-C", checkout, "rev-parse", "HEAD"]
     commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    stated = metadata_of({})["software_commit"]
-    assert commit[:12] in stated or stated.startswith("v")
+    commit_of_metadata = metadata_of({})["software_commit"]
+    assert commit[:12] in commit_of_metadata or commit_of_metadata.startswith("v")
 
 
-def test_without_a_checkout_or_git_there_is_no_commit(monkeypatch, tmp_path):
+def test_no_commit_without_checkout_or_git(monkeypatch, tmp_path):
     software_commit.cache_clear()
     monkeypatch.setenv("PATH", str(tmp_path))
     assert software_commit() == {}

@@ -53,8 +53,8 @@ def descriptors() -> int:
     return sum(1 for _ in Path("/proc/self/fd").iterdir())
 
 
-def test_nothing_is_left_of_a_rig(profile, run):
-    gc.collect()  # of other tests: it would close what counts here
+def test_disconnected_rig_leaves_no_processes_and_descriptors(profile, run):
+    gc.collect()  # objects of other tests: their descriptors would be closed later
     before = set(children(os.getpid())), descriptors()
     rig = Rig(profile, fast=True)
     assert rig.status() is None
@@ -68,7 +68,7 @@ def test_nothing_is_left_of_a_rig(profile, run):
     assert descriptors() <= before[1]
 
 
-def test_status_tells_of_every_process_and_topic(rig, run):
+def test_status_has_every_process_and_topic(rig, run):
     first = rig.status()
     assert first.phase is Phase.OFF
     assert first.torque_command_nm == 0.0
@@ -99,7 +99,7 @@ def test_tare_and_zero_between_sessions(rig, run):
 
 
 @pytest.mark.further  # as in the service
-def test_a_zero_is_lost_with_its_connection_and_has_to_be_set_again(rig, run):
+def test_zero_is_lost_with_the_connection(rig, run):
     rig.zero()
     rig.disconnect()
     with pytest.raises(RigError, match="not connected"):
@@ -111,7 +111,7 @@ def test_a_zero_is_lost_with_its_connection_and_has_to_be_set_again(rig, run):
     assert run(rig).is_successful
 
 
-def test_a_control_process_that_dies_between_sessions_is_noticed(rig):
+def test_death_of_the_control_process_is_noticed(rig):
     rig.watch()
     (control,) = (p for p in rig.status().processes if p.name == "control")
     os.kill(control.pid, signal.SIGKILL)
@@ -123,7 +123,7 @@ def test_a_control_process_that_dies_between_sessions_is_noticed(rig):
     assert not rig.connected
 
 
-def test_a_control_process_that_hangs_is_killed_at_a_stop(rig, run, monkeypatch):
+def test_hanging_control_process_is_killed_at_a_stop(rig, run, monkeypatch):
     monkeypatch.setattr("rigd.runner.session._DRIVE_TIMEOUT_S", 0.3)  # under the virtual clock
     stop = StopRequest()
 
@@ -134,12 +134,12 @@ def test_a_control_process_that_hangs_is_killed_at_a_stop(rig, run, monkeypatch)
             stop.request()
 
     result = run(rig, stop=stop, listener=listener, duration_s=100.0)
-    assert (result.outcome, result.fault) == ("fault", True)  # whatever was asked for
+    assert (result.outcome, result.fault) == ("fault", True)  # although a stop was requested
     assert "did not stop within 0.3 s and was killed" in result.reason
     assert len(read_session(result.path).samples) == result.recorded
 
 
-def test_a_name_that_appears_meanwhile_is_not_overwritten(rig, run, tmp_path):
+def test_file_created_meanwhile_is_not_overwritten(rig, run, tmp_path):
     def listener(progress, events):
         if progress.phase is Phase.RUNNING:
             (tmp_path / "0.mcap").write_text("somebody else's")
@@ -151,7 +151,7 @@ def test_a_name_that_appears_meanwhile_is_not_overwritten(rig, run, tmp_path):
 
 
 @pytest.mark.further  # as in the daemon's service
-def test_a_stop_ends_one_session_and_not_the_next(rig, run, tmp_path):
+def test_stop_ends_only_one_session(rig, run, tmp_path):
     stop = StopRequest()
 
     def listener(progress, events):
@@ -166,7 +166,7 @@ def test_a_stop_ends_one_session_and_not_the_next(rig, run, tmp_path):
     assert read_session(after.path).samples["tick"].tolist() == list(range(1200))
 
 
-def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_path):
+def test_death_of_the_recorder_ends_only_its_session(rig, run, tmp_path):
     def listener(progress, events):
         if progress.phase is Phase.RUNNING:
             (recorder,) = (p for p in rig.status().processes if p.name == "recorder")
@@ -175,14 +175,14 @@ def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_pa
 
     with pytest.raises(SessionFailedError, match="killed by signal 9") as caught:
         run(rig, listener=listener, duration_s=100.0)
-    told = caught.value.result()
-    assert (told.outcome, told.fault, told.path) == ("fault", True, None)
-    assert told.part == tmp_path / "0.mcap.part"
-    assert 0 < told.scheduled < 100_200
-    assert told.as_dict()["recorded"] is None
-    (tmp_path / "0.mcap").touch()  # made whole by a recorder that was only slow, or another's
+    result = caught.value.result()
+    assert (result.outcome, result.fault, result.path) == ("fault", True, None)
+    assert result.part == tmp_path / "0.mcap.part"
+    assert 0 < result.scheduled < 100_200
+    assert result.as_dict()["recorded"] is None
+    (tmp_path / "0.mcap").touch()  # completed by a slow recorder, or another's file
     assert caught.value.result().path is None
-    told.part.unlink()
+    result.part.unlink()
     assert caught.value.result().path == tmp_path / "0.mcap"
     assert rig.status().phase is Phase.OFF
     assert run(rig).is_successful

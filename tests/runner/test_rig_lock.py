@@ -1,4 +1,4 @@
-"""One program at a time runs a rig."""
+"""Only one program at a time runs a rig."""
 
 import os
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 from rigd.runtime.locks import RigBusyError, RigLock
 
 
-def test_whoever_comes_second_is_told_who_is_there(runtime_folder):
+def test_error_names_the_holder_of_the_rig(runtime_folder):
     with RigLock("antenna", "rigd serve", hardware=False):
         with pytest.raises(RigBusyError, match=rf"rigd serve, process {os.getpid()}"):
             RigLock("antenna", "rigd run", hardware=False).acquire()
@@ -19,7 +19,7 @@ def test_whoever_comes_second_is_told_who_is_there(runtime_folder):
         pass
 
 
-def test_simulated_rigs_of_their_own_share_but_not_with_a_daemon(runtime_folder):
+def test_simulated_rigs_share_a_lock_except_with_a_daemon(runtime_folder):
     with (
         RigLock("sim", "rigd run", hardware=False, exclusive=False),
         RigLock("sim", "rigd run", hardware=False, exclusive=False),
@@ -47,7 +47,7 @@ def test_hardware_is_locked_for_all_users_of_the_computer(runtime_folder, monkey
 
 
 @pytest.mark.process
-def test_who_holds_a_lock_without_saying_so_is_named_by_the_kernel(runtime_folder):
+def test_unnamed_holder_of_a_lock_is_found_by_the_kernel(runtime_folder):
     with RigLock("antenna", "rigd run", hardware=False) as lock:
         path = lock._file.path
     path.write_text("rigd serve, process 1")
@@ -65,7 +65,7 @@ def test_who_holds_a_lock_without_saying_so_is_named_by_the_kernel(runtime_folde
         process.communicate()
 
 
-def test_a_folder_that_cannot_be_used_is_named(monkeypatch, tmp_path):
+def test_error_names_an_unusable_folder(monkeypatch, tmp_path):
     (tmp_path / "rigd").write_text("where the folder should be")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with pytest.raises(RigBusyError, match="XDG_RUNTIME_DIR"):

@@ -1,4 +1,4 @@
-"""Sessions of a series, and what a terminal shows of them, without processes."""
+"""Sessions of a series and their output on a terminal, without processes."""
 
 import contextlib
 import json
@@ -18,12 +18,12 @@ from rigd.runner.session import SessionResult
 from rigd.runtime import StopRequest
 from rigd.testing import write_profile
 
-WELL = SessionResult(None, "complete", "", 1200, 1200, 0, 0, 0, fault=False)
-UNSEEN = ("look_follows", False)
+COMPLETE = SessionResult(None, "complete", "", 1200, 1200, 0, 0, 0, fault=False)
+NO_QUICK_LOOK = ("look_follows", False)
 
 
 class Rig:
-    """Runs nothing, and notes what it was to run."""
+    """Runs nothing, and records its orders."""
 
     def __init__(self, *results):
         self.results = list(results)
@@ -37,12 +37,12 @@ class Rig:
         return self.results.pop(0)
 
 
-class Watcher:
+class RecordingListener:
     def __init__(self):
-        self.told = []
+        self.calls = []
 
     def __getattr__(self, name):
-        return lambda *what, **said: self.told.append((name, *what, *said.items()))
+        return lambda *arguments, **options: self.calls.append((name, *arguments, *options.items()))
 
 
 @pytest.fixture
@@ -57,28 +57,30 @@ def make_series(tmp_path):
 
 
 @pytest.mark.process
-def test_a_series_ends_with_the_first_session_that_does_not_go_well(make_series):
+def test_series_ends_with_the_first_failed_session(make_series):
     series = make_series(repeat=4, notes={"operator": "Ada", "note": ""})
-    bad = replace(WELL, outcome="fault")
-    rig, listener = Rig(WELL, bad), Watcher()
+    bad = replace(COMPLETE, outcome="fault")
+    rig, listener = Rig(COMPLETE, bad), RecordingListener()
     series.run(rig, StopRequest(), listener, live=True)
-    assert series.results == [WELL, bad]
+    assert series.results == [COMPLETE, bad]
     assert [dict(order.notes) for order in rig.orders] == [
         {"operator": "Ada", "series": "1 of 4"},
         {"operator": "Ada", "series": "2 of 4"},
     ]
     first, second = (order.path for order in rig.orders)
     assert first.stem.endswith("-hold-01")
-    assert listener.told == [
-        ("on_start", 1, first), ("on_live_view", "Live view: there"), ("on_result", WELL, UNSEEN),
-        ("on_start", 2, second), ("on_live_view", "Live view: there"), ("on_result", bad, UNSEEN),
+    assert listener.calls == [
+        ("on_start", 1, first), ("on_live_view", "Live view: there"),
+        ("on_result", COMPLETE, NO_QUICK_LOOK),
+        ("on_start", 2, second), ("on_live_view", "Live view: there"),
+        ("on_result", bad, NO_QUICK_LOOK),
     ]  # fmt: skip
 
 
 @pytest.mark.process
-def test_a_lone_session_is_not_numbered(make_series):
-    rig = Rig(WELL)
-    make_series().run(rig, StopRequest(), Watcher(), live=False)
+def test_single_session_is_not_numbered(make_series):
+    rig = Rig(COMPLETE)
+    make_series().run(rig, StopRequest(), RecordingListener(), live=False)
     (order,) = rig.orders
     assert order.notes == ()
     assert dict(order.predicted_metadata)["limit_angle_rad"] == "1.57"
@@ -88,10 +90,10 @@ def test_a_lone_session_is_not_numbered(make_series):
 
 
 @pytest.mark.process
-def test_the_sessions_of_a_series_derive_their_seeds_from_the_stated_one(make_series):
+def test_seeds_of_a_series_follow_from_the_stated_seed(make_series):
     def seeds():
-        rig = Rig(*[WELL] * 3)
-        make_series(repeat=3).run(rig, StopRequest(), Watcher(), live=False)
+        rig = Rig(*[COMPLETE] * 3)
+        make_series(repeat=3).run(rig, StopRequest(), RecordingListener(), live=False)
         return [order.seed for order in rig.orders]
 
     assert seeds()[0] == 1
@@ -105,40 +107,40 @@ def test_no_shipped_profile_states_a_seed():
 
 
 @pytest.mark.process
-def test_after_a_stop_no_session_begins(make_series):
-    stop, listener = StopRequest(), Watcher()
+def test_no_session_begins_after_a_stop(make_series):
+    stop, listener = StopRequest(), RecordingListener()
     stop.request()
     make_series(repeat=2).run(Rig(), stop, listener, live=False)
-    assert listener.told == []
+    assert listener.calls == []
 
 
 @pytest.mark.process
-def test_a_disk_that_fills_up_keeps_what_there_is(make_series, tmp_path):
+def test_full_disk_retains_the_results_so_far(make_series, tmp_path):
     series = make_series(repeat=3)
 
-    class Full(Rig):
+    class RigWithFullDisk(Rig):
         def run(self, *order):
             (tmp_path / "out").rmdir()
             (tmp_path / "out").touch()
             return super().run(*order)
 
     with pytest.raises(NoRoomError, match="cannot be created"):
-        series.run(Full(WELL), StopRequest(), Watcher(), live=False)
-    assert series.results == [WELL]
+        series.run(RigWithFullDisk(COMPLETE), StopRequest(), RecordingListener(), live=False)
+    assert series.results == [COMPLETE]
 
 
-class Looks:
+class FakeQuickLookQueue:
     """Quick looks that take three attempts each."""
 
-    def __init__(self, told):
-        self.told, self.left = told, 0
+    def __init__(self, calls):
+        self.calls, self.left = calls, 0
 
     @property
     def busy(self):
         return self.left > 0
 
     def begin(self, path):
-        self.told.append(("look", path.stem[-2:]))
+        self.calls.append(("look", path.stem[-2:]))
         self.left = 3
 
     def poll(self):
@@ -146,68 +148,70 @@ class Looks:
 
     @contextlib.contextmanager
     def suspended(self):
-        self.told.append("held")
+        self.calls.append("held")
         yield
-        self.told.append("let go")
+        self.calls.append("let go")
 
 
 @pytest.mark.process
-def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_series):
-    listener = Watcher()
+def test_quick_look_is_suspended_during_a_session(make_series):
+    listener = RecordingListener()
 
-    class Watched(Rig):
+    class WatchedRig(Rig):
         def watch(self):
-            listener.told.append("watch")
+            listener.calls.append("watch")
 
         def run(self, *order):
-            listener.told.append("run")
+            listener.calls.append("run")
             return super().run(*order)
 
-    stopped = replace(WELL, path=None)
-    results = (replace(WELL, path=Path(f"a-0{number}.mcap")) for number in (1, 2))
-    looks = Looks(listener.told)
+    stopped = replace(COMPLETE, path=None)
+    results = (replace(COMPLETE, path=Path(f"a-0{number}.mcap")) for number in (1, 2))
+    queue = FakeQuickLookQueue(listener.calls)
     series = make_series(repeat=3)
-    series.run(Watched(*results, stopped), StopRequest(), listener, live=False, quick_looks=looks)
+    series.run(
+        WatchedRig(*results, stopped), StopRequest(), listener, live=False, quick_looks=queue
+    )
     session = ["held", "run", "let go", "on_result"]
     pause = ["look", "watch", "watch", "watch"]
-    told = [each if isinstance(each, str) else each[0] for each in listener.told]
-    assert told == ["on_start", *session, *pause] * 2 + ["on_start", *session]
-    ends = [each[-1] for each in listener.told if each[0] == "on_result"]
-    assert ends == [("look_follows", True), ("look_follows", True), UNSEEN]
+    names = [each if isinstance(each, str) else each[0] for each in listener.calls]
+    assert names == ["on_start", *session, *pause] * 2 + ["on_start", *session]
+    ends = [each[-1] for each in listener.calls if each[0] == "on_result"]
+    assert ends == [("look_follows", True), ("look_follows", True), NO_QUICK_LOOK]
 
 
 @pytest.mark.process
-def test_a_stop_ends_the_wait_for_a_quick_look(make_series):
-    listener, stop = Watcher(), StopRequest()
+def test_stop_ends_the_wait_for_a_quick_look(make_series):
+    listener, stop = RecordingListener(), StopRequest()
 
-    class Stopped(Rig):
+    class StoppingRig(Rig):
         def watch(self):
-            listener.told.append("watch")
+            listener.calls.append("watch")
             stop.request()
 
-    looks = Looks(listener.told)
-    result = replace(WELL, path=Path("a-01.mcap"))
-    make_series(repeat=3).run(Stopped(result), stop, listener, live=False, quick_looks=looks)
-    told = [each if isinstance(each, str) else each[0] for each in listener.told]
-    assert told == ["on_start", "held", "let go", "on_result", "look", "watch"]
+    queue = FakeQuickLookQueue(listener.calls)
+    result = replace(COMPLETE, path=Path("a-01.mcap"))
+    make_series(repeat=3).run(StoppingRig(result), stop, listener, live=False, quick_looks=queue)
+    names = [each if isinstance(each, str) else each[0] for each in listener.calls]
+    assert names == ["on_start", "held", "let go", "on_result", "look", "watch"]
 
 
 @pytest.mark.process
-def test_no_quick_look_at_a_move_is_begun_and_none_announced(tmp_path):
-    profile, listener = load_shipped("sim"), Watcher()
+def test_no_quick_look_after_a_move(tmp_path):
+    profile, listener = load_shipped("sim"), RecordingListener()
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
-    recorded, looks = replace(WELL, path=Path("a.mcap")), Looks(listener.told)
+    recorded, queue = replace(COMPLETE, path=Path("a.mcap")), FakeQuickLookQueue(listener.calls)
     series = Series(profile, replace(excitation, stays=True), tmp_path / "out")
-    series.run(Rig(recorded), StopRequest(), listener, live=False, quick_looks=looks)
-    assert listener.told[-2:] == ["let go", ("on_result", recorded, UNSEEN)]
+    series.run(Rig(recorded), StopRequest(), listener, live=False, quick_looks=queue)
+    assert listener.calls[-2:] == ["let go", ("on_result", recorded, NO_QUICK_LOOK)]
 
 
-def test_a_plan_is_told_with_its_limits_from_a_document_as_well(make_series):
+def test_plan_lines_of_new_and_older_documents(make_series):
     document = json.loads(json.dumps(make_series().plan_document()))
     first, peaks, *_ = plan_lines(document)
     assert first == "hold on sim, record of 1.2 s."
     assert " N·m (limit 0.9)." in peaks
-    for name in ("excitation", "profile", "limits", "tip_in_words"):  # of before an update
+    for name in ("excitation", "profile", "limits", "tip_in_words"):  # as before an update
         del document[name]
     first, peaks = plan_lines(document)
     assert first == "record of 1.2 s."
@@ -215,7 +219,7 @@ def test_a_plan_is_told_with_its_limits_from_a_document_as_well(make_series):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "expected"),
     [
         ({}, "Complete: no record."),
         ({"outcome": "fault", "reason": "Gone."}, "Fault: no record. Gone."),
@@ -226,11 +230,11 @@ def test_a_plan_is_told_with_its_limits_from_a_document_as_well(make_series):
         ),
     ],
 )
-def test_a_result_is_told_in_a_line(changes, said):
-    assert result_line(WELL.as_dict() | changes) == said
+def test_result_line(changes, expected):
+    assert result_line(COMPLETE.as_dict() | changes) == expected
 
 
-def test_what_was_said_last_is_written(capsys):
+def test_last_message_is_written(capsys):
     for number in range(20):
         line = ProgressLine()
         line.write_message("[first]")
@@ -239,8 +243,8 @@ def test_what_was_said_last_is_written(capsys):
         assert capsys.readouterr().err == f"[first]\nlast {number}\n"
 
 
-def test_progress_alone_has_the_line_drawn_anew_some_times_a_second(monkeypatch):
-    """However often it is told: drawing costs more than a supervisor's other work."""
+def test_progress_redraws_the_line_a_few_times_a_second(monkeypatch):
+    """However frequent the updates: drawing costs more than a supervisor's other work."""
     line, drawn, now_s = ProgressLine(), [], 0.0
     with monkeypatch.context() as patched:
         patched.setattr("rigd.runner._console.time.monotonic", lambda: now_s)
@@ -254,7 +258,7 @@ def test_progress_alone_has_the_line_drawn_anew_some_times_a_second(monkeypatch)
     line.close()
 
 
-def test_metadata_that_the_profile_requires_is_asked_for(tmp_path):
+def test_error_if_required_metadata_is_missing(tmp_path):
     required = ["operator", "temperature_c", "batch"]
     path = write_profile(tmp_path, {"session.tare_s": 0.5})
     path.write_text(f"{path.read_text()}\n[metadata]\nrequired = {json.dumps(required)}\n")

@@ -1,4 +1,4 @@
-"""How a session ends for its operator, once the loop has finished."""
+"""Result of a session for its operator, after the end of the loop."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +19,9 @@ COUNTS = {"scheduled": 1200, "missed": 0, "late": 0, "stale_angles": 0, "stale_w
 
 @pytest.fixture
 def close():
-    """Close a session whose fit process failed, or did not; with a file, or without."""
+    """Close a session with or without a failed fit process, and with or without a file."""
 
-    def closed(finished, failure, unmet_reason="", *, recorded=True, slow=lambda poll: poll):
+    def close_session(finished, failure, unmet_reason="", *, recorded=True, slow=lambda poll: poll):
         profile = load_shipped("sim")
         order = SessionOrder(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
         group = MagicMock()
@@ -47,11 +47,11 @@ def close():
         group.recorder.poll.side_effect = slow(poll)
         return session._close(finished)
 
-    return closed
+    return close_session
 
 
 @pytest.mark.parametrize("recorded", [True, False])
-def test_a_stop_does_not_hide_why_the_session_was_ending(close, recorded):
+def test_stop_does_not_hide_the_reason_of_the_end(close, recorded):
     stopped = SessionFinished("stopped", STOPPED, fault=False, counts=COUNTS)
     result = close(stopped, KILLED, recorded=recorded)
     assert (result.outcome, result.fault) == ("stopped", True)
@@ -60,7 +60,7 @@ def test_a_stop_does_not_hide_why_the_session_was_ending(close, recorded):
     assert (plain.reason, plain.fault) == (STOPPED, False)
 
 
-def test_a_complete_record_says_what_it_lacks_once(close):
+def test_reason_of_a_complete_record_is_stated_once(close):
     complete = SessionFinished("complete", "", fault=False, counts=COUNTS)
     result = close(complete, KILLED, f"Not known whether the whole record has it: {KILLED}")
     assert result.reason.count(KILLED) == 1
@@ -70,7 +70,7 @@ def test_a_complete_record_says_what_it_lacks_once(close):
 
 
 @pytest.mark.parametrize(("stall_s", "whole"), [(11.9, True), (60.0, False)])
-def test_the_disk_may_stall_at_the_end_as_long_as_in_the_record(close, monkeypatch, stall_s, whole):
+def test_allowed_stall_of_the_disk_at_the_end(close, monkeypatch, stall_s, whole):
     now_s = 0.0
 
     def poll(answer):

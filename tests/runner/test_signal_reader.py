@@ -1,4 +1,4 @@
-"""Signals of a running record for viewers: blocks of ticks, and how near they are to limits."""
+"""Signals of a running record for viewers: blocks of ticks, and fractions of limits."""
 
 import os
 from types import SimpleNamespace
@@ -62,7 +62,7 @@ def put(channels, ticks, angle_rad=0.0, *, command_nm=0.0, wrench=(0.0,) * 6):
     ring.discard()
 
 
-def test_between_records_there_are_gauges_but_no_ticks(reader, channels):
+def test_gauges_without_ticks_between_records(reader, channels):
     channels.shared_state |= {StateField.PHASE: Phase.OFF, StateField.ANGLE_NRAD: -314_000_000}
     (block,) = reader.take(channels)
     assert block.count == 0
@@ -75,7 +75,7 @@ def test_between_records_there_are_gauges_but_no_ticks(reader, channels):
     assert block.gauges["velocity"].fraction is None
 
 
-def test_a_block_has_every_tick_and_missed_ones_are_nan(reader, channels):
+def test_block_has_every_tick_and_nan_for_missed_ones(reader, channels):
     put(channels, range(50))
     put(channels, [52, 53, 55])
     (block,) = reader.take(channels)
@@ -86,7 +86,7 @@ def test_a_block_has_every_tick_and_missed_ones_are_nan(reader, channels):
     assert block.signals["coupling_torque_nm"][0] == 0.5
 
 
-def test_ticks_that_are_missed_between_two_looks_belong_to_the_second(reader, channels):
+def test_ticks_missed_between_two_reads_are_in_the_second(reader, channels):
     put(channels, range(50))
     reader.take(channels)
     put(channels, range(53, 60))
@@ -98,14 +98,14 @@ def test_ticks_that_are_missed_between_two_looks_belong_to_the_second(reader, ch
     assert (block.first_tick, block.count) == (9000, 10)
 
 
-def test_a_new_record_begins_anew_and_long_blocks_are_split(reader, channels):
+def test_new_records_and_long_blocks_are_separate_blocks(reader, channels):
     put(channels, [5, 6, 7])
     put(channels, range(3000))
     blocks = reader.take(channels)
     assert [(block.first_tick, block.count) for block in blocks] == [(5, 3), (0, 2497), (2497, 503)]
 
 
-def test_who_comes_back_after_a_while_gets_no_old_samples(reader, channels, clock):
+def test_no_old_samples_after_a_pause(reader, channels, clock):
     put(channels, range(100))
     clock.now_s += 5.0
     (block,) = reader.take(channels)
@@ -115,15 +115,15 @@ def test_who_comes_back_after_a_while_gets_no_old_samples(reader, channels, cloc
     assert block.first_tick == 100
 
 
-def test_gauges_come_ten_times_a_second_and_have_the_peaks_of_all_ticks(reader, channels, clock):
-    told = []
+def test_gauges_have_the_peaks_of_all_ticks(reader, channels, clock):
+    angles_rad = []
     for first in range(0, 200, 50):
         put(channels, range(first, first + 50), 0.3 if first == 50 else 0.1)
         (block,) = reader.take(channels)
-        told.append(block.gauges and block.gauges["angle"].value)
+        angles_rad.append(block.gauges and block.gauges["angle"].value)
         clock.now_s += 0.05
-    assert told == [0.1, None, 0.3, None]
-    # What is left when the record ends is told with the next ones, without ticks.
+    assert angles_rad == [0.1, None, 0.3, None]
+    # Samples that remain when the record ends are in the next gauges, without ticks.
     put(channels, [200], 0.4)
     clock.now_s -= 0.05
     assert [block.gauges for block in reader.take(channels)] == [None]
@@ -132,7 +132,7 @@ def test_gauges_come_ten_times_a_second_and_have_the_peaks_of_all_ticks(reader, 
     assert (block.count, block.gauges["angle"].value) == (0, 0.4)
 
 
-def test_the_gauges_are_peaks_beside_their_limits(reader, channels, profile, clock):
+def test_gauges_are_peaks_with_their_limits(reader, channels, profile, clock):
     angle = np.array([0.0, 0.0, 0.003, -0.001])
     put(channels, range(4), angle, command_nm=-0.45, wrench=(0, -11.0, 0, 0, 0, 0.1))
     (block,) = reader.take(channels)
@@ -151,14 +151,14 @@ def test_the_gauges_are_peaks_beside_their_limits(reader, channels, profile, clo
         assert (gauge.value, gauge.limit, gauge.unit) == (pytest.approx(value), limit, unit)
         assert gauge.fraction == pytest.approx(value / limit)
     assert list(gauges)[:5] == ["angle", "velocity", "tracking_error", "torque_command", "i2t"]
-    # The speed goes on over the edge of a block.
+    # The speed is continuous across blocks.
     put(channels, [5], [0.001])
     clock.now_s += 0.1
     (block,) = reader.take(channels)
     assert block.gauges["velocity"].value == pytest.approx(1.0)
 
 
-def test_a_reading_that_is_no_number_is_not_told(reader, channels, clock):
+def test_nan_readings_are_ignored(reader, channels, clock):
     put(channels, range(3), [np.nan, np.inf, np.nan])
     (block,) = reader.take(channels)
     assert block.gauges["angle"].value is None
@@ -168,7 +168,7 @@ def test_a_reading_that_is_no_number_is_not_told(reader, channels, clock):
     assert block.gauges["angle"].value == 0.5
 
 
-def test_the_motor_is_as_warm_as_the_limit_monitor_finds_it(reader, channels, profile, clock):
+def test_i2t_gauge_agrees_with_the_limit_monitor(reader, channels, profile, clock):
     motor, torque_nm = profile.rig.motor, 0.6
     for first in range(0, 4050, 50):
         clock.now_s += 0.05

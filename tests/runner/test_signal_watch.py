@@ -1,4 +1,4 @@
-"""Figures of a record, from its samples as they pass."""
+"""Statistics of a record, from its samples as they arrive."""
 
 import os
 
@@ -27,11 +27,11 @@ def put(ring, ticks, *, error_rad=0.0, coupling_nm=0.0, command_nm=0.0, lateness
     ring.discard()
 
 
-def test_nothing_is_told_before_the_first_sample(ring):
+def test_no_statistics_before_the_first_sample(ring):
     assert SignalStatisticsReader(1000.0).poll(ring) is None
 
 
-def test_the_figures_are_of_the_last_second_and_the_peaks_of_the_record(ring):
+def test_statistics_and_peaks_of_a_record(ring):
     watch = SignalStatisticsReader(1000.0)
     watch.poll(ring)
     put(ring, range(100), error_rad=-0.02, coupling_nm=-0.5, command_nm=0.3, lateness_ns=10**6)
@@ -51,7 +51,7 @@ def test_the_figures_are_of_the_last_second_and_the_peaks_of_the_record(ring):
     assert watch.poll(ring)() == status  # nothing has come since
 
 
-def test_another_record_begins_anew_and_missed_ticks_cost_rate(ring):
+def test_statistics_of_a_new_record_with_missed_ticks(ring):
     watch = SignalStatisticsReader(1000.0)
     watch.poll(ring)
     put(ring, range(1000), error_rad=0.5)

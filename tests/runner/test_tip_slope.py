@@ -1,4 +1,4 @@
-"""The slope of the antenna's tip is a limit of identifications, and is stated by all others."""
+"""The slope of the antenna's tip limits identifications; other plans state it."""
 
 import re
 
@@ -28,8 +28,8 @@ MAKE = {
 
 
 @pytest.mark.parametrize("kind", ["chirp", "step", further("multisine")])
-def test_an_identification_beyond_the_limit_is_refused_with_what_would_do(profile, kind):
-    """The message has value, limit, largest amplitude and override; both remedies do."""
+def test_identification_beyond_the_limit_is_refused_with_remedies(profile, kind):
+    """The message has value, limit, largest amplitude and override; both remedies work."""
     excitation = MAKE[kind](0.12)
     refused = predict_session(profile, excitation, force=True).refused  # no torque is concerned
     (line,) = [each for each in refused.splitlines() if "tip slope" in each]
@@ -47,19 +47,19 @@ def test_an_identification_beyond_the_limit_is_refused_with_what_would_do(profil
     assert predict_session(with_tip_slope(profile, 0.99 * slope_rad), excitation).refused
 
 
-def test_a_chirp_is_exempt_up_to_the_paper_s_amplitude(profile):
+def test_chirp_is_exempt_up_to_the_reference_amplitude(profile):
     for amplitude_rad, exempt in ((0.025, True), (0.0251, False)):
         excitation = chirp(rate_hz=1000.0, amplitude_rad=amplitude_rad)
         plan = predict_session(profile, excitation)
         assert bool(plan.refused) == (not exempt)
         assert ("is not refused for it" in plan.tip_in_words) == exempt
         assert "error at most 12 %" in plan.tip_in_words
-    # What is offered is within the range of the linear model all the same.
+    # The offered amplitude is within the range of the linear model.
     offered = chirp(rate_hz=1000.0, amplitude_rad=largest_amplitude(profile, excitation))
     assert predict_session(profile, offered).prediction.tip.slope_rad <= SMALL_SLOPE_RAD
 
 
-def test_a_file_is_refused_with_the_factor_that_would_do(profile, tmp_path):
+def test_file_beyond_the_limit_is_refused_with_a_factor(profile, tmp_path):
     path = tmp_path / "reference.csv"
     path.write_text("\n".join(map(str, 0.1 * np.sin(np.arange(8000) * 2.5 * 2e-3 * np.pi))))
     refused = predict_session(profile, from_csv(path, rate_hz=1000.0)).refused
@@ -75,7 +75,7 @@ def test_a_file_is_refused_with_the_factor_that_would_do(profile, tmp_path):
         ("touch", {"angle_rad": 0.6, "speed_rad_s": 3.0}, "position and force of a touch"),
     ],
 )
-def test_moves_and_touches_state_their_slope_and_are_not_refused(profile, kind, options, meaning):
+def test_moves_and_touches_state_their_slope(profile, kind, options, meaning):
     plan = predict_session(profile, excitation_for(profile, kind, options))
     assert plan.prediction.tip.slope_rad > SMALL_SLOPE_RAD
     assert "slope" not in plan.refused
@@ -85,7 +85,7 @@ def test_moves_and_touches_state_their_slope_and_are_not_refused(profile, kind, 
     assert "amplitude" not in plan.tip_in_words
 
 
-def test_the_identification_of_the_motor_does_not_rest_on_the_model(profile):
+def test_motor_identification_is_independent_of_the_model(profile):
     excitation = speeds_session(profile, torque_percent=40.0, stroke_rad=0.8)
     plan = predict_session(profile, excitation)
     assert plan.prediction.tip.slope_rad > SMALL_SLOPE_RAD
@@ -94,7 +94,7 @@ def test_the_identification_of_the_motor_does_not_rest_on_the_model(profile):
     assert "amplitude" not in plan.tip_in_words
 
 
-def test_a_deflection_that_no_beam_has_is_not_stated(profile):
+def test_impossible_deflection_is_not_stated(profile):
     excitation = chirp(rate_hz=1000.0, amplitude_rad=1.0)
     plan = predict_session(profile, excitation)
     document = plan_document(profile, excitation, plan)
@@ -107,13 +107,13 @@ def test_a_deflection_that_no_beam_has_is_not_stated(profile):
     assert small["limits"]["tip_slope_rad"] == SMALL_SLOPE_RAD
 
 
-def test_the_file_has_the_slope_that_was_predicted(profile):
+def test_file_has_the_predicted_slope(profile):
     excitation = chirp(rate_hz=1000.0)
     plan = predict_session(profile, excitation)
     metadata = predicted_metadata(profile, plan.prediction, excitation)
     assert float(metadata["predicted_peak_tip_slope_rad"]) == plan.prediction.tip.slope_rad
     assert float(metadata["limit_tip_slope_rad"]) == SMALL_SLOPE_RAD
-    # What is planned during the session may go as far as its limit, the scan before does not.
+    # Segments planned during the session may reach the limit; the scan does not.
     rig = with_tip_slope(profile, 0.2)
     search = excitation_for(rig, "until", {"targets": "damping 1%"})
     plan = predict_session(rig, search)
@@ -123,11 +123,11 @@ def test_the_file_has_the_slope_that_was_predicted(profile):
 
 
 @pytest.mark.parametrize("tip_slope_rad", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_limit_that_is_none_is_refused(profile, tip_slope_rad):
+def test_invalid_limit_is_refused(profile, tip_slope_rad):
     with pytest.raises(UserError, match="--tip-slope"):
         with_tip_slope(profile, tip_slope_rad)
 
 
-def test_the_error_of_the_linear_model_grows_with_the_square():
+def test_error_of_the_linear_model_is_quadratic():
     assert linear_model_error(0.6) == pytest.approx(0.12)
     assert linear_model_error(1.2) == pytest.approx(0.48)

@@ -1,4 +1,4 @@
-"""Estimates of touches: what a session does while the touch process prepares."""
+"""Estimates of touches: a session while the touch process prepares."""
 
 import json
 import time
@@ -14,7 +14,7 @@ from rigd.session.touches import touch_line, touches_of
 
 
 class Group(dict):
-    """Processes, of which any is the same one."""
+    """Processes that are all the same one."""
 
     def __init__(self, messages):
         self.channels = SimpleNamespace(specs=None, samples=SimpleNamespace(written_count=0))
@@ -27,15 +27,15 @@ class Group(dict):
         return self.child
 
 
-def estimates(messages):
+def make_client(messages):
     order = SimpleNamespace(shear_projection=None)
     return TouchClient(Group(messages), SimpleNamespace(order=order, model=None), 1000.0)
 
 
-def test_a_stop_does_not_wait_for_a_process_that_prepares():
+def test_stop_does_not_wait_for_the_touch_process():
     begun_s = time.monotonic()
     waits = iter([True, False])
-    touches = estimates(lambda _: [])
+    touches = make_client(lambda _: [])
     touches.await_ready(lambda: next(waits))
     assert time.monotonic() - begun_s < 2.0
     assert touches.poll() == []
@@ -44,25 +44,25 @@ def test_a_stop_does_not_wait_for_a_process_that_prepares():
 @pytest.mark.parametrize(
     ("messages", "words"), [([TouchReady()], []), ([], ["was not ready within 0 s. Touches are"])]
 )
-def test_the_session_waits_until_it_is_ready_or_late(monkeypatch, messages, words):
+def test_session_waits_for_the_touch_process(monkeypatch, messages, words):
     monkeypatch.setattr(TouchClient, "worker", replace(TOUCH, start_timeout_s=0.0))
-    touches = estimates(lambda _: messages)
+    touches = make_client(lambda _: messages)
     touches.await_ready(lambda: True)
-    told = [event.message for event in touches.poll()]
-    assert len(told) == len(words)
-    assert all(each in text for each, text in zip(words, told, strict=True))
+    texts = [event.message for event in touches.poll()]
+    assert len(texts) == len(words)
+    assert all(each in text for each, text in zip(words, texts, strict=True))
 
 
-def test_a_first_estimate_that_no_better_one_followed_is_called_that(monkeypatch):
+def test_first_estimate_without_a_better_one_is_marked(monkeypatch):
     monkeypatch.setattr("rigd.runner._touch_search._FINAL_ESTIMATES_TIMEOUT_S", 0.0)
     x = {"value": 0.6, "std": 0.01, "interval_95": [0.58, 0.62]}
-    told = [TouchReport(1, 900, True, {"x_m": x}), TouchReport(2, 2900, False, {"x_m": x})]
-    touches = estimates(lambda _: told)
+    reports = [TouchReport(1, 900, True, {"x_m": x}), TouchReport(2, 2900, False, {"x_m": x})]
+    touches = make_client(lambda _: reports)
     touches.poll()
     found = touches.finish(3, lambda: None)
     assert [touch.get("final") for touch in found] == [None, False, None]
     for each in (found, touches_of({"touches": json.dumps(found)})):
-        sure, first, without = map(touch_line, each)
-        assert "first estimate" not in sure + without
+        final, first, without = map(touch_line, each)
+        assert "first estimate" not in final + without
         assert first.endswith("(first estimate)")
         assert without == "Touch 3: not estimated"

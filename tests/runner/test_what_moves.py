@@ -1,4 +1,4 @@
-"""What will move is said before it does, and a simulation out of reach is not taken for absent."""
+"""The moving target is stated before motion, and an unreachable simulation blocks the hardware."""
 
 import os
 import socket
@@ -14,7 +14,7 @@ from rigd.runner.request import load_rig
 
 @pytest.fixture
 def profile(write_profile):
-    """A profile of a name that nobody else on this computer simulates."""
+    """A profile whose name nobody else on this computer simulates."""
     return write_profile("antenna_can", {"name": f'"out_of_reach_{os.getpid()}"'})
 
 
@@ -27,7 +27,7 @@ def listening(path):
         yield path
 
 
-def test_hardware_is_named_as_loudly_as_its_simulation(profile, runtime_folder):
+def test_description_of_hardware_and_simulation(profile, runtime_folder):
     loaded, moving = load_rig(profile)
     assert moving is ActuationTarget.HARDWARE
     assert describe_actuation_target(loaded.rig, moving).startswith(
@@ -40,7 +40,7 @@ def test_hardware_is_named_as_loudly_as_its_simulation(profile, runtime_folder):
 
 
 @pytest.mark.process
-def test_a_simulated_rig_of_another_environment_keeps_the_hardware_from_moving(
+def test_no_hardware_motion_with_a_simulation_elsewhere(
     profile, start_simulator, runtime_folder, monkeypatch, tmp_path
 ):
     """As with sudo, cron or ssh, which have another runtime folder or none."""
@@ -55,7 +55,7 @@ def test_a_simulated_rig_of_another_environment_keeps_the_hardware_from_moving(
     assert load_rig(profile)[1] is ActuationTarget.HARDWARE
 
 
-def test_neither_does_the_hardware_move_beside_one_of_another_user(profile, runtime_folder):
+def test_no_hardware_motion_with_a_simulation_of_another_user(profile, runtime_folder):
     name = profile.stem
     with listening(runtime_folder / "elsewhere" / f"{name}.control") as path:
         if os.getuid():
@@ -67,10 +67,8 @@ def test_neither_does_the_hardware_move_beside_one_of_another_user(profile, runt
     assert unreachable_simulators(name) == []
 
 
-def test_a_socket_of_any_name_is_no_traceback_and_does_nothing_to_the_terminal(
-    profile, runtime_folder
-):
-    """Every user may make one, and the kernel lists its name as it is, line breaks included."""
+def test_sockets_with_control_characters_in_their_names(profile, runtime_folder):
+    """Any user can make one, and the kernel lists its name unchanged, with line breaks."""
     for name in ("a\n1: 2 3 xyz 5 6 7 /8", "b\n1 2 3 xyz 5 6 7 8", "c\x0b1 2 3 xyz 5 6 7 8"):
         with listening(runtime_folder / name):
             assert load_rig(profile)[1] is ActuationTarget.HARDWARE
@@ -82,7 +80,7 @@ def test_a_socket_of_any_name_is_no_traceback_and_does_nothing_to_the_terminal(
     assert "\x1b" not in str(refused.value)
 
 
-def test_simulated_rigs_of_other_names_and_dead_ones_are_passed_over(profile, runtime_folder):
+def test_other_and_dead_simulated_rigs_are_ignored(profile, runtime_folder):
     with listening(runtime_folder / "rigd" / f"other_{profile.stem}.control"):
         assert load_rig(profile)[1] is ActuationTarget.HARDWARE
     with socket.socket(socket.AF_UNIX) as bound:  # nobody listens there
@@ -91,7 +89,7 @@ def test_simulated_rigs_of_other_names_and_dead_ones_are_passed_over(profile, ru
 
 
 @pytest.mark.process
-def test_hardware_cannot_be_asked_for_where_something_stands_in(start_simulator, profile):
+def test_error_if_hardware_is_requested_for_a_simulated_rig(start_simulator, profile):
     with pytest.raises(RefusedError, match="--hardware: No hardware: sim is simulated"):
         load_rig("sim", hardware=True)
     start_simulator(profile)

@@ -1,4 +1,4 @@
-"""Hostile requests to the page's server: none acts, none reads what is not the sessions'."""
+"""Hostile requests to the page's server: none acts, none reads other files than sessions."""
 
 import base64
 import contextlib
@@ -27,15 +27,15 @@ def without(*names):
 
 
 @pytest.fixture(scope="module")
-def lure(served, tmp_path_factory):
-    """A file that is not to be read, and ways to it."""
+def secret_file(served, tmp_path_factory):
+    """A file that must not be read, and paths to it."""
     secret = tmp_path_factory.mktemp("elsewhere") / "secret.mcap"
-    bait(served.folder, secret)
+    place_secret_files(served.folder, secret)
     return secret
 
 
-def bait(folder, secret):
-    """Put files beside the folder of the sessions, and links into it that lead to them."""
+def place_secret_files(folder, secret):
+    """Put files next to the folder of the sessions, and links to them into it."""
     secret.write_bytes(SECRET)
     (folder / "link.mcap").symlink_to(secret)
     (folder / "good.mcap").write_bytes(b"no session")
@@ -49,12 +49,12 @@ def bait(folder, secret):
 
 
 @pytest.fixture(autouse=True)
-def _lives_and_has_not_acted(served, lure):
-    before = len(served.daemon.asked)
+def _server_runs_and_has_not_acted(served, secret_file):
+    before = len(served.daemon.requests)
     yield
-    asked = [each for each in served.daemon.asked[before:] if each["command"] not in OBSERVING]
-    assert asked == []
-    status, head, _ = served.ask("GET", "/")
+    acting = [each for each in served.daemon.requests[before:] if each["command"] not in OBSERVING]
+    assert acting == []
+    status, head, _ = served.request("GET", "/")
     assert status == 200
     assert "default-src 'self'" in head
 
@@ -91,47 +91,50 @@ WITHOUT_RIGHT = {
 
 
 @pytest.mark.parametrize("headers", WITHOUT_RIGHT.values(), ids=WITHOUT_RIGHT)
-def test_without_the_right_nothing_is_started(served, headers):
-    status, _, body = served.ask("POST", "/api/command", headers, START)
+def test_no_start_without_the_right(served, headers):
+    status, _, body = served.request("POST", "/api/command", headers, START)
     assert status in (400, 403)
     assert TOKEN.encode() not in body
 
 
 @pytest.mark.parametrize("path", ["/", "/static/main.js", "/api/sessions", "/favicon.ico"])
-def test_another_site_gets_the_icon_alone(served, path):
-    """Which a report asks for: its sandbox makes it a page of another origin."""
+def test_another_site_gets_only_the_icon(served, path):
+    """A report requests the icon: its sandbox makes it a page of another origin."""
     for site in ("cross-site", "same-site"):
-        status, head, _ = served.ask("GET", path, {"Sec-Fetch-Site": site}, b"")
+        status, head, _ = served.request("GET", path, {"Sec-Fetch-Site": site}, b"")
         assert status == (200 if path == "/favicon.ico" else 403)
         shared = "cross-origin-resource-policy: cross-origin" in head.lower()
         assert shared is (path == "/favicon.ico")
 
 
 @pytest.mark.parametrize("command", ["tare", "zero", "reset", "check"])
-def test_without_a_token_nothing_else_acts(served, command):
+def test_no_command_acts_without_a_token(served, command):
     body = json.dumps({"command": command}).encode()
-    status, _, _ = served.ask("POST", "/api/command", without("Authorization"), body)
+    status, _, _ = served.request("POST", "/api/command", without("Authorization"), body)
     assert status == 403
 
 
-def test_a_token_in_the_address_is_none(served):
+def test_token_in_the_address_is_ignored(served):
     target = f"/api/command?token={TOKEN}"
-    status, _, _ = served.ask("POST", target, without("Authorization"), START)
+    status, _, _ = served.request("POST", target, without("Authorization"), START)
     assert status == 403
 
 
-def test_a_prediction_without_a_token_has_no_file_read(served, lure):
-    request = {"command": "predict", "excitation": "file", "parameters": {"path": str(lure)}}
-    status, _, _ = served.ask(
+def test_prediction_without_a_token_reads_no_file(served, secret_file):
+    request = {"command": "predict", "excitation": "file", "parameters": {"path": str(secret_file)}}
+    status, _, _ = served.request(
         "POST", "/api/command", without("Authorization"), json.dumps(request).encode()
     )
     assert status == 403
 
 
 @pytest.mark.parametrize("method", ["OPTIONS", "PUT", "DELETE", "TRACE", "GET", "PATCH", "FOO"])
-def test_other_methods_get_nothing_and_no_permission(served, method):
-    asks = {"Origin": f"http://127.0.0.1:{served.port}", "Access-Control-Request-Method": "POST"}
-    status, head, _ = served.ask(method, "/api/command", RIGHT | asks, START)
+def test_other_methods_are_refused(served, method):
+    preflight = {
+        "Origin": f"http://127.0.0.1:{served.port}",
+        "Access-Control-Request-Method": "POST",
+    }
+    status, head, _ = served.request(method, "/api/command", RIGHT | preflight, START)
     assert status in (400, 405)
     assert "access-control" not in head.lower()
 
@@ -151,19 +154,19 @@ BODIES = {
 
 
 @pytest.mark.parametrize("body", BODIES.values(), ids=BODIES)
-def test_what_is_no_request_is_refused_with_the_token_as_well(served, body):
-    status, _, _ = served.ask("POST", "/api/command", RIGHT, body)
+def test_invalid_requests_with_a_token_are_refused(served, body):
+    status, _, _ = served.request("POST", "/api/command", RIGHT, body)
     assert status in (400, 413)
 
 
 def test_a_compressed_request_is_not_unpacked(served):
     body = zlib.compress(START)
     headers = RIGHT | {"Content-Encoding": "deflate"}
-    status, _, _ = served.ask("POST", "/api/command", headers, body)
+    status, _, _ = served.request("POST", "/api/command", headers, body)
     assert status == 400
 
 
-def test_bodies_of_100_mb_are_not_taken(served):
+def test_bodies_of_100_mb_are_refused(served):
     block = b"x" * 65_536
     head = f"POST /api/command HTTP/1.1\r\nHost: 127.0.0.1:{served.port}\r\nX-Rigd: 1\r\n"
     head += f"Authorization: Bearer {TOKEN}\r\nContent-Type: application/json\r\n"
@@ -171,8 +174,8 @@ def test_bodies_of_100_mb_are_not_taken(served):
     with_length = [head.encode() + b"Content-Length: 100000000\r\n\r\n", *[block] * 1526]
     answer = served.send(with_length)
     assert answer == b"" or b" 413 " in answer
-    piece = b"10000\r\n" + block + b"\r\n"
-    answer = served.send([head.encode() + b"Transfer-Encoding: chunked\r\n\r\n", *[piece] * 1526])
+    chunk = b"10000\r\n" + block + b"\r\n"
+    answer = served.send([head.encode() + b"Transfer-Encoding: chunked\r\n\r\n", *[chunk] * 1526])
     assert answer == b"" or b" 413 " in answer
     assert time.monotonic() - began_s < 20.0
 
@@ -193,7 +196,7 @@ GARBAGE = {
 
 
 @pytest.mark.parametrize("data", GARBAGE.values(), ids=GARBAGE)
-def test_garbage_is_refused(served, hurried, data):
+def test_garbage_is_refused(served, short_timeouts, data):
     answer = served.send(data)
     assert answer == b"" or answer.split()[1][:1] == b"4"
 
@@ -228,8 +231,8 @@ READS = [
 
 
 @pytest.mark.parametrize("target", READS)
-def test_no_file_is_read_but_the_sessions_own(served, target):
-    status, _, body = served.ask("GET", target)
+def test_only_session_files_are_read(served, target):
+    status, _, body = served.request("GET", target)
     assert status in (400, 404)
     assert SECRET not in body
     assert b"root:" not in body
@@ -238,24 +241,24 @@ def test_no_file_is_read_but_the_sessions_own(served, target):
 
 def test_the_overlay_reads_no_other_files(served):
     for ids in ("..%2fsecret", "link", ",".join(["good"] * 20)):
-        status, _, body = served.ask("GET", f"/api/frf?ids={ids}")
+        status, _, body = served.request("GET", f"/api/frf?ids={ids}")
         assert SECRET not in body
         assert status in (200, 400, 404)
 
 
-def test_absurd_pages_of_the_list_are_refused(served):
+def test_invalid_pages_of_the_list_are_refused(served):
     for query in ("limit=-1", "limit=1e9", "offset=x", "limit=99999999999"):
-        assert served.ask("GET", f"/api/sessions?{query}")[0] == 400
+        assert served.request("GET", f"/api/sessions?{query}")[0] == 400
 
 
-def test_reports_and_campaigns_ask_for_the_token_and_for_sessions(served):
+def test_reports_and_campaigns_require_token_and_sessions(served):
     ids = json.dumps({"ids": ["good", "link"]}).encode()
     for target in ("/api/sessions/good/report", "/api/campaign"):
-        assert served.ask("POST", target, without("Authorization"), ids)[0] == 403
-    assert served.ask("POST", "/api/sessions/..%2fsecret/report", RIGHT, b"{}")[0] == 404
+        assert served.request("POST", target, without("Authorization"), ids)[0] == 403
+    assert served.request("POST", "/api/sessions/..%2fsecret/report", RIGHT, b"{}")[0] == 404
     for ids in (["good", "../secret"], ["good", "link"], ["good", "--jobs"], "good", ["good", 1]):
         body = json.dumps({"ids": ids}).encode()
-        assert served.ask("POST", "/api/campaign", RIGHT, body)[0] in (400, 404)
+        assert served.request("POST", "/api/campaign", RIGHT, body)[0] in (400, 404)
 
 
 def handshake(**headers):
@@ -278,31 +281,33 @@ def handshake(**headers):
     ],
     ids=str,
 )
-def test_no_other_page_reads_the_live_signals(served, headers):
-    status, _, _ = served.ask("GET", "/api/live", handshake(**headers, Connection="close, Upgrade"))
+def test_other_pages_cannot_read_the_live_signals(served, headers):
+    status, _, _ = served.request(
+        "GET", "/api/live", handshake(**headers, Connection="close, Upgrade")
+    )
     assert status == 403
 
 
-def test_a_page_that_says_something_is_let_go(served):
+def test_page_is_disconnected_if_it_sends_a_frame(served):
     lines = [f"GET /api/live HTTP/1.1\r\nHost: 127.0.0.1:{served.port}"]
     lines += [f"{name}: {value}" for name, value in handshake().items()]
-    # A frame of 16 MB, as far as its head says.
+    # A frame of 16 MB, according to its head.
     frame = b"\x82\xff" + (1 << 24).to_bytes(8, "big") + b"mask" + b"x" * 100_000
     answer = served.send("\r\n".join(lines).encode() + b"\r\n\r\n" + frame)
     assert b" 101 " in answer
 
 
-def test_who_says_nothing_or_half_is_let_go(served, hurried):
+def test_silent_and_incomplete_clients_are_disconnected(served, short_timeouts):
     half = b"POST /api/command HTTP/1.1\r\nHost: localhost\r\nX-Rigd: 1\r\n"
-    for said in (b"", b"GET / HT", half):
+    for sent in (b"", b"GET / HT", half):
         with served.connect() as link:
-            link.sendall(said)
+            link.sendall(sent)
             assert link.recv(1) == b""
     body = half + b"Content-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
     assert b" 408 " in served.send(body)
 
 
-def test_connections_of_others_shut_nobody_out(served, replace_in_page):
+def test_connections_of_others_displace_no_page(served, replace_in_page):
     replace_in_page(most_connections=8)
     host = f"Host: 127.0.0.1:{served.port}"
     opening = "\r\n".join(f"{name}: {value}" for name, value in handshake().items())
@@ -314,42 +319,47 @@ def test_connections_of_others_shut_nobody_out(served, replace_in_page):
             link = ending.enter_context(served.connect())
             link.sendall(f"GET / HTTP/1.1\r\n{host}\r\n\r\n".encode())
             assert b" 200 " in link.recv(1000)
-        assert served.ask("GET", "/")[0] == 200
+        assert served.request("GET", "/")[0] == 200
         assert len(served.server.pages) == 1
 
 
-def test_more_connections_than_are_served_are_turned_away(served, hurried):
+def test_connections_beyond_the_limit_are_closed(served, short_timeouts):
     links = [served.connect() for _ in range(150)]
     for link in links:
-        assert link.recv(1) == b""  # at once, or because they say nothing
+        assert link.recv(1) == b""  # at once, or because they send nothing
         link.close()
 
 
 @pytest.fixture
 def rig(tmp_path, tmp_path_factory, write_profile_in):
-    """The real daemon with its page, time skipped, and a file that is not to be read."""
+    """The real daemon with its page, time skipped, and a file that must not be read."""
     with rig_with_page(write_profile_in, tmp_path, "--fast") as rig:
         rig.folder.mkdir(exist_ok=True)
-        bait(rig.folder, tmp_path_factory.mktemp("elsewhere") / "secret.mcap")
+        place_secret_files(rig.folder, tmp_path_factory.mktemp("elsewhere") / "secret.mcap")
         yield rig
 
 
 @pytest.mark.further  # as the page's server above, and test_page_daemon.py of a session
-def test_the_real_daemon_obeys_none_of_them_and_runs_a_session_afterwards(rig):
-    def meant(headers):
-        """Give headers the daemon's own token, where they have that of these tests."""
+def test_real_daemon_refuses_all_and_runs_a_session_afterwards(rig):
+    def with_own_token(headers):
+        """Return headers with the daemon's own token in place of that of these tests."""
         return {name: text and text.replace(TOKEN, rig.token) for name, text in headers.items()}
 
     def refused(method, target, headers=(), body=b""):
-        status, _, answer = rig.ask(method, target, meant(dict(headers)), body)
+        status, _, answer = rig.request(method, target, with_own_token(dict(headers)), body)
         assert 400 <= status < 500, (method, target, status)
         assert not any(secret in answer for secret in (SECRET, b"root:", rig.token.encode()))
 
     with Client(find(rig.name)) as client:
 
         def status():
-            told = client.ask("status")
-            return told["state"], told["series"], told["controller"], told["last_check"]
+            document = client.ask("status")
+            return (
+                document["state"],
+                document["series"],
+                document["controller"],
+                document["last_check"],
+            )
 
         while status()[0] != "ready":
             time.sleep(0.02)
@@ -364,18 +374,18 @@ def test_the_real_daemon_obeys_none_of_them_and_runs_a_session_afterwards(rig):
             refused("GET", target)
         for ids in (["good", "../secret"], ["good", "link"], ["good", "--jobs"]):
             refused("POST", "/api/campaign", RIGHT, json.dumps({"ids": ids}).encode())
-        rig.patience_s = 0.2  # for what waits for more that does not come
+        rig.timeout_s = 0.2  # for requests that wait for more bytes
         for data in GARBAGE.values():
             with contextlib.suppress(TimeoutError):
                 answer = rig.send(data)
                 assert answer == b"" or answer.split()[1][:1] == b"4"
         assert status() == ("ready", None, None, None)
 
-        rig.patience_s = 30.0
+        rig.timeout_s = 30.0
         parameters = {"duration_s": 2.0, "rest_s": 0.1, "ring_down_s": 0.1}
         request = {"command": "start", "excitation": "chirp", "parameters": parameters}
         body = json.dumps(request).encode()
-        assert rig.ask("POST", "/api/command", meant(RIGHT), body)[0] == 200
+        assert rig.request("POST", "/api/command", with_own_token(RIGHT), body)[0] == 200
         while (series := client.ask("status")["series"])["running"]:
             time.sleep(0.02)
         assert [session["outcome"] for session in series["sessions"]] == ["complete"]

@@ -15,10 +15,10 @@ from web_daemon import rig_with_page
 
 pytestmark = pytest.mark.browser
 
-TELL_S = 1.0
-"""Within this time the page has to say what the daemon has seen."""
+SHOWN_WITHIN_S = 1.0
+"""Within this time the page must show an event of the daemon."""
 END_MS = 60_000
-"""For what the rig or the analysis does, on a computer that is overloaded."""
+"""For work of the rig or the analysis on an overloaded computer."""
 
 
 @pytest.fixture
@@ -56,83 +56,83 @@ WATCH = """() => {
 }"""
 
 
-def says(page, selector, text):
+def expect_text(page, selector, text):
     expect(page.locator(selector)).to_contain_text(text, timeout=END_MS)
 
 
 def start(page):
     page.wait_for_selector("#start-button:enabled", timeout=END_MS)
     page.click("#start-button")
-    # Under the virtual clock a session may be over before the page is told that it runs.
+    # Under the virtual clock a session may end before the page is informed that it runs.
     begun = re.compile("PREPARING|RUNNING|RETURNING|FINISHING")
     expect(page.locator("#state-word")).to_have_text(begun, timeout=END_MS)
 
 
 def delay_s(page, word, event):
-    """How long after an event, as the daemon dates it, the page showed a state."""
+    """Return the time from an event, as the daemon dates it, to its state on the page."""
     entry = page.locator("#event-list li", has_text=event).first
     return page.evaluate("() => window.told")[word] - float(entry.get_attribute("data-at")) / 1e9
 
 
-def rows(page, count, outcome):
-    """Wait for so many sessions in the table, the newest with an outcome."""
+def expect_rows(page, count, outcome):
+    """Wait for a number of sessions in the table, the newest with an outcome."""
     expect(page.locator("#rows tr[id]")).to_have_count(count, timeout=END_MS)
-    says(page, "#rows tr >> nth=0", outcome)
+    expect_text(page, "#rows tr >> nth=0", outcome)
 
 
-def test_a_session_in_real_time_is_watched_and_stopped(operate):
+def test_session_in_real_time_is_shown_and_stopped(operate):
     _, page = operate("--no-look")
     start(page)
-    says(page, "#phase", "recording")
-    says(page, "#frequency", "Hz")
-    says(page, "#time-left", "0:")
+    expect_text(page, "#phase", "recording")
+    expect_text(page, "#frequency", "Hz")
+    expect_text(page, "#time-left", "0:")
     assert page.locator("#gauge-angle .percent").inner_text() != "–"
     assert page.get_attribute("#strip-angle", "aria-label") != "Angle: no data yet"
     page.click("#stop")
-    says(page, "#state-reason", "was stopped")
-    assert delay_s(page, "READY", "→ ready: chirp was stopped") < TELL_S
-    rows(page, 1, "stopped")
+    expect_text(page, "#state-reason", "was stopped")
+    assert delay_s(page, "READY", "→ ready: chirp was stopped") < SHOWN_WITHIN_S
+    expect_rows(page, 1, "stopped")
 
 
 @pytest.mark.further  # as test_page_states.py, test_page_server.py and tests/daemon
-def test_what_fails_is_told(operate, open_page):
+def test_failures_are_shown(operate, open_page):
     daemon, page = operate()
 
-    def begin():
+    def start_recording():
         start(page)
-        says(page, "#phase", "recording")
+        expect_text(page, "#phase", "recording")
 
-    def fails(reason):
-        says(page, "#state-word", "FAULT")
-        assert delay_s(page, "FAULT", "→ fault") < TELL_S
+    def expect_fault_and_reset(reason):
+        expect_text(page, "#state-word", "FAULT")
+        assert delay_s(page, "FAULT", "→ fault") < SHOWN_WITHIN_S
         assert reason in page.inner_text("#fault-reason")
         page.click("#fault-reset")
-        says(page, "#state-word", "READY")
+        expect_text(page, "#state-word", "READY")
 
-    begin()
-    says(page, "#response-keys", "measured")
+    start_recording()
+    expect_text(page, "#response-keys", "measured")
     os.kill(child_running(daemon.process.pid, "control_process"), signal.SIGKILL)
-    fails("control")
+    expect_fault_and_reset("control")
 
-    begin()
+    start_recording()
     recorder = child_running(daemon.process.pid, "recorder")
     resource.prlimit(recorder, resource.RLIMIT_FSIZE, (20_000, 20_000))  # like a full disk
-    fails("cannot be written")
+    expect_fault_and_reset("cannot be written")
 
-    begin()
+    start_recording()
     daemon.process.send_signal(signal.SIGSTOP)
     stopped_s = time.time()
-    says(page, "#state-word", "OFFLINE")
+    expect_text(page, "#state-word", "OFFLINE")
     assert "press the STO" in page.inner_text("#state-reason")
-    # What the daemon says twice a second may just have come.
-    assert page.evaluate("() => window.told.OFFLINE") - stopped_s < TELL_S + 0.2
+    # The daemon's status, sent twice a second, may just have come.
+    assert page.evaluate("() => window.told.OFFLINE") - stopped_s < SHOWN_WITHIN_S + 0.2
     daemon.process.send_signal(signal.SIGCONT)
-    says(page, "#state-word", "RUNNING")
+    expect_text(page, "#state-word", "RUNNING")
     killed_s = time.time()
     daemon.process.kill()
-    says(page, "#state-word", "OFFLINE")
-    assert page.evaluate("() => window.told.OFFLINE") - killed_s < TELL_S
-    # The page's server ends too, and the browser tells that it finds nobody.
+    expect_text(page, "#state-word", "OFFLINE")
+    assert page.evaluate("() => window.told.OFFLINE") - killed_s < SHOWN_WITHIN_S
+    # The page's server ends too, and the browser logs that it does not answer.
     page.close()
     open_page.complaints.clear()
 
@@ -141,45 +141,43 @@ def test_what_fails_is_told(operate, open_page):
     ("options", "reports"),
     [
         further(("--fast",), False, id="fast"),
-        # Reports and campaigns take longer than all else.
+        # Reports and campaigns take longer than the rest.
         pytest.param(("--fast",), True, id="fast-reports", marks=pytest.mark.slow),
         pytest.param((), True, id="real-time", marks=pytest.mark.slow),
     ],
 )
-def test_a_new_operator_runs_stops_reports_and_compares_sessions(
-    operate, open_page, options, reports
-):
+def test_first_use_from_a_session_to_a_campaign(operate, open_page, options, reports):
     daemon, page = operate(*options)
     page.click("#predict")
-    says(page, "#prediction", "Predicted peaks")
-    says(page, "#prediction", "Largest allowed")
+    expect_text(page, "#prediction", "Predicted peaks")
+    expect_text(page, "#prediction", "Largest allowed")
 
     # A chirp of 10 s to its end; a longer one, stopped; and the first once more.
     start(page)
-    rows(page, 1, "complete")
+    expect_rows(page, 1, "complete")
     page.fill("#parameter-duration_s", "600")
     start(page)
-    says(page, "#phase", "recording")
+    expect_text(page, "#phase", "recording")
     page.click("#stop")
-    rows(page, 2, "stopped")
+    expect_rows(page, 2, "stopped")
     page.fill("#parameter-duration_s", "10")
     start(page)
-    rows(page, 3, "complete")
+    expect_rows(page, 3, "complete")
 
-    looks = page.locator("#event-list li", has_text="Quick look at ")
-    expect(looks).to_have_count(3, timeout=2 * END_MS)
+    quick_looks = page.locator("#event-list li", has_text="Quick look at ")
+    expect(quick_looks).to_have_count(3, timeout=2 * END_MS)
     row = "#rows tr[id] >> nth=0"
     page.click(f"{row} >> button.link >> nth=0")
-    says(page, ".detail:not([hidden])", "Mean coherence")
+    expect_text(page, ".detail:not([hidden])", "Mean coherence")
     if options:  # in real time, missed ticks may leave nothing to identify
-        says(page, f"{row} >> .modes", "Hz")
-        says(page, ".detail:not([hidden])", "95 % interval")
+        expect_text(page, f"{row} >> .modes", "Hz")
+        expect_text(page, ".detail:not([hidden])", "95 % interval")
     completed = page.locator("#event-list li", has_text="Complete: ")
     expect(completed).to_have_count(2)
     for number in (0, 2):
         page.check(f"#rows tr[id] >> nth={number} >> input")
     page.click("#overlay")
-    says(page, "#comparison-keys", "antenna 3")
+    expect_text(page, "#comparison-keys", "antenna 3")
     expect(page.locator("#comparison-keys .key")).to_have_count(2)
     if not reports:
         return
@@ -191,12 +189,12 @@ def test_a_new_operator_runs_stops_reports_and_compares_sessions(
     if options:  # in real time, missed ticks may leave nothing to fit
         page.click("#campaign")
         expect(report).to_have_attribute("href", re.compile("campaign"), timeout=2 * END_MS)
-        told = report_of(daemon, open_page, report)
-        assert "antenna 3" in told
-        assert "2 sessions" in told
+        report_text = report_of(daemon, open_page, report)
+        assert "antenna 3" in report_text
+        assert "2 sessions" in report_text
 
 
 def report_of(daemon, open_page, link):
-    """Open the report that a link of the page leads to; returns what it says."""
+    """Open the report behind a link of the page; return its text."""
     address = daemon.address.split("#")[0].rstrip("/") + link.get_attribute("href")
     return open_page(address).inner_text("body")

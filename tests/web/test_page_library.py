@@ -1,4 +1,4 @@
-"""Sessions on the page: rows, looks, downloads, reports, and the jobs that make them."""
+"""Sessions on the page: rows, quick looks, downloads, reports, and the jobs that make them."""
 
 import asyncio
 import json
@@ -26,17 +26,17 @@ ACTING = {
 
 
 @pytest.fixture
-def two(served, record_briefly, write_quick_look, replace_in_page):
+def two_sessions(served, record_briefly, write_quick_look, replace_in_page):
     """Two sessions, of which one has a quick look and a report."""
-    # What runs only while nothing else does may not run for minutes beside the other tests.
+    # A job of the idle class may wait for minutes while other tests run.
     replace_in_page(worker=replace(REPORT, niceness=0))
     for name, specimen in (("first", "antenna"), ("second", "")):
         record_briefly(name, day=float(name == "second"), specimen=specimen).replace(
             served.folder / f"{name}.mcap"
         )
     response = {"frequency_hz": [1.0], "magnitude": [2.0], "phase_rad": [0.0], "coherence": [1.0]}
-    look = {"version": 1, "specimen": "antenna", "modes": [], "response": response}
-    (served.folder / "first.look.json").write_text(json.dumps(look))
+    quick_look = {"version": 1, "specimen": "antenna", "modes": [], "response": response}
+    (served.folder / "first.look.json").write_text(json.dumps(quick_look))
     report = served.folder / "first.report"
     report.mkdir(exist_ok=True)
     (report / "report.html").write_text("<style>p {}</style><p>A report")
@@ -45,11 +45,11 @@ def two(served, record_briefly, write_quick_look, replace_in_page):
 
 
 def get(served, target):
-    status, head, body = served.ask("GET", target)
+    status, head, body = served.request("GET", target)
     return status, head, json.loads(body) if "application/json" in head else body
 
 
-def test_the_rows_are_the_librarys(served, two):
+def test_rows_are_those_of_the_library(served, two_sessions):
     _, _, found = get(served, "/api/sessions?excitation=chirp")
     assert found["total"] == 2
     assert [row["id"] for row in found["sessions"]] == ["second", "first"]
@@ -60,21 +60,21 @@ def test_the_rows_are_the_librarys(served, two):
     assert (found["total"], [row["id"] for row in found["sessions"]]) == (2, ["first"])
 
 
-def test_a_list_that_cannot_be_made_is_refused_in_words(served, replace_in_page):
-    status, _, told = get(served, "/api/sessions?since=abc")
+def test_error_message_if_no_list_can_be_made(served, replace_in_page):
+    status, _, reply = get(served, "/api/sessions?since=abc")
     assert status == 400
-    assert "abc" in told["error"]
+    assert "abc" in reply["error"]
     replace_in_page(list_sessions={}.popitem)
-    status, _, told = get(served, "/api/sessions")
+    status, _, reply = get(served, "/api/sessions")
     assert status == 500
-    assert "The page's server failed: " in told["error"]
+    assert "The page's server failed: " in reply["error"]
 
 
-def test_files_looks_reports_and_responses_are_served(served, two):
+def test_files_quick_looks_reports_and_responses_are_served(served, two_sessions):
     status, head, body = get(served, "/api/sessions/first/file.mcap")
     assert (status, body) == (200, (served.folder / "first.mcap").read_bytes())
     assert 'attachment; filename="first.mcap"' in head
-    assert get(served, "/api/sessions/first/look")[2]["response"] == two
+    assert get(served, "/api/sessions/first/look")[2]["response"] == two_sessions
     assert get(served, "/api/sessions/second/look")[0] == 404
     (served.folder / "folder.mcap").mkdir()
     assert get(served, "/api/sessions/folder/file.mcap")[0] == 404
@@ -86,12 +86,14 @@ def test_files_looks_reports_and_responses_are_served(served, two):
     assert get(served, "/api/sessions/first/report/fits.csv")[2] == b"a,b"
     assert get(served, "/api/sessions/second/report/")[0] == 404
     _, _, overlay = get(served, "/api/frf?ids=first,second")
-    assert overlay["responses"] == [{"id": "first", "specimen": "antenna", "model": None, **two}]
+    assert overlay["responses"] == [
+        {"id": "first", "specimen": "antenna", "model": None, **two_sessions}
+    ]
     assert "second" in overlay["errors"][0]
 
 
 @pytest.mark.parametrize(
-    ("look", "status"),
+    ("quick_look", "status"),
     [
         pytest.param(b"[" * 100_000, 404, id="nested lists"),
         further(b'{"version": 1, "response": ' * 50_000, 404, id="nested objects"),
@@ -104,10 +106,10 @@ def test_files_looks_reports_and_responses_are_served(served, two):
         further(b"7", 404, id="no look"),
     ],
 )
-def test_a_damaged_look_breaks_neither_list_nor_overlay(served, two, look, status):
-    (served.folder / "first.look.json").write_bytes(look)
+def test_list_and_overlay_with_a_damaged_quick_look(served, two_sessions, quick_look, status):
+    (served.folder / "first.look.json").write_bytes(quick_look)
     assert [row["id"] for row in get(served, "/api/sessions")[2]["sessions"]] == ["second", "first"]
-    found, _, body = served.ask("GET", "/api/sessions/first/look")
+    found, _, body = served.request("GET", "/api/sessions/first/look")
     assert found == status
     json.loads(body, parse_constant=pytest.fail)
     _, _, overlay = get(served, "/api/frf?ids=first")
@@ -116,38 +118,38 @@ def test_a_damaged_look_breaks_neither_list_nor_overlay(served, two, look, statu
     assert asyncio.run_coroutine_threadsafe(finding, served.loop).result(30.0) is None
 
 
-def test_another_format_is_made_and_sent(served, two):
+def test_download_in_another_format(served, two_sessions):
     assert eventually(lambda: not served.server._jobs.paused)
     status, head, body = get(served, "/api/sessions/first/file.mat")
     assert (status, body[:6]) == (200, b"MATLAB"), body
     assert 'filename="first.mat"' in head
 
 
-@pytest.mark.usefixtures("two")
+@pytest.mark.usefixtures("two_sessions")
 @pytest.mark.parametrize("begun", [True, False], ids=["running", "behind another job"])
-def test_a_session_ends_the_wait_for_another_format(served, run_instead, tmp_path, begun):
+def test_new_session_ends_the_wait_for_another_format(served, run_instead, tmp_path, begun):
     assert eventually(lambda: not served.server._jobs.paused)
-    run_instead(PATIENT.format(tmp_path))
+    run_instead(WAITING_PROGRAM.format(tmp_path))
     if not begun:
-        assert served.ask("POST", "/api/sessions/second/report", ACTING, b"{}")[0] == 202
+        assert served.request("POST", "/api/sessions/second/report", ACTING, b"{}")[0] == 202
     try:
         with ThreadPoolExecutor(1) as other:
             waiting = other.submit(get, served, "/api/sessions/first/file.mat")
             assert eventually((tmp_path / "begun").exists)
             assert eventually(served.server._library._exporting.locked)
-            status, _, told = get(served, "/api/sessions/second/file.uff")
-            assert (status, "being converted" in told["error"]) == (409, True)
+            status, _, reply = get(served, "/api/sessions/second/file.uff")
+            assert (status, "being converted" in reply["error"]) == (409, True)
             served.daemon.status["state"] = "running"
-            status, _, told = waiting.result(30.0)
-            assert (status, "A session runs" in told["error"]) == (409, True)
-            # A report goes on after the session, when it may end here.
+            status, _, reply = waiting.result(30.0)
+            assert (status, "A session runs" in reply["error"]) == (409, True)
+            # A report continues after the session, and may end here.
             (tmp_path / "end").touch()
     finally:
         served.daemon.status["state"] = "ready"
     assert eventually(lambda: not served.server._jobs.paused)
 
 
-PATIENT = """
+WAITING_PROGRAM = """
 import pathlib, time
 folder = pathlib.Path("{}")
 (folder / "begun").touch()
@@ -158,11 +160,11 @@ while not (folder / "end").exists():
 
 @pytest.fixture
 def jobs(tmp_path, run_instead):
-    """Jobs whose program runs the Python code it is given."""
+    """Jobs whose program runs the given Python code."""
     run_instead(poll_s=0.02)
-    told = []
-    jobs = Jobs(tmp_path, told.append)
-    jobs.told = told
+    documents = []
+    jobs = Jobs(tmp_path, documents.append)
+    jobs.documents = documents
     return jobs
 
 
@@ -185,7 +187,7 @@ def state_of(pid):
         return "gone"
 
 
-def test_a_job_stands_still_while_a_session_runs_and_gives_way(jobs, tmp_path):
+def test_job_is_suspended_during_a_session(jobs, tmp_path):
     program = (
         "import os, pathlib, time\n"
         "while os.sched_getscheduler(0) != os.SCHED_IDLE: time.sleep(0.01)\n"
@@ -214,10 +216,10 @@ def test_a_job_stands_still_while_a_session_runs_and_gives_way(jobs, tmp_path):
 
     pid, niceness = run(jobs, scenario)
     assert niceness == 19
-    assert eventually(lambda: state_of(pid) in ("Z", "gone"))  # it has ended with the server
+    assert eventually(lambda: state_of(pid) in ("Z", "gone"))  # it ended with the server
 
 
-PAGE = """
+PAGE_PROGRAM = """
 import asyncio, os, pathlib, sys
 from dataclasses import replace
 from rigd.runtime import ignore
@@ -240,7 +242,7 @@ async def work():
 
 asyncio.run(work())
 """
-WORKING = """
+WORKER_PROGRAM = """
 import os, pathlib, subprocess, time
 
 pids = [os.getpid(), subprocess.Popen(["sleep", "600"]).pid]
@@ -261,22 +263,24 @@ time.sleep(600)
     ],
 )
 @pytest.mark.usefixtures("jobs")
-def test_a_job_ends_with_the_page(tmp_path, state, end):
+def test_job_ends_with_the_page(tmp_path, state, end):
     page = subprocess.Popen(
-        [sys.executable, "-c", PAGE, WORKING, state], cwd=tmp_path, stdin=subprocess.PIPE
+        [sys.executable, "-c", PAGE_PROGRAM, WORKER_PROGRAM, state],
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
     )
     pids = []
     try:
         assert eventually((tmp_path / "pids").exists)
         pids = list(map(int, (tmp_path / "pids").read_text().split()))
-        stands = "T" if state == "suspended" else "S"
-        assert eventually(lambda: {state_of(pid) for pid in pids} == {stands})
+        expected = "T" if state == "suspended" else "S"
+        assert eventually(lambda: {state_of(pid) for pid in pids} == {expected})
         if end == "killed":
             page.kill()
         page.communicate(timeout=60.0)
-        # Workers that run see for themselves that their parent has gone.
-        gone = pids if state == "suspended" else pids[:1]
-        assert eventually(lambda: {state_of(pid) for pid in gone} <= {"Z", "gone"}, within_s=10.0)
+        # Workers that run detect the end of their parent themselves.
+        ended = pids if state == "suspended" else pids[:1]
+        assert eventually(lambda: {state_of(pid) for pid in ended} <= {"Z", "gone"}, within_s=10.0)
     finally:
         page.kill()
         page.wait()
@@ -285,7 +289,7 @@ def test_a_job_ends_with_the_page(tmp_path, state, end):
                 os.kill(pid, signal.SIGKILL)
 
 
-def test_what_became_of_a_job_is_told(jobs):
+def test_results_of_jobs_are_published(jobs):
     async def scenario():
         jobs.paused = False
         done = jobs.put("campaign", ["pass"], result_url="/api/campaign/x/")
@@ -294,13 +298,13 @@ def test_what_became_of_a_job_is_told(jobs):
         assert done.done.is_set()
 
     run(jobs, scenario)
-    last = {told["number"]: told for told in jobs.told}
+    last = {document["number"]: document for document in jobs.documents}
     assert (last[1]["state"], last[1]["address"]) == ("done", "/api/campaign/x/")
     assert (last[2]["state"], last[2]["address"]) == ("failed", "")
     assert last[2]["error"] == "The report was not made: too short"
 
 
-def test_only_so_many_jobs_wait(jobs):
+def test_number_of_waiting_jobs_is_limited(jobs):
     async def scenario():
         for _ in range(MAX_JOBS + 1):
             await asyncio.sleep(0)
@@ -311,36 +315,38 @@ def test_only_so_many_jobs_wait(jobs):
     run(jobs, scenario)
 
 
-def test_a_report_and_a_campaign_are_queued_with_the_token(served, two, monkeypatch, run_instead):
+def test_report_and_campaign_are_queued_with_the_token(
+    served, two_sessions, monkeypatch, run_instead
+):
     run_instead("pass")
-    told = []
-    monkeypatch.setattr(served.server._jobs, "_publish", told.append)
-    status, _, body = served.ask("POST", "/api/sessions/first/report", ACTING, b"{}")
+    documents = []
+    monkeypatch.setattr(served.server._jobs, "_publish", documents.append)
+    status, _, body = served.request("POST", "/api/sessions/first/report", ACTING, b"{}")
     assert (status, json.loads(body)["ok"]) == (202, True)
     ids = json.dumps({"ids": ["first", "second"]}).encode()
-    assert served.ask("POST", "/api/campaign", ACTING, ids)[0] == 202
-    assert eventually(lambda: [job["kind"] for job in told if job["state"] == "done"] == BOTH)
+    assert served.request("POST", "/api/campaign", ACTING, ids)[0] == 202
+    assert eventually(lambda: [job["kind"] for job in documents if job["state"] == "done"] == KINDS)
 
 
-BOTH = ["report", "campaign"]
+KINDS = ["report", "campaign"]
 
 
-@pytest.mark.usefixtures("two")
-def test_campaigns_that_wait_get_a_folder_each(served, monkeypatch, run_instead):
+@pytest.mark.usefixtures("two_sessions")
+def test_waiting_campaigns_have_a_folder_each(served, monkeypatch, run_instead):
     making = "import os; os.mkdir(sys.argv[-1])"  # at its end, and never over another
     run_instead(making)
-    told = []
-    monkeypatch.setattr(served.server._jobs, "_publish", told.append)
+    documents = []
+    monkeypatch.setattr(served.server._jobs, "_publish", documents.append)
     ids = json.dumps({"ids": ["first", "second"]}).encode()
     served.daemon.status["state"] = "running"
     try:
         assert eventually(lambda: served.server._jobs.paused)
         for _ in range(2):
-            assert served.ask("POST", "/api/campaign", ACTING, ids)[0] == 202
+            assert served.request("POST", "/api/campaign", ACTING, ids)[0] == 202
     finally:
         served.daemon.status["state"] = "ready"
     over = ("done", "failed")
-    assert eventually(lambda: sum(job["state"] in over for job in told) == 2)
-    made = [(job["error"], job["address"]) for job in told if job["state"] in over]
+    assert eventually(lambda: sum(job["state"] in over for job in documents) == 2)
+    made = [(job["error"], job["address"]) for job in documents if job["state"] in over]
     folders = ("campaign.report", "campaign.report-2")
     assert made == [("", f"/api/campaign/{folder}/") for folder in folders]

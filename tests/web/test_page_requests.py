@@ -1,4 +1,4 @@
-"""The OpenAPI document of the page's requests: complete, and the server answers as it says."""
+"""The OpenAPI document of the page's requests is complete, and the server conforms to it."""
 
 import importlib.util
 import json
@@ -27,7 +27,7 @@ def errors_of(document, schema, value):
     return [each.message for each in Draft202012Validator(whole).iter_errors(value)]
 
 
-def test_every_schema_is_one(document):
+def test_schemas_are_valid(document):
     schemas = document["components"]["schemas"]
     assert {"Command", "Refusal", "StartRequest"} <= schemas.keys()
     assert "WatchRequest" not in schemas  # not one that the page passes on
@@ -58,21 +58,21 @@ def test_the_server_answers_as_documented(served, document, method, address, pat
         schema = described["requestBody"]["content"]["application/json"]["schema"]
         assert bool(errors_of(document, schema, body)) == (status == 400)
         headers, sent = ACTING | TOKEN_HEADER, json.dumps(body).encode()
-    answered, _, reply = served.ask(method, address, headers, sent)
+    answered, _, reply = served.request(method, address, headers, sent)
     assert answered == status
     content = described["responses"][str(status)]["content"]["application/json"]
     assert not errors_of(document, content["schema"], json.loads(reply))
 
 
-def test_what_needs_the_token_is_refused_without(served, document):
+def test_requests_without_a_required_token_are_refused(served, document):
     for path, methods in document["paths"].items():
         described = methods.get("post", {})
         if described.get("security") == [{"token": []}]:
             address = path.replace("{id}", "none")
-            answered, _, reply = served.ask("POST", address, ACTING, b'{"ids": []}')
+            answered, _, reply = served.request("POST", address, ACTING, b'{"ids": []}')
             assert answered == 403
             assert json.loads(reply)["ok"] is False
     commands = {"tare": 403, "stop": 200}
     for command, status in commands.items():
         body = json.dumps({"command": command}).encode()
-        assert served.ask("POST", "/api/command", ACTING, body)[0] == status
+        assert served.request("POST", "/api/command", ACTING, body)[0] == status

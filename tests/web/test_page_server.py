@@ -1,4 +1,4 @@
-"""The page's server in front of a daemon: what pages are told, and what is passed on."""
+"""The page's server in front of a daemon: messages to pages, and requests passed on."""
 
 import asyncio
 import base64
@@ -49,20 +49,20 @@ def pages(served):
 
 
 LINES = weakref.WeakKeyDictionary()
-"""What has come over a WebSocket and has not been looked at."""
+"""Lines received over a WebSocket and not yet read."""
 
 
 async def until(socket, kind, **members):
-    """Wait for a message of a type; returns it with all that came before."""
+    """Wait for a message of a type; return it with all messages before it."""
     before = []
     lines = LINES.setdefault(socket, deque())
     while lines or (message := await socket.receive()).type is aiohttp.WSMsgType.TEXT:
         if not lines:
             lines.extend(message.data.split("\n"))
-        told = json.loads(lines.popleft())
-        if told["type"] == kind and members.items() <= told.items():
-            return told, before
-        before.append(told)
+        report = json.loads(lines.popleft())
+        if report["type"] == kind and members.items() <= report.items():
+            return report, before
+        before.append(report)
     raise AssertionError(f"closed before {kind}: {before}")
 
 
@@ -71,8 +71,8 @@ async def command(session, headers=ACTING, **request):
         return answer.status, await answer.json()
 
 
-def test_a_page_that_opens_is_told_of_rig_state_and_model(served, pages):
-    # After a standstill of the computer the daemon may not have been heard again yet.
+def test_new_page_receives_rig_state_and_model(served, pages):
+    # After a standstill of the computer no new message of the daemon may have come yet.
     assert eventually(lambda: served.server._status is not None, within_s=30.0)
 
     async def scenario(session):
@@ -94,7 +94,7 @@ def test_a_page_that_opens_is_told_of_rig_state_and_model(served, pages):
     assert set(hello["excitations"]) == set(KINDS)
 
 
-def test_specimens_that_have_a_file_are_offered(served, pages, tmp_path, monkeypatch):
+def test_specimens_with_a_file_are_offered(served, pages, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "specimens" / "long one.toml"
     file.parent.mkdir()
@@ -117,7 +117,7 @@ def test_specimens_that_have_a_file_are_offered(served, pages, tmp_path, monkeyp
         ({"ok": False, "error": "later", "wrong_use": False}, 409),
     ],
 )
-def test_requests_are_passed_on_and_answered_as_the_daemon_does(served, pages, reply, status):
+def test_requests_and_replies_are_passed_on(served, pages, reply, status):
     served.daemon.replies["tare"] = reply
 
     async def scenario(session):
@@ -137,20 +137,20 @@ def test_a_stop_and_a_prediction_need_no_token(served, pages):
             await command(session, plain, command="predict", excitation="hold"),
         )
 
-    (stopped, told), (predicted, _) = pages.run(scenario)
+    (stopped, reply), (predicted, _) = pages.run(scenario)
     assert (stopped, predicted) == (200, 200)
-    assert told["stopping"]
+    assert reply["stopping"]
 
 
-async def seen(daemon, name, count=1):
-    """Wait until a daemon has been asked something."""
-    while sum(each["command"] == name for each in daemon.asked) < count:
+async def wait_for_request(daemon, name, count=1):
+    """Wait until a daemon has received a request."""
+    while sum(each["command"] == name for each in daemon.requests) < count:
         await asyncio.sleep(0.005)
 
 
 @pytest.fixture
-def delayed(served):
-    """Have the daemon answer a command only when the function that is returned is called."""
+def delay_reply(served):
+    """Delay the daemon's answer to a command until the returned function is called."""
 
     def delay(name):
         served.daemon.delays[name] = event = asyncio.Event()
@@ -163,50 +163,50 @@ def delayed(served):
 
 
 @pytest.fixture
-def asked_before(served):
-    """Forget what the daemon was asked before."""
-    served.daemon.asked.clear()
+def cleared_daemon(served):
+    """Clear requests and replies of the daemon."""
+    served.daemon.requests.clear()
     served.daemon.replies.clear()
     yield
     served.daemon.replies.clear()
 
 
-@pytest.mark.usefixtures("asked_before")
-def test_a_start_does_not_wait_for_another_request_and_begin_after_a_stop(served, pages, delayed):
-    go_on = delayed("check")
+@pytest.mark.usefixtures("cleared_daemon")
+def test_no_start_after_a_stop_and_another_request(served, pages, delay_reply):
+    release = delay_reply("check")
 
     async def scenario(session):
         checking = asyncio.create_task(command(session, command="check"))
-        await seen(served.daemon, "check")
+        await wait_for_request(served.daemon, "check")
         starting = asyncio.create_task(command(session, command="start", excitation="chirp"))
         await asyncio.sleep(0.05)
         stopped, _ = await command(session, command="stop")
-        go_on()
+        release()
         return (await checking)[0], stopped, await starting
 
-    checked, stopped, (status, told) = pages.run(scenario)
+    checked, stopped, (status, reply) = pages.run(scenario)
     assert (checked, stopped, status) == (200, 200, 409)
-    assert "try again" in told["error"]
+    assert "try again" in reply["error"]
     assert [each["command"] for each in served.daemon.acted] == ["check"]
 
 
-@pytest.mark.usefixtures("asked_before")
-def test_a_start_that_a_crowd_holds_back_is_cancelled_by_a_stop(served, pages):
+@pytest.mark.usefixtures("cleared_daemon")
+def test_stop_cancels_a_start_delayed_by_too_many_clients(served, pages):
     served.daemon.replies["start"] = {"ok": False, "crowded": True, "error": "Too many clients."}
 
     async def scenario(session):
         starting = asyncio.create_task(command(session, command="start", excitation="chirp"))
-        await seen(served.daemon, "start")
+        await wait_for_request(served.daemon, "start")
         await command(session, command="stop")
         del served.daemon.replies["start"]
         return await starting
 
-    status, told = pages.run(scenario)
+    status, reply = pages.run(scenario)
     assert status == 409
-    assert "stopped before it began" in told["error"]
+    assert "stopped before it began" in reply["error"]
 
 
-def test_the_signals_come_as_strips_and_gauges_and_events_with_their_time(served, pages):
+def test_page_receives_strips_gauges_and_events_with_times(served, pages):
     angle = base64.b64encode(np.full(100, 0.5, dtype="<f4").tobytes()).decode()
     gauges = {"angle": {"value": 0.5, "limit": 1.0, "unit": "rad", "fraction": 0.5}}
     signals = {
@@ -220,7 +220,7 @@ def test_the_signals_come_as_strips_and_gauges_and_events_with_their_time(served
             await until(socket, "nominal")
             served.call(served.daemon.publish, signals)
             strip, _ = await until(socket, "strip")
-            told, _ = await until(socket, "gauges")
+            shown_gauges, _ = await until(socket, "gauges")
             level = {"event": "message", "level": "warning", "text": "Hot."}
             served.call(served.daemon.publish, level)
             event, _ = await until(socket, "event")
@@ -229,11 +229,11 @@ def test_the_signals_come_as_strips_and_gauges_and_events_with_their_time(served
             state, _ = await until(socket, "state")
         async with session.ws_connect("/api/live") as socket:  # a page that is opened later
             again, before = await until(socket, "event")
-            return strip, told, event, state, again, before
+            return strip, shown_gauges, event, state, again, before
 
-    strip, told, event, state, again, before = pages.run(scenario)
+    strip, shown_gauges, event, state, again, before = pages.run(scenario)
     assert strip["angle_max"] == [0.5, 0.5]
-    assert (told["angle"], told["frequency_hz"]) == (gauges["angle"], 3.0)
+    assert (shown_gauges["angle"], shown_gauges["frequency_hz"]) == (gauges["angle"], 3.0)
     assert abs(event["utc_ns"] * 1e-9 - time.time()) < 30.0
     assert (event["level"], event["text"]) == ("warning", "Hot.")
     assert state == {"type": "state", "from": "ready", "to": "running", "reason": "r", "utc_ns": 5}
@@ -241,7 +241,7 @@ def test_the_signals_come_as_strips_and_gauges_and_events_with_their_time(served
     assert strip in before
 
 
-def test_a_daemon_that_falls_silent_or_goes_is_told_within_a_second(served, pages):
+def test_lost_daemon_is_reported_within_a_second(served, pages):
     async def scenario(session):
         async with session.ws_connect("/api/live") as socket:
             await until(socket, "nominal")
@@ -266,9 +266,7 @@ def test_a_daemon_that_falls_silent_or_goes_is_told_within_a_second(served, page
     assert gone_s < 1.0
 
 
-def test_a_page_that_does_not_read_is_dropped_and_the_others_are_not(
-    served, pages, replace_in_page
-):
+def test_only_the_stalled_page_is_dropped(served, pages, replace_in_page):
     replace_in_page(most_waiting=20)
     stopped = served.connect()
     stopped.sendall(
@@ -297,7 +295,7 @@ def test_a_page_that_does_not_read_is_dropped_and_the_others_are_not(
         served.server.pages._events.clear()
 
 
-def test_no_more_pages_than_there_is_room_for(served, pages, replace_in_page):
+def test_number_of_pages_is_limited(served, pages, replace_in_page):
     replace_in_page(most_pages=1)
 
     async def scenario(session):
@@ -311,12 +309,14 @@ def test_no_more_pages_than_there_is_room_for(served, pages, replace_in_page):
 
 
 @pytest.fixture
-def begin(served):
-    """Have the daemon say that a session of an excitation has begun, in a file of that name."""
+def begin_session(served):
+    """Have the daemon report a running session of an excitation, in a file of that name."""
 
     def session(name, excitation):
         plan = {
-            "segments": {name: list(ends) for name, ends in excitation.segments.items()},
+            "segments": {
+                name: list(end_series) for name, end_series in excitation.segments.items()
+            },
             "record_s": excitation.reference_rad.size / excitation.rate_hz,
             **{name: served._job[name] for name in ("beam", "damping")},
         }
@@ -330,16 +330,16 @@ def begin(served):
     assert eventually(lambda: served.server._session is None)
 
 
-def test_the_response_of_a_search_is_that_of_its_scan(served, begin, replace_in_page):
+def test_response_of_a_search_is_that_of_its_scan(served, begin_session, replace_in_page):
     begun = []
     replace_in_page(response=lambda sweep, *_, **__: begun.append(tuple(sweep)))
     excitation = KINDS["until"](rate_hz=1000, targets="damping 1%", at_most_s=60)
-    begin("out/1-until.mcap", excitation)
+    begin_session("out/1-until.mcap", excitation)
     assert eventually(lambda: begun)
     assert begun[0] == excitation.segments["scan"]
 
 
-def test_with_each_session_of_a_series_the_nominal_model_is_told_again(served, pages, begin):
+def test_each_session_of_a_series_sends_the_nominal_model(served, pages, begin_session):
     excitation = KINDS["chirp"](rate_hz=1000, duration_s=10)
 
     async def scenario(session):
@@ -347,7 +347,7 @@ def test_with_each_session_of_a_series_the_nominal_model_is_told_again(served, p
             await until(socket, "nominal")
             for path in ("out/1.mcap", "out/2.mcap"):
                 served.server._shown = {"type": "response"}
-                begin(path, excitation)
+                begin_session(path, excitation)
                 await until(socket, "nominal")
                 assert served.server._shown is None
 
@@ -355,29 +355,29 @@ def test_with_each_session_of_a_series_the_nominal_model_is_told_again(served, p
 
 
 @contextlib.asynccontextmanager
-async def page_at(served, session):
-    """Open a page; gives its socket, and the connection by which the server follows the daemon."""
+async def open_live_page(served, session):
+    """Open a page; yield its socket, and the server's connection to the daemon."""
     async with session.ws_connect("/api/live") as socket:
         await until(socket, "nominal")
         (following,) = served.daemon.connected
         yield socket, following
 
 
-def ends(served, series):
+def end_series(served, series):
     served.call(served.daemon.publish, {"event": "series", "series": series})
 
 
-@pytest.mark.usefixtures("asked_before")
-def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
-    held = []
+@pytest.mark.usefixtures("cleared_daemon")
+def test_started_session_has_control_until_its_series_ends(served, pages):
+    connections = []
 
     async def scenario(session):
-        async with page_at(served, session) as (socket, following):
+        async with open_live_page(served, session) as (socket, following):
             served.daemon.replies["start"] = {"series": 1}
             await command(session, command="start", excitation="chirp")
             await command(session, command="reset")
-            held.append(served.daemon.connected - {following})
-            ends(served, 1)
+            connections.append(served.daemon.connected - {following})
+            end_series(served, 1)
             await until(socket, "series")
             while served.daemon.connected != {following}:
                 await asyncio.sleep(0.01)
@@ -385,69 +385,69 @@ def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
             return following
 
     following = pages.run(scenario)
-    assert [len(each) for each in held] == [1]
+    assert [len(each) for each in connections] == [1]
     assert eventually(lambda: served.daemon.connected == {following})
 
 
-@pytest.mark.usefixtures("asked_before")
-def test_a_request_is_sent_once_although_a_series_ends_meanwhile(served, pages, delayed):
+@pytest.mark.usefixtures("cleared_daemon")
+def test_request_is_sent_once_if_a_series_ends_meanwhile(served, pages, delay_reply):
     served.daemon.replies["start"] = {"series": 1}
 
     async def scenario(session):
-        async with page_at(served, session) as (socket, following):
+        async with open_live_page(served, session) as (socket, following):
             await command(session, command="start", excitation="chirp")
             served.daemon.replies["start"] = {"series": 2}
-            go_on = delayed("start")
+            release = delay_reply("start")
             starting = asyncio.create_task(command(session, command="start", excitation="hold"))
-            await seen(served.daemon, "start", 2)
-            ends(served, 1)
+            await wait_for_request(served.daemon, "start", 2)
+            end_series(served, 1)
             await until(socket, "series")
-            go_on()
+            release()
             answer = await starting
-            # The new series keeps control, until it ends.
+            # The new series has control until it ends.
             holding = served.daemon.connected - {following}
-            ends(served, 2)
+            end_series(served, 2)
             await until(socket, "series")
             return answer, holding, following
 
-    (status, told), holding, following = pages.run(scenario)
-    assert (status, told["series"], len(holding)) == (200, 2, 1)
+    (status, reply), holding, following = pages.run(scenario)
+    assert (status, reply["series"], len(holding)) == (200, 2, 1)
     assert [each["command"] for each in served.daemon.acted] == ["start", "start"]
     assert eventually(lambda: served.daemon.connected == {following})
 
 
-@pytest.mark.usefixtures("asked_before")
-def test_a_request_whose_reply_is_lost_is_not_sent_again(served, pages, delayed):
+@pytest.mark.usefixtures("cleared_daemon")
+def test_request_with_lost_reply_is_not_repeated(served, pages, delay_reply):
     served.daemon.replies["start"] = {"series": 1}
 
     async def scenario(session):
-        async with page_at(served, session) as (_, following):
+        async with open_live_page(served, session) as (_, following):
             await command(session, command="start", excitation="chirp")
-            delayed("zero")
+            delay_reply("zero")
             zeroing = asyncio.create_task(command(session, command="zero"))
-            await seen(served.daemon, "zero")
+            await wait_for_request(served.daemon, "zero")
             (holding,) = served.daemon.connected - {following}
             served.call(holding.close)
             lost, _ = await zeroing
-            # What has been found closed before anything was sent is no reason to refuse.
+            # A connection that is closed before anything was sent causes no refusal.
             return lost, (await command(session, command="tare"))[0]
 
     assert pages.run(scenario) == (503, 200)
     assert [each["command"] for each in served.daemon.acted] == ["start", "zero", "tare"]
 
 
-@pytest.mark.usefixtures("asked_before")
-def test_control_is_given_back_after_a_series_that_ends_before_its_reply(served, pages, delayed):
+@pytest.mark.usefixtures("cleared_daemon")
+def test_control_is_released_if_the_series_ends_early(served, pages, delay_reply):
     served.daemon.replies["start"] = {"series": 1}
 
     async def scenario(session):
-        async with page_at(served, session) as (socket, following):
-            go_on = delayed("start")
+        async with open_live_page(served, session) as (socket, following):
+            release = delay_reply("start")
             starting = asyncio.create_task(command(session, command="start", excitation="chirp"))
-            await seen(served.daemon, "start")
-            ends(served, 1)
+            await wait_for_request(served.daemon, "start")
+            end_series(served, 1)
             await until(socket, "series")
-            go_on()
+            release()
             assert (await starting)[0] == 200
             return following
 
@@ -455,14 +455,14 @@ def test_control_is_given_back_after_a_series_that_ends_before_its_reply(served,
     assert eventually(lambda: served.daemon.connected == {following})
 
 
-@pytest.mark.usefixtures("asked_before")
-def test_a_stop_does_not_wait_for_lists_of_sessions(served, pages, replace_in_page):
-    began, go_on, at_once = threading.Event(), threading.Event(), []
+@pytest.mark.usefixtures("cleared_daemon")
+def test_stop_does_not_wait_for_lists_of_sessions(served, pages, replace_in_page):
+    began, release, at_once = threading.Event(), threading.Event(), []
 
     def list_slowly(_):
         at_once.append(None)
         began.set()
-        go_on.wait(20.0)
+        release.wait(20.0)
         at_once.pop()
         return []
 
@@ -476,15 +476,15 @@ def test_a_stop_does_not_wait_for_lists_of_sessions(served, pages, replace_in_pa
             stopping = command(session, command="stop")
             return len(at_once), await asyncio.wait_for(stopping, 10.0)
         finally:
-            go_on.set()
+            release.set()
             for answer in await asyncio.gather(*listings):
                 answer.release()
 
-    together, (status, _) = pages.run(scenario)
-    assert (together, status) == (1, 200)
+    concurrent, (status, _) = pages.run(scenario)
+    assert (concurrent, status) == (1, 200)
 
 
-@pytest.mark.usefixtures("asked_before")
+@pytest.mark.usefixtures("cleared_daemon")
 def test_a_page_stops_over_its_websocket(served, pages):
     served.daemon.replies["stop"] = {"stopping": True}
 
@@ -500,12 +500,12 @@ def test_a_page_stops_over_its_websocket(served, pages):
     stopped, refused = pages.run(scenario)
     assert stopped["stopping"]
     assert (refused["ok"], refused["error"]) == (False, "Not now.")
-    assert [each["command"] for each in served.daemon.asked].count("stop") == 2
+    assert [each["command"] for each in served.daemon.requests].count("stop") == 2
 
 
 @pytest.mark.process
 @pytest.mark.usefixtures("children_copied")
-def test_the_process_writes_no_nonsense_that_it_is_sent_to_its_terminal(served):
+def test_page_process_writes_no_invalid_requests_to_its_terminal(served):
     page = ChildProcess(replace(PAGE, captures_stderr=True))
     try:
         page.start(served._job)

@@ -1,4 +1,4 @@
-"""Top bar of the operator's page: state, reason, STOP; and what stays where it is."""
+"""Top bar of the operator's page: state, reason, STOP; and a stable layout."""
 
 import re
 
@@ -9,8 +9,8 @@ from processes import eventually
 
 pytestmark = pytest.mark.browser
 
-TELL_S = 1.0
-"""Within this time the page has to say what has happened."""
+SHOWN_WITHIN_S = 1.0
+"""Within this time the page must show an event."""
 
 
 @pytest.fixture
@@ -27,9 +27,9 @@ def page(server, open_page):
     return page
 
 
-def says(page, selector, text):
-    """Check that an element says a text within a second."""
-    expect(page.locator(selector)).to_contain_text(text, timeout=1000 * TELL_S)
+def expect_text(page, selector, text):
+    """Check that an element shows a text within a second."""
+    expect(page.locator(selector)).to_contain_text(text, timeout=1000 * SHOWN_WITHIN_S)
 
 
 def change(before, after, reason):
@@ -52,80 +52,80 @@ STATES = [
 ]
 
 
-def test_each_state_and_a_failed_stop_are_told_within_a_second(server, page, open_page):
+def test_states_and_failed_stops_are_shown_within_a_second(server, page, open_page):
     for message, word, reason, tone in STATES:
-        server.tell(message)
-        says(page, "#state-word", word)
-        says(page, "#state-reason", reason)
+        server.send(message)
+        expect_text(page, "#state-word", word)
+        expect_text(page, "#state-reason", reason)
         assert page.get_attribute("#bar", "data-tone") == tone
         assert page.is_visible("#fault") == (word == "FAULT")
-    # A stop that fails says what to do, also where the server answers no more.
+    # The message of a failed stop names a remedy, also if the server does not answer.
     server.replies["stop"] = {"ok": False, "error": "The daemon gave no answer."}
     page.click("#stop")
-    says(page, "#state-reason", "Not stopped: The daemon gave no answer. Use rigd stop")
+    expect_text(page, "#state-reason", "Not stopped: The daemon gave no answer. Use rigd stop")
     page.wait_for_timeout(100)
     assert page.inner_text("#state-word") == "READY"
     server.close()
     page.click("#stop")
-    says(page, "#state-reason", "Not stopped: The page's server does not answer.")
-    # That it cannot be reached is what is tested; an open page would try again.
+    expect_text(page, "#state-reason", "Not stopped: The page's server does not answer.")
+    # The lost connection is the subject of this test; an open page would try again.
     page.close()
     open_page.complaints.clear()
 
 
 @pytest.mark.further
-def test_a_lost_server_is_told_and_found_again(server, page):
+def test_lost_server_is_shown_and_reconnected(server, page):
     server.hang_up()
-    says(page, "#state-word", "OFFLINE")
+    expect_text(page, "#state-word", "OFFLINE")
     assert page.is_disabled("#start-button")
     expect(page.locator("#state-word")).to_have_text("READY")
     assert page.is_enabled("#start-button")
 
 
-@pytest.mark.further  # as tests/daemon/test_service.py has it of the status
-def test_a_session_that_is_prepared_does_not_run_yet(server, page):
-    server.tell(status("running"), progress(0.0, activity="preparing"))
-    says(page, "#state-word", "PREPARING")
-    server.tell(progress(0.1, activity="running"))
-    says(page, "#state-word", "RUNNING")
+@pytest.mark.further  # as the status in tests/daemon/test_service.py
+def test_session_is_preparing_before_it_runs(server, page):
+    server.send(status("running"), progress(0.0, activity="preparing"))
+    expect_text(page, "#state-word", "PREPARING")
+    server.send(progress(0.1, activity="running"))
+    expect_text(page, "#state-word", "RUNNING")
 
 
 @pytest.mark.further
-def test_a_session_that_runs_and_says_nothing_is_offline(server, page):
-    server.tell(status("running"), progress(0.1))
-    says(page, "#state-word", "RUNNING")
+def test_running_session_without_messages_is_offline(server, page):
+    server.send(status("running"), progress(0.1))
+    expect_text(page, "#state-word", "RUNNING")
     expect(page.locator("#state-word")).to_have_text("OFFLINE")
-    server.tell(status("running"), progress(0.2))
-    says(page, "#state-word", "RUNNING")
+    server.send(status("running"), progress(0.2))
+    expect_text(page, "#state-word", "RUNNING")
 
 
 @pytest.mark.further
-def test_a_fault_names_its_reason_and_the_way_out(server, page):
+def test_fault_shows_its_reason_and_remedy(server, page):
     reason = "Angle 0.51 rad exceeds limit 0.5 rad. " + "Turn it back. " * 20
-    server.tell(status("fault", reason=reason))
-    says(page, "#fault-reason", reason.strip())
+    server.send(status("fault", reason=reason))
+    expect_text(page, "#fault-reason", reason.strip())
     assert page.is_disabled("#start-button")
     page.click("#fault-reset")
-    says(page, "#rig-result", "Fault reset.")
-    assert server.asked == [("reset", True)]
+    expect_text(page, "#rig-result", "Fault reset.")
+    assert server.commands == [("reset", True)]
 
 
 @pytest.mark.further
-def test_progress_tells_time_left_phase_and_frequency(server, page):
+def test_progress_shows_time_left_phase_and_frequency(server, page):
     controller = {"pid": 812, "uid": 1000, "user": "ada"}
-    server.tell(
+    server.send(
         status("running", controller=controller),
         progress(0.5, session=2, repeat=3, missed=7),
         gauges(0.4, frequency_hz=12.345),
     )
-    says(page, "#frequency", "12.3 Hz")
-    says(page, "#time-left", "1:08")
-    says(page, "#phase", "recording, 2 of 3")
-    says(page, "#controller", "ada, process 812")
-    says(page, "#count-missed", "7")
-    # Where time is skipped there is no time left to tell.
-    server.tell(progress(0.25, time_left_s=None))
-    says(page, "#time-left", "25 %")
+    expect_text(page, "#frequency", "12.3 Hz")
+    expect_text(page, "#time-left", "1:08")
+    expect_text(page, "#phase", "recording, 2 of 3")
+    expect_text(page, "#controller", "ada, process 812")
+    expect_text(page, "#count-missed", "7")
+    # If time is skipped, there is no time left to show.
+    server.send(progress(0.25, time_left_s=None))
+    expect_text(page, "#time-left", "25 %")
 
 
 @pytest.mark.further
@@ -133,22 +133,22 @@ def test_a_stop_does_not_wait_behind_downloads(server, page):
     server.replies["stop"] = {"stopping": True}
     page.evaluate("() => { for (let k = 0; k < 8; k++) fetch(`/api/sessions/${k}/file.mat`); }")
     # As many as a browser has connections to one server.
-    assert eventually(lambda: server.asked.count(("file", False)) == 6)
+    assert eventually(lambda: server.commands.count(("file", False)) == 6)
     page.click("#stop")
-    says(page, "#state-reason", "Stop requested.")
-    assert ("stop", False) in server.asked
+    expect_text(page, "#state-reason", "Stop requested.")
+    assert ("stop", False) in server.commands
 
 
 @pytest.mark.further
-def test_a_stop_that_is_not_answered_in_time_is_told(server, page):
+def test_stop_without_an_answer_is_reported(server, page):
     server.replies["stop"] = None
     page.click("#stop")
-    told = page.locator("#state-reason")
-    expect(told).to_contain_text("Not stopped: No answer within 3 s.", timeout=10_000)
+    reason = page.locator("#state-reason")
+    expect(reason).to_contain_text("Not stopped: No answer within 3 s.", timeout=10_000)
     assert not page.get_attribute("#stop", "aria-busy")
 
 
-def test_without_the_token_the_page_is_read_only_and_stops(server, open_page):
+def test_without_the_token_the_page_can_only_read_and_stop(server, open_page):
     page = open_page(server.address)
     expect(page.locator("#state-word")).to_have_text("READY")
     assert "rigd serve --web" in page.inner_text("#read-only")
@@ -162,13 +162,13 @@ def test_without_the_token_the_page_is_read_only_and_stops(server, open_page):
     server.replies["stop"] = {"stopping": True}
     page.focus("#stop")
     page.keyboard.press("Enter")
-    says(page, "#state-reason", "Stop requested.")
-    assert server.asked == [("stop", False)]
+    expect_text(page, "#state-reason", "Stop requested.")
+    assert server.commands == [("stop", False)]
     assert "not an emergency stop" in page.inner_text(".stop")
 
 
 @pytest.mark.further
-def test_the_token_stays_with_the_tab_and_leaves_the_address(page, server):
+def test_token_stays_in_the_tab_but_not_the_address(page, server):
     assert TOKEN not in page.url
     page.reload()
     expect(page.locator("#state-word")).to_have_text("READY")
@@ -177,21 +177,21 @@ def test_the_token_stays_with_the_tab_and_leaves_the_address(page, server):
 
 @pytest.mark.further
 @pytest.mark.parametrize("width", [360, 390, 1280])
-def test_nothing_jumps_or_overflows_when_a_session_runs(server, open_page, width):
+def test_layout_is_stable_when_a_session_runs(server, open_page, width):
     page = open_page(f"{server.address}#token={TOKEN}", width=width)
     page.wait_for_selector("#rows tr")
     boxes = """() => ["#stop", "#live", "#response", "#start", "#rig", "#sessions"].map(
         (each) => { const box = document.querySelector(each).getBoundingClientRect();
             return [each, Math.round(box.x), Math.round(box.y), Math.round(box.width)] })"""
     before = page.evaluate(boxes)
-    server.tell(
+    server.send(
         status("running", controller={"pid": 4_194_304, "uid": 1000, "user": "a.rather.long.name"}),
         progress(0.5, repeat=1000, session=999, missed=123_456, late=123_456, phase="waiting"),
         strip(0.0, 200),
         gauges(1.2),
         {"type": "event", "utc_ns": UTC_NS, "level": "warning", "text": "Very long. " * 50},
     )
-    says(page, "#phase", "waiting for the beam to rest")
+    expect_text(page, "#phase", "waiting for the beam to rest")
     assert page.evaluate(boxes) == before
     assert page.evaluate("document.documentElement.scrollWidth") == width
     bar = page.locator("#bar")
@@ -199,14 +199,14 @@ def test_nothing_jumps_or_overflows_when_a_session_runs(server, open_page, width
 
 
 @pytest.mark.further
-def test_the_page_is_there_within_a_second(server, open_page):
+def test_page_loads_within_a_second(server, open_page):
     loaded_s = []
-    for _ in range(3):  # of which the computer may have been elsewhere for one or two
+    for _ in range(3):  # one or two may be slow while the computer is busy
         page = open_page(server.address)
-        says(page, "#state-word", "READY")
+        expect_text(page, "#state-word", "READY")
         timing = "() => performance.getEntriesByType('navigation')[0].loadEventEnd"
         loaded_s.append(page.evaluate(timing) / 1e3)
     assert min(loaded_s) < 1.0
-    # Its modules come at once, not each when the one before has been read.
-    asked = set(re.findall(r"/static/(\w+\.js)", (STATIC / "index.html").read_text()))
-    assert asked == {path.name for path in STATIC.glob("*.js")}
+    # All modules are preloaded, not each after the one before.
+    preloaded = set(re.findall(r"/static/(\w+\.js)", (STATIC / "index.html").read_text()))
+    assert preloaded == {path.name for path in STATIC.glob("*.js")}

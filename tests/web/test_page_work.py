@@ -1,4 +1,4 @@
-"""What an operator does on the page: start, rig, live signals, responses, sessions, events."""
+"""The operator's page: start, rig, live signals, responses, sessions, events."""
 
 import re
 
@@ -37,12 +37,12 @@ def page(server, open_page):
     return page
 
 
-def says(page, selector, text):
+def expect_text(page, selector, text):
     expect(page.locator(selector)).to_contain_text(text)
 
 
-def drawn(page, canvas):
-    """Share of a canvas that has something on it."""
+def drawn_fraction(page, canvas):
+    """Return the fraction of a canvas that is drawn on."""
     return page.evaluate(
         """canvas => {
             const { width, height } = document.querySelector(canvas);
@@ -59,13 +59,13 @@ def drawn(page, canvas):
 # Start
 
 
-def test_a_start_sends_what_the_form_says(server, page):
-    told = "The predicted peak angle of 0.6 rad exceeds 0.5 rad; lower the amplitude."
-    server.replies["start"] = {"ok": False, "error": told}
+def test_start_sends_the_values_of_the_form(server, page):
+    error = "The predicted peak angle of 0.6 rad exceeds 0.5 rad; lower the amplitude."
+    server.replies["start"] = {"ok": False, "error": error}
     page.click("#start-button")
-    says(page, "#start-result", told)
+    expect_text(page, "#start-result", error)
     page.wait_for_selector("#start-button:enabled")
-    server.tell(hello(required_meta=["operator", "temperature_c"]), status())
+    server.send(hello(required_meta=["operator", "temperature_c"]), status())
     # The operator has a field of his own.
     expect(page.locator("#operator")).to_have_attribute("placeholder", "required")
     assert page.evaluate("document.getElementById('operator').required")
@@ -84,8 +84,8 @@ def test_a_start_sends_what_the_form_says(server, page):
     page.fill("#metadata-rows .pair:nth-child(2) input:nth-child(2)", "new")
     server.replies["start"] = {"series": 1, "plan": PLAN}
     page.click("#start-button")
-    says(page, "#prediction", "Predicted peaks")
-    assert server.asked == [("start", True)] * 2
+    expect_text(page, "#prediction", "Predicted peaks")
+    assert server.commands == [("start", True)] * 2
     assert server.requests[1:] == [
         {
             "command": "start", "excitation": "chirp", "repeat": 2, "force": True,
@@ -99,7 +99,7 @@ def test_a_start_sends_what_the_form_says(server, page):
             },
         }
     ]  # fmt: skip
-    assert not page.is_checked("#force")  # it is asked for again
+    assert not page.is_checked("#force")  # required for each start
     # A failed check is shown, and accepted for one start.
     failed = {"name": "travel_no_angle", "text": "travel, if no angle comes: 2.50 rad"}
     beyond = {"name": "unknown_values", "text": "motor.peak_torque_nm: unknown"}
@@ -107,17 +107,17 @@ def test_a_start_sends_what_the_form_says(server, page):
     assert not page.is_visible("#failed-checks")
     shown = status()
     shown["daemon"]["failed_checks"] = rows
-    server.tell(shown)
-    says(page, "#failed-rows", "travel_no_angle: travel, if no angle comes: 2.50 rad")
-    says(page, "#failed-rows", "motor.peak_torque_nm")
+    server.send(shown)
+    expect_text(page, "#failed-rows", "travel_no_angle: travel, if no angle comes: 2.50 rad")
+    expect_text(page, "#failed-rows", "motor.peak_torque_nm")
     assert page.locator("#failed-rows input").count() == 1
     page.check("#failed-rows input")
-    server.tell(shown)  # what is ticked stays
+    server.send(shown)  # the tick remains
     server.replies["predict"] = {"plan": PLAN | {"failed_checks": rows}}
     page.click("#predict")
     assert eventually(lambda: len(server.requests) == 3)
     page.click("#start-button")
-    expect(page.locator("#failed-rows input")).not_to_be_checked()  # it is asked for again
+    expect(page.locator("#failed-rows input")).not_to_be_checked()  # required for each start
     assert [request["accept"] for request in server.requests[2:]] == [["travel_no_angle"]] * 2
 
 
@@ -131,13 +131,13 @@ def test_each_excitation_has_its_own_parameters_with_units(page):
 
 
 @pytest.mark.further
-def test_a_precision_is_asked_for_in_words(server, page):
+def test_target_precision_is_a_text_field(server, page):
     page.select_option("#excitation", "until")
     assert not page.is_visible("#watch-fit")  # it is fitted anyway
     page.fill("#parameter-targets", "damping 1%; alpha 0.03")
     server.replies["start"] = {"series": 1, "plan": PLAN}
     page.click("#start-button")
-    says(page, "#prediction", "Predicted peaks")
+    expect_text(page, "#prediction", "Predicted peaks")
     request = {"targets": "damping 1%; alpha 0.03", "at_most_s": 120}
     assert (server.requests[0]["excitation"], server.requests[0]["parameters"]) == (
         "until", request,
@@ -150,7 +150,7 @@ def test_the_record_of_any_excitation_can_be_fitted(server, page):
     server.replies["start"] = {"series": 1, "plan": PLAN}
     page.check("#watch-fit")
     page.click("#start-button")
-    says(page, "#prediction", "Predicted peaks")
+    expect_text(page, "#prediction", "Predicted peaks")
     assert server.requests[0]["watch_fit"] is True
 
 
@@ -163,60 +163,60 @@ def series(fit, **members):
 
 
 def width(page, cell):
-    """Width of the bar that stands for an interval."""
+    """Return the width of the bar of an interval."""
     return page.locator(f"{cell} .fill").bounding_box()["width"]
 
 
 @pytest.mark.further
-def test_modes_and_what_is_asked_for_are_shown_as_fits_come(server, page):
+def test_modes_and_targets_of_each_fit_are_shown(server, page):
     assert not page.is_visible("#fit")
-    server.tell(status("running", series=series(None)))
-    says(page, "#fit-of", "not yet")
-    server.tell(status("running", series=series(online_fit(6.0, 4.0))))
-    says(page, "#fit-of", "first 6.0 s of the record")
-    says(page, "#fit-search", "About 12 s more.")
+    server.send(status("running", series=series(None)))
+    expect_text(page, "#fit-of", "not yet")
+    server.send(status("running", series=series(online_fit(6.0, 4.0))))
+    expect_text(page, "#fit-of", "first 6.0 s of the record")
+    expect_text(page, "#fit-search", "About 12 s more.")
     cell = "#fit-modes tbody tr:nth-child(1) td:nth-child(3)"
-    says(page, cell, "0.910 ± 0.078")
+    expect_text(page, cell, "0.910 ± 0.078")
     widest = width(page, cell)
-    asked = "#fit-targets tbody tr:nth-child(1)"
-    says(page, asked, "0.00040 (4.4 %)")
-    says(page, asked, "5 %")
-    says(page, "#fit-targets tbody tr:nth-child(2)", "damping of mode 3")
+    target_row = "#fit-targets tbody tr:nth-child(1)"
+    expect_text(page, target_row, "0.00040 (4.4 %)")
+    expect_text(page, target_row, "5 %")
+    expect_text(page, "#fit-targets tbody tr:nth-child(2)", "damping of mode 3")
     assert page.locator("#fit-modes tbody tr").count() == 2  # the third is not visible yet
-    server.tell(status("running", series=series(online_fit(8.0, 0.8, third="doubtful"))))
-    says(page, cell, "0.910 ± 0.016")
+    server.send(status("running", series=series(online_fit(8.0, 0.8, third="doubtful"))))
+    expect_text(page, cell, "0.910 ± 0.016")
     assert width(page, cell) == pytest.approx(0.2 * widest, rel=0.05)
-    says(page, f"{asked} .reached", "100 %")
-    says(page, "#fit-modes tbody tr:nth-child(3)", "0.990 (doubtful)")
-    says(page, "#fit-result", "A disturbance at 50 Hz was modelled.")
+    expect_text(page, f"{target_row} .reached", "100 %")
+    expect_text(page, "#fit-modes tbody tr:nth-child(3)", "0.990 (doubtful)")
+    expect_text(page, "#fit-result", "A disturbance at 50 Hz was modelled.")
     ended = online_fit(9.0, search=False) | {"search": {"reason": "Reached: <all>."}}
-    server.tell(status(series=series(ended, running=False)))
-    says(page, "#fit-search", "Reached: <all>.")
-    server.tell(status(series=series(None, excitation="hold", path="/data/sessions/2.mcap")))
+    server.send(status(series=series(ended, running=False)))
+    expect_text(page, "#fit-search", "Reached: <all>.")
+    server.send(status(series=series(None, excitation="hold", path="/data/sessions/2.mcap")))
     expect(page.locator("#fit")).to_be_hidden()
 
 
 @pytest.mark.further
-def test_a_value_that_is_no_number_is_told_and_not_sent(server, page):
+def test_invalid_number_is_reported_and_not_sent(server, page):
     page.fill("#parameter-amplitude_rad", "much")
     page.click("#start-button")
-    says(page, "#start-result", "Amplitude much is not a number; give one in rad.")
+    expect_text(page, "#start-result", "Amplitude much is not a number; give one in rad.")
     page.fill("#parameter-amplitude_rad", "0.02")
     page.fill("#repeat", "1.5")
     page.click("#start-button")
-    says(page, "#start-result", "Repeat 1.5 is not a whole number")
-    assert server.asked == []
+    expect_text(page, "#start-result", "Repeat 1.5 is not a whole number")
+    assert server.commands == []
 
 
 @pytest.mark.further
-def test_predict_shows_peaks_against_limits_and_offers_the_largest_amplitude(server, page):
+def test_predict_shows_peaks_limits_and_largest_amplitude(server, page):
     refused = "The predicted peak speed of 11 rad/s exceeds 10 rad/s."
     plan = PLAN | {"peak_velocity_rad_s": 11.0, "refused": refused}
     server.replies["predict"] = {"plan": plan, "largest_amplitude_rad": 0.028_679}
     page.click("#predict")
-    says(page, "#prediction", "11.0 of 10 rad/s")
-    says(page, "#prediction", refused)
-    says(page, "#prediction", "39.0 mm")
+    expect_text(page, "#prediction", "11.0 of 10 rad/s")
+    expect_text(page, "#prediction", refused)
+    expect_text(page, "#prediction", "39.0 mm")
     rows = page.locator("#prediction .bar-row")
     assert [rows.nth(k).get_attribute("class").split()[1:] for k in range(3)] == [
         [], ["over"], ["near"],
@@ -234,7 +234,7 @@ def test_predict_shows_peaks_against_limits_and_offers_the_largest_amplitude(ser
 
 
 @pytest.mark.further
-def test_zero_tare_and_check_tell_their_results(server, page):
+def test_results_of_zero_tare_and_check_are_shown(server, page):
     axes = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
     server.replies |= {
         "zero": {"moved_rad": 0.001},
@@ -251,36 +251,36 @@ def test_zero_tare_and_check_tell_their_results(server, page):
         },
     }  # fmt: skip
     page.click("#zero")
-    says(page, "#rig-result", "Zero set (shift 0.00100 rad).")
+    expect_text(page, "#rig-result", "Zero set (shift 0.00100 rad).")
     page.click("#tare")
-    says(page, "#rig-result", "0.401 N")
-    says(page, "#rig-result", "0.020 N·m")
+    expect_text(page, "#rig-result", "0.401 N")
+    expect_text(page, "#rig-result", "0.020 N·m")
     page.click("#check")
-    says(page, "#rig-result", "1 failed")
+    expect_text(page, "#rig-result", "1 failed")
     assert page.locator("#rig-result .failed").inner_text() == "failed priority: none\nSet it."
     assert "None." not in page.inner_text("#rig-result")
-    server.tell(status(last_check={"utc_ns": UTC_NS, "verdict": "1 failed"}))
-    says(page, "#last-check", "1 failed, ")
-    says(page, "#calibration", "FT12345")
+    server.send(status(last_check={"utc_ns": UTC_NS, "verdict": "1 failed"}))
+    expect_text(page, "#last-check", "1 failed, ")
+    expect_text(page, "#calibration", "FT12345")
 
 
-def test_buttons_and_responses_are_those_of_the_state(server, page):
+def test_buttons_and_responses_by_state(server, page):
     enabled = "['zero', 'tare', 'check', 'reset', 'start-button'].filter(id => " \
         "!document.getElementById(id).disabled).join()"  # fmt: skip
     assert page.evaluate(enabled) == "zero,tare,check,start-button"
-    for told, expected in (
+    for message, expected in (
         (status("running"), ""), (status("fault"), "reset"), (status(doing="tare"), ""),
         (status("idle"), "check"),
     ):  # fmt: skip
-        server.tell(told)
+        server.send(message)
         page.wait_for_function(f"() => {enabled} === '{expected}'")
-    # Of the session before, nothing is shown when the next one of a series begins.
-    server.tell(status("running"), response("nominal"), response("last"), response())
-    says(page, "#response-keys", "measured")
-    server.tell(status("running"), response("nominal"))
+    # The response of a session is cleared when the next one of a series begins.
+    server.send(status("running"), response("nominal"), response("last"), response())
+    expect_text(page, "#response-keys", "measured")
+    server.send(status("running"), response("nominal"))
     expect(page.locator("#response-keys")).to_have_text("nominal model")
-    server.tell(response(reached_hz=5.0))
-    says(page, "#response-keys", "measured")
+    server.send(response(reached_hz=5.0))
+    expect_text(page, "#response-keys", "measured")
 
 
 # Live
@@ -288,56 +288,56 @@ def test_buttons_and_responses_are_those_of_the_state(server, page):
 
 @pytest.mark.further
 def test_gauges_are_per_cent_of_limits_and_coloured_near_them(server, page):
-    told = gauges(0.5)
-    told["angle"] |= {"value": 0.4, "fraction": 0.8}
-    told["velocity"] |= {"value": 10.4, "fraction": 1.04}
-    told["i2t"] = {"value": 0.1, "limit": None, "unit": "N·m", "fraction": None}
-    server.tell(told)
-    says(page, "#gauge-angle", "80 %")
+    message = gauges(0.5)
+    message["angle"] |= {"value": 0.4, "fraction": 0.8}
+    message["velocity"] |= {"value": 10.4, "fraction": 1.04}
+    message["i2t"] = {"value": 0.1, "limit": None, "unit": "N·m", "fraction": None}
+    server.send(message)
+    expect_text(page, "#gauge-angle", "80 %")
     assert page.get_attribute("#gauge-angle", "class") == "gauge near"
     assert page.get_attribute("#gauge-angle", "title") == "0.400 rad of 0.500 rad"
     assert page.get_attribute("#gauge-velocity", "class") == "gauge over"
     assert page.inner_text("#gauge-velocity .percent") == "104 %"
-    says(page, "#gauge-i2t", "0.100 N·m")
+    expect_text(page, "#gauge-i2t", "0.100 N·m")
 
 
 @pytest.mark.further
 def test_strips_show_the_last_ten_seconds(server, page):
-    before = drawn(page, "#strip-angle")
-    server.tell(strip(0.0, 300))
+    before = drawn_fraction(page, "#strip-angle")
+    server.send(strip(0.0, 300))
     label = re.compile("^Angle, last 10 s: −0.02[45].* to 0.02[45].* rad$")
     expect(page.locator("#strip-angle")).to_have_attribute("aria-label", label)
-    assert drawn(page, "#strip-angle") > 2 * before
-    # Gaps are none of its business, and a new record starts from zero.
+    assert drawn_fraction(page, "#strip-angle") > 2 * before
+    # Gaps are skipped, and a new record starts from zero.
     gap = strip(0.0, 40)
     for name in ("angle_min", "angle_max", "reference_min", "reference_max"):
         gap[name][10] = None
-    full = drawn(page, "#strip-angle")
-    server.tell(gap)
+    full = drawn_fraction(page, "#strip-angle")
+    server.send(gap)
     page.wait_for_timeout(100)
-    assert 0 < drawn(page, "#strip-angle") < 0.6 * full
+    assert 0 < drawn_fraction(page, "#strip-angle") < 0.6 * full
 
 
 @pytest.mark.further
 def test_the_response_grows_over_model_and_last_session(server, page):
-    before = drawn(page, "#response-plot")
-    server.tell(response("nominal"), response("last", specimen="antenna 3"))
-    says(page, "#response-keys", "last session (antenna 3)")
-    server.tell(response(reached_hz=5.0))
-    says(page, "#response-keys", "measured")
-    little = drawn(page, "#response-plot")
+    before = drawn_fraction(page, "#response-plot")
+    server.send(response("nominal"), response("last", specimen="antenna 3"))
+    expect_text(page, "#response-keys", "last session (antenna 3)")
+    server.send(response(reached_hz=5.0))
+    expect_text(page, "#response-keys", "measured")
+    little = drawn_fraction(page, "#response-plot")
     assert little > before
     page.hover("#response-plot", position={"x": 60, "y": 50})
-    says(page, "#response-readout", "coherence")
+    expect_text(page, "#response-readout", "coherence")
     assert "Hz" in page.inner_text("#response-readout")
 
 
 @pytest.mark.further
-def test_rerun_is_linked_where_there_is_a_live_view(server, page):
+def test_live_view_is_linked(server, page):
     assert page.is_hidden("#rerun")
-    told = status()
-    told["rig"]["live_view"] = {"url": "http://127.0.0.1:9090/?url=x"}
-    server.tell(told)
+    message = status()
+    message["rig"]["live_view"] = {"url": "http://127.0.0.1:9090/?url=x"}
+    server.send(message)
     page.wait_for_selector("#rerun", state="visible")
     assert page.get_attribute("#rerun", "href") == "http://127.0.0.1:9090/?url=x"
 
@@ -346,19 +346,19 @@ def test_rerun_is_linked_where_there_is_a_live_view(server, page):
 
 
 @pytest.mark.further
-def test_sessions_are_filtered_and_looked_at(server, page):
+def test_filter_and_details_of_sessions(server, page):
     server.sessions = [session(0), session(1, outcome="stopped", specimen="antenna 4")]
     page.select_option("[name=outcome]", "stopped")
     page.wait_for_function("() => document.querySelectorAll('#rows tr[id]').length === 1")
-    says(page, "#sessions-count", "1 session")
+    expect_text(page, "#sessions-count", "1 session")
     page.click("#rows button.link >> nth=0")
     page.wait_for_selector(".detail:not([hidden])")
-    told = page.inner_text(".detail")
-    assert "2.61130" in told  # to the second digit of its uncertainty
-    assert "2.60973 to 2.61287" in told
-    assert "the second mode has changed" in told
-    assert "Damping of mode 3 is uncertain" in told
-    assert "Temperature\n21.4 °C" in told
+    details = page.inner_text(".detail")
+    assert "2.61130" in details  # to the second digit of its uncertainty
+    assert "2.60973 to 2.61287" in details
+    assert "the second mode has changed" in details
+    assert "Damping of mode 3 is uncertain" in details
+    assert "Temperature\n21.4 °C" in details
 
 
 @pytest.mark.further
@@ -373,46 +373,46 @@ def test_files_and_report_of_a_session(server, page):
         *(f"/api/sessions/{name}/file.{ending}" for ending in ("mcap", "mat", "uff")),
     ]
     page.click("text=Make report")
-    says(page, "#sessions-result", "Report of")
+    expect_text(page, "#sessions-result", "Report of")
     address = f"/api/sessions/{server.sessions[0]['id']}/report"
-    assert server.asked == [(address, True)]
+    assert server.commands == [(address, True)]
     server.sessions[0] = session(0, report="/somewhere/else/report.html")
-    server.tell(job("done", id=server.sessions[0]["id"], address=f"{address}/"))
+    server.send(job("done", id=server.sessions[0]["id"], address=f"{address}/"))
     page.wait_for_selector(f"#sessions-result a[href='{address}/']")
     assert page.locator("#rows a:text-is('Report')").count() == 2
-    server.tell(job("failed", error="The report was not made: no space."))
-    says(page, "#sessions-result", "The report was not made: no space.")
+    server.send(job("failed", error="The report was not made: no space."))
+    expect_text(page, "#sessions-result", "The report was not made: no space.")
 
 
 @pytest.mark.further
-def test_several_ticked_make_an_overlay_or_a_campaign(server, page):
+def test_overlay_and_campaign_of_selected_sessions(server, page):
     assert page.is_disabled("#overlay")
     for row in (1, 3, 5):
         page.check(f"#rows tr:nth-child({row}) input")
-    says(page, "#ticked", "3 selected")
+    expect_text(page, "#ticked", "3 selected")
     page.click("#overlay")
     page.wait_for_selector("#comparison", state="visible")
     assert page.locator("#comparison-keys .key").count() == 2
-    says(page, "#comparison-keys .key:nth-child(1)", "fitted model, 95 % band")
-    says(page, "#comparison-keys .key:nth-child(2)", "Welch's method, coherence above 0.8")
-    says(page, "#sessions-result", "the coherence of the measured response is not known")
-    assert drawn(page, "#comparison-plot") > 0.02
+    expect_text(page, "#comparison-keys .key:nth-child(1)", "fitted model, 95 % band")
+    expect_text(page, "#comparison-keys .key:nth-child(2)", "Welch's method, coherence above 0.8")
+    expect_text(page, "#sessions-result", "the coherence of the measured response is not known")
+    assert drawn_fraction(page, "#comparison-plot") > 0.02
     page.click("#campaign")
-    says(page, "#sessions-result", "Campaign: running")
-    assert server.asked == [("/api/campaign", True)]
+    expect_text(page, "#sessions-result", "Campaign: running")
+    assert server.commands == [("/api/campaign", True)]
 
 
 @pytest.mark.further
-def test_what_others_wrote_stays_text(server, page):
+def test_markup_in_texts_is_not_interpreted(server, page):
     evil = "<img src=x onerror=\"document.title='broken'\">"
     server.sessions = [session(0, specimen=evil, operator=evil, note=evil, modes=MODES)]
-    server.tell(
+    server.send(
         {"type": "event", "utc_ns": UTC_NS, "level": "info", "text": evil},
         {"type": "session"},
         status("fault", reason=evil),
     )
-    says(page, "#rows", evil)
-    says(page, "#event-list", evil)
+    expect_text(page, "#rows", evil)
+    expect_text(page, "#event-list", evil)
     assert page.locator("main img").count() == 0
     assert page.title() == "sim – rigd"
 
@@ -423,12 +423,12 @@ def test_what_others_wrote_stays_text(server, page):
 @pytest.mark.further
 def test_events_are_listed_once_newest_first(server, page):
     for second, level in ((1, "info"), (3, "warning"), (2, "error")):
-        server.tell({
+        server.send({
             "type": "event", "utc_ns": UTC_NS + second * 10**9, "level": level,
             "text": f"event {second}",
         })  # fmt: skip
-    server.tell(status())
-    says(page, "#event-list", "event 2")
+    server.send(status())
+    expect_text(page, "#event-list", "event 2")
     texts = page.locator("#event-list .text").all_inner_texts()
     assert texts == ["event 3", "event 2", "event 1",
                      "idle → ready: the simulated rig is connected"]  # fmt: skip
