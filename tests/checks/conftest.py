@@ -1,4 +1,4 @@
-"""Profiles to check, and devices that stand in for real ones and keep account of what is asked."""
+"""Profiles to check, and stand-ins for real devices, which record the calls."""
 
 import pytest
 
@@ -23,7 +23,7 @@ def serial_profile():
 
 
 class StandInDrive:
-    """Follows the contract of a drive; what it is told to fail at fails."""
+    """Follows the contract of a drive; fails in the methods of `fails_at`."""
 
     def __init__(self, calls):
         self.calls = calls

@@ -26,7 +26,7 @@ def ratios(model, settings, stiffness):
 
 
 @pytest.mark.parametrize("stiffness", [0.5, 0.8, 1.0, 1.25, 2.0])
-def test_it_damps_a_beam_that_is_not_the_profile_s(model, stiffness):
+def test_damping_of_a_beam_unlike_the_profile(model, stiffness):
     settings = design_damper(close_loop(model))
     without, _ = ratios(model, None, stiffness)
     damped, found = ratios(model, settings, stiffness)
@@ -37,13 +37,13 @@ def test_it_damps_a_beam_that_is_not_the_profile_s(model, stiffness):
     assert found.real.max() < 0.0
 
 
-def test_where_the_torque_is_old_it_is_weaker_or_none(model):
+def test_a_delayed_torque_weakens_the_damper(model):
     prompt = design_damper(close_loop(model))
     old = design_damper(close_loop(replace(model, torque_delay_s=0.02)))
     assert old is None or old.gain_rad_per_nm_s < prompt.gain_rad_per_nm_s
 
 
-def test_without_a_beam_there_is_nothing_to_damp(model):
+def test_no_damper_without_a_beam(model):
     assert design_damper(close_loop(replace(model, plant=None))) is None
 
 
