@@ -44,7 +44,7 @@ class FakeNetcanoem:
         self.active = 0
         self.status = 0
         self.gauges = GAUGES
-        self.asked = []
+        self.requests = []
         self.silent_to = set()
         self.lose_once = set()
         self.lengthen = set()
@@ -55,7 +55,7 @@ class FakeNetcanoem:
         opcode = can_id & 0xF
         if can_id >> 4 != self.base or opcode in self.silent_to:
             return []
-        self.asked.append((opcode, data))
+        self.requests.append((opcode, data))
         replies = self._replies(opcode, data)
         if opcode in self.lengthen:
             replies = [(op, content[:-1]) for op, content in replies]
@@ -145,7 +145,7 @@ class LateBus(FakeBus):
 
 
 class FakeLink:
-    """Stands in for the shared bus."""
+    """Replaces the shared bus."""
 
     def __init__(self, bus):
         self.bus = bus

@@ -69,7 +69,7 @@ def fuzz_stream(n, seed):
         for _ in range(rng.randint(0, 2)):
             disturb(rng, data)
             counts["disturbed"] += 1
-        # So that each batch is judged by itself: a sound end, long enough to synchronise again.
+        # So that batches are independent: a sound end, long enough to synchronise again.
         tail = noisy_records(rng, 4 * protocol.SYNC_RECORDS)
         data += b"".join(tail)
         counts["sent"] += len(records) + len(tail)
@@ -257,7 +257,7 @@ PARTS = {
 
 
 def run(total, seed):
-    """Share `total` between all parts; yield what each did."""
+    """Distribute `total` over all parts; yield the result of each."""
     for name, (part, function) in PARTS.items():
         yield name, function(int(part * total), seed)
 

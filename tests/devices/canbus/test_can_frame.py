@@ -41,7 +41,7 @@ def test_frames_are_those_of_python_can(can_id, data):
 
 
 @given(st.binary(min_size=16, max_size=16))
-def test_any_sixteen_bytes_can_be_taken_apart(raw):
+def test_any_sixteen_bytes_can_be_unpacked(raw):
     can_id, data = unpack_frame(raw)
     assert can_id == int.from_bytes(raw[:4], sys.byteorder)
     assert data == raw[8 : 8 + min(raw[4], 8)]

@@ -119,7 +119,7 @@ def ticks(drive, count):
         drive.command(0.2)
 
 
-def test_lines_that_no_parser_reads(behind_adapter, adapter, scripted):
+def test_unreadable_lines(behind_adapter, adapter, scripted):
     drive = behind_adapter
     drive.connect()
     drive.enable()
@@ -142,7 +142,7 @@ def test_lines_that_no_parser_reads(behind_adapter, adapter, scripted):
     assert drive.off_doubt == ""
 
 
-def test_lines_that_go_on_coming_keep_nothing_from_switching_off(behind_adapter, adapter, scripted):
+def test_endless_lines_do_not_prevent_switching_off(behind_adapter, adapter, scripted):
     drive = behind_adapter
     drive.connect()
     drive.enable()
@@ -172,9 +172,7 @@ def test_lines_that_go_on_coming_keep_nothing_from_switching_off(behind_adapter,
 
 
 @pytest.mark.parametrize("report", [(0x020, bytes(8)), (0x004, b"\0\x10" + bytes(6))])
-def test_an_error_passive_controller_still_sends_the_sync_at_which_torque_zero_acts(
-    drive, scripted, report
-):
+def test_an_error_passive_controller_sends_the_sync_of_zero_torque(drive, scripted, report):
     drive.connect()
     drive.enable()
     ticks(drive, 3)
