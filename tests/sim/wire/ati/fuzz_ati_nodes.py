@@ -81,8 +81,8 @@ def sound(random):
     return with_checksum(bytes([10, function]) + random.randbytes(random.randrange(12)))
 
 
-def pieces(random):
-    """What comes in at once."""
+def chunk(random):
+    """Return bytes that arrive at once."""
     kind = random.randrange(4)
     if kind == 0:
         return random.randbytes(random.randrange(40))
@@ -98,7 +98,7 @@ def fuzz_serial(n, seed):
     written = []
     device = AtiSerialDevice(rig(), simulated_rig(), written.append, lambda *_, **__: None)
     for step in range(n):
-        device.receive(pieces(random))
+        device.receive(chunk(random))
         if step % 8 == 0:
             device.tick(0.001 * step)
             device.emit()

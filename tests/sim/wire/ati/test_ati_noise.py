@@ -4,6 +4,6 @@ import runpy
 from pathlib import Path
 
 
-def test_noise_raises_nothing_and_leaves_the_sensors_useful():
+def test_sensors_survive_noise():
     fuzz = runpy.run_path(str(Path(__file__).with_name("fuzz_ati_nodes.py")))["fuzz"]
     fuzz(20_000)

@@ -67,7 +67,7 @@ class Bench:
             command(torque_nm)
 
         self.exerting = lambda: self.plant._torque_nm
-        # The plant has slots: a stand-in passes everything on.
+        # The plant has slots: a proxy passes everything on.
         self.simulated.plant = _Spy(self.plant, spy)
         self.node = DriveNode(
             rig,
