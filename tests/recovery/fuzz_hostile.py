@@ -134,11 +134,11 @@ def sample_records(first, count, *, permuted=False):
     return rows.tobytes()
 
 
-def samples(count, *, permuted=False, piece=20_000):
+def samples(count, *, permuted=False, block_size=20_000):
     """Make chunks of samples."""
     return b"".join(
-        chunk(sample_records(first, min(piece, count - first), permuted=permuted))
-        for first in range(0, count, piece)
+        chunk(sample_records(first, min(block_size, count - first), permuted=permuted))
+        for first in range(0, count, block_size)
     )
 
 
@@ -219,7 +219,7 @@ def log_flood(rng, scale=1.0):
 
 
 def permuted(rng, scale=1.0):
-    """Samples whose fields stand in another order, and a tail that is missing at times."""
+    """Samples whose fields are in another order, and a tail that is missing at times."""
     end = rng.random() < 0.5
     return session_file(samples(round(2_000_000 * scale), permuted=True), end=end)
 
@@ -296,7 +296,7 @@ def any_length(rng, scale=1.0):
 
 
 def doubled(rng, scale=1.0):
-    """Chunks that stand twice, or not in order."""
+    """Chunks that are repeated, or not in order."""
     parts = [chunk(sample_records(1000 * i, 1000)) for i in range(max(round(20 * scale), 4))]
     for _ in range(rng.randrange(1, 5)):
         parts.insert(rng.randrange(len(parts)), rng.choice(parts))
@@ -390,7 +390,7 @@ class Outcome:
 
 
 def run_forked(action, output, interrupt_s=None):
-    """Run something in a child; return its exit code, and what it took as wait4 tells it.
+    """Run something in a child; return its exit code, and its resources as wait4 reports them.
 
     It gets a SIGINT after so many seconds.
     """
@@ -483,10 +483,10 @@ def warm_up(commands=COMMANDS):
     before = os.dup(1), os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     with tempfile.TemporaryDirectory(prefix="rigd-hostile-") as folder:
-        # Too short for `analyze`, which says so when all is imported and the file is read.
+        # Too short for `analyze`, which reports it once all is imported and the file is read.
         path = Path(folder) / "a.mcap"
         path.write_bytes(session_file(samples(2000)))
-        # Not the streams of Python: what keeps hold of one would keep that of the warm-up.
+        # Not the streams of Python: a reference to one would be a reference to that of the warm-up.
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
         try:

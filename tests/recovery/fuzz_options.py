@@ -2,10 +2,10 @@
 
 Every option and argument of every command of `rigd` and `analyze`, as the typer applications list
 them, and every key of the files that a user writes (profile, specimen, EDS, JSON, reference, record
-of another program), each with a value that nobody means: not finite, beyond every range, a million
-characters, control characters, a pipe in the place of a file. Each command may take 500 MB, 30 s of
+of another program), each with an absurd value: not finite, beyond every range, a million
+characters, control characters, a pipe instead of a file. Each command may take 500 MB, 30 s of
 a processor and 1 MB of output, and ends with 0, 1 or 2 and without a traceback. A daemon of a
-simulated rig takes what `rigd start` and the like ask for, and may not grow.
+simulated rig gets the requests of `rigd start` and the like, and may not grow.
 
 """
 
@@ -123,22 +123,22 @@ class Ground:
         )  # fmt: skip
         self.wait_until_ready()
         # What the first session imports is no growth.
-        self._ask("start", *sound_arguments(self, ["rigd", "start", "chirp"])[:-2])
+        self._run("start", *sound_arguments(self, ["rigd", "start", "chirp"])[:-2])
         self.wait_until_ready()
 
     def wait_until_ready(self):
         """End what the daemon runs, and wait until it can run the next."""
         for _ in range(600):
-            told = self._ask("status", "--json")
-            state = json.loads(told).get("state") if told else ""
+            status = self._run("status", "--json")
+            state = json.loads(status).get("state") if status else ""
             if state == "ready":
                 return
             if state in ("running", "fault"):
-                self._ask("stop" if state == "running" else "reset")
+                self._run("stop" if state == "running" else "reset")
             time.sleep(0.1)
         raise RuntimeError("the daemon does not become ready")
 
-    def _ask(self, *words):
+    def _run(self, *words):
         command = [sys.executable, "-m", "rigd", *words, "--profile", str(self.served)]
         return subprocess.run(command, capture_output=True, check=False).stdout
 
@@ -226,7 +226,7 @@ def commands():
 def option_cases(ground, seed, every):
     """Yield a case for each option and argument, or for every value of it.
 
-    An option that all excitations share is tried once with `rigd run` and once with `rigd start`.
+    An option common to all excitations is tried once with `rigd run` and once with `rigd start`.
     """
     turn = seed
     known = set()
@@ -237,7 +237,7 @@ def option_cases(ground, seed, every):
     for words, parameters in commands():
         sound = sound_arguments(ground, words)
         program, *names = [word for word in words if word != "default"]
-        positional, options = _apart(sound)
+        positional, options = _split_arguments(sound)
         place = -1
         for parameter, annotation in parameters:
             types = {annotation, *get_args(annotation)}
@@ -279,7 +279,7 @@ def _file_values(label):
             yield name
 
 
-def _apart(arguments):
+def _split_arguments(arguments):
     """Split arguments before the first option."""
     first = next((i for i, each in enumerate(arguments) if each.startswith("--")), len(arguments))
     return arguments[:first], arguments[first:]
@@ -551,7 +551,7 @@ def whole_file_cases(ground):
 
 
 def make_odd(path, kind):
-    """Make what stands under a file's name and is no file of the kind that is meant."""
+    """Make an object that has a file's name and is no file of the expected kind."""
     if kind == "pipe":
         os.mkfifo(path)
     elif kind == "folder":
@@ -641,7 +641,7 @@ def warm_up():
 
 
 def all_cases(ground, seed=0, *, every=False):
-    """Yield all cases; `every` value of each option and key in the place of one."""
+    """Yield all cases; `every` value of each option and key instead of one."""
     yield from whole_file_cases(ground)
     yield from option_cases(ground, seed, every)
     yield from key_cases(seed, every)
@@ -687,14 +687,14 @@ def main():
     parser.add_argument("--word", default="", help="only cases whose names match this expression")
     parser.add_argument("--every", action="store_true", help="every value of each option and key")
     parser.add_argument("--verbose", action="store_true", help="name each case")
-    asked = parser.parse_args()
+    parsed = parser.parse_args()
     worst: dict[str, Outcome] = {}
     count = 0
 
     def report(outcome):
         nonlocal count
         count += 1
-        if asked.verbose:
+        if parsed.verbose:
             last = outcome.words.strip().splitlines()[-1:] or [""]
             sys.stdout.write(
                 f"{outcome.code} {outcome.megabytes:4.0f} MB {outcome.seconds:5.1f} s "
@@ -707,16 +707,16 @@ def main():
 
     warm_up()
     with ground_with_daemon() as ground:
-        cases = all_cases(ground, asked.seed, every=asked.every)
+        cases = all_cases(ground, parsed.seed, every=parsed.every)
         wrong = try_cases(
-            ground, (case for case in cases if re.search(asked.word, case.name)), report
+            ground, (case for case in cases if re.search(parsed.word, case.name)), report
         )
         held, most = ground.daemon_megabytes()
     for what, outcome in worst.items():
         sys.stdout.write(f"most {what:10} {getattr(outcome, what):10.1f}  {outcome.case}\n")
     sys.stdout.write("".join(f"WRONG {each}\n" for each in wrong))
     sys.stdout.write(f"daemon: {held:.0f} MB at the end, {most:.0f} MB at most\n")
-    sys.stdout.write(f"{count} cases, seed {asked.seed}: {len(wrong)} wrong\n")
+    sys.stdout.write(f"{count} cases, seed {parsed.seed}: {len(wrong)} wrong\n")
     sys.exit(bool(wrong))
 
 

@@ -207,7 +207,7 @@ def check_recovered(original, at, recovery, case):
 
 
 def check_outcome(original, session, known, case):
-    """Check that the file tells that it was recovered, and accounts for its ticks."""
+    """Check that the file states that it was recovered, and accounts for its ticks."""
     outcome, was = session.outcome, original.session.outcome
     assert outcome["recovered_from"].startswith("a.mcap"), case
     if outcome["outcome"] == was["outcome"]:

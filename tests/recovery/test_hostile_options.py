@@ -1,4 +1,4 @@
-"""Values that nobody means, on the command line and in files: refused in a sentence or two."""
+"""Absurd values, on the command line and in files: refused in a sentence or two."""
 
 import re
 import subprocess

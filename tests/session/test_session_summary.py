@@ -1,4 +1,4 @@
-"""Metadata and counts without the samples: equal to what the whole file says, whoever wrote it."""
+"""Metadata and counts without the samples: equal to those of the whole file, for any writer."""
 
 import pytest
 from cases import further
@@ -35,7 +35,7 @@ def with_unreadable_samples(path):
 
 
 @pytest.mark.process
-def test_it_says_what_the_whole_file_says(short_chirps):
+def test_the_summary_equals_the_whole_file(short_chirps):
     session = read_session(short_chirps[0])
     summary = read_summary(short_chirps[0])
     assert summary.metadata == session.metadata
@@ -76,7 +76,7 @@ def test_files_of_other_writers(tmp_path, options, by_index):
 
 
 @pytest.mark.parametrize("every", [11, further(1)])
-def test_cuts_and_damaged_bytes_at_the_end_are_borne(tmp_path, record_briefly, every):
+def test_cuts_and_damaged_bytes_at_the_end_are_tolerated(tmp_path, record_briefly, every):
     whole = record_briefly("whole").read_bytes()
     stated = read_summary(tmp_path / "whole.mcap")
     path = tmp_path / "harmed.mcap"
