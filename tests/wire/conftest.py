@@ -18,7 +18,7 @@ from rigd.sim.wire import inject
 
 @dataclass(frozen=True)
 class DriveLog:
-    """What the simulated drive says it was told."""
+    """Log of the simulated drive on its commands."""
 
     entries: list[dict]
 
@@ -32,7 +32,7 @@ class DriveLog:
 
     @property
     def last_torque(self) -> dict:
-        """Torque and whether the drive is enabled, as they stand at the end."""
+        """Torque and whether the drive is enabled, at the end."""
         return self.of("torque")[-1]
 
 

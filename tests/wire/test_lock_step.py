@@ -91,8 +91,8 @@ def test_samples_equal_those_of_the_direct_simulation(
 
 
 @pytest.mark.slow
-def test_a_rig_may_be_left_alone_between_sessions(quiet_profile, start_simulator, load, tmp_path):
-    """For longer than the simulated drive waits for a host, which is 5 s; then its STO is told."""
+def test_a_rig_may_be_idle_between_sessions(quiet_profile, start_simulator, load, tmp_path):
+    """Longer than the 5 s that the simulated drive waits for a host; then its STO is reported."""
     profile = load(quiet_profile("antenna_can", {"cia402.enable_timeout_s": "0.1"}))
     start_simulator(profile.path, "--lock-step")
     excitation = hold(rate_hz=1000.0, duration_s=0.1, rest_s=0.0, ring_down_s=0.0)
