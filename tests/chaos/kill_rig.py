@@ -47,7 +47,7 @@ CHANGES = (
     ("missed_ticks_in_a_row = { value = 25", "missed_ticks_in_a_row = { value = 400"),
     ("missed_percent = { value = 2.0", "missed_percent = { value = 20.0"),
     ("stale_percent = { value = 1.0", "stale_percent = { value = 50.0"),
-    # A tick that comes late measures where the motor is by then, which looks like a jump.
+    # A late tick measures a later angle of the motor, which resembles a jump.
     ("acceleration_rad_s2 = { value = 1000.0", "acceleration_rad_s2 = { value = 10000.0"),
     # The motor goes on with the last torque while the loop is paused.
     ("\nvelocity_rad_s = { value = 4.0", "\nvelocity_rad_s = { value = 50.0"),
@@ -65,7 +65,7 @@ DIRECT_CHANGES = (
     ("\nvelocity_rad_s = { value = 15.0", "\nvelocity_rad_s = { value = 50.0"),
     ("tracking_error_rad = { value = 0.5", "tracking_error_rad = { value = 1.5"),
 )
-"""Settings of the profiles; one without a bus has but some of them."""
+"""Settings of the profiles; one without a bus has only some of them."""
 REST_S, RING_DOWN_S = 0.2, 0.3
 
 MODULES = {
@@ -83,7 +83,7 @@ KEPT_S = 0.3
 _TRANSPORT_S = 5e-3
 """The drive's log has a torque one tick after its sample, on a grid half a tick off."""
 _STARTED_S = 180.0
-"""For a process to be there, on a computer that plays several cases at a time."""
+"""For a process to be there, on a computer that runs several cases at a time."""
 _ENDED_S = 15.0
 _LONGEST_S = 60.0
 _NEXT_S = 240.0
@@ -92,7 +92,7 @@ _FLUSHED_S = 0.3
 _COMMAND_S = 240.0
 """Within which `rigd recover` and `analyze` are done, on a busy computer, too."""
 
-# By when the drive has to be off, after the signal: its own watchdog, or the process that notices.
+# Time after the signal within which the drive has to be off, by its watchdog or a process.
 OFF_WITHIN_S = {
     ("control", signal.SIGKILL): HEARTBEAT_TIMEOUT_S,
     ("control", signal.SIGSTOP): HEARTBEAT_TIMEOUT_S,
@@ -123,7 +123,7 @@ class HarnessError(Exception):
 
 @dataclass(frozen=True)
 class Case:
-    """What is done to whom, and when."""
+    """A victim, what is done to it, and when."""
 
     victim: str
     how: signal.Signals
@@ -133,16 +133,16 @@ class Case:
     """The moment counts from the start of the command."""
     mode: str = "wire"
     stopped_s: float | None = None
-    """After which the suspension ends, whatever came of it; None: it lasts until the drive is off,
+    """After which the suspension ends in any case; None: it lasts until the drive is off,
     or until somebody ends it."""
     sweep_s: float = 5.0
     analysed: bool = True
-    """Whether to let `analyze` have a go at the file."""
+    """Whether to run `analyze` on the file."""
     grace_s: float = 0.0
     """Added to the limits where the computer may pause."""
     afterwards: signal.Signals = signal.SIGCONT
-    """What ends the suspension of a supervisor and of all that was suspended with it: they go on,
-    or the supervisor is killed, and the others have to go on by themselves."""
+    """What ends the suspension of a supervisor and its children: they continue,
+    or the supervisor is killed, and the others have to continue without it."""
 
     def __str__(self) -> str:
         where = "start" if self.anywhere else "record"
@@ -182,13 +182,13 @@ class Case:
 
     @property
     def released(self) -> bool:
-        """Whether somebody outside has to end the suspension."""
+        """Whether the suspension has to be ended from outside."""
         return self._ends_suspended
 
 
 @dataclass
 class Verdict:
-    """What came of a case."""
+    """Result of a case."""
 
     case: Case
     complaints: list[str] = field(default_factory=list)
@@ -206,7 +206,7 @@ class Verdict:
     missed: tuple[int, int] = (0, 0)
     """Missed ticks in the two seconds before and after the signal."""
     after: str = "-"
-    """How the next session came about."""
+    """Steps up to the next session."""
 
     def row(self) -> str:
         def number(value: float | None) -> str:
@@ -414,7 +414,7 @@ class Scene:
 
     @property
     def locks_held(self) -> list[str]:
-        """Return the locks that somebody still has who should not."""
+        """Return the locks that are held after the end of the session."""
         held = []
         for path in (self._runtime / "rigd").glob("*.lock"):
             if path.name == _SIMULATORS_LOCK and self.simulator and self.simulator.poll() is None:
@@ -501,7 +501,7 @@ class Scene:
         shutil.rmtree(self._runtime, ignore_errors=True)
 
 
-def play(case: Case, folder: Path) -> Verdict:
+def run_case(case: Case, folder: Path) -> Verdict:
     """Stage a case and check its result.
 
     Raises
@@ -512,12 +512,12 @@ def play(case: Case, folder: Path) -> Verdict:
     scene = Scene(folder, live=case.live, sweep_s=case.sweep_s, mode=case.mode)
     try:
         scene.begin()
-        return _play(case, scene)
+        return _run_case(case, scene)
     finally:
         scene.close()
 
 
-def _play(case: Case, scene: Scene) -> Verdict:
+def _run_case(case: Case, scene: Scene) -> Verdict:
     verdict = Verdict(case)
     if not case.anywhere:
         wait_for(scene.recording, _STARTED_S, "record")
@@ -581,7 +581,7 @@ def _play(case: Case, scene: Scene) -> Verdict:
 def _await_end(verdict: Verdict, scene: Scene, from_s: float) -> None:
     """Wait until the last process of the session is gone, and check what it leaves."""
     ended_s = time.monotonic()
-    # A killed process is seen to be gone before the last of its threads has let its locks go.
+    # A killed process disappears before the last of its threads releases its locks.
     while (left := scene.processes()) or scene.locks_held:
         if time.monotonic() - ended_s > _ENDED_S:
             break
@@ -594,7 +594,7 @@ def _await_end(verdict: Verdict, scene: Scene, from_s: float) -> None:
 
 
 def _check_daemon(verdict: Verdict, scene: Scene) -> None:
-    """See how the daemon took it."""
+    """Check the state of the daemon."""
     expected = {"ready"} if verdict.exit_code == 0 else {"ready", "fault"}
     if verdict.case.victim in ("control", "simulate"):
         expected = {"ready", "fault"}  # which notices it after the session's end, too
@@ -604,7 +604,7 @@ def _check_daemon(verdict: Verdict, scene: Scene) -> None:
 
 
 def _end_daemon(verdict: Verdict, scene: Scene) -> None:
-    """Have it end."""
+    """End the daemon."""
     scene.supervisor.send_signal(signal.SIGTERM)
     with contextlib.suppress(subprocess.TimeoutExpired):
         scene.supervisor.wait(_ENDED_S)
@@ -687,7 +687,7 @@ def _check_drive(
         return
     verdict.off_s = offs[0] - hit_s
     if verdict.outcome == "complete":
-        return  # it was hit so late, or gave so little reason, that the session came to its end
+        return  # hit too late, or with too little effect, to end the session
     within_s = OFF_WITHIN_S[case.victim, case.how] + case.grace_s
     if (case.victim, case.how, case.anywhere) == ("recorder", signal.SIGSTOP, True):
         within_s = max(within_s, ARMED_S)
@@ -776,7 +776,7 @@ def _only_file(verdict: Verdict, scene: Scene) -> Path | None:
 
 
 def _recovered(verdict: Verdict, part: Path, scene: Scene) -> Path | None:
-    """Make a file of what the recorder left."""
+    """Recover the file that the recorder left."""
     done = _finished(verdict, [BIN / "rigd", "recover", part], scene.folder)
     if done is None:
         return None
@@ -899,12 +899,14 @@ def main() -> int:
     started_s = time.monotonic()
     verdicts, skipped = [], 0
     with ProcessPoolExecutor(given.jobs) as pool:
-        played = {
-            pool.submit(play_alone, case, given.keep and given.keep / f"{number:03}"): number
+        futures = {
+            pool.submit(
+                run_case_in_own_folder, case, given.keep and given.keep / f"{number:03}"
+            ): number
             for number, case in enumerate(cases)
         }
-        for future in as_completed(played):
-            number = played[future]
+        for future in as_completed(futures):
+            number = futures[future]
             try:
                 verdicts.append(future.result())
             except HarnessError as error:
@@ -925,8 +927,8 @@ def main() -> int:
     return 1 if bad else 0
 
 
-def play_alone(case: Case, failures: Path | None) -> Verdict:
-    """Play a case in its own folder, which is stored only if something is wrong.
+def run_case_in_own_folder(case: Case, failures: Path | None) -> Verdict:
+    """Run a case in its own folder, which is stored only if something is wrong.
 
     Raises
     ------
@@ -935,7 +937,7 @@ def play_alone(case: Case, failures: Path | None) -> Verdict:
     """
     folder = Path(tempfile.mkdtemp(prefix="rigd-case-"))
     try:
-        verdict = play(case, folder)
+        verdict = run_case(case, folder)
         if verdict.complaints and failures:
             shutil.copytree(folder, failures, dirs_exist_ok=True)
         return verdict

@@ -1,4 +1,4 @@
-"""What happens after the last tick of a record does not make it any less complete."""
+"""A record remains complete whatever happens after its last tick."""
 
 import os
 import signal

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 STANDSTILL_S = 1.0
-"""For which a virtual machine may stop, at the worst moment, and no test fails."""
+"""Pause of a virtual machine that no test fails for, even at the worst moment."""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def rig():
     [
         # Each by itself is killed in tests/cli/test_run.py.
         pytest.param("all", signal.SIGKILL, 0.6, {"analysed": True}, marks=pytest.mark.further),
-        # The others have to go on by themselves, for the drive's sake and for the file's.
+        # The others have to continue without it, for the drive and for the file.
         pytest.param(
             *("all", signal.SIGSTOP, 0.4, {"afterwards": signal.SIGKILL}), marks=pytest.mark.slow
         ),
@@ -43,7 +43,7 @@ def rig():
 )
 def test_drive_goes_off_and_record_stays(rig, tmp_path, victim, how, moment_s, others):
     options = {"analysed": False, "grace_s": STANDSTILL_S, **others}
-    verdict = rig.play(rig.Case(victim, how, moment_s, **options), tmp_path)
+    verdict = rig.run_case(rig.Case(victim, how, moment_s, **options), tmp_path)
     assert not verdict.complaints, f"{verdict.row()}\n{verdict.said}"
 
 
@@ -61,7 +61,7 @@ def test_complaint_if_drive_stays_on(rig, tmp_path, off_s, torque_nm, complaint)
         for t_s, torque, enabled in torques
     ]
     verdict = rig.Verdict(rig.Case("control", signal.SIGKILL, 1.0))
-    rig._judge_drive(verdict, log, 10.0, 10.0, was_on=True)
+    rig._check_drive(verdict, log, 10.0, 10.0, was_on=True)
     assert complaint in "; ".join(verdict.complaints)
     assert bool(verdict.complaints) == bool(complaint)
 

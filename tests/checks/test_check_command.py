@@ -53,7 +53,7 @@ def rows_of_can():
 
 @pytest.fixture
 def computed_already(rows_of_can, monkeypatch):
-    """Have what is computed of the shipped profile at hand, as the table above shows it."""
+    """Reuse the rows computed for the shipped profile, as in the table above."""
     monkeypatch.setattr("rigd.checks._check._rows_without_devices", lambda _: list(rows_of_can))
 
 

@@ -51,7 +51,7 @@ def test_a_fault_is_found_and_not_reset(profile, monkeypatch):
     assert found["exchange", "wrenches missing"] == "0 of 100 ticks"
 
     inject(profile.name, ["emcy,code=0x2310"])
-    for _ in range(2):  # looking at it does not reset it
+    for _ in range(2):  # a check does not reset it
         failed = [row for row in inspect_devices(profile) if row.verdict is CheckResult.FAIL]
         assert [row.group for row in failed] == ["drive"]
         assert "0x2310" in failed[0].found

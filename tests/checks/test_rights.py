@@ -1,4 +1,4 @@
-"""Real-time rights are tried elsewhere: this process stays as it is."""
+"""Real-time rights are tried in another process: this one is unchanged."""
 
 import os
 import pwd

@@ -61,7 +61,7 @@ def run_tick_by_tick(model, reference_rad, torque_limit_nm=math.inf):
                 sensed[before + moment - torque_age],
             )
         sent = (moment - actuation) // SUBSTEPS
-        # The plant has no friction: what the controller adds against it does not act.
+        # The plant has no friction: the compensation of the controller does not act.
         applied = torques[sent] if sent >= 0 else 0.0
         x = phi @ x + gamma * applied
     return angles[before::SUBSTEPS], torques, sensed[before::SUBSTEPS]
@@ -235,7 +235,7 @@ def test_a_loop_without_feed_forward_is_refused(loop_model, paper_damping, pole_
 
 
 def test_growth_without_feed_forward_is_real(loop_model):
-    """The tick-by-tick loop, knocked once, grows at the rate the design step computes."""
+    """The tick-by-tick loop grows after an impact at the rate that the design step computes."""
     change = {"feedforward_gain": 0.0, "pole_rad_s": 40.0}
     model = without_friction(changed(loop_model, change))
     loop = close_loop(model)

@@ -1,4 +1,4 @@
-"""Active damping: how much it damps which beam, and that its recursion is the one designed."""
+"""Active damping: its effect on several beams, and its recursion."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def test_damping_of_a_beam_unlike_the_profile(model, stiffness):
     damped, found = ratios(model, settings, stiffness)
     assert damped[0] > 0.06 > 5 * without[0]
     assert damped[1] > 1.3 * without[1]
-    # The third mode has what it has of its own: a little may be taken from it.
+    # The third mode has damping of its own, which may be reduced a little.
     assert damped[2] > without[2] - 0.004
     assert found.real.max() < 0.0
 
@@ -48,7 +48,7 @@ def test_no_damper_without_a_beam(model):
 
 
 def test_the_recursion_gives_the_designed_poles(model):
-    """The closed loop is marched through with the damper: the first mode decays as computed."""
+    """Simulated with the damper, the first mode of the closed loop decays as computed."""
     settings = design_damper(close_loop(model))
     loop = close_loop(model)
     reading = next(opening.reading for opening in loop.openings if opening.name == "torque reading")

@@ -13,7 +13,7 @@ from rigd.beam import Damping
 from rigd.control import close_loop, loop_margins
 
 MAX_DELAY_PERIODS = 50
-"""Longest delay that a closed loop is computed with."""
+"""Longest delay of a computed closed loop."""
 DELAY_OF = {
     "torque command": "actuation_delay_s",
     "angle reading": "angle_delay_s",
@@ -56,7 +56,7 @@ def test_the_motor_alone_has_the_margins_of_the_designed_loop(motor_alone):
         assert margins.modulus == pytest.approx(np.min(np.abs(1 + gain)), rel=2e-3)
         assert margins.gain_down == pytest.approx(lowest, rel=2e-3)
         assert 2 * math.pi * margins.gain_down_hz == pytest.approx(real_at, rel=2e-3)
-    # Without a beam there is nothing to feed forward.
+    # No feed-forward without a beam.
     assert (torque.gain_up, torque.gain_down, torque.delay_s) == (math.inf, 0.0, math.inf)
     assert torque.modulus == pytest.approx(1.0)
     assert math.isnan(torque.delay_hz)

@@ -1,4 +1,4 @@
-"""What the cycle relies on, of every backend."""
+"""Contract of the cycle with every backend."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""EDS files as vendors and others write them: what is read, and what is refused."""
+"""EDS files of vendors and others: values read, and refusals."""
 
 import io
 import os
@@ -124,7 +124,8 @@ AS_OTHERS_WRITE = {
 def test_equal_content_in_different_notations(read, change):
     def facts(found):
         return {
-            place: (e.bits, e.access, e.mappable, e.default) for place, e in found.entries.items()
+            address: (e.bits, e.access, e.mappable, e.default)
+            for address, e in found.entries.items()
         }
 
     text = eds_text(TABLE)
@@ -192,7 +193,7 @@ def test_an_identifier_relative_to_the_node_id(read, type_name, number):
 
 @pytest.mark.parametrize("name", WITH_TORQUE + WITHOUT_TORQUE)
 def test_values_agree_with_the_library(name):
-    """Where the library reads a file by itself, nothing that it found is lost or changed."""
+    """If the library reads a file unaided, all its values are preserved."""
     path = eds_path(name)
     found = read_eds(path, 5)
     expected = {}
@@ -202,8 +203,8 @@ def test_values_agree_with_the_library(name):
             expected[v.index, v.subindex] = (v.name, v.data_type, v.access_type, v.pdo_mappable,
                                              v.default, v.min, v.max)  # fmt: skip
     assert expected == {
-        place: (e.name, e.data_type, e.access, e.mappable, e.default, e.low, e.high)
-        for place, e in found.entries.items()
+        address: (e.name, e.data_type, e.access, e.mappable, e.default, e.low, e.high)
+        for address, e in found.entries.items()
     }
 
 

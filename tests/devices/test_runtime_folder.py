@@ -1,4 +1,4 @@
-"""What is found in a folder that everybody may write to is not trusted."""
+"""Files in a folder that every user can write to are not trusted."""
 
 import os
 import stat

@@ -30,7 +30,7 @@ class WatchedDrive:
     fault: object = None
     stale_at: int | None = None
     stale_pattern: tuple = (True,)
-    """Staleness of the reads from then on, over and over."""
+    """Staleness of the reads from then on, repeated."""
     reads: int = 0
     held_rad: float = 0.0
     doubt: str = ""

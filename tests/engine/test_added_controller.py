@@ -157,7 +157,7 @@ def test_failure_to_make_a_controller_ends_the_process(make_session, law, monkey
 
 
 class SlowClock(VirtualClock):
-    """Virtual clock that the time of a slow controller passes, too."""
+    """Virtual clock that includes the time of a slow controller."""
 
     def wait_until(self, deadline_ns):
         late_ns = max(0, self.now_ns() - deadline_ns)

@@ -1,4 +1,4 @@
-"""What follows a record: the beam is damped actively, and the motor returns or stays."""
+"""After a record: active damping of the beam, and return of the motor."""
 
 from dataclasses import replace
 
@@ -97,7 +97,7 @@ def test_active_damping_stays_within_the_limit_of_the_angle(make_session):
 
 
 def test_a_damper_that_excites_the_beam_ends(two_sessions):
-    """With the sign turned round it feeds the vibration: it ends after its time, and safely."""
+    """With reversed sign the damper feeds the vibration: it ends in time, and safely."""
     wrong = PostRecordPlan(damper=DamperSettings(-2.0, 0.025, 4.0, 320.0))
     small = step(rate_hz=RATE_HZ, amplitude_rad=0.005, duration_s=0.2, rest_s=0.2, ring_down_s=0.0)
     session, _ = two_sessions(wrong, small)
@@ -130,7 +130,7 @@ def test_a_damper_that_excites_the_beam_ends(two_sessions):
     ids=["inertia", "friction", "delay", "feed-forward", "stiffness"],
 )
 def test_active_damping_tolerates_a_rig_unlike_the_profile(make_session, struck, unlike):
-    """What the supervisor planned for the profile damps a rig that is another."""
+    """The damper planned for the profile damps a different rig."""
     profile = unlike(make_session().profile)
     session = make_session(excitation=struck, profile=profile)
     ending = plan_session_of(struck)

@@ -23,7 +23,7 @@ from rigd.session.layout import Status
 
 
 class FakeRealClock(VirtualClock):
-    """Never late, and yet not virtual: the idle loop observes."""
+    """Never late, but not virtual: the idle loop polls."""
 
     virtual = False
 
@@ -154,7 +154,7 @@ def test_stale_readings_of_a_session_do_not_count_in_the_next(make_session, monk
     ends = []
 
     def stale(drive):
-        """In the middle of the first record for long enough to end it; once in the next tare."""
+        """Long enough to end the first record in its middle; once in the next tare."""
         ended = len(session.parent.messages_of(SessionFinished))
         if ended and not ends:
             ends.append(drive.reads)
@@ -251,7 +251,7 @@ def test_readings_and_heartbeat_are_in_the_shared_state(make_session):
 
 
 def jump_between(session, n, counts=8000):
-    """Have the encoder slip while the rig is ready, after the `n`-th order."""
+    """Let the encoder slip while the rig is ready, after the `n`-th order."""
     give, given = session.parent.poll, []
 
     def poll(timeout_s):
@@ -330,7 +330,7 @@ def test_encoder_slip_in_a_session_ends_the_connection(make_session):
 
 @pytest.mark.parametrize("speed_rad_s", [further(0.1), further(1.0), 3.0])
 def test_the_motor_may_be_turned_by_hand_between_sessions(make_session, speed_rad_s):
-    """Up to a speed and back to rest within a tenth of a second each, and a quarter of a turn."""
+    """Acceleration and deceleration within 0.1 s each, over a quarter of a turn."""
     session = make_session(clock=FakeRealClock())
     rate_hz = session.profile.rig.rate_hz
     speeds = np.interp(np.arange(1000), [200, 300, 600, 700], [0.0, speed_rad_s, speed_rad_s, 0.0])

@@ -1,4 +1,4 @@
-"""What the board shows of the lines."""
+"""Line load and errors in the shared state."""
 
 import os
 from types import SimpleNamespace
@@ -39,7 +39,7 @@ def shown(shared_state, drive, sensor, *times_ns):
 def test_no_line_health_without_a_line(shared_state):
     assert shown(shared_state, Line(LineHealth()), Line(LineHealth()), 0, 10**9) == (-1, -1, -1)
     assert shared_state[StateField.ANGLE_NRAD] == 10**8
-    assert shared_state[StateField.COUPLING_TORQUE_NNM] == 0  # what is not a number is not shown
+    assert shared_state[StateField.COUPLING_TORQUE_NNM] == 0  # NaN is not shown
     assert shared_state[StateField.CONTROL_BEAT] == 2
 
 

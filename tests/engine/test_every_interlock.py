@@ -1,4 +1,4 @@
-"""Every row of the table of interlocks: a session in which it happens, and how that ends."""
+"""Every row of the table of interlocks: a session in which it acts, and its end."""
 
 import re
 from collections.abc import Callable
@@ -260,7 +260,7 @@ ON_THE_WIRE = {
     "emergency message": "emergency message",
     "wired stop": "wired stop dropped",
 }
-"""Rows of docs/faults.md, which are tests of their own."""
+"""Rows of docs/faults.md that have separate tests."""
 AT_REST = {"tare drift"}
 INTERLOCKS_BY_NAME = {row.name: row for row in INTERLOCKS}
 
@@ -294,7 +294,7 @@ def test_an_interlock_ends_the_session_without_torque(make_session, name):
 
 
 def resting(make_session):
-    """A session in which nothing moves: the beam does not swing after it."""
+    """A session without motion: the beam does not swing after it."""
     return make_session(excitation=hold(rate_hz=1000.0, duration_s=1.5, rest_s=0.5))
 
 
@@ -356,7 +356,7 @@ def test_values_near_a_limit_are_reported_once_and_flagged(make_session):
 
 def test_motor_heat_carries_over_between_sessions(make_session, complete_session):
     commanded = complete_session[1]["torque_command_nm"]
-    heat_nm2 = float((commanded**2).sum()) / 1000 / 1e4  # over 10 000 s nothing cools down
+    heat_nm2 = float((commanded**2).sum()) / 1000 / 1e4  # no cooling in 10 000 s
     session = make_session()
     motor(session, continuous_torque_nm=(1.5 * heat_nm2) ** 0.5, thermal_time_constant_s=1e4)
     job = session.order()
@@ -370,7 +370,7 @@ def test_motor_heat_carries_over_between_sessions(make_session, complete_session
 
 @pytest.mark.parametrize("name", [further("sim"), "antenna_can", "antenna_serial"])
 def test_the_paper_s_chirp_comes_near_no_limit(name):
-    """Its torque, speed and angle, as predicted, through the watch of each shipped profile."""
+    """Its predicted torque, speed and angle pass the limits of each shipped profile."""
     profile = load_profile(name)
     excitation = chirp(rate_hz=1000.0)
     response = close_loop(profile.loop_model()).simulate(excitation.reference_rad)
@@ -419,7 +419,7 @@ def test_a_reversed_angle_is_distinguished_from_excessive_amplitude(
 
 @pytest.mark.parametrize("push_nm", [-0.5, 1.5])
 def test_a_push_on_the_beam_is_no_wrong_sign(make_session, push_nm):
-    """A loop that has the sign right turns with its torque, whatever the sensor is made to feel."""
+    """A loop with the right sign turns with its torque, under any load on the sensor."""
     slow = chirp(rate_hz=1000.0, duration_s=4.0, rest_s=0.5, stop_hz=5.0)
     session = make_session(excitation=slow)
     limit(session, velocity_rad_s=2.0, tracking_error_rad=0.02)

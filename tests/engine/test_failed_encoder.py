@@ -50,7 +50,7 @@ class FailingDrive:
         return self.inner.read_angle()
 
     def travel_rad(self):
-        """Greatest distance from where the encoder failed, up to rest."""
+        """Greatest distance from the angle at the failure, up to rest."""
         plant = self.inner._plant
         for _ in range(3000):
             plant.advance(1)
@@ -103,7 +103,7 @@ def further(*case):
 
 
 class ScaledDrive(FailingDrive):
-    """A drive that works, whose motor exerts another torque than it reports."""
+    """A working drive whose motor exerts another torque than it reports."""
 
     def __init__(self, inner, scale):
         super().__init__(inner, np.inf, None)
@@ -222,7 +222,7 @@ def draw_obstacles(random, seconds):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 def test_fifty_sound_sessions_end_well(make_session, seed):
-    """Friction, one quantity of the motor, or a product of two are not those of the profile."""
+    """Friction, one quantity of the motor, or a product of two differ from the profile."""
     random = np.random.default_rng(seed)
     damper = None
     for number in range(50):

@@ -77,7 +77,7 @@ def test_real_deadlines_do_not_drift_with_the_work():
     assert metronome.tick == 50 + missed
     assert min(behind_ns) >= 0
     # A loop that slept a whole period after its work would be twenty milliseconds behind by now.
-    # This one may lose the processor, but hardly each time between waking and looking at the clock.
+    # This one may lose the processor, but hardly each time between waking and reading the clock.
     assert min(behind_ns[-10:]) < 2_000_000
 
 
@@ -90,7 +90,7 @@ def test_spinning_waits_until_the_deadline():
 
 
 class SuspendableComputer:
-    """Two clocks of a computer; each reading takes its time, and a suspend stops one of them."""
+    """Two clocks of a computer; each reading takes time, and a suspend stops one of them."""
 
     def __init__(self, steps_ns=()):
         self._steps_ns = iter(steps_ns)

@@ -1,4 +1,4 @@
-"""How warm the motor is outlives a connection to hardware, and cools down meanwhile."""
+"""The motor's heat is stored between connections to hardware, and decays meanwhile."""
 
 import json
 from dataclasses import replace
@@ -20,7 +20,7 @@ def profile(runtime_folder):
 
 @pytest.fixture
 def heat_file(runtime_folder):
-    """The file of the motor's heat, or None where there is none."""
+    """The file of the motor's heat, or None."""
     return lambda: next(runtime_folder.rglob("heat-*.json"), None)
 
 
@@ -72,7 +72,7 @@ def test_a_motor_is_cold_without_a_folder(profile, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("simulated", [False, True])
 def test_connections_in_a_row_add_up_on_hardware_alone(make_session, heat_file, simulated):
-    """Sessions of torque, each on a connection of its own: as with `rigd run` again and again."""
+    """Sessions with torque, each on its own connection, as with repeated `rigd run`."""
     heat = []
     for _ in range(2):
         session = make_session()

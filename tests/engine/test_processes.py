@@ -1,4 +1,4 @@
-"""Processes and what they are sent: no message is long, and nothing that fails is fatal."""
+"""Processes and their messages: no message is long, and no failure is fatal."""
 
 import contextlib
 import errno

@@ -1,4 +1,4 @@
-"""References that grow while they are followed."""
+"""References that are extended while they are followed."""
 
 import threading
 import time
@@ -55,9 +55,9 @@ def test_a_long_chirp_is_planned_and_shared_without_copies():
     assert sharing_bytes < 0.1 * reference_rad.nbytes
 
 
-def growing(planned=3, room=40):
+def growing(planned=3, space=40):
     shared_state = SharedState.create(shared_memory_fd())
-    reference_rad = np.zeros(planned + room)
+    reference_rad = np.zeros(planned + space)
     reference_rad[:planned] = UNIT_RAD * np.arange(1, planned + 1)
     spec = write_reference(shared_memory_fd(), reference_rad, planned)
     reader = ReferenceReader(map_reference(spec), planned, shared_state)
@@ -117,15 +117,15 @@ def test_the_segment_after_a_hold_is_reported():
     assert shared_state[StateField.HELD_TICKS] == 5
 
 
-@pytest.mark.parametrize(("room", "played"), [(4, [10, 11]), (3, [3])])
-def test_a_segment_beyond_the_end_of_the_record_is_not_begun(room, played):
+@pytest.mark.parametrize(("space", "expected"), [(4, [10, 11]), (3, [3])])
+def test_a_segment_beyond_the_end_of_the_record_is_not_begun(space, expected):
     """The motor would have to stop at full swing."""
-    writer, reader, shared_state = growing(room=room)
+    writer, reader, shared_state = growing(room=space)
     assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
     writer.append(np.array([10.0, 11.0]))
     assert not reader.waits(5)
-    assert [reader.at(tick) for tick in range(5, 3 + room)] == played
-    assert shared_state[StateField.BEGUN_REFERENCE_TICKS] == (5 if len(played) > 1 else 0)
+    assert [reader.at(tick) for tick in range(5, 3 + space)] == expected
+    assert shared_state[StateField.BEGUN_REFERENCE_TICKS] == (5 if len(expected) > 1 else 0)
 
 
 def test_missed_ticks_are_skipped_in_the_reference():

@@ -94,7 +94,7 @@ def test_a_seed_repeats_the_samples(make_session):
 
 
 class StopAt(VirtualClock):
-    """A clock that does something at one of its deadlines."""
+    """A clock that runs an action at one of its deadlines."""
 
     def __init__(self, at_ns, action):
         super().__init__()
@@ -254,7 +254,7 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
 
 
 def test_two_of_three_angles_may_not_be_old(make_session):
-    """No run of them is longer than two ticks, and yet the record would be worth nothing."""
+    """No run of them is longer than two ticks, but the record would be useless."""
     session = make_session()
     session.drive.stale_at, session.drive.stale_pattern = 0, (False, True, True)
     session.run()
@@ -312,7 +312,7 @@ def test_no_start_while_the_motor_moves(make_session):
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_no_start_if_the_reference_exceeds_the_limit(make_session, sign):
-    """As after a move: it was planned from the rig's zero, and nothing moves before it is known."""
+    """As after a move: the plan starts at the rig's zero; its limits are checked before motion."""
     session = make_session()
     session.drive.fault_at = 1
     session.drive.fault = lambda angle: angle + sign * 1.56
@@ -463,7 +463,7 @@ def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
 
 
 def test_a_paused_computer_does_not_count_as_recorder_lag(make_session, monkeypatch):
-    """Under the virtual clock it is waited for; here it reads once the ring has been full."""
+    """The virtual clock waits for it; here it reads once the ring has been full."""
     profile = make_session().profile
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=2.0)
     session = make_session(excitation=excitation, buffered_s=2.0)

@@ -42,7 +42,7 @@ def samples(first, last, *touches, off=False):
 
 @pytest.fixture
 def followed():
-    """Return a function that hands on blocks of samples, and what comes of it."""
+    """Return a function that passes on blocks of samples and returns the calls and reports."""
 
     def follow(ends, *touches, realtime=True, off=False):
         requests, reports = [], []

@@ -1,4 +1,4 @@
-"""What the control loop does about a touch; the detector itself has its own tests."""
+"""Reaction of the control loop to a touch; the detector itself has its own tests."""
 
 from array import array
 from types import SimpleNamespace
@@ -81,7 +81,7 @@ def search(monkeypatch):
 
 
 def run(search, until=None):
-    """Run the ticks; returns what each contact was, by its tick."""
+    """Run the ticks; return the contacts by their ticks."""
     contacts = {}
     for tick in range(until or search.planned.size):
         search.cycle.flags = 0

@@ -1,4 +1,4 @@
-"""The table of workers: what it names is there."""
+"""The table of workers, and the modules and messages in it."""
 
 import pkgutil
 import re

@@ -42,9 +42,9 @@ def test_a_value_replaces_that_of_its_key(loaded, shipped, setting, line):
 def test_reasons_become_comments_above(loaded, shipped):
     text = with_settings(shipped.text, [Setting("cia402.node_id", 7, reason="Because. " * 20)])
     lines = text.splitlines()
-    place = lines.index('node_id = { value = 7, source = "assumed" }')
-    assert lines[place - 1].startswith("# Because.")
-    assert max(map(len, lines[place - 3 : place])) <= 100
+    index = lines.index('node_id = { value = 7, source = "assumed" }')
+    assert lines[index - 1].startswith("# Because.")
+    assert max(map(len, lines[index - 3 : index])) <= 100
     assert loaded(text).rig.cia402.node_id == 7
 
 

@@ -1,4 +1,4 @@
-"""Specimens in their own files: found by name, validated as profiles are, mounted on a rig."""
+"""Specimens in their own files: found by name, validated like profiles, mounted on a rig."""
 
 import re
 from dataclasses import replace

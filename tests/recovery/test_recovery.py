@@ -1,4 +1,4 @@
-"""Torn and damaged files: all that is intact, marked, and nothing that is not proven."""
+"""Torn and damaged files: all intact samples are recovered and marked, and no others."""
 
 import fcntl
 import random
@@ -137,7 +137,7 @@ def test_a_name_taken_meanwhile_is_refused(torn, monkeypatch):
 
 def test_a_file_being_recorded_is_not_recovered(torn):
     with torn.open("r+b") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)  # as a process has that records
+        fcntl.flock(stream, fcntl.LOCK_EX)  # as in a process that records
         with pytest.raises(SessionError, match="is still being recorded"):
             recover(torn)
         with pytest.raises(SessionError, match=r"is still being recorded\. Wait for the end"):
@@ -201,7 +201,7 @@ def test_the_analysis_reports_that_a_file_was_recovered(torn):
 
 
 def write_plainly(path, samples, *, use_chunking):
-    """Write as a program with the plain package does, without an end."""
+    """Write with the plain mcap package, without an end."""
     stream = path.open("wb")
     writer = Writer(stream, use_chunking=use_chunking, chunk_size=20_000)
     writer.start()
@@ -253,8 +253,8 @@ def packed(row):
 
 
 def test_the_progress_runs_from_start_to_end(torn):
-    shares = []
-    recover(torn, shares.append)
-    assert shares == sorted(shares)
-    assert np.isclose(shares[-1], 1.0)
-    assert shares[0] < 0.3
+    fractions = []
+    recover(torn, fractions.append)
+    assert fractions == sorted(fractions)
+    assert np.isclose(fractions[-1], 1.0)
+    assert fractions[0] < 0.3

@@ -1,4 +1,4 @@
-"""Disks that fill, folders that go, processes that die: what was written is recovered."""
+"""Full disks, removed folders, killed processes: all written samples are recovered."""
 
 import os
 import random
@@ -113,7 +113,7 @@ def test_a_limit_of_the_file_size_loses_no_recorded_samples(tmp_path):
 
 @pytest.fixture
 def advance(monkeypatch):
-    """Let the writer's next sync be due."""
+    """Make the writer's next sync due."""
     now = [0.0]
     monkeypatch.setattr("rigd.session._writer.time.monotonic", lambda: now[0])
 

@@ -84,10 +84,10 @@ def test_speed_is_checked_over_the_elapsed_time(watch):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("place", range(8))
-def test_nan_readings_end_the_session(watch, place, bad):
+@pytest.mark.parametrize("index", range(8))
+def test_nan_readings_end_the_session(watch, index, bad):
     values = [0.0] * 8
-    values[place] = bad
+    values[index] = bad
     violation = watch.check(values[0], values[1], tuple(values[2:]))
     assert violation is not None
     assert "not a number" in str(violation)

@@ -29,7 +29,7 @@ def watch():
 
 
 def follow(watch, angles_rad):
-    """Check angles that are their own reference; return the first that ends the session."""
+    """Check angles equal to their reference; return the first that ends the session."""
     for tick, angle_rad in enumerate(angles_rad):
         violation = watch.check(angle_rad, angle_rad, REST)
         if violation is not None:
@@ -71,7 +71,7 @@ def test_late_ticks_are_no_jumps(speed_rad_s, frequency_hz, lateness, phase):
     angles_rad = speed_rad_s / omega * np.sin(omega * t_s + phase)
     angles_rad = np.round(angles_rad / STEP_RAD) * STEP_RAD
     watch.reset(float(angles_rad[0]))
-    # From rest to this speed nothing can go in one tick.
+    # Nothing can accelerate from rest to this speed in one tick.
     watch._previous_moved_rad = watch._second_last_moved_rad = float(angles_rad[1] - angles_rad[0])
     watch._previous_angle_rad = float(angles_rad[1])
     limited = [v for v in angles_rad[2:].tolist() if abs(v) < 1.2]
@@ -179,7 +179,7 @@ def test_many_old_readings_near_their_limit_mark_the_next_sample(watch):
     assert watch.take_notices() == []
     assert watch.check_stale_fraction(51, 60, 10_000) is None
     assert watch.check(0.0, 0.0, REST) is None
-    # No angle was old in this tick or the one before: the check of what is old carries it.
+    # No angle was old in this tick or the one before: the check of old readings reports it.
     assert watch.check_stale(angle_stale=False, wrench_stale=False) is None
     assert watch.warning
     assert watch.check(0.0, 0.0, REST) is None

@@ -75,8 +75,8 @@ def test_the_document_has_the_travel_of_the_shipped_profiles(name):
         assert len(numbers) == 4
         what = row.what.removeprefix("worst, ")
         (blind_ms,) = re.findall(r"in the (\d+) ms", row.found)
-        total, driven, coasting, room = numbers
-        line = f"| {name} | {what} | {blind_ms} ms | {driven} | {coasting} | {total} | {room} |"
+        total, driven, coasting, margin = numbers
+        line = f"| {name} | {what} | {blind_ms} ms | {driven} | {coasting} | {total} | {margin} |"
         assert line in section.splitlines(), f"docs/safety.md lacks the line\n{line}"
     free = max_stopping_distance(
         profile.rig, profile.limits, profile.rig.cia402.heartbeat_timeout_s

@@ -1,4 +1,4 @@
-"""The wired stop (STO) as the drive that is simulated in this process shows it."""
+"""The wired stop (STO) of the drive simulated in this process."""
 
 import pytest
 from shipped_profile import load_shipped

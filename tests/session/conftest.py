@@ -42,7 +42,7 @@ OUTCOME = {"outcome": "complete", "reason": ""}
 
 
 def make_samples(n, *, first_tick=0, seed=0):
-    """Samples with noise in every field that has no meaning of its own."""
+    """Samples with noise in every field without a fixed meaning."""
     rng = np.random.default_rng(seed)
     samples = np.zeros(n, SAMPLE_DTYPE)
     samples["tick"] = first_tick + np.arange(n)

@@ -1,4 +1,4 @@
-"""Messages of any encoding, which are decoded together, read as protobuf decodes each."""
+"""Messages of any encoding: decoded together as protobuf decodes each of them."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_any_encoding_is_read_as_by_protobuf(kit, tmp_path, changes, order, tail
         ]
         messages.append(b"".join(parts) + parts[i % 2] + tail)  # some fields twice
     decoded = [cls.FromString(message) for message in messages]
-    # All of them, and as few as are decoded one by one.
+    # All of them, and few enough to be decoded one by one.
     for name, count in (("all.mcap", 400), ("few.mcap", 9)):
         path = kit.write_third_party(tmp_path / name, messages[:count], schema=schema)
         found = read_session(path).samples

@@ -78,8 +78,8 @@ def test_messages_unlike_their_schema(kit, tmp_path):
 def test_truncation_anywhere(kit, recorded, tmp_path):
     path = tmp_path / "a.mcap.part"
     size = len(recorded.data)
-    places = random.Random(1).sample(range(len(MAGIC), size), 30)
-    for length in [*places, size - 1, size - 8, size - 9, size - 40]:
+    lengths = random.Random(1).sample(range(len(MAGIC), size), 30)
+    for length in [*lengths, size - 1, size - 8, size - 9, size - 40]:
         path.write_bytes(recorded.data[:length])
         with pytest.raises(SessionError, match=r"is incomplete: it (ends|has no)") as error:
             read_session(path)
@@ -87,7 +87,7 @@ def test_truncation_anywhere(kit, recorded, tmp_path):
         # The plain reader decides what is whole; samples are of channel 1.
         whole = [m for chunk in kit.chunks_of(path) for m in chunk if m.channel_id == 1]
         assert readable == len(whole)
-    assert readable == 1111  # all that is missing then is the footer
+    assert readable == 1111  # then only the footer is missing
 
 
 def test_truncated_files_without_chunks_count_their_messages(kit, tmp_path):
@@ -115,9 +115,9 @@ def test_a_tail_of_zeros_after_a_dead_host(recorded, tmp_path):
 def test_bit_flips_anywhere(recorded, tmp_path):
     """Every byte of such a file is under a checksum or compared, so none goes unnoticed."""
     path = tmp_path / "a.mcap"
-    for place in random.Random(2).sample(range(8 * len(recorded.data)), 50):
+    for bit in random.Random(2).sample(range(8 * len(recorded.data)), 50):
         damaged = bytearray(recorded.data)
-        damaged[place // 8] ^= 1 << place % 8
+        damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
         with pytest.raises(SessionError, match=r"damaged|incomplete|not an MCAP"):
             read_session(path)
@@ -138,9 +138,9 @@ def test_bit_flips_in_files_with_fewer_checksums_never_give_wrong_samples(
     )
     data = path.read_bytes()
     refusals = 0
-    for place in random.Random(3).sample(range(8 * len(data)), 80):
+    for bit in random.Random(3).sample(range(8 * len(data)), 80):
         damaged = bytearray(data)
-        damaged[place // 8] ^= 1 << place % 8
+        damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
         try:
             read = read_session(path).samples

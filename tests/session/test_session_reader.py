@@ -1,4 +1,4 @@
-"""Reader of sound files: this writer's, and any other MCAP and protobuf library's."""
+"""Reader of sound files of this writer and of any other MCAP and protobuf library."""
 
 import dataclasses
 import gc

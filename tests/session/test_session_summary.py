@@ -24,7 +24,7 @@ def write_plainly(path, **options):
 
 
 def with_unreadable_samples(path):
-    """Make the first chunk or message claim a length that only a whole read comes across."""
+    """Give the first chunk or message a length that only a whole read detects."""
     data = bytearray(path.read_bytes())
     position = 8
     while data[position] not in (5, 6):
@@ -86,9 +86,9 @@ def test_cuts_and_damaged_bytes_at_the_end_are_tolerated(tmp_path, record_briefl
             assert read_summary(path).problem
         except SessionError as error:
             assert length < 10, error
-    for place in range(len(whole) - 400, len(whole), every):
+    for offset in range(len(whole) - 400, len(whole), every):
         harmed = bytearray(whole)
-        harmed[place] ^= 0x55
+        harmed[offset] ^= 0x55
         path.write_bytes(harmed)
         found = read_summary(path)
         assert found.problem or (found.metadata, found.samples) == (

@@ -26,7 +26,7 @@ PERIOD_S = 1e-3
 FINE_S = {100.0: 1e-5, 3000.0: 1e-5, 100_000.0: 2e-6}
 """Step of the other solution by the stiffness of the obstacle: less than the time it yields for."""
 
-# An angle that no beam disturbs: a heavy motor speeds up for 50 ms to 1 rad/s, and goes on.
+# An angle that no beam disturbs: a heavy motor accelerates in 50 ms to 1 rad/s.
 HEAVY_KG_M2 = 1e5
 START_RAD_S2, START_S = 20.0, 0.05
 TOUCH_RAD = 0.05
@@ -47,7 +47,7 @@ def rig_with(*obstacles, inertia_kg_m2=2e-3, viscous=0.0, coulomb_nm=0.0, **chan
 
 
 class Record:
-    """What a plant does, tick by tick, and the forces of its substeps."""
+    """Motion of a plant, tick by tick, and the forces of its substeps."""
 
     def __init__(self, rig, torques_nm):
         self.plant = plant = SimulatedPlant(rig)
@@ -83,7 +83,7 @@ def started(*obstacles, **changes):
 
 
 class OtherSolution:
-    """Kernels of the exact beam for a force at a place, by inversion along a shifted line."""
+    """Kernels of the exact beam for a force at a position, by inversion along a shifted line."""
 
     def __init__(self, at_m, step_s):
         self.points = round(SESSION_S / step_s)
@@ -109,12 +109,12 @@ class OtherSolution:
 
     def meet(self, stiffness):
         """Force, torque and shear at each point."""
-        place, force = self.free.copy(), np.zeros(self.points)
+        motion, force = self.free.copy(), np.zeros(self.points)
         for j in range(1, self.points):
-            inside = place[j] - self.surface
+            inside = motion[j] - self.surface
             if inside > 0:
                 force[j] = -stiffness * inside / (1 + stiffness * self.by_force[1])
-                place[j:] += force[j] * self.by_force[1 : self.points - j + 1]
+                motion[j:] += force[j] * self.by_force[1 : self.points - j + 1]
         return (
             force,
             self.torque + self._of(force, self.torque_by_force),
@@ -175,7 +175,7 @@ def test_an_obstacle_on_the_other_side_is_the_mirror_image():
 @pytest.mark.parametrize("stiffness", ["300", further("100000"), "rigid"])
 @pytest.mark.parametrize("at_m", [further(0.2), 0.62, further(0.97)])
 def test_rest_against_an_obstacle(at_m, stiffness):
-    # Stiff damping, so that it rests soon; the heavy motor is at rest wherever it was brought.
+    # Stiff damping, so that it rests soon; the heavy motor is at rest at any angle.
     rig = rig_with(
         f"x={at_m},angle=0.01,stiffness={stiffness}",
         inertia_kg_m2=HEAVY_KG_M2,
@@ -197,7 +197,7 @@ def test_rest_against_an_obstacle(at_m, stiffness):
 @pytest.mark.parametrize("damping", [further(Damping()), DAMPING], ids=["undamped", "paper"])
 def test_no_touch_creates_energy(damping, stiffness):
     # A motor without friction drives the beam from one wall to the other and back, then tries to
-    # get out all there is.
+    # extract all the energy.
     rig = rig_with(
         f"x=0.5,angle=0.06,stiffness={stiffness}",
         f"x=0.8,angle=-0.04,side=-1,stiffness={stiffness}",
@@ -214,11 +214,11 @@ def test_no_touch_creates_energy(damping, stiffness):
     assert (record.forces < 0).any()
     assert (record.forces > 0).any()
     moving_j = 0.5 * rig.motor.inertia_kg_m2 * record.velocity**2
-    # What is left is in the beam, in the obstacles, or gone.
+    # The remainder is in the beam, in the obstacles, or dissipated.
     assert (work_j - moving_j).min() > -1e-3 * np.abs(work_j).max()
 
 
-# In steps of a picometre: the smallest numbers there are have no digits to compare.
+# In steps of a picometre: the smallest floats have no digits to compare.
 DEPTHS_M = st.integers(-(10**10), 10**10).map(lambda picometres: 1e-12 * picometres)
 
 
@@ -276,7 +276,7 @@ def test_an_obstacle_comes_and_goes():
 
 
 def test_a_moving_obstacle_strikes_a_beam_at_rest():
-    # Seen from the obstacle the beam comes: the same force as of a beam that is thrown at it.
+    # In the frame of the obstacle the beam moves: the same force as for a beam thrown at it.
     record = Record(
         rig_with("x=0.6,angle=0.02,side=1,rate=-0.5,stiffness=3000", inertia_kg_m2=HEAVY_KG_M2),
         np.zeros(100),
@@ -345,7 +345,7 @@ def test_the_sensor_measures_a_touch_with_its_delay(delay_s):
         expected = np.interp(times - delay_s, fine_times, getattr(fine, name), left=0.0)
         seen = getattr(late, f"sensed_{name}")
         scale = np.abs(expected).max()
-        # But for jumps of the motor's own torque.
+        # Except jumps of the motor's own torque.
         off_jumps = np.abs(times - delay_s - START_S) > 2e-3
         assert np.abs(seen - expected)[off_jumps & (times > 3e-3)].max() < 0.02 * scale
 

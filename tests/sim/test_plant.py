@@ -194,7 +194,7 @@ def test_disabling_stops_the_torque_and_drops_pending_commands():
     coasting = run(plant, [0.5] * 50)
     reference = run(fine, [0.0] * 500)[::10]
     np.testing.assert_allclose(coasting[:, :2], reference[:, :2], rtol=1e-9)
-    plant.enable()  # what was commanded while the drive was off is forgotten
+    plant.enable()  # commands given while the drive was off are dropped
     still = run(fine, [0.0] * 100)[::10]
     np.testing.assert_allclose(run(plant, [0.0] * 10)[:, :2], still[:, :2], rtol=1e-9)
 
@@ -233,7 +233,7 @@ def test_motor_rests_while_the_beam_rings_on():
     assert stopped < 25_000
     assert np.ptp(record[stopped:, 0]) <= 1e-16  # a rounding, on some builds of numpy
     torque = record[stopped:, 2]
-    assert np.max(np.abs(torque)) <= 0.03  # what the friction holds
+    assert np.max(np.abs(torque)) <= 0.03  # held by friction
     # On the locked shaft the beam has its clamped–free first mode, 2.56 Hz, and decays.
     tail = torque[:4096]
     peak_hz = np.argmax(np.abs(np.fft.rfft(tail * np.hanning(4096), 2**18))) * 1000 / 2**18
@@ -274,7 +274,7 @@ def test_energy_is_never_created(damping, coulomb):
     """From rest, the work done is at least the motor's kinetic energy, driven or free.
 
     The torque is constant over a period, so the work is exactly the sum of torque times the
-    change of angle. What the motor has not got is stored in the beam or lost: never negative.
+    change of angle. The remainder is stored in the beam or lost, and never negative.
     """
     plant = enabled(replace(rig(coulomb=coulomb, viscous=0.0), damping=damping))
     # Noise, then the first mode shaken on resonance, then left alone.

@@ -1,4 +1,4 @@
-"""A simulated beam that differs between sessions: its draws, and the plant that has them."""
+"""A simulated beam that differs between sessions: its draws, and its plant."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The plant as encoder and sensor show it."""
+"""The plant as measured by encoder and sensor."""
 
 from dataclasses import replace
 
@@ -68,7 +68,7 @@ def test_a_sensor_at_the_end_of_its_range_reports_saturation(rig):
 
 @pytest.fixture
 def quiet(rig):
-    """A rig whose sensor shows what there is, to every digit."""
+    """A rig whose sensor is exact."""
     return replace(
         rig,
         sensor=replace(rig.sensor, resolution=(0.0,) * 6),

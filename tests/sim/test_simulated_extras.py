@@ -98,11 +98,11 @@ def test_shear_accelerates_the_beam_and_its_tip_mass(rig):
 def test_a_slower_clock_delays_the_torque_ever_more(rig):
     _, usual, _ = driven(rig)
     _, older, _ = driven(rig, clock_rate_difference=-5e-4)
-    place = np.arange(TICKS) * (1 - 5e-4)
-    whole = place.astype(int)
+    delayed_ticks = np.arange(TICKS) * (1 - 5e-4)
+    whole = delayed_ticks.astype(int)
     # Band-limited: a cubic through four ticks, here of the usual readings.
     first = np.clip(whole - 1, 0, TICKS - 4)
-    x = place - first
+    x = delayed_ticks - first
     a, b, c, d = (usual[first + k] for k in range(4))
     seen = (
         -a * (x - 1) * (x - 2) * (x - 3) / 6

@@ -159,7 +159,7 @@ def test_sliding_friction_is_a_constant_torque(rig):
         plant = plant_of(each, stiffness_drift_per_s=-FASTEST)
         plant.enable()
         found.append(run(plant, [torque_nm] * 300))
-    # But for the tick at which the matrix is renewed: one in twenty.
+    # Except the tick at which the matrix is renewed: one in twenty.
     sliding, net = found
     assert np.abs(sliding - net).max(axis=0) == pytest.approx(0.0, abs=1e-6 * np.abs(net).max())
 

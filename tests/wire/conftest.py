@@ -38,7 +38,7 @@ class DriveLog:
 
 @pytest.fixture
 def quiet_profile(write_profile):
-    """A shipped profile whose simulated sensor has no noise, as a file; more can be changed."""
+    """A shipped profile without sensor noise, as a file; other values can be changed."""
 
     def make(name: str, values: dict[str, str] | None = None, *, patient: bool = False) -> Path:
         quiet = {"simulation.torque_noise_nm": "0.0", "simulation.force_noise_n": "0.0"}

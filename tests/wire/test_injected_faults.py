@@ -18,11 +18,11 @@ pytestmark = pytest.mark.process
 
 # Fast from the beginning, so that every fault is met while the motor moves.
 CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1}
-# For a reply that does not come a tick in lock-step waits half a second: where ten of them are what
-# another row shows as well, three have to do.
+# A tick in lock-step waits half a second for a missing reply: where another row has ten of them,
+# three suffice.
 STALE = 3
 
-FATAL, BORNE = "## Faults that end a session", "## Faults that a session tolerates"
+FATAL, TOLERATED = "## Faults that end a session", "## Faults that a session tolerates"
 MESSAGES = {
     "angle lost": r"angle.*10 ticks",
     "wrench lost": r"wrench.*10 ticks",
@@ -115,7 +115,7 @@ AGAIN = {
     "torque commands lost",
     "wrench lost",
 }
-"""What the loop does then another row shows as well, or the same fault of the other device."""
+"""Faults whose reaction is covered by another row, or by the other device."""
 FURTHER = {
     "controller off the bus",
     "emergency message",
@@ -123,8 +123,8 @@ FURTHER = {
     "sensor frozen",
     "serial line cut",
 }
-"""Lost devices and faults of drives, as other rows have them by other ways; what is frozen, as
-tests/engine/test_every_interlock.py has it without the wire."""
+"""Lost devices and faults of drives, covered by other rows; frozen devices are covered in
+tests/engine/test_every_interlock.py without the wire."""
 
 
 def marks(row):
@@ -154,7 +154,7 @@ def test_a_fault_ends_torque_and_the_rig_recovers(
         values |= NOISE
     profile, log = quiet_profile(row.profile, values), tmp_path / "drive.jsonl"
     simulator = start_simulator(profile, "--lock-step", "--log", log)
-    # The record could go on for long, so that the fault comes before its end at any pace.
+    # The record is long, so that the fault comes before its end at any speed.
     options = CHIRP | {"duration_s": 60.0}
     result = run_order(load(profile), "session", fast=True, faults=[row.fault], **options)
     assert result.outcome == "fault"
@@ -217,22 +217,22 @@ def test_passing_faults_are_flagged_and_tolerated(
     """One after the other in one session: each is flagged up to the next, as in its row."""
     profile = quiet_profile(name)
     start_simulator(profile, "--lock-step")
-    borne = [row for row in rows(BORNE) if row.profile == name]
+    tolerated = [row for row in rows(TOLERATED) if row.profile == name]
     injected = []
     result = run_order(
         load(profile),
         "session",
         fast=True,
-        faults=[row.fault for row in borne],
+        faults=[row.fault for row in tolerated],
         injected=injected,
         **CHIRP | {"duration_s": 5.0},
     )
     assert result.is_successful, result.reason
-    assert len(injected) == len(borne)
+    assert len(injected) == len(tolerated)
     status = read_session(result.path).samples["status"]
     stale = status & (Status.ANGLE_STALE | Status.WRENCH_STALE)
     assert not stale[: injected[0]].any()
-    for row, first, end in zip(borne, injected, [*injected[1:], len(status)], strict=True):
+    for row, first, end in zip(tolerated, injected, [*injected[1:], len(status)], strict=True):
         here = stale[first:end]
         if row.ticks:
             flag = Status[row.last.upper().replace(" ", "_")]

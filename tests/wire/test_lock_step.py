@@ -78,14 +78,14 @@ def test_samples_equal_those_of_the_direct_simulation(
     angle = np.abs(ours["angle_rad"] - theirs["angle_rad"]) / rig.encoder.resolution_rad
     _, end = wired.segments["sweep"]
     assert angle[:end].max() < 1.01
-    # A motor that comes to rest sticks on whichever side of the set-point such a step leaves it.
+    # A motor that comes to rest sticks on either side of the set-point.
     assert angle[end:].max() < 10
     torque = ours["coupling_torque_nm"] - theirs["coupling_torque_nm"]
     # A step of the sensor and one of a raw gauge on either side, the tare's own, and what the
     # torque's thousandths do to the motion.
     assert np.abs(torque).max() < 6 * rig.sensor.resolution[5]
     assert torque.std() < rig.sensor.resolution[5]
-    # The controller amplifies an encoder step: compare what the torque does on the whole.
+    # The controller amplifies an encoder step: compare the torque as a whole.
     command = ours["torque_command_nm"] - theirs["torque_command_nm"]
     assert command.std() < 0.05 * theirs["torque_command_nm"].std()
 

@@ -45,7 +45,7 @@ def run_chirp(rigd):
 
 @pytest.fixture
 def refuse_chirp(rigd_here):
-    """The same within this process, as far as it comes without any other."""
+    """The same within this process, up to the start of others."""
     return lambda profile, *options: rigd_here("run", "chirp", "--profile", profile, *options)
 
 
@@ -56,7 +56,7 @@ def start_chirp(start_rigd):
 
 
 def _undisturbed(session) -> np.ndarray:
-    """The tracking error up to the first reading that is missing; none if it began in motion."""
+    """The tracking error up to the first missing reading; none if it began in motion."""
     samples = session.samples
     error = samples["angle_rad"] - samples["angle_reference_rad"]
     disturbed = (samples["status"] & (Status.ANGLE_STALE | Status.WRENCH_STALE)) != 0
@@ -93,7 +93,7 @@ def test_a_chirp_over_the_wire_is_recorded_whole(
     assert np.shape(calibration["matrix"]) == (6, 6)
     fresh = (session.samples["status"] & (Status.ANGLE_STALE | Status.WRENCH_STALE)) == 0
     assert fresh.any()
-    # That it follows all the way is for the lock-step: here it does as far as the machine let it.
+    # Lock-step tests the whole reference: here the computer may pause.
     assert np.abs(_undisturbed(session)).max(initial=0.0) < 0.005  # the whole amplitude
 
     timings = read_timings(tmp_path / counts["path"])
@@ -165,7 +165,7 @@ def test_real_time_can_be_skipped_only_in_lock_step(
 def test_the_drive_goes_off_without_the_loop(
     how, quiet_profile, start_simulator, start_chirp, drive_log, tmp_path
 ):
-    # After how long, to the tick, is for the lock-step: here the simulator may pause as well.
+    # Lock-step tests the exact tick: here the simulator may pause as well.
     timeout = {"cia402.heartbeat_timeout_s": "1.0"}
     profile = quiet_profile("antenna_can", timeout, patient=True)
     log = tmp_path / "drive.jsonl"

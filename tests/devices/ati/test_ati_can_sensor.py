@@ -1,4 +1,4 @@
-"""The sensor behind a NETCANOEM box, against one written by struct from devices.md 1.1."""
+"""The sensor behind a NETCANOEM box, against a fake written with struct from devices.md 1.1."""
 
 import json
 import math
@@ -331,7 +331,7 @@ def test_restart_with_another_calibration_is_a_fault(fakes, can_rig, mode):
 def test_session_continues_after_silence_without_restart(fakes, can_rig, mode):
     bench = Restarting(fakes, can_rig, mode)
     bench.silence(8)
-    bench.fake.lose_once = {2}  # the proof may be lost, too
+    bench.fake.lose_once = {2}  # the check may be lost, too
     assert all(bench.fresh(20)[10:])
     assert (2, b"\0") in bench.fake.requests[-30:]
 
@@ -563,7 +563,7 @@ def test_waiting_for_connection_takes_all_replies_of_the_sensor(bench, fakes):
 
 
 def test_through_the_socket_of_a_simulated_bus(fakes, can_rig, tmp_path):
-    """The whole way once: CanLink, Unix socket, a sensor in another thread."""
+    """The whole path: CanLink, Unix socket, a sensor in another thread."""
     fake = fakes.FakeNetcanoem()
     path = str(tmp_path / "can")
     hub = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

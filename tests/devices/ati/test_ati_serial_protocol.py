@@ -1,6 +1,6 @@
 """The serial protocol: Modbus frames against the bytes in devices.md 2.1, and the record stream.
 
-However the stream is cut and disturbed, what comes out is what the sensor sent.
+However the stream is cut and disturbed, the records are those that the sensor sent.
 """
 
 import random
@@ -253,7 +253,7 @@ def test_a_damaged_record_leaves_no_tick_without_records(fuzz):
 
 @pytest.fixture
 def ambiguous(fakes):
-    """A record that, over and over, can be cut in more than one way."""
+    """A record that, repeated, can be cut in more than one way."""
     return next(
         record
         for record in (fakes.record_of((a, 2, 3, 4, 5, b)) for a in range(200) for b in range(200))

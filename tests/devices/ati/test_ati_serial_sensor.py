@@ -1,4 +1,4 @@
-"""The Digital F/T sensor, against one at a pseudo-terminal, by struct from devices.md 2.1."""
+"""The Digital F/T sensor, against a fake at a pseudo-terminal, from devices.md 2.1."""
 
 import gc
 import json
@@ -21,7 +21,7 @@ from rigd.devices.running_simulator import SimulatorAddress
 
 @pytest.fixture
 def open_sensor(serial_rig, digital_ft):
-    """Make sensors at the fake one, and close them."""
+    """Make sensors on the line of the fake one, and close them."""
     made = []
 
     def make(*, lock_step=False, mode="same_tick", rate_hz=1000.0, deadline_us=1e6, **ati):
@@ -42,7 +42,7 @@ def open_sensor(serial_rig, digital_ft):
 
 @pytest.fixture
 def unhurried(monkeypatch):
-    """However slowly a test runs, no tick comes after a pause that the driver distrusts."""
+    """No tick comes after a pause that the driver distrusts, even if a test runs slowly."""
     monkeypatch.setattr("rigd.devices.ati._serial_sensor._MAX_IDLE_NS", 10**12)
 
 
@@ -225,7 +225,7 @@ PERIOD_NS = 1_000_000
 
 @pytest.fixture
 def follow(open_sensor, digital_ft, fakes, after_first_tick):
-    """Run ticks on which so many records arrive; returns what each shows: number, or stale.
+    """Run ticks in which so many records arrive; return the number of each tick, or stale.
 
     A record that is `torn` loses a byte.
     """
@@ -424,7 +424,7 @@ def test_measuring(open_sensor, digital_ft, fakes):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """Have late replies awaited for no longer than a fake sensor takes."""
+    """Wait for late replies for no longer than a fake sensor takes."""
     monkeypatch.setattr("rigd.devices.ati._serial_setup._LATE_REPLY_WAIT_S", 0.05)
 
 
@@ -516,7 +516,7 @@ def test_failure_to_stop_the_stream(open_sensor, digital_ft, monkeypatch, fakes)
     really_select = select.select
 
     def babble(*descriptors):
-        """However slow the machine is, nothing is ever quiet for the driver."""
+        """The line is never quiet for the driver, even on a slow computer."""
         if threading.current_thread() is threading.main_thread():  # the fake sensor selects too
             digital_ft.emit(fakes.record_of(fakes.GAUGES))
         return really_select(*descriptors)

@@ -1,4 +1,4 @@
-"""The exchange: who gets which frame, waiting for replies, and what the controller reports."""
+"""The exchange: distribution of frames, waiting for replies, and reports of the controller."""
 
 import threading
 import time
@@ -19,15 +19,15 @@ def exchange(ends):
 
 def test_each_frame_goes_to_its_subscriber(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, lambda data: got.append(("drive", data)))
-    exchange.subscribe(0x110, lambda data: got.append(("sensor", data)))
+    received = []
+    exchange.subscribe(0x181, lambda data: received.append(("drive", data)))
+    exchange.subscribe(0x110, lambda data: received.append(("sensor", data)))
     far.send(0x110, b"abc")
     far.send(0x3FF, b"nobody's")
     far.send(0x181, b"12345678")
     far.send(0x110)
     exchange.drain()
-    assert got == [("sensor", b"abc"), ("drive", b"12345678"), ("sensor", b"")]
+    assert received == [("sensor", b"abc"), ("drive", b"12345678"), ("sensor", b"")]
 
 
 @pytest.mark.parametrize("flag", [0x8000_0000, 0x4000_0000])
@@ -46,13 +46,13 @@ def test_one_identifier_has_one_subscriber(exchange):
 
 def test_starting_drops_queued_frames_but_no_subscriptions(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     far.send(0x181, b"old")
     exchange.start()
     far.send(0x181, b"new")
     exchange.drain()
-    assert got == [b"new"]
+    assert received == [b"new"]
 
 
 def test_sending_uses_the_port(ends, exchange):
@@ -63,22 +63,22 @@ def test_sending_uses_the_port(ends, exchange):
 
 def test_waiting_ends_as_soon_as_it_is_ready(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     later = threading.Timer(0.02, far.send, (0x181, b"x"))
     later.start()
-    assert exchange.wait_until(lambda: bool(got), time.monotonic_ns() + 10_000_000_000)
+    assert exchange.wait_until(lambda: bool(received), time.monotonic_ns() + 10_000_000_000)
     later.join()
-    assert got == [b"x"]
+    assert received == [b"x"]
 
 
 def test_waiting_continues_after_other_frames(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     for number in range(3):
         far.send(0x181, bytes([number]))
-    assert exchange.wait_until(lambda: len(got) == 3, time.monotonic_ns() + 1_000_000_000)
+    assert exchange.wait_until(lambda: len(received) == 3, time.monotonic_ns() + 1_000_000_000)
 
 
 def test_waiting_ends_at_its_deadline(exchange):
@@ -89,10 +89,10 @@ def test_waiting_ends_at_its_deadline(exchange):
 
 def test_received_frames_are_taken_after_the_deadline(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     far.send(0x181, b"x")
-    assert exchange.wait_until(lambda: bool(got), time.monotonic_ns() - 1)
+    assert exchange.wait_until(lambda: bool(received), time.monotonic_ns() - 1)
     assert not exchange.wait_until(lambda: False, time.monotonic_ns() - 1)
 
 
@@ -128,13 +128,13 @@ def test_a_warning_of_the_controller_is_only_counted(ends, exchange, kind, data)
 
 def test_frames_before_a_cut_are_delivered(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     far.send(0x181, b"x")
     far.socket.close()
     with pytest.raises(DeviceError, match="cut off"):
         exchange.drain()
-    assert got == [b"x"]
+    assert received == [b"x"]
 
 
 def test_waiting_detects_a_cut_line(ends, exchange):
@@ -151,16 +151,16 @@ def test_waiting_detects_a_cut_line(ends, exchange):
 )
 def test_frames_pass_regardless_of_a_disturbed_bus(ends, exchange, kind, data):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     far.send(ERROR | kind, data)
     far.send(0x181, b"x")
     with exchange.ignore_errors():
         exchange.drain()
         exchange.send(pack_frame(0x80))
         far.send(0x181, b"y")
-        assert exchange.wait_until(lambda: len(got) == 2, time.monotonic_ns() + 10_000_000_000)
-    assert got == [b"x", b"y"]
+        assert exchange.wait_until(lambda: len(received) == 2, time.monotonic_ns() + 10_000_000_000)
+    assert received == [b"x", b"y"]
     assert far.receive() == (0x80, b"")
     with pytest.raises(DeviceError):  # reported to the caller that continues the loop
         exchange.drain()

@@ -146,7 +146,7 @@ def test_errors_of_the_kernel_have_a_remedy():
 
 @pytest.fixture
 def kernel_bus():
-    """The kernel's own virtual bus, where it has one."""
+    """The virtual bus of the kernel, if it has one."""
     try:
         link = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except (AttributeError, OSError) as error:
@@ -283,15 +283,15 @@ def test_waiting_on_an_adapter_loses_nothing(adapter):
 
 def test_one_poll_of_an_adapter_gets_past_frames_of_others(adapter):
     port, peer = adapter
-    got = []
+    payloads = []
     exchange = CanExchange(port)
-    exchange.subscribe(0x181, got.append)
+    exchange.subscribe(0x181, payloads.append)
     exchange.start()
     for _ in range(5):
         peer.send(message(0x3FF))
     peer.send(message(0x181, b"x"))
     exchange.drain()
-    assert got == [b"x"]
+    assert payloads == [b"x"]
 
 
 def test_error_frames_of_an_adapter_pass_the_filters(adapter):
@@ -315,16 +315,16 @@ def test_error_frames_of_an_adapter_pass_the_filters(adapter):
 )
 def test_frames_of_another_kind_are_dropped(adapter, unrelated):
     port, peer = adapter
-    got = []
+    payloads = []
     exchange = CanExchange(port)
-    exchange.subscribe(0x181, got.append)
+    exchange.subscribe(0x181, payloads.append)
     peer.send(unrelated)
     exchange.drain()
-    assert got == []
+    assert payloads == []
     exchange.start()
     peer.send(unrelated)
     exchange.drain()
-    assert got == []
+    assert payloads == []
 
 
 def test_error_of_a_closed_adapter_which_may_close_again(adapter):
@@ -338,7 +338,7 @@ def test_error_of_a_closed_adapter_which_may_close_again(adapter):
 
 
 class Scripted:
-    """A python-can bus whose driver raises, or returns, what it is given; then nothing comes."""
+    """A python-can bus whose driver raises or returns the items of a list, then nothing."""
 
     def __init__(self, *script):
         self._script = list(script)
@@ -371,13 +371,13 @@ def scripted_port(monkeypatch):
     "failure", [ValueError("invalid literal"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "start")]
 )
 def test_a_damaged_line_is_an_error_frame(scripted_port, failure):
-    got = []
+    payloads = []
     exchange = CanExchange(
         scripted_port(failure, message(0x181, b"a"), failure, message(0x181, b"b"))
     )
-    exchange.subscribe(0x181, got.append)
+    exchange.subscribe(0x181, payloads.append)
     exchange.drain()
-    assert got == [b"a", b"b"]
+    assert payloads == [b"a", b"b"]
     assert exchange.error_frames == 2
 
 

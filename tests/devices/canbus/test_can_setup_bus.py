@@ -1,4 +1,4 @@
-"""Set-up through canopen on our ports, and that the port stays as it was."""
+"""Set-up through canopen on our ports, which leaves the port unchanged."""
 
 import socket
 

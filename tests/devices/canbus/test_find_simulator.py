@@ -1,4 +1,4 @@
-"""Where a running simulated rig is found, and that what a dead one left is not one."""
+"""Search for a running simulated rig; the address of a dead one is ignored."""
 
 import json
 import socket
@@ -54,7 +54,7 @@ def test_the_address_of_a_dead_simulator_is_not_found(runtime_folder):
 
 
 def test_a_busy_simulator_counts_as_running(runtime_folder):
-    """Taken for a dead one, it would have the drivers turn to the hardware."""
+    """If it counted as dead, the drivers would open the hardware."""
     path = str(runtime_folder / "control")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(path)

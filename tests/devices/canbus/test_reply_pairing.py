@@ -1,4 +1,4 @@
-"""Which request a reply answers: a reading counts as fresh only if it is that of the last one."""
+"""Pairing of replies and requests: a reading is fresh only if it answers the last request."""
 
 from collections import deque
 
@@ -10,7 +10,7 @@ from rigd.devices.canbus import ReplyPairing
 
 
 class Box:
-    """What has come: how many replies, and the number of the request that the last one answers."""
+    """Number of replies received, and number of the request that the last one answers."""
 
     def __init__(self):
         self.replies = 0
@@ -77,7 +77,7 @@ def test_no_old_reading_is_fresh_while_late_replies_catch_up(events):
     before=st.lists(st.sampled_from(["whole"] * 5 + ["lost"]), max_size=20),
 )
 def test_replies_always_late_never_count(late, before):
-    """From some tick on, whatever was lost before: not when the delay sets in, nor ever after."""
+    """Delayed from some tick on, after any losses: no reading counts, then or later."""
     line = Line()
     for event in before:
         if line.tick(event):
@@ -115,7 +115,7 @@ def test_every_reading_is_fresh_without_losses():
 
 
 def test_replies_read_too_late_do_not_count_for_the_next_tick():
-    # The host was slow once: from then on each reply would be found a tick later.
+    # After one pause of the host each reply would be found a tick later.
     line = Line()
     line.tick()
     assert not line.tick("held")

@@ -63,7 +63,7 @@ def test_the_load_of_any_data_lies_between_plain_and_worst(can_rig, data):
 
 
 def test_real_frames_come_near_the_worst(can_rig):
-    """Data of 3C has a bit stuffed after every four; heads and checksums are as they are."""
+    """Data of 3C has a bit stuffed after every four; heads and checksums are typical."""
     load = bus_load(can_rig)
     stuffed = bits_per_second(load.traffic, lambda frame: b"\x3c" * frame.length)
     assert stuffed > load.worst * 1e6 - 9 * load.frames_per_s

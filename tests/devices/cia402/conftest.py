@@ -80,7 +80,7 @@ class ScriptedDrive(threading.Thread):
         self.position, self.torque = 1000, 0
         self.pending = None  # controlword and torque of an RPDO that waits for SYNC
         self.control = 0
-        self.stays_in = None  # a state that it does not leave upwards
+        self.stays_in = None  # a state from which it makes no transition upwards
         self.on_ready = "ready"  # where it goes instead
         self.ignores_nmt = False
         self.off_delay_s = 0.0  # from the command on
@@ -126,7 +126,7 @@ class ScriptedDrive(threading.Thread):
         self._device_name = b"SCRIPTED DRIVE"
         self._rest = b""
 
-    # What a test does to it.
+    # Actions of a test.
 
     def send(self, can_id, data):
         self._link.sendall(struct.pack("=IB3x8s", can_id, len(data), data))
@@ -143,11 +143,11 @@ class ScriptedDrive(threading.Thread):
     def frames(self, can_id):
         return [data for i, data in self.seen if i == can_id]
 
-    def has_got(self, can_id, data):
+    def wait_for_frame(self, can_id, data):
         """Wait for a frame, and return whether it has come."""
-        return self.comes_to(lambda it: (can_id, data) in it.seen)
+        return self.wait_for(lambda it: (can_id, data) in it.seen)
 
-    def comes_to(self, condition):
+    def wait_for(self, condition):
         """Wait for a condition, and return whether it is true."""
         deadline = time.monotonic() + 30
         while not condition(self) and time.monotonic() < deadline:
@@ -164,7 +164,7 @@ class ScriptedDrive(threading.Thread):
         if self.error is not None:
             raise self.error
 
-    # Its own work.
+    # Internal functions.
 
     def run(self):
         try:
@@ -359,7 +359,7 @@ def settings():
 
 @pytest.fixture(scope="session")
 def rig():
-    """In lock-step: replies are waited for."""
+    """In lock-step, with a wait for replies."""
     return replace(
         load_profile("sim").rig,
         name="scripted",
@@ -411,6 +411,6 @@ def drive(make_drive, rig):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """Have a reply that does not come awaited for no longer than where there is no time."""
+    """Wait for a missing reply for no time at all."""
     monkeypatch.setattr("rigd.devices.cia402._sdo._SDO_TIMEOUT_S", 0.05)
     monkeypatch.setattr("rigd.devices.cia402._switch_off._FIRST_ANSWER_TIMEOUT_S", 0.1)

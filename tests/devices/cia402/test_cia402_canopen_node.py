@@ -137,7 +137,7 @@ def make_drive(node, path, link_to):
 
 @pytest.fixture
 def connect(make_drive, rig):
-    """Connect the driver to the node; return what it found it to have."""
+    """Connect the driver to the node; return the capabilities found."""
 
     def connect(rig=rig):
         drive = make_drive(rig)

@@ -10,8 +10,8 @@ from rigd.devices.contracts import DeviceError
 READ_ONLY, ABSENT, GENERAL = 0x06010002, 0x06020000, 0x08000000
 
 
-def without(scripted, *places):
-    for address in places:
+def without(scripted, *addresses):
+    for address in addresses:
         scripted.objects.pop(address, None)
 
 
@@ -123,7 +123,7 @@ def test_abort_codes_of_absent_objects(make, scripted, code):
 
 
 class TestTheWatchdog:
-    """It never goes missing silently."""
+    """A missing watchdog is always reported."""
 
     def test_the_heartbeat_consumer(self, make):
         drive = make()
@@ -149,7 +149,7 @@ class TestTheWatchdog:
         drive.connect()
         assert scripted.objects[0x1400, 5] == 50
         assert drive.capabilities().watchdog is Watchdog.RPDO_DEADLINE
-        # It times them from the first on, so that they continue without a commanded torque.
+        # The drive times them from the first on, so they continue without a commanded torque.
         scripted.seen.clear()
         for k in range(5):
             drive.latch(k * 1_000_000)
@@ -185,8 +185,8 @@ class TestTheWatchdog:
     def test_the_old_entry_of_a_node_is_cleared_first(self, make, scripted):
         scripted.objects |= {(0x1016, 0): 3, (0x1016, 2): 100 << 16 | 70, (0x1016, 3): 9 << 16 | 5}
         make().connect()
-        places = [(index, sub, value) for index, sub, value in scripted.writes if index == 0x1016]
-        assert places == [(0x1016, 2, 0), (0x1016, 1, 100 << 16 | 50)]
+        writes = [(index, sub, value) for index, sub, value in scripted.writes if index == 0x1016]
+        assert writes == [(0x1016, 2, 0), (0x1016, 1, 100 << 16 | 50)]
 
     @pytest.mark.parametrize(
         ("changes", "time_s"),

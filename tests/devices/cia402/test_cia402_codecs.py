@@ -147,7 +147,7 @@ def test_every_state_has_its_own_statusword():
 
 
 def test_every_error_code_has_a_text_of_its_class():
-    """Canopen's own table of CiA 301's classes is the witness."""
+    """Compared with canopen's table of the classes of CiA 301."""
     ours = {
         "Error Reset / No Error": "no error",
         "Generic Error": "generic",
@@ -197,8 +197,8 @@ def test_the_shipped_dictionary_has_the_types_of_cia_301_and_402():
         datatypes.INTEGER32: [(0x6064, 0)],
         datatypes.VISIBLE_STRING: [(0x1008, 0), (0x100A, 0)],
     }  # fmt: skip
-    for kind, places in types.items():
-        for index, sub in places:
+    for kind, addresses in types.items():
+        for index, sub in addresses:
             assert dictionary.get_variable(index, sub).data_type == kind, f"{index:04X}:{sub}"
     named = {
         value

@@ -1,4 +1,4 @@
-"""Ticks with a scripted drive: what goes out, what comes of what comes in."""
+"""Ticks with a scripted drive: frames sent, and reactions to frames received."""
 
 import struct
 from dataclasses import replace
@@ -131,7 +131,7 @@ def test_ticks_are_stale_while_a_lost_reply_may_be_late(make_drive, rig, scripte
         scripted.position = 1000 + step
         angle = ticks()[0]
         stale.append((drive.angle_stale, round(angle / STEP_RAD)))
-    # Whether the next is the late answer to the first SYNC cannot be known.
+    # The next reply may be the late one to the first SYNC.
     assert stale == [(True, 0), (True, 0), (True, 0), (True, 0), (False, 5), (False, 6)]
 
 
@@ -140,12 +140,12 @@ def test_a_late_reply_does_not_count_for_the_next_tick(make_drive, rig, scripted
     drive.connect()
     ticks = Ticks(drive)
     scripted.hold = 1
-    got = []
+    angles = []
     for step in range(1, 5):
         scripted.position = 1000 + step
         angle = ticks()[0]
-        got.append((drive.angle_stale, round(angle / STEP_RAD)))
-    assert got == [(True, 0), (True, 0), (False, 3), (False, 4)]
+        angles.append((drive.angle_stale, round(angle / STEP_RAD)))
+    assert angles == [(True, 0), (True, 0), (False, 3), (False, 4)]
 
 
 def test_a_reply_of_another_length_counts_as_an_error_of_the_bus(make_drive, rig):
@@ -156,7 +156,7 @@ def test_a_reply_of_another_length_counts_as_an_error_of_the_bus(make_drive, rig
 
 
 def test_a_tolerant_drive_gets_no_sync_after_a_lost_reply(make_drive, rig, settings, scripted):
-    """By it the drive shows which reply is whose."""
+    """The gap shows which SYNC a reply belongs to."""
     slow = replace(
         rig,
         rate_hz=10.0,
@@ -189,9 +189,9 @@ def test_no_sync_is_omitted_after_a_lost_reply(make_drive, rig, scripted):
     for _ in range(6):
         ticks()
         stale.append(drive.angle_stale)
-    # Three periods with one reply each, and what is missing is taken for lost.
+    # After three periods with one reply each, the missing one counts as lost.
     assert stale == [True, True, True, True, False, False]
-    assert scripted.comes_to(lambda it: it.syncs == syncs + 6)  # one per tick
+    assert scripted.wait_for(lambda it: it.syncs == syncs + 6)  # one per tick
     doubt = drive.health().doubt
     assert "unknown while cia402.sync_gaps = false" in doubt
     assert drive.health().doubt_count.endswith("since it was connected: 1.")
@@ -207,12 +207,12 @@ def test_a_late_reply_does_not_count_without_sync_gaps(make_drive, rig, scripted
     drive.connect()
     ticks = Ticks(drive)
     scripted.hold = 1
-    got = []
+    angles = []
     for step in range(1, 5):
         scripted.position = 1000 + step
         angle = ticks()[0]
-        got.append((drive.angle_stale, round(angle / STEP_RAD)))
-    assert got == [(True, 0), (True, 0), (False, 3), (False, 4)]
+        angles.append((drive.angle_stale, round(angle / STEP_RAD)))
+    assert angles == [(True, 0), (True, 0), (False, 3), (False, 4)]
     assert drive.health().doubt == ""
 
 
@@ -248,13 +248,13 @@ def test_angles_of_the_tick_before(make_drive, rig, scripted):
     scripted.on_sync = lambda it: setattr(it, "position", it.position + 1)
     ticks()
     assert drive.angle_stale  # no tick before it
-    got = []
+    angles = []
     times = []
     for _ in range(4):
-        got.append(round(ticks()[0] / STEP_RAD))
+        angles.append(round(ticks()[0] / STEP_RAD))
         assert not drive.angle_stale
         times.append(drive.angle_time_ns)
-    assert got == [1, 2, 3, 4]
+    assert angles == [1, 2, 3, 4]
     assert times == sorted(set(times))
 
 
@@ -424,7 +424,7 @@ def test_an_emergency_message_before_enabling_ends_the_session_too(ticks, script
     scripted.emergency(0x8130)
     with pytest.raises(DeviceError, match="heartbeat of this computer lost") as caught:
         ticks(2)
-    # It is not in fault then, and the operator's reset would find nothing to do.
+    # The drive is not in fault then, and a reset would have no effect.
     assert "if drive or daemon are in fault then: rigd reset --profile scripted" in str(
         caught.value
     )

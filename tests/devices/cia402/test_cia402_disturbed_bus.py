@@ -1,6 +1,6 @@
-"""A drive on a bus that is disturbed, or behind an adapter whose lines come damaged.
+"""A drive on a disturbed bus, or behind an adapter with damaged lines.
 
-The torque is off all the same.
+The torque is off in the end.
 """
 
 import os
@@ -124,7 +124,7 @@ def test_unreadable_lines(behind_adapter, adapter, scripted):
     drive.connect()
     drive.enable()
     ticks(drive, 5)
-    assert scripted.comes_to(lambda it: it.torque > 0)
+    assert scripted.wait_for(lambda it: it.torque > 0)
     before = drive.health().errors
     adapter.garbage = b"tZZZ812\r"  # one of them is an error on the line, and the loop goes on
     ticks(drive, 5)
@@ -149,7 +149,7 @@ def test_endless_lines_do_not_prevent_switching_off(behind_adapter, adapter, scr
     ticks(drive, 5)
 
     class AlwaysDamaged:
-        """What python-can would do with an adapter that never again sends a line it can read."""
+        """Behaves like python-can with an adapter that sends only unreadable lines."""
 
         def __init__(self, bus):
             self._bus = bus
@@ -166,7 +166,7 @@ def test_endless_lines_do_not_prevent_switching_off(behind_adapter, adapter, scr
     with pytest.raises(DeviceError, match=r"no CAN frame, 20 times in a row \(ValueError: non-hex"):
         ticks(drive, 100)
     drive.disable()
-    assert scripted.comes_to(lambda it: it.torque == 0)
+    assert scripted.wait_for(lambda it: it.torque == 0)
     assert scripted.state == "switch-on disabled"
     assert "does not show that it is off" in drive.off_doubt
 

@@ -1,4 +1,4 @@
-"""Enabling and disabling with a scripted drive, in every order and with every obstacle."""
+"""Enabling and disabling with a scripted drive, in every order and with every fault."""
 
 from dataclasses import replace
 
@@ -237,7 +237,7 @@ def test_the_last_resort_is_to_stop_the_node(make_drive, rig, scripted):
     drive.enable()
     scripted.obeys = scripted.sdo_works = False
     drive.disable()
-    assert scripted.has_got(0x000, b"\x02\x05")
+    assert scripted.wait_for_frame(0x000, b"\x02\x05")
     drive.close()
     assert scripted.state == "switch-on disabled"
 
@@ -310,7 +310,7 @@ def test_disabling_a_frozen_drive_ends(make_drive, rig, scripted):
     drive.enable()
     scripted.silent = True
     drive.disable()
-    assert scripted.has_got(0x000, b"\x02\x05")
+    assert scripted.wait_for_frame(0x000, b"\x02\x05")
     assert 1 < rpdos(scripted).count("00000000") < 200
 
 
@@ -370,9 +370,9 @@ class TestByTheClock:
         drive.command(0.1)
         drive.latch(60_000_000)
         drive.read_angle()
-        assert scripted.comes_to(lambda it: it.torque == 200)  # its reply may come too late
+        assert scripted.wait_for(lambda it: it.torque == 200)  # its reply may come too late
         drive.disable()
-        assert scripted.comes_to(lambda it: it.state == "switch-on disabled")
+        assert scripted.wait_for(lambda it: it.state == "switch-on disabled")
         drive.close()
 
     def test_a_stuck_drive(self, drive, scripted):
@@ -380,7 +380,7 @@ class TestByTheClock:
         scripted.stays_in = "ready"
         with pytest.raises(DeviceError, match='stays in "ready to switch on"'):
             drive.enable()
-        assert scripted.comes_to(lambda it: it.state == "switch-on disabled")
+        assert scripted.wait_for(lambda it: it.state == "switch-on disabled")
 
     def test_a_reply_slower_than_a_period_is_refused(self, drive, scripted):
         scripted.reply_delay_s = 0.02
@@ -401,7 +401,7 @@ def test_a_drive_that_stays_on_is_reported_and_left_to_its_watchdog(make_drive, 
     scripted.seen.clear()
     drive.disable()
     assert "does not show that it is off (statusword 0x1" in drive.off_doubt
-    assert scripted.has_got(0x000, bytes([2, 5]))  # NMT stop
+    assert scripted.wait_for_frame(0x000, bytes([2, 5]))  # NMT stop
     drive.close()
     written = [(index, sub) for index, sub, _ in scripted.writes]
     assert (0x1016, 1) not in written[written.index((0x6060, 0)) :]

@@ -53,7 +53,7 @@ def test_enabling_resets_the_comparison(following):
 
 @cache
 def chirp_commands():
-    """The shipped chirp's torques in per mille, with the sensor's noise on them."""
+    """Torques of the shipped chirp in per mille, with the noise of the sensor."""
     profile = load_profile("antenna_can")
     loop = close_loop(profile.loop_model())
     reference_rad = chirp(rate_hz=profile.rig.rate_hz, ring_down_s=1.0).reference_rad
@@ -74,7 +74,7 @@ class TestADriveThatMeasuresItsTorque:
         return chirp_commands()
 
     def drive(self, commands, response_s, lost_from=None):
-        """Return after how many ticks it is found, or None."""
+        """Return the number of ticks until detection, or None."""
         following = TorqueFollowingCheck("Drive", 10.0, response_s, 1e-3)
         fraction = 1 - exp(-1e-3 / self.LAG_S)
         held = pending = 0

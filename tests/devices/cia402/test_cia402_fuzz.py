@@ -1,4 +1,4 @@
-"""The fuzzing of ``fuzz_cia402.py``, a short one."""
+"""A short run of ``fuzz_cia402.py``."""
 
 import importlib.util
 import struct

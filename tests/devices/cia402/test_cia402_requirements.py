@@ -17,8 +17,8 @@ from rigd.devices.cia402.requirements import (
 
 
 def test_each_object_occurs_once():
-    places = [(each.index, each.sub) for each in REQUIREMENTS]
-    assert len(places) == len(set(places))
+    addresses = [(each.index, each.sub) for each in REQUIREMENTS]
+    assert len(addresses) == len(set(addresses))
 
 
 def test_a_missing_core_object_is_refused_with_a_reason():

@@ -102,9 +102,9 @@ def test_disabled_pdos_are_not_written(drive, scripted):
 def test_everything_written_is_read_back(drive, scripted):
     drive.connect()
     requests = scripted.frames(0x605)
-    for place, request in enumerate(requests):
+    for position, request in enumerate(requests):
         if request[0] & 0xE0 == 0x20 and request[1:3] != b"\x40\x60":
-            following = requests[place + 1]
+            following = requests[position + 1]
             assert following[0] == 0x40
             assert following[1:4] == request[1:4]
 
@@ -113,7 +113,7 @@ def test_configuration_in_pre_operational_only(drive, scripted):
     drive.connect()
     before_start = scripted.seen[: scripted.seen.index((0x000, b"\x01\x05"))]
     off = (0x605, bytes.fromhex("2B40600000000000"))
-    # Off before all else, and in pre-operational again, for not every drive takes it before.
+    # Off first, and again in pre-operational, because not every drive accepts it before.
     assert before_start[:2] == [off, (0x000, b"\x80\x05")]
     assert off in before_start[2:]
     assert {can_id for can_id, _ in before_start} == {0x000, 0x605}
@@ -132,8 +132,8 @@ def test_bits_set_by_the_drive_itself_are_no_difference(drive, scripted):
     write = dict.__setitem__
 
     class Sets(dict):
-        def __setitem__(self, place, value):
-            write(self, place, value | 0x40000000 if place == (0x1800, 1) else value)
+        def __setitem__(self, address, value):
+            write(self, address, value | 0x40000000 if address == (0x1800, 1) else value)
 
     scripted.objects = Sets(scripted.objects)
     drive.connect()
@@ -172,7 +172,7 @@ def test_a_drive_without_name_and_serial_number(drive, scripted):
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "words"),
+    ("address", "value", "words"),
     [
         ((0x1018, 1), 0x99, ["vendor_id is 0x00001234", "0x00000099"]),
         ((0x1018, 2), 0x1, ["product_code is 0x0000ABCD", "0x00000001"]),
@@ -180,13 +180,13 @@ def test_a_drive_without_name_and_serial_number(drive, scripted):
         ((0x6076, 0), 6, ["6076 = 6", "0.6 N·m", "0.5 N·m"]),
     ],
 )
-def test_a_drive_other_than_the_profile_s(drive, scripted, place, value, words):
-    scripted.objects[place] = value
+def test_a_drive_other_than_the_profile_s(drive, scripted, address, value, words):
+    scripted.objects[address] = value
     with pytest.raises(DeviceError) as caught:
         drive.connect()
     for word in words:
         assert word in str(caught.value)
-    assert not [place for place in scripted.writes if place[0] != 0x6040]
+    assert not [address for address in scripted.writes if address[0] != 0x6040]
 
 
 STEPS = round(tau / 7e-5)
@@ -215,7 +215,7 @@ def test_scales_unlike_the_profile_are_refused(drive, scripted, stated, words):
     ("stated", "gear", "step"),
     [
         ({0x608F: (STEPS, 100), 0x6091: (100, 1)}, 100.0, 7e-5),
-        # As a drive has them that was never set up for its gear.
+        # As in a drive that was never set up for its gear.
         ({0x608F: (STEPS, 100), 0x6091: (1, 1), 0x6092: (1, 1)}, None, 7e-5),
         # A feed constant in the units that the position has.
         ({0x608F: (10, 1), 0x6091: (100, 1), 0x6092: (STEPS, 1)}, 100.0, 7e-5),
@@ -241,28 +241,28 @@ def test_zero_in_the_profile_accepts_any_drive(make_drive, rig, settings, script
     assert drive.identity()["rated_torque_counts"] is None
 
 
-PLACES = [
+ADDRESSES = [
     (0x1006, 0), (0x1A00, 0), (0x60C2, 1), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x1029, 1),
     (0x6072, 0), (0x6060, 0), (0x1400, 1), (0x1800, 2), (0x1801, 1),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("place", "how"),
+    ("address", "how"),
     [
-        *((place, "keeps") for place in PLACES),
-        *((place, "refuses") for place in PLACES[:2]),
-        *(further(place, "refuses") for place in PLACES[2:]),
+        *((address, "keeps") for address in ADDRESSES),
+        *((address, "refuses") for address in ADDRESSES[:2]),
+        *(further(address, "refuses") for address in ADDRESSES[2:]),
     ],
 )
-def test_an_object_that_ignores_its_value(drive, scripted, place, how):
+def test_an_object_that_ignores_its_value(drive, scripted, address, how):
     scripted.objects |= {(0x1029, 1): 2, (0x60C2, 2): 0, (0x1006, 0): 4000}
-    index, sub = place
+    index, sub = address
     if how == "refuses":
-        scripted.refuse[place] = 0x08000022
+        scripted.refuse[address] = 0x08000022
         words = ["refuses", "present device state"]
     else:
-        scripted.fixed.add(place)
+        scripted.fixed.add(address)
         words = ["was set to", "and reads"]
     with pytest.raises(DeviceError, match="node 5") as caught:
         drive.connect()
@@ -412,7 +412,7 @@ class TestResettingADriveThatTurns:
 
 @pytest.fixture
 def failing_bus(monkeypatch):
-    """Have the library's network raise errors, by the frame's identifier, before it sends."""
+    """Let the library's network raise errors before it sends, by the frame's identifier."""
     really_send = canopen.Network.send_message
 
     def fail(troubles):
@@ -446,7 +446,7 @@ def test_late_replies_do_not_answer_the_next_request(drive, scripted, late):
 
 
 def test_slow_answers_after_a_late_reply(drive, scripted):
-    """Each reply would be taken for that to the next request, as long as that waits for one."""
+    """Each reply would answer the next request while that waits for one."""
     answer, requests = scripted._sdo, []
 
     def slow(data):

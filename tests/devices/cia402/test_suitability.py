@@ -82,10 +82,10 @@ def test_drives_without_torque_mode_are_refused(name, modes):
 
 def test_deficiencies_of_the_two_real_drives(rig):
     elmo = by_address(check_suitability(read_eds(eds_path("elmo_gold")), rig()))
-    for place in ("60E0", "60E1"):
-        assert elmo[place].grade is Grade.FITS
-        assert elmo[place].found == "ro, 50000: it does"
-        assert elmo[place].wanted == "at least 1800"
+    for address in ("60E0", "60E1"):
+        assert elmo[address].grade is Grade.FITS
+        assert elmo[address].found == "ro, 50000: it does"
+        assert elmo[address].wanted == "at least 1800"
     assert not [f for f in elmo.values() if f.grade is Grade.REFUSED]
 
     epos = read_eds(eds_path("epos4_0170"))
@@ -100,8 +100,8 @@ def test_deficiencies_of_the_two_real_drives(rig):
 
 @pytest.mark.parametrize("needed", CORE_REQUIREMENTS, ids=lambda needed: needed.address)
 def test_a_missing_core_object_is_refused_by_name(check, needed):
-    place = f"{needed.index:04X}:{needed.sub}"
-    found = check(without(place if f"{place} " in COMPLETE else needed.address))
+    address = f"{needed.index:04X}:{needed.sub}"
+    found = check(without(address if f"{address} " in COMPLETE else needed.address))
     (refusal,) = found.refusals
     assert needed.address in refusal
     if needed.index == 0x6502:
@@ -130,7 +130,7 @@ def test_a_mode_that_cannot_be_set_does_not_count(check):
 
 
 @pytest.mark.parametrize(
-    ("place", "line", "words"),
+    ("address", "line", "words"),
     [
         ("6071", "i16 rww 0", "cannot be mapped into a PDO"),
         ("6064", "i16 ro 0 *", "has 16 bits, not 32"),
@@ -142,14 +142,14 @@ def test_a_mode_that_cannot_be_set_does_not_count(check):
         ("1800:3", "u16 ro 10", "is read-only and does not hold what is needed (0)"),
     ],
 )
-def test_unusable_objects_are_refused(check, place, line, words):
-    (refusal,) = check(changed(place, line)).refusals
-    assert place.removesuffix(":0") in refusal
+def test_unusable_objects_are_refused(check, address, line, words):
+    (refusal,) = check(changed(address, line)).refusals
+    assert address.removesuffix(":0") in refusal
     assert words in refusal
 
 
 @pytest.mark.parametrize(
-    ("place", "line", "found"),
+    ("address", "line", "found"),
     [
         ("1005", "u32 const 0x80", "const, 0x80: it does"),
         ("1014", "u32 const $NODEID+0x80", "const, 0x81: it does"),
@@ -157,10 +157,10 @@ def test_unusable_objects_are_refused(check, place, line, words):
         ("1400:2", "u8 ro -", "ro: the drive will be asked"),
     ],
 )
-def test_read_only_objects_may_have_the_needed_value(check, place, line, found):
-    suitability = check(changed(place, line))
+def test_read_only_objects_may_have_the_needed_value(check, address, line, found):
+    suitability = check(changed(address, line))
     assert suitability.refusals == ()
-    assert by_address(suitability)[place].found == found
+    assert by_address(suitability)[address].found == found
 
 
 def test_fixed_pdos_mapped_as_needed(check):
@@ -221,13 +221,13 @@ def test_a_missing_watchdog_is_reported(check, rig):
 
 
 @pytest.mark.parametrize(
-    ("place", "key"), [("6080", "max_speed_rad_s"), ("6076", "rated_torque_unit_nm")]
+    ("address", "key"), [("6080", "max_speed_rad_s"), ("6076", "rated_torque_unit_nm")]
 )
-def test_objects_needed_by_the_profile_must_exist(check, rig, place, key):
-    assert check(without(place)).refusals == ()
-    (refusal,) = check(without(place), rig()).refusals
+def test_objects_needed_by_the_profile_must_exist(check, rig, address, key):
+    assert check(without(address)).refusals == ()
+    (refusal,) = check(without(address), rig()).refusals
     assert f"cia402.{key} = 0" in refusal
-    assert check(without(place), rig(**{key: 0.0})).refusals == ()
+    assert check(without(address), rig(**{key: 0.0})).refusals == ()
 
 
 def test_an_unmappable_actual_torque_may_be_accepted(check, rig):

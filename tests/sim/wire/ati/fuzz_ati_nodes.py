@@ -1,6 +1,6 @@
 """Noise against the simulated ATI sensors: python tests/sim/wire/ati/fuzz_ati_nodes.py N [SEED].
 
-Nothing they are sent may raise, and they must be as useful afterwards as before.
+No input may raise, and the sensors must work afterwards as before.
 """
 
 import struct
@@ -52,7 +52,7 @@ def with_checksum(body):
 
 
 def damaged(random):
-    """A known frame with a byte changed, lost or doubled, or none of that."""
+    """A known frame, unchanged or with a byte changed, lost or doubled."""
     frame = bytearray(random.choice(SEEDS))
     at = random.randrange(len(frame))
     match random.randrange(4):
@@ -66,7 +66,7 @@ def damaged(random):
 
 
 def sound(random):
-    """Address, any function, any content, and a checksum that holds."""
+    """Address, any function, any content, and a valid checksum."""
     function = random.choice([3, 4, 0x10, 0x46, 0x6A, random.randrange(256)])
     if function == 0x10:
         data = random.randbytes(random.randrange(30))

@@ -58,7 +58,7 @@ def test_rounding_and_one_count_are_below_half_the_resolution(gauges):
 
 
 def test_the_stated_quantisation_is_nearly_reached(gauges):
-    """It is a bound on all wrenches, and no idle one."""
+    """It is a bound on all wrenches, and nearly reached."""
     wrenches = np.random.default_rng(3).uniform(-1, 1, (20_000, 6)) * RANGE
     counts = gauges.read([tuple(w) for w in wrenches]).astype(float) - UNLOADED
     error = np.abs(counts @ gauges.matrix.astype(float).T / 1e6 - wrenches).max(axis=0)

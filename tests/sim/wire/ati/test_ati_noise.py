@@ -1,4 +1,4 @@
-"""Noise on the wire: the first part of what fuzz_ati_nodes.py does at length."""
+"""Noise on the wire: a short run of fuzz_ati_nodes.py."""
 
 import runpy
 from pathlib import Path

@@ -453,7 +453,7 @@ def test_polled_gauges(serial_host, load):
     assert load.measured == 0
 
 
-def test_gauges_polled_before_the_first_period_are_read_anew(serial_host, load):
+def test_gauges_polled_before_the_first_period_are_measured(serial_host, load):
     serial_host.load_gains(2)
     unloaded = serial_host.registers(0, 6, function=4)
     load.wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5)

@@ -1,4 +1,4 @@
-"""The drive under the master of the canopen library, which knows nothing of ours."""
+"""The drive under the master of the canopen library, which is independent of ours."""
 
 import queue
 import threading

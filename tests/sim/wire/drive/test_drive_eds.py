@@ -1,4 +1,4 @@
-"""A drive made from an EDS file has what the file has, may what the file lets, and nothing else."""
+"""A drive made from an EDS file has exactly its objects and access rights."""
 
 import struct
 from configparser import RawConfigParser
@@ -97,7 +97,7 @@ def test_only_mappable_objects_are_mapped(eds_bench, name):
 def test_a_drive_with_torque_mode_turns(eds_bench, name):
     bench = eds_bench(eds_path(name))
     assert bench.read(0x6502) & 0x200
-    # Whatever the file has mapped, as a good master does: off, count, entries, count, type, on.
+    # The mapping of the file, in the order of a good master: off, count, entries, count, type, on.
     for com, mapping, cob_id, entries in (
         (0x1400, 0x1600, 0x205, (0x60400010, 0x60710010)),
         (0x1800, 0x1A00, 0x4000_0185, (0x60410010, 0x60640020, 0x60770010)),
@@ -149,7 +149,7 @@ def test_values_of_the_file_are_used(made_of):
     assert bench.read(0x1018, 1) == 0xABC
     assert bench.read(0x1018, 2) == 0
     assert bench.read(0x6502) == 0x200  # not in the file, which has a target torque
-    assert bench.read(0x6072) == bench.node._peak_per_mille  # no limit is meant by zero
+    assert bench.read(0x6072) == bench.node._peak_per_mille  # zero means no limit
     assert bench.read(0x6080) == 1234
     assert bench.read(0x6076) == 500  # of the profile's motor
     assert bench.read(0x3000) == 2

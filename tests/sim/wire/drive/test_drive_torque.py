@@ -1,4 +1,4 @@
-"""What reaches the plant: when, how much, and that nothing does once the drive is left."""
+"""Torque of the plant: its time, its value, and none once the drive is off."""
 
 from dataclasses import replace
 
@@ -118,7 +118,7 @@ def test_a_shaft_above_the_speed_limit_is_not_accelerated(running):
 
 
 def test_all_values_of_a_pdo_are_stored_before_they_act(bench):
-    # A target left over from before must not act between the two halves of the frame.
+    # An earlier target must not act between the two halves of the frame.
     bench.configure().sync()
     for word in (0x06, 0x07):
         bench.rpdo(word, 0)

@@ -1,4 +1,4 @@
-"""What the drive does when its host falls silent or talks nonsense."""
+"""Reaction of the drive to a silent host or invalid frames."""
 
 import pytest
 
@@ -277,7 +277,7 @@ def test_a_frozen_drive_is_silent_and_resumes_in_fault(running):
     running.node.frozen = True
     moved_before = running.plant.angle_rad
     running.node.receive(0x80, b"")
-    assert running.plant.angle_rad != moved_before  # the world moves on
+    assert running.plant.angle_rad != moved_before  # the world continues
     running.wait(100, sync=True, rpdo=(0x0F, 300))
     assert running.take() == []
     running.assert_off()

@@ -111,7 +111,7 @@ class SerialSensor:
 
 
 class Recording:
-    """A world, and all that came out of it."""
+    """A world, and its output."""
 
     def __init__(self, rig, *, lock_step, serial, log):
         self.sent = []
@@ -146,16 +146,16 @@ class Recording:
         self.written += data
 
     def sync(self, *ticks):
-        """Hear a SYNC on each of these ticks, fractions allowed."""
+        """Receive a SYNC at each of these ticks, fractions allowed."""
         for tick in ticks:
             self.world.receive_frames([SYNC], "host", round(tick * PERIOD_NS))
 
     def from_nodes(self):
-        """What the nodes sent, as (identifier, data)."""
+        """Return the frames of the nodes, as (identifier, data)."""
         return [unpack(raw) for raw, origin in self.sent if origin is None]
 
     def answers(self):
-        """What the drive answered."""
+        """Return the answers of the drive."""
         return [
             struct.unpack("<I", data)[0] for can_id, data in self.from_nodes() if can_id == 0x181
         ]

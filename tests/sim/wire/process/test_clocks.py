@@ -1,4 +1,4 @@
-"""The world's clock: what a SYNC does, early, late, missing or drifting."""
+"""The world's clock under SYNCs that are early, late, missing or drifting."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -26,7 +26,7 @@ class Bench:
         self.received = []
         self.events = []
         self.hub = links.VirtualBus(
-            path, self.handlers, self._hear, lambda *events: self.events.append(events)
+            path, self.handlers, self._receive, lambda *events: self.events.append(events)
         )
         self.links = []
 
@@ -253,7 +253,7 @@ class Line:
         self.handlers = {}
         self.received = b""
         self.events = []
-        self.pty = links.PtyLine(self.handlers, self._hear, self.events.append)
+        self.pty = links.PtyLine(self.handlers, self._receive, self.events.append)
         self.port = None
 
     def _receive(self, data):

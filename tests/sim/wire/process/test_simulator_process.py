@@ -76,7 +76,7 @@ class Simulator:
 
 
 class Host:
-    """A master that knows a few frames by heart."""
+    """A master with a few fixed frames."""
 
     def __init__(self, path):
         self.link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -227,7 +227,7 @@ def test_a_host_drives_the_motor(simulate, connect):
     assert per_mille == 400
     # 0.2 N·m less 0.03 of friction on some 2 to 3 g·m² for 0.1 s.
     assert 0.1 < (counts - start) * 7e-5 < 0.5
-    # What matters is in the file although it is still open; the rest comes with the end.
+    # Important entries are in the file although it is open; the others come at the end.
     (enabled,) = simulator.events("drive", "state")[-1:]
     assert enabled["state"] == "operation enabled"
     _, out, _ = simulator.end()
@@ -285,16 +285,16 @@ def test_lock_step_is_reproducible(simulate, connect):
         host = connect(simulator)
         host.set_up()
         host.enable()
-        got = []
+        replies_of_host = []
         for tick in range(150):
             time.sleep(pause_s)
             host.send((0x680, b""), (0x77F, b"\x05"))
-            got.append(host.receive(0x680)[1] + host.receive(0x681)[1])
-            got.append(host.tick(0x0F, 300 if tick < 60 else -100))
+            replies_of_host.append(host.receive(0x680)[1] + host.receive(0x681)[1])
+            replies_of_host.append(host.tick(0x0F, 300 if tick < 60 else -100))
         host.tick(0x00)
         host.tick()
         simulator.end()
-        replies.append(got)
+        replies.append(replies_of_host)
         torques = simulator.events("drive", "torque")
         since = torques[0]["t_s"]
         logs.append([(round(e["t_s"] - since, 6), e["torque_nm"], e["enabled"]) for e in torques])

@@ -91,7 +91,7 @@ def over_the_wire(rig, ticks):
             sensor.request(tick * PERIOD_NS)
             angle, wrench = drive.read_angle(), sensor.read_wrench()
             drive.command(torque_nm(tick) if tick >= 0 else 0.0)
-            # Replies that are taken a tick later have come by then, as they have in real time; the
+            # Replies that are read a tick later have arrived by then, as in real time; the
             # simulator serves one after the other, so its second answer is behind all of this.
             ask_simulator(address, {"status": True})
             ask_simulator(address, {"status": True})
@@ -180,11 +180,13 @@ def test_the_wire_changes_nothing(simulated_profile, name, changes):
     rig = simulated_profile(name, changes)
     ticks = 120
     expected = simulate_directly(rig, ticks)
-    got = over_the_wire(rig, ticks)
-    assert [angle for angle, _ in got] == pytest.approx([angle for angle, _ in expected], abs=1e-9)
-    assert max(abs(angle) for angle, _ in got) > 0.01
+    measured = over_the_wire(rig, ticks)
+    assert [angle for angle, _ in measured] == pytest.approx(
+        [angle for angle, _ in expected], abs=1e-9
+    )
+    assert max(abs(angle) for angle, _ in measured) > 0.01
     # The sensor's bias is its own; what counts is the change, as with a tare.
-    changes = [np.subtract(wrench, got[0][1]) for _, wrench in got]
+    changes = [np.subtract(wrench, measured[0][1]) for _, wrench in measured]
     wanted = [np.subtract(wrench, expected[0][1]) for _, wrench in expected]
     off = np.max(np.abs(np.subtract(changes, wanted)), axis=0)
     assert np.all(off <= rig.sensor.resolution)
