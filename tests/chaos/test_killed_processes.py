@@ -44,7 +44,7 @@ def rig():
 def test_drive_goes_off_and_record_stays(rig, tmp_path, victim, how, moment_s, others):
     options = {"analysed": False, "grace_s": STANDSTILL_S, **others}
     verdict = rig.run_case(rig.Case(victim, how, moment_s, **options), tmp_path)
-    assert not verdict.complaints, f"{verdict.row()}\n{verdict.said}"
+    assert not verdict.complaints, f"{verdict.row()}\n{verdict.stderr}"
 
 
 @pytest.mark.parametrize(
