@@ -1,9 +1,9 @@
-"""Kill, suspend and end the processes of a session at random moments, and look at what is left.
+"""Kill, suspend and end the processes of a session at random moments, and check what remains.
 
 Four kinds of rig: simulated in the session itself (direct), by `rigd simulate` on the wire, in
-lock-step with it, and owned by `rigd serve`. The simulated drive says by its log when it was
-switched off, the file says what was kept. Then the rig has to come back: the next session is run,
-after `rigd reset` where that was asked for, and has to be complete.
+lock-step with it, and owned by `rigd serve`. The log of the simulated drive shows when it was
+switched off, the file what was stored. Then the rig has to recover: the next session is run,
+after `rigd reset` where a message requests it, and has to be complete.
 
     python tests/chaos/kill_rig.py --cases 200 --jobs 2
 """
@@ -42,14 +42,14 @@ PROFILE = PROFILES / "antenna_can.toml"
 HEARTBEAT_TIMEOUT_S = 0.3
 RECORDER_LAG_S = 2.0
 CHANGES = (
-    # A virtual machine that is short of processor time stands still for 0.1 s at a time.
+    # A virtual machine that is short of processor time pauses for 0.1 s at a time.
     ("stale_ticks_in_a_row = { value = 10", "stale_ticks_in_a_row = { value = 400"),
     ("missed_ticks_in_a_row = { value = 25", "missed_ticks_in_a_row = { value = 400"),
     ("missed_percent = { value = 2.0", "missed_percent = { value = 20.0"),
     ("stale_percent = { value = 1.0", "stale_percent = { value = 50.0"),
-    # A tick that comes late measures where the motor is by then, which looks like a jump.
+    # A late tick measures a later angle of the motor, which resembles a jump.
     ("acceleration_rad_s2 = { value = 1000.0", "acceleration_rad_s2 = { value = 10000.0"),
-    # The motor goes on with the last torque while the loop stands still.
+    # The motor goes on with the last torque while the loop is paused.
     ("\nvelocity_rad_s = { value = 4.0", "\nvelocity_rad_s = { value = 50.0"),
     ("tracking_error_rad = { value = 0.1", "tracking_error_rad = { value = 1.5"),
     ("max_speed_rad_s = { value = 5.0", "max_speed_rad_s = { value = 0.0"),
@@ -65,7 +65,7 @@ DIRECT_CHANGES = (
     ("\nvelocity_rad_s = { value = 15.0", "\nvelocity_rad_s = { value = 50.0"),
     ("tracking_error_rad = { value = 0.5", "tracking_error_rad = { value = 1.5"),
 )
-"""Settings of the profiles; one without a bus has but some of them."""
+"""Settings of the profiles; one without a bus has only some of them."""
 REST_S, RING_DOWN_S = 0.2, 0.3
 
 MODULES = {
@@ -81,9 +81,9 @@ _ASKING = (signal.SIGTERM, signal.SIGINT)
 KEPT_S = 0.3
 """No sample older than this at the moment of the kill may be lost."""
 _TRANSPORT_S = 5e-3
-"""A torque stands in the drive's log a tick after its sample, on a grid half a tick off."""
+"""The drive's log has a torque one tick after its sample, on a grid half a tick off."""
 _STARTED_S = 180.0
-"""For a process to be there, on a computer that plays several cases at a time."""
+"""For a process to be there, on a computer that runs several cases at a time."""
 _ENDED_S = 15.0
 _LONGEST_S = 60.0
 _NEXT_S = 240.0
@@ -92,7 +92,7 @@ _FLUSHED_S = 0.3
 _COMMAND_S = 240.0
 """Within which `rigd recover` and `analyze` are done, on a busy computer, too."""
 
-# By when the drive has to be off, after the signal: its own watchdog, or the process that notices.
+# Time after the signal within which the drive has to be off, by its watchdog or a process.
 OFF_WITHIN_S = {
     ("control", signal.SIGKILL): HEARTBEAT_TIMEOUT_S,
     ("control", signal.SIGSTOP): HEARTBEAT_TIMEOUT_S,
@@ -102,14 +102,14 @@ OFF_WITHIN_S = {
     ("supervisor", signal.SIGSTOP): 3.0,
     ("recorder", signal.SIGKILL): HEARTBEAT_TIMEOUT_S,
     ("recorder", signal.SIGSTOP): RECORDER_LAG_S + 1.0,
-    # Asked to end, it comes to a stop by itself, through a disabled drive.
+    # On a request to end, it stops by itself and disables the drive.
     **{(victim, how): 1.0 for victim in ("control", "supervisor", "all") for how in _ASKING},
 }
 LOST_S = 0.5
-"""Time of a record that may be lost, where only its file tells."""
+"""Time of a record that may be lost, if only its file shows it."""
 
 _GRACE_S = 0.2
-"""For which a virtual machine stands still now and then; a standstill is not the rig's."""
+"""Duration of occasional pauses of a virtual machine, which are no fault of the rig."""
 
 _SIMULATORS_LOCK = "antenna_can.lock"
 
@@ -118,12 +118,12 @@ ARMED_S = 6.0
 
 
 class HarnessError(Exception):
-    """The case could not be staged: nothing is said of the rig."""
+    """The case could not be staged, which says nothing about the rig."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is done to whom, and when."""
+    """A victim, what is done to it, and when."""
 
     victim: str
     how: signal.Signals
@@ -133,16 +133,16 @@ class Case:
     """The moment counts from the start of the command."""
     mode: str = "wire"
     stopped_s: float | None = None
-    """After which the suspension ends, whatever came of it; None: it lasts until the drive is off,
-    or as long as nobody ends it."""
+    """After which the suspension ends in any case; None: it lasts until the drive is off,
+    or until somebody ends it."""
     sweep_s: float = 5.0
     analysed: bool = True
-    """Whether to let `analyze` have a go at the file."""
+    """Whether to run `analyze` on the file."""
     grace_s: float = 0.0
-    """Added to what is allowed, where the computer may stand still."""
+    """Added to the limits where the computer may pause."""
     afterwards: signal.Signals = signal.SIGCONT
-    """What ends the suspension of a supervisor and of all that was suspended with it: they go on,
-    or the supervisor is killed, and the others have to go on by themselves."""
+    """What ends the suspension of a supervisor and its children: they continue,
+    or the supervisor is killed, and the others have to continue without it."""
 
     def __str__(self) -> str:
         where = "start" if self.anywhere else "record"
@@ -176,26 +176,26 @@ class Case:
         return signal.SIGKILL in (self.how, self._ends_suspended and self.afterwards)
 
     @property
-    def asks_daemon_to_end(self) -> bool:
-        """Whether the daemon was told to end, and is not to be asked for another session."""
+    def ends_daemon(self) -> bool:
+        """Whether the case ends the daemon, which then runs no further session."""
         return self.victim in ("supervisor", "all") and self.how in _ASKING
 
     @property
     def released(self) -> bool:
-        """Whether somebody outside has to end the suspension."""
+        """Whether the suspension has to be ended from outside."""
         return self._ends_suspended
 
 
 @dataclass
 class Verdict:
-    """What came of a case."""
+    """Result of a case."""
 
     case: Case
     complaints: list[str] = field(default_factory=list)
     exit_code: int | None = None
-    said: str = ""
+    stderr: str = ""
     outcome: str = "none"
-    kept: str = "-"
+    file_suffix: str = "-"
     off_s: float | None = None
     """Drive off, after the signal; None: it was off before, or the session went on."""
     behind_s: float | None = None
@@ -206,14 +206,14 @@ class Verdict:
     missed: tuple[int, int] = (0, 0)
     """Missed ticks in the two seconds before and after the signal."""
     after: str = "-"
-    """How the next session came about."""
+    """Steps up to the next session."""
 
     def row(self) -> str:
         def number(value: float | None) -> str:
             return "-" if value is None else f"{value:.3f}"
 
         return (
-            f"{self.case!s:66} exit {self.exit_code!s:>3}  {self.outcome:9} {self.kept:9} "
+            f"{self.case!s:66} exit {self.exit_code!s:>3}  {self.outcome:9} {self.file_suffix:9} "
             f"off {number(self.off_s):>6}  behind {number(self.behind_s):>6}  "
             f"gone {self.gone_s:5.2f}  {self.analysis:9} missed {self.missed[0]}/{self.missed[1]}  "
             f"next {self.after:16}  "
@@ -229,7 +229,7 @@ class DriveLog:
         self._read = 0
         self.entries: list[dict[str, Any]] = []
 
-    def look(self) -> None:
+    def update(self) -> None:
         with self._path.open("rb") as file:
             file.seek(self._read)
             fresh = file.read()
@@ -256,7 +256,7 @@ class Scene:
         self._runtime = Path(tempfile.mkdtemp(prefix="rigd-kill-"))
         self._mark = f"XDG_RUNTIME_DIR={self._runtime}".encode()
         self._environment = {**os.environ, "XDG_RUNTIME_DIR": str(self._runtime)}
-        self._said = (folder / "said.txt").open("w+", encoding="utf-8")
+        self._stderr = (folder / "said.txt").open("w+", encoding="utf-8")
         self._json = (folder / "out.json").open("w+", encoding="utf-8")
         self._profile = folder / "rig.toml"
         direct = mode == "direct"
@@ -319,14 +319,14 @@ class Scene:
         self.log = DriveLog(path)
 
     def _start(self, *arguments: object) -> subprocess.Popen[str]:
-        telling = "simulate" not in arguments
+        with_output = "simulate" not in arguments
         process = subprocess.Popen(
             [BIN / "rigd", *map(str, arguments)],
             cwd=self.folder,
             env=self._environment,
             stdin=subprocess.DEVNULL,
-            stdout=self._json if telling else subprocess.DEVNULL,
-            stderr=self._said if telling else subprocess.DEVNULL,
+            stdout=self._json if with_output else subprocess.DEVNULL,
+            stderr=self._stderr if with_output else subprocess.DEVNULL,
             text=True,
             start_new_session=True,
         )
@@ -335,7 +335,7 @@ class Scene:
 
     @property
     def state(self) -> str:
-        """What the daemon says of itself."""
+        """State that the daemon reports."""
         try:
             done = subprocess.run(
                 [BIN / "rigd", "status", "--json"],
@@ -352,7 +352,7 @@ class Scene:
             address = find_simulator("antenna_can")
         assert address is not None
         origins = []
-        for _ in range(20):  # an idle one looks at its clock every 10 ms
+        for _ in range(20):  # an idle one reads its clock every 10 ms
             there_s = ask_simulator(address, {"status": True})["time_s"]
             origins.append(there_s - time.monotonic())
             time.sleep(0.003)
@@ -399,9 +399,9 @@ class Scene:
         return False
 
     @property
-    def said(self) -> str:
-        self._said.flush()
-        return Path(self._said.name).read_text("utf-8")
+    def stderr(self) -> str:
+        self._stderr.flush()
+        return Path(self._stderr.name).read_text("utf-8")
 
     @property
     def result(self) -> dict[str, Any] | None:
@@ -414,7 +414,7 @@ class Scene:
 
     @property
     def locks_held(self) -> list[str]:
-        """Return the locks that somebody still has who should not."""
+        """Return the locks that are held after the end of the session."""
         held = []
         for path in (self._runtime / "rigd").glob("*.lock"):
             if path.name == _SIMULATORS_LOCK and self.simulator and self.simulator.poll() is None:
@@ -427,7 +427,7 @@ class Scene:
         return held
 
     def next_session(self) -> str:
-        """Run a short session as the operator would, and say how it came about."""
+        """Run a short session as the operator would, and return the steps it took."""
         steps = []
         if self.simulator is not None and self.simulator.poll() is not None:
             self.start_simulator()
@@ -438,29 +438,29 @@ class Scene:
             if self.state == "fault":
                 steps += self._reset()
         for _ in range(3):
-            code, said = self._short_session()
+            code, stderr = self._short_session()
             if code == 0:
                 return ", ".join([*steps, "complete"])
-            if OVERLOADED_ADVICE in said and "stalled" not in steps:
-                steps.append("stalled")  # which is said of the computer, not of the rig
-            elif "rigd reset" not in said or "reset" in steps:
-                return ", ".join([*steps, f"exit {code}: {_line(said)}"])
+            if OVERLOADED_ADVICE in stderr and "stalled" not in steps:
+                steps.append("stalled")  # a message on the computer, not on the rig
+            elif "rigd reset" not in stderr or "reset" in steps:
+                return ", ".join([*steps, f"exit {code}: {_line(stderr)}"])
             if self.mode != "daemon" or self.state == "fault":
-                steps += self._reset() if "rigd reset" in said or self.mode == "daemon" else []
-        return ", ".join([*steps, f"exit {code}: {_line(said)}"])
+                steps += self._reset() if "rigd reset" in stderr or self.mode == "daemon" else []
+        return ", ".join([*steps, f"exit {code}: {_line(stderr)}"])
 
     def _reset(self) -> list[str]:
         done = self._command("reset", *([] if self.mode == "daemon" else self._where[:2]))
         return ["reset"] if done.returncode == 0 else [f"reset refused ({_line(done.stderr)})"]
 
     def _short_session(self) -> tuple[int, str]:
-        """Return its exit code and what was said."""
+        """Return its exit code and its messages."""
         hold = ["hold", "--duration", 0.5, "--rest", 0.1, "--ring-down", 0.1, "--json"]
         hold += self._accepted
         if self.mode == "daemon":
             done = self._command("start", *hold)
         else:
-            # Nobody looks at this one.
+            # This session has no viewer.
             where = [word for word in self._where if word != "--live"]
             where[3] = self.folder / "next"
             done = self._command("run", *hold, "--no-look", *where)
@@ -488,7 +488,7 @@ class Scene:
             return
         self.simulator.send_signal(signal.SIGTERM)
         self.simulator.wait(_ENDED_S)
-        self.log.look()
+        self.log.update()
 
     def close(self) -> None:
         for pid in (*self.processes(), *self._simulators):
@@ -496,13 +496,13 @@ class Scene:
                 os.kill(pid, signal.SIGKILL)
         for process in self._started:
             process.wait()
-        self._said.close()
+        self._stderr.close()
         self._json.close()
         shutil.rmtree(self._runtime, ignore_errors=True)
 
 
-def play(case: Case, folder: Path) -> Verdict:
-    """Stage a case and judge it.
+def run_case(case: Case, folder: Path) -> Verdict:
+    """Stage a case and check its result.
 
     Raises
     ------
@@ -512,22 +512,22 @@ def play(case: Case, folder: Path) -> Verdict:
     scene = Scene(folder, live=case.live, sweep_s=case.sweep_s, mode=case.mode)
     try:
         scene.begin()
-        return _play(case, scene)
+        return _run_case(case, scene)
     finally:
         scene.close()
 
 
-def _play(case: Case, scene: Scene) -> Verdict:
+def _run_case(case: Case, scene: Scene) -> Verdict:
     verdict = Verdict(case)
     if not case.anywhere:
         wait_for(scene.recording, _STARTED_S, "record")
     time.sleep(case.moment_s)
     wait_for(lambda: scene.find(case.victim) or _ended(scene), 10.0, case.victim)
     if _ended(scene):
-        raise HarnessError(f"The session had ended by itself:\n{scene.said}")
+        raise HarnessError(f"The session had ended by itself:\n{scene.stderr}")
     log = scene.log
     if log is not None:
-        log.look()
+        log.update()
     was_on = log is not None and log.enabled
     wall_ns = time.time_ns() - time.monotonic_ns()
     hit = scene.find(case.victim)
@@ -548,23 +548,23 @@ def _play(case: Case, scene: Scene) -> Verdict:
         verdict.exit_code = scene.session.wait(longest_s)
     except subprocess.TimeoutExpired:
         verdict.complaints.append(f"the session goes on after {longest_s:g} s")
-    if case.daemon and scene.supervisor.poll() is None and case.asks_daemon_to_end:
+    if case.daemon and scene.supervisor.poll() is None and case.ends_daemon:
         with contextlib.suppress(subprocess.TimeoutExpired):
             scene.supervisor.wait(_ENDED_S)
     if case.daemon and scene.supervisor.poll() is None:
-        _judge_daemon(verdict, scene)
+        _check_daemon(verdict, scene)
     else:
         _await_end(verdict, scene, from_s)
     _await_off(log, HEARTBEAT_TIMEOUT_S + 2.0)
     if log is not None:
         time.sleep(_FLUSHED_S)
-        log.look()
-    verdict.said = scene.said
-    _judge_end(verdict, scene)
+        log.update()
+    verdict.stderr = scene.stderr
+    _check_end(verdict, scene)
     if log is not None and case.victim != "simulate":
         hit_s = scene.time_of(hit_ns)
-        _judge_drive(verdict, log, scene.time_of(before_ns), hit_s, was_on=was_on)
-    _judge_file(verdict, scene, hit_ns, wall_ns)
+        _check_drive(verdict, log, scene.time_of(before_ns), hit_s, was_on=was_on)
+    _check_file(verdict, scene, hit_ns, wall_ns)
     verdict.after = scene.next_session()
     if not verdict.after.endswith("complete"):
         verdict.complaints.append(f"the next session: {verdict.after}")
@@ -579,9 +579,9 @@ def _play(case: Case, scene: Scene) -> Verdict:
 
 
 def _await_end(verdict: Verdict, scene: Scene, from_s: float) -> None:
-    """Wait until the last process of the session is gone, and look for what it leaves."""
+    """Wait until the last process of the session is gone, and check what it leaves."""
     ended_s = time.monotonic()
-    # A killed process is seen to be gone before the last of its threads has let its locks go.
+    # A killed process disappears before the last of its threads releases its locks.
     while (left := scene.processes()) or scene.locks_held:
         if time.monotonic() - ended_s > _ENDED_S:
             break
@@ -593,8 +593,8 @@ def _await_end(verdict: Verdict, scene: Scene, from_s: float) -> None:
         verdict.complaints.append(f"locked: {', '.join(scene.locks_held)}")
 
 
-def _judge_daemon(verdict: Verdict, scene: Scene) -> None:
-    """See how the daemon took it."""
+def _check_daemon(verdict: Verdict, scene: Scene) -> None:
+    """Check the state of the daemon."""
     expected = {"ready"} if verdict.exit_code == 0 else {"ready", "fault"}
     if verdict.case.victim in ("control", "simulate"):
         expected = {"ready", "fault"}  # which notices it after the session's end, too
@@ -604,7 +604,7 @@ def _judge_daemon(verdict: Verdict, scene: Scene) -> None:
 
 
 def _end_daemon(verdict: Verdict, scene: Scene) -> None:
-    """Have it end."""
+    """End the daemon."""
     scene.supervisor.send_signal(signal.SIGTERM)
     with contextlib.suppress(subprocess.TimeoutExpired):
         scene.supervisor.wait(_ENDED_S)
@@ -623,18 +623,18 @@ def _send(processes: list[int], number: signal.Signals) -> None:
 
 
 def _await_off(log: DriveLog | None, patience_s: float) -> None:
-    """Wait until the drive is off; that it is not is found out by the judge."""
+    """Wait until the drive is off, or for a time; `_check_drive` reports a drive that is on."""
     if log is None:  # it ends with the control process
         time.sleep(HEARTBEAT_TIMEOUT_S)
         return
     deadline = time.monotonic() + patience_s
-    log.look()
+    log.update()
     while log.enabled and time.monotonic() < deadline:
         time.sleep(0.05)
-        log.look()
+        log.update()
 
 
-def _judge_end(verdict: Verdict, scene: Scene) -> None:
+def _check_end(verdict: Verdict, scene: Scene) -> None:
     case, result = verdict.case, scene.result
     if result is not None:
         verdict.outcome = result["outcome"]
@@ -646,38 +646,38 @@ def _judge_end(verdict: Verdict, scene: Scene) -> None:
         if not complete:
             verdict.complaints.append(f"the session did not go on: {verdict.outcome}")
         lost = not passing and case.stopped_s is None and case.timed and not case.anywhere
-        if lost and "It is restarted" not in verdict.said:
+        if lost and "It is restarted" not in verdict.stderr:
             verdict.complaints.append("the publisher was not restarted")
     elif case.killed and case.victim in ("supervisor", "all"):
         # Unless it had ended before.
         expected = {1} if case.daemon else {-signal.SIGKILL, *({0} if complete else ())}
     elif case.how in _ASKING and case.victim in ("supervisor", "all", "control"):
-        # To rigd run 130 is a stop that was asked of itself.
+        # Exit code 130 of rigd run is a requested stop.
         unasked = case.daemon or case.anywhere or case.victim == "control"
         expected = {0} if complete else {130, 1} if unasked else {130}
-        if case.anywhere and not verdict.said:
+        if case.anywhere and not verdict.stderr:
             expected.add(-case.how)  # so early that the interpreter did not handle signals yet
     elif case.anywhere or case.how == signal.SIGSTOP:
         expected = ends_by_itself
         if case.victim == "simulate" and case.mode == "lock-step" and result is None:
-            expected.add(2)  # gone before it was looked for: there is nothing to be fast with
+            expected.add(2)  # gone before the search for it: there is nothing to be fast with
     else:
         expected = {1}
     if verdict.exit_code not in expected:
         verdict.complaints.append(f"exit code {verdict.exit_code} instead of {sorted(expected)}")
-    if "Traceback" in verdict.said:
+    if "Traceback" in verdict.stderr:
         verdict.complaints.append("a traceback")
     words = ("Error: ", "Fault: ", "Stopped: ", "After the record: ")
-    if verdict.exit_code == 1 and not any(word in verdict.said for word in words):
+    if verdict.exit_code == 1 and not any(word in verdict.stderr for word in words):
         verdict.complaints.append("no message")
 
 
-def _judge_drive(
+def _check_drive(
     verdict: Verdict, log: DriveLog, before_s: float, hit_s: float, *, was_on: bool
 ) -> None:
     case, torques = verdict.case, log.torques
     if not case.timed:
-        _judge_lock_step(verdict, torques)
+        _check_lock_step(verdict, torques)
         return
     if torques and (torques[-1]["enabled"] or torques[-1]["torque_nm"]):
         verdict.complaints.append(f"the drive is on in the end: {torques[-1]}")
@@ -687,7 +687,7 @@ def _judge_drive(
         return
     verdict.off_s = offs[0] - hit_s
     if verdict.outcome == "complete":
-        return  # it was hit so late, or gave so little reason, that the session came to its end
+        return  # hit too late, or with too little effect, to end the session
     within_s = OFF_WITHIN_S[case.victim, case.how] + case.grace_s
     if (case.victim, case.how, case.anywhere) == ("recorder", signal.SIGSTOP, True):
         within_s = max(within_s, ARMED_S)
@@ -695,8 +695,8 @@ def _judge_drive(
         verdict.complaints.append(f"the drive was off after {verdict.off_s:.3f} s, not {within_s}")
 
 
-def _judge_lock_step(verdict: Verdict, torques: list[dict[str, Any]]) -> None:
-    """Judge by the simulated time, which goes on by the clock where no SYNC comes any more."""
+def _check_lock_step(verdict: Verdict, torques: list[dict[str, Any]]) -> None:
+    """Check by simulated time, which follows the clock once no SYNC comes."""
     if torques and (torques[-1]["enabled"] or torques[-1]["torque_nm"]):
         verdict.complaints.append(f"the drive is on in the end: {torques[-1]}")
         return
@@ -709,7 +709,7 @@ def _judge_lock_step(verdict: Verdict, torques: list[dict[str, Any]]) -> None:
             )
 
 
-def _judge_file(verdict: Verdict, scene: Scene, hit_ns: int, wall_ns: int) -> None:
+def _check_file(verdict: Verdict, scene: Scene, hit_ns: int, wall_ns: int) -> None:
     path = _only_file(verdict, scene)
     if path is None:
         return
@@ -740,11 +740,11 @@ def _judge_file(verdict: Verdict, scene: Scene, hit_ns: int, wall_ns: int) -> No
     ticks = samples["tick"].astype(np.int64)
     if due_s[0] < hit_s < due_s[0] + REST_S + verdict.case.sweep_s + RING_DOWN_S:
         verdict.behind_s = float(hit_s - due_s[-1])
-        kept_s = KEPT_S + verdict.case.grace_s
+        stored_before_s = KEPT_S + verdict.case.grace_s
         gone = [
             e["t_s"]
             for e in ([] if scene.log is None else scene.log.torques)
-            if due_s[-1] + _TRANSPORT_S < e["t_s"] < hit_s - kept_s and e["enabled"]
+            if due_s[-1] + _TRANSPORT_S < e["t_s"] < hit_s - stored_before_s and e["enabled"]
         ]
         if gone:
             verdict.complaints.append(f"lost {len(gone)} ticks from {hit_s - gone[0]:.3f} s before")
@@ -771,12 +771,12 @@ def _only_file(verdict: Verdict, scene: Scene) -> Path | None:
         return None
     if len(files) > 1:
         verdict.complaints.append(f"files: {[path.name for path in files]}")
-    verdict.kept = files[0].suffix[1:]
+    verdict.file_suffix = files[0].suffix[1:]
     return files[0]
 
 
 def _recovered(verdict: Verdict, part: Path, scene: Scene) -> Path | None:
-    """Make a file of what the recorder left."""
+    """Recover the file that the recorder left."""
     done = _finished(verdict, [BIN / "rigd", "recover", part], scene.folder)
     if done is None:
         return None
@@ -899,12 +899,14 @@ def main() -> int:
     started_s = time.monotonic()
     verdicts, skipped = [], 0
     with ProcessPoolExecutor(given.jobs) as pool:
-        played = {
-            pool.submit(play_alone, case, given.keep and given.keep / f"{number:03}"): number
+        futures = {
+            pool.submit(
+                run_case_in_own_folder, case, given.keep and given.keep / f"{number:03}"
+            ): number
             for number, case in enumerate(cases)
         }
-        for future in as_completed(played):
-            number = played[future]
+        for future in as_completed(futures):
+            number = futures[future]
             try:
                 verdicts.append(future.result())
             except HarnessError as error:
@@ -913,7 +915,7 @@ def main() -> int:
                 continue
             print(f"{number:3} {verdicts[-1].row()}", flush=True)  # noqa: T201
             if verdicts[-1].complaints:
-                print(verdicts[-1].said)  # noqa: T201
+                print(verdicts[-1].stderr)  # noqa: T201
     print(summary(verdicts))  # noqa: T201
     took_s = time.monotonic() - started_s
     bad = [verdict for verdict in verdicts if verdict.complaints]
@@ -925,8 +927,8 @@ def main() -> int:
     return 1 if bad else 0
 
 
-def play_alone(case: Case, keep: Path | None) -> Verdict:
-    """Play a case in its own folder, of which only something wrong is kept.
+def run_case_in_own_folder(case: Case, failures: Path | None) -> Verdict:
+    """Run a case in its own folder, which is stored only if something is wrong.
 
     Raises
     ------
@@ -935,9 +937,9 @@ def play_alone(case: Case, keep: Path | None) -> Verdict:
     """
     folder = Path(tempfile.mkdtemp(prefix="rigd-case-"))
     try:
-        verdict = play(case, folder)
-        if verdict.complaints and keep:
-            shutil.copytree(folder, keep, dirs_exist_ok=True)
+        verdict = run_case(case, folder)
+        if verdict.complaints and failures:
+            shutil.copytree(folder, failures, dirs_exist_ok=True)
         return verdict
     finally:
         shutil.rmtree(folder, ignore_errors=True)

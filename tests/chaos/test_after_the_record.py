@@ -1,4 +1,4 @@
-"""What happens after the last tick of a record does not make it any less complete."""
+"""A record remains complete whatever happens after its last tick."""
 
 import os
 import signal
@@ -37,7 +37,7 @@ def channels():
         (299, "fault", "The supervising process ended during the session."),
     ],
 )
-def test_a_recorder_alone_knows_a_whole_record(channels, tmp_path, ticks, outcome, reason):
+def test_recorder_alone_recognises_a_whole_record(channels, tmp_path, ticks, outcome, reason):
     shared_state, ring = channels.shared_state, channels.samples
     recorder = Recorder(channels, SessionWriter(tmp_path / "alone.mcap"))
     segments = {"rest": (0, 100), "sweep": (100, 300)}
@@ -58,7 +58,7 @@ def test_a_recorder_alone_knows_a_whole_record(channels, tmp_path, ticks, outcom
 
 @pytest.mark.process
 @pytest.mark.usefixtures("children_copied")
-def test_a_control_process_that_dies_on_the_way_back_leaves_a_whole_record(tmp_path):
+def test_whole_record_if_control_process_dies_while_returning(tmp_path):
     profile = load_shipped("sim")
     profile = replace(profile, session=replace(profile.session, tare_s=0.5, return_s=60.0))
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=0.3, rest_s=0.1, ring_down_s=0.0)

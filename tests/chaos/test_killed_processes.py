@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 STANDSTILL_S = 1.0
-"""For which a virtual machine may stop, at the worst moment, and no test fails."""
+"""Pause of a virtual machine that no test fails for, even at the worst moment."""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def rig():
     [
         # Each by itself is killed in tests/cli/test_run.py.
         pytest.param("all", signal.SIGKILL, 0.6, {"analysed": True}, marks=pytest.mark.further),
-        # The others have to go on by themselves, for the drive's sake and for the file's.
+        # The others have to continue without it, for the drive and for the file.
         pytest.param(
             *("all", signal.SIGSTOP, 0.4, {"afterwards": signal.SIGKILL}), marks=pytest.mark.slow
         ),
@@ -41,32 +41,32 @@ def rig():
         pytest.param("supervisor", signal.SIGSTOP, 0.3, {}, marks=pytest.mark.slow),
     ],
 )
-def test_the_drive_goes_off_and_the_record_stays(rig, tmp_path, victim, how, moment_s, others):
+def test_drive_goes_off_and_record_stays(rig, tmp_path, victim, how, moment_s, others):
     options = {"analysed": False, "grace_s": STANDSTILL_S, **others}
-    verdict = rig.play(rig.Case(victim, how, moment_s, **options), tmp_path)
-    assert not verdict.complaints, f"{verdict.row()}\n{verdict.said}"
+    verdict = rig.run_case(rig.Case(victim, how, moment_s, **options), tmp_path)
+    assert not verdict.complaints, f"{verdict.row()}\n{verdict.stderr}"
 
 
 @pytest.mark.parametrize(
     ("off_s", "torque_nm", "complaint"),
     [(10.29, 0.0, ""), (10.4, 0.0, "off after 0.400 s"), (None, 0.2, "on in the end")],
 )
-def test_the_judge_sees_a_drive_that_goes_on(rig, tmp_path, off_s, torque_nm, complaint):
+def test_complaint_if_drive_stays_on(rig, tmp_path, off_s, torque_nm, complaint):
     log = rig.DriveLog(tmp_path / "drive.jsonl")
-    told = [(9.0, 0.1, True), (10.001, 0.2, True)]
+    torques = [(9.0, 0.1, True), (10.001, 0.2, True)]
     if off_s is not None:
-        told.append((off_s, torque_nm, False))
+        torques.append((off_s, torque_nm, False))
     log.entries = [
         {"t_s": t_s, "device": "drive", "what": "torque", "torque_nm": torque, "enabled": enabled}
-        for t_s, torque, enabled in told
+        for t_s, torque, enabled in torques
     ]
     verdict = rig.Verdict(rig.Case("control", signal.SIGKILL, 1.0))
-    rig._judge_drive(verdict, log, 10.0, 10.0, was_on=True)
+    rig._check_drive(verdict, log, 10.0, 10.0, was_on=True)
     assert complaint in "; ".join(verdict.complaints)
     assert bool(verdict.complaints) == bool(complaint)
 
 
-def test_a_command_that_takes_too_long_is_a_complaint_of_its_case(rig, tmp_path, monkeypatch):
+def test_complaint_if_a_command_takes_too_long(rig, tmp_path, monkeypatch):
     monkeypatch.setattr(rig, "BIN", tmp_path)
     monkeypatch.setattr(rig, "_COMMAND_S", 0.05)
     for name in ("analyze", "rigd"):

@@ -1,4 +1,4 @@
-"""Profiles to check, and devices that stand in for real ones and keep account of what is asked."""
+"""Profiles to check, and stand-ins for real devices, which record the calls."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from rigd.profile import load_profile
 
 @pytest.fixture(autouse=True)
 def _no_simulator(tmp_path, monkeypatch, patient_drives):
-    """A simulated rig that somebody runs here must not be found."""
+    """A simulated rig running on this computer must not be found."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
@@ -23,7 +23,7 @@ def serial_profile():
 
 
 class StandInDrive:
-    """Follows the contract of a drive; what it is told to fail at fails."""
+    """Follows the contract of a drive; fails in the methods of `fails_at`."""
 
     def __init__(self, calls):
         self.calls = calls
@@ -149,7 +149,7 @@ class StandIns:
 
 @pytest.fixture
 def stand_ins(monkeypatch):
-    """Devices of which the checks believe that they are the profile's."""
+    """Fake devices, which the checks open as those of the profile."""
     made = StandIns()
     monkeypatch.setattr("rigd.checks.devices.open_devices", made.open)
     monkeypatch.setattr("rigd.devices._fault_reset.open_devices", made.open)

@@ -53,7 +53,7 @@ def rows_of_can():
 
 @pytest.fixture
 def computed_already(rows_of_can, monkeypatch):
-    """Have what is computed of the shipped profile at hand, as the table above shows it."""
+    """Reuse the rows computed for the shipped profile, as in the table above."""
     monkeypatch.setattr("rigd.checks._check._rows_without_devices", lambda _: list(rows_of_can))
 
 
@@ -91,9 +91,7 @@ def test_a_dead_device_fails_with_its_message(rigd, stand_ins, silent):
         further("value = 1_000_000, source", "value = 500_000, source", "% at worst", id="load"),
     ],
 )
-def test_a_bus_that_cannot_be_right_is_left_alone(
-    rigd, stand_ins, can_profile, tmp_path, old, new, word
-):
+def test_nothing_is_sent_on_a_wrong_bus(rigd, stand_ins, can_profile, tmp_path, old, new, word):
     path = changed_profile(can_profile, tmp_path, old, new)
     code, text, _ = rigd("check", "--profile", path, "--json")
     assert code == 1
@@ -117,8 +115,8 @@ def test_the_simulation_can_be_checked(rigd):
     assert "simulated in this" in text
 
 
-def test_hardware_that_is_not_there(rigd, can_profile, tmp_path):
-    """The real drivers, and a bus that nobody has: rows, no traceback."""
+def test_missing_hardware(rigd, can_profile, tmp_path):
+    """The real drivers, and a bus that does not exist: rows, no traceback."""
     path = changed_profile(can_profile, tmp_path, 'channel = "can0"', 'channel = "nocan9"')
     code, text, _ = rigd("check", "--profile", path, "--json")
     assert code == 1
@@ -127,7 +125,7 @@ def test_hardware_that_is_not_there(rigd, can_profile, tmp_path):
     assert all("nocan9" in row["found"] for row in failed)
 
 
-def test_reset_says_what_the_fault_was(rigd, stand_ins):
+def test_reset_names_the_fault(rigd, stand_ins):
     stand_ins.drive.fault = "heartbeat of this computer lost (error code 0x8130)"
     code, text, _ = rigd("reset", "--profile", "antenna_can")
     assert code == 0
@@ -141,7 +139,7 @@ def test_reset_without_a_fault(rigd, stand_ins):
     assert "not in fault" in text
 
 
-def test_a_fault_that_stands(rigd, stand_ins):
+def test_reset_of_a_lasting_fault(rigd, stand_ins):
     stand_ins.drive.fails_at["reset_fault"] = DeviceError("Drive: the fault stands.")
     code, _, errors = rigd("reset", "--profile", "antenna_can")
     assert code == 1

@@ -1,4 +1,4 @@
-"""``rigd check --eds``: what a drive's file tells, on paper."""
+"""``rigd check --eds``: checks of a drive by its file alone."""
 
 import json
 import time
@@ -48,19 +48,19 @@ def test_a_drive_with_torque_mode_can_be_used(rigd, name):
 
 
 @pytest.mark.parametrize("name", WITHOUT_TORQUE)
-def test_a_drive_without_it_is_refused_by_name(rigd, name):
+def test_a_drive_without_torque_mode_is_refused(rigd, name):
     start = time.process_time()
     done = rigd("check", "--eds", eds_path(name))
     assert time.process_time() - start < 5.0  # it is below one where nothing else runs
     assert done.returncode == 1
-    told = " ".join(done.stdout.split())
-    assert "No cyclic synchronous torque mode: object 6502 = 0x" in told
-    assert "lacks bit 9" in told
-    assert "Verdict: failed" in told
-    assert "this drive cannot be used" in told
+    printed = " ".join(done.stdout.split())
+    assert "No cyclic synchronous torque mode: object 6502 = 0x" in printed
+    assert "lacks bit 9" in printed
+    assert "Verdict: failed" in printed
+    assert "this drive cannot be used" in printed
 
 
-def test_a_core_object_that_is_missing_is_named(rigd, tmp_path):
+def test_a_missing_core_object_is_named(rigd, tmp_path):
     path = tmp_path / "drive.eds"
     path.write_text(eds_text(without("6071")))
     done = rigd("check", "--eds", path, "--json")
@@ -82,7 +82,7 @@ def test_json_is_the_document_of_every_check(rigd):
         assert row["verdict"] in ("ok", "warning", "failed", "skipped")
 
 
-def test_under_a_profile_its_values_are_compared(rigd, profile_with):
+def test_values_of_a_profile_are_compared(rigd, profile_with):
     epos = eds_path("epos4_0170")
     done = rigd("check", "--eds", epos, "--profile", "antenna_can", "--json")
     assert done.returncode == 1
@@ -103,7 +103,7 @@ def test_the_eds_of_a_profile_comes_first(rigd, profile_with, monkeypatch):
     assert [row for row in rows if row["group"] == "EDS"] == alone
 
 
-def test_a_profile_whose_eds_is_none_fails(rigd, profile_with, tmp_path, monkeypatch):
+def test_a_profile_with_an_invalid_eds_fails(rigd, profile_with, tmp_path, monkeypatch):
     monkeypatch.setattr("rigd.checks._check.inspect_devices", lambda _: [])
     (tmp_path / "x.eds").write_bytes(b"\0" * 1000)
     done = rigd("check", "--profile", profile_with('eds = "x.eds"'), "--json")
@@ -112,7 +112,7 @@ def test_a_profile_whose_eds_is_none_fails(rigd, profile_with, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("content", [None, b"", b"\0\1\2", b"<xml/>"])
-def test_what_is_no_eds(rigd, tmp_path, content):
+def test_invalid_eds_files(rigd, tmp_path, content):
     path = tmp_path / "drive.eds"
     if content is not None:
         path.write_bytes(content)
@@ -123,13 +123,13 @@ def test_what_is_no_eds(rigd, tmp_path, content):
     assert str(path) in row["found"]
 
 
-def test_a_profile_without_such_a_drive_is_wrong_use(rigd):
+def test_a_profile_without_cia402_is_wrong_use(rigd):
     done = rigd("check", "--eds", eds_path("e35"), "--profile", "sim")
     assert done.returncode == 2
     assert "no section [cia402]" in done.stderr
 
 
-def test_help_says_what_it_does():
+def test_help_describes_eds():
     (command,) = (c for c in app.registered_commands if c.callback.__name__ == "check")
     assert "--eds" in command.callback.__doc__
     assert COMPLETE  # the table that a drive is to have

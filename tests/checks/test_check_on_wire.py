@@ -38,7 +38,7 @@ def profile(request, can_profile, serial_profile):
 
 
 @pytest.mark.process
-def test_a_fault_is_found_and_only_the_operator_resets_it(profile, monkeypatch):
+def test_a_fault_is_found_and_not_reset(profile, monkeypatch):
     from rigd.sim.wire import inject
 
     monkeypatch.setattr("rigd.checks.devices.EXCHANGE_TICKS", 100)
@@ -51,7 +51,7 @@ def test_a_fault_is_found_and_only_the_operator_resets_it(profile, monkeypatch):
     assert found["exchange", "wrenches missing"] == "0 of 100 ticks"
 
     inject(profile.name, ["emcy,code=0x2310"])
-    for _ in range(2):  # looking at it does not reset it
+    for _ in range(2):  # a check does not reset it
         failed = [row for row in inspect_devices(profile) if row.verdict is CheckResult.FAIL]
         assert [row.group for row in failed] == ["drive"]
         assert "0x2310" in failed[0].found
@@ -62,7 +62,7 @@ def test_a_fault_is_found_and_only_the_operator_resets_it(profile, monkeypatch):
     assert overall(inspect_devices(profile)) == "ok"
 
 
-def test_reset_where_there_is_no_bus(can_profile):
+def test_reset_without_a_bus(can_profile):
     rig = can_profile.rig
     with pytest.raises(DeviceError, match="nocan9"):
         reset_drive(replace(rig, can=replace(rig.can, channel="nocan9")))

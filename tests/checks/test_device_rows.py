@@ -1,4 +1,4 @@
-"""What is asked of the devices, and that they are never enabled and always closed."""
+"""Rows of the devices, which are never enabled and always closed."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ def by_name(rows):
 
 
 def test_a_healthy_rig(can_profile, stand_ins):
-    # A machine that stands still for a moment keeps no deadline, not even a stand-in's.
+    # A computer that pauses meets no deadline, not even with a stand-in.
     acquisition = replace(can_profile.rig.acquisition, deadline_us=1e6)
     rig = replace(can_profile.rig, acquisition=acquisition)
     rows = inspect_devices(replace(can_profile, rig=rig))
@@ -50,7 +50,7 @@ def test_no_torque_and_everything_closed(can_profile, stand_ins):
 @pytest.mark.parametrize(
     "error", [DeviceError("it is dead"), OSError(19, "No such device")], ids=repr
 )
-def test_a_dead_device_fails_and_the_other_is_still_asked(can_profile, stand_ins, device, error):
+def test_a_dead_device_fails_and_the_other_is_checked(can_profile, stand_ins, device, error):
     other = {"drive": "sensor", "sensor": "drive"}[device]
     getattr(stand_ins, device).fails_at["connect"] = error
     rows = inspect_devices(can_profile)
@@ -79,14 +79,14 @@ def test_ctrl_c_closes(can_profile, stand_ins, where):
     assert stand_ins.closed
 
 
-def test_a_device_that_does_not_close_keeps_no_other_open(can_profile, stand_ins):
+def test_failure_to_close_a_device_leaves_no_other_open(can_profile, stand_ins):
     stand_ins.drive.fails_at["close"] = DeviceError("it will not let go")
     rows = inspect_devices(can_profile)
     assert stand_ins.closed
     assert overall(rows) == "failed"
 
 
-def test_devices_that_cannot_be_opened(can_profile, monkeypatch):
+def test_failure_to_open_devices(can_profile, monkeypatch):
     def refuse(rig):
         raise DeviceError("a simulated rig is running, and the hardware is here too")
 
@@ -104,7 +104,7 @@ def test_a_range_beyond_the_sensors_fails(can_profile, stand_ins, profile_range,
     assert by_name(inspect_devices(profile))["sensor", "range"].verdict is verdict
 
 
-def test_what_a_sensor_does_not_tell(can_profile, stand_ins):
+def test_values_not_stated_by_the_sensor(can_profile, stand_ins):
     found = stand_ins.sensor.found
     found |= {"range_n_nm": "not stated by the sensor", "calibration_date": "", "owner": ""}
     del found["firmware"]
@@ -124,9 +124,7 @@ def test_what_a_sensor_does_not_tell(can_profile, stand_ins):
         (Watchdog.NONE, CheckResult.WARNING),
     ],
 )
-def test_a_watchdog_that_is_missing_or_unproven_is_a_warning(
-    can_profile, stand_ins, watchdog, verdict
-):
+def test_a_missing_or_unproven_watchdog_is_a_warning(can_profile, stand_ins, watchdog, verdict):
     after_s = float("inf") if watchdog is Watchdog.NONE else 0.05
     stand_ins.drive.capabilities = lambda: DriveCapabilities({}, watchdog, after_s, (), ())
     row = by_name(inspect_devices(can_profile))["drive", "watchdog"]
@@ -136,7 +134,7 @@ def test_a_watchdog_that_is_missing_or_unproven_is_a_warning(
         assert "STO" in row.detail
 
 
-def test_a_sensor_that_complains_is_a_warning(can_profile, stand_ins):
+def test_warning_if_the_sensor_complains(can_profile, stand_ins):
     stand_ins.sensor.found["status"] = ["its watchdog has reset the board"]
     row = by_name(inspect_devices(can_profile))["sensor", "status"]
     assert row.verdict is CheckResult.WARNING
@@ -202,20 +200,20 @@ def test_a_saturated_sensor_fails(can_profile, stand_ins):
     assert row.verdict is CheckResult.FAIL
 
 
-def test_a_shaft_that_moves_by_itself_is_a_warning(can_profile, stand_ins):
+def test_warning_if_the_shaft_moves_by_itself(can_profile, stand_ins):
     stand_ins.drive.angles_rad = iter(tick * 1e-4 for tick in range(100))
     row = by_name(inspect_devices(can_profile))["exchange", "shaft moved"]
     assert row.verdict is CheckResult.WARNING
 
 
-def test_replies_of_the_tick_before_are_not_waited_for(can_profile, stand_ins):
+def test_no_wait_for_replies_of_the_previous_tick(can_profile, stand_ins):
     acquisition = replace(can_profile.rig.acquisition, mode="previous_tick")
     profile = replace(can_profile, rig=replace(can_profile.rig, acquisition=acquisition))
     row = by_name(inspect_devices(profile))["exchange", "both replies after"]
     assert row.verdict is CheckResult.SKIPPED
 
 
-def test_replies_that_take_longer_than_the_deadline_fail(can_profile, stand_ins):
+def test_replies_after_the_deadline_fail(can_profile, stand_ins):
     # No reply comes within 0.1 µs: not even a stand-in's.
     acquisition = replace(can_profile.rig.acquisition, deadline_us=0.1)
     profile = replace(can_profile, rig=replace(can_profile.rig, acquisition=acquisition))

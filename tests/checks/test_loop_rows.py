@@ -48,7 +48,7 @@ def test_an_unstable_loop_fails_with_its_remedy(sim):
     assert margins.verdict is CheckResult.SKIPPED
 
 
-def test_a_loop_that_hardly_grows_is_a_warning(sim):
+def test_a_slowly_growing_loop_is_a_warning(sim):
     light = replace(sim, rig=replace(sim.rig, damping=Damping(zeta=1e-6)))
     stability, margins = loop_rows(light)
     assert stability.verdict is CheckResult.WARNING
@@ -65,7 +65,7 @@ def test_a_margin_below_its_limit_is_a_warning(sim):
     assert overall(rows) == "warnings"
 
 
-def test_a_delay_that_leaves_less_than_a_period_is_a_warning(sim):
+def test_a_delay_margin_below_a_period_is_a_warning(sim):
     rig = replace(sim.rig, actuation=replace(sim.rig.actuation, delay_s=4.5e-3))
     rows = {(row.group, row.what): row for row in loop_rows(replace(sim, rig=rig))}
     delay = rows["loop, torque command", "delay margin"]
@@ -73,7 +73,7 @@ def test_a_delay_that_leaves_less_than_a_period_is_a_warning(sim):
     assert delay.wanted == "1.00 ms"
 
 
-def test_what_cannot_be_designed_fails(sim):
+def test_an_impossible_design_fails(sim):
     stability, _ = loop_rows(with_control(sim, pole_rad_s=0.1))
     assert stability.verdict is CheckResult.FAIL
     assert "too slow for this motor" in stability.found

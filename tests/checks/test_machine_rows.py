@@ -1,4 +1,4 @@
-"""Advice on the computer: read from its files, told with a remedy, never a refusal."""
+"""Advice on the computer: from its files, with a remedy, never a refusal."""
 
 from dataclasses import replace
 
@@ -31,8 +31,8 @@ def rows(tmp_path, monkeypatch):
             file = tmp_path / path
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(text)
-        asked = replace(load_profile("sim").realtime, **settings)
-        return {row.what: row for row in machine_rows(asked, tmp_path, kernel)}
+        realtime = replace(load_profile("sim").realtime, **settings)
+        return {row.what: row for row in machine_rows(realtime, tmp_path, kernel)}
 
     return of
 
@@ -73,7 +73,7 @@ def test_a_good_computer_has_no_advice(rows):
         ("real-time share", "proc/sys/kernel/sched_rt_runtime_us", "500000", "50 %", "950000"),
     ],
 )
-def test_what_is_not_good_is_a_warning_with_a_remedy(rows, what, path, text, found, remedy):
+def test_each_deficiency_is_a_warning_with_a_remedy(rows, what, path, text, found, remedy):
     rows_found = rows({path: text})
     row = rows_found.pop(what)
     assert row.verdict is CheckResult.WARNING
@@ -91,27 +91,27 @@ def test_an_ordinary_kernel_is_a_warning(rows, kernel, found):
     assert (row.found, row.verdict) == (found, CheckResult.WARNING)
 
 
-def test_a_kernel_may_say_in_its_files_that_it_is_a_realtime_one(rows):
+def test_a_realtime_kernel_is_known_from_its_files(rows):
     assert rows({"sys/kernel/realtime": "1\n"}, kernel="#1 SMP")["kernel"].verdict is CheckResult.OK
 
 
-def test_a_loop_that_is_kept_off_the_isolated_core_is_told_so(rows):
+def test_warning_if_the_loop_avoids_the_isolated_core(rows):
     row = rows(cpu=1)["isolated core"]
     assert row.verdict is CheckResult.WARNING
     assert "realtime.cpu" in row.detail
     assert rows(cpu=3)["isolated core"].verdict is CheckResult.OK
 
 
-def test_a_wall_clock_that_nobody_keeps_is_told(rows, monkeypatch):
+def test_warning_if_the_wall_clock_is_not_synchronised(rows, monkeypatch):
     monkeypatch.setattr("rigd.checks.machine._is_wall_clock_synchronised", lambda: False)
     assert rows()["wall clock"].verdict is CheckResult.WARNING
 
 
-def test_nothing_is_read_that_is_not_there(tmp_path):
+def test_missing_files_are_no_failure(tmp_path):
     found = list(machine_rows(load_profile("sim").realtime, tmp_path))
     assert CheckResult.FAIL not in {row.verdict for row in found}
 
 
-def test_this_computer_can_be_looked_at():
+def test_rows_of_this_computer():
     found = [row.what for row in machine_rows(load_profile("sim").realtime)]
     assert len(found) == len(set(found)) == 7

@@ -33,7 +33,7 @@ def test_the_worst_row_is_the_verdict():
     assert overall([warning, fail, ok]) == "failed"
 
 
-def test_assumed_numbers_are_one_warning_that_names_them(can_profile):
+def test_one_warning_names_all_assumed_numbers(can_profile):
     found = by_name(profile_rows(can_profile))["unverified profile values"]
     assert found.verdict is CheckResult.WARNING
     assumed = [key for key, source in can_profile.sources.items() if source == "assumed"]
@@ -47,7 +47,7 @@ def test_a_profile_without_assumptions_has_no_warning(can_profile):
     assert overall(profile_rows(replace(can_profile, sources=sources))) == "ok"
 
 
-def test_the_longest_record_is_the_one_that_can_be_analysed(can_profile):
+def test_the_longest_record_can_be_analysed(can_profile):
     (row,) = record_rows(can_profile)
     assert (row.found, row.verdict, row.detail) == ("4000 s at 1000 Hz", CheckResult.OK, "")
     assert row.wanted == "136 s (run chirp)"
@@ -59,7 +59,7 @@ def test_the_longest_record_is_the_one_that_can_be_analysed(can_profile):
         chirp(rate_hz=40_000.0)
 
 
-def test_an_unknown_tilt_of_the_axis_is_a_warning_that_refuses_nothing(can_profile):
+def test_an_unknown_tilt_of_the_axis_is_only_a_warning(can_profile):
     (row,) = axis_tilt_rows(can_profile)
     assert (row.found, row.verdict) == ("not known", CheckResult.WARNING)
     for words in ("0.027 % for 0.5°", "level", "rig.axis_tilt_deg"):
@@ -71,7 +71,7 @@ def test_an_unknown_tilt_of_the_axis_is_a_warning_that_refuses_nothing(can_profi
 
 
 @pytest.mark.parametrize("tilt_deg", [0.5, -2.0])
-def test_a_measured_tilt_says_by_how_much_it_shifts_mode_1(can_profile, tilt_deg):
+def test_a_measured_tilt_states_the_shift_of_mode_1(can_profile, tilt_deg):
     """By Rayleigh's quotient with the shape of the mode, integrated here."""
     beam = can_profile.rig.beam
     x = np.linspace(0.0, 1.0, 4001)

@@ -1,4 +1,4 @@
-"""One gate: what `rigd check` refuses without a device, no session passes, and the reverse."""
+"""`rigd check` without a device and the start of a session refuse the same profiles."""
 
 import inspect
 import json
@@ -37,31 +37,31 @@ FACTORS = {
     "cia402.heartbeat_timeout_s": (2, 4, 8, 20, 100),
     "actuation.delay_s": (2, 5, 20),
 }
-LIES = [(key, factor) for key, factors in FACTORS.items() for factor in factors]
+WRONG_VALUES = [(key, factor) for key, factors in FACTORS.items() for factor in factors]
 AT_ONCE = {
     ("limits.velocity_rad_s", 0.3), ("actuation.delay_s", 20), ("limits.missed_ticks_in_a_row", 16),
 }  # fmt: skip
 
 
-def test_there_are_sixty():
-    assert len(LIES) == 60
+def test_sixty_wrong_values():
+    assert len(WRONG_VALUES) == 60
 
 
 @pytest.fixture
-def lie(tmp_path, can_profile):
+def wrong_value(tmp_path, can_profile):
     """Write the shipped profile with one value multiplied."""
 
-    def lie(key, factor):
+    def wrong_value(key, factor):
         section, _, name = key.partition(".")
         owner = getattr(can_profile, section, None) or getattr(can_profile.rig, section)
         value = type(getattr(owner, name))(getattr(owner, name) * factor)
         return write_profile(tmp_path, {"name": "one_lie", key: value}, base_profile="antenna_can")
 
-    return lie
+    return wrong_value
 
 
 def refusal(profile, folder, kind, accept=(), **options):
-    """Return why a session is refused; empty: it is not."""
+    """Return the reason for refusing a session, or ""."""
     try:
         Series(profile, excitation_for(profile, kind, options), folder, accept=accept)
     except (RigError, ControlDesignError) as error:
@@ -73,10 +73,10 @@ def refusal(profile, folder, kind, accept=(), **options):
 
 
 @pytest.mark.parametrize(
-    ("key", "factor"), [each if each in AT_ONCE else further(*each) for each in LIES]
+    ("key", "factor"), [each if each in AT_ONCE else further(*each) for each in WRONG_VALUES]
 )
-def test_check_and_run_agree_on_a_profile_with_one_lie(lie, tmp_path, key, factor):
-    path = lie(key, factor)
+def test_check_and_run_agree_on_a_wrong_value(wrong_value, tmp_path, key, factor):
+    path = wrong_value(key, factor)
     try:
         profile = load_profile(path)
     except ProfileError:
@@ -90,7 +90,7 @@ def test_check_and_run_agree_on_a_profile_with_one_lie(lie, tmp_path, key, facto
     assert bool(failed) == bool(refused)
     for row in failed:
         assert f"({row.name})" in refused or row.found in refused
-    # A chirp may leave limits that a hold keeps: check says that, too.
+    # A chirp may exceed limits that a hold does not: check reports that, too.
     chirp = refusal(profile, tmp_path / "out", "chirp")
     advice = [row.verdict for row in rows if row.what == "chirp without options"]
     assert bool(chirp) == bool(failed or advice == [CheckResult.WARNING])
@@ -101,8 +101,8 @@ def test_the_shipped_profiles_pass(can_profile, serial_profile):
         assert run_offline_checks(profile).failed == ()
 
 
-def test_every_row_that_fails_has_a_name_of_its_check(lie):
-    profile = load_profile(lie("limits.stop_angle_rad", 0.51))
+def test_every_failed_row_has_the_name_of_its_check(wrong_value):
+    profile = load_profile(wrong_value("limits.stop_angle_rad", 0.51))
     travel = {
         "travel_loop_fails", "travel_no_angle", "travel_encoder_fails", "travel_missed_ticks",
     }  # fmt: skip
@@ -112,8 +112,8 @@ def test_every_row_that_fails_has_a_name_of_its_check(lie):
     } == travel
 
 
-def test_only_what_is_accepted_passes(lie, tmp_path):
-    profile = load_profile(lie("limits.stop_angle_rad", 0.51))
+def test_only_accepted_rows_pass(wrong_value, tmp_path):
+    profile = load_profile(wrong_value("limits.stop_angle_rad", 0.51))
     rows = ["travel_loop_fails", "travel_no_angle", "travel_encoder_fails", "travel_missed_ticks"]
     left = refusal(profile, tmp_path, "hold", accept=rows[:3])
     assert "(travel_missed_ticks)" in left
@@ -121,13 +121,13 @@ def test_only_what_is_accepted_passes(lie, tmp_path):
     assert not refusal(profile, tmp_path, "hold", accept=rows)
     series = Series(profile, hold(rate_hz=1000.0), tmp_path, accept=rows)
     assert [each.name for each in series.plan.clearance.accepted] == rows
-    # Nothing else is let through with it.
+    # Nothing else is accepted with it.
     assert "limits.velocity_rad_s" in refusal(
         profile, tmp_path, "chirp", accept=rows, amplitude_rad=0.2
     )
 
 
-def test_a_name_that_is_none_is_refused_with_those_there_are(can_profile):
+def test_an_unknown_name_is_refused_with_the_known_ones(can_profile):
     with pytest.raises(UserError, match="travel_loop_fails, travel_no_angle") as refused:
         run_offline_checks(can_profile, ["worst travel"])
     assert refused.value.wrong_use
@@ -135,7 +135,7 @@ def test_a_name_that_is_none_is_refused_with_those_there_are(can_profile):
         run_offline_checks(can_profile, ["unknown_values"])
 
 
-def test_a_drive_s_file_is_asked_for_too(can_profile, tmp_path):
+def test_the_eds_of_the_drive_is_checked(can_profile, tmp_path):
     shutil.copy(eds_path("epos4_0170"), tmp_path / "drive.eds")
     values = {"cia402.eds": "drive.eds"}
     profile = load_profile(write_profile(tmp_path, values, base_profile="antenna_can"))
@@ -144,8 +144,8 @@ def test_a_drive_s_file_is_asked_for_too(can_profile, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["run", further("identify")])
-def test_the_command_line_refuses_before_anything_is_connected(rigd_here, lie, command):
-    path = lie("limits.missed_ticks_in_a_row", 16)
+def test_the_command_refuses_before_it_connects(rigd_here, wrong_value, command):
+    path = wrong_value("limits.missed_ticks_in_a_row", 16)
     what = ("hold",) if command == "run" else ("motor",)
     done = rigd_here(command, *what, "--profile", path)
     assert (done.returncode, done.stdout) == (1, ""), done.stderr
@@ -157,10 +157,10 @@ def test_the_command_line_refuses_before_anything_is_connected(rigd_here, lie, c
         assert "--accept misses: no row of rigd check has that name" in done.stderr
 
 
-def test_check_shows_names(rigd_here, lie, monkeypatch):
+def test_check_shows_names(rigd_here, wrong_value, monkeypatch):
     monkeypatch.setattr("rigd.cli.check.signal.signal", lambda *_: None)
     monkeypatch.setattr("rigd.checks._check.inspect_devices", lambda _: [])
-    path = lie("limits.missed_ticks_in_a_row", 16)
+    path = wrong_value("limits.missed_ticks_in_a_row", 16)
     done = rigd_here("check", "--profile", path)
     assert done.returncode == 1
     for name in ("loop_stability", "can_load", "travel_no_angle", "travel_missed_ticks"):
@@ -173,7 +173,7 @@ def test_check_shows_names(rigd_here, lie, monkeypatch):
 
 @pytest.fixture
 def unknown(tmp_path, can_profile):
-    """Write the shipped profile, or another, with values that nobody knows."""
+    """Write the shipped profile, or another, with unknown values."""
 
     def unknown(*keys, base=can_profile):
         text, section = "", ""
@@ -195,7 +195,7 @@ def unknown(tmp_path, can_profile):
 
 @pytest.mark.process
 @pytest.mark.parametrize("key", MAY_BE_UNKNOWN)
-def test_an_unknown_value_is_named_wherever_it_is_needed(unknown, tmp_path, key):
+def test_an_unknown_value_is_named_where_needed(unknown, tmp_path, key):
     path = unknown(key)
     profile = load_profile(path)
     assert unknown_values(profile.rig) == (key,)
@@ -217,7 +217,7 @@ def test_an_unknown_value_is_named_wherever_it_is_needed(unknown, tmp_path, key)
     assert not (tmp_path / "out").exists()
 
 
-def test_all_unknown_at_once_and_on_a_simulated_rig(unknown, tmp_path):
+def test_all_values_unknown_and_on_a_simulated_rig(unknown, tmp_path):
     assert unknown_values(load_profile(unknown(*MAY_BE_UNKNOWN)).rig) == tuple(MAY_BE_UNKNOWN)
     profile = load_profile(unknown("motor.inertia_kg_m2", base=load_profile("sim")))
     assert overall(check_without_devices(profile, None)) == "failed"
@@ -233,19 +233,19 @@ def test_all_unknown_at_once_and_on_a_simulated_rig(unknown, tmp_path):
     ],
     ids=lambda words: " ".join(words[:2]),
 )  # fmt: skip
-def test_commands_name_what_is_unknown(rigd_here, unknown, monkeypatch, arguments):
+def test_commands_name_unknown_values(rigd_here, unknown, monkeypatch, arguments):
     monkeypatch.setattr("rigd.cli.check.signal.signal", lambda *_: None)
     monkeypatch.setattr("rigd.checks._check.rights_rows", lambda _: [])
     path = unknown("motor.peak_torque_nm", "cia402.gear_ratio")
     done = rigd_here(*arguments, "--profile", path)
     assert done.returncode in (1, 2)
-    said = done.stdout + done.stderr
-    assert "motor.peak_torque_nm" in said
-    assert "cia402.gear_ratio" in said
-    assert "Traceback" not in said
+    printed = done.stdout + done.stderr
+    assert "motor.peak_torque_nm" in printed
+    assert "cia402.gear_ratio" in printed
+    assert "Traceback" not in printed
 
 
-def test_commands_that_need_no_value_work(rigd_here, unknown):
+def test_commands_without_need_of_values_work(rigd_here, unknown):
     path = unknown(*MAY_BE_UNKNOWN)
     done = rigd_here("check", "--eds", eds_path("elmo_gold"), "--profile", path, "--json")
     assert done.returncode == 0, done.stdout + done.stderr
@@ -257,7 +257,7 @@ def test_commands_that_need_no_value_work(rigd_here, unknown):
 
 
 def test_every_excitation_is_refused(unknown, tmp_path):
-    """By the gate, whatever it needs itself."""
+    """By the check, whatever values the excitation itself needs."""
     profile = load_profile(unknown("motor.inertia_kg_m2"))
     for kind, function in KINDS.items():
         given = {"angle_rad": 0.1, "targets": "damping 1%"}

@@ -1,4 +1,4 @@
-"""The computed closed loop against simulations that share none of its algebra."""
+"""The computed closed loop against simulations with other algebra."""
 
 import itertools
 import math
@@ -61,7 +61,7 @@ def run_tick_by_tick(model, reference_rad, torque_limit_nm=math.inf):
                 sensed[before + moment - torque_age],
             )
         sent = (moment - actuation) // SUBSTEPS
-        # The plant has no friction: what the controller adds against it does not act.
+        # The plant has no friction: the compensation of the controller does not act.
         applied = torques[sent] if sent >= 0 else 0.0
         x = phi @ x + gamma * applied
     return angles[before::SUBSTEPS], torques, sensed[before::SUBSTEPS]
@@ -123,7 +123,7 @@ def test_chunks_of_a_long_response_are_those_of_the_whole(loop_model):
     torque=st.integers(0, 18),
     tool=st.sampled_from([0.0, 1e-5]),
 )
-def test_any_fractions_of_a_period_as_delays(loop_model, actuation, angle, torque, tool):
+def test_delays_of_any_fraction_of_a_period(loop_model, actuation, angle, torque, tool):
     eighth_s = 1 / loop_model.rate_hz / SUBSTEPS
     model = replace(
         without_friction(loop_model),
@@ -227,7 +227,7 @@ def test_each_of_the_papers_sets_is_stable(loop_model, paper_damping):
 
 
 @pytest.mark.parametrize("pole_rad_s", [40.0, 60.0, 80.0, 100.0])
-def test_without_feed_forward_it_is_refused(loop_model, paper_damping, pole_rad_s):
+def test_a_loop_without_feed_forward_is_refused(loop_model, paper_damping, pole_rad_s):
     change = {"feedforward_gain": 0.0, "pole_rad_s": pole_rad_s}
     loop = close_loop(changed(damped(loop_model, paper_damping), change))
     with pytest.raises(ControlDesignError, match=r"feedforward_gain = 0 .* set it to 1"):
@@ -235,16 +235,16 @@ def test_without_feed_forward_it_is_refused(loop_model, paper_damping, pole_rad_
 
 
 def test_growth_without_feed_forward_is_real(loop_model):
-    """The tick-by-tick loop, knocked once, grows at the rate the design step computes."""
+    """The tick-by-tick loop grows after an impact at the rate that the design step computes."""
     change = {"feedforward_gain": 0.0, "pole_rad_s": 40.0}
     model = without_friction(changed(loop_model, change))
     loop = close_loop(model)
     assert loop.growth_per_s == pytest.approx(0.0547, abs=0.001)
     pole = loop.poles_rad_s[0]
     assert abs(pole.imag) / 2 / np.pi == pytest.approx(2.43, abs=0.01)
-    knock = np.zeros(12_000)
-    knock[0] = 0.1
-    angle, _, _ = run_tick_by_tick(model, knock)
+    impact = np.zeros(12_000)
+    impact[0] = 0.1
+    angle, _, _ = run_tick_by_tick(model, impact)
     early = np.max(np.abs(angle[4000:4824]))  # two periods of 2.43 Hz
     late = np.max(np.abs(angle[11_000:11_824]))
     assert math.log(late / early) / 7.0 == pytest.approx(loop.growth_per_s, rel=0.05)
@@ -260,7 +260,7 @@ def test_growth_without_feed_forward_is_real(loop_model):
     ],
     ids=str,
 )
-def test_bad_designs_are_refused_with_their_numbers(loop_model, change):
+def test_bad_designs_are_refused_with_numbers(loop_model, change):
     with pytest.raises(ControlDesignError, match=r"spectral radius 1\.\d+.* Hz with damping ratio"):
         check_stability(close_loop(changed(loop_model, change)))
 
@@ -277,7 +277,7 @@ def test_bad_designs_are_refused_with_their_numbers(loop_model, change):
     ],
     ids=str,
 )
-def test_what_is_known_to_be_tolerable_is_accepted(loop_model, change):
+def test_tolerable_designs_are_accepted(loop_model, change):
     assert check_stability(close_loop(changed(loop_model, change))) is None
 
 
@@ -294,7 +294,7 @@ def test_an_absurd_delay_is_refused(loop_model):
         close_loop(replace(loop_model, angle_delay_s=1.0))
 
 
-def test_an_unstable_loop_is_no_endless_simulation(loop_model):
+def test_no_endless_simulation_of_an_unstable_loop(loop_model):
     loop = close_loop(replace(loop_model, actuation_delay_s=20e-3))
     with (
         np.errstate(over="ignore", invalid="ignore"),

@@ -1,4 +1,4 @@
-"""Active damping: how much it damps which beam, and that its recursion is the one designed."""
+"""Active damping: its effect on several beams, and its recursion."""
 
 from dataclasses import replace
 
@@ -26,29 +26,29 @@ def ratios(model, settings, stiffness):
 
 
 @pytest.mark.parametrize("stiffness", [0.5, 0.8, 1.0, 1.25, 2.0])
-def test_it_damps_a_beam_that_is_not_the_profile_s(model, stiffness):
+def test_damping_of_a_beam_unlike_the_profile(model, stiffness):
     settings = design_damper(close_loop(model))
     without, _ = ratios(model, None, stiffness)
     damped, found = ratios(model, settings, stiffness)
     assert damped[0] > 0.06 > 5 * without[0]
     assert damped[1] > 1.3 * without[1]
-    # The third mode has what it has of its own: a little may be taken from it.
+    # The third mode has damping of its own, which may be reduced a little.
     assert damped[2] > without[2] - 0.004
     assert found.real.max() < 0.0
 
 
-def test_where_the_torque_is_old_it_is_weaker_or_none(model):
+def test_a_delayed_torque_weakens_the_damper(model):
     prompt = design_damper(close_loop(model))
     old = design_damper(close_loop(replace(model, torque_delay_s=0.02)))
     assert old is None or old.gain_rad_per_nm_s < prompt.gain_rad_per_nm_s
 
 
-def test_without_a_beam_there_is_nothing_to_damp(model):
+def test_no_damper_without_a_beam(model):
     assert design_damper(close_loop(replace(model, plant=None))) is None
 
 
 def test_the_recursion_gives_the_designed_poles(model):
-    """The closed loop is marched through with the damper: the first mode decays as computed."""
+    """Simulated with the damper, the first mode of the closed loop decays as computed."""
     settings = design_damper(close_loop(model))
     loop = close_loop(model)
     reading = next(opening.reading for opening in loop.openings if opening.name == "torque reading")

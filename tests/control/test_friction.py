@@ -19,7 +19,7 @@ def simulate(loop, disturbances, reference_rad=PATH, draws=3):
     return simulate_disturbed(loop, reference_rad, disturbances, modes=3, draws=draws)
 
 
-def test_without_disturbance_and_compensation_it_is_the_linear_loop(loop):
+def test_linear_loop_without_disturbance_and_compensation(loop):
     from dataclasses import replace
 
     settings = replace(loop.model.settings, friction_compensation_nm=0.0)
@@ -29,7 +29,7 @@ def test_without_disturbance_and_compensation_it_is_the_linear_loop(loop):
     assert found.mode_torque_nm.shape == (PATH.size, 3, 1)
 
 
-def test_the_amplitudes_of_the_modes_are_what_the_torque_rings_with(loop):
+def test_torque_rings_with_the_amplitudes_of_the_modes(loop):
     found = simulate(loop, NONE, draws=1)
     torque = loop.simulate(PATH).coupling_torque_nm[-380:]
     half_range = 0.5 * np.ptp(torque - np.linspace(torque[0], torque[-1], torque.size) * 0.0)
@@ -38,7 +38,7 @@ def test_the_amplitudes_of_the_modes_are_what_the_torque_rings_with(loop):
     assert half_range == pytest.approx(amplitudes[0], rel=0.3)
 
 
-def test_friction_that_is_compensated_leaves_less_than_what_is_not(loop):
+def test_compensated_friction_leaves_less_vibration(loop):
     stated = loop.model.settings.friction_compensation_nm
     errors = []
     for coulomb_nm in (stated, 3 * stated):

@@ -1,4 +1,4 @@
-"""Margins against closed forms, and against loops that are really off by what they say."""
+"""Margins against closed forms, and against loops that are beyond them."""
 
 import math
 from dataclasses import replace
@@ -13,7 +13,7 @@ from rigd.beam import Damping
 from rigd.control import close_loop, loop_margins
 
 MAX_DELAY_PERIODS = 50
-"""Longest delay that a closed loop is computed with."""
+"""Longest delay of a computed closed loop."""
 DELAY_OF = {
     "torque command": "actuation_delay_s",
     "angle reading": "angle_delay_s",
@@ -56,7 +56,7 @@ def test_the_motor_alone_has_the_margins_of_the_designed_loop(motor_alone):
         assert margins.modulus == pytest.approx(np.min(np.abs(1 + gain)), rel=2e-3)
         assert margins.gain_down == pytest.approx(lowest, rel=2e-3)
         assert 2 * math.pi * margins.gain_down_hz == pytest.approx(real_at, rel=2e-3)
-    # Without a beam there is nothing to feed forward.
+    # No feed-forward without a beam.
     assert (torque.gain_up, torque.gain_down, torque.delay_s) == (math.inf, 0.0, math.inf)
     assert torque.modulus == pytest.approx(1.0)
     assert math.isnan(torque.delay_hz)
@@ -72,7 +72,7 @@ def open_loop_gain(loop, opening, phase_rad):
     )
 
 
-def test_cutting_the_torque_reading_leaves_a_loop_without_feed_forward(loop_model):
+def test_no_feed_forward_without_torque_reading(loop_model):
     loop = close_loop(slower(loop_model))
     torque = loop.openings[2]
     unfed = replace(loop.model, settings=replace(loop.model.settings, feedforward_gain=0.0))
@@ -80,7 +80,7 @@ def test_cutting_the_torque_reading_leaves_a_loop_without_feed_forward(loop_mode
     np.testing.assert_allclose(opened, close_loop(unfed).a, atol=1e-12)
 
 
-def test_the_command_carries_what_both_readings_carry(loop_model):
+def test_the_command_carries_both_readings(loop_model):
     """Cut at the command, or at both readings: the same poles are left, those of the plant."""
     loop = close_loop(slower(loop_model))
     command, angle, torque = (
@@ -129,7 +129,7 @@ def test_phase_margin_is_taken_either_way(loop_model):
         assert np.min(np.abs(turned + 1)) < 1e-6
 
 
-def test_no_frequency_of_a_fine_grid_is_nearer_to_minus_one(loop_model):
+def test_no_grid_frequency_is_nearer_to_minus_one(loop_model):
     """Sharp resonances are not stepped over: those of a beam with next to no damping."""
     light = replace(loop_model, plant=replace(loop_model.plant, damping=Damping(zeta=1e-5)))
     grid = 2 * np.pi * np.concatenate([np.linspace(2.5, 2.6, 801), np.linspace(15.8, 16.2, 801)])
@@ -148,7 +148,7 @@ def test_no_frequency_of_a_fine_grid_is_nearer_to_minus_one(loop_model):
     torque_ms=st.floats(0.0, 3.0),
     part=st.floats(0.01, 0.99),
 )
-def test_between_its_gain_margins_every_loop_is_stable(
+def test_every_loop_is_stable_between_its_gain_margins(
     loop_model, pole_rad_s, feedforward, actuation_ms, torque_ms, part
 ):
     model = replace(
@@ -165,8 +165,8 @@ def test_between_its_gain_margins_every_loop_is_stable(
         assert radius_with_gain(loop, opening, low * (high / low) ** part) < 1 + 1e-9
 
 
-def test_what_the_shipped_simulation_has(loop_model):
-    """As documented: the feed-forward bears a third too much, the designed loop the usual 2."""
+def test_margins_of_the_shipped_simulation(loop_model):
+    """As documented: the feed-forward tolerates a third more gain, the loop the usual 2."""
     command, angle, torque = loop_margins(close_loop(loop_model))
     assert command.gain_up == pytest.approx(1.42, abs=0.02)
     assert command.delay_s == pytest.approx(4.0e-3, abs=0.1e-3)

@@ -1,4 +1,4 @@
-"""Pole placement and the discrete controller, against the transfer functions they stand for."""
+"""Pole placement and the discrete controller, against their transfer functions."""
 
 import math
 from dataclasses import replace
@@ -55,7 +55,7 @@ def test_reference_to_angle_is_the_double_pole(inertia, g, ratio):
 
 @given(inertia=inertias, g=friction_poles, ratio=ratios)
 @example(inertia=1.0, g=15.0, ratio=1 / 3)  # no derivative part at all
-def test_all_four_poles_lie_at_the_place_asked_for(inertia, g, ratio):
+def test_all_four_poles_are_as_requested(inertia, g, ratio):
     p = ratio * max(g, 1.0)
     gains = design_pid(inertia, g * inertia, p)
     a3 = 1 / gains.filter_s
@@ -96,7 +96,7 @@ def test_discrete_step_is_tustins_rule_on_the_pid(inputs, expected):
 
 
 @given(angle=st.floats(-3, 3))
-def test_it_takes_over_without_a_bump(angle):
+def test_bumpless_transfer(angle):
     settings = replace(SETTINGS, friction_compensation_nm=0.03)
     controller = PidController(GAINS, settings, RATE_HZ, 0.9)
     controller.step(0.5, -0.2, 0.1)
@@ -124,7 +124,7 @@ def test_terms_add_up_to_the_torque():
     assert not controller.saturated
 
 
-def test_friction_is_compensated_with_the_speed_of_the_filtered_reference():
+def test_friction_compensation_uses_the_filtered_speed():
     settings = replace(SETTINGS, friction_compensation_nm=0.03, friction_velocity_rad_s=0.1)
     controller = PidController(GAINS, settings, RATE_HZ, math.inf)
     p, speed = settings.pole_rad_s, 0.07
@@ -136,7 +136,7 @@ def test_friction_is_compensated_with_the_speed_of_the_filtered_reference():
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_torque_never_exceeds_the_limit_and_says_so(sign):
+def test_torque_is_limited_and_flagged(sign):
     controller = PidController(GAINS, SETTINGS, RATE_HZ, 0.9)
     assert controller.step(sign * 1.0, 0.0, 0.0) == sign * 0.9
     assert controller.saturated

@@ -1,4 +1,4 @@
-"""Every backend there is, opened but not connected."""
+"""All backends, opened but not connected."""
 
 import contextlib
 import os
@@ -21,7 +21,7 @@ def _patient(patient_drives):
 @pytest.fixture(params=["direct", "can", further("serial"), further("previous_tick"), "hardware"])
 def open_backend(request, start_simulator, monkeypatch):
     """Open drive and sensor: simulated directly, by wire in lock-step, or the real ones."""
-    # How long a simulated drive takes to answer while it is set up is the machine's affair.
+    # The time that a simulated drive takes to answer during set-up depends on the computer.
     if request.param != "hardware":
         for name in ("_SDO_TIMEOUT_S", "_HURRIED_TIMEOUT_S"):
             monkeypatch.setattr(f"rigd.devices.cia402._sdo.{name}", 10.0)

@@ -1,4 +1,4 @@
-"""What the cycle relies on, of every backend."""
+"""Contract of the cycle with every backend."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from rigd.testing import DEVICE_CHECKS
 pytestmark = pytest.mark.process
 
 
-def test_a_backend_does_what_the_loop_relies_on(open_backend):
+def test_backends_meet_the_contract_of_the_loop(open_backend):
     for check in DEVICE_CHECKS:
         with open_backend() as devices:
             check(devices)

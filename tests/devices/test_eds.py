@@ -1,4 +1,4 @@
-"""EDS files as vendors and others write them: what is read, and what is refused."""
+"""EDS files of vendors and others: values read, and refusals."""
 
 import io
 import os
@@ -41,7 +41,7 @@ def read(tmp_path):
     return read
 
 
-def test_what_stands_in_it(read):
+def test_objects_and_identity_of_a_file(read):
     found = read(eds_text(TABLE, "VendorName=Ä vendor\nProductName=One\nBaudRate_500=1"), node_id=5)
     assert (found.vendor_name, found.product_name) == ("Ä vendor", "One")
     assert (found.vendor_id, found.product_code) == (0x9A, 0x30923)
@@ -66,7 +66,7 @@ def test_what_stands_in_it(read):
     assert not found.has(0x1401)
 
 
-def test_the_head_tells_the_identity_where_the_object_does_not(read):
+def test_the_head_has_the_identity_if_the_object_does_not(read):
     head = "VendorNumber=0x1A3\nProductNumber=7"
     found = read(eds_text("1018:1 u32 ro 0\n6040 u16 rw 0", head))
     assert (found.vendor_id, found.product_code) == (0x1A3, 7)
@@ -121,10 +121,11 @@ AS_OTHERS_WRITE = {
 
 
 @pytest.mark.parametrize("change", AS_OTHERS_WRITE.values(), ids=AS_OTHERS_WRITE.keys())
-def test_the_same_however_it_is_written(read, change):
+def test_equal_content_in_different_notations(read, change):
     def facts(found):
         return {
-            place: (e.bits, e.access, e.mappable, e.default) for place, e in found.entries.items()
+            address: (e.bits, e.access, e.mappable, e.default)
+            for address, e in found.entries.items()
         }
 
     text = eds_text(TABLE)
@@ -153,7 +154,7 @@ def test_arrays_declared_at_once(read):
     assert found.get(0x1016, 2).name == "The second"
 
 
-def test_a_configured_drive_has_what_its_dcf_sets(read):
+def test_a_configured_drive_has_the_values_of_its_dcf(read):
     found = read("[6072]\nDataType=6\nAccessType=rw\nDefaultValue=5\nParameterValue=0x3E8\n")
     assert found.get(0x6072).default == 1000
 
@@ -166,9 +167,9 @@ def test_a_type_of_its_own_for_a_number_with_limits(read):
     assert found.get(0x6073).bits is None
 
 
-@pytest.mark.parametrize("told", ["", "DataType=\n", "DataType=x\n", "DataType=0\n"])
-def test_a_type_that_is_not_told_is_none(read, told):
-    entry = read(f"[6040]\n{told}AccessType=rw\nDefaultValue=0x10\nHighLimit=20\n").get(0x6040)
+@pytest.mark.parametrize("type_name", ["", "DataType=\n", "DataType=x\n", "DataType=0\n"])
+def test_a_missing_type_is_none(read, type_name):
+    entry = read(f"[6040]\n{type_name}AccessType=rw\nDefaultValue=0x10\nHighLimit=20\n").get(0x6040)
     assert (entry.data_type, entry.bits, entry.default, entry.high) == (0, None, 16, 20)
 
 
@@ -183,16 +184,16 @@ def test_numbers_in_a_text_stay_as_they_are(read):
 
 
 @pytest.mark.parametrize(
-    ("told", "number"),
+    ("type_name", "number"),
     [("$NODEID", 5), ("0x180 + $nodeid", 0x185), ("$NODEID+0600", 0x185), ("$NODEID+x", None)],
 )
-def test_an_identifier_that_goes_with_the_node_id(read, told, number):
-    assert read(f"[1014]\nDataType=7\nDefaultValue={told}\n", 5).get(0x1014).default == number
+def test_an_identifier_relative_to_the_node_id(read, type_name, number):
+    assert read(f"[1014]\nDataType=7\nDefaultValue={type_name}\n", 5).get(0x1014).default == number
 
 
 @pytest.mark.parametrize("name", WITH_TORQUE + WITHOUT_TORQUE)
-def test_it_says_what_the_library_says(name):
-    """Where the library reads a file by itself, nothing that it found is lost or changed."""
+def test_values_agree_with_the_library(name):
+    """If the library reads a file unaided, all its values are preserved."""
     path = eds_path(name)
     found = read_eds(path, 5)
     expected = {}
@@ -202,8 +203,8 @@ def test_it_says_what_the_library_says(name):
             expected[v.index, v.subindex] = (v.name, v.data_type, v.access_type, v.pdo_mappable,
                                              v.default, v.min, v.max)  # fmt: skip
     assert expected == {
-        place: (e.name, e.data_type, e.access, e.mappable, e.default, e.low, e.high)
-        for place, e in found.entries.items()
+        address: (e.name, e.data_type, e.access, e.mappable, e.default, e.low, e.high)
+        for address, e in found.entries.items()
     }
 
 
@@ -223,7 +224,7 @@ NO_EDS = {
 
 
 @pytest.mark.parametrize("content", NO_EDS.values(), ids=NO_EDS.keys())
-def test_what_is_no_eds_is_refused_in_a_sentence(read, tmp_path, content):
+def test_invalid_text_is_refused_in_a_sentence(read, tmp_path, content):
     start = time.process_time()
     with pytest.raises(EdsError) as error:
         read(content)
@@ -235,7 +236,7 @@ def test_what_is_no_eds_is_refused_in_a_sentence(read, tmp_path, content):
     assert len(message) < 300
 
 
-def test_what_is_no_file_is_refused_and_never_waited_for(tmp_path):
+def test_special_files_are_refused_without_waiting(tmp_path):
     os.mkfifo(tmp_path / "pipe.eds")
     (tmp_path / "loop.eds").symlink_to("loop.eds")
     for name, words in {
@@ -313,7 +314,7 @@ def test_a_damaged_file_is_read_or_refused(tmp_path_factory, noise, start, lengt
 
 
 @pytest.mark.process
-def test_nothing_is_printed_and_no_library_is_waited_for(tmp_path):
+def test_no_output_and_no_wait_for_the_library(tmp_path):
     """Neither warnings on the terminal nor an import that takes longer than the file."""
     path = tmp_path / "bare.eds"
     path.write_text("[6040]\nDataType=0x99\nDefaultValue=x\n")
@@ -328,8 +329,8 @@ def test_nothing_is_printed_and_no_library_is_waited_for(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_what_the_library_refuses_of_real_files(read):
-    """Why files are put right before: should the library ever bear it, that can go."""
+def test_real_files_refused_by_the_library(read):
+    """Why files are corrected before: not needed once the library accepts them."""
     for text, error in (
         ("[6040]\nDataType=6\nParameterName=a\n", Exception),
         ("[DeviceInfo]\nVendorNumber=001\n", ValueError),

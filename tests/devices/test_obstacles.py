@@ -1,4 +1,4 @@
-"""Obstacles as they are written, and what is said of those that are not written so."""
+"""Notation of obstacles, and messages on mistakes in it."""
 
 from dataclasses import replace
 from math import inf
@@ -39,11 +39,11 @@ KNOCKS = st.builds(
 
 
 @given(st.one_of(OBSTACLES, KNOCKS))
-def test_what_is_written_is_read_back(disturbance):
+def test_written_obstacles_are_read_back(disturbance):
     assert parse_obstacle(describe_obstacle(disturbance)) == disturbance
 
 
-def test_what_is_left_out():
+def test_defaults_of_an_obstacle():
     assert parse_obstacle("x=0.62, angle=0.6") == Obstacle(0.62, 0.6)
     assert parse_obstacle("x=0.62,angle=0.6,stiffness=rigid").stiffness_n_per_m == inf
     assert parse_obstacle("x=0.62,angle=-0.6").side == -1
@@ -55,7 +55,7 @@ def test_what_is_left_out():
 
 
 @given(st.text(max_size=60))
-def test_any_text_is_an_obstacle_or_refused_in_a_sentence(text):
+def test_any_text_is_read_or_refused_in_a_sentence(text):
     try:
         parse_obstacle(text)
     except ObstacleError as error:
@@ -79,7 +79,7 @@ NAMES = [
 
 
 @given(st.lists(st.tuples(st.sampled_from(NAMES), st.floats().map(repr))))
-def test_any_keys_are_an_obstacle_or_refused(words):
+def test_any_keys_are_read_or_refused(words):
     text = ",".join(f"{name}={value}" for name, value in words)
     try:
         disturbance = parse_obstacle(text)
@@ -89,7 +89,7 @@ def test_any_keys_are_an_obstacle_or_refused(words):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "unknown key ''; give x, angle, stiffness"),
         ("x=0.5", "'angle' is missing; give angle=…, an angle in rad"),
@@ -106,10 +106,10 @@ def test_any_keys_are_an_obstacle_or_refused(words):
         ("x=0.5,force=2,at=1,duration=0", "duration=0: give a time in s"),
     ],
 )
-def test_mistakes(text, said):
+def test_mistakes(text, message):
     with pytest.raises(ObstacleError) as caught:
         parse_obstacle(text)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_obstacles_of_a_rig():

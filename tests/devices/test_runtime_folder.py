@@ -1,4 +1,4 @@
-"""What is found in a folder that everybody may write to is not trusted."""
+"""Files in a folder that every user can write to are not trusted."""
 
 import os
 import stat
@@ -18,9 +18,7 @@ def common(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("taken_by", ["nobody", "a file", "a link", "another user"])
-def test_without_one_of_its_own_a_user_gets_one_that_nobody_else_can_enter(
-    common, monkeypatch, taken_by
-):
+def test_a_new_folder_is_private_to_the_user(common, monkeypatch, taken_by):
     name = common / f"rigd-{os.getuid()}"
     if taken_by == "a file":
         name.touch()
@@ -33,13 +31,13 @@ def test_without_one_of_its_own_a_user_gets_one_that_nobody_else_can_enter(
         name.mkdir()
         os.chown(name, 12345, 12345)
     folder = runtime_folder()
-    assert folder == runtime_folder()  # whoever looks finds the same
+    assert folder == runtime_folder()  # a second search finds the same
     assert (folder == name) is (taken_by == "nobody")
     assert stat.S_IMODE(folder.lstat().st_mode) == 0o700
     assert folder.lstat().st_uid == os.getuid()
 
 
-def test_a_folder_made_beside_another_user_s_is_found_after_that_one_is_gone(common):
+def test_an_alternative_folder_is_found_again(common):
     taken = common / f"rigd-{os.getuid()}"
     taken.touch()
     folder = runtime_folder()
@@ -53,7 +51,7 @@ def test_a_folder_made_beside_another_user_s_is_found_after_that_one_is_gone(com
 
 
 @pytest.mark.parametrize("mode", [0o770, 0o707, 0o2770, 0o1777])
-def test_a_folder_that_others_can_write_to_is_refused(runtime_folder, mode):
+def test_a_folder_writable_by_others_is_refused(runtime_folder, mode):
     folder = runtime_folder / "rigd"
     held = LockFile("rig-a", for_all_users=False)  # before the mode is wrong
     held.acquire("rigd run")
@@ -67,15 +65,15 @@ def test_a_folder_that_others_can_write_to_is_refused(runtime_folder, mode):
     assert LockFile("rig-a", for_all_users=False).path.parent == folder
 
 
-def test_a_folder_whose_parent_others_can_write_to_is_refused(runtime_folder):
+def test_a_parent_folder_writable_by_others_is_refused(runtime_folder):
     runtime_folder.chmod(0o770)
     with pytest.raises(UnsafeFolderError, match=f"{runtime_folder} is writable by its group"):
         LockFile("rig-a", for_all_users=False)
-    runtime_folder.chmod(0o1777)  # as /tmp: nobody can replace what is another's
+    runtime_folder.chmod(0o1777)  # as /tmp: users cannot replace files of others
     assert LockFile("rig-a", for_all_users=False).path.parent == runtime_folder / "rigd"
 
 
-def test_a_folder_of_another_user_is_refused_unless_it_is_shared(runtime_folder, monkeypatch):
+def test_a_folder_of_another_user_is_refused(runtime_folder, monkeypatch):
     folder = runtime_folder / "rigd"
     folder.mkdir(mode=0o700)
     owner = os.getuid() or 4711

@@ -1,4 +1,4 @@
-"""Which rig is opened: the hardware, the simulated one that stands in for it, or neither."""
+"""Which rig is opened: the hardware, its simulation, or neither."""
 
 import os
 import socket
@@ -27,7 +27,7 @@ def stand_in(runtime_folder):
         yield lambda name, **more: announce(name, SimulatorAddress(os.getpid(), path, **more))
 
 
-def test_what_would_move(rig, stand_in):
+def test_actuation_targets(rig, stand_in):
     assert actuation_target(load_profile("sim").rig) is ActuationTarget.SIMULATED
     assert actuation_target(rig) is ActuationTarget.HARDWARE
     stand_in("another_rig")
@@ -38,14 +38,14 @@ def test_what_would_move(rig, stand_in):
     assert actuation_target(rig) is ActuationTarget.LOCK_STEP
 
 
-def test_only_where_nothing_waits_for_the_clock_may_time_be_skipped():
+def test_virtual_clock_only_without_real_time_devices():
     assert {each for each in ActuationTarget if each.allows_virtual_clock} == {
         ActuationTarget.SIMULATED,
         ActuationTarget.LOCK_STEP,
     }
 
 
-def test_what_moves_is_what_was_said_to_move(rig, stand_in):
+def test_only_the_stated_target_moves(rig, stand_in):
     assert not open_devices(rig, ActuationTarget.HARDWARE).simulated
     with pytest.raises(DeviceError, match="was to move, and now it would be the hardware"):
         open_devices(rig, ActuationTarget.SIMULATOR)
@@ -55,19 +55,19 @@ def test_what_moves_is_what_was_said_to_move(rig, stand_in):
         open_devices(rig, ActuationTarget.HARDWARE)
 
 
-def test_devices_say_whether_they_are_simulated(rig, stand_in):
+def test_devices_report_whether_they_are_simulated(rig, stand_in):
     assert not open_devices(rig).simulated
     stand_in(rig.name, can_socket="/nowhere")
     assert open_devices(rig).simulated
 
 
-def test_colliding_identifiers_are_refused_before_anything_is_sent(rig, runtime_folder):
+def test_colliding_identifiers_are_refused_before_sending(rig, runtime_folder):
     colliding = replace(rig, ati_can=replace(rig.ati_can, base_id=0x20))
     with pytest.raises(DeviceError, match=r"0x201"):
         open_devices(colliding)
 
 
-def test_hardware_beside_a_simulated_rig_is_refused(rig, stand_in):
+def test_hardware_and_a_simulated_rig_are_refused(rig, stand_in):
     stand_in(rig.name, can_socket="/nowhere")
     absent, present = (
         replace(rig, can=replace(rig.can, channel=channel)) for channel in ("nocan9", "lo")
@@ -77,7 +77,7 @@ def test_hardware_beside_a_simulated_rig_is_refused(rig, stand_in):
         open_devices(present)
 
 
-def test_a_serial_port_beside_a_simulated_one_is_refused(stand_in, tmp_path):
+def test_a_real_and_a_simulated_serial_port_are_refused(stand_in, tmp_path):
     rig = load_profile("antenna_serial").rig
     port = tmp_path / "ttyUSB0"
     rig = replace(rig, ati_serial=replace(rig.ati_serial, port=str(port)))
@@ -88,13 +88,13 @@ def test_a_serial_port_beside_a_simulated_one_is_refused(stand_in, tmp_path):
         open_devices(rig)
 
 
-def test_a_bus_that_is_too_full_is_refused(rig, runtime_folder):
+def test_an_overloaded_bus_is_refused(rig, runtime_folder):
     slow = replace(rig, can=replace(rig.can, bitrate_bit_s=500_000))
     with pytest.raises(DeviceError, match=r"up to 120 % of the CAN bus at 500000 bit/s"):
         open_devices(slow)
 
 
-def test_what_a_simulated_rig_has_otherwise_is_told(rig, stand_in):
+def test_differences_of_a_simulated_rig_are_reported(rig, stand_in):
     assert simulated_differently(rig) == []
     stand_in(rig.name, rig=described(rig))
     assert simulated_differently(rig) == []

@@ -23,14 +23,14 @@ from rigd.session.layout import decode_samples
 
 @dataclass
 class WatchedDrive:
-    """The simulated drive, with a log of what it was told, and faults from a given read on."""
+    """The simulated drive, with a log of its commands, and faults from a given read on."""
 
     inner: object
     fault_at: int | None = None
     fault: object = None
     stale_at: int | None = None
     stale_pattern: tuple = (True,)
-    """Staleness of the reads from then on, over and over."""
+    """Staleness of the reads from then on, repeated."""
     reads: int = 0
     held_rad: float = 0.0
     doubt: str = ""
@@ -91,7 +91,7 @@ class WatchedDrive:
 
 
 class FakeParent:
-    """A supervisor that gives its orders, notes what it is told, and can die or hang."""
+    """A supervisor that gives its orders, records the messages, and can die or hang."""
 
     def __init__(self, shared_state):
         self.shared_state = shared_state
@@ -105,7 +105,7 @@ class FakeParent:
             raise EOFError
         return self.orders.pop(0)
 
-    def said(self, kind):
+    def messages_of(self, kind):
         """The messages of a kind."""
         return [message for message in self.messages if isinstance(message, kind)]
 
@@ -133,7 +133,7 @@ def strict(profile):
 class Session:
     """One session, run to its end in this process.
 
-    The record is small enough for the rings to hold it, so that nobody needs to read meanwhile.
+    The record is small enough for the rings to hold it, so that no reader is needed meanwhile.
     """
 
     def __init__(self, clock=None, profile=None, excitation=None, buffered_s=RECORDER_BUFFER_S):
@@ -170,7 +170,7 @@ class Session:
         return SessionJob(self.profile, reference, seed=seed)
 
     def obey(self, *orders):
-        """Attend to the rig from connecting to closing, with these orders in between."""
+        """Run the control process from connecting to closing, with these orders in between."""
         self.parent.orders = list(orders)
         run_control(
             self.profile,
@@ -185,7 +185,7 @@ class Session:
 
     @property
     def finished(self):
-        return self.parent.said(SessionFinished)[-1]
+        return self.parent.messages_of(SessionFinished)[-1]
 
     @property
     def samples(self):
@@ -209,7 +209,7 @@ class Session:
 
 @pytest.fixture(scope="session")
 def complete_session():
-    """A session without faults, and its samples; nobody changes them."""
+    """A session without faults, and its samples; not to be changed."""
     session = Session().run()
     yield session, session.samples
     session.close()

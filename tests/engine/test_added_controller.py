@@ -79,7 +79,7 @@ def failing(error):
     return act
 
 
-def test_a_sound_one_holds_the_rig_like_the_pid_it_contains(make_session, law):
+def test_a_sound_controller_acts_like_the_pid_it_contains(make_session, law):
     session = run_hold(make_session).run()
     assert session.finished.outcome == "complete", session.finished.reason
     own = session.samples
@@ -103,14 +103,17 @@ def test_a_sound_one_holds_the_rig_like_the_pid_it_contains(make_session, law):
         (failing(OSError("disk")), "OSError: disk", "shift"),
     ],
 )
-def test_a_failing_one_ends_the_session_as_a_fault_without_torque(
+def test_a_failing_controller_ends_the_session_without_torque(
     make_session, law, monkeypatch, action, words, name
 ):
     monkeypatch.setattr(law, "AT_TICK", 700)
     monkeypatch.setattr(law, "ACTION", action)
     session = run_hold(make_session, name)
     session.obey(session.order(), session.order())  # the rig stays connected
-    assert [each.outcome for each in session.parent.said(SessionFinished)] == ["fault", "fault"]
+    assert [each.outcome for each in session.parent.messages_of(SessionFinished)] == [
+        "fault",
+        "fault",
+    ]
     assert words in session.finished.reason
     assert "bad-laws 0.9" in session.finished.reason
     samples = session.samples
@@ -145,7 +148,7 @@ def test_a_reset_that_fails_ends_the_session_before_the_first_torque(
     session.assert_safe()
 
 
-def test_one_that_cannot_be_made_ends_the_process_without_torque(make_session, law, monkeypatch):
+def test_failure_to_make_a_controller_ends_the_process(make_session, law, monkeypatch):
     monkeypatch.setattr(law, "design_pid", failing(ValueError("no gains")))
     session = run_hold(make_session).run()
     assert "bad-laws 0.9" in session.parent.messages[-1].reason
@@ -154,7 +157,7 @@ def test_one_that_cannot_be_made_ends_the_process_without_torque(make_session, l
 
 
 class SlowClock(VirtualClock):
-    """Virtual clock that the time of a slow controller passes, too."""
+    """Virtual clock that includes the time of a slow controller."""
 
     def wait_until(self, deadline_ns):
         late_ns = max(0, self.now_ns() - deadline_ns)
@@ -166,7 +169,7 @@ class SlowClock(VirtualClock):
         return 0.0
 
 
-def test_a_slow_one_counts_as_missed_ticks(make_session, law, monkeypatch):
+def test_a_slow_controller_counts_as_missed_ticks(make_session, law, monkeypatch):
     clock = SlowClock()
     monkeypatch.setattr(law, "AT_TICK", 700)
     monkeypatch.setattr(law, "ACTION", lambda: clock.spend(5_300_000))
@@ -175,11 +178,11 @@ def test_a_slow_one_counts_as_missed_ticks(make_session, law, monkeypatch):
     session.assert_safe()
 
 
-def test_a_probing_move_is_its_own_controller(make_session, law, monkeypatch):
+def test_a_probing_move_has_its_own_controller(make_session, law, monkeypatch):
     monkeypatch.setattr(law.Law, "step", lambda *_: float("nan"))
     session = run_hold(make_session)
     session.obey(ProbeOrder(session.profile), session.order())
-    (measured,) = session.parent.said(MeasurementResult)
+    (measured,) = session.parent.messages_of(MeasurementResult)
     assert measured.values["end"] == "COMPLETE"
     assert session.finished.outcome == "fault"  # the session after it has the profile's controller
     session.assert_safe()

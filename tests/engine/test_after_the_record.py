@@ -1,4 +1,4 @@
-"""What follows a record: the beam is damped actively, and the motor returns or stays."""
+"""After a record: active damping of the beam, and return of the motor."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def two_sessions(make_session, struck):
         brief = hold(rate_hz=RATE_HZ, duration_s=0.1, rest_s=0.0, ring_down_s=0.0)
         orders = [session.order(), session.order(brief)]
         session.obey(*(replace(order, ending=ending) for order in orders))
-        outcomes = [finished.outcome for finished in session.parent.said(SessionFinished)]
+        outcomes = [finished.outcome for finished in session.parent.messages_of(SessionFinished)]
         assert outcomes == ["complete", "complete"]
         session.assert_safe()
         return session, session.clock.now_ns() * 1e-9
@@ -46,7 +46,7 @@ def two_sessions(make_session, struck):
     return run
 
 
-def test_the_next_session_need_not_wait_for_the_beam(two_sessions, struck):
+def test_no_wait_for_the_beam_before_the_next_session(two_sessions, struck):
     ending = plan_session_of(struck)
     damped, damped_s = two_sessions(ending)
     left, left_s = two_sessions(replace(ending, damper=None))
@@ -55,7 +55,7 @@ def test_the_next_session_need_not_wait_for_the_beam(two_sessions, struck):
     assert any("Waiting" in event.message for event in left.events)
     # The zero of the torque can be checked right after the record, which needs a beam at rest.
     for session, checked in ((damped, True), (left, False)):
-        finished = session.parent.said(SessionFinished)[0]
+        finished = session.parent.messages_of(SessionFinished)[0]
         assert ("tare_drift_nm" in finished.results) == checked
 
 
@@ -66,7 +66,9 @@ def plan_session_of(excitation):
 
 
 def starts_rad(session):
-    return [float(ready.tare["start_angle_rad"]) for ready in session.parent.said(ReadyToRecord)]
+    return [
+        float(ready.tare["start_angle_rad"]) for ready in session.parent.messages_of(ReadyToRecord)
+    ]
 
 
 def test_the_motor_returns_to_where_it_started(two_sessions, stepped):
@@ -75,7 +77,7 @@ def test_the_motor_returns_to_where_it_started(two_sessions, stepped):
     assert second_rad == pytest.approx(first_rad, abs=1e-3)
 
 
-def test_a_move_stays_where_it_went(two_sessions, stepped):
+def test_the_motor_stays_after_a_move(two_sessions, stepped):
     session, _ = two_sessions(replace(plan_session_of(stepped), stays=True), stepped)
     first_rad, second_rad = starts_rad(session)
     assert second_rad - first_rad == pytest.approx(0.05, abs=1e-3)
@@ -95,7 +97,7 @@ def test_active_damping_stays_within_the_limit_of_the_angle(make_session):
 
 
 def test_a_damper_that_excites_the_beam_ends(two_sessions):
-    """With the sign turned round it feeds the vibration: it ends after its time, and safely."""
+    """With reversed sign the damper feeds the vibration: it ends in time, and safely."""
     wrong = PostRecordPlan(damper=DamperSettings(-2.0, 0.025, 4.0, 320.0))
     small = step(rate_hz=RATE_HZ, amplitude_rad=0.005, duration_s=0.2, rest_s=0.2, ring_down_s=0.0)
     session, _ = two_sessions(wrong, small)
@@ -127,8 +129,8 @@ def test_a_damper_that_excites_the_beam_ends(two_sessions):
     ],
     ids=["inertia", "friction", "delay", "feed-forward", "stiffness"],
 )
-def test_active_damping_bears_a_rig_unlike_the_profile(make_session, struck, unlike):
-    """What the supervisor planned for the profile damps a rig that is another."""
+def test_active_damping_tolerates_a_rig_unlike_the_profile(make_session, struck, unlike):
+    """The damper planned for the profile damps a different rig."""
     profile = unlike(make_session().profile)
     session = make_session(excitation=struck, profile=profile)
     ending = plan_session_of(struck)

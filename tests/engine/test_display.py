@@ -1,4 +1,4 @@
-"""What the board shows of the lines."""
+"""Line load and errors in the shared state."""
 
 import os
 from types import SimpleNamespace
@@ -36,19 +36,19 @@ def shown(shared_state, drive, sensor, *times_ns):
     return tuple(shared_state[word] for word in words)
 
 
-def test_without_a_line_nothing_is_known_of_one(shared_state):
+def test_no_line_health_without_a_line(shared_state):
     assert shown(shared_state, Line(LineHealth()), Line(LineHealth()), 0, 10**9) == (-1, -1, -1)
     assert shared_state[StateField.ANGLE_NRAD] == 10**8
-    assert shared_state[StateField.COUPLING_TORQUE_NNM] == 0  # what is not a number is not shown
+    assert shared_state[StateField.COUPLING_TORQUE_NNM] == 0  # NaN is not shown
     assert shared_state[StateField.CONTROL_BEAT] == 2
 
 
-def test_the_busiest_line_counts_and_the_errors_of_all(shared_state):
+def test_load_of_the_busiest_line_and_errors_of_all(shared_state):
     can = Line(LineHealth(0, 1e6, 1), LineHealth(300_000, 1e6, 1))
     serial = Line(LineHealth(0, 2e6, 2, 8), LineHealth(400_000, 2e6, 2, 8))
     assert shown(shared_state, can, serial, 0, 10**9) == (300_000, 3, 8)
 
 
-def test_while_time_stands_still_the_load_is_what_it_was(shared_state):
+def test_the_load_is_unchanged_while_time_is_paused(shared_state):
     can = Line(*(LineHealth(bits, 1e6) for bits in (0, 1000, 5000, 9000)))
     assert shown(shared_state, can, Line(LineHealth()), 0, 10**6 * 2, 10**6 * 2)[0] == 500_000

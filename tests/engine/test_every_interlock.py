@@ -1,4 +1,4 @@
-"""Every row of the table of interlocks: a session in which it happens, and how that ends."""
+"""Every row of the table of interlocks: a session in which it acts, and its end."""
 
 import re
 from collections.abc import Callable
@@ -70,7 +70,7 @@ class Sensor:
 
 
 class Clock(VirtualClock):
-    """Late at some of its deadlines, and does something at one; not virtual if asked for."""
+    """Late at some of its deadlines, and runs an action at one; not virtual if requested."""
 
     def __init__(self, action=None, late_ns=(), *, virtual=True):
         super().__init__()
@@ -123,7 +123,7 @@ def strengthen(session):
     inner.command = strong
 
 
-def asks_too_much(session):
+def demand_excessive_torque(session):
     motor(session, peak_torque_nm=0.04)
     limit(session, torque_command_nm=0.05)
 
@@ -148,20 +148,20 @@ def miss(session, *late_ns):
 
 def lag(session):
     limit(session, recorder_lag_s=1.0)
-    session.clock = Clock(virtual=False)  # nobody takes what is in the ring
+    session.clock = Clock(virtual=False)  # nothing reads the ring
 
 
 @dataclass(frozen=True)
 class Case:
-    """How an interlock is made to act, and what is said then."""
+    """How an interlock is made to act, and its message."""
 
     happens: Callable
-    says: str
+    message: str
 
 
 CASES = {
     "angle": Case(
-        # Beyond what the reference asks for, at which the session would not begin.
+        # Beyond the demand of the reference, at which the session would not begin.
         lambda s: (
             limit(s, angle_rad=0.03),
             sensor(s, 2200, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.5]),
@@ -206,7 +206,7 @@ CASES = {
         r"Percentage of readings of the sensor's whole wrench that repeat the one before \d\d\.\d",
     ),
     "torque command": Case(
-        asks_too_much,
+        demand_excessive_torque,
         r"Torque command -?0\.0\d+ N·m exceeds limit 0\.05 N·m",
     ),
     "i²t": Case(
@@ -260,7 +260,7 @@ ON_THE_WIRE = {
     "emergency message": "emergency message",
     "wired stop": "wired stop dropped",
 }
-"""Rows of docs/faults.md, which are tests of their own."""
+"""Rows of docs/faults.md that have separate tests."""
 AT_REST = {"tare drift"}
 INTERLOCKS_BY_NAME = {row.name: row for row in INTERLOCKS}
 
@@ -282,7 +282,7 @@ def test_an_interlock_ends_the_session_without_torque(make_session, name):
     assert not session.drive.inner._plant.enabled
     finished = session.finished
     assert finished.outcome == ("stopped" if row.action is Action.STOP else "fault")
-    assert re.match(case.says, finished.reason), finished.reason
+    assert re.match(case.message, finished.reason), finished.reason
     if row.limit:
         assert f"({row.limit}). {row.remedy}" in finished.reason
     samples = session.samples
@@ -294,11 +294,11 @@ def test_an_interlock_ends_the_session_without_torque(make_session, name):
 
 
 def resting(make_session):
-    """A session in which nothing moves: the beam does not swing after it."""
+    """A session without motion: the beam does not swing after it."""
     return make_session(excitation=hold(rate_hz=1000.0, duration_s=1.5, rest_s=0.5))
 
 
-def test_a_zero_that_moves_during_a_session_is_told(make_session):
+def test_a_zero_drift_in_a_session_is_reported(make_session):
     session = resting(make_session)
     sensor(session, wrong_from=3600, added=[0.0, 0.0, 0.0, 0.0, 0.0, 0.05])
     finished = session.run().finished
@@ -313,15 +313,13 @@ def test_a_zero_that_moves_during_a_session_is_told(make_session):
 
 
 @pytest.mark.parametrize("operator_tares", [False, True])
-def test_a_zero_that_moves_between_two_sessions_is_refused_unless_it_is_tared(
-    make_session, operator_tares
-):
+def test_a_zero_drift_between_sessions_needs_a_tare(make_session, operator_tares):
     session = resting(make_session)
     sensor(session, wrong_from=4301, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.05])
     job = session.order()
     session.obey(*[job, *([TareOrder()] if operator_tares else []), job])
     session.assert_safe()
-    first, second = session.parent.said(SessionFinished)
+    first, second = session.parent.messages_of(SessionFinished)
     assert (first.outcome, first.reason) == ("complete", "")
     if operator_tares:
         assert (second.outcome, second.reason) == ("complete", "")
@@ -350,7 +348,7 @@ def test_a_small_drift_is_a_warning(make_session):
     assert re.match(r"Drift of the .* zero 0\.00\d+ N·m above warning level", warning.message)
 
 
-def test_what_keeps_coming_near_its_limit_is_told_once_and_flagged_each_time(make_session):
+def test_values_near_a_limit_are_reported_once_and_flagged(make_session):
     session = make_session()
     limit(session, angle_rad=0.028)  # of which 0.8 are 0.0224; the chirp reaches 0.025
     finished = session.run().finished
@@ -365,14 +363,14 @@ def test_what_keeps_coming_near_its_limit_is_told_once_and_flagged_each_time(mak
     assert all(re.match(r"Angle .* rad above warning level", w.message) for w in warnings)
 
 
-def test_the_motor_stays_warm_through_the_sessions_of_a_connection(make_session, complete_session):
+def test_motor_heat_carries_over_between_sessions(make_session, complete_session):
     commanded = complete_session[1]["torque_command_nm"]
-    heat_nm2 = float((commanded**2).sum()) / 1000 / 1e4  # over 10 000 s nothing cools down
+    heat_nm2 = float((commanded**2).sum()) / 1000 / 1e4  # no cooling in 10 000 s
     session = make_session()
     motor(session, continuous_torque_nm=(1.5 * heat_nm2) ** 0.5, thermal_time_constant_s=1e4)
     job = session.order()
     session.obey(job, job)
-    first, second = session.parent.said(SessionFinished)
+    first, second = session.parent.messages_of(SessionFinished)
     assert (first.outcome, first.reason) == ("complete", "")
     assert second.outcome == "fault"
     assert "i²t" in second.reason
@@ -381,7 +379,7 @@ def test_the_motor_stays_warm_through_the_sessions_of_a_connection(make_session,
 
 @pytest.mark.parametrize("name", [further("sim"), "antenna_can", "antenna_serial"])
 def test_the_paper_s_chirp_comes_near_no_limit(name):
-    """Its torque, speed and angle, as predicted, through the watch of each shipped profile."""
+    """Its predicted torque, speed and angle pass the limits of each shipped profile."""
     profile = load_profile(name)
     excitation = chirp(rate_hz=1000.0)
     response = close_loop(profile.loop_model()).simulate(excitation.reference_rad)
@@ -410,7 +408,7 @@ def test_the_paper_s_chirp_comes_near_no_limit(name):
     ("amplitude_rad", "slow"),
     [(0.01, True), (0.025, False), further(0.01, False), further(0.025, True)],
 )
-def test_an_angle_that_counts_the_other_way_round_is_told_from_too_much_amplitude(
+def test_a_reversed_angle_is_distinguished_from_excessive_amplitude(
     make_session, amplitude_rad, slow
 ):
     excitation = chirp(
@@ -429,8 +427,8 @@ def test_an_angle_that_counts_the_other_way_round_is_told_from_too_much_amplitud
 
 
 @pytest.mark.parametrize("push_nm", [-0.5, 1.5])
-def test_a_push_on_the_beam_is_not_taken_for_a_wrong_sign(make_session, push_nm):
-    """A loop that has the sign right turns with its torque, whatever the sensor is made to feel."""
+def test_a_push_on_the_beam_is_no_wrong_sign(make_session, push_nm):
+    """A loop with the right sign turns with its torque, under any load on the sensor."""
     slow = chirp(rate_hz=1000.0, duration_s=4.0, rest_s=0.5, stop_hz=5.0)
     session = make_session(excitation=slow)
     limit(session, velocity_rad_s=2.0, tracking_error_rad=0.02)
@@ -440,7 +438,7 @@ def test_a_push_on_the_beam_is_not_taken_for_a_wrong_sign(make_session, push_nm)
     assert "against the torque" not in reason
 
 
-def test_too_great_an_amplitude_is_not_taken_for_a_wrong_sign(make_session):
+def test_an_excessive_amplitude_is_no_wrong_sign(make_session):
     session = make_session()
     limit(session, velocity_rad_s=0.4)
     reason = session.run().finished.reason

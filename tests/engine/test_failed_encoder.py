@@ -50,7 +50,7 @@ class FailingDrive:
         return self.inner.read_angle()
 
     def travel_rad(self):
-        """Greatest distance from where the encoder failed, up to rest."""
+        """Greatest distance from the angle at the failure, up to rest."""
         plant = self.inner._plant
         for _ in range(3000):
             plant.advance(1)
@@ -103,7 +103,7 @@ def further(*case):
 
 
 class ScaledDrive(FailingDrive):
-    """A drive that works, whose motor exerts another torque than it reports."""
+    """A working drive whose motor exerts another torque than it reports."""
 
     def __init__(self, inner, scale):
         super().__init__(inner, np.inf, None)
@@ -129,9 +129,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "at", "friction_nm"), CASES)
-def test_a_frozen_encoder_ends_the_session_before_the_shaft_has_turned_far(
-    make_session, name, at, friction_nm
-):
+def test_a_frozen_encoder_ends_the_session_soon(make_session, name, at, friction_nm):
     finished, drive = run_with_failing_encoder(make_session, REFERENCES[name], at, friction_nm)
     travel_rad = drive.travel_rad()
     assert travel_rad <= 0.3
@@ -144,7 +142,7 @@ def test_a_frozen_encoder_ends_the_session_before_the_shaft_has_turned_far(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", REFERENCES)
-def test_wherever_an_encoder_freezes_the_shaft_does_not_turn_far(make_session, name):
+def test_the_shaft_turns_little_wherever_an_encoder_freezes(make_session, name):
     random = np.random.default_rng(7)
     reference_rad = REFERENCES[name]
     for _ in range(20):
@@ -164,7 +162,7 @@ def coasting_rad(drive, friction_nm):
 @pytest.mark.parametrize(
     ("name", "every"), [("move", 2), further("move", 3), further("chirp", 2), further("chirp", 3)]
 )
-def test_an_encoder_that_repeats_readings_is_detected(make_session, name, every):
+def test_an_encoder_with_repeated_readings_is_detected(make_session, name, every):
     finished, _ = run_with_failing_encoder(
         make_session, REFERENCES[name], BEFORE_RECORD, 0.03, StuckReadings(every)
     )
@@ -184,17 +182,17 @@ def test_an_encoder_that_repeats_readings_is_detected(make_session, name, every)
         further("slow chirp", 0.1),
     ],
 )
-def test_no_working_encoder_is_called_failed(make_session, name, friction_nm):
-    """Not even where a knock makes the beam pull at a shaft that stands still."""
+def test_a_working_encoder_is_not_reported_failed(make_session, name, friction_nm):
+    """Not even if an impact makes the beam pull at a resting shaft."""
     reference_rad = REFERENCES[name]
     session = make_session()
     rig = session.profile.rig
-    knocks = ("knock,x=0.5,force=0.4,at=1,duration=0.02", "x=0.8,force=-0.3,at=2,duration=0.01")
-    knocks = tuple(knock.removeprefix("knock,") for knock in knocks)
+    impacts = ("knock,x=0.5,force=0.4,at=1,duration=0.02", "x=0.8,force=-0.3,at=2,duration=0.01")
+    impacts = tuple(impact.removeprefix("knock,") for impact in impacts)
     truth = replace(
         rig,
         motor=replace(rig.motor, coulomb_nm=friction_nm),
-        simulation=replace(rig.simulation, obstacles=knocks),
+        simulation=replace(rig.simulation, obstacles=impacts),
     )
     devices = open_devices(truth)
     session.devices = Devices(devices.drive, devices.sensor, simulated=True)
@@ -205,7 +203,7 @@ def test_no_working_encoder_is_called_failed(make_session, name, friction_nm):
 
 
 def draw_obstacles(random, seconds):
-    """Draw what the beam meets: nothing, an obstacle, or knocks."""
+    """Draw a disturbance of the beam: none, an obstacle, or impacts."""
     x = random.uniform(0.2, 0.95)
     match random.integers(4):
         case 0:
@@ -224,7 +222,7 @@ def draw_obstacles(random, seconds):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 def test_fifty_sound_sessions_end_well(make_session, seed):
-    """Friction, one quantity of the motor, or a product of two are not those of the profile."""
+    """Friction, one quantity of the motor, or a product of two differ from the profile."""
     random = np.random.default_rng(seed)
     damper = None
     for number in range(50):

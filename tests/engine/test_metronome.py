@@ -9,7 +9,7 @@ from rigd.engine.timing import SUSPENDED_S, RealClock, SuspendMonitor, TickSched
 
 
 class LateClock:
-    """A clock on which each wait wakes late by what the test says."""
+    """A clock on which each wait wakes late by times set by the test."""
 
     virtual = False
 
@@ -45,7 +45,7 @@ def test_every_tick_is_run_once_or_counted_as_missed(rate_hz, delays):
     assert metronome.start_ns - start_ns == round(period_ns)
 
 
-def test_a_burst_of_missed_ticks_is_not_made_up():
+def test_a_burst_of_missed_ticks_is_not_run_later():
     metronome = TickScheduler(LateClock([0, 7_300_000, 0, 0]), 1000.0)
     assert metronome.wait() == 0
     assert metronome.wait() == 7
@@ -54,7 +54,7 @@ def test_a_burst_of_missed_ticks_is_not_made_up():
     assert (metronome.tick, metronome.lateness_ns) == (10, 0)
 
 
-def test_due_times_go_on_evenly_through_a_restart():
+def test_due_times_continue_evenly_through_a_restart():
     metronome = TickScheduler(VirtualClock(), 1000.0)
     due = []
     for tick in range(6):
@@ -77,11 +77,11 @@ def test_real_deadlines_do_not_drift_with_the_work():
     assert metronome.tick == 50 + missed
     assert min(behind_ns) >= 0
     # A loop that slept a whole period after its work would be twenty milliseconds behind by now.
-    # This one may lose the processor, but hardly each time between waking and looking at the clock.
+    # This one may lose the processor, but hardly each time between waking and reading the clock.
     assert min(behind_ns[-10:]) < 2_000_000
 
 
-def test_spinning_ends_the_wait_at_the_deadline_and_not_before():
+def test_spinning_waits_until_the_deadline():
     clock = RealClock(spin_ns=150_000)
     for _ in range(5):
         deadline_ns = clock.now_ns() + 1_000_000
@@ -90,7 +90,7 @@ def test_spinning_ends_the_wait_at_the_deadline_and_not_before():
 
 
 class SuspendableComputer:
-    """Two clocks of a computer; each reading takes its time, and a suspend stops one of them."""
+    """Two clocks of a computer; each reading takes time, and a suspend stops one of them."""
 
     def __init__(self, steps_ns=()):
         self._steps_ns = iter(steps_ns)
@@ -111,15 +111,15 @@ class SuspendableComputer:
 @given(
     st.lists(st.integers(0, 10**9), min_size=4, max_size=4), st.integers(0, 10**13), st.booleans()
 )
-def test_a_suspend_shows_and_a_delay_between_two_readings_does_not(steps_ns, suspended_ns, delayed):
+def test_a_suspend_is_detected_and_a_reading_delay_is_not(steps_ns, suspended_ns, delayed):
     computer = SuspendableComputer(steps_ns if delayed else ())
     watch = computer.watch()
     assert watch.suspended_s() == 0.0
     computer.suspended_ns = suspended_ns
-    told_s = watch.suspended_s()
-    assert told_s <= suspended_ns * 1e-9
+    reported_s = watch.suspended_s()
+    assert reported_s <= suspended_ns * 1e-9
     if not delayed:
-        assert told_s >= suspended_ns * 1e-9 - 1e-6
+        assert reported_s >= suspended_ns * 1e-9 - 1e-6
 
 
 def test_this_computer_was_not_suspended_meanwhile():

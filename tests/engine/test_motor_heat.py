@@ -1,4 +1,4 @@
-"""How warm the motor is outlives a connection to hardware, and cools down meanwhile."""
+"""The motor's heat is stored between connections to hardware, and decays meanwhile."""
 
 import json
 from dataclasses import replace
@@ -20,7 +20,7 @@ def profile(runtime_folder):
 
 @pytest.fixture
 def heat_file(runtime_folder):
-    """The file of the motor's heat, or None where there is none."""
+    """The file of the motor's heat, or None."""
     return lambda: next(runtime_folder.rglob("heat-*.json"), None)
 
 
@@ -46,7 +46,7 @@ def test_a_motor_cools_down_by_its_time_constant(profile, at):
     assert make_limit_monitor(profile, 0.25).heat_nm2 == 0.25
 
 
-def test_one_of_before_a_restart_is_cold_and_none_is_warmer_than_can_be(profile, at):
+def test_heat_before_a_restart_is_dropped_and_heat_is_bounded(profile, at):
     store_motor_heat(profile, 1e9)
     assert stored_motor_heat_nm2(profile) == profile.rig.motor.peak_torque_nm**2
     at(999.0)
@@ -57,13 +57,13 @@ def test_one_of_before_a_restart_is_cold_and_none_is_warmer_than_can_be(profile,
     "text", ["", "{", "[]", "null", '{"heat_nm2": "x", "boot_s": 1}', '{"heat_nm2": 1}',
              '{"heat_nm2": NaN, "boot_s": 1}', '{"heat_nm2": 1, "boot_s": NaN}'],
 )  # fmt: skip
-def test_a_file_that_says_nothing_is_a_cold_motor(profile, heat_file, text):
+def test_an_unusable_file_is_a_cold_motor(profile, heat_file, text):
     store_motor_heat(profile, 1.0)
     heat_file().write_text(text)
     assert stored_motor_heat_nm2(profile) == 0.0
 
 
-def test_without_a_folder_a_motor_is_cold(profile, monkeypatch, tmp_path):
+def test_a_motor_is_cold_without_a_folder(profile, monkeypatch, tmp_path):
     (tmp_path / "rigd").touch()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     store_motor_heat(profile, 1.0)
@@ -72,7 +72,7 @@ def test_without_a_folder_a_motor_is_cold(profile, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("simulated", [False, True])
 def test_connections_in_a_row_add_up_on_hardware_alone(make_session, heat_file, simulated):
-    """Sessions of torque, each on a connection of its own: as with `rigd run` again and again."""
+    """Sessions with torque, each on its own connection, as with repeated `rigd run`."""
     heat = []
     for _ in range(2):
         session = make_session()
@@ -87,7 +87,7 @@ def test_connections_in_a_row_add_up_on_hardware_alone(make_session, heat_file, 
             ring_down_s=0.0,
         )
         session.obey(session.order(sweep))
-        assert session.parent.said(SessionFinished)[0].outcome == "complete"
+        assert session.parent.messages_of(SessionFinished)[0].outcome == "complete"
         if not simulated:
             heat.append(json.loads(heat_file().read_text())["heat_nm2"])
     if simulated:

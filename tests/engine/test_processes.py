@@ -1,4 +1,4 @@
-"""Processes and what they are sent: no message is long, and nothing that fails is fatal."""
+"""Processes and their messages: no message is long, and no failure is fatal."""
 
 import contextlib
 import errno
@@ -28,7 +28,7 @@ def memory():
     os.close(fd)
 
 
-def test_a_reference_is_found_where_it_was_placed(memory):
+def test_a_reference_is_found_in_its_memory(memory):
     for ticks in (1000, 10, 3000):  # each session has its own
         reference_rad = np.random.default_rng(ticks).standard_normal(ticks)
         found = map_reference(write_reference(memory, reference_rad))
@@ -37,7 +37,7 @@ def test_a_reference_is_found_where_it_was_placed(memory):
         assert np.array_equal(np.array(found), reference_rad)
 
 
-def test_a_loop_takes_the_longest_session_without_waiting_for_its_bytes(memory):
+def test_the_longest_session_is_received_without_waiting(memory):
     job = SessionJob(load_profile("sim"), write_reference(memory, np.zeros(MAX_SAMPLES)))
     assert len(encode(job)) < PIPE_BYTES
 
@@ -51,7 +51,7 @@ def pipe():
             os.close(end)
 
 
-def test_nobody_waits_for_the_rest_of_a_message(pipe):
+def test_no_wait_for_the_rest_of_a_message(pipe):
     read, write = pipe
     reader, message = MessageReader(read), ReadyToRecord({"start_angle_rad": "0.1"})
     for byte in (data := encode(message))[:-1]:
@@ -66,7 +66,7 @@ def test_nobody_waits_for_the_rest_of_a_message(pipe):
         reader.next(None)
 
 
-def test_what_is_no_message_is_not_waited_for(pipe):
+def test_no_wait_for_an_invalid_message(pipe):
     read, write = pipe
     os.write(write, b"Warning: something has been printed\n")
     with pytest.raises(ValueError, match="no message, but b'Warning: "):
@@ -74,7 +74,7 @@ def test_what_is_no_message_is_not_waited_for(pipe):
 
 
 @pytest.mark.process
-def test_what_is_no_message_is_told_with_the_name_of_the_process():
+def test_an_invalid_message_is_reported_with_the_process():
     child = ChildProcess(replace(RECORDER, module="this"))  # prints the Zen of Python
     try:
         with pytest.raises(ChildError, match="recorder process sent no message, but b'The Zen of"):
@@ -84,15 +84,15 @@ def test_what_is_no_message_is_told_with_the_name_of_the_process():
 
 
 @pytest.mark.process
-def test_what_a_library_prints_does_not_stand_among_the_messages():
-    says = (
+def test_output_of_a_library_is_not_among_the_messages():
+    code = (
         "import os; from rigd.engine.messages import ControlEnded; "
         "from rigd.engine.processes import SupervisorConnection; "
         "parent = SupervisorConnection(); print('of a library', flush=True); "
         "os.write(1, b'and so on'); parent.send(ControlEnded(''))"
     )
     child = subprocess.Popen(
-        [sys.executable, "-c", says, str(os.getpid())],
+        [sys.executable, "-c", code, str(os.getpid())],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     output, errors = child.communicate(timeout=60)
@@ -109,7 +109,7 @@ def test_a_process_may_be_stopped_twice():
 
 
 @pytest.mark.process
-def test_a_process_that_the_system_does_not_start_is_told(monkeypatch):
+def test_failure_to_start_a_process_is_reported(monkeypatch):
     def refuse(*_, **__):
         raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 

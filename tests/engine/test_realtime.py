@@ -48,7 +48,7 @@ def obtained_by_a_process(*, priority=0, cpu=-1, root="/", before=""):
 
 @pytest.fixture
 def machine(tmp_path):
-    """A file system that says what the test wants of the computer."""
+    """A file system with the properties of a computer that the test sets."""
 
     def write(path, text):
         file = tmp_path / path
@@ -59,7 +59,7 @@ def machine(tmp_path):
     return write
 
 
-def test_what_is_reported_is_what_was_obtained():
+def test_the_report_is_what_was_obtained():
     report, affinity, policy = obtained_by_a_process(priority=10)
     assert report["garbage_collector"] == "off"
     if not isolated_cores():
@@ -71,7 +71,7 @@ def test_what_is_reported_is_what_was_obtained():
         assert report["scheduling"].startswith("refused: ")
 
 
-def test_a_core_that_does_not_exist_is_refused_and_the_rest_is_tried():
+def test_a_missing_core_is_refused_and_the_rest_is_tried():
     report, affinity, _ = obtained_by_a_process(cpu=4000)
     assert report["cpu"].startswith("refused: ")
     assert set(affinity) == os.sched_getaffinity(0)
@@ -79,7 +79,7 @@ def test_a_core_that_does_not_exist_is_refused_and_the_rest_is_tried():
     assert "memory" in report
 
 
-def test_without_rights_each_refusal_is_told_and_the_rest_is_done():
+def test_refusals_are_reported_and_the_rest_is_applied():
     report, affinity, policy = obtained_by_a_process(priority=80, before=NO_RIGHTS)
     assert policy == os.SCHED_OTHER
     assert report["scheduling"].startswith("refused: ")
@@ -89,7 +89,7 @@ def test_without_rights_each_refusal_is_told_and_the_rest_is_done():
 
 
 class Libc:
-    """Grants everything and notes what it was asked for."""
+    """Grants everything and records the flags requested."""
 
     flags = 0
 
@@ -119,14 +119,14 @@ def test_an_isolated_core_is_preferred(machine):
     assert affinity == [first]
 
 
-def test_an_isolated_core_that_may_not_be_used_is_left(machine):
+def test_a_forbidden_isolated_core_is_not_used(machine):
     root = machine("sys/devices/system/cpu/isolated", "4000\n")
     report, affinity, _ = obtained_by_a_process(root=root)
     assert report["cpu"] == str(max(os.sched_getaffinity(0)))
     assert affinity == [max(os.sched_getaffinity(0))]
 
 
-def test_deep_idle_states_are_kept_away(machine):
+def test_deep_idle_states_are_prevented(machine):
     machine("sys/devices/system/cpu/cpu0/cpuidle/state0/latency", "0\n")
     root = machine("sys/devices/system/cpu/cpu0/cpuidle/state1/latency", "133\n")
     assert obtained_by_a_process(root=root)[0]["idle_states"].startswith("refused: ")
@@ -135,7 +135,7 @@ def test_deep_idle_states_are_kept_away(machine):
     assert struct.unpack("=i", bound.read_bytes()) == (MAX_WAKE_UP_US,)
 
 
-def test_where_no_idle_state_is_deep_none_is_bounded(machine):
+def test_shallow_idle_states_are_not_bounded(machine):
     root = machine("sys/devices/system/cpu/cpu0/cpuidle/state0/latency", "1\n")
     assert "refused" not in obtained_by_a_process(root=root)[0]["idle_states"]
 
@@ -144,11 +144,11 @@ def test_where_no_idle_state_is_deep_none_is_bounded(machine):
     ("text", "cores"),
     [("\n", set()), ("3\n", {3}), ("0-2,5", {0, 1, 2, 5}), ("2-3,6-7", {2, 3, 6, 7})],
 )
-def test_lists_of_cores_are_read_as_the_kernel_writes_them(text, cores):
+def test_lists_of_cores_of_the_kernel_are_read(text, cores):
     assert parse_core_list(text) == cores
 
 
-def test_a_list_that_cannot_be_read_isolates_nothing(machine, tmp_path):
+def test_an_unreadable_list_isolates_nothing(machine, tmp_path):
     assert isolated_cores(tmp_path) == frozenset()
     assert isolated_cores(machine("sys/devices/system/cpu/isolated", "(null)")) == frozenset()
 
@@ -215,7 +215,7 @@ ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="needs rights that only root
 
 @functools.cache
 def precedence_of_a_process(*, priority=20, cpu=-1, before="", root="/", with_child=False):
-    """Return what a process, and a child of it, tell of their precedence before and after."""
+    """Return the precedence that a process and its child report before and after."""
     code = PRECEDENCE.format(
         priority=priority, cpu=cpu, before=before, root=root, with_child=with_child
     )
@@ -224,41 +224,44 @@ def precedence_of_a_process(*, priority=20, cpu=-1, before="", root="/", with_ch
 
 
 def granted_realtime():
-    told = precedence_of_a_process(with_child=True)
-    if not told["obtained"]["scheduling"].startswith("SCHED_RR"):
-        pytest.skip(f"no real-time priority here: {told['obtained']}")
-    return told
+    precedence = precedence_of_a_process(with_child=True)
+    if not precedence["obtained"]["scheduling"].startswith("SCHED_RR"):
+        pytest.skip(f"no real-time priority here: {precedence['obtained']}")
+    return precedence
 
 
-def test_supervisor_and_recorder_go_before_ordinary_programs_and_keep_off_the_loops_core():
-    told = granted_realtime()
-    _, nice, all_cores = told["before"]
+def test_priority_and_cores_of_supervisor_and_recorder():
+    precedence = granted_realtime()
+    _, nice, all_cores = precedence["before"]
     cores = all_cores[:-1] or all_cores
-    assert told["obtained"] == {"scheduling": "SCHED_RR 20", "cores": ",".join(map(str, cores))}
-    assert told["with"] == told["thread"] == [os.SCHED_RR, nice, cores]
+    assert precedence["obtained"] == {
+        "scheduling": "SCHED_RR 20",
+        "cores": ",".join(map(str, cores)),
+    }
+    assert precedence["with"] == precedence["thread"] == [os.SCHED_RR, nice, cores]
 
 
-def test_what_they_start_is_an_ordinary_process_on_every_core():
-    told = granted_realtime()
-    assert told["child"] == [os.SCHED_OTHER, 0]
-    assert told["cores of a process of the rig"] == told["before"][2]
+def test_child_processes_are_ordinary_on_every_core():
+    precedence = granted_realtime()
+    assert precedence["child"] == [os.SCHED_OTHER, 0]
+    assert precedence["cores of a process of the rig"] == precedence["before"][2]
 
 
-def test_released_all_is_as_before():
-    told = precedence_of_a_process(with_child=True)
-    assert told["after"] == told["thread after"] == told["before"]
+def test_release_restores_the_precedence():
+    precedence = precedence_of_a_process(with_child=True)
+    assert precedence["after"] == precedence["thread after"] == precedence["before"]
 
 
-def test_a_loop_on_a_core_of_its_own_is_kept_off_that_one():
+def test_supervision_avoids_the_core_of_the_loop():
     granted_realtime()
     first = min(os.sched_getaffinity(0))
     others = sorted(os.sched_getaffinity(0) - {first}) or [first]
-    told = precedence_of_a_process(cpu=first)
-    assert told["with"][2] == others
+    precedence = precedence_of_a_process(cpu=first)
+    assert precedence["with"][2] == others
 
 
 @pytest.mark.parametrize("isolated", [further("4000"), ""])
-def test_the_core_that_is_kept_off_is_the_one_that_the_loop_gets(machine, isolated):
+def test_the_avoided_core_is_the_one_of_the_loop(machine, isolated):
     granted_realtime()
     first = str(min(os.sched_getaffinity(0)))
     root = machine("sys/devices/system/cpu/isolated", f"{isolated or first}\n")
@@ -267,27 +270,29 @@ def test_the_core_that_is_kept_off_is_the_one_that_the_loop_gets(machine, isolat
     assert precedence_of_a_process(root=root)["with"][2] == others
 
 
-def test_without_any_right_the_refusal_is_told_and_nothing_changes():
-    told = precedence_of_a_process(before=NO_RIGHTS)
-    assert told["obtained"]["scheduling"].startswith("refused: ")
-    assert told["with"] == told["after"] == told["before"]
+def test_refusal_is_reported_without_rights():
+    precedence = precedence_of_a_process(before=NO_RIGHTS)
+    assert precedence["obtained"]["scheduling"].startswith("refused: ")
+    assert precedence["with"] == precedence["after"] == precedence["before"]
 
 
 @ROOT
-def test_where_no_realtime_priority_is_granted_a_nice_value_is_tried():
-    told = precedence_of_a_process(before=NICE_ONLY)
-    assert told["obtained"]["scheduling"].startswith(
+def test_a_nice_value_is_tried_without_realtime_priority():
+    precedence = precedence_of_a_process(before=NICE_ONLY)
+    assert precedence["obtained"]["scheduling"].startswith(
         f"nice {SUPERVISION_NICENESS} (SCHED_RR refused: "
     )
-    assert told["with"][:2] == told["thread"][:2] == [os.SCHED_OTHER, SUPERVISION_NICENESS]
-    assert told["child"] == [os.SCHED_OTHER, 0]
-    assert told["after"] == told["before"]
+    assert (
+        precedence["with"][:2] == precedence["thread"][:2] == [os.SCHED_OTHER, SUPERVISION_NICENESS]
+    )
+    assert precedence["child"] == [os.SCHED_OTHER, 0]
+    assert precedence["after"] == precedence["before"]
 
 
-def test_who_asks_for_no_priority_gets_none():
-    told = precedence_of_a_process(priority=0)
-    assert told["obtained"] == {}
-    assert told["with"] == told["before"]
+def test_no_priority_without_request():
+    precedence = precedence_of_a_process(priority=0)
+    assert precedence["obtained"] == {}
+    assert precedence["with"] == precedence["before"]
 
 
 @pytest.mark.parametrize(("loop", "supervision"), [(80, 20), (4, 1), (3, 0), (0, 0), (99, 24)])

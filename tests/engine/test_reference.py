@@ -1,4 +1,4 @@
-"""References that grow while they are followed."""
+"""References that are extended while they are followed."""
 
 import threading
 import time
@@ -26,7 +26,7 @@ from rigd.engine.shared_state import SharedState, StateField, StopReason
 from rigd.excitation import chirp
 
 UNIT_RAD = 1e-7
-"""Unit of the angles here: pieces begin and end at rest."""
+"""Unit of the angles here: segments begin and end at rest."""
 
 
 class InUnits:
@@ -55,9 +55,9 @@ def test_a_long_chirp_is_planned_and_shared_without_copies():
     assert sharing_bytes < 0.1 * reference_rad.nbytes
 
 
-def growing(planned=3, room=40):
+def growing(planned=3, space=40):
     shared_state = SharedState.create(shared_memory_fd())
-    reference_rad = np.zeros(planned + room)
+    reference_rad = np.zeros(planned + space)
     reference_rad[:planned] = UNIT_RAD * np.arange(1, planned + 1)
     spec = write_reference(shared_memory_fd(), reference_rad, planned)
     reader = ReferenceReader(map_reference(spec), planned, shared_state)
@@ -65,7 +65,7 @@ def growing(planned=3, room=40):
     return both, both, shared_state
 
 
-def test_pieces_follow_each_other_without_a_gap():
+def test_segments_follow_each_other_without_a_gap():
     writer, reader, shared_state = growing()
     writer.append(np.array([10.0, 11.0]))
     writer.append(np.array([20.0]))
@@ -73,7 +73,7 @@ def test_pieces_follow_each_other_without_a_gap():
     assert shared_state[StateField.HELD_TICKS] == 0
 
 
-def test_a_record_is_whole_with_the_last_piece_and_all_ticks_held():
+def test_a_record_is_whole_after_its_last_segment():
     writer, reader, shared_state = growing(planned=3, room=40)
     assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
     writer.append(np.array([10.0, 11.0]))
@@ -86,7 +86,7 @@ def test_a_record_is_whole_with_the_last_piece_and_all_ticks_held():
     assert not covers_reference(shared_state, 0, 43)
 
 
-def test_a_record_of_what_was_given_is_whole_at_its_end():
+def test_a_record_of_a_given_reference_is_whole_at_its_end():
     shared_state = SharedState.create(shared_memory_fd())
     assert [covers_reference(shared_state, scheduled, 9) for scheduled in (0, 8, 9)] == [
         False,
@@ -95,7 +95,7 @@ def test_a_record_of_what_was_given_is_whole_at_its_end():
     ]
 
 
-def test_the_last_angle_is_held_until_the_next_piece():
+def test_the_last_angle_is_held_until_the_next_segment():
     writer, reader, shared_state = growing()
     assert [reader.at(tick) for tick in range(6)] == [1, 2, 3, 3, 3, 3]
     assert shared_state[StateField.HELD_TICKS] == 3
@@ -104,7 +104,7 @@ def test_the_last_angle_is_held_until_the_next_piece():
     assert shared_state[StateField.HELD_TICKS] == 4
 
 
-def test_it_is_told_before_which_piece_the_angle_was_held():
+def test_the_segment_after_a_hold_is_reported():
     writer, reader, shared_state = growing()
     before = []
     for tick in range(12):
@@ -112,23 +112,23 @@ def test_it_is_told_before_which_piece_the_angle_was_held():
             writer.append(np.array([10.0, 11.0]))
         reader.at(tick)
         before.append(shared_state[StateField.HELD_TICKS_BEFORE_SEGMENT])
-    assert before == [0] * 6 + [1] * 6  # the first piece at tick 3, the second at tick 6
+    assert before == [0] * 6 + [1] * 6  # the first segment at tick 3, the second at tick 6
     assert shared_state[StateField.BEGUN_REFERENCE_TICKS] == 7
     assert shared_state[StateField.HELD_TICKS] == 5
 
 
-@pytest.mark.parametrize(("room", "played"), [(4, [10, 11]), (3, [3])])
-def test_a_piece_that_would_not_end_with_the_record_is_not_begun(room, played):
+@pytest.mark.parametrize(("space", "expected"), [(4, [10, 11]), (3, [3])])
+def test_a_segment_beyond_the_end_of_the_record_is_not_begun(space, expected):
     """The motor would have to stop at full swing."""
-    writer, reader, shared_state = growing(room=room)
+    writer, reader, shared_state = growing(room=space)
     assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
     writer.append(np.array([10.0, 11.0]))
     assert not reader.waits(5)
-    assert [reader.at(tick) for tick in range(5, 3 + room)] == played
-    assert shared_state[StateField.BEGUN_REFERENCE_TICKS] == (5 if len(played) > 1 else 0)
+    assert [reader.at(tick) for tick in range(5, 3 + space)] == expected
+    assert shared_state[StateField.BEGUN_REFERENCE_TICKS] == (5 if len(expected) > 1 else 0)
 
 
-def test_missed_ticks_are_played_by_as_in_a_given_reference():
+def test_missed_ticks_are_skipped_in_the_reference():
     writer, reader, shared_state = growing()
     writer.append(np.array([10.0, 11.0, 12.0]))
     assert [reader.at(tick) for tick in (0, 4)] == [1, 11]
@@ -138,7 +138,7 @@ def test_missed_ticks_are_played_by_as_in_a_given_reference():
     assert shared_state[StateField.HELD_TICKS] == 3
 
 
-def test_the_end_comes_after_all_that_is_planned():
+def test_the_end_is_after_the_last_planned_segment():
     writer, reader, shared_state = growing()
     assert reader.waits(3)
     writer.append(np.array([10.0]))
@@ -153,7 +153,7 @@ def test_the_end_comes_after_all_that_is_planned():
     assert not reader.waits(4)
 
 
-def test_a_piece_without_room_is_refused():
+def test_a_segment_without_space_is_refused():
     writer, _, shared_state = growing(room=2)
     with pytest.raises(ValueError, match="room for 2"):
         writer.append(np.zeros(3))
@@ -161,37 +161,37 @@ def test_a_piece_without_room_is_refused():
 
 
 @pytest.mark.parametrize(
-    "piece_rad",
+    "segment_rad",
     [[0.01, 0.0], [0.0, 0.01], [0.0, np.nan, 0.0], [np.nan, 0.0], [0.0, np.inf], [0.0, 7.0, 0.0]],
 )
-def test_a_piece_that_does_not_begin_and_end_at_rest_is_refused(piece_rad):
+def test_a_segment_not_beginning_and_ending_at_rest_is_refused(segment_rad):
     writer, _, shared_state = growing()
     with pytest.raises(ValueError, match="a segment from"):
-        writer.append(np.array(piece_rad) / UNIT_RAD)
+        writer.append(np.array(segment_rad) / UNIT_RAD)
     assert shared_state[StateField.PLANNED] == 0
 
 
 @given(
-    pieces=st.lists(
+    segments=st.lists(
         st.tuples(st.integers(1, 9), st.integers(0, 20)), max_size=8
     ),  # length, and tick at which it is appended
     missed=st.lists(st.integers(0, 3), min_size=60, max_size=60),
 )
-def test_every_angle_of_a_piece_comes_in_its_order(pieces, missed):
-    """Whatever is late: the pieces are followed, held in between, without what was missed."""
+def test_angles_of_segments_are_followed_in_order(segments, missed):
+    """With any lateness: segments are followed and held in between, without missed ticks."""
     writer, reader, shared_state = growing(room=100)
-    arrivals = sorted(pieces, key=lambda piece: piece[1])
-    told, tick, followed = 3, -1, []
+    arrivals = sorted(segments, key=lambda segment: segment[1])
+    appended, tick, followed = 3, -1, []
     for skipped in missed:
         before = tick
         tick += 1 + skipped
         while arrivals and arrivals[0][1] <= before + 1:
             length, _ = arrivals.pop(0)
-            writer.append(np.arange(told + 1, told + length + 1))
-            told += length
+            writer.append(np.arange(appended + 1, appended + length + 1))
+            appended += length
         followed.append((tick, reader.at(tick)))
         held = shared_state[StateField.HELD_TICKS]
-        assert followed[-1][1] == min(tick - held + 1, told)
+        assert followed[-1][1] == min(tick - held + 1, appended)
     values = [value for _, value in followed]
     assert values == sorted(values)
     for (first, a), (then, b) in pairwise(followed):
@@ -203,19 +203,19 @@ def wait_until_followed(session, ticks):
     assert eventually(lambda: session.shared_state[StateField.SCHEDULED] >= ticks)
 
 
-def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
-    """Under the virtual clock time stands still until the next piece is there."""
+def test_a_session_follows_segments_appended_while_running(make_session):
+    """The virtual clock is paused until the next segment is there."""
     session = make_session()
     begun = np.zeros(400)
-    pieces_rad = [0.01 * np.sin(np.linspace(0, 2 * np.pi, 301)) ** 3, np.zeros(100)]
+    segments_rad = [0.01 * np.sin(np.linspace(0, 2 * np.pi, 301)) ** 3, np.zeros(100)]
     whole = np.concatenate([begun, np.zeros(2000)])
     spec = write_reference(shared_memory_fd(), whole, begun.size)
     writer = ReferenceWriter(spec, session.shared_state)
 
     def plan():
-        for piece_rad in pieces_rad:
+        for segment_rad in segments_rad:
             time.sleep(0.1)
-            writer.append(piece_rad)
+            writer.append(segment_rad)
         session.shared_state[StateField.LAST_SEGMENT] = 1
 
     planner = threading.Thread(target=plan)
@@ -223,7 +223,7 @@ def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
     session.obey(SessionJob(session.profile, spec))
     planner.join()
     samples = session.samples
-    expected = np.concatenate([begun, *pieces_rad])
+    expected = np.concatenate([begun, *segments_rad])
     assert session.finished.outcome == "complete"
     assert session.finished.counts["scheduled"] == len(samples) == expected.size
     reference_rad = samples["angle_reference_rad"]
@@ -233,7 +233,7 @@ def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
 
 
 @pytest.mark.parametrize(("bits", "held"), [(None, False), (0, True)])
-def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_signs_of_life(
+def test_pauses_of_virtual_time_are_short_for_a_drive_with_heartbeat(
     make_session, monkeypatch, bits, held
 ):
     """A drive on a line takes a host that is silent for 5 s for dead, the torque being on."""
@@ -261,7 +261,7 @@ def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_sign
     session.assert_safe()
 
 
-def test_a_stop_ends_the_wait_for_a_piece(make_session):
+def test_a_stop_ends_the_wait_for_a_segment(make_session):
     session = make_session()
     spec = ReferenceSpec(write_reference(shared_memory_fd(), np.zeros(900)).fd, 900, 300)
 

@@ -1,4 +1,4 @@
-"""The ring hands every record over once and in order, and says no when it is full."""
+"""The ring hands every record over once and in order, and refuses when it is full."""
 
 import struct
 import subprocess
@@ -41,7 +41,7 @@ def take_all(source, most=100):
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 12)), max_size=60))
-def test_any_mix_of_writing_and_reading_keeps_the_order(steps):
+def test_any_mix_of_writing_and_reading_preserves_the_order(steps):
     ring = Ring.create(RECORD.size, 8, shared_memory_fd())
     written, read = 0, []
     for writing, count in steps:
@@ -64,7 +64,7 @@ def test_a_full_ring_takes_no_more_until_something_is_read(ring):
     assert take_all(ring) == list(range(1, 9))
 
 
-def test_an_observer_never_holds_the_producer_up_and_counts_what_it_missed(ring):
+def test_an_observer_counts_missed_records_without_blocking(ring):
     observer = Observer(ring)
     for number in range(20):
         assert put(ring, number)
@@ -87,7 +87,7 @@ def test_an_observer_in_time_sees_everything(ring):
 
 
 @pytest.mark.process
-def test_another_process_reads_what_this_one_wrote(ring):
+def test_another_process_reads_the_records(ring):
     for number in range(5):
         put(ring, number)
     spec = ring.spec

@@ -46,16 +46,16 @@ def test_a_complete_session_has_every_tick(complete_session):
     session.assert_safe()
 
 
-def test_the_reference_starts_where_the_motor_stands_and_follows_the_excitation(complete_session):
+def test_the_reference_starts_at_the_angle_of_the_motor(complete_session):
     session, samples = complete_session
     relative = samples["angle_reference_rad"] - samples["angle_reference_rad"][0]
     assert np.allclose(relative, session.excitation.reference_rad, atol=1e-15)
     assert abs(samples["angle_reference_rad"][0] - samples["angle_rad"][0]) < 3 * 7e-5
 
 
-def test_the_tare_takes_the_offset_away(complete_session):
+def test_the_tare_removes_the_offset(complete_session):
     session, samples = complete_session
-    ready = session.parent.said(ReadyToRecord)[0].tare
+    ready = session.parent.messages_of(ReadyToRecord)[0].tare
     offset = session.profile.rig.simulation.offset
     axes = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
     for axis, expected in zip(axes, offset, strict=True):
@@ -79,11 +79,11 @@ def test_without_friction_and_noise_the_rig_is_the_computed_closed_loop(
     assert np.abs(samples["torque_command_nm"] - response.torque_nm).max() < 0.02 * scale
 
 
-def test_a_seed_gives_the_same_samples_again_and_without_one_it_is_fresh_and_stated(make_session):
+def test_a_seed_repeats_the_samples(make_session):
     session = make_session(excitation=BRIEF)
     session.obey(session.order(seed=None), session.order(seed=None))
     first, second = (
-        int(ready.tare["simulation_seed"]) for ready in session.parent.said(ReadyToRecord)
+        int(ready.tare["simulation_seed"]) for ready in session.parent.messages_of(ReadyToRecord)
     )
     assert first != second
     here, there = np.split(session.samples, 2)
@@ -94,7 +94,7 @@ def test_a_seed_gives_the_same_samples_again_and_without_one_it_is_fresh_and_sta
 
 
 class StopAt(VirtualClock):
-    """A clock that does something at one of its deadlines."""
+    """A clock that runs an action at one of its deadlines."""
 
     def __init__(self, at_ns, action):
         super().__init__()
@@ -171,7 +171,7 @@ def test_a_reading_beyond_its_limit_ends_in_a_fault_in_the_same_tick(
     session.assert_safe()
     assert session.finished.outcome == "fault"
     assert words in session.finished.reason
-    # With the session over, two more tell where the motor stands, unless the encoder failed.
+    # With the session over, two more measure the motor's angle, unless the encoder failed.
     after = 0 if session.finished.device_failed else 2
     assert session.drive.reads == read + after
     samples = session.samples
@@ -211,7 +211,7 @@ def test_a_device_that_fails_leaves_the_torque_off(make_session, read, error):
 
 
 @pytest.mark.parametrize("read", [20, 1200, 1600, 2000])
-def test_an_encoder_that_falls_silent_does_not_let_the_motor_run_away(make_session, read):
+def test_the_motor_does_not_run_away_without_encoder(make_session, read):
     session = make_session()
     session.drive.stale_at = read
     session.run()
@@ -235,26 +235,26 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
     stale = set(range(1500, 3500, 10)) | set(range(1501, 3500, 10))
     limits = replace(session.profile.limits, velocity_rad_s=1.0, stale_percent=6.0)
     session.profile = replace(session.profile, limits=limits)
-    type(session.drive).angle_stale, kept = (
+    type(session.drive).angle_stale, original = (
         property(lambda drive: drive.reads in stale),
         type(session.drive).angle_stale,
     )
     try:
         session.run()
     finally:
-        type(session.drive).angle_stale = kept
+        type(session.drive).angle_stale = original
     assert session.finished.outcome == "complete"
     assert np.flatnonzero(session.samples["status"] & Status.ANGLE_STALE).size == len(stale)
     assert session.finished.counts == books(scheduled=3000, stale_angles=len(stale))
     assert session.shared_state[StateField.STALE_ANGLES] == len(stale)
-    # Four per cent of ten seconds, of which there may be six: said once, and past the half of it.
+    # Four per cent of ten seconds, of which there may be six: reported once, and past half of it.
     [warning] = [event.message for event in session.events if event.level == "warning"]
     assert warning.startswith("Share of ticks without a new angle 3 % above warning level")
     assert "limit 6, limits.stale_percent" in warning
 
 
 def test_two_of_three_angles_may_not_be_old(make_session):
-    """No run of them is longer than two ticks, and yet the record would be worth nothing."""
+    """No run of them is longer than two ticks, but the record would be useless."""
     session = make_session()
     session.drive.stale_at, session.drive.stale_pattern = 0, (False, True, True)
     session.run()
@@ -296,7 +296,7 @@ def test_a_device_that_fails_at_the_stop_does_not_spoil_the_ending(make_session)
     assert_books_balance(session, samples)
 
 
-def test_it_refuses_to_start_while_the_motor_moves(make_session):
+def test_no_start_while_the_motor_moves(make_session):
     profile = make_session().profile
     brief = replace(profile.session, rest_timeout_s=2.0)
     session = make_session(profile=replace(profile, session=brief))
@@ -311,8 +311,8 @@ def test_it_refuses_to_start_while_the_motor_moves(make_session):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_it_refuses_to_start_where_the_reference_would_leave_the_limit(make_session, sign):
-    """As after a move: it was planned from the rig's zero, and nothing moves before it is known."""
+def test_no_start_if_the_reference_exceeds_the_limit(make_session, sign):
+    """As after a move: the plan starts at the rig's zero; its limits are checked before motion."""
     session = make_session()
     session.drive.fault_at = 1
     session.drive.fault = lambda angle: angle + sign * 1.56
@@ -359,7 +359,7 @@ def test_missed_ticks_are_skipped_flagged_and_counted(make_session):
 
 
 class WorkingClock(VirtualClock):
-    """A clock that goes on while this thread works, but not while the machine stands still."""
+    """A clock that runs while this thread works, but not while the computer is paused."""
 
     virtual = False
 
@@ -403,7 +403,7 @@ def test_too_many_missed_ticks_in_a_row_end_the_session(make_session):
     assert_books_balance(session, samples)
 
 
-def test_a_drive_that_ends_right_after_missed_ticks_ended_for_the_computers_sake(make_session):
+def test_missed_ticks_explain_a_drive_fault_just_after(make_session):
     session = make_session(clock=LateAt({2_000_000_000: 40_200_000}))
 
     def fail(_):
@@ -437,7 +437,7 @@ def test_ticks_missed_beyond_the_end_of_the_record_do_not_count(make_session):
 
 
 def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
-    # The ring holds 2 s. In real time nobody waits for the reader, which here sleeps that long.
+    # The ring holds 2 s. In real time the loop does not wait for the reader, which sleeps so long.
     profile = make_session().profile
     read_late = []
 
@@ -462,8 +462,8 @@ def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
     assert samples["status"][-1] & Status.TORQUE_OFF
 
 
-def test_a_computer_that_stands_still_takes_no_recorder_s_time(make_session, monkeypatch):
-    """Under the virtual clock it is waited for; here it reads once the ring has been full."""
+def test_a_paused_computer_does_not_count_as_recorder_lag(make_session, monkeypatch):
+    """The virtual clock waits for it; here it reads once the ring has been full."""
     profile = make_session().profile
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=2.0)
     session = make_session(excitation=excitation, buffered_s=2.0)
@@ -471,7 +471,7 @@ def test_a_computer_that_stands_still_takes_no_recorder_s_time(make_session, mon
 
     def stand_still(_):
         now_s[0] += 5.0
-        if len(taken) < 2:  # the first time the recorder stands still as well
+        if len(taken) < 2:  # the first time the recorder is paused as well
             taken.append(b"" if not taken else session.channels.samples.take(1500))
 
     clock = SimpleNamespace(monotonic=lambda: now_s[0], sleep=stand_still)
@@ -482,7 +482,7 @@ def test_a_computer_that_stands_still_takes_no_recorder_s_time(make_session, mon
     assert samples["tick"].tolist() == list(range(session.finished.counts["scheduled"]))
 
 
-def test_a_recorder_that_does_not_read_is_not_waited_for_for_ever(make_session, monkeypatch):
+def test_the_wait_for_a_blocked_recorder_has_a_timeout(make_session, monkeypatch):
     profile = make_session().profile
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=2.0)
     session = make_session(excitation=excitation, buffered_s=2.0)
@@ -510,7 +510,7 @@ def test_a_sample_lost_in_the_last_tick_is_a_fault_too(make_session):
     assert_books_balance(session, session.samples)
 
 
-def test_ticks_missed_up_to_the_end_are_judged_like_all_others(make_session):
+def test_ticks_missed_at_the_end_count_like_all_others(make_session):
     # The last 100 ticks of the record and some beyond.
     session = make_session(clock=LateAt({3_902_000_000: 150_000_000}))
     session.run()
@@ -523,7 +523,7 @@ def test_ticks_missed_up_to_the_end_are_judged_like_all_others(make_session):
     assert_books_balance(session, session.samples)
 
 
-def test_a_swinging_beam_is_not_taken_for_a_drift_of_the_sensor(make_session):
+def test_a_swinging_beam_is_no_drift_of_the_sensor(make_session):
     from rigd.excitation import step
 
     profile = make_session().profile
@@ -539,16 +539,16 @@ def test_a_swinging_beam_is_not_taken_for_a_drift_of_the_sensor(make_session):
     assert "tare_drift_nm" not in session.finished.results
 
 
-def test_settings_that_were_not_granted_are_told_and_logged(make_session):
+def test_refused_settings_are_reported_and_logged(make_session):
     session = make_session(excitation=BRIEF)
     session.obtained = {"clock": "real", "memory": "refused: no", "scheduling": "refused: never"}
     session.run()
     [warning] = [event for event in session.events if event.level == "warning"]
     assert "memory (refused: no), scheduling (refused: never)" in warning.message
-    assert session.parent.said(DevicesConnected)[0].realtime == session.obtained
+    assert session.parent.messages_of(DevicesConnected)[0].realtime == session.obtained
 
 
-def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session):
+def test_refusals_of_supervisor_and_recorder_are_reported(make_session):
     session = make_session(excitation=BRIEF)
     order = session.order()
     refused = {"supervisor_scheduling": "refused: not permitted"}
@@ -560,7 +560,7 @@ def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session)
     )
 
 
-def test_a_supervisor_that_does_nothing_does_not_keep_the_torque_on(make_session, monkeypatch):
+def test_torque_ends_without_action_of_the_supervisor(make_session, monkeypatch):
     monkeypatch.setattr("rigd.engine._session_sequence._START_TIMEOUT_S", 0.2)
     session = make_session()
     session.shared_state[StateField.GO] = 0
@@ -582,7 +582,7 @@ def test_the_drive_is_disabled_by_the_cycle_after_the_session_and_at_the_end(mak
     assert len(calls) == 3
 
 
-def test_a_drive_that_may_still_be_on_is_told(make_session):
+def test_a_drive_possibly_still_on_is_reported(make_session):
     session = make_session(excitation=BRIEF)
     session.drive.doubt = "Drive: it does not show that it is off."
     finished = session.run().finished
@@ -591,7 +591,7 @@ def test_a_drive_that_may_still_be_on_is_told(make_session):
 
 
 class StallOnTheWayBack(VirtualClock):
-    """Stands still for 60 periods, once, after the record."""
+    """Pauses for 60 periods, once, after the record."""
 
     shared_state = None
 
@@ -603,7 +603,7 @@ class StallOnTheWayBack(VirtualClock):
         return late_ns
 
 
-def test_standing_still_on_the_way_back_has_its_limit_too(make_session):
+def test_missed_ticks_while_returning_have_their_limit(make_session):
     clock = StallOnTheWayBack()
     session = make_session(clock=clock, excitation=BRIEF)
     clock.shared_state = session.shared_state
@@ -612,12 +612,12 @@ def test_standing_still_on_the_way_back_has_its_limit_too(make_session):
     session.assert_safe()
 
 
-def test_a_doubt_about_the_age_of_readings_is_told_once_in_each_session(make_session):
+def test_doubt_about_reading_age_is_reported_once_per_session(make_session):
     session = make_session()
     health = session.devices.sensor.health
 
     def doubtful():
-        late = session.shared_state[StateField.SCHEDULED] > 1000 or session.parent.said(
+        late = session.shared_state[StateField.SCHEDULED] > 1000 or session.parent.messages_of(
             SessionFinished
         )
         count = f"Late so far: {session.shared_state[StateField.SCHEDULED]}." if late else ""
@@ -627,16 +627,16 @@ def test_a_doubt_about_the_age_of_readings_is_told_once_in_each_session(make_ses
     short = hold(rate_hz=1000.0, duration_s=2.0, rest_s=0.2, ring_down_s=0.0)
     session.obey(session.order(short), session.order(short))
     events = session.events
-    told = [event for event in events if event.message == "Records are late."]
-    assert [event.level for event in told] == ["warning", "warning"]
-    assert told[0].t_ns > 1_000_000_000
-    assert told[1].t_ns == 0, "in its tare"
+    doubts = [event for event in events if event.message == "Records are late."]
+    assert [event.level for event in doubts] == ["warning", "warning"]
+    assert doubts[0].t_ns > 1_000_000_000
+    assert doubts[1].t_ns == 0, "in its tare"
     counts = [event.message for event in events if event.message.startswith("Late so far")]
     assert counts == ["Late so far: 2200."] * 2
-    assert [m.outcome for m in session.parent.said(SessionFinished)] == ["complete"] * 2
+    assert [m.outcome for m in session.parent.messages_of(SessionFinished)] == ["complete"] * 2
 
 
-def test_what_the_sensor_knows_of_the_cause_is_the_remedy(make_session):
+def test_the_cause_known_to_the_sensor_is_the_remedy(make_session):
     session = make_session()
     sensor = session.devices.sensor
     health = sensor.health

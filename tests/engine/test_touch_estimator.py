@@ -14,18 +14,18 @@ RATE_HZ = 1000.0
 
 
 class Growing:
-    """Notes what it is asked, and with how many samples after the detection."""
+    """Records its calls, each with the number of samples after the detection."""
 
-    def __init__(self, asked):
-        self.asked = asked
+    def __init__(self, requests):
+        self.requests = requests
 
     def preview(self, record):
-        self.asked.append(("look", record.angle_rad.size - record.detected))
+        self.requests.append(("look", record.angle_rad.size - record.detected))
 
     def update(self, record, *, scan, first):
         assert not scan
         after = record.angle_rad.size - record.detected
-        self.asked.append(("first" if first else "last", after))
+        self.requests.append(("first" if first else "last", after))
         return SimpleNamespace(as_dict=lambda start_s: {"start_s": start_s})
 
 
@@ -42,58 +42,58 @@ def samples(first, last, *touches, off=False):
 
 @pytest.fixture
 def followed():
-    """Return a function that hands on blocks of samples, and what comes of it."""
+    """Return a function that passes on blocks of samples and returns the calls and reports."""
 
     def follow(ends, *touches, realtime=True, off=False):
-        asked, told = [], []
+        requests, reports = [], []
         job = TouchJob(None, 0, RATE_HZ, None, None, SimpleNamespace() if realtime else None)
-        follower = RunningTouchEstimator(SimpleNamespace(follow=lambda: Growing(asked)), job)
+        follower = RunningTouchEstimator(SimpleNamespace(follow=lambda: Growing(requests)), job)
         for first, last in zip([0, *ends], ends, strict=False):
             follower.take(samples(first, last, *touches, off=off and last == ends[-1]))
             while some := follower.reports():
-                told += some
-        return asked, told
+                reports += some
+        return requests, reports
 
     return follow
 
 
-def test_it_looks_then_answers_then_answers_again(followed):
-    asked, told = followed(range(5, 2300, 5), TOUCH)
-    assert asked == [("look", 25), ("first", 50), ("last", 200)]
-    assert [(each.number, each.tick, each.final) for each in told] == [
+def test_a_preview_precedes_the_first_and_last_estimate(followed):
+    requests, reports = followed(range(5, 2300, 5), TOUCH)
+    assert requests == [("look", 25), ("first", 50), ("last", 200)]
+    assert [(each.number, each.tick, each.final) for each in reports] == [
         (1, TOUCH, False),
         (1, TOUCH, True),
     ]
-    assert [each.document["start_s"] for each in told] == [0.5, 0.5]
+    assert [each.document["start_s"] for each in reports] == [0.5, 0.5]
 
 
-def test_samples_that_came_meanwhile_do_not_change_the_first_answer(followed):
-    asked, _ = followed([1000, 2000, 2040, 2300], TOUCH)
-    assert asked == [("look", 25), ("first", 50), ("last", 200)]
+def test_later_samples_do_not_change_the_first_estimate(followed):
+    requests, _ = followed([1000, 2000, 2040, 2300], TOUCH)
+    assert requests == [("look", 25), ("first", 50), ("last", 200)]
     assert followed([1000, 2300], TOUCH)[0] == [("first", 50), ("last", 200)]
 
 
-def test_where_nobody_waits_only_the_last_answer_is_made(followed):
+def test_only_the_last_estimate_without_realtime(followed):
     assert followed([1000, 2300], TOUCH, realtime=False)[0] == [("last", 200)]
 
 
 @pytest.mark.parametrize(
-    ("end", "asked"),
+    ("end", "requests"),
     [(2031, [("last", 31)]), (2050, [("first", 50), ("last", 50)])],
 )
-def test_a_record_that_ends_is_estimated_as_far_as_it_goes(followed, end, asked):
-    assert followed([1000, end], TOUCH, off=True)[0] == asked
+def test_a_record_is_estimated_to_its_end(followed, end, requests):
+    assert followed([1000, end], TOUCH, off=True)[0] == requests
 
 
-def test_the_beam_is_not_free_for_some_time_after_a_touch(followed):
-    _, told = followed(range(50, 3400, 50), TOUCH, TOUCH + 900)
-    assert [(each.number, each.final) for each in told] == [
+def test_the_beam_is_in_contact_for_a_time_after_a_touch(followed):
+    _, reports = followed(range(50, 3400, 50), TOUCH, TOUCH + 900)
+    assert [(each.number, each.final) for each in reports] == [
         (1, False), (1, True), (2, False), (2, True),
     ]  # fmt: skip
-    assert told[-1].document["start_s"] == (TOUCH + 800) / RATE_HZ
+    assert reports[-1].document["start_s"] == (TOUCH + 800) / RATE_HZ
 
 
-def test_of_a_touch_soon_after_another_nothing_is_known_before_it(followed):
-    asked, told = followed(range(25, 3000, 25), TOUCH, TOUCH + 300)
-    assert asked[3:] == [("look", 25), ("first", 50), ("last", 200)]
-    assert told[-1].document["start_s"] == (TOUCH + 300) / RATE_HZ
+def test_a_touch_soon_after_another_starts_at_its_detection(followed):
+    requests, reports = followed(range(25, 3000, 25), TOUCH, TOUCH + 300)
+    assert requests[3:] == [("look", 25), ("first", 50), ("last", 200)]
+    assert reports[-1].document["start_s"] == (TOUCH + 300) / RATE_HZ

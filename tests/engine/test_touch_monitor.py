@@ -1,4 +1,4 @@
-"""What the control loop does about a touch; the detector itself has its own tests."""
+"""Reaction of the control loop to a touch; the detector itself has its own tests."""
 
 from array import array
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ def one_pass(first):
 
 
 class ScriptedDetector:
-    """Detects in the ticks that the test says, if it is armed."""
+    """Detects in the ticks set by the test, if it is armed."""
 
     def __init__(self, *_):
         self.armed_at, self.disarmed_at = [], []
@@ -81,7 +81,7 @@ def search(monkeypatch):
 
 
 def run(search, until=None):
-    """Run the ticks; returns what each contact was, by its tick."""
+    """Run the ticks; return the contacts by their ticks."""
     contacts = {}
     for tick in range(until or search.planned.size):
         search.cycle.flags = 0
@@ -93,13 +93,13 @@ def run(search, until=None):
     return contacts
 
 
-def test_without_a_touch_the_reference_stays(search):
+def test_the_reference_is_unchanged_without_a_touch(search):
     assert run(search) == {}
     assert np.array_equal(search.reference, search.planned)
     assert search.detector.armed_at == [search.one.begins, search.two.begins]
 
 
-def test_after_a_touch_it_brakes_holds_and_goes_back(search):
+def test_the_motor_brakes_holds_and_returns_after_a_touch(search):
     tick = search.one.begins + 300
     search.detector.at = {tick}
     contacts = run(search, tick + 1)
@@ -112,15 +112,15 @@ def test_after_a_touch_it_brakes_holds_and_goes_back(search):
     # No step in angle or speed: the deceleration is that of the braking path at most.
     slowing = np.diff(speed[tick - 1 : tick + 60]) * RATE_HZ
     assert np.abs(slowing).max() <= 1.5 / BRAKING.duration_s + 1e-6
-    stands = reference[tick + 60 : tick + 200]
-    assert np.ptp(stands) == 0.0
-    assert stands[0] == pytest.approx(reference[tick] + 0.5 * BRAKING.duration_s, abs=1e-3)
+    held_rad = reference[tick + 60 : tick + 200]
+    assert np.ptp(held_rad) == 0.0
+    assert held_rad[0] == pytest.approx(reference[tick] + 0.5 * BRAKING.duration_s, abs=1e-3)
     assert reference[tick + 200 + BACK.size] == pytest.approx(0.0)
     assert not reference[tick + 200 + BACK.size : search.two.begins].any()
     assert np.array_equal(reference[search.one.ends :], search.planned[search.one.ends :])
 
 
-def test_it_looks_again_in_the_next_pass(search):
+def test_the_detector_is_armed_again_in_the_next_pass(search):
     search.detector.at = {search.one.begins + 100, search.one.ends + 50, search.two.begins + 100}
     contacts = run(search)
     assert list(contacts) == [search.one.begins + 100, search.two.begins + 100]
@@ -145,7 +145,7 @@ def test_a_touch_on_the_way_back_stops_the_session(search):
     assert search.cycle.flags & Status.TOUCHED
 
 
-def test_too_great_a_force_ends_as_a_fault(search):
+def test_an_excessive_force_is_a_fault(search):
     tick = search.one.begins + 50
     search.detector.force_n = {tick - 20: -6.0, tick: -6.0, tick + 1: -6.0}
     contacts = run(search)
@@ -154,7 +154,7 @@ def test_too_great_a_force_ends_as_a_fault(search):
     assert "6 N exceeds force_limit_n = 5 N" in contacts[tick + 1].message
 
 
-def test_the_detector_is_told_all(search):
+def test_the_detector_receives_all_readings(search):
     search.cycle.wrench = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     search.cycle.flags = int(Status.ANGLE_STALE | Status.WRENCH_STALE)
     search.monitor.step(3, 3)
@@ -167,7 +167,7 @@ def test_the_detector_is_told_all(search):
     speed=st.floats(-3.0, 3.0),
     hold=st.integers(50, 300),
 )
-def test_what_follows_a_touch_is_smooth_and_ends_at_the_start(tick, speed, hold):
+def test_the_path_after_a_touch_is_smooth(tick, speed, hold):
     approach = Approach((), BRAKING, hold, BACK, 1.0)
     recent = tuple(0.3 + speed * k / RATE_HZ for k in (-2, -1, 0))
     ends = 1000 + BACK.size
@@ -175,7 +175,7 @@ def test_what_follows_a_touch_is_smooth_and_ends_at_the_start(tick, speed, hold)
     assert path.shape == (ends - tick - 1,)
     assert path[-1] == pytest.approx(-0.2)
     if ends - tick - 1 - BACK.size < 50:
-        return  # too late to brake: it stood in the pause already
+        return  # too late to brake: the motor was at rest in the pause already
     whole = np.concatenate([recent, path])
     jump = np.abs(np.diff(whole, 2)).max() * RATE_HZ**2
     back = 6 * (abs(path[60] + 0.2) + 0.2) / 0.4**2

@@ -1,4 +1,4 @@
-"""The table of workers: what it names is there."""
+"""The table of workers, and the modules and messages in it."""
 
 import pkgutil
 import re
@@ -18,13 +18,13 @@ ARCHITECTURE = Path(__file__).parents[2] / "docs" / "architecture.md"
 @pytest.mark.parametrize(
     "worker", [each for each in WORKERS if each is not SUPERVISOR], ids=lambda worker: worker.name
 )
-def test_module_and_messages_of_a_row_are_there(worker):
+def test_module_and_messages_of_each_row_exist(worker):
     assert find_spec(worker.module)
     elsewhere = {each.__name__ for each in (LiveAddress, LiveSessionShown)}
     assert all(hasattr(messages, name) or name in elsewhere for name in worker.sends)
 
 
-def test_the_estimator_of_the_fit_is_there():
+def test_the_estimator_of_the_fit_exists():
     assert pkgutil.resolve_name(ONLINE_ESTIMATOR).estimate
 
 

@@ -1,4 +1,4 @@
-"""Where the profile of a name is looked for, and which of several is taken."""
+"""Folders searched for the profile of a name, and their order."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def put(folder):
     return folder / "sim.toml"
 
 
-def test_the_working_folder_comes_before_the_users_and_that_before_the_shipped(own):
+def test_order_of_the_folders_of_profiles(own):
     here = put(Path("hw_profiles"))
     shipped = CHECKOUT / "hw_profiles" / "sim.toml"
     assert [(file.path, file.origin.name) for file in profile_files()["sim"]] == [
@@ -40,19 +40,19 @@ def test_the_working_folder_comes_before_the_users_and_that_before_the_shipped(o
             path.unlink()
 
 
-def test_in_the_checkout_itself_its_profiles_are_the_shipped_ones(own, monkeypatch):
+def test_profiles_of_a_checkout_are_the_shipped_ones(own, monkeypatch):
     monkeypatch.chdir(CHECKOUT)
     assert [file.origin.name for file in profile_files()["sim"]] == ["USER", "SHIPPED"]
     assert [file.origin.name for file in profile_files()["antenna_can"]] == ["SHIPPED"]
 
 
-def test_the_users_folder_is_below_his_home_unless_said_otherwise(tmp_path, monkeypatch):
+def test_the_user_s_folder_is_below_home_by_default(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    for said in (None, "", "relative/folder"):
-        if said is None:
+    for value in (None, "", "relative/folder"):
+        if value is None:
             monkeypatch.delenv("XDG_CONFIG_HOME")
         else:
-            monkeypatch.setenv("XDG_CONFIG_HOME", said)
+            monkeypatch.setenv("XDG_CONFIG_HOME", value)
         assert user_folder() == tmp_path / ".config" / "rigd" / "profiles"
 
 
@@ -66,7 +66,7 @@ def test_a_user_without_a_home_has_the_shipped_profiles(monkeypatch):
     assert load_profile("sim").path.parent == CHECKOUT / "hw_profiles"
 
 
-def test_from_a_folder_that_is_gone_the_shipped_profiles_are_found(tmp_path, monkeypatch):
+def test_the_shipped_profiles_are_found_from_a_removed_folder(tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()

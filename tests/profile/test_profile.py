@@ -1,4 +1,4 @@
-"""Profiles: what the shipped one says, and every way to get one wrong."""
+"""Profiles: the shipped one, and all kinds of mistakes."""
 
 import dataclasses
 import os
@@ -35,7 +35,7 @@ def test_shipped_profile_is_stable(profile):
     assert check_stability(close_loop(profile.loop_model())) is None
 
 
-def test_the_loop_is_made_of_the_rigs_own_values(profile):
+def test_the_loop_has_the_values_of_the_rig(profile):
     rig = profile.rig
     rig = dataclasses.replace(
         rig,
@@ -69,13 +69,13 @@ def test_every_number_has_a_source(profile):
     assert len(sources) == len(numbers) > 40
 
 
-def test_profile_is_frozen_and_can_be_sent_to_another_process(profile):
+def test_profile_is_frozen_and_picklable(profile):
     assert pickle.loads(pickle.dumps(profile)) == profile
     with pytest.raises(dataclasses.FrozenInstanceError):
         profile.name = "other"
 
 
-def test_a_path_and_a_name_find_the_same_profile():
+def test_path_and_name_find_the_same_profile():
     profile = load_profile("sim")
     assert load_profile(profile.path) == profile
     assert load_profile(str(profile.path)).rig == profile.rig
@@ -130,7 +130,7 @@ def test_a_binary_file_is_named(tmp_path):
         load_profile(path)
 
 
-def test_a_syntax_error_is_given_with_its_line(refuse):
+def test_a_syntax_error_has_its_line(refuse):
     [line] = refuse(("[motor]", "[motor"))
     assert re.search(r"not valid TOML: .*line \d+", line)
 
@@ -141,7 +141,7 @@ def test_an_unknown_key_names_the_closest_one_and_its_unit(refuse):
     assert len(lines) == 2  # and the right one is missing
 
 
-def test_a_wrong_unit_says_which_is_meant(refuse):
+def test_a_wrong_unit_is_reported_with_the_right_one(refuse):
     lines = refuse((INERTIA, 'inertia_g_cm2 = { value = 2.0e4, source = "assumed" }'))
     assert (
         "motor.inertia_g_cm2 = 20000 has the wrong unit ('g_cm2'); "
@@ -166,14 +166,14 @@ def test_a_missing_section_is_named_once(refuse, sim_toml):
     assert refuse((section, "")) == ["section [encoder] is missing."]
 
 
-def test_what_has_a_default_in_the_code_must_stand_in_a_profile(refuse, sim_toml):
+def test_defaults_of_the_code_are_required_in_a_profile(refuse, sim_toml):
     section = sim_toml[sim_toml.index("[beam.damping]") : sim_toml.index("[motor]")]
     assert refuse((section, "")) == ["section [beam.damping] is missing."]
     [line] = refuse(("tool_inertia_kg_m2 = { value = 0.0, source", "# { value = 0.0, source"))
     assert line.startswith("sensor.tool_inertia_kg_m2 is missing")
 
 
-def test_a_section_must_be_one(refuse, sim_toml):
+def test_a_section_must_be_a_table(refuse, sim_toml):
     section = sim_toml[sim_toml.index("[encoder]") : sim_toml.index("[sensor]")]
     lines = refuse((section, ""), ("[rig]", "encoder = 3\n[rig]"))
     assert "encoder = 3 must be a section; write [encoder] and its keys below." in lines
@@ -231,7 +231,7 @@ def test_a_made_up_source_is_refused(refuse):
     assert '"datasheet"' in line
 
 
-def test_more_than_value_and_source_is_refused(refuse):
+def test_only_value_and_source_are_allowed(refuse):
     [line] = refuse((INERTIA, INERTIA.replace(" }", ", error = 0.1 }")))
     assert "unknown part 'error'" in line
 
@@ -343,9 +343,7 @@ def test_simulated_devices_need_their_section(refuse, sim_toml):
         ("stiffness_drift_per_s", -1e-5),
     ],
 )
-def test_what_is_not_simulated_beside_drag_of_the_air_is_refused(
-    loaded, refuse, sim_toml, name, value
-):
+def test_unsupported_settings_with_air_drag_are_refused(loaded, refuse, sim_toml, name, value):
     def with_extras(**extras):
         more = [f'{key} = {{ value = {extras[key]}, source = "assumed" }}' for key in extras]
         return sim_toml, "\n".join([sim_toml, *more, ""])
@@ -357,7 +355,7 @@ def test_what_is_not_simulated_beside_drag_of_the_air_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
         ({"hum_nm": -1e-3}, "simulation.hum_nm = -0.001 N·m must be at least 0."),
         ({"hum_hz": 0.0}, "simulation.hum_hz = 0 Hz must be more than 0."),
@@ -376,13 +374,13 @@ def test_what_is_not_simulated_beside_drag_of_the_air_is_refused(
         ),
     ],
 )
-def test_disturbances_that_cannot_be_simulated_are_refused(refuse, sim_toml, more, said):
+def test_unsupported_disturbances_are_refused(refuse, sim_toml, more, message):
     lines = [f'{key} = {{ value = {more[key]}, source = "assumed" }}' for key in more]
     [line] = refuse((sim_toml, "\n".join([sim_toml, *lines, ""])))
-    assert line.startswith(said)
+    assert line.startswith(message)
 
 
-def test_a_hum_may_be_faster_than_the_ticks_where_a_sensor_streams(loaded):
+def test_a_hum_may_be_faster_than_the_ticks_of_a_stream(loaded):
     path = Path(__file__).resolve().parents[2] / "hw_profiles" / "antenna_serial.toml"
     lines = [
         f'{key} = {{ value = {value}, source = "assumed" }}'
@@ -394,35 +392,35 @@ def test_a_hum_may_be_faster_than_the_ticks_where_a_sensor_streams(loaded):
     assert loaded(text).rig.simulation.hum_hz == 700.0
 
 
-def test_a_projection_of_nothing_is_refused(refuse):
+def test_a_zero_projection_is_refused(refuse):
     [line] = refuse(("0.0, 0.0, 1.0]", "0.0, 0.0, 0.0]"))
     assert line.startswith("sensor.projection is all zero")
 
 
-def test_a_shear_that_is_the_torque_is_refused(refuse):
+def test_a_shear_equal_to_the_torque_is_refused(refuse):
     [line] = refuse(("[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 2.0]"))
     assert line.startswith("sensor.shear_projection = [0, 0, 0, 0, 0, 2] is a multiple of")
 
 
-def test_the_base_shear_may_be_left_out(loaded, sim_toml):
+def test_the_base_shear_is_optional(loaded, sim_toml):
     lines = [line for line in sim_toml.splitlines() if not line.startswith("shear_projection")]
     profile = loaded("\n".join(lines))
     assert profile.rig.sensor.shear_projection == (0.0,) * 6
 
 
 @pytest.mark.parametrize(
-    ("obstacle", "said"),
+    ("obstacle", "message"),
     [
         ("x=0.5", "simulation.obstacles: Obstacle 'x=0.5': 'angle' is missing"),
         ("x=1.5,angle=1", "simulation.obstacles: Obstacle 'x=1.5,angle=1': x=1.5 m lies beyond"),
     ],
 )
-def test_obstacles_are_looked_at(refuse, sim_toml, obstacle, said):
+def test_obstacles_are_checked(refuse, sim_toml, obstacle, message):
     [line] = refuse((sim_toml, f'{sim_toml}\nobstacles = ["{obstacle}"]\n'))
-    assert line.startswith(said)
+    assert line.startswith(message)
 
 
-def test_an_obstacle_beside_what_is_not_simulated_with_it_is_refused(refuse, sim_toml):
+def test_unsupported_settings_with_an_obstacle_are_refused(refuse, sim_toml):
     more = 'obstacles = ["x=0.5,angle=1"]\ntip_mass_kg = { value = 1e-3, source = "assumed" }\n'
     [line] = refuse((sim_toml, f"{sim_toml}\n{more}"))
     assert line.startswith("simulation.obstacles: simulation.tip_mass_kg and an obstacle")
@@ -441,7 +439,7 @@ def test_all_problems_are_reported_at_once(refuse):
     assert any(line.startswith("name is missing") for line in lines)
 
 
-def test_the_shipped_profile_stands_where_the_checkout_keeps_it(profile):
+def test_the_shipped_profile_is_in_hw_profiles(profile):
     assert profile.path == Path(__file__).resolve().parents[2] / "hw_profiles" / "sim.toml"
 
 
@@ -454,7 +452,7 @@ def test_the_shipped_profile_stands_where_the_checkout_keeps_it(profile):
         ("recorder_lag_s = { value = 12.0", "recorder_lag_s = { value = 15.9"),
     ],
 )
-def test_limits_that_can_only_just_be_exceeded_are_taken(sim_toml, tmp_path, old, new):
+def test_barely_exceedable_limits_are_accepted(sim_toml, tmp_path, old, new):
     assert old in sim_toml
     path = tmp_path / "rig.toml"
     path.write_text(sim_toml.replace(old, new), encoding="utf-8")
@@ -470,8 +468,8 @@ def test_a_seed_of_the_noise_is_optional_and_a_whole_number(sim_toml, tmp_path):
         if not refused:
             assert load_profile(path).rig.simulation.seed == int(value)
             continue
-        with pytest.raises(ProfileError) as told:
+        with pytest.raises(ProfileError) as caught:
             load_profile(path)
-        assert "simulation.seed" in str(told.value)
-        assert refused in str(told.value)
-        assert len(str(told.value).splitlines()) == 1, str(told.value)
+        assert "simulation.seed" in str(caught.value)
+        assert refused in str(caught.value)
+        assert len(str(caught.value).splitlines()) == 1, str(caught.value)

@@ -1,4 +1,4 @@
-"""Other values in the text of a profile: comments stay, and it says what it is told to say."""
+"""Other values in the text of a profile: comments stay, and the values are the new ones."""
 
 import pytest
 
@@ -27,7 +27,7 @@ def shipped():
         (Setting("cia402.sync_gaps", False), "sync_gaps = false"),
     ],
 )
-def test_a_value_stands_where_its_key_stood(loaded, shipped, setting, line):
+def test_a_value_replaces_that_of_its_key(loaded, shipped, setting, line):
     text = with_settings(shipped.text, [setting])
     old, new = shipped.text.splitlines(), text.splitlines()
     assert len(old) == len(new)
@@ -42,15 +42,17 @@ def test_a_value_stands_where_its_key_stood(loaded, shipped, setting, line):
 def test_reasons_become_comments_above(loaded, shipped):
     text = with_settings(shipped.text, [Setting("cia402.node_id", 7, reason="Because. " * 20)])
     lines = text.splitlines()
-    place = lines.index('node_id = { value = 7, source = "assumed" }')
-    assert lines[place - 1].startswith("# Because.")
-    assert max(map(len, lines[place - 3 : place])) <= 100
+    index = lines.index('node_id = { value = 7, source = "assumed" }')
+    assert lines[index - 1].startswith("# Because.")
+    assert max(map(len, lines[index - 3 : index])) <= 100
     assert loaded(text).rig.cia402.node_id == 7
 
 
-def test_a_key_that_is_shown_nowhere_comes_first_in_its_section(shipped):
-    bare = "\n".join(line for line in shipped.text.splitlines() if "accept_without" not in line)
-    text = with_settings(bare, [Setting("cia402.accept_without", ("torque_limit",))])
+def test_a_new_key_comes_first_in_its_section(shipped):
+    without_acceptance = "\n".join(
+        line for line in shipped.text.splitlines() if "accept_without" not in line
+    )
+    text = with_settings(without_acceptance, [Setting("cia402.accept_without", ("torque_limit",))])
     lines = text.splitlines()
     assert lines[lines.index("[cia402]") + 1] == 'accept_without = ["torque_limit"]'
     with pytest.raises(KeyError):

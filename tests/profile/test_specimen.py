@@ -1,4 +1,4 @@
-"""Specimens in their own files: found by name, validated as profiles are, mounted on a rig."""
+"""Specimens in their own files: found by name, validated like profiles, mounted on a rig."""
 
 import re
 from dataclasses import replace
@@ -48,7 +48,7 @@ def test_a_specimen_has_a_beam_and_may_have_damping(write):
     assert load_specimen(write(BEAM + DAMPING)).damping == Damping(8e-5, 1.0, 5e-2, 0.6)
 
 
-def test_its_beam_takes_the_place_of_the_profiles(write):
+def test_its_beam_replaces_that_of_the_profile(write):
     path = write(BEAM)
     profile = load_profile("sim")
     mounted = with_specimen(profile, " antenna 4 ")
@@ -67,7 +67,7 @@ def test_its_beam_takes_the_place_of_the_profiles(write):
     assert "nominal damping of its own" in mounted.specimen_in_words
 
 
-def test_how_well_its_beam_is_known_is_its_own(write, tmp_path):
+def test_uncertainty_of_its_beam_replaces_that_of_the_profile(write, tmp_path):
     path = write_profile(tmp_path)
     stated = "torque_scale_percent = 2.0, length_percent = 0.3, density_percent = 4.0"
     numbers = re.sub(r"= ([\d.]+),?", r'= { value = \1, source = "measured" }\n', stated)
@@ -86,7 +86,7 @@ def test_how_well_its_beam_is_known_is_its_own(write, tmp_path):
     assert uncertainty.stated == {"torque_scale_percent": 2.0}
 
 
-def test_a_mass_at_the_tip_is_the_specimen_s_own(write):
+def test_tip_mass_of_a_specimen(write):
     profile = replace(load_profile("sim"), tip_mass_kg=3e-4, axis_tilt_deg=1.0)
     write(BEAM)
     mounted = with_specimen(profile, "antenna 4")
@@ -98,20 +98,20 @@ def test_a_mass_at_the_tip_is_the_specimen_s_own(write):
     assert "tip mass 0.5 g" in mounted.specimen_in_words
 
 
-def test_the_same_beam_is_said_to_be_the_same(write):
+def test_an_equal_beam_is_reported_as_equal(write):
     write(BEAM.replace("0.95", "0.98").replace("0.0903", "0.090275"))
     words = with_specimen(load_profile("sim"), "antenna 4").specimen_in_words
     assert words.endswith("beam as in the profile.")
 
 
 @pytest.mark.parametrize("name", ["", "antenna 5", "../specimens/antenna 4", "antenna 4.toml", "."])
-def test_any_other_name_is_a_label(write, name):
+def test_an_unknown_name_is_a_label(write, name):
     write(BEAM)
     profile = load_profile("sim")
     assert with_specimen(profile, name) is profile
 
 
-def test_the_working_folder_comes_before_the_users_own(write, tmp_path, monkeypatch):
+def test_the_working_folder_comes_before_the_user_s(write, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     assert specimen_files() == {}
     write(BEAM, folder="config/rigd/specimens")
@@ -144,7 +144,7 @@ def test_the_working_folder_comes_before_the_users_own(write, tmp_path, monkeypa
         ("steel", "x" * 17_000, "is longer than 16384 bytes"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named(write, old, new, complaint):
+def test_mistakes_are_named(write, old, new, complaint):
     assert old in BEAM
     path = write(BEAM.replace(old, new, 1))
     with pytest.raises(ProfileError) as caught:

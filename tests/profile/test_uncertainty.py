@@ -26,7 +26,7 @@ def with_examples(name):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_profiles_state_none_and_show_how(loaded, name):
+def test_shipped_profiles_have_uncertainty_in_comments(loaded, name):
     profile = load_profile(name)
     assert profile.uncertainty.stated == {}
     assert (profile.tip_mass_kg, profile.axis_tilt_deg) == (None, None)
@@ -51,7 +51,7 @@ def header_of(loaded):
     return header_of
 
 
-def test_a_session_carries_what_its_profile_states(header_of):
+def test_a_session_has_the_uncertainty_of_its_profile(header_of):
     def metadata(text):
         header = header_of(text.replace("length_percent", "# length_percent"))
         return {k: v for k, v in header.metadata.items() if k.startswith("uncertainty")}
@@ -63,7 +63,7 @@ def test_a_session_carries_what_its_profile_states(header_of):
     }  # fmt: skip
 
 
-def test_a_share_of_more_than_half_is_refused(complaints_of):
+def test_an_uncertainty_above_half_is_refused(complaints_of):
     text = with_examples("sim")
     [line] = complaints_of(
         text, ("length_percent = { value = 0.05", "length_percent = { value = 60")
@@ -80,12 +80,12 @@ def test_a_session_states_the_uniformity_of_the_beam(header_of, percent, stated)
     assert header_of(text).metadata["uniformity_percent"] == stated
 
 
-def test_a_session_may_state_a_uniformity_of_its_own(header_of):
+def test_a_session_may_state_another_uniformity(header_of):
     text = load_profile("sim").text
     assert header_of(text, uniformity_percent=0.0).metadata["uniformity_percent"] == "0.0"
 
 
-def test_tip_mass_and_tilt_are_in_the_file_only_if_they_are_stated(header_of):
+def test_tip_mass_and_tilt_are_in_the_file_only_if_stated(header_of):
     def stated(text):
         metadata = header_of(text).metadata
         return metadata.get("tip_mass_kg"), metadata.get("axis_tilt_deg")
@@ -113,7 +113,7 @@ def test_absurd_tip_masses_and_tilts_are_refused(complaints_of, line, wrong, wor
     assert words in complaint
 
 
-def test_a_beam_that_is_far_from_uniform_is_refused(complaints_of):
+def test_a_beam_far_from_uniform_is_refused(complaints_of):
     text = with_examples("sim")
     [line] = complaints_of(
         text, ("uniformity_percent = { value = 0.1", "uniformity_percent = { value = 12")

@@ -18,5 +18,5 @@ def test_the_ending_of_a_key_is_its_unit(key, unit):
     assert unit_of(key) == unit
 
 
-def test_a_number_is_shown_to_the_second_digit_of_its_uncertainty():
+def test_rounding_to_the_second_digit_of_the_uncertainty():
     assert [decimals(each) for each in (250.0, 2.5, 0.25, 0.1, 0.001)] == [0, 1, 2, 2, 4]

@@ -1,4 +1,4 @@
-"""Profiles of rigs on the wire: what the shipped ones say, and contradictions with the protocol."""
+"""Profiles of rigs on the wire: the shipped ones, and contradictions with the protocol."""
 
 import re
 from pathlib import Path
@@ -24,7 +24,7 @@ def refuse(complaints_of):
 
 
 @pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
-def test_every_number_says_where_it_comes_from(name):
+def test_every_number_has_a_source(name):
     profile = load_profile(name)
     numbers = re.findall(r"^\w+ = \{", profile.text, re.MULTILINE)
     assert len(profile.sources) == len(numbers) > 60
@@ -37,7 +37,7 @@ def test_the_papers_chirp_is_within_the_limits_and_the_loop_stable(name):
     assert plan_session(profile, chirp(rate_hz=profile.rig.rate_hz)).warnings == ()
 
 
-def test_the_sections_of_the_chosen_devices_are_there_and_no_others():
+def test_sections_are_those_of_the_chosen_devices():
     can, serial = load_profile("antenna_can").rig, load_profile("antenna_serial").rig
     assert can.can == serial.can
     assert can.cia402 == serial.cia402
@@ -48,7 +48,7 @@ def test_the_sections_of_the_chosen_devices_are_there_and_no_others():
     assert (can.name, serial.name) == ("antenna_can", "antenna_serial")
 
 
-def test_a_section_that_a_device_needs_is_asked_for(refuse):
+def test_a_section_needed_by_a_device_is_required(refuse):
     (line,) = refuse("antenna_can", ('sensor = "ati_can"', 'sensor = "ati_serial"'))[:1]
     assert line == (
         'section [ati_serial] is missing, which devices.drive = "cia402" with devices.sensor = '
@@ -56,7 +56,7 @@ def test_a_section_that_a_device_needs_is_asked_for(refuse):
     )
 
 
-def test_a_section_that_nobody_reads_is_refused(refuse):
+def test_an_unused_section_is_refused(refuse):
     lines = refuse("antenna_can", ('drive = "cia402"', 'drive = "sim"'), (
         'sensor = "ati_can"', 'sensor = "sim"'))  # fmt: skip
     assert any(line.startswith("section [ati_can] belongs to none of") for line in lines)
@@ -105,13 +105,13 @@ def test_a_section_that_nobody_reads_is_refused(refuse):
          r"ati_serial.stream_hz = 700 Hz is below rig.rate_hz"),
     ],
 )  # fmt: skip
-def test_a_contradiction_with_the_protocol_is_told(refuse, name, old, new, complaint):
+def test_a_contradiction_with_the_protocol_is_reported(refuse, name, old, new, complaint):
     lines = refuse(name, (old, new))
     assert any(re.match(complaint, line) for line in lines), lines
 
 
 @pytest.mark.parametrize("name", ["../../evil", "a/b", "a\\u0000b", "x" * 70, ".hidden", "-x"])
-def test_a_name_has_to_be_fit_for_files(refuse, name):
+def test_a_name_has_to_be_valid_in_file_names(refuse, name):
     (line,) = refuse("antenna_can", ('name = "antenna_can"', f'name = "{name}"'))
     assert "is not fit for file names" in line
 
@@ -147,12 +147,12 @@ def test_a_name_has_to_be_fit_for_files(refuse, name):
         ),
     ],
 )
-def test_a_key_of_a_drive_that_differs(refuse, line, complaint):
+def test_wrong_values_of_optional_keys(refuse, line, complaint):
     lines = refuse("antenna_can", ("[cia402]\n", f"[cia402]\n{line}\n"))
     assert any(re.match(f"cia402.{complaint}", each) for each in lines), lines
 
 
-def test_keys_that_may_be_left_out(tmp_path):
+def test_optional_keys(tmp_path):
     text = load_profile("antenna_can").text
     plain = load_profile("antenna_can").rig.cia402
     assert (plain.eds, plain.set_objects, plain.accept_without) == ("", (), ())
@@ -171,9 +171,9 @@ def test_keys_that_may_be_left_out(tmp_path):
     )
     path.write_text(text.replace("[cia402]\n", "[cia402]\n" + "\n".join(lines) + "\n"))
     profile = load_profile(path)
-    told = profile.rig.cia402
-    assert told.eds == str(tmp_path.resolve() / "drive.eds")
-    assert told.set_objects == ("3001:2 u32 2500", "0x2005 i16 -3")
-    assert told.accept_without == ("torque_limit",)
-    assert (told.sync_gaps, told.follows_target_bit) == (True, False)
+    drive = profile.rig.cia402
+    assert drive.eds == str(tmp_path.resolve() / "drive.eds")
+    assert drive.set_objects == ("3001:2 u32 2500", "0x2005 i16 -3")
+    assert drive.accept_without == ("torque_limit",)
+    assert (drive.sync_gaps, drive.follows_target_bit) == (True, False)
     assert profile.sources["cia402.torque_response_s"] == "measured"

@@ -9,7 +9,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def load_script():
-    """Return what imports a script of this folder: test modules cannot import it by name."""
+    """Return a function that imports a script of this folder, which has no importable name."""
 
     def load(name):
         spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
@@ -35,7 +35,7 @@ def original(fuzz_recovery, tmp_path_factory):
 
 @pytest.fixture
 def torn(original, tmp_path):
-    """What a process leaves that died before it closed the file, with 300 bytes of a chunk."""
+    """The file of a process that died before it closed it, with 300 bytes of a chunk."""
     path = tmp_path / "a.mcap.part"
     path.write_bytes(original.data[: int(original.chunk_ends[3]) + 300])
     return path

@@ -27,7 +27,7 @@ import zstandard
 
 from rigd.runtime.background import use_one_thread
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "plugins"))  # as pytest has it
+sys.path.insert(0, str(Path(__file__).parents[1] / "plugins"))  # as in pytest
 
 MAGIC = b"\x89MCAP0\r\n"
 MOST_MEGABYTES = 500
@@ -37,7 +37,7 @@ COMMANDS = ("info", "recover", "analyze")
 _CONTROL = re.compile("[\x00-\x09\x0b\x0c\x0e-\x1f\x7f-\x9f]")
 """Characters that a terminal obeys; a line may end, and a progress bar go back."""
 _PATIENCE_S = 600
-"""After which a command counts as one that does not end, however busy the machine is."""
+"""After which a command counts as endless, even on a busy computer."""
 
 
 def record(opcode, content):
@@ -46,7 +46,7 @@ def record(opcode, content):
 
 
 def text(value):
-    """Make a string as MCAP has it."""
+    """Make a string as in MCAP."""
     value = value.encode() if isinstance(value, str) else value
     return struct.pack("<I", len(value)) + value
 
@@ -134,11 +134,11 @@ def sample_records(first, count, *, permuted=False):
     return rows.tobytes()
 
 
-def samples(count, *, permuted=False, piece=20_000):
+def samples(count, *, permuted=False, block_size=20_000):
     """Make chunks of samples."""
     return b"".join(
-        chunk(sample_records(first, min(piece, count - first), permuted=permuted))
-        for first in range(0, count, piece)
+        chunk(sample_records(first, min(block_size, count - first), permuted=permuted))
+        for first in range(0, count, block_size)
     )
 
 
@@ -150,7 +150,7 @@ def event(message_text):
     return message(2, log(level=2, message=message_text, name="x").SerializeToString())
 
 
-# The files that were lost once, each by what it is made of. `scale` 1 is what they were.
+# Files that once failed, by their content; `scale` 1 is the original size.
 
 
 def digits(rng, scale=1.0):
@@ -219,12 +219,12 @@ def log_flood(rng, scale=1.0):
 
 
 def permuted(rng, scale=1.0):
-    """Samples whose fields stand in another order, and a tail that is missing at times."""
+    """Samples whose fields are in another order, and a tail that is missing at times."""
     end = rng.random() < 0.5
     return session_file(samples(round(2_000_000 * scale), permuted=True), end=end)
 
 
-# Others, with whatever numbers come up.
+# Others, with random numbers.
 
 
 def giant_claim(rng, scale=1.0):
@@ -280,13 +280,13 @@ def many_records(rng, scale=1.0):
 
 
 def many_chunks(rng, scale=1.0):
-    """Chunks that hold next to nothing."""
+    """Chunks with hardly any content."""
     part = chunk(sample_records(5000, 1)) if rng.random() < 0.5 else chunk(b"")
     return session_file(samples(2000), part * round(200_000 * scale))
 
 
 def any_length(rng, scale=1.0):
-    """Samples of which hardly two are of the same length, as unknown fields make them."""
+    """Samples of nearly all different lengths, due to unknown fields."""
     whole = sample_records(0, 1)[31:]
     rows = [
         message(1, whole + b"\xa2\x01" + bytes([n]) + bytes(n))
@@ -296,7 +296,7 @@ def any_length(rng, scale=1.0):
 
 
 def doubled(rng, scale=1.0):
-    """Chunks that stand twice, or not in order."""
+    """Chunks that are repeated, or not in order."""
     parts = [chunk(sample_records(1000 * i, 1000)) for i in range(max(round(20 * scale), 4))]
     for _ in range(rng.randrange(1, 5)):
         parts.insert(rng.randrange(len(parts)), rng.choice(parts))
@@ -361,7 +361,7 @@ def damaged(rng, scale=1.0):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command took."""
+    """Result and resources of a command."""
 
     case: str
     command: str
@@ -374,7 +374,7 @@ class Outcome:
     """The end of what was printed."""
 
     def wrong(self):
-        """Return what is wrong with it, "" if nothing is."""
+        """Return the complaint, or ""."""
         found = ["control characters"] if _CONTROL.search(self.words) else []
         if self.code not in (0, 1, 2):
             found.append(f"ended with {self.code}")
@@ -390,7 +390,7 @@ class Outcome:
 
 
 def run_forked(action, output, interrupt_s=None):
-    """Run something in a child; return its exit code, and what it took as wait4 tells it.
+    """Run something in a child; return its exit code, and its resources as wait4 reports them.
 
     It gets a SIGINT after so many seconds.
     """
@@ -426,7 +426,7 @@ def run_forked(action, output, interrupt_s=None):
 
 
 def command_action(command, path):
-    """Return what runs a command on a file."""
+    """Return a function that runs a command on a file."""
 
     def action():
         folder = path.parent
@@ -446,7 +446,7 @@ def command_action(command, path):
 
 
 def check_file(make, case, folder, commands=COMMANDS):
-    """Make a file, and give it to the commands; yield what each took."""
+    """Make a file, and run the commands on it; yield their results."""
     path = folder / "a.mcap"
     made = folder / "made"
     with made.open("wb") as log:
@@ -477,16 +477,16 @@ def cases(count, seed, scale=None):
 
 
 def warm_up(commands=COMMANDS):
-    """Give each command a sound file, so that not every child has to import what they need."""
+    """Run each command on a sound file, so that the imports are not repeated in each child."""
     use_one_thread()  # as the commands do themselves
     sys.stdout.flush()
     before = os.dup(1), os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     with tempfile.TemporaryDirectory(prefix="rigd-hostile-") as folder:
-        # Too short for `analyze`, which says so when all is imported and the file is read.
+        # Too short for `analyze`, which reports it once all is imported and the file is read.
         path = Path(folder) / "a.mcap"
         path.write_bytes(session_file(samples(2000)))
-        # Not the streams of Python: what keeps hold of one would keep that of the warm-up.
+        # Not the streams of Python: a reference to one would be a reference to that of the warm-up.
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
         try:
@@ -503,7 +503,7 @@ def warm_up(commands=COMMANDS):
 
 
 def fuzz(count, seed, scale=None, report=lambda outcome: None):
-    """Try so many files; return what is wrong."""
+    """Try so many files; return the complaints."""
     warm_up()
     wrong = []
     for name, make in cases(count, seed, scale):

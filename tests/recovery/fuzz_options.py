@@ -2,10 +2,10 @@
 
 Every option and argument of every command of `rigd` and `analyze`, as the typer applications list
 them, and every key of the files that a user writes (profile, specimen, EDS, JSON, reference, record
-of another program), each with a value that nobody means: not finite, beyond every range, a million
-characters, control characters, a pipe in the place of a file. Each command may take 500 MB, 30 s of
+of another program), each with an absurd value: not finite, beyond every range, a million
+characters, control characters, a pipe instead of a file. Each command may take 500 MB, 30 s of
 a processor and 1 MB of output, and ends with 0, 1 or 2 and without a traceback. A daemon of a
-simulated rig takes what `rigd start` and the like ask for, and may not grow.
+simulated rig gets the requests of `rigd start` and the like, and may not grow.
 
 """
 
@@ -52,14 +52,14 @@ FILES = (
     "pipe", "folder", "socket", "/dev/zero", "/dev/null", "missing", "empty", "binary", "nul",
     "x" * 5000, "", "\udcff", "loop", "huge", CONTROL, "/proc/self/mem", "\u202e.mcap",
 )  # fmt: skip
-"""Names of what `make_odd` makes, and others."""
+"""Names of the objects of `make_odd`, and others."""
 ODD = ("pipe", "folder", "socket", "empty", "binary", "nul", "loop", "huge", "missing")
 SUFFIXES = (".toml", ".json", ".csv", ".mcap", ".mat", ".uff", ".tdms", ".eds", ".rrd", "")
 INTERRUPTED_AFTER_S = 8.0
 """Time after which a command that serves is interrupted."""
 SERVING = ("serve", "simulate", "live", "status", "replay")
 MOST_GROWTH_MEGABYTES = 40
-"""What the daemon may hold more in the end."""
+"""Memory by which the daemon may grow."""
 IMPORTED = (
     "rigd.cli.app", "rigd.runner", "rigd.profile", "rigd.daemon", "rigd.session", "rigd.checks",
     "rigd.devices", "analysis.cli.app", "analysis.cli.exchange", "analysis.exchange",
@@ -70,22 +70,22 @@ IMPORTED = (
 
 @dataclass(frozen=True)
 class Case:
-    """A command line and what it is given."""
+    """A command line with its files."""
 
     name: str
     program: str
     arguments: list[str]
     files: dict[str, bytes | Callable[[], bytes]] = field(default_factory=dict)
-    """Files that it needs, or what makes them, by their names in the case's folder."""
+    """Files that it needs, or their makers, by their names in the case's folder."""
 
     @property
     def serves(self):
-        """Whether it goes on until it is interrupted."""
+        """Whether it runs until it is interrupted."""
         return any(word in SERVING for word in self.arguments[:1])
 
 
 class Ground:
-    """What commands need that are otherwise in order: a session, a reference, a daemon."""
+    """Files and daemon for commands that are otherwise in order."""
 
     def __init__(self, folder):
         self.folder = Path(folder)
@@ -115,30 +115,30 @@ class Ground:
         write_profile(self.folder, {"name": "served"})
 
     def start_daemon(self):
-        """Have a daemon serve a simulated rig; wait until it is ready."""
+        """Start a daemon of a simulated rig; wait until it is ready."""
         command = [sys.executable, "-m", "rigd", "serve", "--profile", str(self.served), "--fast"]
         self.daemon = subprocess.Popen(
             [*command, "--no-look", "--output", str(self.folder / "served")],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         self.wait_until_ready()
-        # What the first session imports is no growth.
-        self._ask("start", *sound_arguments(self, ["rigd", "start", "chirp"])[:-2])
+        # Imports of the first session do not count as growth.
+        self._run("start", *sound_arguments(self, ["rigd", "start", "chirp"])[:-2])
         self.wait_until_ready()
 
     def wait_until_ready(self):
-        """End what the daemon runs, and wait until it can run the next."""
+        """End the session of the daemon, and wait until it is ready."""
         for _ in range(600):
-            told = self._ask("status", "--json")
-            state = json.loads(told).get("state") if told else ""
+            status = self._run("status", "--json")
+            state = json.loads(status).get("state") if status else ""
             if state == "ready":
                 return
             if state in ("running", "fault"):
-                self._ask("stop" if state == "running" else "reset")
+                self._run("stop" if state == "running" else "reset")
             time.sleep(0.1)
         raise RuntimeError("the daemon does not become ready")
 
-    def _ask(self, *words):
+    def _run(self, *words):
         command = [sys.executable, "-m", "rigd", *words, "--profile", str(self.served)]
         return subprocess.run(command, capture_output=True, check=False).stdout
 
@@ -149,7 +149,7 @@ class Ground:
             self.daemon.wait(60)
 
     def daemon_megabytes(self):
-        """Return what it holds, and what it has held at most."""
+        """Return its memory now and its peak memory."""
         status = Path(f"/proc/{self.daemon.pid}/status").read_text()
         fields = dict(line.split(":", 1) for line in status.splitlines())
         return tuple(int(fields[name].split()[0]) / 1024 for name in ("VmRSS", "VmHWM"))
@@ -226,7 +226,7 @@ def commands():
 def option_cases(ground, seed, every):
     """Yield a case for each option and argument, or for every value of it.
 
-    An option that all excitations share is tried once with `rigd run` and once with `rigd start`.
+    An option common to all excitations is tried once with `rigd run` and once with `rigd start`.
     """
     turn = seed
     known = set()
@@ -237,13 +237,13 @@ def option_cases(ground, seed, every):
     for words, parameters in commands():
         sound = sound_arguments(ground, words)
         program, *names = [word for word in words if word != "default"]
-        positional, options = _apart(sound)
-        place = -1
+        positional, options = _split_arguments(sound)
+        position = -1
         for parameter, annotation in parameters:
             types = {annotation, *get_args(annotation)}
             is_option = parameter.param_type_name == "option"
             label = parameter.opts[-1] if is_option else parameter.name
-            place += not is_option
+            position += not is_option
             if bool in types:
                 values = ("",)
             elif types & {int, float}:
@@ -258,7 +258,7 @@ def option_cases(ground, seed, every):
             for value in values if every else [values[turn % len(values)]]:
                 name = f"{' '.join(words)} {label} {value[:40]!r}"
                 if not is_option:
-                    given = [*positional[:place], value, *positional[place + 1 :], *options]
+                    given = [*positional[:position], value, *positional[position + 1 :], *options]
                 elif bool in types:
                     given = [*sound, label]
                 elif label in sound and not parameter.multiple:
@@ -271,7 +271,7 @@ def option_cases(ground, seed, every):
 
 
 def _file_values(label):
-    """Yield names of files that are none, with the suffixes that readers go by."""
+    """Yield names of objects other than files, with the suffixes of the readers."""
     for number, name in enumerate(FILES * len(SUFFIXES)):
         if name in ODD:
             yield f"@odd/{name}{SUFFIXES[number % len(SUFFIXES)]}"
@@ -279,7 +279,7 @@ def _file_values(label):
             yield name
 
 
-def _apart(arguments):
+def _split_arguments(arguments):
     """Split arguments before the first option."""
     first = next((i for i, each in enumerate(arguments) if each.startswith("--")), len(arguments))
     return arguments[:first], arguments[first:]
@@ -551,7 +551,7 @@ def whole_file_cases(ground):
 
 
 def make_odd(path, kind):
-    """Make what stands under a file's name and is no file of the kind that is meant."""
+    """Make an object that has a file's name and is no file of the expected kind."""
     if kind == "pipe":
         os.mkfifo(path)
     elif kind == "folder":
@@ -583,7 +583,7 @@ def write_files(files, folder):
 def prepared(case, folder):
     """Make the files of a case; return its arguments with their paths."""
     if case.files:
-        with (folder / "made").open("wb") as log:  # in a child, which takes its memory with it
+        with (folder / "made").open("wb") as log:  # in a child, whose memory is freed with it
             code, _ = run_forked(lambda: write_files(case.files, folder), log.fileno())
         assert code == 0, (folder / "made").read_text()
     arguments = []
@@ -599,7 +599,7 @@ def prepared(case, folder):
 
 
 def run_case(case):
-    """Run a command line as its program does; return what it took."""
+    """Run a command line as its program does; return result and resources."""
     with tempfile.TemporaryDirectory(prefix="rigd-hostile-") as name:
         folder = Path(name)
         arguments = prepared(case, folder)
@@ -634,21 +634,21 @@ def run_case(case):
 
 
 def warm_up():
-    """Import what the commands need, so that not every child has to."""
+    """Import the modules of the commands, so that the imports are not repeated in each child."""
     use_one_thread()
     for module in IMPORTED:
         importlib.import_module(module)
 
 
 def all_cases(ground, seed=0, *, every=False):
-    """Yield all cases; `every` value of each option and key in the place of one."""
+    """Yield all cases; `every` value of each option and key instead of one."""
     yield from whole_file_cases(ground)
     yield from option_cases(ground, seed, every)
     yield from key_cases(seed, every)
 
 
 def try_cases(ground, cases, report=lambda outcome: None):
-    """Try cases in turn; return what is wrong, with the daemon's growth."""
+    """Try cases in turn; return the complaints, with the daemon's growth."""
     wrong = []
     before = ground.daemon_megabytes()
     for case in cases:
@@ -666,7 +666,7 @@ def try_cases(ground, cases, report=lambda outcome: None):
 
 @contextlib.contextmanager
 def ground_with_daemon():
-    """Give what the commands need, for as long as it lasts."""
+    """Yield files and daemon for the commands, and remove them."""
     with tempfile.TemporaryDirectory(prefix="rigd-ground-") as name:
         runtime = Path(name) / "runtime"
         runtime.mkdir(mode=0o700)
@@ -681,20 +681,20 @@ def ground_with_daemon():
 
 
 def main():
-    """Try all, and print the worst and what is wrong."""
+    """Try all cases, and print the worst and the complaints."""
     parser = argparse.ArgumentParser(description=__doc__.partition(":")[0])
     parser.add_argument("--seed", type=int, default=0, help="turns the values of the options")
     parser.add_argument("--word", default="", help="only cases whose names match this expression")
     parser.add_argument("--every", action="store_true", help="every value of each option and key")
     parser.add_argument("--verbose", action="store_true", help="name each case")
-    asked = parser.parse_args()
+    parsed = parser.parse_args()
     worst: dict[str, Outcome] = {}
     count = 0
 
     def report(outcome):
         nonlocal count
         count += 1
-        if asked.verbose:
+        if parsed.verbose:
             last = outcome.words.strip().splitlines()[-1:] or [""]
             sys.stdout.write(
                 f"{outcome.code} {outcome.megabytes:4.0f} MB {outcome.seconds:5.1f} s "
@@ -707,16 +707,16 @@ def main():
 
     warm_up()
     with ground_with_daemon() as ground:
-        cases = all_cases(ground, asked.seed, every=asked.every)
+        cases = all_cases(ground, parsed.seed, every=parsed.every)
         wrong = try_cases(
-            ground, (case for case in cases if re.search(asked.word, case.name)), report
+            ground, (case for case in cases if re.search(parsed.word, case.name)), report
         )
         held, most = ground.daemon_megabytes()
     for what, outcome in worst.items():
         sys.stdout.write(f"most {what:10} {getattr(outcome, what):10.1f}  {outcome.case}\n")
     sys.stdout.write("".join(f"WRONG {each}\n" for each in wrong))
     sys.stdout.write(f"daemon: {held:.0f} MB at the end, {most:.0f} MB at most\n")
-    sys.stdout.write(f"{count} cases, seed {asked.seed}: {len(wrong)} wrong\n")
+    sys.stdout.write(f"{count} cases, seed {parsed.seed}: {len(wrong)} wrong\n")
     sys.exit(bool(wrong))
 
 

@@ -45,13 +45,13 @@ _SMEAR = 600
 
 @dataclass(frozen=True)
 class Original:
-    """A sound session, and where what is in it ends."""
+    """A sound session, and the ends of its parts."""
 
     data: bytes
     part_bytes: int
-    """Its beginning, up to the outcome: what a dead process leaves."""
+    """Its beginning, up to the outcome, as a dead process leaves it."""
     head_bytes: int
-    """Up to where the first sample may be lost with what is damaged."""
+    """Offset up to which damage may cost the first sample."""
     chunk_ends: np.ndarray
     """(n,) byte at which each chunk with samples ends."""
     chunk_samples: np.ndarray
@@ -129,7 +129,7 @@ def write_session(path, seconds=3.0, seed=0):
 
 
 def damaged(original, kind, rng):
-    """Return damaged data and the first byte that is not as it was."""
+    """Return damaged data and the offset of the first changed byte."""
     is_part = kind.endswith("part")
     data = bytearray(original.data[: original.part_bytes] if is_part else original.data)
     at = rng.randrange(8, len(data))
@@ -149,7 +149,7 @@ def damaged(original, kind, rng):
 
 
 def check_case(original, kind, rng, folder):
-    """Try one case in an empty folder; return what came of it."""
+    """Try one case in an empty folder; return its result."""
     data, at = damaged(original, kind, rng)
     path = folder / ("a.mcap.part" if kind.endswith("part") else "a.mcap")
     path.write_bytes(data)
@@ -193,8 +193,8 @@ def check_recovered(original, at, recovery, case):
     assert (known[:least] == np.arange(least)).all(), case
     for read, expected in ((read_controls, original.controls), (read_timings, original.timings)):
         found = read(recovery.path)
-        places = np.searchsorted(expected["tick"], found["tick"])
-        assert identical(found, expected[places]), case
+        indices = np.searchsorted(expected["tick"], found["tick"])
+        assert identical(found, expected[indices]), case
         assert np.count_nonzero(found["tick"] <= samples["tick"][-1]) >= np.count_nonzero(
             np.isin(expected["tick"], samples["tick"])
         ), case
@@ -207,7 +207,7 @@ def check_recovered(original, at, recovery, case):
 
 
 def check_outcome(original, session, known, case):
-    """Check that the file tells that it was recovered, and accounts for its ticks."""
+    """Check that the file states that it was recovered, and accounts for its ticks."""
     outcome, was = session.outcome, original.session.outcome
     assert outcome["recovered_from"].startswith("a.mcap"), case
     if outcome["outcome"] == was["outcome"]:

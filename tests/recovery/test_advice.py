@@ -1,4 +1,4 @@
-"""What messages advise about torn files works, and where nothing can be done none is promised."""
+"""Advice about torn files works, and none is given if nothing can be recovered."""
 
 import re
 import shlex
@@ -32,57 +32,57 @@ def first_bytes(original, count):
 
 
 @pytest.mark.parametrize("count", [8, 9, 500])
-def test_of_a_file_without_a_sample_no_recovery_is_promised(original, tmp_path, run, count):
+def test_no_recovery_of_a_file_without_samples(original, tmp_path, run, count):
     part = tmp_path / "a.mcap.part"
     part.write_bytes(first_bytes(original, count))
-    said = run("info", part).stderr
-    assert "0 complete samples are readable before that, so there is nothing to recover" in said
-    assert "rigd recover" not in said
+    message = run("info", part).stderr
+    assert "0 complete samples are readable before that, so there is nothing to recover" in message
+    assert "rigd recover" not in message
     assert run("recover", part).exit_code == 1
-    kept = remaining_file_text(tmp_path / "a.mcap")
-    assert kept == f"Nothing was recorded; {part} holds no sample and can be removed."
+    message = remaining_file_text(tmp_path / "a.mcap")
+    assert message == f"Nothing was recorded; {part} holds no sample and can be removed."
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MC"])
-def test_nor_of_one_that_was_only_begun(tmp_path, content):
+def test_no_recovery_of_a_file_only_begun(tmp_path, content):
     (tmp_path / "a.mcap.part").write_bytes(content)
     assert "rigd recover" not in remaining_file_text(tmp_path / "a.mcap")
 
 
-def test_a_damaged_file_without_a_sample_before_that_is_only_worth_a_copy(original, tmp_path, run):
+def test_advice_to_copy_a_file_damaged_before_any_sample(original, tmp_path, run):
     path = tmp_path / "a.mcap"
     data = bytearray(original.data)
     data[original.chunk_ends[0] - 1000] ^= 1
     path.write_bytes(data)
-    said = run("info", path).stderr
-    assert "nothing to recover. Copy it again from where it was recorded.\n" in said
+    message = run("info", path).stderr
+    assert "nothing to recover. Copy it again from where it was recorded.\n" in message
     assert run("recover", path).exit_code == 1
 
 
-def test_what_a_plain_reader_cannot_pass_counts_as_it_can_be_recovered(original, torn, run):
+def test_readable_samples_are_those_that_can_be_recovered(original, torn, run):
     data = bytearray(torn.read_bytes())
     data[data.index(b"profile.toml") + 40] ^= 1  # an attachment, before all samples
     torn.write_bytes(data)
-    said = run("info", torn).stderr
+    message = run("info", torn).stderr
     recovered = run("recover", torn)
     assert recovered.exit_code == 0
-    (count,) = re.findall(r"; (\d+) complete samples are readable", said)
+    (count,) = re.findall(r"; (\d+) complete samples are readable", message)
     assert f": {count} samples recovered" in recovered.stdout
 
 
-def test_a_recovery_whose_name_is_taken_is_offered_with_what_has_to_go_first(torn, run):
+def test_advice_to_move_a_file_that_blocks_recovery(torn, run):
     taken = torn.with_suffix("")
     taken.write_text("somebody else's")
     assert run("recover", torn).exit_code == 1
-    said = run("info", torn).stderr
-    assert f"`rigd recover {torn}`, once {taken}, which may hold it already, is moved away" in said
+    message = run("info", torn).stderr
+    assert (
+        f"`rigd recover {torn}`, once {taken}, which may hold it already, is moved away" in message
+    )
 
 
 @pytest.mark.process
 @pytest.mark.parametrize("name", ["a.mcap", "an antenna_1.mcap"])
-def test_what_is_kept_beside_a_name_that_was_taken_can_be_recovered_as_told(
-    torn, tmp_path, run, name
-):
+def test_advised_commands_recover_the_part_of_a_taken_name(torn, tmp_path, run, name):
     folder = tmp_path / "sessions"
     folder.mkdir()
     path = folder / name
@@ -92,8 +92,8 @@ def test_what_is_kept_beside_a_name_that_was_taken_can_be_recovered_as_told(
         f"rigd recover {shlex.quote(str(part))} makes a clean file of it."
     )
     path.write_text("somebody else's")
-    said = remaining_file_text(path)
-    move, recovery = re.findall(r"after (mv .*) (rigd recover .*) makes a clean file", said)[0]
+    message = remaining_file_text(path)
+    move, recovery = re.findall(r"after (mv .*) (rigd recover .*) makes a clean file", message)[0]
     assert subprocess.run(shlex.split(move), check=False).returncode == 0
     assert run(*shlex.split(recovery)[1:]).exit_code == 0
     assert path.read_text() == "somebody else's"

@@ -1,4 +1,4 @@
-"""Files made to take memory, time or the terminal: each command stays within its share."""
+"""Files made to take memory, time or the terminal: each command stays within its limits."""
 
 import random
 import subprocess
@@ -19,7 +19,7 @@ def hostile(load_script):
 
 @pytest.mark.process
 @pytest.mark.further  # the worst kinds are below
-def test_a_file_of_each_hostile_kind_and_as_many_damaged_ones(hostile):
+def test_files_of_each_hostile_kind_and_damaged_ones(hostile):
     """In a separate process, which forks for each command: this one is large, and has threads."""
     script = Path(hostile.__file__)
     count = 2 * len((*hostile.LOST_ONCE, *hostile.OTHERS))  # every second one is damaged
@@ -52,13 +52,13 @@ sys.exit("".join(wrong) or 0)
     ("kinds", "scale", "megabytes"),
     [
         further("digits long_key control_characters log_flood permuted", 1.0, 500),
-        # A chunk of these has 50 MB, for which there is no room if it is held as a whole.
+        # A chunk of these has 50 MB, too much to be held as a whole.
         further("wide_chunks other_topic", 0.2, 80),
         pytest.param("wide_chunks other_topic in_turn", 1.0, 500, marks=pytest.mark.slow),
     ],
     ids=["full", "long chunks", "longest chunks"],
 )
-def test_what_once_took_all_memory_or_time(hostile, kinds, scale, megabytes):
+def test_files_that_once_took_all_memory_or_time(hostile, kinds, scale, megabytes):
     """`rigd info` alone: the others read in the same way."""
     folder = str(Path(hostile.__file__).parent)
     code = FULL_SCALE.format(folder=folder, kinds=kinds, scale=scale, megabytes=megabytes)
@@ -68,7 +68,7 @@ def test_what_once_took_all_memory_or_time(hostile, kinds, scale, megabytes):
     assert done.returncode == 0, done.stderr
 
 
-def test_what_is_not_shown_is_said(hostile, tmp_path):
+def test_omitted_content_is_reported(hostile, tmp_path):
     path = tmp_path / "a.mcap"
     path.write_bytes(hostile.long_key(random.Random(1)))
     info = describe(path)
@@ -80,7 +80,7 @@ def test_what_is_not_shown_is_said(hostile, tmp_path):
     assert info.as_dict()["left_out"] == info.omission_texts
 
 
-def test_a_log_of_too_much_is_cut_and_counted(hostile, tmp_path, monkeypatch):
+def test_an_excessive_log_is_cut_and_counted(hostile, tmp_path, monkeypatch):
     monkeypatch.setattr("rigd.session._reader.MAX_EVENTS", 10_000)  # a tenth, in a tenth the time
     path = tmp_path / "a.mcap"
     lines = b"".join(hostile.event(f"line {i}") for i in range(12_000))
@@ -97,15 +97,15 @@ def test_a_log_of_too_much_is_cut_and_counted(hostile, tmp_path, monkeypatch):
     assert f"… and {12_001 - len(shown.events)} more messages of the log" in shown.omission_texts[0]
 
 
-def test_samples_in_another_order_of_fields_are_read_as_they_are(hostile, tmp_path):
+def test_samples_with_another_order_of_fields_are_read(hostile, tmp_path):
     path, plain = tmp_path / "a.mcap", tmp_path / "b.mcap"
     path.write_bytes(hostile.session_file(hostile.samples(30_000, permuted=True)))
     plain.write_bytes(hostile.session_file(hostile.samples(30_000)))
     np.testing.assert_array_equal(read_session(path).samples, read_session(plain).samples)
 
 
-def test_a_chunk_longer_than_a_piece_is_read_like_any_other(hostile, tmp_path):
-    """Records begin in one piece and end in another; a long one that is not wanted is skipped."""
+def test_a_chunk_longer_than_a_block_is_read(hostile, tmp_path):
+    """Records begin in one block and end in another; a long one that is not needed is skipped."""
     filler = hostile.channel(3, "/other", 0) + hostile.message(3, bytes(9_000_000))
     rows = hostile.sample_records(0, 70_000)
     records = rows[:1_500_000] + filler + rows[1_500_000:]
@@ -118,7 +118,7 @@ def test_a_chunk_longer_than_a_piece_is_read_like_any_other(hostile, tmp_path):
 
 
 @pytest.mark.parametrize("order", [(0, 1, 1, 2, 3), (0, 1, 2, 1, 3), (0, 1, 2, 3, 0, 1)])
-def test_chunks_that_stand_twice_are_recovered_once(hostile, tmp_path, order):
+def test_repeated_chunks_are_recovered_once(hostile, tmp_path, order):
     path = tmp_path / "a.mcap"
     chunks = [hostile.chunk(hostile.sample_records(1000 * i, 1000)) for i in range(4)]
     path.write_bytes(hostile.session_file(*[chunks[i] for i in order]))
@@ -132,7 +132,7 @@ def test_chunks_that_stand_twice_are_recovered_once(hostile, tmp_path, order):
     assert "repeat or precede" in session.outcome["recovered_damage"]
 
 
-def test_a_doubled_chunk_of_a_whole_session_is_left_out_of_every_channel(original, tmp_path):
+def test_a_repeated_chunk_is_omitted_from_every_channel(original, tmp_path):
     path = tmp_path / "a.mcap"
     first, second = original.chunk_ends[1:3]
     path.write_bytes(original.data[:second] + original.data[first:second] + original.data[second:])
@@ -143,17 +143,17 @@ def test_a_doubled_chunk_of_a_whole_session_is_left_out_of_every_channel(origina
 
 
 @pytest.mark.parametrize(
-    ("ticks", "kept"),
+    ("ticks", "remaining"),
     [
         ([*range(40), 4_000_000_000, *range(41, 100)], [*range(40), *range(41, 100)]),
         ([7, 7, 3], [7]),
     ],
     ids=["one far too high", "one twice"],
 )
-def test_a_tick_that_is_wrong_takes_nothing_with_it(hostile, tmp_path, ticks, kept):
+def test_a_wrong_tick_leaves_the_others(hostile, tmp_path, ticks, remaining):
     path = tmp_path / "a.mcap"
     rows = b"".join(hostile.sample_records(tick, 1) for tick in ticks)
     path.write_bytes(hostile.session_file(hostile.chunk(rows)))
     recovery = recover(path)
-    assert f"has {len(ticks) - len(kept)} samples that repeat or precede" in recovery.damage
-    assert read_session(recovery.path).samples["tick"].tolist() == kept
+    assert f"has {len(ticks) - len(remaining)} samples that repeat or precede" in recovery.damage
+    assert read_session(recovery.path).samples["tick"].tolist() == remaining

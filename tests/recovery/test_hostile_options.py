@@ -1,4 +1,4 @@
-"""Values that nobody means, on the command line and in files: refused in a sentence or two."""
+"""Absurd values, on the command line and in files: refused in a sentence or two."""
 
 import re
 import subprocess
@@ -92,7 +92,7 @@ def test_a_hostile_interval_of_an_import(analyze_here, options, tmp_path, value)
 
 
 @pytest.mark.process
-@pytest.mark.slow  # half an hour: every case, and what each takes
+@pytest.mark.slow  # half an hour: every case with its resources
 def test_all_cases(options):
     done = subprocess.run(
         [sys.executable, str(Path(options.__file__))], capture_output=True, text=True, check=False

@@ -1,4 +1,4 @@
-"""Torn and damaged files: all that is intact, marked, and nothing that is not proven."""
+"""Torn and damaged files: all intact samples are recovered and marked, and no others."""
 
 import fcntl
 import random
@@ -15,14 +15,14 @@ from rigd.session import SessionError, SessionExistsError, describe, read_sessio
 from rigd.session.layout import encode_samples
 
 
-def test_damage_of_every_kind_gives_what_was_before_it_or_a_refusal(fuzz_recovery, original):
+def test_samples_before_any_damage_or_a_refusal(fuzz_recovery, original):
     results = fuzz_recovery.fuzz(original, 10, seed=1)
     for kind in fuzz_recovery.KINDS:
         assert results[kind, "recovered"] > 4
     assert results.total() == 10 * len(fuzz_recovery.KINDS)
 
 
-def test_a_flipped_bit_in_the_head_of_a_record_invents_nothing(
+def test_a_flipped_bit_in_a_record_head_adds_nothing(
     fuzz_recovery, original, tmp_path, monkeypatch
 ):
     """An opcode or a length that is wrong makes a reader take one record for another."""
@@ -45,7 +45,7 @@ def test_a_flipped_bit_in_the_head_of_a_record_invents_nothing(
         fuzz_recovery.check_case(original, "flipped part", rng, folder)
 
 
-def test_a_recovered_file_is_complete_for_any_reader_and_says_what_it_is(torn, original):
+def test_a_recovered_file_is_complete_and_marked(torn, original):
     recovery = recover(torn)
     assert recovery.path == torn.with_name("a.mcap")
     assert recovery.samples == original.chunk_samples[3]
@@ -69,7 +69,7 @@ def test_a_recovered_file_is_complete_for_any_reader_and_says_what_it_is(torn, o
     assert torn.exists()
 
 
-def test_the_statistics_of_a_damaged_file_tell_how_much_is_lost(original, tmp_path):
+def test_the_statistics_of_a_damaged_file_give_the_loss(original, tmp_path):
     path = tmp_path / "a.mcap"
     data = bytearray(original.data)
     data[original.chunk_ends[1] + 20_000] ^= 1
@@ -80,7 +80,7 @@ def test_the_statistics_of_a_damaged_file_tell_how_much_is_lost(original, tmp_pa
     assert recovery.outcome["scheduled"] == str(500 + 997)
 
 
-def test_a_file_of_which_the_summary_alone_is_damaged_keeps_its_outcome(original, tmp_path):
+def test_outcome_is_preserved_if_only_the_summary_is_damaged(original, tmp_path):
     path = tmp_path / "a.mcap.part"
     path.write_bytes(original.data[:-20])
     outcome = read_session(recover(path).path).outcome
@@ -92,7 +92,7 @@ def test_a_file_of_which_the_summary_alone_is_damaged_keeps_its_outcome(original
     assert any("recovered from a.mcap.part, without loss of samples" in text for text in warnings)
 
 
-def test_a_part_that_is_complete_is_given_its_name(original, tmp_path):
+def test_a_complete_part_gets_its_name(original, tmp_path):
     path = tmp_path / "a.mcap.part"
     path.write_bytes(original.data)
     recovery = recover(path)
@@ -101,7 +101,7 @@ def test_a_part_that_is_complete_is_given_its_name(original, tmp_path):
     assert "complete and intact" in recovery.lines()[0]
 
 
-def test_a_sound_file_needs_nothing(original, tmp_path):
+def test_a_sound_file_needs_no_recovery(original, tmp_path):
     path = tmp_path / "a.mcap"
     path.write_bytes(original.data)
     assert recover(path).path is None
@@ -109,7 +109,7 @@ def test_a_sound_file_needs_nothing(original, tmp_path):
 
 
 @pytest.mark.parametrize("complete", [True, False])
-def test_a_name_that_is_taken_is_refused(original, torn, complete):
+def test_a_taken_name_is_refused(original, torn, complete):
     if complete:
         torn.write_bytes(original.data)
     target = torn.with_name("a.mcap")
@@ -120,7 +120,7 @@ def test_a_name_that_is_taken_is_refused(original, torn, complete):
     assert sorted(p.name for p in torn.parent.iterdir()) == ["a.mcap", "a.mcap.part"]
 
 
-def test_a_name_that_is_taken_meanwhile_is_refused(torn, monkeypatch):
+def test_a_name_taken_meanwhile_is_refused(torn, monkeypatch):
     target = torn.with_name("a.mcap")
     read = read_session
 
@@ -135,9 +135,9 @@ def test_a_name_that_is_taken_meanwhile_is_refused(torn, monkeypatch):
     assert sorted(p.name for p in torn.parent.iterdir()) == ["a.mcap", "a.mcap.part"]
 
 
-def test_a_file_that_is_being_recorded_is_left_alone(torn):
+def test_a_file_being_recorded_is_not_recovered(torn):
     with torn.open("r+b") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)  # as a process has that records
+        fcntl.flock(stream, fcntl.LOCK_EX)  # as in a process that records
         with pytest.raises(SessionError, match="is still being recorded"):
             recover(torn)
         with pytest.raises(SessionError, match=r"is still being recorded\. Wait for the end"):
@@ -167,7 +167,7 @@ def test_a_file_without_an_intact_sample_is_refused(original, tmp_path):
         (b"rest", b"test"),
     ],
 )
-def test_wrong_metadata_of_a_torn_file_are_not_believed(original, torn, value, instead):
+def test_wrong_metadata_of_a_torn_file_are_ignored(original, torn, value, instead):
     data = torn.read_bytes()
     assert value in data[:400]
     torn.write_bytes(data.replace(value, instead, 1))
@@ -176,7 +176,7 @@ def test_wrong_metadata_of_a_torn_file_are_not_believed(original, torn, value, i
     assert session.segments == original.session.segments
 
 
-def test_a_damaged_attachment_is_left_out_and_the_rest_kept(original, torn):
+def test_a_damaged_attachment_is_omitted(original, torn):
     torn.write_bytes(torn.read_bytes().replace(b"rate_hz = 1000\n", b"rate_hz = 1001\n", 1))
     recovery = recover(torn)
     assert recovery.samples == 1000
@@ -186,7 +186,7 @@ def test_a_damaged_attachment_is_left_out_and_the_rest_kept(original, torn):
     assert "wrong checksum" in session.outcome["recovered_left_out"]
 
 
-def test_the_analysis_of_a_recovered_file_says_so(torn):
+def test_the_analysis_reports_that_a_file_was_recovered(torn):
     with pytest.raises(
         SessionError, match=r"is incomplete: .* Save them with `rigd recover .*part"
     ):
@@ -201,7 +201,7 @@ def test_the_analysis_of_a_recovered_file_says_so(torn):
 
 
 def write_plainly(path, samples, *, use_chunking):
-    """Write as a program with the plain package does, without an end."""
+    """Write with the plain mcap package, without an end."""
     stream = path.open("wb")
     writer = Writer(stream, use_chunking=use_chunking, chunk_size=20_000)
     writer.start()
@@ -253,8 +253,8 @@ def packed(row):
 
 
 def test_the_progress_runs_from_start_to_end(torn):
-    shares = []
-    recover(torn, shares.append)
-    assert shares == sorted(shares)
-    assert np.isclose(shares[-1], 1.0)
-    assert shares[0] < 0.3
+    fractions = []
+    recover(torn, fractions.append)
+    assert fractions == sorted(fractions)
+    assert np.isclose(fractions[-1], 1.0)
+    assert fractions[0] < 0.3

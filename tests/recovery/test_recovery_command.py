@@ -1,4 +1,4 @@
-"""`rigd recover`, and what `rigd info` and `analyze` say of the files."""
+"""`rigd recover`, and the messages of `rigd info` and `analyze` on the files."""
 
 import json
 import os
@@ -19,7 +19,7 @@ def run():
     return run
 
 
-def test_several_files_of_which_one_cannot_be_recovered(run, torn, tmp_path):
+def test_several_files_and_one_unrecoverable(run, torn, tmp_path):
     result = run(rigd, "recover", tmp_path / "nothing.mcap.part", torn)
     assert result.exit_code == 1
     assert "nothing.mcap.part cannot be read: No such file" in result.stderr
@@ -28,7 +28,7 @@ def test_several_files_of_which_one_cannot_be_recovered(run, torn, tmp_path):
     assert len(read_session(tmp_path / "a.mcap").samples) == 1000
 
 
-def test_a_document_and_nothing_else(run, torn, tmp_path):
+def test_output_is_one_document(run, torn, tmp_path):
     result = run(rigd, "recover", torn, torn, "--json")
     assert result.exit_code == 1
     first, second = json.loads(result.stdout)["files"]
@@ -43,7 +43,7 @@ def test_a_document_and_nothing_else(run, torn, tmp_path):
     }
 
 
-def test_what_is_no_file_is_refused(run, tmp_path):
+def test_paths_other_than_files_are_refused(run, tmp_path):
     pipe = tmp_path / "pipe.mcap.part"
     os.mkfifo(pipe)
     for path in ("/", ".", tmp_path, pipe):
@@ -53,7 +53,7 @@ def test_what_is_no_file_is_refused(run, tmp_path):
         assert result.exception is None or isinstance(result.exception, SystemExit)
 
 
-def test_without_a_file_it_is_wrong_use(run):
+def test_wrong_use_without_a_file(run):
     assert run(rigd, "recover").exit_code == 2
 
 
@@ -78,7 +78,7 @@ def test_a_damaged_file_is_offered_a_copy_or_the_recovery(run, original, tmp_pat
     assert len(read_session(tmp_path / "a b.recovered.mcap").samples) == 750
 
 
-def test_a_recovery_that_takes_long_shows_its_progress(run, torn, monkeypatch):
+def test_a_long_recovery_shows_its_progress(run, torn, monkeypatch):
     monkeypatch.setattr("rigd.cli.options._PROGRESS_DELAY_S", -1.0)
     monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes that for a terminal
     result = run(rigd, "recover", torn)

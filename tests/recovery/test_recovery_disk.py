@@ -1,4 +1,4 @@
-"""Disks that fill, folders that go, processes that die: what was written is recovered."""
+"""Full disks, removed folders, killed processes: all written samples are recovered."""
 
 import os
 import random
@@ -64,7 +64,7 @@ def small_disk(tmp_path):
 
 
 @pytest.mark.process
-def test_a_full_disk_keeps_what_was_recorded(small_disk, tmp_path):
+def test_a_full_disk_loses_no_recorded_samples(small_disk, tmp_path):
     writer = begun(small_disk / "a.mcap")
     count, message = fill(writer)
     assert count > 500
@@ -75,18 +75,18 @@ def test_a_full_disk_keeps_what_was_recorded(small_disk, tmp_path):
     assert [p.name for p in small_disk.iterdir()] == ["a.mcap.part"]
     elsewhere = tmp_path / "a.mcap.part"
     shutil.copy(writer.part, elsewhere)
-    # The last chunk may have found room, and only its index not.
+    # The last chunk may have fitted, and only its index not.
     assert recovered_ticks(elsewhere) in (list(range(count)), list(range(count + 250)))
 
 
 @pytest.mark.process
-def test_a_disk_that_cannot_be_written_is_refused_before_anything_moves(small_disk):
+def test_an_unwritable_disk_is_refused_before_motion(small_disk):
     subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
     with pytest.raises(SessionError, match=r"cannot be written: Read-only file system\. Check"):
         SessionWriter(small_disk / "a.mcap")
 
 
-def test_a_folder_that_may_not_be_written_is_refused(tmp_path):
+def test_an_unwritable_folder_is_refused(tmp_path):
     if os.geteuid() == 0:
         pytest.skip("root may write everywhere")
     tmp_path.chmod(0o500)
@@ -97,7 +97,7 @@ def test_a_folder_that_may_not_be_written_is_refused(tmp_path):
         tmp_path.chmod(0o700)
 
 
-def test_a_limit_of_the_file_size_keeps_what_was_recorded(tmp_path):
+def test_a_limit_of_the_file_size_loses_no_recorded_samples(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     writer = begun(tmp_path / "a.mcap")
     resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, hard))
@@ -113,7 +113,7 @@ def test_a_limit_of_the_file_size_keeps_what_was_recorded(tmp_path):
 
 @pytest.fixture
 def advance(monkeypatch):
-    """Let the writer's next sync be due."""
+    """Make the writer's next sync due."""
     now = [0.0]
     monkeypatch.setattr("rigd.session._writer.time.monotonic", lambda: now[0])
 
@@ -132,7 +132,7 @@ def rename_folder(folder):
 
 
 @pytest.mark.parametrize(
-    ("mishap", "kept"),
+    ("mishap", "file_name"),
     [
         (remove_file, "sessions/a.mcap.part"),
         (shutil.rmtree, "a.mcap.part"),
@@ -140,8 +140,8 @@ def rename_folder(folder):
     ],
 )
 @pytest.mark.parametrize("at_the_end", [False, True])
-def test_a_file_that_goes_while_it_is_recorded_is_noticed_and_saved(
-    tmp_path, advance, mishap, kept, at_the_end
+def test_a_file_removed_while_recording_is_detected_and_saved(
+    tmp_path, advance, mishap, file_name, at_the_end
 ):
     folder = tmp_path / "sessions"
     folder.mkdir()
@@ -154,11 +154,11 @@ def test_a_file_that_goes_while_it_is_recorded_is_noticed_and_saved(
         else:
             advance()
             writer.write_samples(packed(600, 250))
-    assert writer.abandon() == tmp_path / kept
-    assert recovered_ticks(tmp_path / kept) == list(range(600 if at_the_end else 850))
+    assert writer.abandon() == tmp_path / file_name
+    assert recovered_ticks(tmp_path / file_name) == list(range(600 if at_the_end else 850))
 
 
-def test_what_nobody_takes_is_said_to_be_lost(tmp_path, monkeypatch):
+def test_samples_without_a_reader_are_reported_lost(tmp_path, monkeypatch):
     folder = tmp_path / "sessions"
     folder.mkdir()
     writer = begun(folder / "a.mcap")
@@ -192,7 +192,7 @@ CHILD = """
 @pytest.mark.parametrize(
     "rate_hz", [1000.0, *(pytest.param(hz, marks=pytest.mark.further) for hz in (100.0, 8000.0))]
 )
-def test_a_recorder_that_is_killed_loses_a_quarter_of_a_second(tmp_path, rate_hz):
+def test_a_killed_recorder_loses_a_quarter_of_a_second(tmp_path, rate_hz):
     path = tmp_path / "a.mcap"
     here = Path(__file__).parent
     command = [sys.executable, "-c", textwrap.dedent(CHILD), path, here, repr(rate_hz)]
@@ -202,7 +202,7 @@ def test_a_recorder_that_is_killed_loses_a_quarter_of_a_second(tmp_path, rate_hz
             if int(line) == after:
                 break
         child.send_signal(signal.SIGKILL)
-        # It says what it has been given; a line may be cut off by its death.
+        # It prints what it was given; a line may be cut off by its death.
         given = max(after, *(int(line) for line in child.stdout if line.endswith(b"\n")), 0)
     samples = read_session(recover(tmp_path / "a.mcap.part").path).samples
     expected = decode_samples(packed(0, len(samples), rate_hz))

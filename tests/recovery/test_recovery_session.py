@@ -1,4 +1,4 @@
-"""A session whose file cannot be written any more stops safely and keeps what it has."""
+"""A session whose file cannot be written any more stops safely and retains its samples."""
 
 import json
 import resource
@@ -23,7 +23,7 @@ def limit_files():
 
 
 @pytest.mark.further  # as test_recovery_disk.py
-def test_a_file_that_cannot_grow_ends_the_session(tmp_path):
+def test_a_file_at_its_size_limit_ends_the_session(tmp_path):
     result = subprocess.run(
         [RIGD, "run", "chirp", "--fast", "--json", "--output", tmp_path],
         capture_output=True,
@@ -47,7 +47,7 @@ def test_a_file_that_cannot_grow_ends_the_session(tmp_path):
     assert len(samples) > 20_000
 
 
-def test_a_folder_that_is_removed_ends_the_session(write_profile, tmp_path):
+def test_a_removed_folder_ends_the_session(write_profile, tmp_path):
     folder = tmp_path / "sessions"
     where = ("--profile", write_profile("sim", patient=True), "--output", folder)
     process = warm_start.start(

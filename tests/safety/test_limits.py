@@ -69,7 +69,7 @@ def test_each_limit_is_found_with_its_numbers(watch, reading, channel, unit):
     assert f"{violation.limit:.4g} {unit}" in str(violation)
 
 
-def test_speed_is_checked_over_the_time_that_passed(watch):
+def test_speed_is_checked_over_the_elapsed_time(watch):
     watch.reset(0.0)
     assert watch.check(0.05, 0.05, REST).channel == "speed"
     watch.reset(0.0)
@@ -84,10 +84,10 @@ def test_speed_is_checked_over_the_time_that_passed(watch):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("place", range(8))
-def test_readings_that_are_no_numbers_end_the_session(watch, place, bad):
+@pytest.mark.parametrize("index", range(8))
+def test_nan_readings_end_the_session(watch, index, bad):
     values = [0.0] * 8
-    values[place] = bad
+    values[index] = bad
     violation = watch.check(values[0], values[1], tuple(values[2:]))
     assert violation is not None
     assert "not a number" in str(violation)
@@ -122,14 +122,14 @@ def test_missed_ticks_in_a_row(watch):
     )
 
 
-def test_percentage_of_missed_ticks_bears_an_early_burst(watch):
+def test_percentage_of_missed_ticks_tolerates_an_early_burst(watch):
     assert watch.check_missed(40, 200, 300) is None  # 2 % of ten seconds
     assert watch.check_missed(1, 201, 5000).unit == "%"
     assert watch.check_missed(1, 1999, 100_000) is None
     assert watch.check_missed(1, 2001, 100_000) is not None
 
 
-def test_stale_readings_are_let_through_for_as_long_as_the_limit_says(watch):
+def test_stale_readings_are_tolerated_up_to_the_limit(watch):
     for angle, wrench, word in ((True, False, "angle"), (False, True, "wrench")):
         watch.reset(0.0)
         for _ in range(3):
@@ -137,7 +137,7 @@ def test_stale_readings_are_let_through_for_as_long_as_the_limit_says(watch):
         assert f"without a new {word}" in str(watch.check_stale(angle, wrench))
 
 
-def test_a_fresh_reading_starts_the_count_of_stale_ones_again(watch):
+def test_a_fresh_reading_resets_the_count_of_stale_ones(watch):
     for _ in range(20):
         assert watch.check_stale(True, True) is None
         assert watch.check_stale(True, False) is None
@@ -145,7 +145,7 @@ def test_a_fresh_reading_starts_the_count_of_stale_ones_again(watch):
         assert watch.check_stale(False, False) is None
 
 
-def test_the_speed_after_stale_angles_is_taken_over_all_of_the_time(watch):
+def test_speed_after_stale_angles_is_over_the_whole_time(watch):
     """A shaft at 9 of 10 rad/s, of which three angles do not arrive."""
     step = 9.0 / 1000
     watch.reset(0.0)

@@ -1,4 +1,4 @@
-"""The watch over jumps, heat, lag and disk, and how often it says that something is near."""
+"""Monitoring of jumps, heat, lag and disk, and how often it reports values near a limit."""
 
 import math
 from dataclasses import replace
@@ -29,7 +29,7 @@ def watch():
 
 
 def follow(watch, angles_rad):
-    """Check angles that are their own reference; return the first that ends the session."""
+    """Check angles equal to their reference; return the first that ends the session."""
     for tick, angle_rad in enumerate(angles_rad):
         violation = watch.check(angle_rad, angle_rad, REST)
         if violation is not None:
@@ -47,7 +47,7 @@ def test_a_slip_of_the_encoder_at_rest_is_found_at_once(watch, counts, sign):
     assert violation.limit == pytest.approx(1e-3 + 2 * STEP_RAD)
 
 
-def test_a_slip_in_motion_is_found_where_no_limit_of_speed_would(watch):
+def test_a_slip_in_motion_is_found_below_the_speed_limit(watch):
     angles_rad = 0.5e-3 * np.arange(100)
     angles_rad[60:] += 0.003  # 3.5 rad/s for a tick, where 4 are allowed
     tick, violation = follow(watch, angles_rad.tolist())
@@ -71,7 +71,7 @@ def test_late_ticks_are_no_jumps(speed_rad_s, frequency_hz, lateness, phase):
     angles_rad = speed_rad_s / omega * np.sin(omega * t_s + phase)
     angles_rad = np.round(angles_rad / STEP_RAD) * STEP_RAD
     watch.reset(float(angles_rad[0]))
-    # From rest to this speed nothing can go in one tick.
+    # Nothing can accelerate from rest to this speed in one tick.
     watch._previous_moved_rad = watch._second_last_moved_rad = float(angles_rad[1] - angles_rad[0])
     watch._previous_angle_rad = float(angles_rad[1])
     limited = [v for v in angles_rad[2:].tolist() if abs(v) < 1.2]
@@ -91,7 +91,7 @@ def test_uneven_latches_after_missed_ticks_are_no_jumps(watch):
     assert (tick, violation.channel) == (6, "encoder jump")
 
 
-def test_angles_that_are_missing_make_no_jump(watch):
+def test_missing_angles_are_no_jump(watch):
     """Nine old angles in a row, while the motor goes from rest to 3 rad/s."""
     speeds_rad_s = np.minimum(np.arange(20) * 0.4, 3.0)
     angles_rad = np.cumsum(speeds_rad_s) * 1e-3
@@ -104,29 +104,29 @@ def test_angles_that_are_missing_make_no_jump(watch):
 
 def heat(watch, torque_nm, seconds, start_s=0.0):
     """Exert a torque; return when that ends the session."""
-    for look in range(round(seconds * 1000 / SLOW_CHECK_TICKS)):
-        now_ns = round(start_s * 1e9) + look * SLOW_CHECK_TICKS * PERIOD_NS
+    for check in range(round(seconds * 1000 / SLOW_CHECK_TICKS)):
+        now_ns = round(start_s * 1e9) + check * SLOW_CHECK_TICKS * PERIOD_NS
         if watch.check_slow(now_ns, SLOW_CHECK_TICKS * torque_nm**2) is not None:
             return (now_ns * 1e-9) - start_s
     return None
 
 
 @pytest.mark.parametrize("torque_nm", [0.45, 0.6, 0.9])
-def test_the_motor_bears_a_torque_for_as_long_as_its_time_constant_says(watch, torque_nm):
+def test_the_motor_heats_up_with_its_time_constant(watch, torque_nm):
     motor = PROFILE.rig.motor
     ratio = (motor.continuous_torque_nm / torque_nm) ** 2
     expected_s = -motor.thermal_time_constant_s * math.log(1 - ratio)
     assert heat(watch, torque_nm, 60.0) == pytest.approx(expected_s, abs=0.2)
 
 
-def test_the_motor_bears_its_continuous_torque_for_ever_and_cools_down_meanwhile(watch):
+def test_continuous_torque_has_no_time_limit(watch):
     assert heat(watch, 0.99 * PROFILE.rig.motor.continuous_torque_nm, 300.0) is None
     assert heat(watch, 0.9, 5.0, start_s=300.0) < 0.3
-    # A minute without a look, as between two sessions.
+    # A minute without a check, as between two sessions.
     assert heat(watch, 0.9, 5.0, start_s=400.0) > 1.5
 
 
-def test_heat_lag_and_disk_mark_the_samples_until_they_are_well_again(watch):
+def test_heat_lag_and_disk_mark_samples_until_normal(watch):
     assert watch.check_slow(0, 0.0, 0.6 * LIMITS.recorder_lag_s) is None
     assert watch.check(0.0, 0.0, REST) is None
     assert watch.warning
@@ -141,11 +141,11 @@ def test_heat_lag_and_disk_mark_the_samples_until_they_are_well_again(watch):
     assert "Free space on the session's disk 400 MB below warning level 500 MB (limit 50" in disk
 
 
-def test_a_channel_is_told_anew_after_a_second_clear_of_its_limit(watch):
+def test_a_channel_is_reported_again_after_a_second(watch):
     near = 0.9 * LIMITS.angle_rad
 
-    def be_at(angle_rad, looks):
-        for _ in range(looks):
+    def be_at(angle_rad, checks):
+        for _ in range(checks):
             watch.reset(angle_rad)
             assert watch.check(angle_rad, angle_rad, REST) is None
             assert watch.check_slow(0) is None
@@ -158,7 +158,7 @@ def test_a_channel_is_told_anew_after_a_second_clear_of_its_limit(watch):
     assert be_at(near, 1) == 1  # back after 1.3 s
 
 
-def test_what_is_beyond_its_limit_is_no_notice(watch):
+def test_no_notice_beyond_the_limit(watch):
     watch.reset(2.0)
     assert watch.check(2.0, 2.0, REST) is not None
     assert watch.take_notices() == []
@@ -179,7 +179,7 @@ def test_many_old_readings_near_their_limit_mark_the_next_sample(watch):
     assert watch.take_notices() == []
     assert watch.check_stale_fraction(51, 60, 10_000) is None
     assert watch.check(0.0, 0.0, REST) is None
-    # No angle was old in this tick or the one before: the check of what is old carries it.
+    # No angle was old in this tick or the one before: the check of old readings reports it.
     assert watch.check_stale(angle_stale=False, wrench_stale=False) is None
     assert watch.warning
     assert watch.check(0.0, 0.0, REST) is None
@@ -201,9 +201,9 @@ def test_too_many_old_readings_end_a_session(watch, angles, wrenches, which):
     assert watch.check_stale_fraction(400, 400, 40_000) is None
 
 
-def test_a_torque_that_is_no_number_is_never_commanded(watch):
+def test_a_nan_torque_is_never_commanded(watch):
     assert "not a number" in str(watch.check_torque(math.nan))
-    assert watch.check_torque(1.0) is None  # cut at 0.9 N·m, and told
+    assert watch.check_torque(1.0) is None  # cut at 0.9 N·m, and reported
     assert len(watch.take_notices()) == 1
 
 
@@ -211,8 +211,8 @@ def usage(free_mb):
     return lambda _: SimpleNamespace(free=round(free_mb * 1e6))
 
 
-def test_a_session_that_would_fill_the_disk_is_refused(tmp_path, monkeypatch):
-    excitation = hold(rate_hz=1000.0, duration_s=100.0)  # up to 27 MB with what is spare
+def test_a_session_too_large_for_the_disk_is_refused(tmp_path, monkeypatch):
+    excitation = hold(rate_hz=1000.0, duration_s=100.0)  # up to 27 MB with the reserve
     monkeypatch.setattr("shutil.disk_usage", usage(80.0))
     Series(PROFILE, excitation, tmp_path / "sessions")
     assert (tmp_path / "sessions").is_dir()
@@ -227,35 +227,35 @@ OVERLOADED_ADVICE = "The computer is overloaded: close other programs."
 
 
 def left_behind(watch):
-    """Have the shaft fall far behind its reference, and return what is said of it."""
+    """Have the shaft fall far behind its reference, and return the message."""
     return str(watch.check(2.0 * LIMITS.tracking_error_rad, 0.0, REST))
 
 
-def test_what_a_limit_finds_right_after_a_standstill_is_the_computers_doing(watch):
+def test_a_violation_after_a_pause_is_due_to_the_computer(watch):
     assert "lower the amplitude" in left_behind(watch)
     watch.reset(0.0)
     assert watch.check_missed(20, 20, 1000) is None
-    said = left_behind(watch)
-    assert said.endswith(f"It came after 20 missed ticks. {OVERLOADED_ADVICE}")
-    assert "amplitude" not in said
+    message = left_behind(watch)
+    assert message.endswith(f"It came after 20 missed ticks. {OVERLOADED_ADVICE}")
+    assert "amplitude" not in message
 
 
-def test_missed_ticks_of_several_gaps_are_told_together(watch):
+def test_missed_ticks_of_several_gaps_are_reported_together(watch):
     watch.skip(4)
     assert watch.after_missed == "It came after 4 missed ticks."
     watch.skip(5)
     assert watch.after_missed == f"It came after 9 missed ticks. {OVERLOADED_ADVICE}"
 
 
-def test_a_tick_or_two_do_not_acquit_the_beam(watch):
+def test_few_missed_ticks_do_not_explain_a_violation(watch):
     watch.skip(1)
-    said = left_behind(watch)
-    assert "It came after 1 missed tick." in said
-    assert "lower the amplitude" in said
-    assert OVERLOADED_ADVICE not in said
+    message = left_behind(watch)
+    assert "It came after 1 missed tick." in message
+    assert "lower the amplitude" in message
+    assert OVERLOADED_ADVICE not in message
 
 
-def test_missed_ticks_are_forgotten_after_two_looks(watch):
+def test_missed_ticks_expire_after_two_checks(watch):
     watch.skip(20)
     watch.check_slow(0)
     assert watch.after_missed
@@ -264,23 +264,23 @@ def test_missed_ticks_are_forgotten_after_two_looks(watch):
     assert "amplitude" in left_behind(watch)
 
 
-def test_missed_ticks_are_not_to_blame_for_what_they_cannot_do(watch):
+def test_missed_ticks_do_not_explain_a_full_disk(watch):
     watch.skip(20)
     violation = watch.check_slow(0, disk_free_mb=0.5 * LIMITS.disk_free_mb)
     assert "missed" not in str(violation)
 
 
-def test_a_new_session_starts_without_the_missed_ticks_of_the_last_one(watch):
+def test_a_new_session_resets_the_missed_ticks(watch):
     watch.skip(20)
     watch.reset(0.0)
     assert watch.after_missed == ""
 
 
-@pytest.mark.parametrize(("readings", "judged"), [(90, False), (110, True)])
-def test_a_sensor_is_judged_by_enough_readings_at_rest_alone(readings, judged):
+@pytest.mark.parametrize(("readings", "checked"), [(90, False), (110, True)])
+def test_a_sensor_is_checked_by_enough_readings_at_rest(readings, checked):
     sensor_monitor = SensorMonitor(("fx", "fy"), (True, True), 1000.0)
     for _ in range(readings):
         assert sensor_monitor.step((1.0, 2.0)) is None
-    assert (sensor_monitor.finish_learning() is not None) == judged
-    if not judged:
+    assert (sensor_monitor.finish_learning() is not None) == checked
+    if not checked:
         assert not any(sensor_monitor.step((1.0, 2.0)) for _ in range(2000))

@@ -17,7 +17,7 @@ def profile():
 
 
 @pytest.mark.parametrize(
-    ("lie", "coulomb_nm", "says"),
+    ("lie", "coulomb_nm", "message"),
     [
         pytest.param(Lie(profile={STEP: 0.1}), 0.02, "encoder.resolution_rad", id="step 0.1"),
         further(Lie(profile={STEP: 0.25}), 0.1, "encoder.resolution_rad", id="step 0.25"),
@@ -41,9 +41,9 @@ def profile():
         further(Lie(frozen_from=1650), 0.02, "encoder stands still", id="frozen while moving"),
     ],
 )
-def test_a_lie_is_named_and_the_shaft_stays_within_its_limits(profile, lie, coulomb_nm, says):
+def test_a_lie_is_named_within_the_limits_of_the_shaft(profile, lie, coulomb_nm, message):
     done = probe(profile, lie, coulomb_nm=coulomb_nm)
-    assert says in done.contradiction
+    assert message in done.contradiction
     assert done.speed_rad_s < profile.limits.velocity_rad_s
     assert done.angle_rad < (0.3 if lie.frozen_from is not None else profile.limits.angle_rad)
 
@@ -82,7 +82,7 @@ def test_every_lie(profile, lie, coulomb_nm):
     assert done.angle_rad < profile.limits.angle_rad
 
 
-def test_the_plan_keeps_to_the_limits_of_the_profile(profile):
+def test_the_plan_is_within_the_limits_of_the_profile(profile):
     rig = probed_rig(profile)
     plan = plan_probe(rig)
     assert plan.travel_rad >= 0.1

@@ -1,4 +1,4 @@
-"""docs/safety.md says what the code does."""
+"""docs/safety.md agrees with the code."""
 
 import re
 from pathlib import Path
@@ -67,7 +67,7 @@ def test_every_level_is_a_key_of_a_profile():
 
 
 @pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
-def test_the_travel_of_the_shipped_profiles_is_the_document_s(name):
+def test_the_document_has_the_travel_of_the_shipped_profiles(name):
     profile = load_profile(name)
     section = TEXT[TEXT.index("## How far it turns") :].partition("\n## ")[0]
     for row in stopping_distance_rows(profile):
@@ -75,8 +75,8 @@ def test_the_travel_of_the_shipped_profiles_is_the_document_s(name):
         assert len(numbers) == 4
         what = row.what.removeprefix("worst, ")
         (blind_ms,) = re.findall(r"in the (\d+) ms", row.found)
-        total, driven, coasting, room = numbers
-        line = f"| {name} | {what} | {blind_ms} ms | {driven} | {coasting} | {total} | {room} |"
+        total, driven, coasting, margin = numbers
+        line = f"| {name} | {what} | {blind_ms} ms | {driven} | {coasting} | {total} | {margin} |"
         assert line in section.splitlines(), f"docs/safety.md lacks the line\n{line}"
     free = max_stopping_distance(
         profile.rig, profile.limits, profile.rig.cia402.heartbeat_timeout_s

@@ -24,7 +24,7 @@ def with_motor(rig, **changes):
     return replace(rig, motor=replace(rig.motor, **changes))
 
 
-def test_without_friction_it_turns_for_ever(profile):
+def test_endless_travel_without_friction(profile):
     rig = with_motor(profile.rig, viscous_nm_s_per_rad=0.0, coulomb_nm=0.0)
     travel = max_stopping_distance(rig, profile.limits, 0.05)
     assert travel.driven_rad == pytest.approx(4.0 * 0.05 + 0.5 * 450.0 * 0.05**2, rel=1e-6)
@@ -50,7 +50,7 @@ def test_viscous_friction_alone_brakes_by_its_time_constant(profile):
     assert travel.coasting_rad == pytest.approx(4.0 * inertia_kg_m2 / 0.02, rel=1e-2)
 
 
-def test_the_drive_s_own_speed_limit_shortens_it(profile):
+def test_the_speed_limit_of_the_drive_shortens_the_travel(profile):
     free = max_stopping_distance(profile.rig, profile.limits, 0.05)
     limited = max_stopping_distance(profile.rig, profile.limits, 0.05, 5.0)
     assert limited.driven_rad < 5.0 * 0.05
@@ -67,7 +67,7 @@ def test_the_shipped_rigs_come_to_rest_in_time(name):
     assert [row.detail for row in rows if row is not worst] == [""] * 3
 
 
-def test_a_drive_in_this_program_ends_with_it():
+def test_a_drive_in_process_needs_no_travel_check():
     (row,) = stopping_distance_rows(load_profile("sim"))
     assert row.verdict is CheckResult.SKIPPED
 
@@ -95,7 +95,7 @@ def test_a_travel_beyond_the_stop_is_refused(profile, drive, limits):
         ({"missed_ticks_in_a_row": 1000}, "if ticks are missed", "limits.missed_ticks_in_a_row"),
     ],
 )
-def test_a_loop_that_runs_blind_for_long_is_the_worst(profile, limits, what, key):
+def test_the_worst_travel_is_of_a_blind_loop(profile, limits, what, key):
     """With a thousand old angles a shaft turned by 38.5 rad, its drive's heartbeat being there."""
     blind = replace(profile, limits=replace(profile.limits, **limits))
     row = worst_row(blind)
@@ -111,7 +111,7 @@ def test_a_loop_that_runs_blind_for_long_is_the_worst(profile, limits, what, key
     assert row.found.startswith(f"{travel.total_rad:.2f} rad: {travel.driven_rad:.2f} rad in the")
 
 
-def test_what_nothing_ends_is_told_and_takes_no_time(profile):
+def test_endless_travel_is_reported_at_once(profile):
     endless = {"max_speed_rad_s": 0.0}
     blind = replace(
         profile,
@@ -124,12 +124,12 @@ def test_what_nothing_ends_is_told_and_takes_no_time(profile):
     assert max_stopping_distance(profile.rig, profile.limits, math.inf, 5.0).total_rad == math.inf
 
 
-def test_a_speed_that_stays_is_not_followed_step_by_step(profile):
+def test_constant_speed_needs_no_steps(profile):
     travel = max_stopping_distance(profile.rig, profile.limits, 10.0, 5.0)
     assert travel.driven_rad == pytest.approx(50.0, abs=0.02)
 
 
-def test_a_drive_that_is_accepted_without_a_watchdog_has_no_bound(profile):
+def test_no_bound_for_a_drive_accepted_without_watchdog(profile):
     drive = replace(profile.rig.cia402, accept_without=("watchdog",))
     rows = list(stopping_distance_rows(replace(profile, rig=replace(profile.rig, cia402=drive))))
     worst, *others = rows
@@ -140,7 +140,7 @@ def test_a_drive_that_is_accepted_without_a_watchdog_has_no_bound(profile):
     assert not any(row.what.startswith("worst") for row in others)
 
 
-def test_the_watchdog_of_the_maker_counts_where_it_is_slower(profile):
+def test_a_slower_watchdog_of_the_maker_counts(profile):
     drive = replace(profile.rig.cia402, own_watchdog_s=0.06)
     row = worst_row(replace(profile, rig=replace(profile.rig, cia402=drive)))
     assert "60 ms of the drive's watchdog (cia402.own_watchdog_s)" in row.found

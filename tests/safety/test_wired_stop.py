@@ -1,4 +1,4 @@
-"""The wired stop (STO) as the drive that is simulated in this process shows it."""
+"""The wired stop (STO) of the drive simulated in this process."""
 
 import pytest
 from shipped_profile import load_shipped
@@ -17,7 +17,7 @@ def direct():
     return devices.drive
 
 
-def test_the_direct_drive_has_no_torque_from_that_instant_on(direct):
+def test_the_direct_drive_loses_torque_at_the_stop(direct):
     direct.sto_dropped = True
     assert not direct._plant.enabled
     direct.command(0.2)
@@ -26,7 +26,7 @@ def test_the_direct_drive_has_no_torque_from_that_instant_on(direct):
         direct.read_angle()
 
 
-def test_the_direct_drive_stays_off_until_it_is_released_and_enabled_again(direct):
+def test_the_direct_drive_stays_off_until_enabled_again(direct):
     direct.sto_dropped = True
     direct.disable()
     direct.read_angle()  # a drive that is off may be watched

@@ -42,7 +42,7 @@ OUTCOME = {"outcome": "complete", "reason": ""}
 
 
 def make_samples(n, *, first_tick=0, seed=0):
-    """Samples with noise in every field that has no meaning of its own."""
+    """Samples with noise in every field without a fixed meaning."""
     rng = np.random.default_rng(seed)
     samples = np.zeros(n, SAMPLE_DTYPE)
     samples["tick"] = first_tick + np.arange(n)
@@ -63,7 +63,7 @@ def packed(samples):
 
 
 def packed_timings(ticks):
-    """Ages that tell the ticks apart."""
+    """Ages that differ in every tick."""
     buffer = bytearray(TIMING_SIZE * len(ticks))
     for i, tick in enumerate(ticks):
         pack_timing_into(buffer, i * TIMING_SIZE, tick * 1_000_000, tick, 1e-6 * tick, -2e-6 * tick)
@@ -91,7 +91,7 @@ MINIMUM = {
 }
 
 
-def write_foreign(path, messages, *, schema=None, name="rigd.Sample", metadata=MINIMUM,
+def write_third_party(path, messages, *, schema=None, name="rigd.Sample", metadata=MINIMUM,
                   topic="/rig/sample", extra=None, encoding="protobuf", **options):  # fmt: skip
     """Write messages with the plain mcap package; `extra` names a second channel."""
     with path.open("wb") as stream:

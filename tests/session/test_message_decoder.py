@@ -1,4 +1,4 @@
-"""Messages of any encoding, which are decoded together, read as protobuf decodes each."""
+"""Messages of any encoding: decoded together as protobuf decodes each of them."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def schema_with(changes):
     tail=st.sampled_from([b"", b"\xa0\x01\x07", b"\xa2\x01\x03abc", b"\xa5\x01abcd"]),
     seed=st.integers(0, 99),
 )
-def test_any_encoding_reads_as_protobuf_reads_it(kit, tmp_path, changes, order, tail, seed):
+def test_any_encoding_is_read_as_by_protobuf(kit, tmp_path, changes, order, tail, seed):
     """Fields left out at zero, in another order, twice, unknown, or as numbers of any length."""
     rng = np.random.default_rng(seed)
     samples = kit.make_samples(400)
@@ -56,9 +56,9 @@ def test_any_encoding_reads_as_protobuf_reads_it(kit, tmp_path, changes, order, 
         ]
         messages.append(b"".join(parts) + parts[i % 2] + tail)  # some fields twice
     decoded = [cls.FromString(message) for message in messages]
-    # All of them, and as few as are decoded one by one.
+    # All of them, and few enough to be decoded one by one.
     for name, count in (("all.mcap", 400), ("few.mcap", 9)):
-        path = kit.write_foreign(tmp_path / name, messages[:count], schema=schema)
+        path = kit.write_third_party(tmp_path / name, messages[:count], schema=schema)
         found = read_session(path).samples
         assert found.tolist() == [
             tuple(getattr(each, name) for name in SAMPLE_FIELDS) for each in decoded[:count]
@@ -69,24 +69,24 @@ def test_any_encoding_reads_as_protobuf_reads_it(kit, tmp_path, changes, order, 
 def test_samples_of_another_order_are_decoded_together(kit, tmp_path, monkeypatch):
     samples = kit.make_samples(5000)
     messages = [m[9:14] + m[:9] + m[14:] for m in kit.fixed_messages(samples)]
-    path = kit.write_foreign(tmp_path / "f.mcap", messages)
+    path = kit.write_third_party(tmp_path / "f.mcap", messages)
     monkeypatch.setattr(limits, "MAX_SINGLE_MESSAGES", 0)
     np.testing.assert_array_equal(read_session(path).samples, samples)
 
 
-def test_too_many_messages_that_differ_are_refused(kit, tmp_path, monkeypatch):
+def test_too_many_differing_messages_are_refused(kit, tmp_path, monkeypatch):
     monkeypatch.setattr(limits, "MAX_SINGLE_MESSAGES", 100)
     whole = kit.fixed_messages(kit.make_samples(300))
     messages = [m + b"\xa2\x01" + bytes([i % 100]) + bytes(i % 100) for i, m in enumerate(whole)]
-    path = kit.write_foreign(tmp_path / "f.mcap", messages)
+    path = kit.write_third_party(tmp_path / "f.mcap", messages)
     with pytest.raises(SessionError, match="more than 100 messages of /rig/sample differ so much"):
         read_session(path)
 
 
-def test_a_message_that_ends_too_early_is_found_among_others_alike(kit, tmp_path):
+def test_a_truncated_message_is_found_among_equal_ones(kit, tmp_path):
     messages = [m[9:14] + m[:9] + m[14:] for m in kit.fixed_messages(kit.make_samples(100))]
     messages[50] = messages[50][:-1] + b"\x80"  # still a number
     messages[60] = b"\xff" * len(messages[60])
-    path = kit.write_foreign(tmp_path / "f.mcap", messages)
+    path = kit.write_third_party(tmp_path / "f.mcap", messages)
     with pytest.raises(SessionError, match="not what its schema says"):
         read_session(path)

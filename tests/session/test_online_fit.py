@@ -24,7 +24,7 @@ def mode(number, hz, damping, *, shown=True, flag=None) -> dict:
     }
 
 
-def test_lines_tell_modes_changes_doubts_and_findings():
+def test_lines_state_modes_changes_doubts_and_findings():
     before = answer_with(mode(1, 2.5, 0.01), mode(2, 16.0, 0.005, shown=False))
     now = answer_with(
         mode(1, 2.502, 0.0102),
@@ -47,7 +47,7 @@ def test_lines_tell_modes_changes_doubts_and_findings():
     assert modes_from_json(now["modes"])[0].line() in estimate_lines(now)[1]
 
 
-def test_lines_tell_why_there_is_no_estimate():
+def test_lines_state_the_reason_for_no_estimate():
     assert estimate_lines(answer_with(problem="Nothing is excited yet.")) == [
         "After 7.0 s: Nothing is excited yet."
     ]

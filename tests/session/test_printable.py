@@ -13,11 +13,11 @@ from rigd.printable import printable
         ("\x00\x9b\u202e\ud800", "????"),
     ],
 )
-def test_what_a_terminal_would_obey_is_marked(text, shown):
+def test_control_characters_are_marked(text, shown):
     assert printable(text) == shown
     assert printable(text).isprintable()
 
 
 @pytest.mark.parametrize(("most", "shown"), [(2, "ab…"), (3, "abc"), (None, "abc")])
-def test_what_is_too_long_is_cut(most, shown):
+def test_long_text_is_cut(most, shown):
     assert printable("abc", most) == shown

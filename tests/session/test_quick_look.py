@@ -1,4 +1,4 @@
-"""Files of quick looks: whatever lies there, what is read of them can be used."""
+"""Files of quick looks: with any content, the values read from them are valid."""
 
 import json
 import os
@@ -43,7 +43,7 @@ def write(folder, name, **members) -> Path:
     return path
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_a_written_file_is_read(tmp_path):
     written = {
         "version": 1, "file": "a.mcap", "session_id": "a", "specimen": "antenna 3",
         "excitation": "chirp", "start_utc_ns": 5, "made_utc_ns": 6, "took_s": 2.5,
@@ -61,10 +61,10 @@ def test_what_is_written_is_read(tmp_path):
      "linear_model_error": 0.1}, {"predicted_peak_tip_slope_rad": True, "linear_model_error": 0.1},
      {"predicted_peak_tip_slope_rad": 10**400, "linear_model_error": 0.1}],
 )  # fmt: skip
-def test_a_validity_that_is_none_is_unknown_and_not_good(tmp_path, stated):
-    look = read_quick_look(write(tmp_path, "a", modes=[mode(2.5)], validity=stated))
-    assert look["validity"] == Validity().as_json()
-    assert "unknown" in look["validity"]["sentence"]
+def test_an_invalid_validity_is_unknown(tmp_path, stated):
+    quick_look = read_quick_look(write(tmp_path, "a", modes=[mode(2.5)], validity=stated))
+    assert quick_look["validity"] == Validity().as_json()
+    assert "unknown" in quick_look["validity"]["sentence"]
 
 
 @pytest.mark.parametrize(
@@ -72,11 +72,11 @@ def test_a_validity_that_is_none_is_unknown_and_not_good(tmp_path, stated):
     [None, 7, {}, {"status": "perhaps", "p_value": 0.5}, {"status": "passed"}, {"status": []},
      {"status": "refused", "p_value": -1.0}, {"status": "passed", "p_value": "0.5"}],
 )  # fmt: skip
-def test_a_test_of_uniformity_that_is_none_is_unknown(tmp_path, stated):
-    look = read_quick_look(
+def test_an_invalid_test_of_uniformity_is_unknown(tmp_path, stated):
+    quick_look = read_quick_look(
         write(tmp_path, "a", modes=[mode(2.5)], validity={"uniform_beam": stated})
     )
-    assert look["validity"]["uniform_beam"] is None
+    assert quick_look["validity"]["uniform_beam"] is None
 
 
 @pytest.mark.parametrize(
@@ -97,10 +97,15 @@ def test_a_test_of_uniformity_is_stated_in_words(found, sentence, short):
     assert BeamUniformity.from_document(found.as_json()) == found
 
 
-def test_what_is_missing_is_empty(tmp_path):
-    look = read_quick_look(write(tmp_path, "a"))
-    assert (look["specimen"], look["start_utc_ns"], look["modes"], look["text"]) == ("", 0, [], [])
-    assert look["response"] is None
+def test_missing_values_are_empty(tmp_path):
+    quick_look = read_quick_look(write(tmp_path, "a"))
+    assert (
+        quick_look["specimen"],
+        quick_look["start_utc_ns"],
+        quick_look["modes"],
+        quick_look["text"],
+    ) == ("", 0, [], [])
+    assert quick_look["response"] is None
 
 
 @pytest.mark.parametrize(
@@ -110,7 +115,7 @@ def test_what_is_missing_is_empty(tmp_path):
      b'{"version": 1, "text": 7}', b'{"version": 1, "text": [7]}',
      b'{"version": 1, "flags": "' + b"a" * (1 << 20) + b'"}'],
 )  # fmt: skip
-def test_a_file_that_is_none_is_not_read(tmp_path, content):
+def test_invalid_files_are_not_read(tmp_path, content):
     path = quick_look_path(tmp_path / "a.mcap")
     path.write_bytes(content)
     assert read_quick_look(path) is None
@@ -126,7 +131,7 @@ def test_a_file_that_is_none_is_not_read(tmp_path, content):
      [mode(2.5) | {"damping_ratio": {"value": float("inf")}}],
      [mode(2.5) | {"damping_ratio": {"value": 10**400}}]],
 )  # fmt: skip
-def test_modes_without_their_numbers_are_left_out(tmp_path, modes):
+def test_modes_without_their_numbers_are_omitted(tmp_path, modes):
     whole = mode(16.0) | {"mode": 2, "shown": True} | OF_MODAL_MODEL
     given = [*modes, whole] if isinstance(modes, list) else modes
     found = read_quick_look(write(tmp_path, "a", modes=given))["modes"]
@@ -134,7 +139,7 @@ def test_modes_without_their_numbers_are_left_out(tmp_path, modes):
     assert [each.as_json() for each in modes_from_json(given)] == found
 
 
-def test_an_interval_without_two_numbers_is_none():
+def test_an_interval_needs_two_numbers():
     (found,) = modes_from_json(
         [mode(2.5) | {"frequency_hz": quantity(2.5, 0.1) | {"interval_95": [2]}}]
     )
@@ -155,8 +160,8 @@ def test_a_response_is_whole_or_none(tmp_path, wrong):
 def test_numbers_beyond_all_floats_are_unknown(tmp_path):
     path = quick_look_path(tmp_path / "a.mcap")
     path.write_text('{"version": 1, "took_s": 1e999, "coherence": {"mean": NaN}}')
-    look = read_quick_look(path)
-    assert (look["took_s"], look["coherence"]) == (None, {"mean": None})
+    quick_look = read_quick_look(path)
+    assert (quick_look["took_s"], quick_look["coherence"]) == (None, {"mean": None})
 
 
 @given(st.recursive(
@@ -168,18 +173,18 @@ def test_numbers_beyond_all_floats_are_unknown(tmp_path):
     ),
     max_leaves=10,
 ))  # fmt: skip
-def test_anything_is_read_as_json_or_not_at_all(tmp_path_factory, found):
+def test_any_content_is_read_as_json_or_refused(tmp_path_factory, found):
     folder = tmp_path_factory.getbasetemp()
     members = found if isinstance(found, dict) else {"modes": found, "response": found}
-    look = read_quick_look(write(folder, f"any-{os.getpid()}", **members | {"version": 1}))
-    if look is not None:
-        json.dumps(look, allow_nan=False)
+    quick_look = read_quick_look(write(folder, f"any-{os.getpid()}", **members | {"version": 1}))
+    if quick_look is not None:
+        json.dumps(quick_look, allow_nan=False)
 
 
 # The last one
 
 
-def test_the_last_look_is_that_of_the_latest_session(tmp_path):
+def test_the_last_quick_look_is_of_the_latest_session(tmp_path):
     write(tmp_path, "early", start_utc_ns=5, specimen="A", response=RESPONSE)
     write(tmp_path, "late", start_utc_ns=9, specimen="A")
     write(tmp_path, "other", start_utc_ns=8, specimen="B")
@@ -192,13 +197,13 @@ def test_the_last_look_is_that_of_the_latest_session(tmp_path):
 
     assert last("A") == "late.mcap"
     assert last("A", excluded_session="late") == last("A", before_utc_ns=9) == "early.mcap"
-    assert last("A", usable=lambda look: look["response"]) == "early.mcap"
+    assert last("A", usable=lambda quick_look: quick_look["response"]) == "early.mcap"
     assert last("") == "none.mcap"
     assert last("C") is None
     assert last_quick_look(tmp_path / "missing", "A", is_usable=bool) is None
 
 
-def test_the_fit_of_a_file_is_read_as_far_as_it_can_be_used():
+def test_usable_parts_of_a_fit_are_read():
     fit = online_fit(9.5, third="doubtful")
     found = fit_of({"fit": json.dumps(fit)})
     assert found["duration_s"] == 9.5
@@ -222,7 +227,7 @@ def test_the_fit_of_a_file_is_read_as_far_as_it_can_be_used():
         ),
     )
 )
-def test_anything_else_in_its_place_is_no_fit_or_one_without_it(found):
+def test_invalid_parts_of_a_fit_are_omitted(found):
     for content in (found, online_fit() | found if isinstance(found, dict) else found):
         fit = fit_of({"fit": json.dumps(content)})
         assert fit is None or fit_table(fit)

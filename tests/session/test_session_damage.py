@@ -44,7 +44,7 @@ def test_an_empty_file(tmp_path):
 
 
 @pytest.mark.parametrize("data", [b"\n", b"time,angle\n0,0\n" * 1000, bytes(5000), MAGIC[:-1]])
-def test_a_file_that_is_no_mcap(tmp_path, data):
+def test_a_file_of_another_format(tmp_path, data):
     path = tmp_path / "a.mcap"
     path.write_bytes(data)
     refused(path, r"is not an MCAP file\. Give a session file")
@@ -52,25 +52,25 @@ def test_a_file_that_is_no_mcap(tmp_path, data):
 
 def test_an_mcap_file_without_samples_channel(kit, tmp_path):
     messages = kit.fixed_messages(kit.make_samples(3))
-    path = kit.write_foreign(tmp_path / "a.mcap", messages, topic="/other")
+    path = kit.write_third_party(tmp_path / "a.mcap", messages, topic="/other")
     refused(path, "without the channel /rig/sample, so it is not a session")
 
 
-def test_samples_that_are_no_protobuf(kit, tmp_path):
-    path = kit.write_foreign(tmp_path / "a.mcap", [b"{}"], encoding="jsonschema", schema=b"{}")
+def test_samples_without_protobuf(kit, tmp_path):
+    path = kit.write_third_party(tmp_path / "a.mcap", [b"{}"], encoding="jsonschema", schema=b"{}")
     with pytest.raises(SessionError, match=r"encoding 'jsonschema'.*has protobuf"):
         read_session(path)
 
 
 @pytest.mark.parametrize("schema", [b"", b"\xff\xff", b"garbage" * 20])
-def test_a_schema_that_is_none(kit, tmp_path, schema):
-    path = kit.write_foreign(tmp_path / "a.mcap", [b""], schema=schema)
+def test_an_invalid_schema(kit, tmp_path, schema):
+    path = kit.write_third_party(tmp_path / "a.mcap", [b""], schema=schema)
     with pytest.raises(SessionError, match="not a usable protobuf schema"):
         read_session(path)
 
 
-def test_messages_that_contradict_their_schema(kit, tmp_path):
-    path = kit.write_foreign(tmp_path / "a.mcap", [b"\x09\x00"])
+def test_messages_unlike_their_schema(kit, tmp_path):
+    path = kit.write_third_party(tmp_path / "a.mcap", [b"\x09\x00"])
     with pytest.raises(SessionError, match="not what its schema says"):
         read_session(path)
 
@@ -78,21 +78,21 @@ def test_messages_that_contradict_their_schema(kit, tmp_path):
 def test_truncation_anywhere(kit, recorded, tmp_path):
     path = tmp_path / "a.mcap.part"
     size = len(recorded.data)
-    places = random.Random(1).sample(range(len(MAGIC), size), 30)
-    for length in [*places, size - 1, size - 8, size - 9, size - 40]:
+    lengths = random.Random(1).sample(range(len(MAGIC), size), 30)
+    for length in [*lengths, size - 1, size - 8, size - 9, size - 40]:
         path.write_bytes(recorded.data[:length])
         with pytest.raises(SessionError, match=r"is incomplete: it (ends|has no)") as error:
             read_session(path)
         readable = int(str(error.value).split("; ")[1].split()[0])
-        # The plain reader is the judge of what is whole; samples are of channel 1.
+        # The plain reader decides what is whole; samples are of channel 1.
         whole = [m for chunk in kit.chunks_of(path) for m in chunk if m.channel_id == 1]
         assert readable == len(whole)
-    assert readable == 1111  # all that is missing then is the footer
+    assert readable == 1111  # then only the footer is missing
 
 
 def test_truncated_files_without_chunks_count_their_messages(kit, tmp_path):
     messages = kit.fixed_messages(kit.make_samples(30))
-    data = kit.write_foreign(tmp_path / "a.mcap", messages, use_chunking=False).read_bytes()
+    data = kit.write_third_party(tmp_path / "a.mcap", messages, use_chunking=False).read_bytes()
     second = data.index(messages[1])
     path = tmp_path / "b.mcap"
     path.write_bytes(data[: second + 119 + 150 * 5 + 30])
@@ -100,13 +100,13 @@ def test_truncated_files_without_chunks_count_their_messages(kit, tmp_path):
 
 
 @pytest.mark.parametrize("length", [8, 20, 300])
-def test_where_no_sample_is_whole_nothing_is_there_to_be_recovered(recorded, tmp_path, length):
+def test_nothing_to_recover_without_a_whole_sample(recorded, tmp_path, length):
     path = tmp_path / "a.mcap"
     path.write_bytes(recorded.data[:length])
     refused(path, "; 0 complete samples are readable before that, so there is nothing to recover")
 
 
-def test_a_tail_of_zeros_as_a_dead_host_leaves_it(recorded, tmp_path):
+def test_a_tail_of_zeros_after_a_dead_host(recorded, tmp_path):
     path = tmp_path / "a.mcap.part"
     path.write_bytes(recorded.data[:60_000] + bytes(60_000))
     refused(path, "is incomplete: it .*complete samples are readable")
@@ -115,9 +115,9 @@ def test_a_tail_of_zeros_as_a_dead_host_leaves_it(recorded, tmp_path):
 def test_bit_flips_anywhere(recorded, tmp_path):
     """Every byte of such a file is under a checksum or compared, so none goes unnoticed."""
     path = tmp_path / "a.mcap"
-    for place in random.Random(2).sample(range(8 * len(recorded.data)), 50):
+    for bit in random.Random(2).sample(range(8 * len(recorded.data)), 50):
         damaged = bytearray(recorded.data)
-        damaged[place // 8] ^= 1 << place % 8
+        damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
         with pytest.raises(SessionError, match=r"damaged|incomplete|not an MCAP"):
             read_session(path)
@@ -130,7 +130,7 @@ def test_bit_flips_in_files_with_fewer_checksums_never_give_wrong_samples(
     from mcap.writer import CompressionType
 
     samples = kit.make_samples(300)
-    path = kit.write_foreign(
+    path = kit.write_third_party(
         tmp_path / "a.mcap",
         kit.fixed_messages(samples),
         compression=CompressionType[compression],
@@ -138,15 +138,15 @@ def test_bit_flips_in_files_with_fewer_checksums_never_give_wrong_samples(
     )
     data = path.read_bytes()
     refusals = 0
-    for place in random.Random(3).sample(range(8 * len(data)), 80):
+    for bit in random.Random(3).sample(range(8 * len(data)), 80):
         damaged = bytearray(data)
-        damaged[place // 8] ^= 1 << place % 8
+        damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
         try:
             read = read_session(path).samples
         except SessionError:
             refusals += 1
-        else:  # a flip in what nobody needs
+        else:  # a flip in unused bytes
             np.testing.assert_array_equal(read, samples)
     assert refusals > 40
 
@@ -196,9 +196,7 @@ SMALL = b"\x05" * 1000
         (2**64 - 1, b"", lambda: SMALL, "claims"),
     ],
 )
-def test_a_chunk_that_lies_about_its_size_costs_no_memory(
-    tmp_path, claimed, compression, packed, message
-):
+def test_a_chunk_with_a_false_size_takes_no_memory(tmp_path, claimed, compression, packed, message):
     path = chunk_file(
         tmp_path / "a.mcap", claimed=claimed, packed=packed(), compression=compression
     )
@@ -217,8 +215,8 @@ def streamed(data):
     return compressor.compress(data) + compressor.flush()
 
 
-def test_many_chunks_that_add_up_to_too_much_are_refused(kit, tmp_path, monkeypatch):
-    path = kit.write_foreign(
+def test_many_chunks_of_excessive_total_size_are_refused(kit, tmp_path, monkeypatch):
+    path = kit.write_third_party(
         tmp_path / "a.mcap", kit.fixed_messages(kit.make_samples(100)), chunk_size=3000
     )
     assert len(read_session(path).samples) == 100  # 15 000 bytes and a schema
@@ -269,9 +267,9 @@ def test_a_channel_or_schema_declared_twice_differently(tmp_path):
     refused(path, "declares channel 1 twice")
 
 
-def test_messages_that_the_statistics_count_must_be_there(kit, tmp_path):
-    """A chunk whose opcode was damaged is skipped as an unknown record: nothing else would tell."""
-    path = kit.write_foreign(
+def test_messages_counted_in_the_statistics_must_exist(kit, tmp_path):
+    """A chunk whose opcode was damaged is skipped as an unknown record: no other check finds it."""
+    path = kit.write_third_party(
         tmp_path / "a.mcap", kit.fixed_messages(kit.make_samples(100)), chunk_size=5000
     )
     data = bytearray(path.read_bytes())

@@ -1,4 +1,4 @@
-"""docs/session_format.md: what it says is what the code does, and its example runs."""
+"""docs/session_format.md agrees with the code, and its example runs."""
 
 import re
 import subprocess
@@ -35,7 +35,7 @@ def test_the_proto_text_is_the_layout(message, types):
     ]
 
 
-def test_the_kinds_of_a_touch_are_those_of_the_code():
+def test_kinds_of_a_touch_are_those_of_the_code():
     (kinds,) = re.findall(r"kind = 9;\s*// (.*)", DOCUMENT)
     assert kinds == ", ".join(f"{n} {name}" for n, name in enumerate(TOUCH_KINDS))
     assert f"({TOUCH_SIZE} bytes), written at the end" in DOCUMENT
@@ -86,7 +86,7 @@ def test_the_example_writes_a_session(tmp_path):
     assert samples["tick"].tolist() == list(range(2000))
     t = samples["t_ns"] * 1e-9
     np.testing.assert_allclose(samples["angle_rad"], 0.02 * np.sin(np.pi * t), atol=1e-15)
-    # The sign that the document asks for: in phase with the angular acceleration.
+    # The sign required by the document: in phase with the angular acceleration.
     inertia = session.number("beam_density_kg_per_m") * session.number("beam_length_m") ** 3 / 3
     acceleration = -0.02 * np.pi**2 * np.sin(np.pi * t)
     np.testing.assert_allclose(samples["coupling_torque_nm"], inertia * acceleration, atol=1e-12)

@@ -79,7 +79,7 @@ def test_a_packed_touch_is_decoded_by_protobuf_and_by_numpy(values):
     assert all(map(same, decode_touches(data)[0].item(), expected))
 
 
-def test_a_touch_of_an_unheard_kind_is_unknown():
+def test_a_touch_of_a_new_kind_is_unknown():
     assert decode_touches(pack_touch(1, 2, *[0.0] * 6, "bite"))["kind"] == 0
 
 
@@ -105,7 +105,7 @@ def test_a_packed_timing_message_is_decoded_by_protobuf_and_by_numpy(values):
 
 
 @given(st.lists(SAMPLES, max_size=5), st.integers(0, 7))
-def test_samples_are_packed_at_an_offset_and_nowhere_else(rows, offset):
+def test_samples_are_packed_only_at_their_offset(rows, offset):
     buffer = bytearray(b"\xa5" * (offset + len(rows) * SAMPLE_SIZE + 3))
     for i, values in enumerate(rows):
         pack_sample_into(memoryview(buffer), offset + i * SAMPLE_SIZE, *values)
@@ -138,7 +138,7 @@ def test_a_wrong_tag_is_refused(values, number, difference):
         decode_samples(data)
 
 
-def test_a_block_that_is_no_whole_number_of_samples_is_refused():
+def test_a_block_with_a_partial_sample_is_refused():
     with pytest.raises(ValueError, match="not a whole number of 119-byte"):
         decode_samples(bytes(120))
 

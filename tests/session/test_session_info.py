@@ -51,7 +51,7 @@ def test_a_trimmed_copy_is_not_complete(kit, tmp_path, stated):
     assert info.as_dict()["absent"] == info.missing_samples_text
 
 
-def test_a_whole_one_lacks_nothing(kit, tmp_path):
+def test_no_omissions_of_a_whole_session(kit, tmp_path):
     writer = SessionWriter(tmp_path / "a.mcap")
     writer.begin(kit.START_UTC_NS, kit.METADATA, kit.SEGMENTS, kit.ATTACHMENTS)
     writer.write_samples(kit.packed(kit.make_samples(900)))
@@ -73,7 +73,7 @@ def test_the_document_is_json(gappy, kit):
     ]
 
 
-def test_the_lines_tell_people_and_carry_no_control_characters(gappy):
+def test_the_lines_have_no_control_characters(gappy):
     lines = describe(gappy).lines()
     assert all(line.isprintable() for line in lines)
     text = "\n".join(lines)
@@ -90,14 +90,14 @@ def test_the_lines_tell_people_and_carry_no_control_characters(gappy):
 
 
 def test_a_file_without_rate_is_refused(kit, tmp_path):
-    path = kit.write_foreign(tmp_path / "a.mcap", [], metadata=None)
+    path = kit.write_third_party(tmp_path / "a.mcap", [], metadata=None)
     with pytest.raises(SessionError, match=r"a\.mcap.*has no rate_hz"):
         describe(path)
 
 
 @pytest.mark.parametrize("rate", ["0", "-1000"])
 def test_a_rate_that_is_not_positive_is_refused(kit, tmp_path, rate):
-    path = kit.write_foreign(tmp_path / "a.mcap", [], metadata={"rate_hz": rate})
+    path = kit.write_third_party(tmp_path / "a.mcap", [], metadata={"rate_hz": rate})
     with pytest.raises(SessionError, match=r"a\.mcap.*rate_hz .*must be greater than 0 Hz"):
         describe(path)
 
@@ -136,7 +136,7 @@ def test_numbers_are_rounded_and_times_local(kit, tmp_path, monkeypatch):
     assert rows["series"] == "1 of 2"
 
 
-def test_several_files_are_told_one_after_the_other(gappy, rigd_here, tmp_path):
+def test_several_files_are_described_in_turn(gappy, rigd_here, tmp_path):
     done = rigd_here("info", gappy, "missing.mcap", gappy)
     assert done.returncode == 1
     assert done.stdout.count("outcome ") == 2

@@ -18,7 +18,7 @@ NODE_FILES = Path(__file__).parent / "node"
 
 @pytest.fixture(scope="module")
 def script(request):
-    """The reading script beside its installed packages, which the pytest cache keeps."""
+    """The reading script with its installed packages, which the pytest cache stores."""
     for program in ("node", "npm"):
         if shutil.which(program) is None:
             pytest.skip(f"{program} is not installed")
@@ -42,7 +42,7 @@ def script(request):
     return shutil.copy(NODE_FILES / "read_session.mjs", folder)
 
 
-def test_the_reference_implementation_reads_all_of_it(script, recorded, kit):
+def test_the_reference_implementation_reads_everything(script, recorded, kit):
     result = subprocess.run(
         ["node", script, recorded.path], capture_output=True, text=True, timeout=300, check=False
     )

@@ -1,4 +1,4 @@
-"""Reader of sound files: this writer's, and any other MCAP and protobuf library's."""
+"""Reader of sound files of this writer and of any other MCAP and protobuf library."""
 
 import dataclasses
 import gc
@@ -66,7 +66,7 @@ def test_the_samples_of_a_session_are_freed_with_it(recorded):
         gc.enable()
 
 
-def test_samples_that_are_passed_on_are_not_stored(recorded):
+def test_samples_passed_on_are_not_stored(recorded):
     blocks = []
     session = read_session(recorded.path, on_samples=lambda block: blocks.append(block.copy()))
     assert session == dataclasses.replace(read_session(recorded.path), samples=session.samples)
@@ -74,7 +74,7 @@ def test_samples_that_are_passed_on_are_not_stored(recorded):
     np.testing.assert_array_equal(np.concatenate(blocks), recorded.samples)
 
 
-def test_many_small_chunks_share_one_decompressor(kit, tmp_path, monkeypatch):
+def test_many_small_chunks_use_one_decompressor(kit, tmp_path, monkeypatch):
     """Making one takes 28 µs, a small chunk one: a file of them would take seven times as long."""
     made = []
     original = zstandard.ZstdDecompressor
@@ -84,7 +84,7 @@ def test_many_small_chunks_share_one_decompressor(kit, tmp_path, monkeypatch):
         return original(**options)
 
     messages = kit.fixed_messages(kit.make_samples(50))
-    path = kit.write_foreign(
+    path = kit.write_third_party(
         tmp_path / "a.mcap", messages, chunk_size=1, compression=CompressionType.ZSTD
     )
     assert len(kit.chunks_of(path)) == 50
@@ -115,7 +115,7 @@ def test_many_small_chunks_share_one_decompressor(kit, tmp_path, monkeypatch):
 )
 def test_any_container_is_read(kit, tmp_path, compression, extra, options):
     samples = kit.make_samples(333)
-    path = kit.write_foreign(
+    path = kit.write_third_party(
         tmp_path / "f.mcap",
         kit.fixed_messages(samples),
         compression=compression,
@@ -140,7 +140,7 @@ def test_fixed_and_other_encodings_mix_in_any_order(kit, tmp_path, kinds, chunk_
     samples["status"] = 0  # which the other encoder leaves out
     samples["fx_n"][::2] = 0.0
     pairs = zip(kinds, kit.fixed_messages(samples), encoded(samples), strict=True)
-    path = kit.write_foreign(
+    path = kit.write_third_party(
         tmp_path / "f.mcap",
         [fixed if kind else other for kind, fixed, other in pairs],
         chunk_size=chunk_size,
@@ -149,13 +149,13 @@ def test_fixed_and_other_encodings_mix_in_any_order(kit, tmp_path, kinds, chunk_
     np.testing.assert_array_equal(read_session(path).samples, samples)
 
 
-def test_a_schema_is_interpreted_once_however_the_messages_vary(kit, tmp_path, monkeypatch):
+def test_a_schema_is_interpreted_once_for_varying_messages(kit, tmp_path, monkeypatch):
     """Zeros left out make lengths differ, so that hardly two messages are taken together."""
     samples = kit.make_samples(300)
     samples["fx_n"][::2] = 0.0
     # A schema of its own, which nothing has read before.
     schema = changed_schema(lambda message: message.field.add(name="once", number=99, type=9))
-    path = kit.write_foreign(tmp_path / "f.mcap", encoded(samples), schema=schema)
+    path = kit.write_third_party(tmp_path / "f.mcap", encoded(samples), schema=schema)
     built = []
     get_class = message_factory.GetMessageClass
     monkeypatch.setattr(
@@ -171,10 +171,10 @@ def test_fields_in_another_order_and_unknown_ones_are_decoded(kit, tmp_path):
     for message in kit.fixed_messages(samples):
         # Fields 1 and 2 exchanged, at unchanged length; then an unknown field 20.
         messages += [message[9:14] + message[:9] + message[14:] + b"\xa0\x01\x07"]
-    path = kit.write_foreign(tmp_path / "f.mcap", messages)
+    path = kit.write_third_party(tmp_path / "f.mcap", messages)
     np.testing.assert_array_equal(read_session(path).samples, samples)
     swapped = [m[:-3] for m in messages]
-    path = kit.write_foreign(tmp_path / "g.mcap", swapped)
+    path = kit.write_third_party(tmp_path / "g.mcap", swapped)
     np.testing.assert_array_equal(read_session(path).samples, samples)
 
 
@@ -185,7 +185,7 @@ def test_samples_of_the_fixed_length_follow_their_own_schema(kit, tmp_path):
         message.field[3].name, message.field[5].name = message.field[5].name, message.field[3].name
 
     samples = kit.make_samples(20)
-    path = kit.write_foreign(
+    path = kit.write_third_party(
         tmp_path / "f.mcap", kit.fixed_messages(samples), schema=changed_schema(swap)
     )  # fmt: skip
     read = read_session(path).samples
@@ -215,7 +215,7 @@ def test_other_numbers_types_names_and_files_are_decoded(kit, tmp_path):
         cls(note="x", **{name: sample[name].item() for name in names}).SerializeToString()
         for sample in samples
     ]
-    path = kit.write_foreign(tmp_path / "f.mcap", messages, schema=schema, name="rigd.Probe")
+    path = kit.write_third_party(tmp_path / "f.mcap", messages, schema=schema, name="rigd.Probe")
     np.testing.assert_array_equal(read_session(path).samples, samples)
 
 
@@ -224,7 +224,7 @@ def test_a_schema_without_a_required_field_is_refused(kit, tmp_path, field):
     def change(message):
         del message.field[SAMPLE_FIELDS.index(field)]
 
-    path = kit.write_foreign(tmp_path / "f.mcap", [b""], schema=changed_schema(change))
+    path = kit.write_third_party(tmp_path / "f.mcap", [b""], schema=changed_schema(change))
     with pytest.raises(SessionError, match=rf"f\.mcap: the schema .* no field {field}"):
         read_session(path)
 
@@ -237,7 +237,7 @@ def test_a_schema_with_unreadable_types_is_refused(kit, tmp_path, field, kind, l
         message.field[SAMPLE_FIELDS.index(field)].type = kind
         message.field[SAMPLE_FIELDS.index(field)].label = label
 
-    path = kit.write_foreign(tmp_path / "f.mcap", [b""], schema=changed_schema(change))
+    path = kit.write_third_party(tmp_path / "f.mcap", [b""], schema=changed_schema(change))
     with pytest.raises(SessionError, match=rf"field {field} .*{SAMPLE_TYPES[field]}"):
         read_session(path)
 
@@ -248,30 +248,30 @@ def test_a_number_too_large_for_its_field_is_refused(kit, tmp_path):
 
     schema = changed_schema(change)
     message = message_class("rigd.Sample", schema)(tick=2**32).SerializeToString()
-    path = kit.write_foreign(tmp_path / "f.mcap", [message], schema=schema)
+    path = kit.write_third_party(tmp_path / "f.mcap", [message], schema=schema)
     with pytest.raises(SessionError, match="holds a number that its field cannot take"):
         read_session(path)
 
 
-def test_an_event_log_that_is_no_protobuf_is_left_out(kit, tmp_path):
-    path = kit.write_foreign(
+def test_an_event_log_without_protobuf_is_omitted(kit, tmp_path):
+    path = kit.write_third_party(
         tmp_path / "f.mcap", kit.fixed_messages(kit.make_samples(3)), extra="/rig/event"
     )
     assert read_session(path).events == []
 
 
 @pytest.mark.parametrize("ticks", [[0, 1, 1], [0, 2, 1], [5, 4, 3]])
-def test_ticks_that_do_not_increase_are_refused(kit, tmp_path, ticks):
+def test_non_increasing_ticks_are_refused(kit, tmp_path, ticks):
     samples = kit.make_samples(3)
     samples["tick"] = ticks
-    path = kit.write_foreign(tmp_path / "f.mcap", kit.fixed_messages(samples))
+    path = kit.write_third_party(tmp_path / "f.mcap", kit.fixed_messages(samples))
     with pytest.raises(SessionError, match=r"f\.mcap: tick \d follows tick \d"):
         read_session(path)
 
 
 def test_gaps_in_the_ticks_are_read(kit, tmp_path):
     samples = kit.make_samples(10)[[0, 1, 5, 9]]
-    path = kit.write_foreign(tmp_path / "f.mcap", kit.fixed_messages(samples))
+    path = kit.write_third_party(tmp_path / "f.mcap", kit.fixed_messages(samples))
     assert read_session(path).samples["tick"].tolist() == [0, 1, 5, 9]
 
 
@@ -291,7 +291,7 @@ def test_a_bad_number_in_the_metadata_is_named(kit, tmp_path, value, message):
     del metadata["rate_hz"]
     if value is not None:
         metadata["rate_hz"] = value
-    path = kit.write_foreign(
+    path = kit.write_third_party(
         tmp_path / "f.mcap", kit.fixed_messages(kit.make_samples(2)), metadata=metadata
     )
     session = read_session(path)
@@ -309,7 +309,7 @@ def test_a_bad_number_in_the_metadata_is_named(kit, tmp_path, value, message):
     ],
 )
 def test_other_bad_metadata_is_named(kit, tmp_path, metadata, message):
-    path = kit.write_foreign(
+    path = kit.write_third_party(
         tmp_path / "f.mcap", kit.fixed_messages(kit.make_samples(2)), metadata=metadata
     )
     with pytest.raises(SessionError, match=message):

@@ -1,4 +1,4 @@
-"""Metadata and counts without the samples: equal to what the whole file says, whoever wrote it."""
+"""Metadata and counts without the samples: equal to those of the whole file, for any writer."""
 
 import pytest
 from cases import further
@@ -24,7 +24,7 @@ def write_plainly(path, **options):
 
 
 def with_unreadable_samples(path):
-    """Make the first chunk or message claim a length that only a whole read comes across."""
+    """Give the first chunk or message a length that only a whole read detects."""
     data = bytearray(path.read_bytes())
     position = 8
     while data[position] not in (5, 6):
@@ -35,7 +35,7 @@ def with_unreadable_samples(path):
 
 
 @pytest.mark.process
-def test_it_says_what_the_whole_file_says(short_chirps):
+def test_the_summary_equals_the_whole_file(short_chirps):
     session = read_session(short_chirps[0])
     summary = read_summary(short_chirps[0])
     assert summary.metadata == session.metadata
@@ -76,7 +76,7 @@ def test_files_of_other_writers(tmp_path, options, by_index):
 
 
 @pytest.mark.parametrize("every", [11, further(1)])
-def test_cuts_and_damaged_bytes_at_the_end_are_borne(tmp_path, record_briefly, every):
+def test_cuts_and_damaged_bytes_at_the_end_are_tolerated(tmp_path, record_briefly, every):
     whole = record_briefly("whole").read_bytes()
     stated = read_summary(tmp_path / "whole.mcap")
     path = tmp_path / "harmed.mcap"
@@ -86,9 +86,9 @@ def test_cuts_and_damaged_bytes_at_the_end_are_borne(tmp_path, record_briefly, e
             assert read_summary(path).problem
         except SessionError as error:
             assert length < 10, error
-    for place in range(len(whole) - 400, len(whole), every):
+    for offset in range(len(whole) - 400, len(whole), every):
         harmed = bytearray(whole)
-        harmed[place] ^= 0x55
+        harmed[offset] ^= 0x55
         path.write_bytes(harmed)
         found = read_summary(path)
         assert found.problem or (found.metadata, found.samples) == (

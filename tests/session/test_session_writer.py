@@ -27,7 +27,7 @@ from rigd.session import (
 from rigd.session.layout import SAMPLE_FIELDS, TIMING_SIZE, decode_controls, decode_samples
 
 
-def test_the_plain_reader_finds_and_decodes_everything(kit, recorded):
+def test_the_plain_reader_decodes_everything(kit, recorded):
     with recorded.path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         classes, decoded = {}, {}
@@ -164,12 +164,12 @@ def test_a_killed_recorder_loses_at_most_250_samples(kit, tmp_path, after):
             if int(line) >= after:
                 break
         child.send_signal(signal.SIGKILL)
-        # What it still said before it died, it had written before.
-        said = [after, *(int(line) for line in child.stdout if line.strip().isdigit())]
+        # What it printed before it died, it had written before.
+        printed = [after, *(int(line) for line in child.stdout if line.strip().isdigit())]
     part = tmp_path / "a.mcap.part"
     ticks = [decode_samples(m.data)["tick"][0] for chunk in kit.chunks_of(part) for m in chunk]
     assert ticks == list(range(len(ticks)))
-    assert len(ticks) > max(said) - 250
+    assert len(ticks) > max(printed) - 250
     assert not path.exists()
     with pytest.raises(SessionError, match=rf"is incomplete.* {len(ticks)} complete samples"):
         read_session(part)
@@ -193,7 +193,7 @@ def test_the_file_is_synced_about_once_a_second(kit, tmp_path, monkeypatch):
     assert min(waited) >= 1.0
 
 
-def test_a_file_that_grows_says_so_as_long_as_its_writer_lives(kit, tmp_path):
+def test_a_growing_file_is_marked_while_its_writer_lives(kit, tmp_path):
     writer = kit.begin(tmp_path / "a.mcap")
     writer.write_samples(kit.packed(kit.make_samples(250)))
     with pytest.raises(SessionError, match=r"because it is still being recorded\. Wait"):
@@ -204,7 +204,7 @@ def test_a_file_that_grows_says_so_as_long_as_its_writer_lives(kit, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "a.mcap.part"])
-def test_an_existing_file_is_refused_and_left_alone(tmp_path, name):
+def test_an_existing_file_is_refused_and_unchanged(tmp_path, name):
     existing = tmp_path / name
     existing.write_bytes(b"precious")
     with pytest.raises(SessionExistsError, match=rf"{name} exists"):
@@ -214,7 +214,7 @@ def test_an_existing_file_is_refused_and_left_alone(tmp_path, name):
 
 
 @pytest.mark.parametrize("hard_links", [True, False])
-def test_a_file_that_appears_meanwhile_is_not_overwritten(kit, tmp_path, monkeypatch, hard_links):
+def test_a_file_created_meanwhile_is_not_overwritten(kit, tmp_path, monkeypatch, hard_links):
     if not hard_links:
         forbid_hard_links(monkeypatch)
     path = tmp_path / "a.mcap"
@@ -234,7 +234,7 @@ def forbid_hard_links(monkeypatch):
     monkeypatch.setattr(os, "link", link)
 
 
-def test_without_hard_links_a_session_still_gets_its_name(kit, tmp_path, monkeypatch):
+def test_a_session_gets_its_name_without_hard_links(kit, tmp_path, monkeypatch):
     forbid_hard_links(monkeypatch)
     writer = kit.begin(tmp_path / "a.mcap")
     writer.write_samples(kit.packed(kit.make_samples(3)))
@@ -243,7 +243,7 @@ def test_without_hard_links_a_session_still_gets_its_name(kit, tmp_path, monkeyp
     assert len(read_session(tmp_path / "a.mcap").samples) == 3
 
 
-def test_a_name_that_could_not_be_given_is_free_again(kit, tmp_path, monkeypatch):
+def test_a_name_is_free_again_after_a_failure(kit, tmp_path, monkeypatch):
     """Without hard links the name is reserved by an empty file, which would block a recovery."""
     forbid_hard_links(monkeypatch)
 
@@ -262,7 +262,7 @@ def test_a_name_that_could_not_be_given_is_free_again(kit, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("size", [0, 100, 20_000])
-def test_a_file_that_another_program_shortens_is_not_complete(kit, tmp_path, size):
+def test_a_file_shortened_by_another_program_is_incomplete(kit, tmp_path, size):
     writer = kit.begin(tmp_path / "a.mcap")
     writer.write_samples(kit.packed(kit.make_samples(250)))
     os.truncate(writer.part, size)
@@ -273,7 +273,7 @@ def test_a_file_that_another_program_shortens_is_not_complete(kit, tmp_path, siz
     assert writer.abandon() == writer.part
 
 
-def test_of_many_writers_of_one_name_one_wins(tmp_path):
+def test_one_of_many_writers_gets_the_name(tmp_path):
     path = tmp_path / "a.mcap"
     barrier = threading.Barrier(8)
     won, lost = [], []
@@ -295,7 +295,7 @@ def test_of_many_writers_of_one_name_one_wins(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_abandoning_keeps_what_was_written(kit, tmp_path):
+def test_abandoning_retains_written_samples(kit, tmp_path):
     writer = kit.begin(tmp_path / "a.mcap")
     writer.write_samples(kit.packed(kit.make_samples(260)))
     writer.abandon()
@@ -303,31 +303,31 @@ def test_abandoning_keeps_what_was_written(kit, tmp_path):
     assert not writer.path.exists()
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path):
+def test_a_missing_folder_is_named(tmp_path):
     with pytest.raises(
         SessionError, match=r"nowhere/a\.mcap\.part cannot be written: No such file"
     ):
         SessionWriter(tmp_path / "nowhere" / "a.mcap")
 
 
-def test_a_full_disk_ends_the_recording_with_all_that_went_before(kit, tmp_path, monkeypatch):
+def test_a_full_disk_ends_the_recording_and_loses_nothing_written(kit, tmp_path, monkeypatch):
     writer = kit.begin(tmp_path / "a.mcap")
     writer.write_samples(kit.packed(kit.make_samples(250)))
     full = Path("/dev/full")
     if not full.exists():
         pytest.skip("no /dev/full on this system")
-    kept = writer._stream
+    stream = writer._stream
     writer._stream = writer._mcap._stream = full.open("wb")
     with pytest.raises(SessionError, match="cannot be written: No space left on device"):
         writer.write_samples(kit.packed(kit.make_samples(250, first_tick=250)))
     with pytest.raises(SessionError, match="writing failed before"):
         writer.write_samples(kit.packed(kit.make_samples(1, first_tick=500)))
     writer.abandon()
-    kept.close()
+    stream.close()
     assert sum(len(chunk) for chunk in kit.chunks_of(writer.part)) == 250
 
 
-def test_use_in_the_wrong_order_or_with_broken_blocks_is_a_programming_error(kit, tmp_path):
+def test_wrong_use_of_the_writer_is_a_programming_error(kit, tmp_path):
     writer = SessionWriter(tmp_path / "a.mcap")
     with pytest.raises(RuntimeError, match="begin"):
         writer.write_samples(b"")

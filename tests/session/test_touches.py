@@ -24,7 +24,7 @@ TOUCH = {
 BARE = {"number": 2}
 
 
-def test_they_are_written_at_the_end_and_read_back(kit, tmp_path):
+def test_touches_are_written_at_the_end_and_read_back(kit, tmp_path):
     writer = kit.begin(tmp_path / "a.mcap")
     writer.write_samples(kit.packed(kit.make_samples(600)))
     writer.write_touches(packed_touches([(128, TOUCH), (400, BARE)], 1000.0))
@@ -39,13 +39,13 @@ def test_they_are_written_at_the_end_and_read_back(kit, tmp_path):
     assert len(read_session(tmp_path / "a.mcap").samples) == 600
 
 
-def test_a_session_without_any_has_none(kit, tmp_path):
+def test_a_session_without_touches(kit, tmp_path):
     writer = kit.begin(tmp_path / "a.mcap")
     writer.close(kit.OUTCOME)
     assert len(read_touches(tmp_path / "a.mcap")) == 0
 
 
-def test_they_survive_a_recovery(kit, tmp_path):
+def test_touches_survive_a_recovery(kit, tmp_path):
     writer = kit.begin(tmp_path / "a.mcap")
     writer.write_samples(kit.packed(kit.make_samples(300)))
     writer.write_touches(packed_touches([(128, TOUCH)], 1000.0))
@@ -61,18 +61,18 @@ def test_a_block_of_another_size_is_refused(kit, tmp_path):
     writer.abandon()
 
 
-def test_the_outcome_lists_them():
+def test_the_outcome_lists_touches():
     assert touches_of({"touches": json.dumps([TOUCH])}) == [TOUCH]
     assert touches_of(None) == touches_of({"outcome": "complete"}) == []
 
 
 @pytest.mark.parametrize("text", ["", "{", "7", '{"number": 1}', "[1, null]", "[" * 100_000])
-def test_what_is_no_list_of_touches_is_left_out(text):
+def test_invalid_lists_of_touches_are_omitted(text):
     assert touches_of({"touches": text}) == []
 
 
 @pytest.mark.parametrize(
-    "told",
+    "position_m",
     [
         7,
         {"value": 1.0},
@@ -82,13 +82,13 @@ def test_what_is_no_list_of_touches_is_left_out(text):
         {"value": 1.0, "std": 1.0, "interval_95": 3},
     ],
 )
-def test_a_number_that_is_none_is_not_known(told):
-    (touch,) = touches_of({"touches": json.dumps([{"number": -1, "x_m": told, "kind": [1]}])})
+def test_an_invalid_number_is_unknown(position_m):
+    (touch,) = touches_of({"touches": json.dumps([{"number": -1, "x_m": position_m, "kind": [1]}])})
     assert touch["x_m"] is None
     assert (touch["number"], touch["kind"]) == (0, "")
 
 
-def test_a_line_says_what_is_known():
+def test_a_line_states_the_known_values():
     assert touch_line(TOUCH) == (
         "Touch 1: 0.6200 ± 0.0020 m from the axis, 0.12340 ± 0.00020 s, 0.750 ± 0.040 N, rigid"
     )

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from rigd.session.user_metadata import MetadataError, added_metadata, metadata_keys
 
 
-def test_a_unit_in_the_name_makes_a_number():
+def test_a_name_with_a_unit_is_a_number():
     given = {"temperature_c": "21.40", "humidity_percent": 40, "clamp_torque_nm": "1e-1"}
     keys = metadata_keys(given | {"batch": "7", "series": 3})
     assert keys == {"meta_temperature_c": "21.4", "meta_humidity_percent": "40.0",
@@ -19,7 +19,7 @@ def test_a_unit_in_the_name_makes_a_number():
     }  # fmt: skip
 
 
-def test_a_file_of_others_may_hold_anything():
+def test_third_party_files_may_have_any_metadata():
     assert added_metadata({"meta_temperature_c": "warm", "meta_": "x", "meta_mass_kg": "nan"}) == {
         "temperature_c": "warm", "": "x", "mass_kg": "nan"
     }  # fmt: skip
@@ -45,12 +45,12 @@ def test_a_file_of_others_may_hold_anything():
         ({f"n{i}": "x" for i in range(33)}, "33 names"),
     ],
 )
-def test_what_breaks_a_rule_is_refused_by_its_name(given, named):
+def test_violations_of_a_rule_are_refused_by_name(given, named):
     with pytest.raises(MetadataError, match=named) as refusal:
         metadata_keys(given)
     assert len(str(refusal.value)) < 300
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
-def test_numbers_keep_all_their_digits(value):
+def test_numbers_retain_all_their_digits(value):
     assert added_metadata(metadata_keys({"force_n": value})) == {"force_n": value}

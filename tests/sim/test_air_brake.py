@@ -36,10 +36,10 @@ def swept(parameters):
     plant = SimulatedPlant(parameters)
     plant.enable()
     t = np.arange(TICKS) / RATE_HZ - 1
-    asked = np.where((t > 0) & (t < 20), 0.025 * np.sin(2 * np.pi * (0.05 + 0.5 * t) * t), 0.0)
+    reference = np.where((t > 0) & (t < 20), 0.025 * np.sin(2 * np.pi * (0.05 + 0.5 * t) * t), 0.0)
     stiffness, viscosity = 12.0, 0.35
     rows, before = np.empty((TICKS, 2)), 0.0
-    for tick, angle in enumerate(asked.tolist()):
+    for tick, angle in enumerate(reference.tolist()):
         rows[tick] = plant.sensed_angle_rad, plant.sensed_torque_nm
         speed = (angle - before) * RATE_HZ
         before = angle
@@ -53,7 +53,7 @@ def swept(parameters):
 
 
 def unexplained(parameters, drag_m):
-    """Share of the simulated torque that the model with a drag leaves, and that of the drag."""
+    """Fraction of the simulated torque that the model with a drag leaves, and that of the drag."""
     angle_rad, torque_nm = swept(parameters)
     known = np.ones(TICKS, dtype=bool)
     measured = Measurement(
@@ -94,7 +94,7 @@ def test_the_simulated_drag_is_that_of_the_exact_beam(damping, coulomb_nm, delay
 
 
 @pytest.mark.fit
-def test_without_drag_there_is_none():
+def test_no_drag_by_default():
     damping = Damping(7.1e-5, 0.996, 0.055, 0.594)
     still, braked = (swept(rig(drag_m, damping)) for drag_m in (0.0, DRAG_M))
     assert np.abs(still - braked).max() > 0.01
@@ -108,9 +108,9 @@ def test_the_air_s_torque_and_shear_are_those_of_its_force():
     plant.enable()
     grid = plant._air._grid
     ticks = 6000
-    told, forces = np.empty((ticks, 3)), np.empty((ticks, grid.x_m.size))
+    outputs, forces = np.empty((ticks, 3)), np.empty((ticks, grid.x_m.size))
     for tick in range(ticks):
-        told[tick] = plant.angle_rad, plant.coupling_torque_nm, plant.base_shear_n
+        outputs[tick] = plant.angle_rad, plant.coupling_torque_nm, plant.base_shear_n
         forces[tick] = plant._air._forces[plant._air._newest] * grid.weight_m
         plant.command(0.15 * np.sin(2 * np.pi * 1.7e-3 * tick) - 0.1 * plant.velocity_rad_s)
         plant.advance()
@@ -118,7 +118,7 @@ def test_the_air_s_torque_and_shear_are_those_of_its_force():
     decay = np.exp(-8 * np.arange(ticks) / ticks)
     s = 8 * RATE_HZ / ticks + 2j * np.pi * np.fft.rfftfreq(padded, 1 / RATE_HZ)
     exact = PointForceGrid(s, parameters.beam, parameters.damping)
-    angle, *_ = np.fft.rfft(told.T * decay, padded)
+    angle, *_ = np.fft.rfft(outputs.T * decay, padded)
     pushed = np.fft.rfft(forces.T * decay, padded).T
     for column, per_angle, per_force in (
         (1, exact.torque_per_angle(), exact.torque_per_force(grid.x_m)),
@@ -126,7 +126,7 @@ def test_the_air_s_torque_and_shear_are_those_of_its_force():
     ):
         drag = np.fft.irfft((per_force * pushed).sum(axis=1), padded)[:ticks] / decay
         whole = np.fft.irfft(per_angle * angle, padded)[:ticks] / decay + drag
-        kept = slice(0, ticks // 2)
-        scale = np.std(told[kept, column])
-        assert np.std(drag[kept]) > 0.1 * scale
-        assert np.std((told[:, column] - whole)[kept]) < 0.01 * scale
+        first_half = slice(0, ticks // 2)
+        scale = np.std(outputs[first_half, column])
+        assert np.std(drag[first_half]) > 0.1 * scale
+        assert np.std((outputs[:, column] - whole)[first_half]) < 0.01 * scale

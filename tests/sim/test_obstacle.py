@@ -26,7 +26,7 @@ PERIOD_S = 1e-3
 FINE_S = {100.0: 1e-5, 3000.0: 1e-5, 100_000.0: 2e-6}
 """Step of the other solution by the stiffness of the obstacle: less than the time it yields for."""
 
-# An angle that no beam disturbs: a heavy motor speeds up for 50 ms to 1 rad/s, and goes on.
+# An angle that no beam disturbs: a heavy motor accelerates in 50 ms to 1 rad/s.
 HEAVY_KG_M2 = 1e5
 START_RAD_S2, START_S = 20.0, 0.05
 TOUCH_RAD = 0.05
@@ -47,7 +47,7 @@ def rig_with(*obstacles, inertia_kg_m2=2e-3, viscous=0.0, coulomb_nm=0.0, **chan
 
 
 class Record:
-    """What a plant does, tick by tick, and the forces of its substeps."""
+    """Motion of a plant, tick by tick, and the forces of its substeps."""
 
     def __init__(self, rig, torques_nm):
         self.plant = plant = SimulatedPlant(rig)
@@ -83,7 +83,7 @@ def started(*obstacles, **changes):
 
 
 class OtherSolution:
-    """Kernels of the exact beam for a force at a place, by inversion along a shifted line."""
+    """Kernels of the exact beam for a force at a position, by inversion along a shifted line."""
 
     def __init__(self, at_m, step_s):
         self.points = round(SESSION_S / step_s)
@@ -109,12 +109,12 @@ class OtherSolution:
 
     def meet(self, stiffness):
         """Force, torque and shear at each point."""
-        place, force = self.free.copy(), np.zeros(self.points)
+        motion, force = self.free.copy(), np.zeros(self.points)
         for j in range(1, self.points):
-            inside = place[j] - self.surface
+            inside = motion[j] - self.surface
             if inside > 0:
                 force[j] = -stiffness * inside / (1 + stiffness * self.by_force[1])
-                place[j:] += force[j] * self.by_force[1 : self.points - j + 1]
+                motion[j:] += force[j] * self.by_force[1 : self.points - j + 1]
         return (
             force,
             self.torque + self._of(force, self.torque_by_force),
@@ -139,7 +139,7 @@ def test_force_torque_and_shear_of_a_touch(at_m, stiffness):
     peak = np.abs(force).max()
     assert np.abs(record.forces).max() == pytest.approx(peak, rel=0.01)
 
-    # The plant tells the mean over each substep.
+    # The plant returns the mean over each substep.
     times = np.arange(force.size) * fine_s
     impulse = np.append(0.0, np.cumsum((force[1:] + force[:-1]) / 2 * fine_s))
     step_s = PERIOD_S / record.substeps
@@ -175,7 +175,7 @@ def test_an_obstacle_on_the_other_side_is_the_mirror_image():
 @pytest.mark.parametrize("stiffness", ["300", further("100000"), "rigid"])
 @pytest.mark.parametrize("at_m", [further(0.2), 0.62, further(0.97)])
 def test_rest_against_an_obstacle(at_m, stiffness):
-    # Stiff damping, so that it rests soon; the heavy motor is at rest wherever it was brought.
+    # Stiff damping, so that it rests soon; the heavy motor is at rest at any angle.
     rig = rig_with(
         f"x={at_m},angle=0.01,stiffness={stiffness}",
         inertia_kg_m2=HEAVY_KG_M2,
@@ -195,9 +195,9 @@ def test_rest_against_an_obstacle(at_m, stiffness):
 
 @pytest.mark.parametrize("stiffness", [further("300"), further("30000"), "rigid"])
 @pytest.mark.parametrize("damping", [further(Damping()), DAMPING], ids=["undamped", "paper"])
-def test_no_touch_makes_energy(damping, stiffness):
+def test_no_touch_creates_energy(damping, stiffness):
     # A motor without friction drives the beam from one wall to the other and back, then tries to
-    # get out all there is.
+    # extract all the energy.
     rig = rig_with(
         f"x=0.5,angle=0.06,stiffness={stiffness}",
         f"x=0.8,angle=-0.04,side=-1,stiffness={stiffness}",
@@ -214,11 +214,11 @@ def test_no_touch_makes_energy(damping, stiffness):
     assert (record.forces < 0).any()
     assert (record.forces > 0).any()
     moving_j = 0.5 * rig.motor.inertia_kg_m2 * record.velocity**2
-    # What is left is in the beam, in the obstacles, or gone.
+    # The remainder is in the beam, in the obstacles, or dissipated.
     assert (work_j - moving_j).min() > -1e-3 * np.abs(work_j).max()
 
 
-# In steps of a picometre: the smallest numbers there are have no digits to compare.
+# In steps of a picometre: the smallest floats have no digits to compare.
 DEPTHS_M = st.integers(-(10**10), 10**10).map(lambda picometres: 1e-12 * picometres)
 
 
@@ -229,9 +229,7 @@ DEPTHS_M = st.integers(-(10**10), 10**10).map(lambda picometres: 1e-12 * picomet
     damping=st.one_of(st.just(0.0), st.floats(0.0, 1e8)),
     compliance=st.floats(1e-9, 1e-2),
 )
-def test_a_substep_takes_at_least_the_energy_that_the_obstacle_then_holds(
-    a, p, stiffness, damping, compliance
-):
+def test_a_substep_takes_the_energy_stored_in_the_obstacle(a, p, stiffness, damping, compliance):
     wall = _ActiveObstacle(0, 1, stiffness, damping, compliance, np.zeros(1), a, np.zeros(1))
     push, q = wall.force_and_penetration(p)
     assert push >= 0
@@ -244,7 +242,7 @@ def test_a_substep_takes_at_least_the_energy_that_the_obstacle_then_holds(
         assert lost <= 1e-4 * size  # a spring that the substeps resolve loses none
 
 
-def test_a_knock_is_half_a_sine_at_its_instant():
+def test_an_impact_is_half_a_sine_at_its_instant():
     rig = rig_with("x=0.5,force=2,duration=0.02,at=0.0305", inertia_kg_m2=HEAVY_KG_M2)
     record = Record(rig, np.zeros(80))
     step_s = PERIOD_S / record.substeps
@@ -272,13 +270,13 @@ def test_an_obstacle_comes_and_goes():
     before = 140 * touched.substeps
     assert (touched.forces[:before] < 0).any()
     assert (late.forces[:before] == 0).all()
-    assert late.forces[before] < -1  # the beam stands in its way
+    assert late.forces[before] < -1  # the beam is in its way
     assert short.forces[:before] == pytest.approx(touched.forces[:before])
     assert (short.forces[before:] == 0).all()
 
 
-def test_an_obstacle_that_moves_strikes_a_beam_at_rest():
-    # Seen from the obstacle the beam comes: the same force as of a beam that is thrown at it.
+def test_a_moving_obstacle_strikes_a_beam_at_rest():
+    # In the frame of the obstacle the beam moves: the same force as for a beam thrown at it.
     record = Record(
         rig_with("x=0.6,angle=0.02,side=1,rate=-0.5,stiffness=3000", inertia_kg_m2=HEAVY_KG_M2),
         np.zeros(100),
@@ -288,8 +286,8 @@ def test_an_obstacle_that_moves_strikes_a_beam_at_rest():
     assert record.forces.min() < -0.1
 
 
-def test_several_obstacles_are_each_as_alone_until_waves_meet():
-    # 30 cm apart: it takes 3 ms until the beam's own waves of a kHz come from one to the other.
+def test_several_obstacles_are_independent_until_waves_meet():
+    # Distance 30 cm: the beam's own waves of a kHz take 3 ms from one to the other.
     alone = started(f"x=0.9,angle={TOUCH_RAD},stiffness=1000")
     both = started(
         f"x=0.9,angle={TOUCH_RAD},stiffness=1000", f"x=0.3,angle={TOUCH_RAD},stiffness=1000"
@@ -300,7 +298,7 @@ def test_several_obstacles_are_each_as_alone_until_waves_meet():
     assert np.abs(both.forces[:, :1] - alone.forces).max() > 0.01
 
 
-def test_friction_holds_a_shaft_that_is_pushed_gently():
+def test_friction_holds_a_gently_pushed_shaft():
     rig = rig_with("x=0.5,force=0.02,duration=0.2,at=0.05", coulomb_nm=0.03)
     held = Record(rig, np.zeros(300))
     assert (held.angle == 0).all()
@@ -328,7 +326,7 @@ def test_far_from_an_obstacle_nothing_changes():
 
 
 @pytest.mark.parametrize("delay_s", [further(0.0), 0.3e-3, further(1.4e-3)])
-def test_the_sensor_sees_a_touch_as_late_as_it_is(delay_s):
+def test_the_sensor_measures_a_touch_with_its_delay(delay_s):
     prompt = started(f"x=0.6,angle={TOUCH_RAD},stiffness=300")
     late = started(
         f"x=0.6,angle={TOUCH_RAD},stiffness=300", sensor=replace(RIG.sensor, delay_s=delay_s)
@@ -347,9 +345,9 @@ def test_the_sensor_sees_a_touch_as_late_as_it_is(delay_s):
         expected = np.interp(times - delay_s, fine_times, getattr(fine, name), left=0.0)
         seen = getattr(late, f"sensed_{name}")
         scale = np.abs(expected).max()
-        # But for jumps of the motor's own torque.
-        apart = np.abs(times - delay_s - START_S) > 2e-3
-        assert np.abs(seen - expected)[apart & (times > 3e-3)].max() < 0.02 * scale
+        # Except jumps of the motor's own torque.
+        off_jumps = np.abs(times - delay_s - START_S) > 2e-3
+        assert np.abs(seen - expected)[off_jumps & (times > 3e-3)].max() < 0.02 * scale
 
 
 @pytest.mark.parametrize(
@@ -362,7 +360,7 @@ def test_the_sensor_sees_a_touch_as_late_as_it_is(delay_s):
         ({"stiffness_drift_per_s": -1e-5}, "stiffness_drift_per_s"),
     ],
 )
-def test_what_is_not_simulated_together_is_refused(simulation, key):
+def test_unsupported_combinations_are_refused(simulation, key):
     rig = rig_with("x=0.5,angle=0.1")
     with pytest.raises(ObstacleError, match=key):
         SimulatedPlant(replace(rig, simulation=replace(rig.simulation, **simulation)))

@@ -1,4 +1,4 @@
-"""The simulated plant's behaviour beside its linear response: delays, friction, limits, energy."""
+"""Behaviour of the simulated plant except its linear response: delays, friction, limits, energy."""
 
 from dataclasses import replace
 
@@ -83,7 +83,7 @@ def noise(n, level=0.1, seed=0):
 
 # Delays, against the same physics at ten times the rate, where they are whole periods. (At a jump
 # of the torque the sensed torque is the mean of both sides, which the fast plant cannot know: the
-# torque delays are chosen so as not to look at a jump.)
+# torque delays are chosen to avoid jumps.)
 
 
 @pytest.mark.parametrize("delay", [further(0.0), 0.3e-3, further(1e-3), 2.7e-3])
@@ -181,7 +181,7 @@ def test_a_disabled_drive_gives_no_torque():
     assert not run(plant, noise(50)).any()
 
 
-def test_disabling_stops_the_torque_at_once_and_drops_commands_on_their_way():
+def test_disabling_stops_the_torque_and_drops_pending_commands():
     plant = enabled(rig(delay=3.6e-3))
     run(plant, [0.2] * 100)
     plant.disable()
@@ -194,7 +194,7 @@ def test_disabling_stops_the_torque_at_once_and_drops_commands_on_their_way():
     coasting = run(plant, [0.5] * 50)
     reference = run(fine, [0.0] * 500)[::10]
     np.testing.assert_allclose(coasting[:, :2], reference[:, :2], rtol=1e-9)
-    plant.enable()  # what was commanded while the drive was off is forgotten
+    plant.enable()  # commands given while the drive was off are dropped
     still = run(fine, [0.0] * 100)[::10]
     np.testing.assert_allclose(run(plant, [0.0] * 10)[:, :2], still[:, :2], rtol=1e-9)
 
@@ -210,7 +210,7 @@ def test_sticks_below_the_friction_torque():
     assert np.all(np.diff(moving[1:, 0]) > 0)
 
 
-def test_what_counts_for_sticking_is_the_mean_torque_of_a_period():
+def test_sticking_depends_on_the_mean_torque_of_a_period():
     pulse = [0.0, 0.05, 0.0, 0.0]
     assert run(enabled(rig(coulomb=0.03)), pulse)[:, 0].any()
     assert not run(enabled(rig(coulomb=0.03, delay=0.5e-3)), pulse)[:, 0].any()
@@ -225,7 +225,7 @@ def test_sliding_friction_is_a_constant_torque_against_the_motion():
     np.testing.assert_array_equal(back, -sliding)
 
 
-def test_comes_to_true_rest_while_the_beam_rings_on():
+def test_motor_rests_while_the_beam_rings_on():
     plant = enabled(rig(coulomb=0.03))
     run(plant, [0.3] * 100 + [-0.3] * 60)
     record = run(plant, [0.0] * 30_000)
@@ -233,7 +233,7 @@ def test_comes_to_true_rest_while_the_beam_rings_on():
     assert stopped < 25_000
     assert np.ptp(record[stopped:, 0]) <= 1e-16  # a rounding, on some builds of numpy
     torque = record[stopped:, 2]
-    assert np.max(np.abs(torque)) <= 0.03  # what the friction holds
+    assert np.max(np.abs(torque)) <= 0.03  # held by friction
     # On the locked shaft the beam has its clamped–free first mode, 2.56 Hz, and decays.
     tail = torque[:4096]
     peak_hz = np.argmax(np.abs(np.fft.rfft(tail * np.hanning(4096), 2**18))) * 1000 / 2**18
@@ -274,7 +274,7 @@ def test_energy_is_never_created(damping, coulomb):
     """From rest, the work done is at least the motor's kinetic energy, driven or free.
 
     The torque is constant over a period, so the work is exactly the sum of torque times the
-    change of angle. What the motor has not got is stored in the beam or lost: never negative.
+    change of angle. The remainder is stored in the beam or lost, and never negative.
     """
     plant = enabled(replace(rig(coulomb=coulomb, viscous=0.0), damping=damping))
     # Noise, then the first mode shaken on resonance, then left alone.

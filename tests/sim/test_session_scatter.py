@@ -1,4 +1,4 @@
-"""A simulated beam that differs between sessions: its draws, and the plant that has them."""
+"""A simulated beam that differs between sessions: its draws, and its plant."""
 
 from dataclasses import replace
 
@@ -70,7 +70,7 @@ def test_a_session_has_the_plant_of_its_seed():
 
 
 @pytest.mark.parametrize("more", [{}, {"torque_filter_hz": 100.0}])
-def test_a_session_begins_at_rest_at_the_angle_of_the_last(more):
+def test_a_session_begins_at_rest_at_the_last_angle(more):
     simulated = SimulatedRig(rig_with(**SCATTER, **more))
     plant = simulated.plant
     torques_of(plant)
@@ -86,6 +86,6 @@ def test_a_session_begins_at_rest_at_the_angle_of_the_last(more):
         assert plant.sensed_torque_nm == pytest.approx(0.0, abs=2e-5)
 
 
-def test_scatter_beside_obstacles_is_refused():
+def test_scatter_with_obstacles_is_refused():
     with pytest.raises(ObstacleError, match="gamma_scatter_percent and an obstacle cannot"):
         SimulatedPlant(rig_with(gamma_scatter_percent=5.0, obstacles=("x=0.6,angle=0.1",)))

@@ -1,4 +1,4 @@
-"""The plant as encoder and sensor show it."""
+"""The plant as measured by encoder and sensor."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def test_angles_come_in_whole_steps(rig):
     assert np.unique(np.round(steps)).size > 20
 
 
-def test_the_wrench_comes_in_whole_steps_with_the_stated_noise_and_offset(rig):
+def test_the_wrench_has_the_stated_steps_noise_and_offset(rig):
     _, wrenches, saturated = watch(rig, 4000, lambda tick: 0.0)
     resolution = np.array(rig.sensor.resolution)
     steps = wrenches / resolution
@@ -58,7 +58,7 @@ def test_the_wrench_comes_in_whole_steps_with_the_stated_noise_and_offset(rig):
     assert not saturated.any()
 
 
-def test_a_sensor_at_the_end_of_its_range_says_so(rig):
+def test_a_sensor_at_the_end_of_its_range_reports_saturation(rig):
     narrow = replace(rig, sensor=replace(rig.sensor, range=(20.0, 20.0, 60.0, 1.0, 1.0, 0.05)))
     _, wrenches, saturated = watch(narrow, 1500, wiggle)
     assert saturated.any()
@@ -68,7 +68,7 @@ def test_a_sensor_at_the_end_of_its_range_says_so(rig):
 
 @pytest.fixture
 def quiet(rig):
-    """A rig whose sensor shows what there is, to every digit."""
+    """A rig whose sensor is exact."""
     return replace(
         rig,
         sensor=replace(rig.sensor, resolution=(0.0,) * 6),
@@ -78,7 +78,7 @@ def quiet(rig):
     )
 
 
-def test_the_projections_of_the_wrench_are_coupling_torque_and_base_shear(quiet):
+def test_coupling_torque_and_base_shear_are_projections_of_the_wrench(quiet):
     # A sensor turned by 180° about x, and off the axis: its fy has a lever arm of 3 cm.
     turned = replace(
         quiet,
@@ -97,21 +97,21 @@ def test_the_projections_of_the_wrench_are_coupling_torque_and_base_shear(quiet)
     assert wrenches @ np.array(turned.sensor.shear_projection) == pytest.approx(straight[:, 1])
 
 
-def test_without_a_place_for_it_there_is_no_shear(quiet):
-    told = replace(
+def test_no_shear_without_its_projection(quiet):
+    without_shear = replace(
         quiet,
         sensor=replace(
             quiet.sensor, projection=(0, 0.03, 0, 0, 0, -1.0), shear_projection=(0.0,) * 6
         ),
     )
     _, straight, _ = watch(quiet, 400, wiggle)
-    _, wrenches, _ = watch(told, 400, wiggle)
+    _, wrenches, _ = watch(without_shear, 400, wiggle)
     # The smallest wrench of which the projection makes the torque.
-    assert wrenches @ np.array(told.sensor.projection) == pytest.approx(straight[:, 5])
+    assert wrenches @ np.array(without_shear.sensor.projection) == pytest.approx(straight[:, 5])
     assert wrenches[:, 1] == pytest.approx(-0.03 * wrenches[:, 5])
 
 
-def test_crosstalk_is_a_share_of_each_range_and_always_the_same(quiet):
+def test_crosstalk_is_a_fixed_fraction_of_each_range(quiet):
     crossed = replace(quiet, simulation=replace(quiet.simulation, crosstalk_percent=2.0))
     _, straight, _ = watch(quiet, 400, wiggle)
     _, wrenches, _ = watch(crossed, 400, wiggle)
@@ -126,7 +126,7 @@ def test_crosstalk_is_a_share_of_each_range_and_always_the_same(quiet):
 
 
 def hum_of(quiet, ticks, **more):
-    """Wrenches of a rig whose motor stands still, with a hum on its torque."""
+    """Wrenches of a rig with the motor at rest and a hum on its torque."""
     rig = replace(quiet, simulation=replace(quiet.simulation, **more))
     return watch(rig, ticks, lambda _: 0.0)[1]
 
@@ -138,13 +138,13 @@ def test_a_hum_is_a_sine_on_the_projection_of_the_torque(quiet):
     sine = 5e-3 * np.sin(2 * np.pi * 33.3e-3 * np.arange(2000))
     assert torque == pytest.approx(sine, abs=1e-12)
     assert wrenches @ np.array(turned.sensor.shear_projection) == pytest.approx(0.0, abs=1e-15)
-    # 50 Hz unless it is said; none unless it is asked for.
+    # 50 Hz by default; no hum unless requested.
     mains = hum_of(quiet, 200, hum_nm=2e-3)[:, 5]
     assert mains == pytest.approx(2e-3 * np.sin(0.1 * np.pi * np.arange(200)), abs=1e-12)
     assert not hum_of(quiet, 200).any()
 
 
-def test_a_hum_is_there_whatever_the_beam_does(quiet):
+def test_a_hum_is_independent_of_the_beam(quiet):
     _, alone, _ = watch(quiet, 600, wiggle)
     humming = replace(quiet, simulation=replace(quiet.simulation, hum_nm=5e-3))
     angles, wrenches, _ = watch(humming, 600, wiggle)
@@ -203,21 +203,21 @@ def streaming():
     )
 
 
-def test_a_streaming_sensor_averages_its_records_and_is_as_old_as_the_profile_says(streaming):
+def test_a_streaming_sensor_averages_records_with_the_stated_delay(streaming):
     # At low frequency a mean over a tick differs from a delay by (ωT)²/24 only.
     point = replace(streaming, ati_serial=None)
     _, averaged, _ = watch(streaming, 800, wiggle)
     _, delayed, _ = watch(point, 800, wiggle)
     torque, expected = averaged[100:, 5], delayed[100:, 5]
     assert np.abs(torque - expected).max() < 2e-3 * np.abs(expected).max()
-    # The same without the filter's delay is visibly wrong: the agreement above says something.
+    # The same without the filter's delay is visibly wrong: the agreement above is meaningful.
     early = replace(point, sensor=replace(point.sensor, delay_s=0.0))
     _, undelayed, _ = watch(early, 800, wiggle)
     assert np.abs(torque - undelayed[100:, 5]).max() > 5e-3 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize(("shape", "gain"), [("mean", 1 / 7), ("triangle", 231 / 2401)])
-def test_a_decimating_filter_takes_noise_away(streaming, shape, gain):
+def test_a_decimating_filter_reduces_noise(streaming, shape, gain):
     # Sum of the squared weights: 7/49, and (2(1² + … + 6²) + 7²)/49² = 231/2401.
     noisy = replace(
         streaming,

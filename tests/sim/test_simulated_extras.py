@@ -1,4 +1,4 @@
-"""What a simulated rig may have beside, against the exact response to its own angle."""
+"""Optional parts of a simulated rig, against the exact response to its own angle."""
 
 from dataclasses import replace
 
@@ -71,11 +71,11 @@ def test_torque_and_shear_are_those_of_the_exact_response(rig, more):
         seen *= low_pass(s, more["torque_filter_hz"], more.get("torque_filter_order", 1))
     for sensed, response in ((torque, beam.transfer(s)), (shear, beam.shear(s))):
         exact = np.fft.irfft(seen * response, 4 * TICKS)[:TICKS]
-        apart = (sensed - exact / decay)[: TICKS * 9 // 10]
-        assert np.std(apart) < 3e-4 * np.std(sensed)
+        difference = (sensed - exact / decay)[: TICKS * 9 // 10]
+        assert np.std(difference) < 3e-4 * np.std(sensed)
 
 
-def test_shear_is_what_accelerates_the_beam_and_its_tip_mass(rig):
+def test_shear_accelerates_the_beam_and_its_tip_mass(rig):
     # Integral over the beam, and not a derivative at its root.
     s = 2j * np.pi * np.geomspace(0.1, 100, 50)
     mass_kg, compliance = 3e-4, 0.02
@@ -100,14 +100,14 @@ def test_shear_is_what_accelerates_the_beam_and_its_tip_mass(rig):
     assert soft.shear(s) == pytest.approx(momentum * turned, rel=1e-9)
 
 
-def test_a_slower_clock_shows_the_torque_ever_older(rig):
+def test_a_slower_clock_delays_the_torque_ever_more(rig):
     _, usual, _ = driven(rig)
     _, older, _ = driven(rig, clock_rate_difference=-5e-4)
-    place = np.arange(TICKS) * (1 - 5e-4)
-    whole = place.astype(int)
+    delayed_ticks = np.arange(TICKS) * (1 - 5e-4)
+    whole = delayed_ticks.astype(int)
     # Band-limited: a cubic through four ticks, here of the usual readings.
     first = np.clip(whole - 1, 0, TICKS - 4)
-    x = place - first
+    x = delayed_ticks - first
     a, b, c, d = (usual[first + k] for k in range(4))
     seen = (
         -a * (x - 1) * (x - 2) * (x - 3) / 6

@@ -14,7 +14,7 @@ from rigd.sim import SimulatedPlant
 
 RATE_HZ = 1000.0
 LARGEST_DRIFT = 0.05
-"""Share of the stiffness at which a drift ends."""
+"""Fraction of the stiffness at which a drift ends."""
 FASTEST = 1e-3
 STATE = (
     "angle_rad", "velocity_rad_s", "coupling_torque_nm", "base_shear_n",
@@ -94,7 +94,7 @@ def test_poles_are_those_of_the_stiffness_at_each_time(rig, damping, more, rate)
 
 
 @pytest.mark.parametrize("sign", [further(1), -1])
-def test_after_the_drift_it_is_a_beam_of_that_stiffness(rig, sign):
+def test_the_beam_has_the_final_stiffness_after_the_drift(rig, sign):
     rig = replace(rig, motor=replace(rig.motor, coulomb_nm=0.03))
     torques = noise(2000, 0.2)
     drifted = plant_of(rig, stiffness_drift_per_s=sign * FASTEST)
@@ -108,7 +108,7 @@ def test_after_the_drift_it_is_a_beam_of_that_stiffness(rig, sign):
     )
 
 
-def test_it_counts_from_the_first_enabling(rig):
+def test_the_drift_begins_at_the_first_enabling(rig):
     once, twice = (plant_of(rig, stiffness_drift_per_s=FASTEST) for _ in range(2))
     once.advance(5000)
     for plant in (once, twice):
@@ -125,8 +125,8 @@ def test_it_counts_from_the_first_enabling(rig):
     usual.disable()
     usual.advance(1000)
     usual.enable()
-    apart = run(twice, torques) - run(usual, torques)
-    assert np.abs(apart[:, 2]).max() > 1e-3 * 0.1
+    difference = run(twice, torques) - run(usual, torques)
+    assert np.abs(difference[:, 2]).max() > 1e-3 * 0.1
 
 
 def test_a_drift_that_cannot_be_realised_is_refused(rig, monkeypatch):
@@ -141,7 +141,7 @@ def test_a_drift_that_cannot_be_realised_is_refused(rig, monkeypatch):
         plant_of(rig, stiffness_drift_per_s=-FASTEST)
 
 
-def test_hardly_any_drift_is_none(rig):
+def test_a_negligible_drift_is_no_drift(rig):
     torques = noise(3000)
     found = []
     for rate in (0.0, 1e-12):
@@ -159,7 +159,7 @@ def test_sliding_friction_is_a_constant_torque(rig):
         plant = plant_of(each, stiffness_drift_per_s=-FASTEST)
         plant.enable()
         found.append(run(plant, [torque_nm] * 300))
-    # But for the tick at which the matrix is renewed: one in twenty.
+    # Except the tick at which the matrix is renewed: one in twenty.
     sliding, net = found
     assert np.abs(sliding - net).max(axis=0) == pytest.approx(0.0, abs=1e-6 * np.abs(net).max())
 
@@ -179,7 +179,7 @@ def kelvin_voigt(rig, **motor):
 
 
 @pytest.mark.parametrize("rate", [FASTEST, further(-FASTEST)])
-def test_it_moves_as_its_modal_equations(rig, rate):
+def test_motion_follows_the_modal_equations(rig, rate):
     rig = kelvin_voigt(rig)
     rig = replace(rig, actuation=replace(rig.actuation, delay_s=0.0))
     plant = plant_of(rig, stiffness_drift_per_s=rate)
@@ -201,14 +201,14 @@ def test_it_moves_as_its_modal_equations(rig, rate):
         seen = torque_nm - motor.viscous_nm_s_per_rad * speed - motor.inertia_kg_m2 * turn
         return np.concatenate([q_rate, -pull - turn, [speed, turn]]), seen
 
-    state, pieces = np.zeros(2 * MODES + 2), 5
-    h = 1 / RATE_HZ / pieces
+    state, steps = np.zeros(2 * MODES + 2), 5
+    h = 1 / RATE_HZ / steps
     expected = np.empty((ticks, 2))
     for tick, torque_nm in enumerate(torques.tolist()):
-        before = torques[max(tick - 1, 0)]  # at a jump the plant tells the value just before
+        before = torques[max(tick - 1, 0)]  # at a jump the plant returns the value just before
         expected[tick] = state[-2], slope(t[tick], state, before)[1]
-        for piece in range(pieces):
-            now = t[tick] + piece * h
+        for step in range(steps):
+            now = t[tick] + step * h
             a = slope(now, state, torque_nm)[0]
             b = slope(now + h / 2, state + h / 2 * a, torque_nm)[0]
             c = slope(now + h / 2, state + h / 2 * b, torque_nm)[0]
@@ -221,7 +221,7 @@ def test_it_moves_as_its_modal_equations(rig, rate):
 
 
 @pytest.mark.parametrize("rate", [FASTEST, further(-FASTEST)])
-def test_a_beam_on_a_locked_shaft_rings_as_its_modal_equations(rig, rate):
+def test_a_locked_beam_rings_as_the_modal_equations(rig, rate):
     rig = kelvin_voigt(rig, coulomb_nm=0.1)
     plant = plant_of(rig, stiffness_drift_per_s=rate)
     plant.enable()

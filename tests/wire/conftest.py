@@ -18,7 +18,7 @@ from rigd.sim.wire import inject
 
 @dataclass(frozen=True)
 class DriveLog:
-    """What the simulated drive says it was told."""
+    """Log of the simulated drive on its commands."""
 
     entries: list[dict]
 
@@ -32,13 +32,13 @@ class DriveLog:
 
     @property
     def last_torque(self) -> dict:
-        """Torque and whether the drive is enabled, as they stand at the end."""
+        """Torque and whether the drive is enabled, at the end."""
         return self.of("torque")[-1]
 
 
 @pytest.fixture
 def quiet_profile(write_profile):
-    """A shipped profile whose simulated sensor has no noise, as a file; more can be changed."""
+    """A shipped profile without sensor noise, as a file; other values can be changed."""
 
     def make(name: str, values: dict[str, str] | None = None, *, patient: bool = False) -> Path:
         quiet = {"simulation.torque_noise_nm": "0.0", "simulation.force_noise_n": "0.0"}

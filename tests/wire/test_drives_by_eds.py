@@ -15,7 +15,7 @@ CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1, "d
 
 
 @pytest.mark.further  # as test_injected_faults.py has it of another drive
-def test_a_drive_with_torque_mode_runs_fails_is_reset_and_runs_again(
+def test_a_drive_with_torque_mode_runs_again_after_a_fault(
     quiet_profile, start_simulator, run_order, load, drive_log, tmp_path
 ):
     path, log = quiet_profile("antenna_can"), tmp_path / "drive.jsonl"
@@ -44,17 +44,17 @@ def test_a_drive_without_torque_mode_is_refused_by_name(quiet_profile, start_sim
     rig.disconnect()
 
 
-def test_the_profile_s_own_file_makes_the_drive(quiet_profile, start_simulator, load):
+def test_the_simulated_drive_follows_the_eds_of_the_profile(quiet_profile, start_simulator, load):
     path = quiet_profile("antenna_can")
     text = path.read_text()
     path.write_text(text.replace("[cia402]\n", f'[cia402]\neds = "{eds_path("pilz_prbt")}"\n', 1))
     start_simulator(path, "--lock-step")
-    told = inject(load(path).name, [])
-    assert "drive: pilz_prbt.eds" in told
+    printed = inject(load(path).name, [])
+    assert "drive: pilz_prbt.eds" in printed
 
 
 @pytest.mark.further  # as rigd check --eds has it
-def test_a_file_that_is_none_ends_the_command(rigd, quiet_profile, runtime_folder, tmp_path):
+def test_an_invalid_file_ends_the_command(rigd, quiet_profile, runtime_folder, tmp_path):
     done = rigd("simulate", "--profile", quiet_profile("antenna_can"), "--eds", tmp_path / "no.eds")
     assert done.returncode == 1
     assert "cannot be read (No such file" in done.stderr

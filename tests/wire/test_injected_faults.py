@@ -18,11 +18,11 @@ pytestmark = pytest.mark.process
 
 # Fast from the beginning, so that every fault is met while the motor moves.
 CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1}
-# For a reply that does not come a tick in lock-step waits half a second: where ten of them are what
-# another row shows as well, three have to do.
+# A tick in lock-step waits half a second for a missing reply: where another row has ten of them,
+# three suffice.
 STALE = 3
 
-FATAL, BORNE = "## Faults that end a session", "## Faults that a session tolerates"
+FATAL, TOLERATED = "## Faults that end a session", "## Faults that a session tolerates"
 MESSAGES = {
     "angle lost": r"angle.*10 ticks",
     "wrench lost": r"wrench.*10 ticks",
@@ -64,7 +64,7 @@ UNTIL_MENDED = {
     "controller off the bus": "no answer",
     "bus cut": "does not answer",
 }
-"""What `rigd reset` says while the cause is there; elsewhere it would reset a fault that comes
+"""Message of `rigd reset` while the cause is there; elsewhere it would reset a fault that comes
 again."""
 
 
@@ -115,7 +115,7 @@ AGAIN = {
     "torque commands lost",
     "wrench lost",
 }
-"""What the loop does then another row shows as well, or the same fault of the other device."""
+"""Faults whose reaction is covered by another row, or by the other device."""
 FURTHER = {
     "controller off the bus",
     "emergency message",
@@ -123,8 +123,8 @@ FURTHER = {
     "sensor frozen",
     "serial line cut",
 }
-"""Lost devices and faults of drives, as other rows have them by other ways; what is frozen, as
-tests/engine/test_every_interlock.py has it without the wire."""
+"""Lost devices and faults of drives, covered by other rows; frozen devices are covered in
+tests/engine/test_every_interlock.py without the wire."""
 
 
 def marks(row):
@@ -145,7 +145,7 @@ def test_every_row_has_its_message():
     "row",
     [pytest.param(row, marks=marks(row), id=named(row)) for row in rows(FATAL)],
 )
-def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
+def test_a_fault_ends_torque_and_the_rig_recovers(
     row, quiet_profile, start_simulator, run_order, load, drive_log, tmp_path, monkeypatch
 ):
     shortened = MESSAGES[row.name].endswith(f"{STALE} ticks")
@@ -154,7 +154,7 @@ def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
         values |= NOISE
     profile, log = quiet_profile(row.profile, values), tmp_path / "drive.jsonl"
     simulator = start_simulator(profile, "--lock-step", "--log", log)
-    # The record could go on for long, so that the fault comes before its end at any pace.
+    # The record is long, so that the fault comes before its end at any speed.
     options = CHIRP | {"duration_s": 60.0}
     result = run_order(load(profile), "session", fast=True, faults=[row.fault], **options)
     assert result.outcome == "fault"
@@ -164,7 +164,7 @@ def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
     session = read_session(result.path)
     assert session.outcome["outcome"] == "fault"
     assert session.samples[-1]["status"] & Status.TORQUE_OFF
-    # A drive that nobody can reach any more goes off a little later, by itself.
+    # A drive that cannot be reached any more goes off a little later, by itself.
     assert eventually(lambda: drive_log(log).last_torque["enabled"] is False)
     at_the_end = drive_log(log)
 
@@ -180,9 +180,9 @@ def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
     if "`rigd reset`" in row.back:
         with pytest.raises(RigError, match=f"rigd reset --profile {rig.name}"):
             run_order(load(profile), "refused", fast=True, **CHIRP)
-        told = reset_drive(rig)
-        assert "The fault is reset" in told
-        assert READY in told
+        message = reset_drive(rig)
+        assert "The fault is reset" in message
+        assert READY in message
     else:
         assert "start again" in row.back
     following = run_order(load(profile), "next", fast=True, **CHIRP | {"duration_s": 0.1})
@@ -191,11 +191,11 @@ def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
     simulator.terminate()
     assert simulator.wait(30.0) == 0
 
-    said = at_the_end
-    (begun,) = said.of("fault", "simulator")
-    end = said.last_torque
+    entries = at_the_end
+    (begun,) = entries.of("fault", "simulator")
+    end = entries.last_torque
     assert (end["enabled"], end["torque_nm"]) == (False, 0.0)
-    off = next(e for e in said.of("torque") if e["t_s"] >= begun["t_s"] and not e["enabled"])
+    off = next(e for e in entries.of("torque") if e["t_s"] >= begun["t_s"] and not e["enabled"])
     assert off["torque_nm"] == 0.0
     ticks = row.ticks - (
         10 - STALE if shortened and row.last.startswith("the loop: more than ten") else 0
@@ -211,28 +211,28 @@ def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
 @pytest.mark.parametrize(
     "name", ["antenna_can", pytest.param("antenna_serial", marks=pytest.mark.slow)]
 )
-def test_passing_faults_are_flagged_and_borne(
+def test_passing_faults_are_flagged_and_tolerated(
     name, quiet_profile, start_simulator, run_order, load
 ):
-    """One after the other in one session: each is flagged up to the next, as its row says."""
+    """One after the other in one session: each is flagged up to the next, as in its row."""
     profile = quiet_profile(name)
     start_simulator(profile, "--lock-step")
-    borne = [row for row in rows(BORNE) if row.profile == name]
+    tolerated = [row for row in rows(TOLERATED) if row.profile == name]
     injected = []
     result = run_order(
         load(profile),
         "session",
         fast=True,
-        faults=[row.fault for row in borne],
+        faults=[row.fault for row in tolerated],
         injected=injected,
         **CHIRP | {"duration_s": 5.0},
     )
     assert result.is_successful, result.reason
-    assert len(injected) == len(borne)
+    assert len(injected) == len(tolerated)
     status = read_session(result.path).samples["status"]
     stale = status & (Status.ANGLE_STALE | Status.WRENCH_STALE)
     assert not stale[: injected[0]].any()
-    for row, first, end in zip(borne, injected, [*injected[1:], len(status)], strict=True):
+    for row, first, end in zip(tolerated, injected, [*injected[1:], len(status)], strict=True):
         here = stale[first:end]
         if row.ticks:
             flag = Status[row.last.upper().replace(" ", "_")]
@@ -250,7 +250,7 @@ def test_passing_faults_are_flagged_and_borne(
         ("antenna_serial", "sensor", 3),
     ],
 )
-def test_readings_that_stay_late_are_warned_of_where_nothing_can_tell_them_from_lost_ones(
+def test_readings_late_or_lost_are_a_warning(
     name, sender, ms, quiet_profile, start_simulator, run_order, load
 ):
     profile = quiet_profile(name)
@@ -258,14 +258,14 @@ def test_readings_that_stay_late_are_warned_of_where_nothing_can_tell_them_from_
     fault = f"delay,from={sender},ms={ms},frames=1000000"
     result = run_order(load(profile), "session", fast=True, faults=[fault], **CHIRP)
     assert result.outcome == "complete"
-    (told,) = [e for e in read_session(result.path).events if "all have been delayed" in e.message]
-    assert (told.level, told.t_ns > 0) == ("warning", True)
+    (warning,) = [
+        e for e in read_session(result.path).events if "all have been delayed" in e.message
+    ]
+    assert (warning.level, warning.t_ns > 0) == ("warning", True)
 
 
 @pytest.mark.further  # as lost ones do
-def test_polls_that_are_answered_late_for_good_end_the_session(
-    quiet_profile, start_simulator, run_order, load
-):
+def test_permanently_late_answers_end_the_session(quiet_profile, start_simulator, run_order, load):
     profile = quiet_profile("antenna_can", {"limits.stale_ticks_in_a_row": "6"})
     start_simulator(profile, "--lock-step")
     fault = "delay,from=sensor,ms=2,frames=1000000"

@@ -78,21 +78,21 @@ def test_samples_equal_those_of_the_direct_simulation(
     angle = np.abs(ours["angle_rad"] - theirs["angle_rad"]) / rig.encoder.resolution_rad
     _, end = wired.segments["sweep"]
     assert angle[:end].max() < 1.01
-    # A motor that comes to rest sticks on whichever side of the set-point such a step leaves it.
+    # A motor that comes to rest sticks on either side of the set-point.
     assert angle[end:].max() < 10
     torque = ours["coupling_torque_nm"] - theirs["coupling_torque_nm"]
     # A step of the sensor and one of a raw gauge on either side, the tare's own, and what the
     # torque's thousandths do to the motion.
     assert np.abs(torque).max() < 6 * rig.sensor.resolution[5]
     assert torque.std() < rig.sensor.resolution[5]
-    # The controller amplifies an encoder step: compare what the torque does on the whole.
+    # The controller amplifies an encoder step: compare the torque as a whole.
     command = ours["torque_command_nm"] - theirs["torque_command_nm"]
     assert command.std() < 0.05 * theirs["torque_command_nm"].std()
 
 
 @pytest.mark.slow
-def test_a_rig_may_be_left_alone_between_sessions(quiet_profile, start_simulator, load, tmp_path):
-    """For longer than the simulated drive waits for a host, which is 5 s; then its STO is told."""
+def test_a_rig_may_be_idle_between_sessions(quiet_profile, start_simulator, load, tmp_path):
+    """Longer than the 5 s that the simulated drive waits for a host; then its STO is reported."""
     profile = load(quiet_profile("antenna_can", {"cia402.enable_timeout_s": "0.1"}))
     start_simulator(profile.path, "--lock-step")
     excitation = hold(rate_hz=1000.0, duration_s=0.1, rest_s=0.0, ring_down_s=0.0)

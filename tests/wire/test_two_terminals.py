@@ -14,7 +14,7 @@ from rigd.session.layout import Status
 
 pytestmark = pytest.mark.process
 
-# Little torque: while the machine stands still it is held, and swings the motor out.
+# Little torque: while the computer is paused it is held, and swings the motor out.
 CHIRP = ("--amplitude", "0.005", "--stop-hz", "5", "--duration", "1.5")
 LENGTHS = ("--rest", "0.2", "--ring-down", "0.3")
 
@@ -27,7 +27,7 @@ def _recording(folder: Path) -> bool:
     return any(part.stat().st_size > 100_000 for part in folder.glob("sessions/*.part"))
 
 
-# A patient profile lets the shaft turn for as long as a machine may stand still.
+# A patient profile lets the shaft turn for as long as a computer may pause.
 ACCEPTED = [
     word
     for name in ("travel_loop_fails", "travel_no_angle", "travel_missed_ticks")
@@ -45,7 +45,7 @@ def run_chirp(rigd):
 
 @pytest.fixture
 def refuse_chirp(rigd_here):
-    """The same within this process, as far as it comes without any other."""
+    """The same within this process, up to the start of others."""
     return lambda profile, *options: rigd_here("run", "chirp", "--profile", profile, *options)
 
 
@@ -56,7 +56,7 @@ def start_chirp(start_rigd):
 
 
 def _undisturbed(session) -> np.ndarray:
-    """The tracking error up to the first reading that is missing; none if it began in motion."""
+    """The tracking error up to the first missing reading; none if it began in motion."""
     samples = session.samples
     error = samples["angle_rad"] - samples["angle_reference_rad"]
     disturbed = (samples["status"] & (Status.ANGLE_STALE | Status.WRENCH_STALE)) != 0
@@ -70,7 +70,7 @@ def _undisturbed(session) -> np.ndarray:
 @pytest.mark.parametrize(
     "name", [pytest.param("antenna_can", marks=pytest.mark.slow), "antenna_serial"]
 )
-def test_a_chirp_through_the_wires_is_recorded_whole(
+def test_a_chirp_over_the_wire_is_recorded_whole(
     name, quiet_profile, start_simulator, run_chirp, drive_log, tmp_path
 ):
     profile = quiet_profile(name, patient=True)
@@ -93,24 +93,24 @@ def test_a_chirp_through_the_wires_is_recorded_whole(
     assert np.shape(calibration["matrix"]) == (6, 6)
     fresh = (session.samples["status"] & (Status.ANGLE_STALE | Status.WRENCH_STALE)) == 0
     assert fresh.any()
-    # That it follows all the way is for the lock-step: here it does as far as the machine let it.
+    # Lock-step tests the whole reference: here the computer may pause.
     assert np.abs(_undisturbed(session)).max(initial=0.0) < 0.005  # the whole amplitude
 
     timings = read_timings(tmp_path / counts["path"])
     assert np.array_equal(timings["tick"], session.samples["tick"])
-    # Asked for after the tick was due, in the same tick.
-    asked = -timings["angle_age_s"][fresh]
-    assert np.all(asked >= 0)
-    assert np.median(asked) < 1e-3
+    # Requested after the tick was due, in the same tick.
+    request_delay_s = -timings["angle_age_s"][fresh]
+    assert np.all(request_delay_s >= 0)
+    assert np.median(request_delay_s) < 1e-3
     assert np.median(-timings["wrench_age_s"][fresh]) < 1e-3
 
     simulator.send_signal(signal.SIGTERM)
     assert simulator.wait(30.0) == 0
-    said = drive_log(log)
-    assert said.last_torque["enabled"] is False
-    assert said.last_torque["torque_nm"] == 0.0
-    assert max(abs(entry["torque_nm"]) for entry in said.of("torque")) > 0.01
-    assert not said.of("emergency")
+    entries = drive_log(log)
+    assert entries.last_torque["enabled"] is False
+    assert entries.last_torque["torque_nm"] == 0.0
+    assert max(abs(entry["torque_nm"]) for entry in entries.of("torque")) > 0.01
+    assert not entries.of("emergency")
 
 
 @pytest.mark.further  # as faults do in test_injected_faults.py
@@ -132,21 +132,19 @@ def test_ctrl_c_stops_the_motor_over_the_wire(
     assert last["status"] & Status.TORQUE_OFF
     simulator.send_signal(signal.SIGTERM)
     assert simulator.wait(30.0) == 0
-    said = drive_log(log)
-    assert (said.last_torque["enabled"], said.last_torque["torque_nm"]) == (False, 0.0)
-    assert not said.of("emergency")
+    entries = drive_log(log)
+    assert (entries.last_torque["enabled"], entries.last_torque["torque_nm"]) == (False, 0.0)
+    assert not entries.of("emergency")
 
 
-def test_without_hardware_and_simulator_the_message_says_what_to_do(
-    quiet_profile, run_chirp, runtime_folder
-):
+def test_advice_without_hardware_and_simulator(quiet_profile, run_chirp, runtime_folder):
     done = run_chirp(quiet_profile("antenna_can", ALONE))
     assert done.returncode == 1
     assert "rigd simulate" in done.stderr + done.stdout
     assert "Traceback" not in done.stderr
 
 
-def test_real_time_cannot_be_skipped_unless_in_lock_step(
+def test_real_time_can_be_skipped_only_in_lock_step(
     quiet_profile, start_simulator, refuse_chirp, runtime_folder
 ):
     profile = quiet_profile("antenna_can", ALONE)
@@ -164,10 +162,10 @@ def test_real_time_cannot_be_skipped_unless_in_lock_step(
 @pytest.mark.parametrize(
     "how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)]
 )
-def test_without_the_loop_the_drive_goes_off_by_itself(
+def test_the_drive_goes_off_without_the_loop(
     how, quiet_profile, start_simulator, start_chirp, drive_log, tmp_path
 ):
-    # After how long, to the tick, is for the lock-step: here the simulator may stand still as well.
+    # Lock-step tests the exact tick: here the simulator may pause as well.
     timeout = {"cia402.heartbeat_timeout_s": "1.0"}
     profile = quiet_profile("antenna_can", timeout, patient=True)
     log = tmp_path / "drive.jsonl"
@@ -181,16 +179,14 @@ def test_without_the_loop_the_drive_goes_off_by_itself(
     simulator.send_signal(signal.SIGTERM)
     assert simulator.wait(30.0) == 0
 
-    said = drive_log(log)
-    end = said.last_torque
+    entries = drive_log(log)
+    end = entries.last_torque
     assert (end["enabled"], end["torque_nm"]) == (False, 0.0)
-    (lost,) = [e for e in said.of("emcy") if e["code"] == 0x8130]
+    (lost,) = [e for e in entries.of("emcy") if e["code"] == 0x8130]
     assert end["t_s"] == pytest.approx(lost["t_s"], abs=2e-3)
 
 
-def test_a_profile_that_cannot_share_its_bus_is_wrong_use(
-    quiet_profile, refuse_chirp, runtime_folder
-):
+def test_identifiers_that_collide_are_wrong_use(quiet_profile, refuse_chirp, runtime_folder):
     done = refuse_chirp(quiet_profile("antenna_can", {"ati_can.base_id": "0x20"}))
     assert done.returncode == 2
     assert "0x201" in done.stderr

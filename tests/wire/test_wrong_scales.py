@@ -13,11 +13,11 @@ from rigd.session import read_session
 pytestmark = pytest.mark.process
 
 SILENT = ("0x608F", "0x6091")
-"""Objects that tell the scales of the encoder."""
+"""Objects that state the scales of the encoder."""
 
 
-class Told:
-    """What the operator of a series is told; he may stop it at the first word."""
+class OperatorMessages:
+    """Messages to the operator of a series, which may stop it at the first one."""
 
     def __init__(self, stop=None):
         self.texts = []
@@ -60,19 +60,19 @@ def rig_on_wire(write_profile, start_simulator, load, tmp_path):
             other = line.partition(", source")[0] + ', source = "measured" }'
             path.write_text(text.replace(line, other), encoding="utf-8")
         profile, stop = load(path), StopRequest()
-        told = Told(stop if stopped else None)
+        messages = OperatorMessages(stop if stopped else None)
         excitation = hold(rate_hz=1000.0, duration_s=0.1, rest_s=0.0, ring_down_s=0.0)
         series = Series(profile, excitation, tmp_path / "sessions", **options)
         rig = Rig(profile, fast=True)
         rigs.append(rig)
         rig.connect()
         try:
-            series.run(rig, stop, told, live=False)
+            series.run(rig, stop, messages, live=False)
         finally:
             torques = [json.loads(line) for line in log.read_text("utf-8").splitlines()[:-1]]
             torques = [entry for entry in torques if entry["what"] == "torque"]
             assert not torques or not torques[-1]["enabled"]
-        return series.results, told.texts, rig, profile
+        return series.results, messages.texts, rig, profile
 
     yield run
     for rig in rigs:
@@ -80,13 +80,13 @@ def rig_on_wire(write_profile, start_simulator, load, tmp_path):
 
 
 @pytest.mark.further
-def test_a_scale_that_the_drive_states_is_refused_before_any_torque(rig_on_wire):
+def test_a_wrong_scale_stated_by_the_drive_is_refused(rig_on_wire):
     with pytest.raises(RigError, match=r"608F and 6091.*resolution_rad says 2.8e-05"):
         rig_on_wire({"encoder.resolution_rad": "2.8e-5"}, states_scales=True)
 
 
 @pytest.mark.parametrize(
-    ("stated", "says"),
+    ("stated", "message"),
     [
         pytest.param({"encoder.resolution_rad": "1.75e-5"}, "encoder.resolution_rad", id="step"),
         further({"motor.inertia_kg_m2": "6.0e-3"}, "motor.inertia_kg_m2", id="inertia"),
@@ -94,8 +94,8 @@ def test_a_scale_that_the_drive_states_is_refused_before_any_torque(rig_on_wire)
         further({"cia402.direction": "-1"}, "encoder|sensor.projection", id="direction"),
     ],
 )
-def test_one_that_it_does_not_state_is_found_by_the_probing_move(rig_on_wire, stated, says):
-    with pytest.raises(ProbeFailedError, match=says):
+def test_an_unstated_wrong_scale_is_found_by_the_probing_move(rig_on_wire, stated, message):
+    with pytest.raises(ProbeFailedError, match=message):
         rig_on_wire(stated)
 
 
@@ -112,9 +112,9 @@ def test_a_rig_within_a_quarter_is_probed_once(rig_on_wire, tmp_path):
         hold(rate_hz=1000.0, duration_s=0.1, rest_s=0.0, ring_down_s=0.0),
         tmp_path / "sessions",
     )
-    told = Told()
-    again.run(rig, StopRequest(), told, live=False)
-    assert told.texts == []
+    messages = OperatorMessages()
+    again.run(rig, StopRequest(), messages, live=False)
+    assert messages.texts == []
     assert again.results[0].is_successful
 
 
@@ -135,6 +135,6 @@ def test_a_stop_ends_the_move(rig_on_wire):
 
 
 @pytest.mark.further
-def test_the_motor_that_is_to_be_identified_may_be_another(rig_on_wire):
+def test_the_motor_to_be_identified_may_differ(rig_on_wire):
     results, _, *_ = rig_on_wire({"motor.inertia_kg_m2": "6.0e-3"}, identifies_motor=True)
     assert results[0].is_successful

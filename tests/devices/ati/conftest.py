@@ -10,7 +10,7 @@ import pytest
 from rigd.profile import load_profile
 
 
-def load_beside(name):
+def load_module(name):
     """Import a module of this folder: pytest's import mode puts the folder on no path."""
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, Path(__file__).parent / f"{name}.py")
@@ -22,12 +22,12 @@ def load_beside(name):
 
 @pytest.fixture(scope="session")
 def fakes():
-    return load_beside("fakes_ati")
+    return load_module("fakes_ati")
 
 
 @pytest.fixture(scope="session")
 def fuzz(fakes):
-    return load_beside("fuzz_ati")
+    return load_module("fuzz_ati")
 
 
 @pytest.fixture

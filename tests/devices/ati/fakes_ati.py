@@ -1,4 +1,4 @@
-"""Both ATI sensors as they are described, by plain struct: nothing here uses the drivers' codecs.
+"""Fakes of both ATI sensors, written with struct: nothing here uses the drivers' codecs.
 
 Sources: devices.md 1.1 (NETCANOEM) and 2.1 (Digital F/T).
 """
@@ -31,7 +31,7 @@ def frame_of(can_id, data=b""):
 
 
 class FakeNetcanoem:
-    """Answers every request; what it answers can be changed."""
+    """Answers every request; the answers can be changed."""
 
     def __init__(self, base=BASE):
         self.base = base
@@ -44,7 +44,7 @@ class FakeNetcanoem:
         self.active = 0
         self.status = 0
         self.gauges = GAUGES
-        self.asked = []
+        self.requests = []
         self.silent_to = set()
         self.lose_once = set()
         self.lengthen = set()
@@ -55,7 +55,7 @@ class FakeNetcanoem:
         opcode = can_id & 0xF
         if can_id >> 4 != self.base or opcode in self.silent_to:
             return []
-        self.asked.append((opcode, data))
+        self.requests.append((opcode, data))
         replies = self._replies(opcode, data)
         if opcode in self.lengthen:
             replies = [(op, content[:-1]) for op, content in replies]
@@ -90,7 +90,7 @@ class FakeNetcanoem:
 
 
 class FakeBus:
-    """A CAN port whose other end is a function from a frame to the frames it causes."""
+    """A CAN port whose other end is a function that returns the replies to a frame."""
 
     name = "fake0"
 
@@ -118,7 +118,7 @@ class FakeBus:
 
 
 class LateBus(FakeBus):
-    """One on which replies take time: none, but for requests (opcode, data) that have theirs."""
+    """A bus with delayed replies: by `late_s` of a request (opcode, data), else at once."""
 
     def __init__(self, answer):
         super().__init__(answer)
@@ -128,7 +128,7 @@ class LateBus(FakeBus):
         can_id, length = struct.unpack_from("=IB", frame)
         late_s = self.late_s.get((can_id & 0xF, frame[8 : 8 + length]))
         arrives_s = time.monotonic() + (late_s.pop() if late_s else 0.0)
-        for reply in self.answer(frame):  # one after the other, whatever they belong to
+        for reply in self.answer(frame):  # one after the other, for any request
             last_s = self.queue[-1][0] if self.queue else 0.0
             self.queue.append((max(arrives_s, last_s + 2e-3), reply))
 
@@ -145,7 +145,7 @@ class LateBus(FakeBus):
 
 
 class FakeLink:
-    """Stands in for the shared bus."""
+    """Replaces the shared bus."""
 
     def __init__(self, bus):
         self.bus = bus
@@ -255,7 +255,7 @@ class FakeDigitalFt:
         return struct.unpack("=i", count)[0]
 
     def hang_up(self):
-        """Go away as an unplugged adapter does."""
+        """Disappear like an unplugged adapter."""
         self._stop()
         os.close(self._slave)
         os.close(self.master)

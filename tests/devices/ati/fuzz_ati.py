@@ -1,6 +1,6 @@
 """Feed both drivers rubbish: ``python tests/devices/ati/fuzz_ati.py 1000000``.
 
-Each function handles `n` chunks or frames, counts what happened, and fails where a driver raises
+Each function handles `n` chunks or frames, counts the results, and fails if a driver raises
 anything but its own errors or delivers a value that no sensor sent.
 """
 
@@ -27,7 +27,7 @@ from rigd.profile import load_profile
 
 
 def noisy_records(rng, count):
-    """Records of a load that wanders, with the noise of a real sensor."""
+    """Records of a drifting load, with the noise of a real sensor."""
     levels = [rng.randint(-8000, 8000) for _ in range(6)]
     records = []
     for _ in range(count):
@@ -69,7 +69,7 @@ def fuzz_stream(n, seed):
         for _ in range(rng.randint(0, 2)):
             disturb(rng, data)
             counts["disturbed"] += 1
-        # So that each batch is judged by itself: a sound end, long enough to synchronise again.
+        # So that batches are independent: a sound end, long enough to synchronise again.
         tail = noisy_records(rng, 4 * protocol.SYNC_RECORDS)
         data += b"".join(tail)
         counts["sent"] += len(records) + len(tail)
@@ -157,7 +157,7 @@ def fuzz_can(n, seed, mode="same_tick"):
             replies = replies[: 2 - len(later)]
         elif fate < 0.45:
             replies = [reply[:4] + bytes((rng.randint(0, 8),)) + reply[5:] for reply in replies]
-        # What is not half a reading of the sensor may come anywhere between.
+        # Other frames than half readings of the sensor may come anywhere between.
         for _ in range(rng.choice((0, 0, 1, 3))):
             can_id = rng.choice(
                 (BASE << 4 | rng.randint(2, 15), rng.randrange(0x800), 0x80, 0x20000004)
@@ -257,7 +257,7 @@ PARTS = {
 
 
 def run(total, seed):
-    """Share `total` between all parts; yield what each did."""
+    """Distribute `total` over all parts; yield the result of each."""
     for name, (part, function) in PARTS.items():
         yield name, function(int(part * total), seed)
 

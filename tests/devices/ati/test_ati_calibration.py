@@ -58,7 +58,7 @@ def test_torque_units(code, newton_metre):
     assert rows[0][0] == 1.0
 
 
-def test_forces_and_torques_have_their_own_counts():
+def test_forces_and_torques_have_separate_counts():
     rows = calibration(counts_per_force=4, counts_per_torque=5).wrench_per_count()
     assert rows[1][1] == 0.25
     assert rows[4][4] == 0.2
@@ -73,7 +73,7 @@ def test_unknown_units_are_refused(code):
 
 
 @pytest.mark.parametrize("counts", [0, -1])
-def test_counts_that_are_not_positive_are_refused(counts):
+def test_counts_below_one_are_refused(counts):
     with pytest.raises(ValueError, match="counts"):
         calibration(counts_per_force=counts)
     with pytest.raises(ValueError, match="counts"):
@@ -81,7 +81,7 @@ def test_counts_that_are_not_positive_are_refused(counts):
 
 
 @pytest.mark.parametrize("entry", [math.nan, math.inf, -math.inf])
-def test_a_matrix_with_entries_that_are_no_numbers_is_refused(entry):
+def test_a_matrix_with_nan_entries_is_refused(entry):
     rows = [list(row) for row in ONES]
     rows[4][1] = entry
     with pytest.raises(ValueError, match=r"entry Ty, gauge 1 .* not a number"):
@@ -96,34 +96,34 @@ def test_a_matrix_with_an_empty_row_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("axis", "entry", "says"),
+    ("axis", "entry", "message"),
     [
         (0, 1e35, r"entry Fx, gauge 2 .* 1e\+35 .*more than any sensor has \(1e\+06 N\)"),
         (5, -1e35, r"entry Tz, gauge 2 .* -1e\+35 .*more than any sensor has \(1e\+06 N·m\)"),
         (3, 31.0, r"entry Tx, gauge 2 .* 31 "),
     ],
 )
-def test_an_entry_that_no_sensor_has_is_named(axis, entry, says):
+def test_an_impossible_entry_is_named(axis, entry, message):
     rows = [list(row) for row in ONES]
     rows[axis][2] = entry
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         calibration(matrix=tuple(map(tuple, rows)))
 
 
-def test_an_entry_just_within_what_a_sensor_may_have_is_taken():
+def test_an_entry_just_within_the_limits_is_accepted():
     rows = [list(row) for row in ONES]
     rows[3][2] = 30.0
     calibration(matrix=tuple(map(tuple, rows)))
 
 
-def test_a_row_of_next_to_nothing_is_named():
+def test_a_row_of_tiny_entries_is_named():
     tiny = tuple(1e-30 * entry for entry in ONES[1])
     with pytest.raises(ValueError, match=r"row Fy .* beyond 1e-30 "):
         calibration(matrix=(ONES[0], tiny, *ONES[2:]))
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3, -25.0])
-def test_a_matrix_that_cannot_tell_two_loads_apart_is_refused(scale):
+def test_a_singular_matrix_is_refused(scale):
     copied = tuple(scale * entry for entry in ONES[2])
     with pytest.raises(ValueError, match="is singular"):
         calibration(matrix=(*ONES[:3], copied, *ONES[4:]))
@@ -132,7 +132,7 @@ def test_a_matrix_that_cannot_tell_two_loads_apart_is_refused(scale):
 
 
 @given(st.lists(st.floats(1e-4, 1e4), min_size=6, max_size=6), st.permutations(range(6)))
-def test_axes_and_gauges_of_any_size_and_order_are_taken(sizes, order):
+def test_axes_and_gauges_of_any_scale_and_order_are_accepted(sizes, order):
     rows = [
         [size * 1e-3 * entry for entry in ONES[k]] for size, k in zip(sizes, order, strict=True)
     ]
@@ -141,13 +141,15 @@ def test_axes_and_gauges_of_any_size_and_order_are_taken(sizes, order):
 
 def test_the_range_is_given_in_newtons():
     found = calibration(force_unit=1, torque_unit=4, ratings=(5.0, 5.0, 15.0, 1e3, 1e3, 1e3))
-    said = found.as_dict()
-    assert said["range_n_nm"] == pytest.approx([22.2411, 22.2411, 66.7233, 1.0, 1.0, 1.0], rel=1e-5)
-    assert said["force_unit"] == "lbf"
-    assert json.loads(json.dumps(said, allow_nan=False)) == said
+    document = found.as_dict()
+    assert document["range_n_nm"] == pytest.approx(
+        [22.2411, 22.2411, 66.7233, 1.0, 1.0, 1.0], rel=1e-5
+    )
+    assert document["force_unit"] == "lbf"
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
 
 
-def test_a_range_that_is_unknown_is_said_to_be():
+def test_an_unknown_range_is_reported_as_unknown():
     assert calibration().as_dict()["range_n_nm"] == "not stated by the sensor"
     unwritten = calibration(ratings=(math.nan,) * 6)
     assert unwritten.as_dict()["range_n_nm"] == "not stated by the sensor"
@@ -198,7 +200,7 @@ def test_text_is_always_printable(raw):
     assert printable_text(raw).isprintable()
 
 
-def test_where_calibration_blocks_are():
+def test_addresses_of_calibration_blocks():
     assert first_block_register(1) == 0x00E3
     assert first_block_register(2) == 0x01A3
     assert first_block_register(16) == 0x0C23
@@ -225,7 +227,7 @@ def test_an_empty_calibration_block_is_refused(fill):
 
 @settings(max_examples=30)
 @given(st.lists(st.integers(0, 0xFFFF), min_size=133, max_size=133), st.booleans())
-def test_any_calibration_block_is_read_or_refused_in_words(registers, sound_units):
+def test_any_calibration_block_is_read_or_refused(registers, sound_units):
     if sound_units:
         registers[104] = 0x0203
     try:

@@ -1,4 +1,4 @@
-"""The sensor behind a NETCANOEM box, against one written by struct from devices.md 1.1."""
+"""The sensor behind a NETCANOEM box, against a fake written with struct from devices.md 1.1."""
 
 import json
 import math
@@ -57,12 +57,12 @@ def expected_wrench(fakes, gauges, counts=(1_000_000, 2_000_000)):
     ]
 
 
-def test_connecting_selects_the_calibration_and_reads_it_before_the_first_poll(bench):
+def test_connecting_selects_and_reads_the_calibration(bench):
     bench.sensor.connect()
-    opcodes = [opcode for opcode, _ in bench.fake.asked]
-    assert (6, b"\x01") in bench.fake.asked
+    opcodes = [opcode for opcode, _ in bench.fake.requests]
+    assert (6, b"\x01") in bench.fake.requests
     assert opcodes.index(6) < opcodes.index(2) < opcodes.index(7) < opcodes.index(8)
-    assert [data for opcode, data in bench.fake.asked if opcode == 2] == [
+    assert [data for opcode, data in bench.fake.requests if opcode == 2] == [
         bytes((axis,)) for axis in (*range(6), *range(6))
     ]
     # Nothing that resets, re-addresses or re-clocks the sensor is ever sent.
@@ -71,16 +71,19 @@ def test_connecting_selects_the_calibration_and_reads_it_before_the_first_poll(b
 
 def test_the_calibration_goes_into_the_file(bench, fakes):
     bench.sensor.connect()
-    said = bench.sensor.calibration()
-    assert json.loads(json.dumps(said, allow_nan=False)) == said
-    assert said["serial_number"] == "FT12345"
-    assert said["firmware"] == "3.8.2"
-    assert said["calibration"] == 1
-    assert said["matrix"] == [list(row) for row in fakes.MATRIX]
-    assert (said["counts_per_force"], said["counts_per_torque"]) == (1_000_000, 2_000_000)
-    assert (said["force_unit"], said["torque_unit"]) == ("N", "N·m")
-    assert said["range_n_nm"] == "not stated by the sensor"
-    assert said["status"] == []
+    calibration = bench.sensor.calibration()
+    assert json.loads(json.dumps(calibration, allow_nan=False)) == calibration
+    assert calibration["serial_number"] == "FT12345"
+    assert calibration["firmware"] == "3.8.2"
+    assert calibration["calibration"] == 1
+    assert calibration["matrix"] == [list(row) for row in fakes.MATRIX]
+    assert (calibration["counts_per_force"], calibration["counts_per_torque"]) == (
+        1_000_000,
+        2_000_000,
+    )
+    assert (calibration["force_unit"], calibration["torque_unit"]) == ("N", "N·m")
+    assert calibration["range_n_nm"] == "not stated by the sensor"
+    assert calibration["status"] == []
 
 
 def test_the_wrench_is_the_matrix_times_the_gauges(bench, fakes):
@@ -92,20 +95,20 @@ def test_the_wrench_is_the_matrix_times_the_gauges(bench, fakes):
 
 
 @pytest.mark.parametrize("firmware", [(3, 6, 9), (2, 9, 0)])
-def test_older_firmware_is_not_asked_for_its_counts_or_units(bench, fakes, firmware):
+def test_no_request_of_counts_and_units_from_older_firmware(bench, fakes, firmware):
     bench.fake.firmware = firmware
     bench.fake.units = (1, 1)
     bench.sensor.connect()
-    assert not {7, 8} & {opcode for opcode, _ in bench.fake.asked}
+    assert not {7, 8} & {opcode for opcode, _ in bench.fake.requests}
     wanted = expected_wrench(fakes, fakes.GAUGES, (1_000_000, 1_000_000))
     assert bench.tick() == pytest.approx(wanted, rel=1e-12)
-    said = bench.sensor.calibration()
-    assert (said["force_unit"], said["torque_unit"]) == ("N", "N·m")
-    assert "3.7" in said["assumed"]
+    calibration = bench.sensor.calibration()
+    assert (calibration["force_unit"], calibration["torque_unit"]) == ("N", "N·m")
+    assert "3.7" in calibration["assumed"]
 
 
 @pytest.mark.parametrize("firmware", [(3, 7, 0), (3, 7, 9), (3, 8, 0), (4, 0, 0)])
-def test_firmware_from_3_7_on_tells_its_counts_and_units(bench, fakes, firmware):
+def test_firmware_from_3_7_on_reports_counts_and_units(bench, fakes, firmware):
     bench.fake.firmware = firmware
     bench.fake.counts = (2_000_000, 2_000_000)
     bench.sensor.connect()
@@ -114,7 +117,7 @@ def test_firmware_from_3_7_on_tells_its_counts_and_units(bench, fakes, firmware)
     assert "assumed" not in bench.sensor.calibration()
 
 
-def test_the_serial_number_is_that_of_the_selected_calibration(fakes, can_rig):
+def test_serial_number_of_the_selected_calibration(fakes, can_rig):
     bench = Bench(fakes, with_ati(can_rig, serial_number="FT00001"))
     answer = bench.bus.answer
 
@@ -135,19 +138,17 @@ def test_units_become_newtons(bench, fakes):
     assert bench.tick() == pytest.approx([w * f for w, f in zip(wanted, factors, strict=True)])
 
 
-def test_a_reply_that_comes_twice_is_not_taken_for_that_to_the_next_request(
-    fakes, can_rig, monkeypatch
-):
-    """One that is late is asked for again, and then two are on their way."""
+def test_a_repeated_reply_does_not_answer_the_next_request(fakes, can_rig, monkeypatch):
+    """A late reply is requested again, and then two are on their way."""
     monkeypatch.setattr("rigd.devices.ati._can_sensor._REPLY_TIMEOUT_S", 0.25)
     bench = Bench(fakes, can_rig, fakes.LateBus)
     bench.bus.late_s = {(2, b"\0"): [0.35, 0.35]}
     bench.sensor.connect()
-    assert bench.fake.asked.count((2, b"\0")) == 3
+    assert bench.fake.requests.count((2, b"\0")) == 3
     assert bench.sensor.calibration()["matrix"] == [list(row) for row in fakes.MATRIX]
 
 
-def test_a_lost_set_up_frame_is_asked_for_again(bench, quick):
+def test_a_lost_set_up_frame_is_requested_again(bench, quick):
     bench.fake.lose_once = {0, 2, 5, 6, 7, 8, 0xF}
     bench.sensor.connect()
     assert bench.fake.lose_once == set()
@@ -165,7 +166,7 @@ def test_a_lost_set_up_frame_is_asked_for_again(bench, quick):
         (8, "unit codes"),
     ],
 )
-def test_a_sensor_that_does_not_answer(bench, quick, opcode, what):
+def test_no_answer_of_the_sensor(bench, quick, opcode, what):
     bench.fake.silent_to = {opcode}
     message = bench.refusal()
     assert what in message
@@ -179,7 +180,7 @@ def test_replies_of_the_wrong_length(bench, quick, opcode):
     assert "bytes instead of" in bench.refusal()
 
 
-def test_half_readings_of_the_wrong_length_are_no_reading(bench, quick):
+def test_half_readings_of_the_wrong_length_are_ignored(bench, quick):
     bench.fake.lengthen = {0}
     assert "a reading" in bench.refusal()
 
@@ -191,7 +192,7 @@ def test_another_serial_number(fakes, can_rig):
     Bench(fakes, with_ati(can_rig, serial_number="FT12345")).sensor.connect()
 
 
-def test_a_calibration_that_the_sensor_does_not_have(fakes, can_rig):
+def test_a_missing_calibration(fakes, can_rig):
     bench = Bench(fakes, with_ati(can_rig, calibration=9))
     assert "asked for calibration 9, it selected 0" in bench.refusal()
 
@@ -225,7 +226,7 @@ def test_an_empty_matrix(bench):
     assert "row Fx of its calibration matrix is zero" in bench.refusal()
 
 
-def test_a_matrix_that_changes_between_two_readings(bench):
+def test_a_matrix_changed_between_two_readings(bench):
     answer = bench.bus.answer
 
     def swap(frame):
@@ -251,7 +252,7 @@ def test_a_profile_without_the_section(can_rig, section):
         AtiCanSensor(replace(can_rig, **{section: None}), None)
 
 
-def test_critical_status_ends_the_session_in_words(bench):
+def test_critical_status_ends_the_session_with_a_message(bench):
     bench.sensor.connect()
     bench.fake.status = 0x8800
     with pytest.raises(DeviceError, match="the sensor is too hot"):
@@ -275,11 +276,13 @@ def test_a_watchdog_reset_in_mid_session_is_a_fault(bench):
     bench.sensor.connect()
     bench.tick()
     bench.fake.status = 0x8001
-    with pytest.raises(DeviceError, match=r"watchdog has reset it .*back at calibration 0") as told:
+    with pytest.raises(
+        DeviceError, match=r"watchdog has reset it .*back at calibration 0"
+    ) as caught:
         bench.tick()
-    assert "not measured with calibration 1 (ati_can.calibration)" in str(told.value)
+    assert "not measured with calibration 1 (ati_can.calibration)" in str(caught.value)
     bench.sensor.connect()  # the bit stays, and the calibration is selected again
-    assert bench.fake.asked.count((6, b"\x01")) == 2
+    assert bench.fake.requests.count((6, b"\x01")) == 2
     bench.tick()
     assert not bench.sensor.wrench_stale
     bench.fake.status = 0
@@ -315,7 +318,7 @@ class Restarting(Bench):
 
 
 @pytest.mark.parametrize("mode", ["same_tick", "previous_tick"])
-def test_a_box_that_was_without_power_and_is_back_at_another_calibration(fakes, can_rig, mode):
+def test_restart_with_another_calibration_is_a_fault(fakes, can_rig, mode):
     bench = Restarting(fakes, can_rig, mode)
     bench.silence(8)
     bench.fake.active = 0
@@ -325,23 +328,23 @@ def test_a_box_that_was_without_power_and_is_back_at_another_calibration(fakes, 
 
 
 @pytest.mark.parametrize("mode", ["same_tick", "previous_tick"])
-def test_a_box_that_was_silent_and_is_the_same_goes_on(fakes, can_rig, mode):
+def test_session_continues_after_silence_without_restart(fakes, can_rig, mode):
     bench = Restarting(fakes, can_rig, mode)
     bench.silence(8)
-    bench.fake.lose_once = {2}  # the proof may be lost, too
+    bench.fake.lose_once = {2}  # the check may be lost, too
     assert all(bench.fresh(20)[10:])
-    assert (2, b"\0") in bench.fake.asked[-30:]
+    assert (2, b"\0") in bench.fake.requests[-30:]
 
 
-def test_a_reply_that_is_lost_now_and_then_asks_for_no_proof(fakes, can_rig):
+def test_occasional_lost_replies_need_no_check(fakes, can_rig):
     bench = Restarting(fakes, can_rig, "same_tick")
-    bench.fake.asked.clear()
+    bench.fake.requests.clear()
     for _ in range(5):
         bench.without_power = True
         bench.tick()
         bench.without_power = False
         bench.fresh(10)
-    assert {opcode for opcode, _ in bench.fake.asked} == {0}
+    assert {opcode for opcode, _ in bench.fake.requests} == {0}
 
 
 @pytest.mark.parametrize("gauge", range(6))
@@ -367,13 +370,13 @@ class Numbered(Bench):
         self.sensor.connect()
         self.number = 0
         self.held = []
-        self.keep = lambda frames: frames
+        self.filter_frames = lambda frames: frames
         self.bus.answer = self.answer
 
     def answer(self, frame):
         self.number += 1
         self.fake.gauges = (self.number,) * 6
-        return self.keep(self.fake.answer(frame))
+        return self.filter_frames(self.fake.answer(frame))
 
     def hold(self, frames):
         self.held += frames
@@ -395,11 +398,11 @@ def numbered(fakes, can_rig):
     return Numbered(fakes, can_rig)
 
 
-def test_a_lost_reply_leaves_the_last_value_and_says_so(numbered):
+def test_a_lost_reply_leaves_the_last_value_and_a_flag(numbered):
     assert numbered.read() == (1, False)
-    numbered.keep = lambda frames: []
+    numbered.filter_frames = lambda frames: []
     assert numbered.read() == (1, True)
-    numbered.keep = lambda frames: frames
+    numbered.filter_frames = lambda frames: frames
     assert numbered.read() == (1, True), "it may be the missing one, late"
     # One tick without a poll: no reply comes, so none is on its way.
     assert numbered.read() == (1, True)
@@ -411,9 +414,9 @@ def test_a_lost_reply_leaves_the_last_value_and_says_so(numbered):
 @pytest.mark.parametrize("lost", [0, 1])
 def test_half_a_reply_never_pairs_with_the_next(numbered, lost):
     assert numbered.read() == (1, False)
-    numbered.keep = lambda frames: [frames[1 - lost]]
+    numbered.filter_frames = lambda frames: [frames[1 - lost]]
     assert numbered.read() == (1, True)
-    numbered.keep = lambda frames: frames
+    numbered.filter_frames = lambda frames: frames
     assert numbered.read() == (1, True)
     assert numbered.read() == (1, True)
     assert numbered.read() == (4, False)
@@ -421,39 +424,39 @@ def test_half_a_reply_never_pairs_with_the_next(numbered, lost):
 
 def test_a_reply_after_the_deadline_is_dropped_and_costs_one_tick(numbered):
     assert numbered.read() == (1, False)
-    numbered.keep = numbered.hold
+    numbered.filter_frames = numbered.hold
     assert numbered.read() == (1, True)
-    numbered.keep = lambda frames: frames
+    numbered.filter_frames = lambda frames: frames
     numbered.release()
     assert numbered.read() == (3, False)
     assert numbered.sensor.late_replies == 1
     assert numbered.sensor.polls.lost == 0
 
 
-def test_a_reply_in_the_next_tick_is_not_taken_for_its_own(numbered):
+def test_a_reply_in_the_next_tick_is_dropped(numbered):
     assert numbered.read() == (1, False)
-    numbered.keep = numbered.hold
+    numbered.filter_frames = numbered.hold
     assert numbered.read() == (1, True)
-    numbered.keep = lambda frames: frames
+    numbered.filter_frames = lambda frames: frames
     numbered.sensor.request(0)
     numbered.release()
-    # As the drive does, which shares the bus.
+    # As the drive on the same bus does.
     numbered.link.open().drain()
     assert numbered.sensor.read_wrench()[0] == 1
     assert numbered.sensor.wrench_stale
     assert numbered.read() == (4, False)
 
 
-def test_the_second_half_in_the_next_tick_is_not_taken(numbered):
+def test_the_second_half_in_the_next_tick_is_dropped(numbered):
     assert numbered.read() == (1, False)
 
     def hold_second(frames):
         numbered.held.append(frames[1])
         return frames[:1]
 
-    numbered.keep = hold_second
+    numbered.filter_frames = hold_second
     assert numbered.read() == (1, True)
-    numbered.keep = lambda frames: frames
+    numbered.filter_frames = lambda frames: frames
     numbered.sensor.request(0)
     numbered.release()
     assert numbered.sensor.read_wrench()[0] == 1
@@ -463,7 +466,7 @@ def test_the_second_half_in_the_next_tick_is_not_taken(numbered):
 @pytest.mark.parametrize("mode", ["same_tick", "previous_tick"])
 @pytest.mark.parametrize("late", [1, 2, 3, 5])
 @pytest.mark.parametrize("part", [slice(2), slice(1), slice(1, 2)])
-def test_replies_that_are_late_for_good_never_count(fakes, can_rig, mode, late, part):
+def test_replies_always_late_never_count(fakes, can_rig, mode, late, part):
     """By whole ticks: each comes right after the poll of a later one, whole or half."""
     numbered = Numbered(fakes, can_rig, mode=mode)
     numbered.read() if mode == "same_tick" else numbered.tick()
@@ -474,7 +477,7 @@ def test_replies_that_are_late_for_good_never_count(fakes, can_rig, mode, late, 
         due.append((tick + late, frames[part]))
         return [frame for frame in frames if frame not in frames[part]]
 
-    numbered.keep = delay
+    numbered.filter_frames = delay
     stale = []
     for tick in range(40):
         numbered.sensor.request(0)
@@ -486,7 +489,7 @@ def test_replies_that_are_late_for_good_never_count(fakes, can_rig, mode, late, 
     assert all(stale[first:])
 
 
-def test_frames_nobody_asked_for_are_dropped(numbered, fakes):
+def test_unrequested_frames_are_dropped(numbered, fakes):
     numbered.read()
     numbered.bus.queue.extend(numbered.fake.answer(fakes.frame_of(fakes.BASE << 4)))
     numbered.bus.queue.append(fakes.frame_of(fakes.BASE << 4 | 1, bytes(6)))
@@ -501,14 +504,14 @@ def test_with_the_previous_tick_a_tick_shows_the_poll_before(fakes, can_rig):
     assert numbered.read() == (1, False)
     assert numbered.sensor.wrench_time_ns == sent_ns
     assert numbered.read() == (2, False)
-    numbered.keep = numbered.hold
+    numbered.filter_frames = numbered.hold
     assert numbered.read() == (3, False)
-    numbered.keep = lambda frames: frames
+    numbered.filter_frames = lambda frames: frames
     numbered.release()
     assert numbered.read() == (4, False), "it came in time for this tick"
-    numbered.keep = lambda frames: []
+    numbered.filter_frames = lambda frames: []
     assert numbered.read() == (5, False)
-    numbered.keep = lambda frames: frames
+    numbered.filter_frames = lambda frames: frames
     assert numbered.read() == (5, True)
     assert numbered.read() == (5, True)
     assert numbered.read() == (5, True)
@@ -516,7 +519,7 @@ def test_with_the_previous_tick_a_tick_shows_the_poll_before(fakes, can_rig):
 
 
 def test_a_wait_ends_at_the_deadline_of_the_tick(numbered, monkeypatch):
-    numbered.keep = lambda frames: []
+    numbered.filter_frames = lambda frames: []
     waited = []
     monkeypatch.setattr(
         numbered.link.open(), "wait_until", lambda ready, end_ns: waited.append(end_ns)
@@ -531,14 +534,14 @@ def test_measuring(numbered):
     assert found["polls_hz"] > 0
     assert 0 < found["turnaround_median_s"] <= found["turnaround_p99_s"]
     assert found["lost"] == 0
-    numbered.keep = lambda frames: []
+    numbered.filter_frames = lambda frames: []
     silent = numbered.sensor.measure(0.03)
     assert silent["lost"] >= 1
     assert silent["polls_hz"] == 0
     assert math.isnan(silent["turnaround_median_s"])
 
 
-def test_unconnected_and_closed_sensors_say_so(bench):
+def test_error_of_unconnected_and_closed_sensors(bench):
     for use in (bench.tick, bench.sensor.calibration, lambda: bench.sensor.measure(0.01)):
         with pytest.raises(DeviceError, match="not connected"):
             use()
@@ -553,14 +556,14 @@ def test_unconnected_and_closed_sensors_say_so(bench):
     bench.tick()
 
 
-def test_a_wait_for_connection_lets_in_all_replies_of_the_sensor(bench, fakes):
+def test_waiting_for_connection_takes_all_replies_of_the_sensor(bench, fakes):
     bench.sensor.connect()
     replies = {fakes.BASE << 4 | opcode for opcode in (0, 1, 2, 3, 4, 5, 6, 7, 8, 0xF)}
     assert replies <= bench.bus.accepted
 
 
 def test_through_the_socket_of_a_simulated_bus(fakes, can_rig, tmp_path):
-    """The whole way once: CanLink, Unix socket, a sensor in another thread."""
+    """The whole path: CanLink, Unix socket, a sensor in another thread."""
     fake = fakes.FakeNetcanoem()
     path = str(tmp_path / "can")
     hub = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

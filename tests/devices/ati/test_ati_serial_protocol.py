@@ -1,6 +1,6 @@
 """The serial protocol: Modbus frames against the bytes in devices.md 2.1, and the record stream.
 
-However the stream is cut and disturbed, what comes out is what the sensor sent.
+However the stream is cut and disturbed, the records are those that the sensor sent.
 """
 
 import random
@@ -69,7 +69,7 @@ def reply_to_status(fakes, body):
 @pytest.mark.parametrize(
     ("code", "words"), [(1, "function"), (2, "no such register"), (4, "failed"), (99, "code 99")]
 )
-def test_a_refusal_is_told_in_words(fakes, code, words):
+def test_a_refusal_is_reported_in_words(fakes, code, words):
     with pytest.raises(protocol.ModbusExceptionError, match=words):
         reply_to_status(fakes, bytes((0x0A, 0x83, code)))
 
@@ -91,7 +91,7 @@ def test_a_declined_start_and_lock_are_refusals(fakes):
         ("0A 03 04 00 00 00 00", "9 bytes came instead of 7"),
     ],
 )
-def test_replies_that_do_not_fit_the_request(fakes, body, words):
+def test_replies_unfit_for_the_request(fakes, body, words):
     with pytest.raises(protocol.InvalidReplyError, match=words):
         reply_to_status(fakes, hexed(body))
 
@@ -135,7 +135,7 @@ def split(data):
 
 
 def feed_all(stream, data, sizes=(91,)):
-    """Feed in pieces of the given sizes, over and over; return the records."""
+    """Feed in chunks of the given sizes, in turn; return the records."""
     out, at, i = b"", 0, 0
     while at < len(data):
         size = sizes[i % len(sizes)]
@@ -197,9 +197,7 @@ def test_the_beginning_is_found_behind_rubbish(fuzz, seed, rubbish, sizes):
     mask=st.integers(1, 127),
     sizes=sizes,
 )
-def test_after_a_disturbance_exactly_what_was_sent_comes_out(
-    fuzz, seed, kind, at, extra, mask, sizes
-):
+def test_exact_records_after_a_disturbance(fuzz, seed, kind, at, extra, mask, sizes):
     records = fuzz.noisy_records(random.Random(seed), 80)
     data = bytearray(b"".join(records))
     first_hurt = at // 13
@@ -235,7 +233,7 @@ def test_one_damaged_record_costs_no_other(fuzz, seed, which, byte, mask, sizes)
     stream = aligned_stream()
     found = feed_all(stream, bytes(data), sizes)
     if which < protocol.SYNC_RECORDS:
-        # Not yet in sync: the beginning has to be looked for.
+        # Not yet in sync: the beginning has to be found.
         assert found == records[len(records) - len(found) :]
     else:
         assert found == records[:which] + records[which + 1 :]
@@ -255,7 +253,7 @@ def test_a_damaged_record_leaves_no_tick_without_records(fuzz):
 
 @pytest.fixture
 def ambiguous(fakes):
-    """A record that, over and over, can be cut in more than one way."""
+    """A record that, repeated, can be cut in more than one way."""
     return next(
         record
         for record in (fakes.record_of((a, 2, 3, 4, 5, b)) for a in range(200) for b in range(200))
@@ -264,15 +262,15 @@ def ambiguous(fakes):
 
 
 @pytest.mark.parametrize("sizes", [(91,), (1,), (5,), (1000,)])
-def test_records_that_are_all_alike_keep_the_beginning_they_had(ambiguous, sizes):
-    """A load at rest without noise: nothing but the beginning so far tells the records apart."""
+def test_equal_records_retain_their_beginning(ambiguous, sizes):
+    """A load at rest without noise: only the beginning found before separates the records."""
     damaged = bytearray(ambiguous * 40)
     damaged[13 * 20 + 3] ^= 0x11
     assert feed_all(aligned_stream(), bytes(damaged), sizes) == [ambiguous] * 39
 
 
 @pytest.mark.parametrize("sizes", [(91,), (1,)])
-def test_a_beginning_that_was_found_is_kept_as_well(fuzz, ambiguous, sizes):
+def test_a_found_beginning_is_retained(fuzz, ambiguous, sizes):
     noisy = b"".join(fuzz.noisy_records(random.Random(2), 20))
     stream = protocol.RecordStream()
     feed_all(stream, noisy[5:])
@@ -281,7 +279,7 @@ def test_a_beginning_that_was_found_is_kept_as_well(fuzz, ambiguous, sizes):
     assert feed_all(stream, bytes(damaged), sizes) == [ambiguous] * 19
 
 
-def test_records_that_are_all_alike_are_not_guessed_at(ambiguous):
+def test_no_guess_of_the_beginning_of_equal_records(ambiguous):
     assert feed_all(protocol.RecordStream(), ambiguous[5:] + ambiguous * 40) == []
 
 

@@ -1,4 +1,4 @@
-"""The Digital F/T sensor, against one at a pseudo-terminal, by struct from devices.md 2.1."""
+"""The Digital F/T sensor, against a fake at a pseudo-terminal, from devices.md 2.1."""
 
 import gc
 import json
@@ -21,7 +21,7 @@ from rigd.devices.running_simulator import SimulatorAddress
 
 @pytest.fixture
 def open_sensor(serial_rig, digital_ft):
-    """Make sensors at the fake one, and close them."""
+    """Make sensors on the line of the fake one, and close them."""
     made = []
 
     def make(*, lock_step=False, mode="same_tick", rate_hz=1000.0, deadline_us=1e6, **ati):
@@ -42,7 +42,7 @@ def open_sensor(serial_rig, digital_ft):
 
 @pytest.fixture
 def unhurried(monkeypatch):
-    """However slowly a test runs, no tick comes after a pause that the driver distrusts."""
+    """No tick comes after a pause that the driver distrusts, even if a test runs slowly."""
     monkeypatch.setattr("rigd.devices.ati._serial_sensor._MAX_IDLE_NS", 10**12)
 
 
@@ -80,7 +80,7 @@ def test_connecting_loads_gains_and_offsets_between_unlock_and_lock(open_sensor,
     assert not digital_ft.unlocked
 
 
-def test_a_stream_that_still_runs_is_stopped_first(open_sensor, digital_ft):
+def test_a_running_stream_is_stopped_first(open_sensor, digital_ft):
     digital_ft.streaming = True
     open_sensor().connect()
     assert digital_ft.log[0] == "jam"
@@ -89,16 +89,16 @@ def test_a_stream_that_still_runs_is_stopped_first(open_sensor, digital_ft):
 def test_the_calibration_goes_into_the_file(open_sensor, digital_ft, fakes):
     sensor = open_sensor()
     sensor.connect()
-    said = sensor.calibration()
-    assert json.loads(json.dumps(said, allow_nan=False)) == said
-    assert (said["serial_number"], said["part_number"]) == ("FT12345", "SI-20-1")
-    assert (said["family"], said["calibration_date"]) == ("DIG", "2021/03/04 12:00")
-    assert said["matrix"] == [list(row) for row in fakes.MATRIX]
-    assert said["range_n_nm"] == [20.0, 20.0, 60.0, 1.0, 1.0, 1.0]
-    assert said["gains"] == [541, 550, 560, 570, 575, 579]
-    assert said["low_latency"] is False
-    assert (said["port"], said["baud"]) == (digital_ft.port, 1_250_000)
-    assert sum(said["filter_weights"]) == pytest.approx(1.0)
+    calibration = sensor.calibration()
+    assert json.loads(json.dumps(calibration, allow_nan=False)) == calibration
+    assert (calibration["serial_number"], calibration["part_number"]) == ("FT12345", "SI-20-1")
+    assert (calibration["family"], calibration["calibration_date"]) == ("DIG", "2021/03/04 12:00")
+    assert calibration["matrix"] == [list(row) for row in fakes.MATRIX]
+    assert calibration["range_n_nm"] == [20.0, 20.0, 60.0, 1.0, 1.0, 1.0]
+    assert calibration["gains"] == [541, 550, 560, 570, 575, 579]
+    assert calibration["low_latency"] is False
+    assert (calibration["port"], calibration["baud"]) == (digital_ft.port, 1_250_000)
+    assert sum(calibration["filter_weights"]) == pytest.approx(1.0)
 
 
 def test_another_calibration_block_is_found(open_sensor, digital_ft, fakes):
@@ -109,7 +109,7 @@ def test_another_calibration_block_is_found(open_sensor, digital_ft, fakes):
 
 
 def test_the_wrench_is_the_filter_over_the_newest_records(
-    open_sensor, digital_ft, fakes, unhurried, settled
+    open_sensor, digital_ft, fakes, unhurried, after_first_tick
 ):
     rng = random.Random(5)
     for kind, weights in (
@@ -137,7 +137,7 @@ def test_the_wrench_is_the_filter_over_the_newest_records(
 
 
 @pytest.fixture
-def settled(fakes, digital_ft):
+def after_first_tick(fakes, digital_ft):
     """Let a connected sensor do a first tick, with records of the start."""
 
     def settle(sensor):
@@ -148,43 +148,45 @@ def settled(fakes, digital_ft):
     return settle
 
 
-def watch_waits(sensor, digital_ft, pieces):
-    """Have each wait of the driver bring one more piece; returns the timeouts it asked for."""
+def watch_waits(sensor, digital_ft, chunks):
+    """Let each wait of the driver bring one more chunk; return the requested timeouts."""
     waits = []
     original = sensor._line.wait
 
     def wait(timeout_s):
         waits.append(timeout_s)
-        if pieces:
-            digital_ft.emit(pieces.pop(0))
+        if chunks:
+            digital_ft.emit(chunks.pop(0))
         original(timeout_s)
 
     sensor._line.wait = wait
     return waits
 
 
-def test_in_lock_step_a_tick_waits_for_all_its_records(open_sensor, digital_ft, fakes, settled):
+def test_a_tick_waits_for_all_its_records_in_lock_step(
+    open_sensor, digital_ft, fakes, after_first_tick
+):
     sensor = open_sensor(lock_step=True)
     sensor.connect()
-    settled(sensor)
-    pieces = [fakes.record_of((k, 0, 0, 0, 0, 0)) for k in range(7)]
+    after_first_tick(sensor)
+    chunks = [fakes.record_of((k, 0, 0, 0, 0, 0)) for k in range(7)]
     sensor.request(0)
-    waits = watch_waits(sensor, digital_ft, pieces)
+    waits = watch_waits(sensor, digital_ft, chunks)
     wrench = sensor.read_wrench()
     del sensor._line.wait
     assert len(waits) == 7
-    assert pieces == []
+    assert chunks == []
     assert wrench == pytest.approx(wrench_of(fakes, (3, 0, 0, 0, 0, 0)), abs=1e-15)
     assert all(earlier > later > 0.5 for earlier, later in pairwise(waits))
 
 
-def test_for_a_last_record_a_tick_waits_no_longer_than_a_record_takes(
-    open_sensor, digital_ft, fakes, settled, unhurried
+def test_wait_for_the_last_record_is_one_record_long(
+    open_sensor, digital_ft, fakes, after_first_tick, unhurried
 ):
     """Else a sensor with a slow clock would drag every tick to its deadline."""
     sensor = open_sensor(deadline_us=5e6)
     sensor.connect()
-    settled(sensor)
+    after_first_tick(sensor)
     six = b"".join(fakes.record_of((k, 0, 0, 0, 0, 0)) for k in range(6))
     sensor.request(0)
     waits = watch_waits(sensor, digital_ft, [six])
@@ -195,12 +197,12 @@ def test_for_a_last_record_a_tick_waits_no_longer_than_a_record_takes(
     assert all(timeout_s <= 1 / 7000 for timeout_s in waits[1:])
 
 
-def test_a_tick_without_records_keeps_the_last_value_and_says_so(
-    open_sensor, digital_ft, fakes, unhurried, settled
+def test_a_tick_without_records_repeats_the_last_value_and_a_flag(
+    open_sensor, digital_ft, fakes, unhurried, after_first_tick
 ):
     sensor = open_sensor(deadline_us=2000.0)
     sensor.connect()
-    before = tick(settled(sensor))
+    before = tick(after_first_tick(sensor))
     time_ns = sensor.wrench_time_ns
     assert tick(sensor) == before
     assert sensor.wrench_stale
@@ -211,7 +213,7 @@ def test_a_tick_without_records_keeps_the_last_value_and_says_so(
     assert sensor.wrench_time_ns > time_ns
 
 
-def test_the_start_of_the_stream_stands_until_the_first_tick(open_sensor, fakes):
+def test_the_start_of_the_stream_lasts_until_the_first_tick(open_sensor, fakes):
     sensor = open_sensor(deadline_us=1.0)
     sensor.connect()
     assert tick(sensor) == pytest.approx(wrench_of(fakes, fakes.GAUGES), rel=1e-12)
@@ -222,8 +224,8 @@ PERIOD_NS = 1_000_000
 
 
 @pytest.fixture
-def follow(open_sensor, digital_ft, fakes, settled):
-    """Run ticks on which so many records arrive; returns what each shows: number, or stale.
+def follow(open_sensor, digital_ft, fakes, after_first_tick):
+    """Run ticks in which so many records arrive; return the number of each tick, or stale.
 
     A record that is `torn` loses a byte.
     """
@@ -231,7 +233,7 @@ def follow(open_sensor, digital_ft, fakes, settled):
     def run(counts, lost=(), due_ns=lambda tick: tick * PERIOD_NS, torn=()):
         sensor = open_sensor(deadline_us=3000.0)
         sensor.connect()
-        settled(sensor)
+        after_first_tick(sensor)
         number, shown = 0, []
         run.doubts = []
         for index, count in enumerate(counts):
@@ -252,27 +254,27 @@ def follow(open_sensor, digital_ft, fakes, settled):
     return run
 
 
-def test_records_that_are_late_are_not_taken_for_those_of_the_tick(follow):
+def test_late_records_do_not_count_for_the_tick(follow):
     # The adapter held a tick's records back once; then each tick finds the ones before its own.
     assert follow([7, 0, 7, 7, 14, 7]) == [6, "stale", "stale", "stale", 34, 41]
     assert follow.doubt == ""
 
 
-def test_records_that_stay_late_cannot_be_told_from_lost_ones_and_that_is_said(follow):
+def test_doubt_whether_records_are_late_or_lost(follow):
     shown = follow([7, 0, 0, 0, 7, 7, 7, 7])
     assert shown[1:6] == ["stale"] * 5
     assert "records did not arrive, or all have been delayed since" in follow.doubt
     assert follow.count.endswith("since it was connected: 21; or the wrench is late by 3 ms.")
 
 
-def test_more_records_that_stay_late_are_no_other_warning(follow):
+def test_one_warning_for_all_late_records(follow):
     follow([7, 0, 0, 0, 7, 7, 7, 7, 0, 0, 7, 7, 7, 7])
     assert len({doubt for doubt in follow.doubts if doubt}) == 1
     assert ": 35; or" in follow.count
 
 
-def test_an_adapter_that_holds_records_back_is_named(
-    open_sensor, digital_ft, fakes, settled, monkeypatch
+def test_the_latency_timer_of_the_adapter_is_named(
+    open_sensor, digital_ft, fakes, after_first_tick, monkeypatch
 ):
     now_ns = 0
     monkeypatch.setattr(
@@ -280,7 +282,7 @@ def test_an_adapter_that_holds_records_back_is_named(
     )
     sensor = open_sensor(deadline_us=0.0)
     sensor.connect()
-    settled(sensor)
+    after_first_tick(sensor)
 
     def block(gap_ms):
         nonlocal now_ns
@@ -301,7 +303,7 @@ def test_an_adapter_that_holds_records_back_is_named(
     assert [block(gap_ms) for gap_ms in (3.0, 40.0, 7.0, 90.0, 3.0)][-1] == ""
 
 
-def test_what_was_lost_with_a_torn_record_is_no_doubt(follow):
+def test_no_doubt_after_a_torn_record(follow):
     shown = follow([7, 7, 0, 7, 7, 7, 7, 7], lost={2}, torn={1})
     assert "stale" in shown
     assert shown[-1] != "stale"
@@ -319,16 +321,18 @@ def test_missed_ticks_bring_their_records_with_them(follow):
 
 
 @pytest.mark.parametrize("extra", [-1, 1])
-def test_another_clock_is_no_lag(follow, extra):
+def test_a_different_clock_is_no_lag(follow, extra):
     shown = follow([7, 7 + extra, 7, 7 + extra, 7, 7, 7 + extra, 7])
     assert "stale" not in shown
 
 
-def test_after_a_pause_only_new_records_count(open_sensor, digital_ft, fakes, monkeypatch, settled):
+def test_after_a_pause_only_new_records_count(
+    open_sensor, digital_ft, fakes, monkeypatch, after_first_tick
+):
     monkeypatch.setattr("rigd.devices.ati._serial_sensor._MAX_IDLE_NS", 1_000_000)
     sensor = open_sensor()
     sensor.connect()
-    settled(sensor)
+    after_first_tick(sensor)
     emitted(fakes, digital_ft, [(1000, 0, 0, 0, 0, 0)] * 300)
     time.sleep(0.005)
     sensor.request(0)
@@ -337,7 +341,7 @@ def test_after_a_pause_only_new_records_count(open_sensor, digital_ft, fakes, mo
     assert not sensor.wrench_stale
 
 
-def test_in_lock_step_the_first_records_come_with_the_first_tick(open_sensor, digital_ft, fakes):
+def test_first_records_with_the_first_tick_in_lock_step(open_sensor, digital_ft, fakes):
     digital_ft.first_records = []
     sensor = open_sensor(lock_step=True, filter="triangle")
     sensor.connect()
@@ -350,11 +354,11 @@ def test_in_lock_step_the_first_records_come_with_the_first_tick(open_sensor, di
 
 @pytest.mark.parametrize("gauge", range(6))
 def test_saturation_of_any_gauge_of_any_new_record(
-    open_sensor, digital_ft, fakes, gauge, unhurried, settled
+    open_sensor, digital_ft, fakes, gauge, unhurried, after_first_tick
 ):
     sensor = open_sensor(saturation_counts=32700)
     sensor.connect()
-    settled(sensor)
+    after_first_tick(sensor)
     for counts, saturated in ((32699, False), (-32700, True), (0, False), (32700, True)):
         gauges = [[0] * 6 for _ in range(7)]
         gauges[gauge][gauge] = counts
@@ -363,12 +367,12 @@ def test_saturation_of_any_gauge_of_any_new_record(
         assert sensor.wrench_saturated is saturated
 
 
-def test_a_sensor_that_reports_an_error_ends_the_session(
-    open_sensor, digital_ft, fakes, unhurried, settled
+def test_an_error_of_the_sensor_ends_the_session(
+    open_sensor, digital_ft, fakes, unhurried, after_first_tick
 ):
     sensor = open_sensor()
     sensor.connect()
-    settled(sensor)
+    after_first_tick(sensor)
     single = [fakes.record_of(fakes.GAUGES, error=i == 3) for i in range(7)]
     digital_ft.emit(b"".join(single))
     tick(sensor)
@@ -384,10 +388,12 @@ def test_a_sensor_that_reports_an_error_ends_the_session(
     ]
 
 
-def test_damage_is_counted_and_survived(open_sensor, digital_ft, fakes, fuzz, unhurried, settled):
+def test_damage_is_counted_and_survived(
+    open_sensor, digital_ft, fakes, fuzz, unhurried, after_first_tick
+):
     sensor = open_sensor(deadline_us=20_000.0)
     sensor.connect()
-    settled(sensor)
+    after_first_tick(sensor)
     records = fuzz.noisy_records(random.Random(3), 70)
     data = bytearray(b"".join(records))
     data[13 * 30 + 2] ^= 1
@@ -406,19 +412,19 @@ def test_damage_is_counted_and_survived(open_sensor, digital_ft, fakes, fuzz, un
 def test_measuring(open_sensor, digital_ft, fakes):
     sensor = open_sensor()
     sensor.connect()
-    pieces = [fakes.record_of(fakes.GAUGES) * 7] * 10
-    watch_waits(sensor, digital_ft, pieces)
+    chunks = [fakes.record_of(fakes.GAUGES) * 7] * 10
+    watch_waits(sensor, digital_ft, chunks)
     found = sensor.measure(0.05)
     assert 0 < found["records_hz"] <= 70 / 0.05
     assert found["checksum_errors"] == found["dropped_bytes"] == 0
     assert found["longest_gap_s"] > 0
-    pieces[:] = [b"\x01" + fakes.record_of(fakes.GAUGES) * 10]
+    chunks[:] = [b"\x01" + fakes.record_of(fakes.GAUGES) * 10]
     assert sensor.measure(0.02)["checksum_errors"] == 1
 
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """Have late replies awaited for no longer than a fake sensor takes."""
+    """Wait for late replies for no longer than a fake sensor takes."""
     monkeypatch.setattr("rigd.devices.ati._serial_setup._LATE_REPLY_WAIT_S", 0.05)
 
 
@@ -431,13 +437,13 @@ def test_a_silent_sensor(impatient, open_sensor, digital_ft, monkeypatch):
     assert "ati_serial.baud" in message
 
 
-def test_a_disturbed_reply_is_asked_for_again(impatient, open_sensor, digital_ft):
+def test_a_disturbed_reply_is_requested_again(impatient, open_sensor, digital_ft):
     digital_ft.damage_next = 2
     open_sensor().connect()
     assert digital_ft.log.count("0a 03 00 1d 00 01 15 77") == 4
 
 
-def test_replies_that_stay_disturbed(impatient, open_sensor, digital_ft):
+def test_disturbed_replies(impatient, open_sensor, digital_ft):
     digital_ft.damage_next = 9
     assert "checksum of the reply is wrong" in refusal(open_sensor())
 
@@ -447,13 +453,13 @@ def test_a_refused_request(open_sensor, digital_ft):
     assert "it refused: it has no such register" in refusal(open_sensor())
 
 
-def test_refused_writing_locks_again(open_sensor, digital_ft):
+def test_a_refused_write_locks_the_storage(open_sensor, digital_ft):
     digital_ft.refuse = {0x10: 4}
     assert "load gains and offsets" in refusal(open_sensor())
     assert digital_ft.log[-1] == "0a 6a 18 7f 68"
 
 
-def test_gains_that_do_not_stay(open_sensor, digital_ft):
+def test_gains_not_stored_by_the_sensor(open_sensor, digital_ft):
     digital_ft.forgets_writes = True
     assert "read back as (0, 0, 0, 0, 0, 0" in refusal(open_sensor())
 
@@ -504,13 +510,13 @@ def test_a_start_without_sound_records(open_sensor, digital_ft, monkeypatch, fir
     assert "only 0 were sound records" in message
 
 
-def test_a_sensor_that_does_not_stop_streaming(open_sensor, digital_ft, monkeypatch, fakes):
+def test_failure_to_stop_the_stream(open_sensor, digital_ft, monkeypatch, fakes):
     monkeypatch.setattr("rigd.devices.ati._serial_setup._DRAIN_LIMIT_S", 0.1)
     digital_ft.streaming = digital_ft.deaf_to_jam = True
     really_select = select.select
 
     def babble(*descriptors):
-        """However slow the machine is, nothing is ever quiet for the driver."""
+        """The line is never quiet for the driver, even on a slow computer."""
         if threading.current_thread() is threading.main_thread():  # the fake sensor selects too
             digital_ft.emit(fakes.record_of(fakes.GAUGES))
         return really_select(*descriptors)
@@ -530,7 +536,7 @@ def test_a_stream_slower_than_the_loop(open_sensor):
     assert "fewer than the loop's 1000 ticks" in refusal(open_sensor(stream_hz=500.0))
 
 
-def test_a_port_that_does_not_exist(serial_rig):
+def test_a_missing_port(serial_rig):
     port = "/dev/ttyNowhere7"
     sensor = AtiSerialSensor(
         replace(serial_rig, ati_serial=replace(serial_rig.ati_serial, port=port)), None
@@ -541,7 +547,7 @@ def test_a_port_that_does_not_exist(serial_rig):
     sensor.close()
 
 
-def test_a_file_that_is_no_port(serial_rig, tmp_path):
+def test_a_file_in_place_of_a_port(serial_rig, tmp_path):
     port = tmp_path / "port"
     port.touch()
     settings = replace(serial_rig.ati_serial, port=str(port))
@@ -550,7 +556,7 @@ def test_a_file_that_is_no_port(serial_rig, tmp_path):
     )
 
 
-def test_a_port_that_another_program_has(open_sensor):
+def test_a_port_in_use_by_another_program(open_sensor):
     open_sensor().connect()
     assert "another program has it open" in refusal(open_sensor())
 
@@ -568,10 +574,10 @@ def test_an_unplugged_adapter_in_the_cycle(open_sensor, digital_ft):
     assert time.monotonic() - begin < 1.0
 
 
-def test_an_adapter_unplugged_while_waiting(open_sensor, digital_ft, unhurried, settled):
+def test_an_adapter_unplugged_while_waiting(open_sensor, digital_ft, unhurried, after_first_tick):
     sensor = open_sensor()
     sensor.connect()
-    settled(sensor)
+    after_first_tick(sensor)
     sensor.request(0)
     original = sensor._line.wait
 
@@ -594,7 +600,7 @@ def test_closing_stops_the_stream_and_frees_the_port(open_sensor, digital_ft):
     assert tick(sensor)
 
 
-def test_unconnected_sensors_say_so(open_sensor):
+def test_error_of_unconnected_sensors(open_sensor):
     sensor = open_sensor()
     for use in (lambda: tick(sensor), sensor.calibration, lambda: sensor.measure(0.01)):
         with pytest.raises(DeviceError, match="not connected"):

@@ -1,4 +1,4 @@
-"""Both ends of a bus: a port under test, and a bare socket on the other side."""
+"""Both ends of a bus: a port under test, and a raw socket on the other side."""
 
 import socket
 import struct
@@ -11,7 +11,7 @@ from rigd.devices.canbus.adapters import SocketPort
 
 @dataclass
 class FarEnd:
-    """Frames put together and taken apart by hand, as linux/can.h has them."""
+    """Packs and unpacks frames by hand, as linux/can.h defines them."""
 
     socket: socket.socket
 

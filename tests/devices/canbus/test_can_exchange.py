@@ -1,4 +1,4 @@
-"""The exchange: who gets which frame, waiting for replies, and what the controller reports."""
+"""The exchange: distribution of frames, waiting for replies, and reports of the controller."""
 
 import threading
 import time
@@ -17,45 +17,45 @@ def exchange(ends):
     return CanExchange(ends[0])
 
 
-def test_each_frame_goes_to_whom_subscribed_to_it(ends, exchange):
+def test_each_frame_goes_to_its_subscriber(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, lambda data: got.append(("drive", data)))
-    exchange.subscribe(0x110, lambda data: got.append(("sensor", data)))
+    received = []
+    exchange.subscribe(0x181, lambda data: received.append(("drive", data)))
+    exchange.subscribe(0x110, lambda data: received.append(("sensor", data)))
     far.send(0x110, b"abc")
     far.send(0x3FF, b"nobody's")
     far.send(0x181, b"12345678")
     far.send(0x110)
     exchange.drain()
-    assert got == [("sensor", b"abc"), ("drive", b"12345678"), ("sensor", b"")]
+    assert received == [("sensor", b"abc"), ("drive", b"12345678"), ("sensor", b"")]
 
 
 @pytest.mark.parametrize("flag", [0x8000_0000, 0x4000_0000])
-def test_long_identifiers_and_requests_for_data_are_for_nobody(ends, exchange, flag):
+def test_long_identifiers_and_remote_frames_are_dropped(ends, exchange, flag):
     _, far = ends
     exchange.subscribe(0x181, lambda data: pytest.fail("not ours"))
     far.send(0x181 | flag)
     exchange.drain()
 
 
-def test_one_identifier_is_for_one_device(exchange):
+def test_one_identifier_has_one_subscriber(exchange):
     exchange.subscribe(0x201, print)
     with pytest.raises(DeviceError, match=r"two devices use the identifier 0x201.*profile"):
         exchange.subscribe(0x201, repr)
 
 
-def test_starting_drops_what_is_queued_and_keeps_the_subscriptions(ends, exchange):
+def test_starting_drops_queued_frames_but_no_subscriptions(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     far.send(0x181, b"old")
     exchange.start()
     far.send(0x181, b"new")
     exchange.drain()
-    assert got == [b"new"]
+    assert received == [b"new"]
 
 
-def test_sending_is_the_port_s(ends, exchange):
+def test_sending_uses_the_port(ends, exchange):
     _, far = ends
     exchange.send(pack_frame(0x80, b"\x01"))
     assert far.receive() == (0x80, b"\x01")
@@ -63,22 +63,22 @@ def test_sending_is_the_port_s(ends, exchange):
 
 def test_waiting_ends_as_soon_as_it_is_ready(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     later = threading.Timer(0.02, far.send, (0x181, b"x"))
     later.start()
-    assert exchange.wait_until(lambda: bool(got), time.monotonic_ns() + 10_000_000_000)
+    assert exchange.wait_until(lambda: bool(received), time.monotonic_ns() + 10_000_000_000)
     later.join()
-    assert got == [b"x"]
+    assert received == [b"x"]
 
 
-def test_waiting_goes_on_over_frames_that_do_not_help(ends, exchange):
+def test_waiting_continues_after_other_frames(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     for number in range(3):
         far.send(0x181, bytes([number]))
-    assert exchange.wait_until(lambda: len(got) == 3, time.monotonic_ns() + 1_000_000_000)
+    assert exchange.wait_until(lambda: len(received) == 3, time.monotonic_ns() + 1_000_000_000)
 
 
 def test_waiting_ends_at_its_deadline(exchange):
@@ -87,17 +87,17 @@ def test_waiting_ends_at_its_deadline(exchange):
     assert time.monotonic_ns() >= before + 5_000_000
 
 
-def test_a_deadline_that_has_passed_still_takes_what_has_arrived(ends, exchange):
+def test_received_frames_are_taken_after_the_deadline(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     far.send(0x181, b"x")
-    assert exchange.wait_until(lambda: bool(got), time.monotonic_ns() - 1)
+    assert exchange.wait_until(lambda: bool(received), time.monotonic_ns() - 1)
     assert not exchange.wait_until(lambda: False, time.monotonic_ns() - 1)
 
 
 @pytest.mark.parametrize(
-    ("kind", "data", "says"),
+    ("kind", "data", "message"),
     [
         (0x040, bytes(8), "bus-off"),
         (0x020, bytes(8), "no device acknowledges"),
@@ -106,11 +106,11 @@ def test_a_deadline_that_has_passed_still_takes_what_has_arrived(ends, exchange)
         (0x044, bytes(8), "bus-off"),
     ],
 )
-def test_a_disturbed_bus_is_told_now_and_later(ends, exchange, kind, data, says):
+def test_a_disturbed_bus_is_reported_each_time(ends, exchange, kind, data, message):
     _, far = ends
     far.send(ERROR | kind, data)
     for _ in range(2):
-        with pytest.raises(DeviceError, match=says):
+        with pytest.raises(DeviceError, match=message):
             exchange.drain()
     assert exchange.error_frames == 1
 
@@ -128,16 +128,16 @@ def test_a_warning_of_the_controller_is_only_counted(ends, exchange, kind, data)
 
 def test_frames_before_a_cut_are_delivered(ends, exchange):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     far.send(0x181, b"x")
     far.socket.close()
     with pytest.raises(DeviceError, match="cut off"):
         exchange.drain()
-    assert got == [b"x"]
+    assert received == [b"x"]
 
 
-def test_waiting_notices_a_cut(ends, exchange):
+def test_waiting_detects_a_cut_line(ends, exchange):
     _, far = ends
     cut = threading.Timer(0.02, far.socket.close)
     cut.start()
@@ -149,24 +149,24 @@ def test_waiting_notices_a_cut(ends, exchange):
 @pytest.mark.parametrize(
     ("kind", "data"), [(0x020, bytes(8)), (0x004, b"\0\x10" + bytes(6)), (0x040, bytes(8))]
 )
-def test_regardless_of_a_disturbed_bus_frames_go_and_come(ends, exchange, kind, data):
+def test_frames_pass_regardless_of_a_disturbed_bus(ends, exchange, kind, data):
     _, far = ends
-    got = []
-    exchange.subscribe(0x181, got.append)
+    received = []
+    exchange.subscribe(0x181, received.append)
     far.send(ERROR | kind, data)
     far.send(0x181, b"x")
     with exchange.ignore_errors():
         exchange.drain()
         exchange.send(pack_frame(0x80))
         far.send(0x181, b"y")
-        assert exchange.wait_until(lambda: len(got) == 2, time.monotonic_ns() + 10_000_000_000)
-    assert got == [b"x", b"y"]
+        assert exchange.wait_until(lambda: len(received) == 2, time.monotonic_ns() + 10_000_000_000)
+    assert received == [b"x", b"y"]
     assert far.receive() == (0x80, b"")
-    with pytest.raises(DeviceError):  # it is told to whoever goes on with the loop
+    with pytest.raises(DeviceError):  # reported to the caller that continues the loop
         exchange.drain()
 
 
-def test_regardless_of_a_line_that_is_gone_waiting_ends_in_time(ends, exchange):
+def test_waiting_ends_in_time_on_a_lost_line(ends, exchange):
     _, far = ends
     far.socket.close()
     with exchange.ignore_errors():
@@ -179,7 +179,7 @@ def test_regardless_of_a_line_that_is_gone_waiting_ends_in_time(ends, exchange):
         exchange.drain()
 
 
-def test_regardless_of_a_port_that_cannot_be_waited_for_the_computer_is_not_kept_busy(ends):
+def test_no_busy_wait_on_a_port_without_wait(ends):
     port, _ = ends
     tries = 0
 

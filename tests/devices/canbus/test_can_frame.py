@@ -34,14 +34,14 @@ def test_frames_are_those_of_python_can(can_id, data):
     assert len(raw) == FRAME_SIZE
     message = Message(arbitration_id=can_id, is_extended_id=False, data=data)
     theirs = build_can_frame(message)
-    # The eighth byte is theirs for lengths beyond eight, which the kernel ignores here.
+    # The eighth byte is for lengths beyond eight, which the kernel ignores here.
     assert raw[:7] + raw[8:] == theirs[:7] + theirs[8:]
     assert dissect_can_frame(raw) == (can_id, len(data), 0, data)
     assert unpack_frame(raw) == (can_id, data)
 
 
 @given(st.binary(min_size=16, max_size=16))
-def test_any_sixteen_bytes_can_be_taken_apart(raw):
+def test_any_sixteen_bytes_can_be_unpacked(raw):
     can_id, data = unpack_frame(raw)
     assert can_id == int.from_bytes(raw[:4], sys.byteorder)
     assert data == raw[8 : 8 + min(raw[4], 8)]

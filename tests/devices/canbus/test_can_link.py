@@ -1,4 +1,4 @@
-"""The bus that devices share: opened by the first, closed by the last."""
+"""The common bus of the devices: opened by the first, closed by the last."""
 
 import os
 import socket
@@ -39,7 +39,7 @@ def is_connected(far):
         return True
 
 
-def test_two_users_share_one_bus_and_the_last_closes_it(hub, link):
+def test_two_users_have_one_bus_and_the_last_closes_it(hub, link):
     exchange = link.open()
     assert link.open() is exchange
     assert link.exchange is exchange
@@ -55,7 +55,7 @@ def test_two_users_share_one_bus_and_the_last_closes_it(hub, link):
         assert not is_connected(far)
 
 
-def test_a_bus_that_is_not_open_is_told(link):
+def test_error_if_the_bus_is_not_open(link):
     with pytest.raises(DeviceError, match="not open"):
         _ = link.exchange
     link.open()
@@ -64,7 +64,7 @@ def test_a_bus_that_is_not_open_is_told(link):
         _ = link.exchange
 
 
-def test_closing_too_often_is_harmless_and_it_opens_again(hub, link):
+def test_closing_twice_is_harmless_and_the_bus_opens_again(hub, link):
     link.close()
     first = link.open()
     link.close()
@@ -75,7 +75,7 @@ def test_closing_too_often_is_harmless_and_it_opens_again(hub, link):
         _ = link.exchange
 
 
-def test_a_bus_that_does_not_open_counts_no_user():
+def test_a_failure_to_open_counts_no_user():
     link = CanLink(SETTINGS, None)
     for _ in range(2):
         with pytest.raises(DeviceError, match="rigd-none0"):

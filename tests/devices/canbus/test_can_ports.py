@@ -31,7 +31,7 @@ def test_frames_go_both_ways_in_order(ends):
     assert port.receive() is None
 
 
-def test_a_line_that_is_cut_off_is_told(ends):
+def test_error_if_the_line_is_cut(ends):
     port, far = ends
     far.send(0x123)
     far.socket.close()
@@ -42,7 +42,7 @@ def test_a_line_that_is_cut_off_is_told(ends):
         port.send(pack_frame(0x80))
 
 
-def test_a_line_nobody_reads_is_told_and_does_not_block(ends):
+def test_error_without_blocking_if_nobody_reads(ends):
     port, _ = ends
     frame = pack_frame(0x80)
     with pytest.raises(DeviceError, match="no other device acknowledges"):
@@ -75,7 +75,7 @@ def test_waiting_ends_with_a_frame(ends):
     assert port.receive() is None
 
 
-def test_a_closed_port_is_told_and_may_be_closed_again(ends):
+def test_error_of_a_closed_port_which_may_close_again(ends):
     port, _ = ends
     port.close()
     port.close()
@@ -85,7 +85,7 @@ def test_a_closed_port_is_told_and_may_be_closed_again(ends):
         port.receive()
 
 
-def test_the_simulated_bus_brings_everything(ends):
+def test_the_simulated_bus_delivers_every_frame(ends):
     port, far = ends
     port.accept([0x181])
     far.send(0x182)
@@ -117,7 +117,7 @@ class RecordingLink:
         raise OSError(self.error or errno.EAGAIN, "network is down")
 
 
-def test_the_kernel_is_told_which_frames_to_let_in():
+def test_the_kernel_filters_frames_as_requested():
     link = RecordingLink()
     SocketPort(link, "can0").accept({0x701: None, 0x181: None})
     # Identifier and mask; neither long identifiers nor requests for data get through.
@@ -125,7 +125,7 @@ def test_the_kernel_is_told_which_frames_to_let_in():
     assert link.options == [(101, 1, wanted)]  # SOL_CAN_RAW, CAN_RAW_FILTER
 
 
-def test_an_exchange_that_starts_lets_in_what_was_subscribed_to():
+def test_a_starting_exchange_admits_subscribed_frames():
     link = RecordingLink()
     exchange = CanExchange(SocketPort(link, "can0"))
     exchange.subscribe(0x181, print)
@@ -135,7 +135,7 @@ def test_an_exchange_that_starts_lets_in_what_was_subscribed_to():
     assert [len(filters) for _, _, filters in link.options] == [8, 16]
 
 
-def test_what_the_kernel_says_has_its_remedy():
+def test_errors_of_the_kernel_have_a_remedy():
     full = SocketPort(RecordingLink(errno.ENOBUFS), "can0")
     with pytest.raises(DeviceError, match="no other device acknowledges: check cable"):
         full.send(pack_frame(1))
@@ -146,7 +146,7 @@ def test_what_the_kernel_says_has_its_remedy():
 
 @pytest.fixture
 def kernel_bus():
-    """The kernel's own virtual bus, where it has one."""
+    """The virtual bus of the kernel, if it has one."""
     try:
         link = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except (AttributeError, OSError) as error:
@@ -159,7 +159,7 @@ def kernel_bus():
         yield link
 
 
-def test_on_the_kernel_s_bus_only_what_is_wanted_gets_in(kernel_bus):
+def test_the_kernel_s_bus_delivers_subscribed_frames_only(kernel_bus):
     port = open_port(replace(SETTINGS, channel="vcan0"), None)
     port.accept([0x181])
     try:
@@ -188,7 +188,7 @@ class KernelSocket:
         pass
 
 
-def test_a_kernel_without_can_is_not_told_to_bring_an_interface_up(monkeypatch):
+def test_no_advice_to_bring_up_can_without_a_can_kernel(monkeypatch):
     def refuse(*_):
         raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
 
@@ -200,7 +200,7 @@ def test_a_kernel_without_can_is_not_told_to_bring_an_interface_up(monkeypatch):
     assert "rigd simulate" in str(refused.value)
 
 
-def test_a_bus_that_is_not_there_is_told_with_its_remedy(monkeypatch):
+def test_a_missing_bus_is_an_error_with_a_remedy(monkeypatch):
     monkeypatch.setattr("rigd.devices.canbus.adapters.socket.socket", KernelSocket)
     with pytest.raises(DeviceError) as refused:
         open_port(SETTINGS, None)
@@ -210,7 +210,7 @@ def test_a_bus_that_is_not_there_is_told_with_its_remedy(monkeypatch):
 
 
 @pytest.mark.parametrize("interface", ["no-such-adapter", "slcan"])
-def test_an_adapter_that_is_not_there_is_told(interface):
+def test_a_missing_adapter_is_an_error(interface):
     with pytest.raises(DeviceError, match=r"check can\.interface and can\.channel"):
         open_port(CanBus(interface, "/dev/rigd-none", 1_000_000), None)
     gc.collect()
@@ -231,25 +231,25 @@ def test_the_simulated_bus_is_reached_by_its_socket(runtime_folder):
             assert far.recv(16) == b""
 
 
-def test_a_simulated_bus_that_is_gone_is_told(runtime_folder):
+def test_a_lost_simulated_bus_is_an_error(runtime_folder):
     address = SimulatorAddress(1, "", can_socket=str(runtime_folder / "gone"))
     with pytest.raises(DeviceError, match="start rigd simulate again"):
         open_port(SETTINGS, address)
 
 
-def test_a_simulator_on_a_real_bus_leaves_the_profile_s(runtime_folder):
+def test_a_simulator_on_a_real_bus_uses_the_profile_s_bus(runtime_folder):
     with pytest.raises(DeviceError, match=r"CAN bus rigd-none0: .*start the simulated rig"):
         open_port(SETTINGS, SimulatorAddress(1, "", can_socket=""))
 
 
 @pytest.fixture
 def adapter(request):
-    """A port on python-can's virtual bus, and a bus of python-can beside it."""
+    """A port on python-can's virtual bus, and a peer of python-can on it."""
     channel = request.node.name
     port = open_port(CanBus("virtual", channel, 1_000_000), None)
-    with can.Bus(interface="virtual", channel=channel) as beside:
+    with can.Bus(interface="virtual", channel=channel) as peer:
         assert not isinstance(port, SocketPort)
-        yield port, beside
+        yield port, peer
         port.close()
 
 
@@ -258,21 +258,21 @@ def message(can_id, data=b"", **flags):
 
 
 def test_an_adapter_carries_frames_both_ways(adapter):
-    port, beside = adapter
+    port, peer = adapter
     port.send(pack_frame(0x201, b"\x0f\x00"))
-    heard = beside.recv(1.0)
-    assert (heard.arbitration_id, bytes(heard.data)) == (0x201, b"\x0f\x00")
-    assert not heard.is_extended_id
-    assert not heard.is_error_frame
-    beside.send(message(0x181, b"12345678"))
+    received = peer.recv(1.0)
+    assert (received.arbitration_id, bytes(received.data)) == (0x201, b"\x0f\x00")
+    assert not received.is_extended_id
+    assert not received.is_error_frame
+    peer.send(message(0x181, b"12345678"))
     assert unpack_frame(port.receive()) == (0x181, b"12345678")
     assert port.receive() is None
 
 
 def test_waiting_on_an_adapter_loses_nothing(adapter):
-    port, beside = adapter
+    port, peer = adapter
     for number in range(3):
-        beside.send(message(0x181, bytes([number])))
+        peer.send(message(0x181, bytes([number])))
     port.wait(1.0)
     port.wait(1.0)
     received = [unpack_frame(port.receive()) for _ in range(3)]
@@ -282,30 +282,30 @@ def test_waiting_on_an_adapter_loses_nothing(adapter):
 
 
 def test_one_poll_of_an_adapter_gets_past_frames_of_others(adapter):
-    port, beside = adapter
-    got = []
+    port, peer = adapter
+    payloads = []
     exchange = CanExchange(port)
-    exchange.subscribe(0x181, got.append)
+    exchange.subscribe(0x181, payloads.append)
     exchange.start()
     for _ in range(5):
-        beside.send(message(0x3FF))
-    beside.send(message(0x181, b"x"))
+        peer.send(message(0x3FF))
+    peer.send(message(0x181, b"x"))
     exchange.drain()
-    assert got == [b"x"]
+    assert payloads == [b"x"]
 
 
-def test_what_an_adapter_says_of_itself_gets_past_the_filters(adapter):
-    port, beside = adapter
+def test_error_frames_of_an_adapter_pass_the_filters(adapter):
+    port, peer = adapter
     exchange = CanExchange(port)
     exchange.subscribe(0x181, print)
     exchange.start()
-    beside.send(message(0x40, bytes(8), is_error_frame=True))
+    peer.send(message(0x40, bytes(8), is_error_frame=True))
     with pytest.raises(DeviceError, match="bus-off"):
         exchange.drain()
 
 
 @pytest.mark.parametrize(
-    "foreign",
+    "unrelated",
     [
         message(0x181, b"x", is_extended_id=True),
         message(0x1800_0181, b"x", is_extended_id=True),
@@ -313,21 +313,21 @@ def test_what_an_adapter_says_of_itself_gets_past_the_filters(adapter):
     ],
     ids=["long", "long, same end", "remote"],
 )
-def test_frames_of_another_kind_are_not_taken_for_ours(adapter, foreign):
-    port, beside = adapter
-    got = []
+def test_frames_of_another_kind_are_dropped(adapter, unrelated):
+    port, peer = adapter
+    payloads = []
     exchange = CanExchange(port)
-    exchange.subscribe(0x181, got.append)
-    beside.send(foreign)
+    exchange.subscribe(0x181, payloads.append)
+    peer.send(unrelated)
     exchange.drain()
-    assert got == []
+    assert payloads == []
     exchange.start()
-    beside.send(foreign)
+    peer.send(unrelated)
     exchange.drain()
-    assert got == []
+    assert payloads == []
 
 
-def test_a_closed_adapter_is_told_and_may_be_closed_again(adapter):
+def test_error_of_a_closed_adapter_which_may_close_again(adapter):
     port, _ = adapter
     port.close()
     port.close()
@@ -338,7 +338,7 @@ def test_a_closed_adapter_is_told_and_may_be_closed_again(adapter):
 
 
 class Scripted:
-    """A python-can bus whose driver raises, or returns, what it is given; then nothing comes."""
+    """A python-can bus whose driver raises or returns the items of a list, then nothing."""
 
     def __init__(self, *script):
         self._script = list(script)
@@ -370,25 +370,25 @@ def scripted_port(monkeypatch):
 @pytest.mark.parametrize(
     "failure", [ValueError("invalid literal"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "start")]
 )
-def test_a_damaged_line_is_an_error_frame_and_the_next_one_counts(scripted_port, failure):
-    got = []
+def test_a_damaged_line_is_an_error_frame(scripted_port, failure):
+    payloads = []
     exchange = CanExchange(
         scripted_port(failure, message(0x181, b"a"), failure, message(0x181, b"b"))
     )
-    exchange.subscribe(0x181, got.append)
+    exchange.subscribe(0x181, payloads.append)
     exchange.drain()
-    assert got == [b"a", b"b"]
+    assert payloads == [b"a", b"b"]
     assert exchange.error_frames == 2
 
 
-def test_nineteen_damaged_lines_between_sound_ones_end_nothing(scripted_port):
+def test_nineteen_damaged_lines_between_sound_ones_are_tolerated(scripted_port):
     script = [ValueError()] * 19 + [message(0x181)] + [ValueError()] * 19
     exchange = CanExchange(scripted_port(*script))
     exchange.drain()
     assert exchange.error_frames == 38
 
 
-def test_silence_and_the_controller_s_reports_do_not_make_damaged_lines_sound(scripted_port):
+def test_silence_and_reports_do_not_reset_damaged_lines(scripted_port):
     script = [ValueError("odd"), None, message(1, bytes(8), is_error_frame=True)] * 20
     exchange = CanExchange(scripted_port(*script))
     with pytest.raises(DeviceError, match=r"slcan0 \(slcan\).*20 times in a row.*ValueError: odd"):
@@ -396,13 +396,13 @@ def test_silence_and_the_controller_s_reports_do_not_make_damaged_lines_sound(sc
             exchange.drain()
 
 
-def test_a_frame_of_can_fd_is_none_of_ours(scripted_port):
+def test_a_frame_of_can_fd_is_dropped(scripted_port):
     port = scripted_port(message(0x181, bytes(64), is_fd=True))
     assert unpack_frame(port.receive())[0] & 0x2000_0000
 
 
 @pytest.mark.parametrize("failure", [can.CanOperationError("gone"), OSError(5, "gone")])
-def test_an_adapter_that_has_failed_is_told_at_once(scripted_port, failure):
+def test_a_failed_adapter_is_reported_at_once(scripted_port, failure):
     port = scripted_port(failure, failure)
     with pytest.raises(DeviceError, match=r"it cannot be read .*gone"):
         port.receive()
@@ -410,14 +410,14 @@ def test_an_adapter_that_has_failed_is_told_at_once(scripted_port, failure):
         port.wait(0.1)
 
 
-def test_whatever_an_adapter_s_driver_raises_is_told_and_closing_is_silent(scripted_port):
+def test_any_error_of_a_driver_is_reported_except_while_closing(scripted_port):
     port = scripted_port()
     with pytest.raises(DeviceError, match=r"takes no more frames \(AssertionError\)"):
         port.send(pack_frame(0x80))
     port.close()
 
 
-def test_waiting_for_a_closed_port_is_told(ends):
+def test_error_while_waiting_for_a_closed_port(ends):
     port, _ = ends
     port.close()
     with pytest.raises(DeviceError, match="cannot be waited for"):

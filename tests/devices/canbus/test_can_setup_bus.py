@@ -1,4 +1,4 @@
-"""Set-up through canopen on our ports, and that the port stays as it was."""
+"""Set-up through canopen on our ports, which leaves the port unchanged."""
 
 import socket
 
@@ -60,7 +60,7 @@ def test_objects_are_written_and_read(nodes):
     assert remote.sdo["text"].raw == text
 
 
-def test_a_refusal_is_canopen_s(nodes):
+def test_a_refusal_is_an_error_of_canopen(nodes):
     remote, _, _, _ = nodes
     with pytest.raises(canopen.SdoAbortedError, match="0x06020000"):
         remote.sdo.upload(0x3000, 0)
@@ -76,7 +76,7 @@ def test_after_set_up_the_port_is_still_open(nodes):
     assert unpack_frame(ports[1].receive()) == (0x80, b"")
 
 
-def test_receiving_waits_for_its_time_and_no_longer(ends):
+def test_receiving_waits_for_its_timeout(ends):
     port, far = ends
     bus = port.open_bus()
     assert bus.recv(0.0) is None
@@ -88,7 +88,7 @@ def test_receiving_waits_for_its_time_and_no_longer(ends):
 
 
 @pytest.mark.parametrize("flag", [0x8000_0000, 0x4000_0000])
-def test_frames_of_another_kind_are_not_taken_for_a_node_s(ends, flag):
+def test_frames_of_another_kind_are_dropped(ends, flag):
     port, far = ends
     bus = port.open_bus()
     far.send(flag | 0x585)

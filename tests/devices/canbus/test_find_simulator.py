@@ -1,4 +1,4 @@
-"""Where a running simulated rig is found, and that what a dead one left is not one."""
+"""Search for a running simulated rig; the address of a dead one is ignored."""
 
 import json
 import socket
@@ -22,7 +22,7 @@ def alive(runtime_folder):
         yield str(path)
 
 
-def test_what_was_announced_is_found(alive):
+def test_an_announced_simulator_is_found(alive):
     address = SimulatorAddress(4711, alive, "/run/can", "/dev/pts/7", lock_step=True)
     path = announce("antenna", address)
     assert find_simulator("antenna") == address
@@ -41,7 +41,7 @@ def test_a_rig_without_a_simulator_has_none(runtime_folder):
     assert find_simulator("antenna") is None
 
 
-def test_what_a_dead_one_left_is_not_found(runtime_folder):
+def test_the_address_of_a_dead_simulator_is_not_found(runtime_folder):
     path = runtime_folder / "control"
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(str(path))
@@ -53,8 +53,8 @@ def test_what_a_dead_one_left_is_not_found(runtime_folder):
     assert find_simulator("antenna") is None
 
 
-def test_one_that_is_too_busy_to_answer_runs_all_the_same(runtime_folder):
-    """Taken for a dead one, it would have the drivers turn to the hardware."""
+def test_a_busy_simulator_counts_as_running(runtime_folder):
+    """If it counted as dead, the drivers would open the hardware."""
     path = str(runtime_folder / "control")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(path)
@@ -93,17 +93,17 @@ def test_a_garbled_file_is_not_a_simulator(runtime_folder, text):
     assert find_simulator("antenna") is None
 
 
-def test_bytes_that_are_no_text_are_not_a_simulator(runtime_folder):
+def test_a_binary_file_is_not_a_simulator(runtime_folder):
     announce("antenna", SimulatorAddress(1, "x")).write_bytes(b"\xff\xfe\x00")
     assert find_simulator("antenna") is None
 
 
-def test_other_settings_of_the_file_are_kept(alive):
+def test_other_settings_of_the_file_remain(alive):
     path = announce("antenna", SimulatorAddress(1, alive, can_socket="c"))
     assert json.loads(path.read_text("utf-8"))["can_socket"] == "c"
 
 
-def test_without_a_runtime_folder_it_is_this_user_s_own(monkeypatch, tmp_path):
+def test_default_runtime_folder_of_the_user(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
     assert current_folder().parent == Path(tempfile.gettempdir())
     monkeypatch.delenv("XDG_RUNTIME_DIR")

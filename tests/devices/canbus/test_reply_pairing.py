@@ -1,4 +1,4 @@
-"""Which request a reply answers: a reading counts as fresh only if it is that of the last one."""
+"""Pairing of replies and requests: a reading is fresh only if it answers the last request."""
 
 from collections import deque
 
@@ -10,7 +10,7 @@ from rigd.devices.canbus import ReplyPairing
 
 
 class Box:
-    """What has come: how many replies, and the number of the request that the last one answers."""
+    """Number of replies received, and number of the request that the last one answers."""
 
     def __init__(self):
         self.replies = 0
@@ -64,7 +64,7 @@ class Line:
         st.tuples(st.sampled_from(["whole"] * 3 + ["held", "lost"]), st.booleans()), max_size=60
     )
 )
-def test_no_old_reading_counts_as_fresh_while_late_replies_catch_up(events):
+def test_no_old_reading_is_fresh_while_late_replies_catch_up(events):
     line = Line()
     for event, before in events:
         if line.tick(event, before=before):
@@ -76,8 +76,8 @@ def test_no_old_reading_counts_as_fresh_while_late_replies_catch_up(events):
     late=st.integers(1, 8),
     before=st.lists(st.sampled_from(["whole"] * 5 + ["lost"]), max_size=20),
 )
-def test_replies_that_are_late_for_good_never_count(late, before):
-    """From some tick on, whatever was lost before: not when the delay sets in, nor ever after."""
+def test_replies_always_late_never_count(late, before):
+    """Delayed from some tick on, after any losses: no reading counts, then or later."""
     line = Line()
     for event in before:
         if line.tick(event):
@@ -87,7 +87,7 @@ def test_replies_that_are_late_for_good_never_count(late, before):
 
 
 @given(late=st.integers(1, 8), ticks=st.integers(1, 30))
-def test_replies_that_were_late_for_a_while_count_again(late, ticks):
+def test_replies_count_again_after_a_late_period(late, ticks):
     line = Line()
     line.tick()
     for _ in range(ticks):
@@ -99,7 +99,7 @@ def test_replies_that_were_late_for_a_while_count_again(late, ticks):
 
 
 @pytest.mark.parametrize("losses", [1, 2, 3, 7])
-def test_after_a_loss_one_tick_without_a_request_tells(losses):
+def test_one_tick_without_request_resolves_a_loss(losses):
     line = Line()
     line.tick()
     assert not any(line.tick("lost") for _ in range(losses))
@@ -108,14 +108,14 @@ def test_after_a_loss_one_tick_without_a_request_tells(losses):
     assert line.right()
 
 
-def test_without_trouble_every_reading_is_fresh_and_no_request_left_out():
+def test_every_reading_is_fresh_without_losses():
     line = Line()
     assert all(line.tick() for _ in range(100))
     assert line.paused == 0
 
 
-def test_replies_that_are_read_too_late_are_not_taken_for_those_of_the_next_tick():
-    # The host was slow once: from then on each reply would be found a tick later.
+def test_replies_read_too_late_do_not_count_for_the_next_tick():
+    # After one pause of the host each reply would be found a tick later.
     line = Line()
     line.tick()
     assert not line.tick("held")
@@ -134,7 +134,7 @@ def test_several_periods_of_replies_at_once():
     assert line.right()
 
 
-def test_where_time_passes_with_the_requests_a_loss_stays_unproven():
+def test_a_loss_stays_unproven_in_lock_step():
     line = Line(may_pause=False)
     line.tick()
     fresh = [line.tick(event) for event in ("lost", "lost", *["whole"] * 5)]

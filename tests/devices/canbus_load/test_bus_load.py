@@ -63,7 +63,7 @@ def test_the_load_of_any_data_lies_between_plain_and_worst(can_rig, data):
 
 
 def test_real_frames_come_near_the_worst(can_rig):
-    """Data of 3C has a bit stuffed after every four; heads and checksums are as they are."""
+    """Data of 3C has a bit stuffed after every four; heads and checksums are typical."""
     load = bus_load(can_rig)
     stuffed = bits_per_second(load.traffic, lambda frame: b"\x3c" * frame.length)
     assert stuffed > load.worst * 1e6 - 9 * load.frames_per_s
@@ -83,7 +83,7 @@ def test_half_the_bit_rate_does_not_fit(can_rig):
     assert bus_load(replace(can_rig, can=replace(can_rig.can, bitrate_bit_s=500_000))).worst > 1.18
 
 
-def test_with_the_sensor_on_its_own_line_only_the_motor_is_on_the_bus(serial_rig):
+def test_load_of_the_motor_alone_with_a_serial_sensor(serial_rig):
     drive = serial_rig.cia402
     slow = replace(
         serial_rig, cia402=replace(drive, heartbeat_period_s=1.0, drive_heartbeat_period_s=1.0)
@@ -109,6 +109,6 @@ def test_frames_carry_the_identifiers_of_the_profile(can_rig):
     assert found["sensor's reply 2"] == 0x6A1
 
 
-def test_no_bus_no_load():
+def test_no_load_without_a_bus():
     with pytest.raises(ValueError, match="no CAN bus"):
         bus_load(load_profile("sim").rig)

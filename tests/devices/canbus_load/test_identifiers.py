@@ -27,7 +27,7 @@ def test_the_shipped_profiles_have_no_collision():
 
 
 @pytest.mark.parametrize("node", [1, 2, 12, 15])
-def test_the_sensors_usual_base_meets_the_torque_commands(node):
+def test_usual_base_of_the_sensor_collides_with_torque_commands(node):
     (found,) = check_identifiers(rig(base=0x20, node=node))
     assert f"0x{0x200 + node:03x} (RPDO1)" in found
     assert "ati_can.base_id = 0x20 takes the identifiers 0x200 to 0x20f" in found
@@ -35,7 +35,7 @@ def test_the_sensors_usual_base_meets_the_torque_commands(node):
     assert "0x68" in found
 
 
-def test_that_base_leaves_other_nodes_alone():
+def test_usual_base_of_the_sensor_fits_other_nodes():
     assert check_identifiers(rig(base=0x20, node=16)) == []
 
 
@@ -72,7 +72,7 @@ def test_two_heartbeats_of_one_node():
 
 
 @given(st.integers(0, 0x7F), st.integers(1, 127), st.integers(1, 127))
-def test_a_collision_is_found_exactly_where_there_is_one(base, node, host):
+def test_collisions_are_found_and_no_others(base, node, host):
     used = {0x000, 0x080, 0x100, 0x7E4, 0x7E5, 0x700 + host}
     used |= {0x80 + node, 0x580 + node, 0x600 + node, 0x700 + node}
     used |= {pdo + node for pdo in range(0x180, 0x580, 0x80)}
@@ -81,5 +81,5 @@ def test_a_collision_is_found_exactly_where_there_is_one(base, node, host):
 
 
 @given(st.integers(1, 127), st.integers(1, 127))
-def test_the_base_that_is_advised_is_free(node, host):
+def test_the_advised_base_is_free(node, host):
     assert node == host or check_identifiers(rig(base=0x68, node=node, host=host)) == []

@@ -59,10 +59,10 @@ def _format(index, sub):
 
 
 class ScriptedDrive(threading.Thread):
-    """A drive that does what its attributes say. One client; time passes with SYNC.
+    """A drive that follows its attributes. One client; time passes with SYNC.
 
     `drop` counts SYNCs that are left without an answer (`drop_at`: which ones), `hold` replies
-    that are kept back until the next SYNC, and come before its own reply; `garble` replaces the
+    that are delayed until the next SYNC, and come before its own reply; `garble` replaces the
     next replies.
     """
 
@@ -80,11 +80,11 @@ class ScriptedDrive(threading.Thread):
         self.position, self.torque = 1000, 0
         self.pending = None  # controlword and torque of an RPDO that waits for SYNC
         self.control = 0
-        self.stays_in = None  # a state that it does not leave upwards
+        self.stays_in = None  # a state from which it makes no transition upwards
         self.on_ready = "ready"  # where it goes instead
         self.ignores_nmt = False
         self.off_delay_s = 0.0  # from the command on
-        self.told_off_after = -1  # SDO frames, until the statusword was read as off
+        self.off_read_after = -1  # SDO frames, until the statusword was read as off
         self._off_at = None
         self.follows = True
         self.mode_follows = True
@@ -99,7 +99,7 @@ class ScriptedDrive(threading.Thread):
         self.syncs = 0
         self.on_sync = None
         self.reply_delay_s = 0.0
-        self.refuse, self.keep = {}, set()
+        self.refuse, self.fixed = {}, set()
         self.read_only, self.refuse_value = set(), {}
         self.write_only = set()
         self.formats = {}
@@ -123,10 +123,10 @@ class ScriptedDrive(threading.Thread):
             }  # fmt: skip
             for sub in (2, 3):
                 self.objects[0x1600 + n, sub] = self.objects[0x1A00 + n, sub] = 0
-        self._told_name = b"SCRIPTED DRIVE"
+        self._device_name = b"SCRIPTED DRIVE"
         self._rest = b""
 
-    # What a test does to it.
+    # Actions of a test.
 
     def send(self, can_id, data):
         self._link.sendall(struct.pack("=IB3x8s", can_id, len(data), data))
@@ -143,12 +143,12 @@ class ScriptedDrive(threading.Thread):
     def frames(self, can_id):
         return [data for i, data in self.seen if i == can_id]
 
-    def has_got(self, can_id, data):
-        """Wait until a frame has come, and say whether it has."""
-        return self.comes_to(lambda it: (can_id, data) in it.seen)
+    def wait_for_frame(self, can_id, data):
+        """Wait for a frame, and return whether it has come."""
+        return self.wait_for(lambda it: (can_id, data) in it.seen)
 
-    def comes_to(self, condition):
-        """Wait until something is true of it, and say whether it is."""
+    def wait_for(self, condition):
+        """Wait for a condition, and return whether it is true."""
         deadline = time.monotonic() + 30
         while not condition(self) and time.monotonic() < deadline:
             time.sleep(0.001)
@@ -164,7 +164,7 @@ class ScriptedDrive(threading.Thread):
         if self.error is not None:
             raise self.error
 
-    # Its own work.
+    # Internal functions.
 
     def run(self):
         try:
@@ -260,7 +260,7 @@ class ScriptedDrive(threading.Thread):
         rising = controlword & 0x80 and not self.control & 0x80
         self.control = controlword
         if self.state == "fault":
-            if rising and not self.objects[0x603F, 0] & 1:  # an odd code stands
+            if rising and not self.objects[0x603F, 0] & 1:  # an odd code remains
                 self.state = "switch-on disabled"
             return
         low = controlword & 0x0F
@@ -294,12 +294,12 @@ class ScriptedDrive(threading.Thread):
         elif command == 0x40 and (index, sub) in self.write_only:
             self.send(0x580 + NODE, b"\x80" + reply + struct.pack("<I", 0x06010001))
         elif command == 0x40 and index in (0x1008, 0x100A):
-            self._rest = self._told_name if index == 0x1008 else b"V2.10 beta"
+            self._rest = self._device_name if index == 0x1008 else b"V2.10 beta"
             size = struct.pack("<I", len(self._rest))
             self.send(0x580 + NODE, b"\x41" + reply + size)
         elif command == 0x40:
-            if index == 0x6041 and self.state != "enabled" and self.told_off_after < 0:
-                self.told_off_after = len(self.frames(0x605))
+            if index == 0x6041 and self.state != "enabled" and self.off_read_after < 0:
+                self.off_read_after = len(self.frames(0x605))
             value = {0x6041: self.status(), 0x6061: self._mode()}.get(index)
             value = self.objects[index, sub] if value is None else value
             raw = struct.pack(self.formats.get(index) or _format(index, sub), value)
@@ -320,7 +320,7 @@ class ScriptedDrive(threading.Thread):
                 self.send(0x580 + NODE, b"\x80" + reply + struct.pack("<I", no))
                 return
             self.writes.append((index, sub, value))
-            if (index, sub) not in self.keep:
+            if (index, sub) not in self.fixed:
                 self.objects[index, sub] = value
             if index == 0x6040:
                 self._command(value)
@@ -359,7 +359,7 @@ def settings():
 
 @pytest.fixture(scope="session")
 def rig():
-    """In lock-step: replies are waited for."""
+    """In lock-step, with a wait for replies."""
     return replace(
         load_profile("sim").rig,
         name="scripted",
@@ -411,6 +411,6 @@ def drive(make_drive, rig):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """Have a reply that does not come awaited for no longer than where there is no time."""
+    """Wait for a missing reply for no time at all."""
     monkeypatch.setattr("rigd.devices.cia402._sdo._SDO_TIMEOUT_S", 0.05)
     monkeypatch.setattr("rigd.devices.cia402._switch_off._FIRST_ANSWER_TIMEOUT_S", 0.1)

@@ -1,6 +1,6 @@
 """Random and mutated frames at the driver: python fuzz_cia402.py FRAMES.
 
-Whatever comes, the handlers take it, and only ``DeviceError`` leaves the driver.
+The handlers accept any frame, and the driver raises only ``DeviceError``.
 """
 
 import random
@@ -75,7 +75,7 @@ class FuzzPort:
 
 
 def connected(rig, seed):
-    """A driver as after its set-up, on a port that fuzzes."""
+    """A driver after its set-up, on a port that fuzzes."""
     port = FuzzPort(seed)
     exchange = CanExchange(port)
     drive = Cia402Drive(rig, None)

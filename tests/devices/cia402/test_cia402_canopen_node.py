@@ -137,7 +137,7 @@ def make_drive(node, path, link_to):
 
 @pytest.fixture
 def connect(make_drive, rig):
-    """Connect the driver to the node; return what it found it to have."""
+    """Connect the driver to the node; return the capabilities found."""
 
     def connect(rig=rig):
         drive = make_drive(rig)
@@ -155,7 +155,7 @@ def test_the_whole_set_up(node, connect, rig):
     def raw(index, sub=0):
         return node.get_data(index, sub).hex(" ")
 
-    # Bytes as a drive would keep them.
+    # Bytes as a drive stores them.
     assert raw(0x1006) == "e8 03 00 00"
     assert (raw(0x60C2, 1), raw(0x60C2, 2)) == ("01", "fd")
     assert raw(0x1016, 1) == "32 00 64 00"
@@ -174,7 +174,7 @@ def test_the_whole_set_up(node, connect, rig):
     assert node.nmt.state == "OPERATIONAL"
 
 
-def test_what_canopen_itself_reads_of_the_pdos(node, connect, rig):
+def test_pdos_as_read_by_canopen(node, connect, rig):
     connect()
     for pdo in (node.tpdo[1], node.rpdo[1]):
         pdo.read(from_od=False)
@@ -195,7 +195,7 @@ def test_a_node_without_an_object(node, connect, rig):
         connect()
 
 
-def test_limits_that_are_read_only_as_elmos(node, connect, rig):
+def test_read_only_limits_of_elmo(node, connect, rig):
     for index in (0x60E0, 0x60E1):
         entry = node.object_dictionary[index]
         node.sdo[index].raw = 50_000
@@ -205,14 +205,14 @@ def test_limits_that_are_read_only_as_elmos(node, connect, rig):
     assert capabilities.accepted == ()
 
 
-def test_a_limit_that_is_read_only_and_too_low(node, connect, rig):
+def test_a_read_only_limit_that_is_too_low(node, connect, rig):
     node.sdo[0x60E1].raw = 500
     node.object_dictionary[0x60E1].access_type = "ro"
     with pytest.raises(DeviceError, match=r"60E1 .*is 500, needed is 1800.*read-only"):
         connect()
 
 
-def test_objects_that_are_missing_as_maxons(node, connect, rig):
+def test_missing_objects_of_maxon(node, connect, rig):
     for index in (0x6072, 0x1006):
         del node.object_dictionary[index]
     limit = canopen.objectdictionary.ODVariable("Output current limit", 0x3001, 2)

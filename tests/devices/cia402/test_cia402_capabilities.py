@@ -1,4 +1,4 @@
-"""Drives that lack objects, or have them read-only: what stands in, and what is refused by name."""
+"""Drives that lack objects, or have them read-only: substitutes, and refusals by name."""
 
 from dataclasses import replace
 
@@ -10,8 +10,8 @@ from rigd.devices.contracts import DeviceError
 READ_ONLY, ABSENT, GENERAL = 0x06010002, 0x06020000, 0x08000000
 
 
-def without(scripted, *places):
-    for address in places:
+def without(scripted, *addresses):
+    for address in addresses:
         scripted.objects.pop(address, None)
 
 
@@ -28,9 +28,9 @@ def written(scripted):
 
 
 class TestTheTwoRealDrives:
-    """What their public EDS files say."""
+    """Limits and objects of their public EDS files."""
 
-    def test_elmo_gold_has_torque_limits_that_are_read_only_and_far_off(self, make, scripted):
+    def test_elmo_gold_has_far_read_only_torque_limits(self, make, scripted):
         scripted.objects |= {(0x60E0, 0): 50_000, (0x60E1, 0): 50_000}
         scripted.read_only |= {(0x60E0, 0), (0x60E1, 0)}
         drive = make()
@@ -46,14 +46,14 @@ class TestTheTwoRealDrives:
         drive.connect()
         assert scripted.objects[0x3001, 2] == 2500
         assert [row.address for row in drive.capabilities().lacks] == ["6072", "1006"]
-        told = drive.statement()
-        assert told["drive_without"] == "torque_limit"
-        assert told["drive_objects_set"] == "3001:2 u32 2500"
-        assert "1006: transmission type 1" in told["drive_stand_ins"]
+        statement = drive.statement()
+        assert statement["drive_without"] == "torque_limit"
+        assert statement["drive_objects_set"] == "3001:2 u32 2500"
+        assert "1006: transmission type 1" in statement["drive_stand_ins"]
         drive.enable()
         assert scripted.state == "enabled"
 
-    def test_a_torque_limit_that_is_missing_has_to_be_accepted_by_name(self, make, scripted):
+    def test_a_missing_torque_limit_has_to_be_accepted_by_name(self, make, scripted):
         without(scripted, (0x6072, 0))
         with pytest.raises(
             DeviceError, match=r'no object 6072.*accept_without = \["torque_limit"\]'
@@ -70,13 +70,13 @@ def test_a_read_only_limit_below_the_wanted_one_is_refused_by_name(make, scripte
         make().connect()
 
 
-def test_a_read_only_object_that_holds_what_is_needed_is_fine(make, scripted):
+def test_a_read_only_object_with_the_needed_value_is_accepted(make, scripted):
     scripted.objects |= {(0x6072, 0): 1800, (0x60C2, 1): 1, (0x6007, 0): 2, (0x1017, 0): 20}
     scripted.read_only |= {(0x6072, 0), (0x60C2, 1), (0x60C2, 2), (0x6007, 0), (0x1017, 0)}
     make().connect()
 
 
-def test_a_read_only_limit_that_is_too_high_is_none(make, scripted):
+def test_a_read_only_limit_that_is_too_high_does_not_count(make, scripted):
     scripted.objects[0x6072, 0] = 5000
     scripted.read_only.add((0x6072, 0))
     with pytest.raises(DeviceError, match=r"6072 .*is 5000, needed is 1800"):
@@ -91,7 +91,7 @@ def test_a_limit_that_is_too_high_may_be_accepted_by_name(make, scripted):
     assert drive.capabilities().accepted == ("torque_limit",)
 
 
-def test_a_mode_that_is_write_only_is_written_and_told_by_6061(make, scripted):
+def test_a_write_only_mode_is_written_and_read_from_6061(make, scripted):
     scripted.write_only |= {(0x6060, 0)}
     drive = make()
     drive.connect()
@@ -100,14 +100,14 @@ def test_a_mode_that_is_write_only_is_written_and_told_by_6061(make, scripted):
     assert scripted.state == "enabled"
 
 
-def test_a_write_only_mode_that_is_not_taken_is_named(make, scripted):
+def test_an_ignored_write_only_mode_is_named(make, scripted):
     scripted.write_only |= {(0x6060, 0)}
     scripted.refuse_value[0x6060, 0] = 0x06090030
     with pytest.raises(DeviceError, match=r"object 6060.*0x06090030"):
         make().connect()
 
 
-def test_a_write_only_object_that_may_hold_something_from_before_is_refused(make, scripted):
+def test_a_write_only_object_with_an_unknown_value_is_refused(make, scripted):
     scripted.objects[0x60B2, 0] = 5
     scripted.write_only |= {(0x60B2, 0)}
     with pytest.raises(DeviceError, match="reading object 60B2"):
@@ -115,7 +115,7 @@ def test_a_write_only_object_that_may_hold_something_from_before_is_refused(make
 
 
 @pytest.mark.parametrize("code", [ABSENT, GENERAL, 0x06090011, 0x060A0023, 0x05040001])
-def test_the_ways_of_makers_to_say_that_an_object_is_absent(make, scripted, code):
+def test_abort_codes_of_absent_objects(make, scripted, code):
     scripted.refuse |= dict.fromkeys([(0x1006, 0), (0x60C2, 1), (0x60C2, 2)], code)
     drive = make()
     drive.connect()
@@ -123,7 +123,7 @@ def test_the_ways_of_makers_to_say_that_an_object_is_absent(make, scripted, code
 
 
 class TestTheWatchdog:
-    """It never goes missing silently."""
+    """A missing watchdog is always reported."""
 
     def test_the_heartbeat_consumer(self, make):
         drive = make()
@@ -134,36 +134,36 @@ class TestTheWatchdog:
             "drive_watchdog_s": "0.05",
         }
 
-    def test_none_at_all_is_refused(self, make, scripted):
+    def test_no_watchdog_is_refused(self, make, scripted):
         without(scripted, (0x1016, 1))
         with pytest.raises(DeviceError) as caught:
             make().connect()
-        told = str(caught.value)
+        message = str(caught.value)
         for words in ("1016:1", "cia402.own_watchdog_s", 'accept_without = ["watchdog"]'):
-            assert words in told
+            assert words in message
 
-    def test_the_deadline_of_the_rpdo_stands_in(self, make, scripted):
+    def test_the_deadline_of_the_rpdo_is_a_substitute(self, make, scripted):
         without(scripted, (0x1016, 1))
         scripted.objects[0x1400, 5] = 0
         drive = make()
         drive.connect()
         assert scripted.objects[0x1400, 5] == 50
         assert drive.capabilities().watchdog is Watchdog.RPDO_DEADLINE
-        # It times them from the first on, so that they go on while nobody commands a torque.
+        # The drive times them from the first on, so they continue without a commanded torque.
         scripted.seen.clear()
         for k in range(5):
             drive.latch(k * 1_000_000)
             drive.read_angle()
         assert len(scripted.frames(0x205)) == 5
 
-    def test_the_makers_own_stands_in_as_the_profile_says(self, make, scripted):
+    def test_own_watchdog_of_the_profile_is_a_substitute(self, make, scripted):
         without(scripted, (0x1016, 1), (0x6007, 0))
         drive = make(own_watchdog_s=0.03)
         drive.connect()
         assert drive.statement()["drive_watchdog_s"] == "0.03"
         assert "maker's own" in drive.statement()["drive_watchdog"]
 
-    def test_none_is_accepted_by_name_and_told(self, make, scripted, rig):
+    def test_no_watchdog_is_accepted_by_name_and_reported(self, make, scripted, rig):
         without(scripted, (0x1016, 1))
         drive = make(accept_without=("watchdog",))
         drive.connect()
@@ -171,22 +171,22 @@ class TestTheWatchdog:
         assert drive.statement()["drive_without"] == "watchdog"
         assert drive.capabilities().watchdog is Watchdog.NONE
 
-    def test_a_watchdog_of_which_nobody_knows_what_it_does(self, make, scripted):
+    def test_a_watchdog_with_unknown_reaction(self, make, scripted):
         without(scripted, (0x6007, 0))
         with pytest.raises(DeviceError, match=r'no object 6007.*\["abort_option"\]'):
             make().connect()
 
-    def test_what_it_does_may_be_accepted_by_name(self, make, scripted):
+    def test_an_unknown_reaction_may_be_accepted_by_name(self, make, scripted):
         without(scripted, (0x6007, 0))
         drive = make(accept_without=("abort_option",))
         drive.connect()
         assert drive.capabilities().accepted == ("abort_option",)
 
-    def test_one_node_twice_is_refused_so_the_old_entry_goes_first(self, make, scripted):
+    def test_the_old_entry_of_a_node_is_cleared_first(self, make, scripted):
         scripted.objects |= {(0x1016, 0): 3, (0x1016, 2): 100 << 16 | 70, (0x1016, 3): 9 << 16 | 5}
         make().connect()
-        places = [(index, sub, value) for index, sub, value in scripted.writes if index == 0x1016]
-        assert places == [(0x1016, 2, 0), (0x1016, 1, 100 << 16 | 50)]
+        writes = [(index, sub, value) for index, sub, value in scripted.writes if index == 0x1016]
+        assert writes == [(0x1016, 2, 0), (0x1016, 1, 100 << 16 | 50)]
 
     @pytest.mark.parametrize(
         ("changes", "time_s"),
@@ -198,7 +198,7 @@ class TestTheWatchdog:
             ({"accept_without": ("torque_limit",)}, 0.05),
         ],
     )
-    def test_its_time_as_far_as_a_profile_tells(self, settings, changes, time_s):
+    def test_watchdog_time_of_a_profile(self, settings, changes, time_s):
         assert replace(settings, **changes).watchdog_s == time_s
 
 
@@ -206,13 +206,13 @@ class TestWhatADriveHoldsFromBefore:
     @pytest.mark.parametrize(
         ("address", "value"), [((0x1007, 0), 100), ((0x1019, 0), 10), ((0x1800, 3), 10)]
     )
-    def test_it_is_cleared(self, make, scripted, address, value):
+    def test_values_from_before_are_cleared(self, make, scripted, address, value):
         scripted.objects[address] = value
         make().connect()
         assert scripted.objects[address] == 0
 
     @pytest.mark.parametrize("address", [(0x1007, 0), (0x1019, 0), (0x1800, 3), (0x60B2, 0)])
-    def test_what_cannot_be_cleared_is_refused_by_name(self, make, scripted, address):
+    def test_values_that_cannot_be_cleared_are_refused_by_name(self, make, scripted, address):
         scripted.objects[address] = 10
         scripted.read_only.add(address)
         index, sub = address
@@ -260,7 +260,7 @@ class TestWhatADriveHoldsFromBefore:
         assert drive.identity()["fault_reaction_option"] == 0
 
 
-def test_pdos_that_are_mapped_as_wanted_may_be_read_only(make, scripted):
+def test_pdos_already_mapped_as_needed_may_be_read_only(make, scripted):
     scripted.objects |= {
         (0x1800, 1): 0x40000185, (0x1800, 2): 1, (0x1400, 1): 0x205, (0x1400, 2): 1,
         (0x1A00, 0): 3, (0x1A00, 1): 0x60410010, (0x1A00, 2): 0x60640020, (0x1A00, 3): 0x60770010,
@@ -276,14 +276,14 @@ def test_pdos_that_are_mapped_as_wanted_may_be_read_only(make, scripted):
     assert scripted.state == "enabled"
 
 
-def test_a_target_torque_that_cannot_be_mapped_is_named(make, scripted):
+def test_an_unmappable_target_torque_is_named(make, scripted):
     scripted.refuse_value[0x1600, 2] = 0x06040041
     with pytest.raises(DeviceError, match=r"6071 \(Target torque\) into RPDO1.*cannot be mapped"):
         make().connect()
 
 
 class TestWithoutItsTorque:
-    def test_it_is_refused(self, make, scripted):
+    def test_a_drive_without_torque_is_refused(self, make, scripted):
         scripted.refuse_value[0x1A00, 3] = ABSENT
         with pytest.raises(DeviceError, match=r'no object 6077.*\["torque_feedback"\]'):
             make().connect()
@@ -301,7 +301,7 @@ class TestWithoutItsTorque:
             drive.command(0.4)
 
 
-def test_without_a_heartbeat_of_its_own_its_tpdos_tell_that_it_is_there(make, scripted):
+def test_tpdos_replace_a_missing_heartbeat(make, scripted):
     without(scripted, (0x1017, 0))
     scripted.heartbeat_every = 10**9
     scripted.nmt_heartbeats = False
@@ -348,27 +348,27 @@ PDOMapping=0
         path.write_text(self.TEXT.format(vendor=vendor, product=product))
         return str(path)
 
-    def test_its_types_are_used(self, make, scripted, tmp_path):
+    def test_types_of_the_eds_are_used(self, make, scripted, tmp_path):
         scripted.objects[0x60E0, 0] = 70_000  # no u16 holds that
         scripted.formats[0x60E0] = "<I"
         make(eds=self.eds(tmp_path)).connect()
         assert scripted.objects[0x60E0, 0] == 1800
 
-    def test_the_drive_has_to_be_its(self, make, scripted, tmp_path):
+    def test_another_vendor_is_refused(self, make, scripted, tmp_path):
         with pytest.raises(DeviceError, match=r"VendorNumber in .*drive\.eds is 0x00000099"):
             make(eds=self.eds(tmp_path, vendor="0x99")).connect()
 
-    def test_the_product_has_to_be_its(self, make, scripted, tmp_path):
+    def test_another_product_is_refused(self, make, scripted, tmp_path):
         with pytest.raises(DeviceError, match=r"ProductNumber in .*drive\.eds is 0x00000007"):
             make(eds=self.eds(tmp_path, product="7")).connect()
 
-    def test_a_type_that_it_does_not_tell_stays_that_of_the_standard(self, make, tmp_path):
+    def test_a_missing_type_is_that_of_the_standard(self, make, tmp_path):
         path = tmp_path / "drive.eds"
         path.write_text("[6040]\nDataType=x\n[6072]\nParameterName=Max torque\n")
         make(eds=str(path)).connect()
 
     @pytest.mark.parametrize("content", ["nonsense", "[60E0\n", "\0\0", "<xml/>"])
-    def test_a_file_that_is_none(self, make, scripted, tmp_path, content):
+    def test_an_invalid_file(self, make, scripted, tmp_path, content):
         path = tmp_path / "broken.eds"
         path.write_text(content)
         scripted.state, scripted.torque = "enabled", 200

@@ -51,7 +51,7 @@ def test_identifiers_of_the_drives_frames():
 
 
 @pytest.mark.parametrize(
-    ("data", "told"),
+    ("data", "fields"),
     [
         ("37 12 00 00 00 00 00 00", (0x1237, 0, 0)),
         ("50 02 01 00 00 00 F4 01", (0x0250, 1, 500)),
@@ -60,8 +60,8 @@ def test_identifiers_of_the_drives_frames():
         ("27 00 FF FF FF 7F FF 7F", (0x0027, 2**31 - 1, 32767)),
     ],
 )
-def test_tpdo(data, told):
-    assert protocol.unpack_tpdo(bytes.fromhex(data)) == told
+def test_tpdo(data, fields):
+    assert protocol.unpack_tpdo(bytes.fromhex(data)) == fields
 
 
 @given(
@@ -106,7 +106,7 @@ def test_emergency():
         ("", None),
     ],
 )
-def test_reply_to_the_question_for_the_mode(data, mode):
+def test_reply_to_the_request_of_the_mode(data, mode):
     assert protocol.read_mode(bytes.fromhex(data)) == mode
 
 
@@ -119,7 +119,7 @@ def test_confirmation_of_a_write():
 
 
 def test_the_state_of_every_statusword():
-    """CiA 402: bits 0 to 3 and 6, with bit 5 where the state tells a quick stop from the rest."""
+    """CiA 402: bits 0 to 3 and 6, with bit 5 where it separates a quick stop from others."""
     words = {
         0b000_0000: protocol.DriveState.NOT_READY,
         0b100_0000: protocol.DriveState.SWITCH_ON_DISABLED,
@@ -141,13 +141,13 @@ def test_the_state_of_every_statusword():
     assert set(seen) == set(protocol.DriveState)
 
 
-def test_no_two_states_share_a_statusword():
+def test_every_state_has_its_own_statusword():
     for word in range(0x80):
         assert sum(word & mask == value for mask, value, _ in protocol._STATE_CODES) <= 1
 
 
-def test_every_error_code_has_words_of_its_class():
-    """Canopen's own table of CiA 301's classes is the witness."""
+def test_every_error_code_has_a_text_of_its_class():
+    """Compared with canopen's table of the classes of CiA 301."""
     ours = {
         "Error Reset / No Error": "no error",
         "Generic Error": "generic",
@@ -197,8 +197,8 @@ def test_the_shipped_dictionary_has_the_types_of_cia_301_and_402():
         datatypes.INTEGER32: [(0x6064, 0)],
         datatypes.VISIBLE_STRING: [(0x1008, 0), (0x100A, 0)],
     }  # fmt: skip
-    for kind, places in types.items():
-        for index, sub in places:
+    for kind, addresses in types.items():
+        for index, sub in addresses:
             assert dictionary.get_variable(index, sub).data_type == kind, f"{index:04X}:{sub}"
     named = {
         value

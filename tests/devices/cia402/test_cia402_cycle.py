@@ -1,4 +1,4 @@
-"""Ticks with a scripted drive: what goes out, what comes of what comes in."""
+"""Ticks with a scripted drive: frames sent, and reactions to frames received."""
 
 import struct
 from dataclasses import replace
@@ -35,7 +35,7 @@ def ticks(drive):
     return Ticks(drive)
 
 
-def test_the_angle_is_zero_where_the_drive_was_found(ticks, drive):
+def test_the_angle_is_zero_at_connection(ticks, drive):
     assert ticks() == [0.0]
     assert not drive.angle_stale
     assert drive.angle_time_ns > 0
@@ -48,7 +48,7 @@ def test_the_angle_follows_the_count(ticks, scripted):
     assert ticks() == [pytest.approx(-1040 * STEP_RAD)]
 
 
-def test_a_drive_that_counts_the_other_way_round(make_drive, rig, settings, scripted):
+def test_reversed_count_of_a_drive(make_drive, rig, settings, scripted):
     drive = make_drive(replace(rig, cia402=replace(settings, direction=-1)))
     drive.connect()
     scripted.position += 10
@@ -96,13 +96,13 @@ def test_torque_is_clipped_to_the_peak_and_rounded(ticks, drive, scripted):
         assert scripted.torque == per_mille
 
 
-def test_a_torque_that_is_not_a_number_is_refused(ticks, drive):
+def test_a_nan_torque_is_refused(ticks, drive):
     drive.enable()
     with pytest.raises(DeviceError, match="not a number"):
         ticks(1, float("nan"))
 
 
-def test_before_enabling_no_command_carries_torque_or_enables(ticks, scripted):
+def test_no_torque_and_no_enabling_before_enable(ticks, scripted):
     ticks(20, torque_nm=0.3)
     sent = scripted.frames(0x205)
     assert len(sent) >= 19
@@ -110,7 +110,7 @@ def test_before_enabling_no_command_carries_torque_or_enables(ticks, scripted):
     assert scripted.state == "switch-on disabled"
 
 
-def test_heartbeats_go_out_by_the_ticks_time(ticks, scripted):
+def test_heartbeats_are_timed_by_the_ticks(ticks, scripted):
     assert not scripted.frames(0x764)
     ticks(1)
     ticks(1)
@@ -119,7 +119,7 @@ def test_heartbeats_go_out_by_the_ticks_time(ticks, scripted):
     assert len(scripted.frames(0x764)) == 11
 
 
-def test_a_lost_reply_makes_ticks_stale_until_it_cannot_be_late_any_more(make_drive, rig, scripted):
+def test_ticks_are_stale_while_a_lost_reply_may_be_late(make_drive, rig, scripted):
     quick = replace(rig, acquisition=Acquisition("same_tick", 1e5))
     drive = make_drive(quick)
     drive.connect()
@@ -131,21 +131,21 @@ def test_a_lost_reply_makes_ticks_stale_until_it_cannot_be_late_any_more(make_dr
         scripted.position = 1000 + step
         angle = ticks()[0]
         stale.append((drive.angle_stale, round(angle / STEP_RAD)))
-    # Whether the next is the late answer to the first SYNC cannot be known.
+    # The next reply may be the late one to the first SYNC.
     assert stale == [(True, 0), (True, 0), (True, 0), (True, 0), (False, 5), (False, 6)]
 
 
-def test_a_late_reply_is_never_taken_for_the_next_ticks(make_drive, rig, scripted):
+def test_a_late_reply_does_not_count_for_the_next_tick(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e5)))
     drive.connect()
     ticks = Ticks(drive)
     scripted.hold = 1
-    got = []
+    angles = []
     for step in range(1, 5):
         scripted.position = 1000 + step
         angle = ticks()[0]
-        got.append((drive.angle_stale, round(angle / STEP_RAD)))
-    assert got == [(True, 0), (True, 0), (False, 3), (False, 4)]
+        angles.append((drive.angle_stale, round(angle / STEP_RAD)))
+    assert angles == [(True, 0), (True, 0), (False, 3), (False, 4)]
 
 
 def test_a_reply_of_another_length_counts_as_an_error_of_the_bus(make_drive, rig):
@@ -155,10 +155,8 @@ def test_a_reply_of_another_length_counts_as_an_error_of_the_bus(make_drive, rig
     assert drive.health().errors == 1
 
 
-def test_a_drive_that_tolerates_it_misses_one_sync_after_a_lost_reply(
-    make_drive, rig, settings, scripted
-):
-    """By it the drive shows which reply is whose."""
+def test_a_tolerant_drive_gets_no_sync_after_a_lost_reply(make_drive, rig, settings, scripted):
+    """The gap shows which SYNC a reply belongs to."""
     slow = replace(
         rig,
         rate_hz=10.0,
@@ -180,7 +178,7 @@ def test_a_drive_that_tolerates_it_misses_one_sync_after_a_lost_reply(
     assert drive.health().doubt == ""
 
 
-def test_a_lost_reply_leaves_no_sync_out(make_drive, rig, scripted):
+def test_no_sync_is_omitted_after_a_lost_reply(make_drive, rig, scripted):
     slow = replace(rig, rate_hz=10.0, acquisition=Acquisition("same_tick", 5e4))
     drive = make_drive(slow)
     drive.connect()
@@ -191,34 +189,34 @@ def test_a_lost_reply_leaves_no_sync_out(make_drive, rig, scripted):
     for _ in range(6):
         ticks()
         stale.append(drive.angle_stale)
-    # Three periods with one reply each, and what is missing is taken for lost.
+    # After three periods with one reply each, the missing one counts as lost.
     assert stale == [True, True, True, True, False, False]
-    assert scripted.comes_to(lambda it: it.syncs == syncs + 6)  # one per tick
-    told = drive.health().doubt
-    assert "unknown while cia402.sync_gaps = false" in told
+    assert scripted.wait_for(lambda it: it.syncs == syncs + 6)  # one per tick
+    doubt = drive.health().doubt
+    assert "unknown while cia402.sync_gaps = false" in doubt
     assert drive.health().doubt_count.endswith("since it was connected: 1.")
     scripted.drop = 1
     ticks(6)
-    assert drive.health().doubt == told
+    assert drive.health().doubt == doubt
     assert drive.health().doubt_count.endswith("since it was connected: 2.")
 
 
-def test_without_gaps_a_late_reply_is_still_not_the_next_ticks(make_drive, rig, scripted):
+def test_a_late_reply_does_not_count_without_sync_gaps(make_drive, rig, scripted):
     slow = replace(rig, rate_hz=10.0, acquisition=Acquisition("same_tick", 5e4))
     drive = make_drive(slow)
     drive.connect()
     ticks = Ticks(drive)
     scripted.hold = 1
-    got = []
+    angles = []
     for step in range(1, 5):
         scripted.position = 1000 + step
         angle = ticks()[0]
-        got.append((drive.angle_stale, round(angle / STEP_RAD)))
-    assert got == [(True, 0), (True, 0), (False, 3), (False, 4)]
+        angles.append((drive.angle_stale, round(angle / STEP_RAD)))
+    assert angles == [(True, 0), (True, 0), (False, 3), (False, 4)]
     assert drive.health().doubt == ""
 
 
-def test_in_lock_step_a_lost_reply_leaves_a_doubt(make_drive, rig, scripted):
+def test_a_lost_reply_leaves_a_doubt_in_lock_step(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e4)))
     drive.connect()
     ticks = Ticks(drive)
@@ -230,7 +228,7 @@ def test_in_lock_step_a_lost_reply_leaves_a_doubt(make_drive, rig, scripted):
     assert "a TPDO did not arrive, or all have been delayed by a period" in drive.health().doubt
 
 
-def test_a_reply_that_comes_between_the_ticks_does_not_count(make_drive, rig, scripted):
+def test_a_reply_between_the_ticks_does_not_count(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e5)))
     drive.connect()
     ticks = Ticks(drive)
@@ -250,13 +248,13 @@ def test_angles_of_the_tick_before(make_drive, rig, scripted):
     scripted.on_sync = lambda it: setattr(it, "position", it.position + 1)
     ticks()
     assert drive.angle_stale  # no tick before it
-    got = []
+    angles = []
     times = []
     for _ in range(4):
-        got.append(round(ticks()[0] / STEP_RAD))
+        angles.append(round(ticks()[0] / STEP_RAD))
         assert not drive.angle_stale
         times.append(drive.angle_time_ns)
-    assert got == [1, 2, 3, 4]
+    assert angles == [1, 2, 3, 4]
     assert times == sorted(set(times))
 
 
@@ -310,7 +308,7 @@ def switched_off(scripted):
     scripted.state = "switch-on disabled"
 
 
-def told_to_disable(scripted):
+def commanded_to_disable(scripted):
     scripted.state = "ready"
 
 
@@ -361,7 +359,7 @@ def falls_silent(scripted):
             ],
         ),
         (
-            told_to_disable,
+            commanded_to_disable,
             ['for "ready to switch on"', "a corrupt frame, a second master", "the bus cable"],
         ),
         (switched_off_with_a_reason, ["under-voltage in the DC link", "rigd reset"]),
@@ -371,7 +369,7 @@ def falls_silent(scripted):
         (falls_silent, ["no heartbeat", "drive_heartbeat_timeout_s = 0.05 s"]),
     ],
 )
-def test_what_ends_a_session(make_drive, rig, scripted, happens, words):
+def test_faults_that_end_a_session(make_drive, rig, scripted, happens, words):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e5)))
     drive.connect()
     ticks = Ticks(drive)
@@ -388,7 +386,7 @@ def test_what_ends_a_session(make_drive, rig, scripted, happens, words):
     assert scripted.torque == 0
 
 
-def test_the_code_of_the_profile_says_that_the_wired_stop_was_dropped(make_drive, rig, scripted):
+def test_the_code_of_the_profile_is_reported_as_the_wired_stop(make_drive, rig, scripted):
     settings = replace(rig.cia402, sto_error_code=0xFF20)
     ticks = Ticks(make_drive(replace(rig, cia402=settings)))
     ticks.drive.connect()
@@ -403,7 +401,7 @@ def test_the_code_of_the_profile_says_that_the_wired_stop_was_dropped(make_drive
         assert words in str(caught.value)
 
 
-def test_silence_is_told_as_soon_as_it_is_too_long(ticks, drive, scripted):
+def test_silence_is_reported_once_it_is_too_long(ticks, drive, scripted):
     scripted.heartbeat_every = 1
     ticks(5)
     scripted.heartbeat_every = 10**9
@@ -412,7 +410,7 @@ def test_silence_is_told_as_soon_as_it_is_too_long(ticks, drive, scripted):
         ticks(2)
 
 
-def test_without_its_supply_a_drive_says_nothing_for_a_command(make_drive, rig, scripted):
+def test_a_lost_supply_is_not_reported_as_a_command(make_drive, rig, scripted):
     ticks = Ticks(make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e5))))
     ticks.drive.connect()
     ticks.drive.enable()
@@ -426,13 +424,13 @@ def test_an_emergency_message_before_enabling_ends_the_session_too(ticks, script
     scripted.emergency(0x8130)
     with pytest.raises(DeviceError, match="heartbeat of this computer lost") as caught:
         ticks(2)
-    # It is not in fault then, and the operator's reset would find nothing to do.
+    # The drive is not in fault then, and a reset would have no effect.
     assert "if drive or daemon are in fault then: rigd reset --profile scripted" in str(
         caught.value
     )
 
 
-def test_the_first_of_several_alarms_is_told(ticks, scripted):
+def test_the_first_of_several_alarms_is_reported(ticks, scripted):
     scripted.emergency(0x8130)
     scripted.emergency(0x2310)
     scripted.heartbeat(0x7F)
@@ -440,7 +438,7 @@ def test_the_first_of_several_alarms_is_told(ticks, scripted):
         ticks(2)
 
 
-def test_the_toggle_bit_of_a_heartbeat_is_no_state(ticks, scripted):
+def test_the_toggle_bit_of_a_heartbeat_is_ignored(ticks, scripted):
     scripted.heartbeat(0x85)
     ticks(3)
     scripted.heartbeat(0x50)
@@ -448,7 +446,7 @@ def test_the_toggle_bit_of_a_heartbeat_is_no_state(ticks, scripted):
         ticks(3)
 
 
-def test_the_end_of_an_emergency_is_none(ticks, scripted):
+def test_the_end_of_an_emergency_is_no_fault(ticks, scripted):
     scripted.emergency(0x0000)
     ticks(3)
 
@@ -461,38 +459,36 @@ def test_broken_emergencies_and_heartbeats_are_passed_over(ticks, scripted):
     ticks(3)
 
 
-def test_a_bus_that_is_cut_is_told(ticks, scripted):
+def test_a_cut_bus_is_reported(ticks, scripted):
     ticks(2)
     scripted.cut()
     with pytest.raises(DeviceError, match="CAN bus can0"):
         ticks(5)
 
 
-def test_a_controller_off_the_bus_is_told(ticks, scripted):
+def test_a_controller_off_the_bus_is_reported(ticks, scripted):
     scripted._link.sendall(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))
     with pytest.raises(DeviceError, match="bus-off"):
         ticks(3)
 
 
-def test_what_is_not_connected_says_so(make_drive, rig):
+def test_error_of_an_unconnected_drive(make_drive, rig):
     drive = make_drive(rig)
     for call in (lambda: drive.latch(0), drive.read_angle, drive.enable, lambda: drive.command(0)):
         with pytest.raises(DeviceError, match="not connected"):
             call()
 
 
-def test_a_drive_that_leaves_operation_and_is_back_in_the_next_tpdo_is_noticed(
-    ticks, drive, scripted
-):
+def test_a_brief_exit_from_operation_is_detected(ticks, drive, scripted):
     drive.enable()
     ticks(3, torque_nm=0.1)
-    # Two TPDOs in one tick: the first says "switched on", the second that all is well again.
+    # Two TPDOs in one tick: "switched on" in the first, no fault in the second.
     scripted.send(0x185, struct.pack("<Hih", 0x0233, scripted.position, 0))
     with pytest.raises(DeviceError, match=r'left "operation enabled" for "switched on"'):
         ticks(3, torque_nm=0.1)
 
 
-def test_a_fault_from_before_does_not_outlive_connecting(ticks, drive, scripted):
+def test_connecting_clears_an_earlier_fault(ticks, drive, scripted):
     scripted.state = "fault"
     with pytest.raises(DeviceError, match="fault"):
         ticks(2)

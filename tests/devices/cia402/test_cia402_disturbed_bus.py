@@ -1,6 +1,6 @@
-"""A drive on a bus that is disturbed, or behind an adapter whose lines come damaged.
+"""A drive on a disturbed bus, or behind an adapter with damaged lines.
 
-The torque is off all the same.
+The torque is off in the end.
 """
 
 import os
@@ -119,12 +119,12 @@ def ticks(drive, count):
         drive.command(0.2)
 
 
-def test_lines_that_no_parser_reads(behind_adapter, adapter, scripted):
+def test_unreadable_lines(behind_adapter, adapter, scripted):
     drive = behind_adapter
     drive.connect()
     drive.enable()
     ticks(drive, 5)
-    assert scripted.comes_to(lambda it: it.torque > 0)
+    assert scripted.wait_for(lambda it: it.torque > 0)
     before = drive.health().errors
     adapter.garbage = b"tZZZ812\r"  # one of them is an error on the line, and the loop goes on
     ticks(drive, 5)
@@ -142,14 +142,14 @@ def test_lines_that_no_parser_reads(behind_adapter, adapter, scripted):
     assert drive.off_doubt == ""
 
 
-def test_lines_that_go_on_coming_keep_nothing_from_switching_off(behind_adapter, adapter, scripted):
+def test_endless_lines_do_not_prevent_switching_off(behind_adapter, adapter, scripted):
     drive = behind_adapter
     drive.connect()
     drive.enable()
     ticks(drive, 5)
 
     class AlwaysDamaged:
-        """What python-can would do with an adapter that never again sends a line it can read."""
+        """Behaves like python-can with an adapter that sends only unreadable lines."""
 
         def __init__(self, bus):
             self._bus = bus
@@ -166,15 +166,13 @@ def test_lines_that_go_on_coming_keep_nothing_from_switching_off(behind_adapter,
     with pytest.raises(DeviceError, match=r"no CAN frame, 20 times in a row \(ValueError: non-hex"):
         ticks(drive, 100)
     drive.disable()
-    assert scripted.comes_to(lambda it: it.torque == 0)
+    assert scripted.wait_for(lambda it: it.torque == 0)
     assert scripted.state == "switch-on disabled"
     assert "does not show that it is off" in drive.off_doubt
 
 
 @pytest.mark.parametrize("report", [(0x020, bytes(8)), (0x004, b"\0\x10" + bytes(6))])
-def test_an_error_passive_controller_still_sends_the_sync_at_which_torque_zero_acts(
-    drive, scripted, report
-):
+def test_an_error_passive_controller_sends_the_sync_of_zero_torque(drive, scripted, report):
     drive.connect()
     drive.enable()
     ticks(drive, 3)

@@ -1,4 +1,4 @@
-"""Enabling and disabling with a scripted drive, in every order and with every obstacle."""
+"""Enabling and disabling with a scripted drive, in every order and with every fault."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def test_heartbeats_go_on_while_enabling(drive, scripted):
     assert len(scripted.frames(0x764)) == 3
 
 
-def test_enabling_without_a_tick_before_sends_the_first_heartbeat(drive, scripted):
+def test_enabling_before_a_tick_sends_the_first_heartbeat(drive, scripted):
     drive.connect()
     assert not scripted.frames(0x764)
     drive.enable()
@@ -91,19 +91,19 @@ def test_enabling_twice_sends_nothing(drive, scripted):
         ("switched on", "operation enabled"),
     ],
 )
-def test_the_state_it_is_stuck_in_is_named(drive, scripted, stays, wanted):
+def test_the_state_of_a_stuck_drive_is_named(drive, scripted, stays, wanted):
     drive.connect()
     scripted.stays_in = stays
     with pytest.raises(DeviceError, match=f'does not get to "{wanted}"') as caught:
         drive.enable()
-    told = {"ready": "ready to switch on"}.get(stays, stays)
-    assert f'stays in "{told}"' in str(caught.value)
+    phrase = {"ready": "ready to switch on"}.get(stays, stays)
+    assert f'stays in "{phrase}"' in str(caught.value)
     assert "enable_timeout_s = 0.05 s" in str(caught.value)
     assert scripted.state == "switch-on disabled"
     assert rpdos(scripted)[-1] == "00000000"
 
 
-def test_a_drive_that_ignores_the_torque_is_not_left_enabled(drive, scripted):
+def test_a_drive_ignoring_torque_is_disabled(drive, scripted):
     drive.connect()
     scripted.follows = False
     with pytest.raises(DeviceError, match="bit 12"):
@@ -111,14 +111,14 @@ def test_a_drive_that_ignores_the_torque_is_not_left_enabled(drive, scripted):
     assert scripted.state == "switch-on disabled"
 
 
-def test_a_mode_that_is_shown_only_when_enabled_is_fine(drive, scripted):
+def test_a_mode_shown_only_when_enabled_is_accepted(drive, scripted):
     scripted.mode_follows = "enabled"
     drive.connect()
     drive.enable()
     assert scripted.state == "enabled"
 
 
-def test_a_mode_that_never_comes_is_refused(drive, scripted):
+def test_a_mode_never_shown_is_refused(drive, scripted):
     scripted.mode_follows = False
     drive.connect()
     with pytest.raises(DeviceError, match=r"object 6061\) is 0, not 10"):
@@ -126,7 +126,7 @@ def test_a_mode_that_never_comes_is_refused(drive, scripted):
     assert scripted.state == "switch-on disabled"
 
 
-def test_a_fault_while_enabling_is_told(drive, scripted):
+def test_a_fault_while_enabling_is_reported(drive, scripted):
     drive.connect()
 
     def fail(it):
@@ -139,13 +139,13 @@ def test_a_fault_while_enabling_is_told(drive, scripted):
         drive.enable()
 
 
-def test_a_stop_is_heard_while_the_drive_takes_its_time(make_drive, rig, settings, scripted):
+def test_a_stop_is_obeyed_while_a_slow_drive_enables(make_drive, rig, settings, scripted):
     drive = make_drive(replace(rig, cia402=replace(settings, enable_timeout_s=10.0)))
     drive.connect()
     scripted.stays_in = "switched on"
-    asked = []
-    drive.enable(lambda: asked.append(1) or len(asked) > 20)
-    assert len(asked) == 21
+    polls = []
+    drive.enable(lambda: polls.append(1) or len(polls) > 20)
+    assert len(polls) == 21
     assert scripted.state == "switch-on disabled"
     scripted.stays_in = None
     drive.command(0.3)
@@ -155,7 +155,7 @@ def test_a_stop_is_heard_while_the_drive_takes_its_time(make_drive, rig, setting
     assert scripted.state == "enabled"
 
 
-def test_a_drive_that_falls_silent_while_enabling(make_drive, rig, scripted):
+def test_silence_of_the_drive_while_enabling(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
     drive.connect()
     scripted.drop = 10**9
@@ -163,7 +163,7 @@ def test_a_drive_that_falls_silent_while_enabling(make_drive, rig, scripted):
         drive.enable()
 
 
-def test_disabling_takes_the_torque_away_and_every_later_command_too(drive, scripted):
+def test_disabling_ends_torque_and_later_commands(drive, scripted):
     drive.connect()
     drive.enable()
     tick(drive)
@@ -200,7 +200,7 @@ def test_enabling_after_disabling(drive, scripted):
         assert scripted.state == "switch-on disabled"
 
 
-def test_a_drive_that_takes_no_pdo_any_more_is_switched_off_by_sdo(make_drive, rig, scripted):
+def test_a_drive_that_ignores_pdos_is_switched_off_by_sdo(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
     drive.connect()
     drive.enable()
@@ -216,7 +216,7 @@ def test_a_drive_that_takes_no_pdo_any_more_is_switched_off_by_sdo(make_drive, r
     assert drive.off_doubt == ""
 
 
-def test_an_old_statusword_does_not_show_that_the_drive_is_off(make_drive, rig, scripted):
+def test_an_old_statusword_does_not_count_as_off(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
     drive.connect()
     scripted.seen.clear()
@@ -237,7 +237,7 @@ def test_the_last_resort_is_to_stop_the_node(make_drive, rig, scripted):
     drive.enable()
     scripted.obeys = scripted.sdo_works = False
     drive.disable()
-    assert scripted.has_got(0x000, b"\x02\x05")
+    assert scripted.wait_for_frame(0x000, b"\x02\x05")
     drive.close()
     assert scripted.state == "switch-on disabled"
 
@@ -256,7 +256,7 @@ def test_disabling_never_raises(make_drive, rig, scripted):
 
 
 class TestAnAdapterThatRaisesAnything:
-    """Nothing that its library does keeps the way off from switching the torque off."""
+    """No error of its library prevents switching the torque off."""
 
     @pytest.fixture
     def drive(self, make_drive, rig, scripted):
@@ -282,7 +282,7 @@ class TestAnAdapterThatRaisesAnything:
         assert drive.off_doubt == ""
         assert scripted.frames(0x605) == []  # by PDO, at once
 
-    def test_an_error_that_stands_keeps_no_sync_from_being_sent(self, drive, scripted):
+    def test_a_lasting_error_does_not_prevent_sync(self, drive, scripted):
         drive._node.exchange._bus_error = "CAN bus can0: the controller is error-passive."
         drive.disable()
         assert scripted.state == "switch-on disabled"
@@ -292,7 +292,7 @@ class TestAnAdapterThatRaisesAnything:
         assert 0x605 not in order
 
     @pytest.mark.parametrize("error", [ValueError, RuntimeError, MemoryError, KeyError])
-    def test_nothing_works_any_more(self, drive, error):
+    def test_every_call_fails(self, drive, error):
         def fail(*_):
             raise error("anything")
 
@@ -304,17 +304,17 @@ class TestAnAdapterThatRaisesAnything:
         drive.close()
 
 
-def test_a_frozen_drive_does_not_hold_disabling_up_for_ever(make_drive, rig, scripted):
+def test_disabling_a_frozen_drive_ends(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e4)))
     drive.connect()
     drive.enable()
     scripted.silent = True
     drive.disable()
-    assert scripted.has_got(0x000, b"\x02\x05")
+    assert scripted.wait_for_frame(0x000, b"\x02\x05")
     assert 1 < rpdos(scripted).count("00000000") < 200
 
 
-def test_closing_leaves_a_quiet_drive_that_expects_nothing(drive, scripted):
+def test_closing_leaves_a_silent_unwatched_drive(drive, scripted):
     drive.connect()
     drive.enable()
     assert scripted.objects[0x1016, 1] == 100 << 16 | 50
@@ -324,7 +324,7 @@ def test_closing_leaves_a_quiet_drive_that_expects_nothing(drive, scripted):
     assert scripted.objects[0x1016, 1] == 0
 
 
-def test_the_bus_is_given_up_once(drive, scripted, monkeypatch):
+def test_the_bus_is_released_once(drive, scripted, monkeypatch):
     drive.connect()
     link = drive._link
     calls = []
@@ -335,7 +335,7 @@ def test_the_bus_is_given_up_once(drive, scripted, monkeypatch):
     assert calls == [1]
 
 
-def test_after_enabling_the_ticks_go_on(drive, scripted):
+def test_ticks_continue_after_enabling(drive, scripted):
     drive.connect()
     tick(drive, 10)
     drive.enable()
@@ -370,19 +370,19 @@ class TestByTheClock:
         drive.command(0.1)
         drive.latch(60_000_000)
         drive.read_angle()
-        assert scripted.comes_to(lambda it: it.torque == 200)  # its reply may come too late
+        assert scripted.wait_for(lambda it: it.torque == 200)  # its reply may come too late
         drive.disable()
-        assert scripted.comes_to(lambda it: it.state == "switch-on disabled")
+        assert scripted.wait_for(lambda it: it.state == "switch-on disabled")
         drive.close()
 
-    def test_stuck(self, drive, scripted):
+    def test_a_stuck_drive(self, drive, scripted):
         drive.connect()
         scripted.stays_in = "ready"
         with pytest.raises(DeviceError, match='stays in "ready to switch on"'):
             drive.enable()
-        assert scripted.comes_to(lambda it: it.state == "switch-on disabled")
+        assert scripted.wait_for(lambda it: it.state == "switch-on disabled")
 
-    def test_a_reply_that_takes_longer_than_a_period_is_refused(self, drive, scripted):
+    def test_a_reply_slower_than_a_period_is_refused(self, drive, scripted):
         scripted.reply_delay_s = 0.02
         with pytest.raises(DeviceError, match="answers SYNC only after"):
             drive.connect()
@@ -393,9 +393,7 @@ class TestByTheClock:
             drive.connect()
 
 
-def test_a_drive_that_takes_the_command_and_stays_on_is_told_and_left_to_its_own_watch(
-    make_drive, rig, scripted
-):
+def test_a_drive_that_stays_on_is_reported_and_left_to_its_watchdog(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
     drive.connect()
     drive.enable()
@@ -403,13 +401,13 @@ def test_a_drive_that_takes_the_command_and_stays_on_is_told_and_left_to_its_own
     scripted.seen.clear()
     drive.disable()
     assert "does not show that it is off (statusword 0x1" in drive.off_doubt
-    assert scripted.has_got(0x000, bytes([2, 5]))  # NMT stop
+    assert scripted.wait_for_frame(0x000, bytes([2, 5]))  # NMT stop
     drive.close()
     written = [(index, sub) for index, sub, _ in scripted.writes]
     assert (0x1016, 1) not in written[written.index((0x6060, 0)) :]
 
 
-def test_a_drive_that_went_off_leaves_no_doubt(make_drive, rig, scripted):
+def test_no_doubt_about_a_drive_that_is_off(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
     drive.connect()
     drive.enable()
@@ -417,7 +415,7 @@ def test_a_drive_that_went_off_leaves_no_doubt(make_drive, rig, scripted):
     assert drive.off_doubt == ""
 
 
-def test_what_a_drive_adds_or_limits_by_itself_is_set_right(make_drive, rig, scripted):
+def test_offsets_and_limits_of_the_drive_are_corrected(make_drive, rig, scripted):
     scripted.objects |= {(0x60B2, 0): 40, (0x60E0, 0): 150, (0x60E1, 0): 1800}
     make_drive(rig).connect()
     changed = {index: value for index, _, value in scripted.writes}

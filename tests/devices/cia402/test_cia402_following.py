@@ -1,4 +1,4 @@
-"""A drive that does not exert what it is told is noticed, by what it says it exerts."""
+"""Detection of a drive that does not follow its torque command, by its actual torque."""
 
 from functools import cache
 from math import exp
@@ -25,27 +25,27 @@ def run(following, commands, actuals):
 
 
 @pytest.mark.parametrize("lag", [1, 2])
-def test_a_drive_that_follows_by_one_or_two_ticks_is_left_alone(following, lag):
+def test_a_lag_of_one_or_two_ticks_is_accepted(following, lag):
     commands = [300 * (-1) ** (k // 3) for k in range(60)]
     run(following, commands, [0] * lag + commands[:-lag])
 
 
-def test_lost_commands_are_noticed_after_ten_ticks(following):
+def test_lost_commands_are_detected_after_ten_ticks(following):
     commands = [500 + 10 * k for k in range(9)]
     run(following, [*commands, 0], [0] * 10)
     with pytest.raises(DeviceError, match=r"exerts 0 % .* 60 % were commanded, for 10 ticks"):
         run(following, [500 + 10 * k for k in range(12)], [0] * 12)
 
 
-def test_within_the_tolerance_nothing_is_said(following):
+def test_no_report_within_the_tolerance(following):
     run(following, [200] * 50, [299] * 50)
 
 
-def test_zero_compares_nothing():
+def test_no_comparison_at_zero():
     run(TorqueFollowingCheck("Drive", 0.0), [900] * 50, [0] * 50)
 
 
-def test_enabling_begins_anew(following):
+def test_enabling_resets_the_comparison(following):
     run(following, [500] * 9, [0] * 9)
     following.start()
     run(following, [0] * 9, [0] * 9)
@@ -53,7 +53,7 @@ def test_enabling_begins_anew(following):
 
 @cache
 def chirp_commands():
-    """The shipped chirp's torques in per mille, with the sensor's noise on them."""
+    """Torques of the shipped chirp in per mille, with the noise of the sensor."""
     profile = load_profile("antenna_can")
     loop = close_loop(profile.loop_model())
     reference_rad = chirp(rate_hz=profile.rig.rate_hz, ring_down_s=1.0).reference_rad
@@ -74,9 +74,9 @@ class TestADriveThatMeasuresItsTorque:
         return chirp_commands()
 
     def drive(self, commands, response_s, lost_from=None):
-        """Return after how many ticks it is found, or None."""
+        """Return the number of ticks until detection, or None."""
         following = TorqueFollowingCheck("Drive", 10.0, response_s, 1e-3)
-        share = 1 - exp(-1e-3 / self.LAG_S)
+        fraction = 1 - exp(-1e-3 / self.LAG_S)
         held = pending = 0
         actual = 0.0
         for tick, command in enumerate(commands):
@@ -85,21 +85,21 @@ class TestADriveThatMeasuresItsTorque:
             except DeviceError:
                 return tick
             held = pending  # at SYNC
-            actual += share * (held - actual)
+            actual += fraction * (held - actual)
             following.command(command)
             if lost_from is None or tick < lost_from:
                 pending = command
         return None
 
-    def test_without_the_lag_the_chirp_is_ended(self, commands):
+    def test_the_chirp_ends_if_no_lag_is_stated(self, commands):
         assert self.drive(commands, 0.0) is not None
 
     @pytest.mark.parametrize("stated_s", [3.2e-3, 2.6e-3, 4e-3])
-    def test_with_the_lag_stated_about_right_it_runs_through(self, commands, stated_s):
+    def test_the_chirp_completes_with_the_stated_lag(self, commands, stated_s):
         assert self.drive(commands, stated_s) is None
 
     @pytest.mark.parametrize("lost_from", [20_000, 40_000, 80_000, 115_000])
-    def test_lost_commands_are_found_all_the_same(self, commands, lost_from):
+    def test_lost_commands_are_found_with_a_stated_lag(self, commands, lost_from):
         found = self.drive(commands, self.LAG_S, lost_from)
         assert found is not None
         assert found - lost_from < 300

@@ -1,4 +1,4 @@
-"""The fuzzing of ``fuzz_cia402.py``, a short one."""
+"""A short run of ``fuzz_cia402.py``."""
 
 import importlib.util
 import struct
@@ -33,7 +33,7 @@ def test_only_device_errors_leave_the_driver(rig, settings, mode):
     assert 100 < ends < 12_000
 
 
-def test_the_fuzzer_finds_a_handler_that_raises(rig, monkeypatch):
+def test_the_fuzzer_finds_a_failing_handler(rig, monkeypatch):
     subscribe = CanExchange.subscribe
 
     def subscribe_fragile(exchange, can_id, handler):

@@ -26,44 +26,44 @@ def writes_to(scripted, *indices):
     return [(i, s, v) for i, s, v in scripted.writes if i in indices]
 
 
-def test_what_the_drive_is_told(drive, scripted):
+def test_values_written_to_the_drive(drive, scripted):
     scripted.objects |= {(0x60C2, 2): 0, (0x1029, 1): 1}
     drive.connect()
-    told = {(index, sub): value for index, sub, value in scripted.writes}
-    assert told[0x1006, 0] == 1000
-    assert (told[0x60C2, 1], told[0x60C2, 2]) == (1, -3)
-    assert told[0x1016, 1] == 0x00640032
-    assert told[0x1017, 0] == 20
-    assert told[0x6007, 0] == 2
-    assert told[0x1029, 1] == 0
-    assert told[0x6072, 0] == 1800
-    assert told[0x6060, 0] == 10
-    assert (0x1005, 0) not in told
+    written = {(index, sub): value for index, sub, value in scripted.writes}
+    assert written[0x1006, 0] == 1000
+    assert (written[0x60C2, 1], written[0x60C2, 2]) == (1, -3)
+    assert written[0x1016, 1] == 0x00640032
+    assert written[0x1017, 0] == 20
+    assert written[0x6007, 0] == 2
+    assert written[0x1029, 1] == 0
+    assert written[0x6072, 0] == 1800
+    assert written[0x6060, 0] == 10
+    assert (0x1005, 0) not in written
 
 
 def limited(rig, speed_rad_s):
     return replace(rig, cia402=replace(rig.cia402, max_speed_rad_s=speed_rad_s))
 
 
-def test_the_drive_is_told_its_own_speed_limit(make_drive, rig, scripted):
+def test_the_speed_limit_is_written_in_units_of_the_drive(make_drive, rig, scripted):
     scripted.objects[0x6080, 0] = 20_000
     make_drive(limited(rig, 5.0)).connect()
     # 5 rad/s behind a gear of 100 are 4774.6 turns a minute.
     assert writes_to(scripted, 0x6080) == [(0x6080, 0, 4775)]
 
 
-def test_a_speed_limit_of_0_leaves_what_the_drive_has(make_drive, rig, scripted):
+def test_a_speed_limit_of_0_writes_none(make_drive, rig, scripted):
     scripted.objects[0x6080, 0] = 20_000
     make_drive(limited(rig, 0.0)).connect()
     assert writes_to(scripted, 0x6080) == []
 
 
-def test_a_drive_without_a_speed_limit_is_refused_where_one_is_asked_for(make_drive, rig):
+def test_a_drive_without_a_required_speed_limit_is_refused(make_drive, rig):
     with pytest.raises(DeviceError, match=r"object 6080.*cia402\.max_speed_rad_s = 0"):
         make_drive(limited(rig, 5.0)).connect()
 
 
-def test_the_order_in_which_a_pdo_is_mapped(drive, scripted):
+def test_order_of_mapping_a_pdo(drive, scripted):
     drive.connect()
     assert writes_to(scripted, 0x1800, 0x1A00) == [
         (0x1800, 1, 0xC0000185),
@@ -86,14 +86,14 @@ def test_the_order_in_which_a_pdo_is_mapped(drive, scripted):
     ]
 
 
-def test_other_pdos_are_disabled_where_they_exist(drive, scripted):
+def test_other_existing_pdos_are_disabled(drive, scripted):
     drive.connect()
     assert scripted.objects[0x1801, 1] == 0xC0000285
     assert scripted.objects[0x1401, 1] == 0x80000305
     assert not writes_to(scripted, 0x1802, 0x1803, 0x1402, 0x1403)
 
 
-def test_pdos_that_are_disabled_are_left_alone(drive, scripted):
+def test_disabled_pdos_are_not_written(drive, scripted):
     scripted.objects[0x1801, 1] |= 0x80000000
     drive.connect()
     assert not writes_to(scripted, 0x1801)
@@ -102,18 +102,18 @@ def test_pdos_that_are_disabled_are_left_alone(drive, scripted):
 def test_everything_written_is_read_back(drive, scripted):
     drive.connect()
     requests = scripted.frames(0x605)
-    for place, request in enumerate(requests):
+    for position, request in enumerate(requests):
         if request[0] & 0xE0 == 0x20 and request[1:3] != b"\x40\x60":
-            following = requests[place + 1]
+            following = requests[position + 1]
             assert following[0] == 0x40
             assert following[1:4] == request[1:4]
 
 
-def test_nothing_is_configured_but_in_pre_operational(drive, scripted):
+def test_configuration_in_pre_operational_only(drive, scripted):
     drive.connect()
     before_start = scripted.seen[: scripted.seen.index((0x000, b"\x01\x05"))]
     off = (0x605, bytes.fromhex("2B40600000000000"))
-    # Off before all else, and in pre-operational again, for not every drive takes it before.
+    # Off first, and again in pre-operational, because not every drive accepts it before.
     assert before_start[:2] == [off, (0x000, b"\x80\x05")]
     assert off in before_start[2:]
     assert {can_id for can_id, _ in before_start} == {0x000, 0x605}
@@ -121,19 +121,19 @@ def test_nothing_is_configured_but_in_pre_operational(drive, scripted):
     assert {can_id for can_id, _ in after} == {0x080}
 
 
-def test_a_drive_that_makes_the_sync_itself_is_told_not_to(drive, scripted):
+def test_sync_production_of_the_drive_is_switched_off(drive, scripted):
     scripted.objects[0x1005, 0] = 0x40000080
     drive.connect()
     assert writes_to(scripted, 0x1005) == [(0x1005, 0, 0x80)]
 
 
-def test_a_bit_that_a_drive_may_set_by_itself_is_no_difference(drive, scripted):
+def test_bits_set_by_the_drive_itself_are_no_difference(drive, scripted):
     """Bit 30 of a TPDO's identifier: no remote requests."""
     write = dict.__setitem__
 
     class Sets(dict):
-        def __setitem__(self, place, value):
-            write(self, place, value | 0x40000000 if place == (0x1800, 1) else value)
+        def __setitem__(self, address, value):
+            write(self, address, value | 0x40000000 if address == (0x1800, 1) else value)
 
     scripted.objects = Sets(scripted.objects)
     drive.connect()
@@ -144,7 +144,7 @@ def test_no_thread_outlives_the_set_up(drive, scripted):
     assert {thread for thread in threading.enumerate() if "Notifier" in thread.name} == set()
 
 
-def test_who_the_drive_is(drive):
+def test_identity_of_the_drive(drive):
     drive.connect()
     assert drive.identity() == {
         "vendor_id": 0x1234,
@@ -172,7 +172,7 @@ def test_a_drive_without_name_and_serial_number(drive, scripted):
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "words"),
+    ("address", "value", "words"),
     [
         ((0x1018, 1), 0x99, ["vendor_id is 0x00001234", "0x00000099"]),
         ((0x1018, 2), 0x1, ["product_code is 0x0000ABCD", "0x00000001"]),
@@ -180,13 +180,13 @@ def test_a_drive_without_name_and_serial_number(drive, scripted):
         ((0x6076, 0), 6, ["6076 = 6", "0.6 N·m", "0.5 N·m"]),
     ],
 )
-def test_a_drive_that_is_not_the_profiles(drive, scripted, place, value, words):
-    scripted.objects[place] = value
+def test_a_drive_other_than_the_profile_s(drive, scripted, address, value, words):
+    scripted.objects[address] = value
     with pytest.raises(DeviceError) as caught:
         drive.connect()
     for word in words:
         assert word in str(caught.value)
-    assert not [place for place in scripted.writes if place[0] != 0x6040]
+    assert not [address for address in scripted.writes if address[0] != 0x6040]
 
 
 STEPS = round(tau / 7e-5)
@@ -202,7 +202,7 @@ STEPS = round(tau / 7e-5)
         ({0x6092: (4 * STEPS, 1)}, ["object 6092", "the ratio 0.25"]),
     ],
 )
-def test_scales_that_contradict_the_profile_are_refused(drive, scripted, stated, words):
+def test_scales_unlike_the_profile_are_refused(drive, scripted, stated, words):
     for index, ratio in stated.items():
         scripted.objects |= {(index, 1): ratio[0], (index, 2): ratio[1]}
     with pytest.raises(DeviceError, match="node 5") as caught:
@@ -215,14 +215,14 @@ def test_scales_that_contradict_the_profile_are_refused(drive, scripted, stated,
     ("stated", "gear", "step"),
     [
         ({0x608F: (STEPS, 100), 0x6091: (100, 1)}, 100.0, 7e-5),
-        # As a drive has them that was never set up for its gear.
+        # As in a drive that was never set up for its gear.
         ({0x608F: (STEPS, 100), 0x6091: (1, 1), 0x6092: (1, 1)}, None, 7e-5),
         # A feed constant in the units that the position has.
         ({0x608F: (10, 1), 0x6091: (100, 1), 0x6092: (STEPS, 1)}, 100.0, 7e-5),
         ({0x608F: (0, 0), 0x6091: (100, 0)}, None, None),
     ],
 )
-def test_scales_that_the_drive_states(drive, scripted, stated, gear, step):
+def test_scales_stated_by_the_drive(drive, scripted, stated, gear, step):
     for index, ratio in stated.items():
         scripted.objects |= {(index, 1): ratio[0], (index, 2): ratio[1]}
     drive.connect()
@@ -241,28 +241,28 @@ def test_zero_in_the_profile_accepts_any_drive(make_drive, rig, settings, script
     assert drive.identity()["rated_torque_counts"] is None
 
 
-PLACES = [
+ADDRESSES = [
     (0x1006, 0), (0x1A00, 0), (0x60C2, 1), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x1029, 1),
     (0x6072, 0), (0x6060, 0), (0x1400, 1), (0x1800, 2), (0x1801, 1),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("place", "how"),
+    ("address", "how"),
     [
-        *((place, "keeps") for place in PLACES),
-        *((place, "refuses") for place in PLACES[:2]),
-        *(further(place, "refuses") for place in PLACES[2:]),
+        *((address, "keeps") for address in ADDRESSES),
+        *((address, "refuses") for address in ADDRESSES[:2]),
+        *(further(address, "refuses") for address in ADDRESSES[2:]),
     ],
 )
-def test_an_object_that_does_not_take_its_value(drive, scripted, place, how):
+def test_an_object_that_ignores_its_value(drive, scripted, address, how):
     scripted.objects |= {(0x1029, 1): 2, (0x60C2, 2): 0, (0x1006, 0): 4000}
-    index, sub = place
+    index, sub = address
     if how == "refuses":
-        scripted.refuse[place] = 0x08000022
+        scripted.refuse[address] = 0x08000022
         words = ["refuses", "present device state"]
     else:
-        scripted.keep.add(place)
+        scripted.fixed.add(address)
         words = ["was set to", "and reads"]
     with pytest.raises(DeviceError, match="node 5") as caught:
         drive.connect()
@@ -270,8 +270,8 @@ def test_an_object_that_does_not_take_its_value(drive, scripted, place, how):
         assert word in str(caught.value)
 
 
-def test_what_was_wanted_and_what_came(drive, scripted):
-    scripted.keep.add((0x6072, 0))
+def test_wanted_and_actual_value_in_the_message(drive, scripted):
+    scripted.fixed.add((0x6072, 0))
     with pytest.raises(DeviceError, match=r"6072 \(Max torque\) was set to 1800 and reads 1000"):
         drive.connect()
 
@@ -283,7 +283,7 @@ def test_a_drive_left_enabled_is_switched_off_first(drive, scripted):
     assert scripted.writes[0] == (0x6040, 0, 0)
 
 
-def test_a_drive_that_does_not_switch_off(drive, scripted):
+def test_failure_to_switch_off(drive, scripted):
     scripted.state, scripted.obeys = "enabled", False
     with pytest.raises(DeviceError, match='"switch-on disabled", it is in "operation enabled"'):
         drive.connect()
@@ -301,12 +301,12 @@ def test_a_drive_in_fault_is_left_to_the_operator(drive, scripted):
 def test_a_fault_without_a_code_is_named_by_its_emergency_message(drive, scripted):
     scripted.state = "fault"
 
-    def tell(can_id, data, take=scripted._take):
+    def alarm_on_read(can_id, data, take=scripted._take):
         if can_id == 0x605 and data[1:3] == b"\x18\x10":
             scripted.emergency(0x7300)
         take(can_id, data)
 
-    scripted._take = tell
+    scripted._take = alarm_on_read
     with pytest.raises(DeviceError, match="encoder"):
         drive.connect()
 
@@ -336,7 +336,7 @@ def test_resetting_after_a_session_that_ended_in_a_fault(drive, scripted):
     assert scripted.state == "enabled"
 
 
-def test_without_a_fault_there_is_nothing_to_reset(drive, scripted):
+def test_no_reset_without_a_fault(drive, scripted):
     assert drive.reset_fault() is None
     assert scripted.writes == [(0x6040, 0, 0), (0x1016, 1, 0), (0x6040, 0, 6), (0x6040, 0, 0)]
     assert scripted.state == "switch-on disabled"
@@ -352,33 +352,33 @@ class TestResettingADriveThatTurns:
         scripted.ignores_nmt = True
         return scripted
 
-    def test_it_is_off_before_anything_else(self, drive, turning):
+    def test_it_is_switched_off_first(self, drive, turning):
         assert drive.reset_fault() is None
         assert turning.seen[0] == (0x605, bytes.fromhex("2B40600000000000"))
         assert (turning.state, turning.torque, turning.nmt) == ("switch-on disabled", 0, 5)
 
-    def test_its_watch_is_taken_away_only_after_it_was_seen_off(self, drive, turning):
+    def test_its_watchdog_is_removed_only_once_it_is_off(self, drive, turning):
         turning.off_delay_s = 0.08
         drive.reset_fault()
         frames = [data for can_id, data in turning.seen if can_id == 0x605]
         watch = frames.index(struct.pack("<BHBI", 0x23, 0x1016, 1, 0))
-        seen_off = turning.told_off_after
+        seen_off = turning.off_read_after
         assert 0 < seen_off <= watch
 
-    def test_a_drive_that_stays_on_is_said_to_turn_and_keeps_its_watch(self, drive, turning):
+    def test_a_drive_that_stays_on_is_reported_and_retains_its_watchdog(self, drive, turning):
         turning.obeys = False
         began = time.monotonic()
         with pytest.raises(DeviceError) as caught:
             drive.reset_fault()
         assert time.monotonic() - began < 5
-        told = str(caught.value)
+        message = str(caught.value)
         for words in ("within 0.2 s", '"operation enabled"', "0x1237", "may still turn", "STO"):
-            assert words in told
+            assert words in message
         assert turning.objects[0x1016, 1] == 100 << 16 | 50
         assert (0x1016, 1, 0) not in turning.writes
 
-    def test_a_node_that_was_stopped_answers_again(self, drive, turning):
-        """It answers no SDO before it is told to leave that state."""
+    def test_a_stopped_node_answers_again(self, drive, turning):
+        """It answers no SDO before a command to leave that state."""
         turning.ignores_nmt, turning.nmt = False, 4
         answers, sdo = turning._sdo, []
         turning._sdo = lambda data: sdo.append(data) if turning.nmt == 4 else answers(data)
@@ -386,12 +386,12 @@ class TestResettingADriveThatTurns:
         assert sdo
         assert turning.state == "switch-on disabled"
 
-    def test_nobody_answers(self, impatient, drive, turning):
+    def test_no_answer(self, impatient, drive, turning):
         turning.silent = True
         with pytest.raises(DeviceError, match=r"no answer on CAN bus can0 .* not shown that .*STO"):
             drive.reset_fault()
 
-    def test_whatever_an_adapter_raises_at_first_it_is_told_again(
+    def test_commands_are_repeated_after_any_error_of_the_adapter(
         self, drive, turning, failing_bus
     ):
         """A full queue, or a library with its own errors."""
@@ -402,7 +402,7 @@ class TestResettingADriveThatTurns:
         assert drive.reset_fault() is None
         assert (turning.state, turning.torque) == ("switch-on disabled", 0)
 
-    def test_an_adapter_that_goes_on_failing_is_told_with_what_was_not_seen(
+    def test_lasting_failure_of_the_adapter_is_reported(
         self, impatient, drive, turning, failing_bus
     ):
         failing_bus({can_id: [RuntimeError("a library's own")] * 1000 for can_id in (0x605, 0x000)})
@@ -412,7 +412,7 @@ class TestResettingADriveThatTurns:
 
 @pytest.fixture
 def failing_bus(monkeypatch):
-    """Have the library's network raise errors, by the frame's identifier, before it sends."""
+    """Let the library's network raise errors before it sends, by the frame's identifier."""
     really_send = canopen.Network.send_message
 
     def fail(troubles):
@@ -427,31 +427,31 @@ def failing_bus(monkeypatch):
 
 
 @pytest.mark.parametrize("late", [1, further(2)])
-def test_replies_that_come_late_are_not_taken_for_the_next_ones(drive, scripted, late):
+def test_late_replies_do_not_answer_the_next_request(drive, scripted, late):
     """The first command is given up after 50 ms; its reply comes when another one is awaited."""
-    answer, kept = scripted._sdo, []
+    answer, delayed = scripted._sdo, []
 
     def answer_late(data):
         if data[0] != 0x80:  # given up
-            kept.append(data)
-        if len(kept) > late:
+            delayed.append(data)
+        if len(delayed) > late:
             scripted._sdo = answer
-            for request in kept:
+            for request in delayed:
                 answer(request)
 
     scripted._sdo = answer_late
     drive.connect()
-    assert len(kept) == late + 1
+    assert len(delayed) == late + 1
     assert scripted.objects[0x6072, 0] == 1800
 
 
-def test_a_drive_that_answers_slowly_after_a_reply_that_came_late(drive, scripted):
-    """Each reply would be taken for that to the next request, as long as that waits for one."""
-    answer, heard = scripted._sdo, []
+def test_slow_answers_after_a_late_reply(drive, scripted):
+    """Each reply would answer the next request while that waits for one."""
+    answer, requests = scripted._sdo, []
 
     def slow(data):
-        heard.append(data)
-        time.sleep(0.12 if len(heard) == 1 else 0.004)  # the first is given up after 50 ms
+        requests.append(data)
+        time.sleep(0.12 if len(requests) == 1 else 0.004)  # the first is given up after 50 ms
         answer(data)
 
     scripted._sdo = slow
@@ -459,17 +459,17 @@ def test_a_drive_that_answers_slowly_after_a_reply_that_came_late(drive, scripte
     assert scripted.objects[0x6072, 0] == 1800
 
 
-def test_a_drive_with_its_sto_open_is_not_said_to_be_ready(drive, scripted):
+def test_a_drive_with_open_sto_is_not_reported_ready(drive, scripted):
     scripted.state = "switch-on disabled, no supply"
     with pytest.raises(DeviceError) as caught:
         drive.reset_fault()
-    told = str(caught.value)
+    message = str(caught.value)
     for words in ("not in fault", "it is disabled", "does not get ready", "0x0240", "STO"):
-        assert words in told
-    assert "supply is not there" in told
+        assert words in message
+    assert "supply is not there" in message
 
 
-def test_a_fault_that_comes_back_when_it_is_told_to_get_ready(drive, scripted):
+def test_a_fault_that_recurs_on_the_shutdown_command(drive, scripted):
     scripted.on_ready = "fault"
     scripted.objects[0x603F, 0] = 0x3220
     with pytest.raises(
@@ -478,7 +478,7 @@ def test_a_fault_that_comes_back_when_it_is_told_to_get_ready(drive, scripted):
         drive.reset_fault()
 
 
-def test_another_drive_that_turns_is_switched_off_before_it_is_refused(drive, scripted):
+def test_a_turning_wrong_drive_is_switched_off_and_refused(drive, scripted):
     scripted.state, scripted.torque = "enabled", 200
     scripted.objects[0x1018, 2] = 0x1
     with pytest.raises(DeviceError, match="another drive") as caught:
@@ -487,14 +487,14 @@ def test_another_drive_that_turns_is_switched_off_before_it_is_refused(drive, sc
     assert "may still turn" not in str(caught.value)
 
 
-def test_another_drive_that_cannot_be_switched_off_is_said_to_turn(drive, scripted):
+def test_a_wrong_drive_that_stays_on_is_reported_as_turning(drive, scripted):
     scripted.state, scripted.obeys = "enabled", False
     scripted.objects[0x6502, 0] = 0x1ED
     with pytest.raises(DeviceError, match=r"no cyclic synchronous torque.*may still turn.*STO"):
         drive.connect()
 
 
-def test_a_fault_whose_cause_stands(drive, scripted):
+def test_a_fault_with_a_lasting_cause(drive, scripted):
     scripted.state = "fault"
     scripted.objects[0x603F, 0] = 0x8611
     with pytest.raises(DeviceError, match=r"cannot be reset: following error.*remove the cause"):
@@ -507,14 +507,14 @@ def test_no_drive_on_the_bus(impatient, drive, scripted):
         drive.connect()
 
 
-def test_others_on_the_bus_are_named(impatient, make_drive, rig, settings, scripted):
+def test_other_nodes_on_the_bus_are_named(impatient, make_drive, rig, settings, scripted):
     drive = make_drive(replace(rig, cia402=replace(settings, node_id=6)))
     with pytest.raises(DeviceError, match=r"node 6.*frames came from node 5"):
         threading.Timer(0.05, scripted.heartbeat).start()
         drive.connect()
 
 
-def test_a_bus_that_is_cut_in_the_middle(impatient, drive, scripted):
+def test_a_bus_cut_in_mid_setup(impatient, drive, scripted):
     def cut(can_id, data, take=scripted._take):
         if can_id == 0x605 and data[1:3] == b"\x06\x10":
             scripted.cut()
@@ -527,7 +527,7 @@ def test_a_bus_that_is_cut_in_the_middle(impatient, drive, scripted):
     drive.close()
 
 
-def test_a_drive_that_does_not_become_operational(drive, scripted):
+def test_failure_to_become_operational(drive, scripted):
     def stay(can_id, data, take=scripted._take):
         if (can_id, data[:1]) == (0x000, b"\x01"):
             scripted.heartbeat(0x7F)
@@ -539,14 +539,14 @@ def test_a_drive_that_does_not_become_operational(drive, scripted):
         drive.connect()
 
 
-def test_no_bus_at_all(link_to, rig):
+def test_no_bus(link_to, rig):
     drive = Cia402Drive(rig, link_to("nothing"))
     with pytest.raises(DeviceError, match="start rigd simulate again"):
         drive.connect()
     drive.close()
 
 
-def test_an_angle_that_is_not_quantised_cannot_be_counted(make_drive, rig):
+def test_an_angle_without_resolution_cannot_be_counted(make_drive, rig):
     drive = make_drive(replace(rig, encoder=replace(rig.encoder, resolution_rad=0.0)))
     with pytest.raises(DeviceError, match="resolution_rad"):
         drive.connect()
@@ -572,14 +572,14 @@ def test_connecting_again_after_closing(drive, scripted, make_drive, rig):
         (8000.0, 125, 125, -6),
     ],
 )
-def test_the_period_in_the_drives_terms(rate_hz, period_us, value, exponent):
+def test_the_period_in_units_of_the_drive(rate_hz, period_us, value, exponent):
     assert sync_period_us(rate_hz) == period_us
     assert interpolation_time(rate_hz) == (value, exponent)
     assert value * 10.0**exponent == pytest.approx(1 / rate_hz)
 
 
 @pytest.mark.parametrize("rate_hz", [300.0, 7000.0])
-def test_a_period_that_the_drive_cannot_be_told(make_drive, rig, rate_hz, scripted):
+def test_a_period_beyond_the_units_of_the_drive(make_drive, rig, rate_hz, scripted):
     with pytest.raises(DeviceError, match="choose another rate"):
         sync_period_us(rate_hz)
     drive = make_drive(replace(rig, rate_hz=rate_hz))
@@ -588,7 +588,7 @@ def test_a_period_that_the_drive_cannot_be_told(make_drive, rig, rate_hz, script
     assert not scripted.seen
 
 
-def test_a_period_of_whole_microseconds_that_60c2_cannot_hold():
+def test_a_period_beyond_60c2():
     assert sync_period_us(1e6 / 1001) == 1001
     with pytest.raises(DeviceError, match="60C2"):
         interpolation_time(1e6 / 1001)

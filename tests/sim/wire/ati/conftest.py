@@ -34,7 +34,7 @@ def framed(body: bytes) -> bytes:
 
 
 class Load:
-    """Stands in for the simulated rig: the sensor measures what the test puts here."""
+    """Replaces the simulated rig: the sensor measures the load set by the test."""
 
     def __init__(self) -> None:
         self.wrench = (0.0,) * 6
@@ -74,7 +74,7 @@ class CanHost:
             rig, load, lambda can_id, data: self.frames.append((can_id, data)), self.log, **options
         )
 
-    def ask(self, opcode, data=b""):
+    def request(self, opcode, data=b""):
         """Frames that came in answer, as (identifier, data)."""
         self.frames.clear()
         self.node.receive(self.base << 4 | opcode, data)
@@ -83,18 +83,18 @@ class CanHost:
     def matrix(self):
         rows = []
         for axis in range(6):
-            frames = self.ask(0x2, bytes([axis]))
+            frames = self.request(0x2, bytes([axis]))
             assert [can_id & 0xF for can_id, _ in frames] == [2, 3, 4]
             rows.append([v for _, data in frames for v in struct.unpack(">ff", data)])
         return np.array(rows)
 
     def counts_per_unit(self):
-        ((_, data),) = self.ask(0x7)
+        ((_, data),) = self.request(0x7)
         return struct.unpack(">II", data)
 
     def gauges(self):
         """Status, and gauges 0 to 5."""
-        (first_id, first), (second_id, second) = self.ask(0x0)
+        (first_id, first), (second_id, second) = self.request(0x0)
         assert (first_id, second_id) == (self.base << 4, self.base << 4 | 1)
         status, g0, g2, g4 = struct.unpack(">Hhhh", first)
         g1, g3, g5 = struct.unpack(">hhh", second)
@@ -109,35 +109,35 @@ class SerialHost:
         self.writes = []
         self.device = AtiSerialDevice(rig, load, self.writes.append, self.log)
 
-    def tell(self, data):
-        """What the device wrote in answer."""
+    def send(self, data):
+        """Return the answer of the device."""
         self.writes.clear()
         self.device.receive(data)
         return b"".join(self.writes)
 
-    def ask(self, body):
+    def request(self, body):
         """Answer to a request, without address and checksum."""
-        answer = self.tell(framed(b"\x0a" + body))
+        answer = self.send(framed(b"\x0a" + body))
         assert answer[:1] == b"\x0a"
         assert crc16(answer) == 0
         return answer[1:-2]
 
     def registers(self, first, count, function=3):
-        answer = self.ask(struct.pack(">BHH", function, first, count))
+        answer = self.request(struct.pack(">BHH", function, first, count))
         assert answer[:2] == bytes([function, 2 * count])
         return list(struct.unpack(f">{count}H", answer[2:]))
 
     def write(self, first, values):
         data = struct.pack(f">{len(values)}H", *values)
-        return self.ask(struct.pack(">BHHB", 0x10, first, len(values), len(data)) + data)
+        return self.request(struct.pack(">BHHB", 0x10, first, len(values), len(data)) + data)
 
     def load_gains(self, block=1):
         """The set-up before a stream."""
-        assert self.ask(b"\x6a\xaa") == b"\x6a\x01"
+        assert self.request(b"\x6a\xaa") == b"\x6a\x01"
         at = 0xE3 + (block - 1) * 192
         assert self.write(0, self.registers(at + 121, 6)) == b"\x10\x00\x00\x00\x06"
         assert self.write(6, self.registers(at + 127, 6)) == b"\x10\x00\x06\x00\x06"
-        assert self.ask(b"\x6a\x18") == b"\x6a\x01"
+        assert self.request(b"\x6a\x18") == b"\x6a\x01"
 
     def calibration(self, block=1):
         """Matrix, and counts per N and per N·m."""
@@ -189,7 +189,7 @@ def rig():
 def can_host(rig, load):
     """Its calibration is selected already."""
     host = CanHost(rig, load)
-    assert host.ask(0x6, b"\x03") == [(0x116, b"\x03")]
+    assert host.request(0x6, b"\x03") == [(0x116, b"\x03")]
     return host
 
 

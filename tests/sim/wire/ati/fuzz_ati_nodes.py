@@ -1,6 +1,6 @@
 """Noise against the simulated ATI sensors: python tests/sim/wire/ati/fuzz_ati_nodes.py N [SEED].
 
-Nothing they are sent may raise, and they must be as useful afterwards as before.
+No input may raise, and the sensors must work afterwards as before.
 """
 
 import struct
@@ -52,7 +52,7 @@ def with_checksum(body):
 
 
 def damaged(random):
-    """A known frame with a byte changed, lost or doubled, or none of that."""
+    """A known frame, unchanged or with a byte changed, lost or doubled."""
     frame = bytearray(random.choice(SEEDS))
     at = random.randrange(len(frame))
     match random.randrange(4):
@@ -66,7 +66,7 @@ def damaged(random):
 
 
 def sound(random):
-    """Address, any function, any content, and a checksum that holds."""
+    """Address, any function, any content, and a valid checksum."""
     function = random.choice([3, 4, 0x10, 0x46, 0x6A, random.randrange(256)])
     if function == 0x10:
         data = random.randbytes(random.randrange(30))
@@ -81,8 +81,8 @@ def sound(random):
     return with_checksum(bytes([10, function]) + random.randbytes(random.randrange(12)))
 
 
-def pieces(random):
-    """What comes in at once."""
+def chunk(random):
+    """Return bytes that arrive at once."""
     kind = random.randrange(4)
     if kind == 0:
         return random.randbytes(random.randrange(40))
@@ -98,7 +98,7 @@ def fuzz_serial(n, seed):
     written = []
     device = AtiSerialDevice(rig(), simulated_rig(), written.append, lambda *_, **__: None)
     for step in range(n):
-        device.receive(pieces(random))
+        device.receive(chunk(random))
         if step % 8 == 0:
             device.tick(0.001 * step)
             device.emit()

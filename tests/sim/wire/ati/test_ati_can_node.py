@@ -1,4 +1,4 @@
-"""The simulated NETCANOEM box, asked by a host that was written from the protocol's table."""
+"""The simulated NETCANOEM box, polled by a host written from the protocol's table."""
 
 import math
 import struct
@@ -37,7 +37,7 @@ def test_frames_are_those_of_the_protocol(can_host, can_id, request_hex, replies
 
 def test_a_matrix_row_comes_in_three_frames(can_host):
     for axis in range(6):
-        frames = can_host.ask(0x2, bytes([axis]))
+        frames = can_host.request(0x2, bytes([axis]))
         assert [can_id for can_id, _ in frames] == [0x112, 0x113, 0x114]
         row = can_host.node.gauges.matrix[axis]
         assert b"".join(data for _, data in frames) == row.astype(">f4").tobytes()
@@ -59,17 +59,17 @@ def test_a_host_recovers_the_wrench(can_host, load, rig, fractions):
     assert np.all(np.abs(wrench - load.wrench) < 0.5 * np.array(rig.sensor.resolution))
 
 
-def test_a_host_that_honours_counts_per_unit_recovers_it_in_every_scale(make_can_host, load):
+def test_a_host_with_counts_per_unit_recovers_every_scale(make_can_host, load):
     load.wrench = (3.0, -7.0, 21.0, 0.2, -0.3, 0.4)
     host = make_can_host(counts_per_unit=(200_000, 8_000_000))
-    host.ask(0x6, b"\x03")
+    host.request(0x6, b"\x03")
     assert host.counts_per_unit() == (200_000, 8_000_000)
     wrench = host.matrix() @ (host.gauges()[1] - UNLOADED) / np.repeat([200_000, 8_000_000], 3)
     assert np.all(np.abs(wrench - load.wrench) <= host.node.gauges.quantisation + 1e-9)
 
 
 @pytest.mark.parametrize("gauge", range(6))
-def test_each_gauge_has_its_place(can_host, load, gauge):
+def test_each_gauge_has_its_index(can_host, load, gauge):
     """The wrench under which only one gauge differs from its bias."""
     load.wrench = tuple(can_host.matrix()[:, gauge] * 1000 / 1e6)
     _, gauges = can_host.gauges()
@@ -82,7 +82,7 @@ def test_each_request_is_one_reading_of_the_simulated_sensor(rig, make_can_host)
     twin = SimulatedRig(rig)
     simulated = SimulatedRig(rig)
     host = make_can_host(simulated)
-    host.ask(0x6, b"\x03")
+    host.request(0x6, b"\x03")
     matrix = host.matrix()
     for _ in range(50):
         simulated.advance(1)
@@ -101,54 +101,54 @@ def test_injected_status_bits_bring_the_summary_bit(can_host, bits):
     assert can_host.gauges()[0] == 0
 
 
-def test_after_power_up_calibration_0_is_active_and_bad_unless_it_is_there(make_can_host):
+def test_calibration_0_is_active_after_power_up(make_can_host):
     host = make_can_host()
     assert host.gauges()[0] == 0x8040
     assert np.isnan(host.matrix()).all()
-    host.ask(0x6, b"\x03")
+    host.request(0x6, b"\x03")
     assert host.gauges()[0] == 0
     assert np.isfinite(host.matrix()).all()
     assert make_can_host(calibrations=[0, 5]).gauges()[0] == 0
 
 
 @pytest.mark.parametrize("index", [0, 1, 2, 4, 15])
-def test_a_calibration_that_is_missing_is_echoed_and_told_by_the_status(can_host, index):
-    assert can_host.ask(0x6, bytes([index])) == [(0x116, bytes([index]))]
+def test_a_missing_calibration_is_echoed_and_in_the_status(can_host, index):
+    assert can_host.request(0x6, bytes([index])) == [(0x116, bytes([index]))]
     assert can_host.gauges()[0] == 0x8040
-    ((_, data),) = can_host.ask(0x2, b"\x00")[:1]
+    ((_, data),) = can_host.request(0x2, b"\x00")[:1]
     assert all(map(math.isnan, struct.unpack(">ff", data)))
 
 
-def test_a_reset_forgets_the_calibration_that_was_set(can_host):
-    assert can_host.ask(0xC) == []
+def test_a_reset_clears_the_selected_calibration(can_host):
+    assert can_host.request(0xC) == []
     assert can_host.gauges()[0] == 0x8041
     assert can_host.log.entries[-1] == ("sensor", "reset", {})
-    can_host.ask(0x6, b"\x03")
+    can_host.request(0x6, b"\x03")
     assert can_host.gauges()[0] == 0x8001
 
 
-def test_a_power_up_forgets_the_calibration_and_that_there_was_a_reset(can_host):
-    can_host.ask(0x6, b"\x03")
+def test_a_power_up_clears_calibration_and_reset_flag(can_host):
+    can_host.request(0x6, b"\x03")
     can_host.node.reset()
     can_host.node.power_cycle()
     assert can_host.gauges()[0] == 0x8040
 
 
 def test_a_new_base_takes_effect_at_the_next_power_up(can_host):
-    assert can_host.ask(0xD, b"\x6a") == [(0x11D, b"")]
+    assert can_host.request(0xD, b"\x6a") == [(0x11D, b"")]
     assert can_host.log.entries[-1] == ("sensor", "base identifier set", {"base_id": 0x6A})
-    assert can_host.ask(0xF)
-    can_host.ask(0xC)
-    assert can_host.ask(0xF), "a reset is not a power-up"
+    assert can_host.request(0xF)
+    can_host.request(0xC)
+    assert can_host.request(0xF), "a reset is not a power-up"
     can_host.node.power_cycle()
-    assert can_host.ask(0xF) == []
+    assert can_host.request(0xF) == []
     can_host.base = 0x6A
-    assert can_host.ask(0xF) == [(0x6AF, bytes.fromhex("03 08 00 02"))]
+    assert can_host.request(0xF) == [(0x6AF, bytes.fromhex("03 08 00 02"))]
     assert can_host.gauges()[1].tolist() == UNLOADED
 
 
 def test_a_new_bit_rate_is_only_logged(can_host):
-    can_host.ask(0xE, b"\x03")
+    can_host.request(0xE, b"\x03")
     assert can_host.log.entries[-1] == (
         "sensor",
         "baud set",
@@ -157,11 +157,11 @@ def test_a_new_bit_rate_is_only_logged(can_host):
 
 
 @pytest.mark.parametrize("firmware", [(3, 6, 9), (3, 6, 0), (2, 9, 1)])
-def test_old_firmware_does_not_tell_its_counts(make_can_host, load, firmware):
+def test_old_firmware_does_not_report_counts(make_can_host, load, firmware):
     host = make_can_host(firmware=firmware, counts_per_unit=(5, 7))
-    host.ask(0x6, b"\x03")
-    assert host.ask(0x7) == host.ask(0x8) == host.ask(0x9, b"\x02") == []
-    ((_, version),) = host.ask(0xF)
+    host.request(0x6, b"\x03")
+    assert host.request(0x7) == host.request(0x8) == host.request(0x9, b"\x02") == []
+    ((_, version),) = host.request(0xF)
     assert struct.unpack(">BBH", version) == firmware
     load.wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5)
     wrench = host.matrix() @ (host.gauges()[1] - UNLOADED) / 1e6
@@ -169,7 +169,7 @@ def test_old_firmware_does_not_tell_its_counts(make_can_host, load, firmware):
 
 
 @pytest.mark.parametrize("firmware", [(3, 7, 0), (3, 8, 0), (4, 0, 0)])
-def test_newer_firmware_tells_its_counts(make_can_host, firmware):
+def test_newer_firmware_reports_counts(make_can_host, firmware):
     assert make_can_host(firmware=firmware).counts_per_unit() == (1_000_000, 1_000_000)
 
 
@@ -177,23 +177,23 @@ LENGTHS = {0: 0, 2: 1, 5: 0, 6: 1, 7: 0, 8: 0, 9: 1, 0xC: 0, 0xD: 1, 0xE: 1, 0xF
 
 
 @pytest.mark.parametrize("opcode", range(16))
-def test_what_is_no_request_gets_no_reply(can_host, opcode):
+def test_invalid_requests_get_no_reply(can_host, opcode):
     for length in range(9):
         if LENGTHS.get(opcode) != length:
-            assert can_host.ask(opcode, bytes(length)) == []
+            assert can_host.request(opcode, bytes(length)) == []
     assert can_host.log.what == ["calibration set"]
 
 
 @pytest.mark.parametrize(("opcode", "index"), [(0x2, 6), (0x6, 16), (0x9, 6), (0xD, 0x80)])
-def test_an_index_that_cannot_be_gets_no_reply(can_host, opcode, index):
-    assert can_host.ask(opcode, bytes([index])) == []
+def test_an_impossible_index_gets_no_reply(can_host, opcode, index):
+    assert can_host.request(opcode, bytes([index])) == []
     assert can_host.gauges()[0] == 0
 
 
 @pytest.mark.parametrize(
     "can_id", [0x100, 0x120, 0x10F, 0x080, 0x711, 0x8000_0110, 0x4000_0110, 0x2000_0110]
 )
-def test_frames_of_others_are_not_for_the_box(can_host, can_id):
+def test_the_box_ignores_frames_for_others(can_host, can_id):
     can_host.frames.clear()
     can_host.node.receive(can_id, b"")
     assert can_host.frames == []
@@ -204,12 +204,12 @@ def test_saturation_of_one_gauge(can_host):
     assert can_host.gauges()[1].tolist() == [612, -1043, 385, 32767, -724, 198]
 
 
-def test_a_frozen_box_answers_nothing_and_takes_nothing_in(can_host, load):
+def test_a_frozen_box_neither_answers_nor_measures(can_host, load):
     can_host.node.frozen = True
     measured = load.measured
     for opcode in range(16):
         for data in (b"", b"\x01"):
-            assert can_host.ask(opcode, data) == []
+            assert can_host.request(opcode, data) == []
     assert load.measured == measured
     can_host.node.frozen = False
     assert can_host.gauges()[0] == 0
@@ -217,10 +217,10 @@ def test_a_frozen_box_answers_nothing_and_takes_nothing_in(can_host, load):
 
 def test_the_serial_number_is_the_profile_s(make_can_host):
     host = make_can_host(serial_number="FT09876X")
-    assert host.ask(0x5) == [(0x115, b"FT09876X")]
+    assert host.request(0x5) == [(0x115, b"FT09876X")]
 
 
 def test_time_passes_without_effect(can_host):
-    before = can_host.ask(0x0)
+    before = can_host.request(0x0)
     can_host.node.tick(1e3)
-    assert can_host.ask(0x0) == before
+    assert can_host.request(0x0) == before

@@ -48,7 +48,7 @@ def make_rig(**changes):
 
 
 class Bench:
-    """One drive, what it sent and logged, and the few requests that tests need."""
+    """One drive, its frames and log, and the few requests that tests need."""
 
     node_id = NODE
 
@@ -67,7 +67,7 @@ class Bench:
             command(torque_nm)
 
         self.exerting = lambda: self.plant._torque_nm
-        # The plant has slots: a stand-in passes everything on.
+        # The plant has slots: a proxy passes everything on.
         self.simulated.plant = _Spy(self.plant, spy)
         self.node = DriveNode(
             rig,
@@ -84,12 +84,12 @@ class Bench:
         return self
 
     def take(self):
-        """What was sent since the last call."""
+        """Return the frames sent since the last call."""
         sent, self.sent[:] = list(self.sent), []
         return sent
 
     def wait(self, milliseconds, *, sync=False, beat=False, rpdo=None):
-        """Let time pass, with what the host does in each millisecond."""
+        """Let time pass, with the actions of the host in each millisecond."""
         for _ in range(milliseconds):
             self.now_s += PERIOD_S
             if beat:
@@ -172,7 +172,7 @@ class Bench:
         return self
 
     def drive(self, per_mille):
-        """Have a torque take effect."""
+        """Make a torque take effect."""
         self.rpdo(0x0F, per_mille)
         return self.sync()
 

@@ -1,4 +1,4 @@
-"""The drive under the master of the canopen library, which knows nothing of ours."""
+"""The drive under the master of the canopen library, which is independent of ours."""
 
 import queue
 import threading
@@ -189,7 +189,7 @@ def test_nmt_heartbeat_and_boot_up(node):
     assert not waiting.is_alive()
 
 
-def test_the_mapping_is_read_back_as_it_was_saved(node):
+def test_the_mapping_is_read_back_as_saved(node):
     configure(node, 1)
     node.pdo.read()
     assert [(v.index, v.length) for v in node.rpdo[1]] == [(0x6040, 16), (0x6071, 16)]
@@ -199,7 +199,7 @@ def test_the_mapping_is_read_back_as_it_was_saved(node):
 
 
 @pytest.mark.parametrize("delivery", [1, 255])
-def test_the_library_takes_the_drive_through_its_states(bus, node, bench, delivery):
+def test_the_library_commands_all_states_of_the_drive(bus, node, bench, delivery):
     configure(node, delivery)
     node.nmt.state = "OPERATIONAL"
     node.setup_402_state_machine(read_pdos=False)

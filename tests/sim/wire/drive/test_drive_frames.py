@@ -7,7 +7,7 @@ def frames(bench):
     return [f"{can_id:03X} {data.hex(' ')}".strip() for can_id, data in bench.take()]
 
 
-def test_it_boots_with_the_boot_up_message_into_pre_operational(rig, make_bench):
+def test_boot_up_message_and_pre_operational_state(rig, make_bench):
     bench = make_bench()
     bench.nmt(129)
     assert frames(bench) == ["705 00"]
@@ -15,7 +15,7 @@ def test_it_boots_with_the_boot_up_message_into_pre_operational(rig, make_bench)
 
 
 @pytest.mark.parametrize("first", ["tick", "frame"])
-def test_it_boots_in_its_first_call(make_bench, first):
+def test_boot_up_in_the_first_call(make_bench, first):
     bench = make_bench(booted=False)
     assert bench.take() == []
     if first == "tick":
@@ -118,7 +118,7 @@ def test_a_download_in_segments_of_any_size(bench, sizes, announced):
     assert bench.read(0x1006) == 0x04030201
 
 
-def test_a_new_transfer_takes_the_place_of_one_that_has_not_ended(bench):
+def test_a_new_transfer_replaces_an_unfinished_one(bench):
     bench.request("20 06 10 00 00 00 00 00")
     bench.request("0a aa aa 00 00 00 00 00")
     assert bench.request("40 08 10 00 00 00 00 00") == "41 08 10 00 15 00 00 00"
@@ -155,18 +155,18 @@ def test_a_new_transfer_takes_the_place_of_one_that_has_not_ended(bench):
         ("00 00 00 00 00 00 00 00", "80 00 00 00 01 00 04 05"),
     ],
 )
-def test_what_it_refuses(bench, request_, reply):
+def test_refused_transfers(bench, request_, reply):
     assert bench.request(request_) == reply
 
 
-def test_a_segment_whose_toggle_bit_does_not_alternate_ends_the_transfer(bench):
+def test_a_wrong_toggle_bit_ends_the_transfer(bench):
     bench.request("40 08 10 00 00 00 00 00")
     bench.request("60 00 00 00 00 00 00 00")
     assert bench.request("60 00 00 00 00 00 00 00") == "80 08 10 00 00 00 03 05"
     assert bench.request("70 00 00 00 00 00 00 00") == "80 00 00 00 01 00 04 05"
 
 
-def test_a_download_of_more_than_the_object_holds_ends(bench):
+def test_a_download_longer_than_the_object_ends(bench):
     bench.request("20 17 10 00 00 00 00 00")
     assert bench.request("00 01 02 03 04 05 06 07") == "80 17 10 00 10 00 07 06"
     assert bench.read(0x1017) == 0
@@ -180,7 +180,7 @@ def test_an_abort_by_the_client_ends_the_transfer_without_a_reply(bench):
     assert bench.request("60 00 00 00 00 00 00 00").startswith("80")
 
 
-def test_a_request_that_is_not_of_eight_bytes_is_none(bench):
+def test_a_request_without_eight_bytes_is_ignored(bench):
     bench.node.receive(0x605, bytes.fromhex("40 00 10 00"))
     assert bench.take() == []
 
@@ -230,7 +230,7 @@ def test_the_heartbeat_in_each_nmt_state(bench):
     assert frames(bench) == ["705 04", "705 04"]
 
 
-def test_the_heartbeat_keeps_its_mean_period_where_time_comes_in_other_steps(bench):
+def test_the_mean_period_of_heartbeats_is_independent_of_time_steps(bench):
     bench.write(0x1017, 0, 10, 2)
     bench.take()
     for step in range(300):
@@ -254,14 +254,14 @@ def test_an_emergency_its_history_and_its_end(bench):
     assert bench.request("40 03 10 00 00 00 00 00") == "4f 03 10 00 00 00 00 00"
 
 
-def test_the_history_keeps_the_last_eight_newest_first(bench):
+def test_the_history_has_the_last_eight_newest_first(bench):
     for code in range(0xFF00, 0xFF0A):
         bench.node.emergency(code, 0x80, b"")
     assert bench.read(0x1003) == 8
     assert [bench.read(0x1003, sub) for sub in (1, 2, 8)] == [0xFF09, 0xFF08, 0xFF02]
 
 
-def test_nmt_commands_for_others_and_of_a_wrong_length_are_not_taken(bench):
+def test_nmt_commands_for_others_and_wrong_lengths_are_ignored(bench):
     for data in (b"\x01\x06", b"\x01", b"\x01\x05\x00", b"\x55\x05", b""):
         bench.node.receive(0, data)
         assert bench.nmt_state() == "pre-operational"
@@ -269,7 +269,7 @@ def test_nmt_commands_for_others_and_of_a_wrong_length_are_not_taken(bench):
     assert bench.nmt_state() == "operational"
 
 
-def test_a_stopped_node_answers_no_sdo_and_takes_no_pdo(bench):
+def test_a_stopped_node_ignores_sdos_and_pdos(bench):
     bench.configure()
     bench.nmt(2)
     bench.take()
@@ -299,7 +299,7 @@ def test_reset_node_restores_everything(bench):
     assert bench.read(0x1A00) == 1
 
 
-def test_a_sync_counter_has_to_come_where_one_is_set(bench):
+def test_a_configured_sync_counter_is_required(bench):
     bench.write(0x1019, 0, 10, 1)
     bench.configure()
     bench.take()

@@ -1,4 +1,4 @@
-"""Nonsense at the drive."""
+"""Random frames at the drive."""
 
 import importlib.util
 from pathlib import Path
@@ -18,7 +18,7 @@ def load_fuzzer():
 def test_no_frame_raises_or_brings_torque_beyond_the_limits(seed):
     seen = load_fuzzer().fuzz(10_000, seed)
     assert seen["frames"] == 10_000
-    # The run was worth something: the drive was in every state, and pushed.
+    # The run was meaningful: the drive was in every state, and exerted torque.
     for state in (
         "operation enabled",
         "quick stop active",

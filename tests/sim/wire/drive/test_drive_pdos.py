@@ -52,7 +52,7 @@ def fitting(objects):
 
 @MODEST
 @given(number=st.integers(1, 4), chosen=fitting(SENDABLE), data=st.data())
-def test_a_tpdo_carries_what_sdo_reads(bench, number, chosen, data):
+def test_a_tpdo_has_the_values_read_by_sdo(bench, number, chosen, data):
     bench.nmt(129)
     bench.node.angle_offset_counts = data.draw(st.integers(-(1 << 31), (1 << 31) - 1))
     bench.write(0x6071, 0, data.draw(st.integers(-32768, 32767)), 2)
@@ -74,7 +74,7 @@ def test_a_tpdo_carries_what_sdo_reads(bench, number, chosen, data):
     delivery=st.sampled_from([0, 1, 7, 240, 254, 255]),
     data=st.data(),
 )
-def test_an_rpdo_stores_what_sdo_reads_back(bench, number, chosen, delivery, data):
+def test_an_rpdo_stores_the_values_read_by_sdo(bench, number, chosen, delivery, data):
     bench.nmt(129)
     bench.map_pdo(number, "r", delivery, *(entry(*one) for one in chosen))
     bench.nmt(1)
@@ -101,7 +101,7 @@ def test_an_rpdo_stores_what_sdo_reads_back(bench, number, chosen, delivery, dat
     assert not bench.plant.enabled
 
 
-def test_a_value_out_of_range_in_an_rpdo_is_left_out(bench):
+def test_an_rpdo_value_out_of_range_is_ignored(bench):
     bench.map_pdo(1, "r", 255, 0x6060_0008, 0x6071_0010)
     bench.nmt(1)
     bench.node.receive(0x205, b"\x0a\x64\x00")
@@ -136,7 +136,7 @@ def test_a_tpdo_of_type_0_comes_with_a_sync_after_a_change(bench):
     assert came() == ["3102"]
 
 
-def test_a_tpdo_on_events_comes_with_a_change_and_when_its_timer_runs_out(bench):
+def test_an_event_tpdo_follows_changes_and_its_timer(bench):
     bench.write(0x1800, 1, 0x8000_0185, 4)
     assert bench.write(0x1800, 3, 50, 2) == 0  # 5 ms between two
     assert bench.write(0x1800, 5, 100, 2) == 0
@@ -157,7 +157,7 @@ def test_a_tpdo_on_events_comes_with_a_change_and_when_its_timer_runs_out(bench)
     assert bench.take() == [(0x185, b"\x31\x02")]
 
 
-def test_pdos_rest_outside_of_operational(bench):
+def test_no_pdos_outside_of_operational(bench):
     bench.configure()
     bench.nmt(128)
     assert bench.sync() is None
@@ -167,7 +167,7 @@ def test_pdos_rest_outside_of_operational(bench):
     assert bench.state() == "switch on disabled"
 
 
-def test_a_pdo_that_waits_is_dropped_when_operational_is_left(bench):
+def test_leaving_operational_drops_a_pending_pdo(bench):
     bench.configure()
     bench.rpdo(0x06, 0)
     bench.nmt(128)
@@ -182,7 +182,7 @@ def test_the_last_pdo_before_a_sync_counts(running):
     assert running.sync()[2] == 300
 
 
-def test_another_pdo_may_be_changed_while_the_torque_flows(running):
+def test_another_pdo_may_be_changed_during_operation(running):
     running.drive(300)
     running.rpdo(0x0F, 310)
     running.map_pdo(2, "t", 1, 0x606C_0020)
@@ -190,7 +190,7 @@ def test_another_pdo_may_be_changed_while_the_torque_flows(running):
     assert running.state() == "operation enabled"
 
 
-def test_what_waited_for_a_sync_is_dropped_when_its_pdo_is_mapped_anew(running):
+def test_mapping_a_pdo_drops_its_pending_values(running):
     running.rpdo(0x0F, 300)
     running.map_pdo(1, "r", 1, 0x6071_0010)
     assert running.sync()[2] == 0
@@ -225,7 +225,7 @@ def test_what_waited_for_a_sync_is_dropped_when_its_pdo_is_mapped_anew(running):
         ([(0x1801, 1, 0x285, 4), (0x1801, 3, 10, 2)], 0x08000022),
     ],
 )
-def test_what_cannot_be_mapped(bench, steps, code):
+def test_refused_mappings(bench, steps, code):
     *before, last = steps
     for step in before:
         assert bench.write(*step) == 0

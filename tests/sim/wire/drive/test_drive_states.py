@@ -71,7 +71,7 @@ def test_every_command_in_every_state(bench, state, command):
 
 @pytest.mark.parametrize("state", [SOD, READY, ON])
 @pytest.mark.parametrize("command", [0x86, 0x87, 0x8F], ids=hex)
-def test_nothing_leads_upwards_while_the_reset_bit_is_set(bench, state, command):
+def test_no_transition_upwards_while_the_reset_bit_is_set(bench, state, command):
     go(bench, state)
     bench.write(0x6040, 0, command, 2)
     assert bench.state() == (READY if (state, command) == (ON, 0x86) else state)
@@ -92,7 +92,7 @@ def test_a_fault_is_reset_by_a_rising_edge_only(bench):
 
 
 @pytest.mark.parametrize("option", [1, 2])
-def test_a_quick_stop_that_does_not_stay_ends_in_switch_on_disabled(bench, option):
+def test_a_passing_quick_stop_ends_in_switch_on_disabled(bench, option):
     bench.configure().enable()
     bench.write(0x605A, 0, option, 2)
     bench.drive(100)
@@ -114,12 +114,12 @@ def test_a_quick_stop_by_disabling_does_not_linger(running):
 
 
 @pytest.mark.parametrize("option", [5, 6])
-def test_a_quick_stop_that_stays_can_be_left_again(bench, option):
+def test_a_lasting_quick_stop_can_be_left(bench, option):
     bench.configure().enable()
     bench.write(0x605A, 0, option, 2)
     bench.write(0x6040, 0, QUICK_STOP, 2)
     bench.wait(200, sync=True)
-    assert bench.read(0x6041) == 0x0617  # the shaft stands
+    assert bench.read(0x6041) == 0x0617  # the shaft is at rest
     assert bench.state() == STOP
     bench.write(0x6040, 0, ENABLE, 2)
     assert bench.state() == OP
@@ -127,7 +127,7 @@ def test_a_quick_stop_that_stays_can_be_left_again(bench, option):
 
 
 @pytest.mark.parametrize("option", [1, 2])
-def test_a_fault_reaction_by_ramp_takes_its_time_without_torque(running, option):
+def test_a_fault_reaction_by_ramp_takes_time_without_torque(running, option):
     running.write(0x605E, 0, option, 2)
     running.drive(300)
     running.node.emergency(0x4310, 0x08, b"")
@@ -151,7 +151,7 @@ def test_operation_is_not_enabled_outside_of_nmt_operational(bench):
     assert bench.state() == OP
 
 
-def test_a_reset_of_the_node_forgets_fault_errors_and_the_last_controlword(bench):
+def test_a_reset_of_the_node_clears_fault_and_controlword(bench):
     go(bench, FAULT)
     bench.write(0x6040, 0, 0x80, 2)
     bench.node.emergency(0x2310, 0x02, b"")
@@ -189,7 +189,7 @@ def statusword(bench):
     return word
 
 
-def test_a_drive_without_a_code_shows_the_wired_stop_in_its_statusword(make_bench):
+def test_the_wired_stop_without_a_code_is_in_the_statusword(make_bench):
     bench = make_bench(sto_error_code=0).configure().enable()
     assert statusword(bench) & 0x7F == 0x37
     bench.node.sto_dropped = True
@@ -204,7 +204,7 @@ def test_a_drive_without_a_code_shows_the_wired_stop_in_its_statusword(make_benc
     assert bench.plant.enabled
 
 
-def test_a_drive_with_a_code_goes_to_fault_and_stays_there_while_the_wired_stop_lasts(make_bench):
+def test_the_wired_stop_with_a_code_is_a_lasting_fault(make_bench):
     bench = make_bench(sto_error_code=0xFF20).configure().enable()
     bench.node.sto_dropped = True
     assert not bench.plant.enabled

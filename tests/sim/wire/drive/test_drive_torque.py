@@ -1,4 +1,4 @@
-"""What reaches the plant: when, how much, and that nothing does once the drive is left."""
+"""Torque of the plant: its time, its value, and none once the drive is off."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from rigd.devices.contracts import DeviceError
 RATED_NM = 0.5
 
 
-def test_a_torque_of_tick_k_takes_effect_at_sync_k_plus_1_before_the_plant_moves(running):
+def test_torque_of_tick_k_acts_from_sync_k_plus_1(running):
     running.rpdo(0x0F, 200)
     assert running.torques == []
     order = []
@@ -24,7 +24,7 @@ def test_a_torque_of_tick_k_takes_effect_at_sync_k_plus_1_before_the_plant_moves
     assert running.torques == [0.1]
 
 
-def test_on_arrival_a_torque_takes_effect_at_once(bench):
+def test_torque_acts_at_once_on_arrival(bench):
     bench.configure(delivery=255)
     bench.sync()
     for word in (0x06, 0x07, 0x0F):
@@ -34,7 +34,7 @@ def test_on_arrival_a_torque_takes_effect_at_once(bench):
 
 
 @pytest.mark.parametrize("direction", [1, -1])
-def test_the_rig_moves_as_it_does_without_a_wire(make_bench, direction):
+def test_motion_is_the_same_without_a_wire(make_bench, direction):
     bench = make_bench(direction=direction).configure().enable()
     per_mille = [round(300 * np.sin(0.05 * k)) for k in range(400)]
     angles = []
@@ -68,7 +68,7 @@ def test_the_offset_is_added_and_the_limits_clip(running):
     assert running.witness() == (pytest.approx(-0.045), True)
 
 
-def test_no_setting_lets_more_than_the_peak_through(running):
+def test_no_setting_allows_more_than_the_peak(running):
     for index in (0x6072, 0x60E0, 0x60E1):
         running.write(index, 0, 0xFFFF, 2)
     running.write(0x60B2, 0, 32767, 2)
@@ -78,7 +78,7 @@ def test_no_setting_lets_more_than_the_peak_through(running):
     assert running.witness() == (pytest.approx(-0.9), True)
 
 
-def test_the_direction_turns_torque_and_angle(make_bench):
+def test_the_direction_reverses_torque_and_angle(make_bench):
     bench = make_bench(direction=-1).configure().enable()
     bench.drive(500)
     assert bench.torques == [pytest.approx(-0.25)]
@@ -88,7 +88,7 @@ def test_the_direction_turns_torque_and_angle(make_bench):
     assert bench.read(0x606C, signed=True) > 0
 
 
-def test_halt_and_other_modes_take_the_torque_away_and_nothing_else(running):
+def test_halt_and_other_modes_end_the_torque_only(running):
     running.drive(200)
     running.rpdo(0x010F, 200)
     status, _, torque = running.sync()
@@ -103,7 +103,7 @@ def test_halt_and_other_modes_take_the_torque_away_and_nothing_else(running):
     assert running.sync()[::2] == (0x1237, 200)
 
 
-def test_a_shaft_that_is_too_fast_is_not_driven_faster(running):
+def test_a_shaft_above_the_speed_limit_is_not_accelerated(running):
     running.write(0x6080, 0, 1000, 4)  # 10 rpm at the output: 1.047 rad/s
     statuses = []
     for _ in range(400):
@@ -117,8 +117,8 @@ def test_a_shaft_that_is_too_fast_is_not_driven_faster(running):
     assert running.sync()[2] == -400
 
 
-def test_all_values_of_a_pdo_are_stored_before_one_acts(bench):
-    # A target left over from before must not act between the two halves of the frame.
+def test_all_values_of_a_pdo_are_stored_before_they_act(bench):
+    # An earlier target must not act between the two halves of the frame.
     bench.configure().sync()
     for word in (0x06, 0x07):
         bench.rpdo(word, 0)
@@ -130,7 +130,7 @@ def test_all_values_of_a_pdo_are_stored_before_one_acts(bench):
     assert bench.torques == []
 
 
-def test_a_target_is_ignored_until_a_pdo_has_brought_it(bench):
+def test_a_target_is_ignored_until_received_in_a_pdo(bench):
     bench.configure()
     bench.sync()
     bench.write(0x6071, 0, 400, 2)
@@ -140,7 +140,7 @@ def test_a_target_is_ignored_until_a_pdo_has_brought_it(bench):
     assert bench.drive(300)[::2] == (0x1237, 300)
 
 
-def test_a_target_is_ignored_until_a_sync_has_come(bench):
+def test_a_target_is_ignored_until_a_sync(bench):
     bench.write(0x6060, 0, 10, 1)
     bench.nmt(1)
     bench.write(0x6071, 0, 400, 2)
@@ -153,7 +153,7 @@ def test_a_target_is_ignored_until_a_sync_has_come(bench):
     assert bench.torques == [pytest.approx(0.2)]
 
 
-def test_after_another_nmt_state_a_target_waits_for_a_sync_again(running):
+def test_a_target_needs_a_sync_after_another_nmt_state(running):
     running.write(0x6007, 0, 2, 2)
     running.nmt(128)
     running.nmt(1)
@@ -183,7 +183,7 @@ WAYS_OUT = {
 
 @pytest.mark.parametrize("option", [0, 1, 2, 3])
 @pytest.mark.parametrize("way", WAYS_OUT)
-def test_torque_is_zero_and_the_drive_off_after_each_way_out(make_bench, way, option):
+def test_each_exit_ends_torque_and_operation(make_bench, way, option):
     bench = make_bench().configure()
     bench.write(0x6007, 0, option, 2)
     bench.enable()
@@ -200,7 +200,7 @@ def test_torque_is_zero_and_the_drive_off_after_each_way_out(make_bench, way, op
 
 
 @pytest.mark.parametrize("delivery", [1, 255])
-def test_a_pdo_with_the_command_to_leave_leaves(make_bench, delivery):
+def test_a_pdo_with_the_disable_command_disables(make_bench, delivery):
     bench = make_bench().configure(delivery=delivery)
     bench.sync()
     bench.enable()
@@ -210,7 +210,7 @@ def test_a_pdo_with_the_command_to_leave_leaves(make_bench, delivery):
     bench.assert_off()
 
 
-def test_an_encoder_that_jumps_and_wraps(running):
+def test_a_jumping_and_wrapping_encoder(running):
     _, before, _ = running.sync()
     running.node.angle_offset_counts = 12345
     assert running.sync()[1] == before + 12345
@@ -220,7 +220,7 @@ def test_an_encoder_that_jumps_and_wraps(running):
     assert running.sync()[1] == before - 0x7FFF_FFFF
 
 
-def test_a_log_entry_for_each_change_of_torque_or_enabling_and_no_other(running):
+def test_each_change_of_torque_or_enabling_is_logged_once(running):
     running.events.clear()
     for per_mille in (0, 100, 100, -100, 0):
         running.drive(per_mille)
@@ -234,7 +234,7 @@ def test_a_log_entry_for_each_change_of_torque_or_enabling_and_no_other(running)
     ]
 
 
-def test_a_profile_a_drive_cannot_serve_is_refused(rig, bench_on, make_bench):
+def test_an_unsupported_profile_is_refused(rig, bench_on, make_bench):
     with pytest.raises(DeviceError, match=r"\[cia402\]"):
         bench_on(replace(rig, cia402=None))
     with pytest.raises(DeviceError, match="resolution_rad"):

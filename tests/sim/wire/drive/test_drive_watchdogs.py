@@ -1,4 +1,4 @@
-"""What the drive does when its host falls silent or talks nonsense."""
+"""Reaction of the drive to a silent host or invalid frames."""
 
 import pytest
 
@@ -46,7 +46,7 @@ def test_a_lost_heartbeat(running, abort, state):
 @pytest.mark.parametrize(
     ("reaction", "nmt"), [(0, "pre-operational"), (1, "operational"), (2, "stopped")]
 )
-def test_a_lost_heartbeat_changes_the_nmt_state_as_1029_says(running, reaction, nmt):
+def test_a_lost_heartbeat_changes_the_nmt_state_as_in_1029(running, reaction, nmt):
     guard(running, abort=2, reaction=reaction)
     running.wait(51, sync=True)
     assert running.nmt_state() == nmt
@@ -103,7 +103,7 @@ def test_a_fault_is_not_reset_while_the_heartbeat_is_missing(running):
     running.enable()
 
 
-def test_it_cannot_be_switched_on_while_the_heartbeat_is_missing(running):
+def test_no_switching_on_while_the_heartbeat_is_missing(running):
     guard(running, abort=2)
     running.wait(60, sync=True)
     assert running.sync()[0] == 0x02D0  # bit 7: warning
@@ -129,7 +129,7 @@ def test_a_quick_stop_is_not_left_upwards_while_the_heartbeat_is_missing(running
     assert running.state() == "operation enabled"
 
 
-def test_the_reset_of_another_fault_leaves_a_missing_heartbeat_standing(running):
+def test_reset_of_another_fault_does_not_clear_a_missing_heartbeat(running):
     guard(running, abort=0)
     running.wait(60, sync=True)
     running.node.emergency(0x2310, 0x02, b"")
@@ -142,14 +142,14 @@ def test_the_reset_of_another_fault_leaves_a_missing_heartbeat_standing(running)
     assert running.emergencies() == [(0, 0, "0000000000")]
 
 
-def test_a_reset_of_the_node_forgets_a_missing_heartbeat(running):
+def test_a_reset_of_the_node_clears_a_missing_heartbeat(running):
     guard(running)
     running.wait(60, sync=True)
     running.nmt(129)
     running.configure().enable()
 
 
-def test_writing_1016_starts_the_watch_anew(running):
+def test_writing_1016_restarts_the_watch(running):
     guard(running)
     running.wait(60, sync=True)
     running.write(0x1016, 1, 100 << 16 | 80, 4)
@@ -158,7 +158,7 @@ def test_writing_1016_starts_the_watch_anew(running):
     assert running.state() == "switch on disabled"
 
 
-def test_writing_1016_takes_the_error_back_where_it_was_no_fault(running):
+def test_writing_1016_clears_an_error_without_fault(running):
     guard(running, abort=2)
     running.wait(60, sync=True)
     assert running.read(0x1001) == COMMUNICATION
@@ -178,7 +178,7 @@ def test_a_lost_sync_is_a_fault(running):
     running.assert_off()
 
 
-def test_the_sync_may_take_as_long_as_its_period_says(running):
+def test_the_sync_timeout_follows_its_period(running):
     running.write(0x1006, 0, 5000, 4)
     running.sync()
     running.wait(150)
@@ -187,7 +187,7 @@ def test_the_sync_may_take_as_long_as_its_period_says(running):
     assert running.state() == "fault"
 
 
-def test_the_sync_may_take_as_long_as_the_simulator_wants(make_bench):
+def test_the_sync_timeout_follows_the_simulator(make_bench):
     bench = make_bench({"sync_timeout_s": 0.2}).configure().enable()
     bench.wait(200)
     assert bench.state() == "operation enabled"
@@ -195,7 +195,7 @@ def test_the_sync_may_take_as_long_as_the_simulator_wants(make_bench):
     assert bench.state() == "fault"
 
 
-def test_without_sync_nothing_happens_to_a_drive_that_is_not_in_operation(bench):
+def test_no_sync_fault_out_of_operation(bench):
     bench.configure()
     bench.sync()
     bench.wait(100)
@@ -204,7 +204,7 @@ def test_without_sync_nothing_happens_to_a_drive_that_is_not_in_operation(bench)
 
 
 @pytest.mark.parametrize("delivery", [1, 255])
-def test_missing_rpdos_are_a_fault_where_a_deadline_is_set(bench, delivery):
+def test_missing_rpdos_are_a_fault_with_a_deadline(bench, delivery):
     bench.write(0x1400, 5, 20, 2)
     bench.configure(delivery=delivery).sync()
     bench.enable()
@@ -219,14 +219,14 @@ def test_missing_rpdos_are_a_fault_where_a_deadline_is_set(bench, delivery):
     bench.assert_off()
 
 
-def test_without_a_deadline_the_torque_is_held(running):
+def test_the_torque_is_held_without_a_deadline(running):
     running.drive(300)
     running.wait(500, sync=True)
     assert running.witness() == (pytest.approx(0.15), True)
 
 
 @pytest.mark.parametrize(("data", "vendor"), [(b"", "0004000000"), (b"\x0f\x00\x64", "0304000000")])
-def test_a_pdo_that_is_too_short_is_a_fault_in_operation(running, data, vendor):
+def test_a_short_pdo_is_a_fault_in_operation(running, data, vendor):
     running.drive(300)
     running.take()
     running.node.receive(0x205, data)
@@ -235,7 +235,7 @@ def test_a_pdo_that_is_too_short_is_a_fault_in_operation(running, data, vendor):
     running.assert_off()
 
 
-def test_of_a_pdo_that_is_too_long_the_first_bytes_count(running):
+def test_the_first_bytes_of_a_long_pdo_count(running):
     running.drive(300)
     running.take()
     running.node.receive(0x205, b"\x0f\x00\x64\x00\x00")
@@ -256,7 +256,7 @@ def test_one_node_is_not_watched_twice(bench):
     assert bench.write(0x1016, 1, HOST << 16 | 60, 4) == 0  # again, the same entry
 
 
-def test_a_pdo_that_is_too_short_is_only_reported_otherwise(bench):
+def test_a_short_pdo_is_only_reported_out_of_operation(bench):
     bench.configure()
     bench.take()
     for _ in range(3):
@@ -270,14 +270,14 @@ def test_a_pdo_that_is_too_short_is_only_reported_otherwise(bench):
     assert bench.emergencies() == [(0, 0, "0000000000")]
 
 
-def test_a_frozen_drive_is_silent_and_comes_back_in_fault(running):
+def test_a_frozen_drive_is_silent_and_resumes_in_fault(running):
     running.write(0x1017, 0, 20, 2)
     running.drive(300)
     running.take()
     running.node.frozen = True
     moved_before = running.plant.angle_rad
     running.node.receive(0x80, b"")
-    assert running.plant.angle_rad != moved_before  # the world moves on
+    assert running.plant.angle_rad != moved_before  # the world continues
     running.wait(100, sync=True, rpdo=(0x0F, 300))
     assert running.take() == []
     running.assert_off()
@@ -287,7 +287,7 @@ def test_a_frozen_drive_is_silent_and_comes_back_in_fault(running):
     assert running.sync()[0] == 0x0218
 
 
-def test_a_frozen_drive_hears_nothing(bench):
+def test_a_frozen_drive_receives_nothing(bench):
     bench.configure(delivery=255)
     bench.take()
     bench.node.frozen = True
@@ -302,7 +302,7 @@ def test_a_frozen_drive_hears_nothing(bench):
     assert bench.nmt_state() == "operational"
 
 
-def test_the_nmt_command_to_leave_operation_is_a_fault_if_6007_says_so(running):
+def test_leaving_nmt_operational_is_a_fault_with_6007(running):
     running.write(0x6007, 0, 1, 2)
     running.take()
     running.nmt(2)
@@ -311,7 +311,7 @@ def test_the_nmt_command_to_leave_operation_is_a_fault_if_6007_says_so(running):
     assert running.nmt_state() == "stopped"
 
 
-def test_the_host_s_own_end_leaves_no_fault_behind(running):
+def test_no_fault_after_a_regular_end_of_the_host(running):
     guard(running, abort=1)
     running.rpdo(0x06, 0)
     running.sync()

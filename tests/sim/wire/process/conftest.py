@@ -1,4 +1,4 @@
-"""Stand-ins for the nodes, and a world that lives in memory."""
+"""Fakes of the nodes, and a world in memory."""
 
 import struct
 
@@ -33,7 +33,7 @@ class Drive:
         self.never_sets_bit_12 = self.stays_operational = self.ignores_silent_host = False
         self.restarts = []
         self.angle_offset_counts = 0
-        self.heard = []
+        self.received = []
         self.ticks_s = []
         self.emergencies = []
         self.step, self.send = step, send
@@ -42,7 +42,7 @@ class Drive:
     def receive(self, can_id, data):
         if self.frozen:
             return
-        self.heard.append((can_id, data))
+        self.received.append((can_id, data))
         if can_id == 0x80:
             self.step()
             self.send(0x181, struct.pack("<I", self.rig_periods()))
@@ -67,7 +67,7 @@ class Sensor:
         self.frozen = False
         self.saturate = None
         self.status_bits = 0
-        self.heard = []
+        self.received = []
         self.restarts = []
         self.send = send
 
@@ -78,7 +78,7 @@ class Sensor:
         self.restarts.append("power_cycle")
 
     def receive(self, can_id, data):
-        self.heard.append((can_id, data))
+        self.received.append((can_id, data))
         if can_id == 0x680 and not self.frozen:
             self.send(0x680, b"first")
             self.send(0x681, b"second")
@@ -94,13 +94,13 @@ class SerialSensor:
         self.frozen = False
         self.saturate = None
         self.status_bits = 0
-        self.heard = b""
+        self.received = b""
         self.write = write
         self.records_per_period = records_per_period
         self.emitted = 0
 
     def receive(self, data):
-        self.heard += data
+        self.received += data
 
     def emit(self):
         first, self.emitted = self.emitted, self.emitted + self.records_per_period
@@ -111,7 +111,7 @@ class SerialSensor:
 
 
 class Recording:
-    """A world, and all that came out of it."""
+    """A world, and its output."""
 
     def __init__(self, rig, *, lock_step, serial, log):
         self.sent = []
@@ -146,16 +146,16 @@ class Recording:
         self.written += data
 
     def sync(self, *ticks):
-        """Hear a SYNC on each of these ticks, fractions allowed."""
+        """Receive a SYNC at each of these ticks, fractions allowed."""
         for tick in ticks:
             self.world.receive_frames([SYNC], "host", round(tick * PERIOD_NS))
 
     def from_nodes(self):
-        """What the nodes sent, as (identifier, data)."""
+        """Return the frames of the nodes, as (identifier, data)."""
         return [unpack(raw) for raw, origin in self.sent if origin is None]
 
     def answers(self):
-        """What the drive answered."""
+        """Return the answers of the drive."""
         return [
             struct.unpack("<I", data)[0] for can_id, data in self.from_nodes() if can_id == 0x181
         ]
@@ -167,7 +167,7 @@ def unpack(raw):
 
 
 class Events:
-    """Keeps what is logged, with the simulated time that the world sets."""
+    """Records log entries, with the simulated time that the world sets."""
 
     def __init__(self):
         self.time_s = 0.0

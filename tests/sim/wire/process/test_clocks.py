@@ -1,4 +1,4 @@
-"""The world's clock: what a SYNC does, early, late, missing or drifting."""
+"""The world's clock under SYNCs that are early, late, missing or drifting."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +19,7 @@ def test_a_regular_sync_moves_the_world_by_one_period():
     start=st.floats(0, 1000),
     jitter=st.lists(st.floats(-0.24, 0.24), min_size=2, max_size=400),
 )
-def test_jitter_up_to_a_quarter_period_is_borne_from_the_first_sync_on(start, jitter):
+def test_jitter_of_a_quarter_period_is_tolerated_from_the_start(start, jitter):
     clock = WallClock(T, 0)
     moves = [clock.sync((start + tick + off) * T) for tick, off in enumerate(jitter)]
     assert set(moves[1:]) == {1}
@@ -30,7 +30,7 @@ def test_jitter_up_to_a_quarter_period_is_borne_from_the_first_sync_on(start, ji
     phase=st.floats(-0.5, 0.5),
     jitter=st.lists(st.floats(-0.45, 0.45), min_size=1, max_size=8),
 )
-def test_jitter_up_to_half_a_period_is_borne_once_the_phase_is_known(phase, jitter):
+def test_jitter_of_half_a_period_is_tolerated_with_known_phase(phase, jitter):
     clock = WallClock(T, 0)
     for tick in range(500):
         clock.sync((10 + tick + phase) * T)
@@ -40,12 +40,12 @@ def test_jitter_up_to_half_a_period_is_borne_once_the_phase_is_known(phase, jitt
 
 @quiet
 @given(events=st.lists(st.tuples(st.floats(-0.4, 0.4), st.booleans()), min_size=10, max_size=300))
-def test_the_world_is_where_the_syncs_say_however_many_are_missing(events):
+def test_the_world_follows_the_syncs_despite_losses(events):
     clock = WallClock(T, 0)
     for tick in range(500):
         clock.sync(tick * T)
     for tick, (off, missing) in enumerate(events, start=500):
-        # The loop looks at the clock often; half a period after a tick it has passed.
+        # The loop reads the clock often; half a period after a tick it has passed.
         clock.elapse(round((tick - 0.51) * T))
         if missing:
             clock.elapse(round((tick + 0.49) * T))
@@ -58,7 +58,7 @@ def test_the_world_is_where_the_syncs_say_however_many_are_missing(events):
 
 @settings(max_examples=10)
 @given(drift=st.floats(-3e-4, 3e-4), noise=st.lists(st.floats(-0.3, 0.3), min_size=16, max_size=16))
-def test_a_host_whose_clock_runs_otherwise_is_followed(drift, noise):
+def test_a_host_with_another_clock_rate_is_followed(drift, noise):
     clock = WallClock(T, 0)
     moves = [
         clock.sync((tick * (1 + drift) + (noise[tick % 16] if tick > 300 else 0.0)) * T)
@@ -67,7 +67,7 @@ def test_a_host_whose_clock_runs_otherwise_is_followed(drift, noise):
     assert set(moves[1:]) == {1}
 
 
-def test_periods_without_a_sync_pass_by_themselves():
+def test_periods_pass_without_a_sync():
     clock = WallClock(T, 0)
     assert clock.elapse(round(0.4 * T)) == 0
     assert clock.elapse(round(10.4 * T)) == 9
@@ -84,7 +84,7 @@ def test_a_second_sync_in_a_period_moves_nothing():
     assert clock.sync(101 * T) == 1
 
 
-def test_after_a_silence_the_phase_counts_anew():
+def test_the_phase_is_reset_after_a_silence():
     clock = WallClock(T, 0)
     for tick in range(500):
         clock.sync(tick * T)
@@ -97,12 +97,12 @@ def test_after_a_silence_the_phase_counts_anew():
     assert moves == [1, 1, 1]
 
 
-def test_lock_step_moves_one_period_a_sync_whenever_it_comes():
+def test_each_sync_is_one_period_in_lock_step():
     clock = LockStep(T, 0)
     assert [clock.sync(now) for now in (5 * T, 5 * T + 1, 900 * T, 901 * T)] == [1] * 4
 
 
-def test_lock_step_waits_for_a_host_but_not_for_ever():
+def test_lock_step_waits_for_a_host_with_a_timeout():
     clock = LockStep(T, 0)
     clock.sync(0)
     assert clock.elapse(5_000_000_000) == 0
@@ -112,13 +112,13 @@ def test_lock_step_waits_for_a_host_but_not_for_ever():
     assert clock.elapse(10_000_000_000) == 0
 
 
-def test_lock_step_does_not_wait_for_nobody():
+def test_lock_step_does_not_wait_without_a_host():
     clock = LockStep(T, 0)
     clock.sync(0)
     clock.stop_waiting(10 * T)
     assert clock.elapse(14 * T) == 4
 
 
-def test_in_lock_step_time_goes_on_before_the_first_sync():
+def test_time_passes_before_the_first_sync_in_lock_step():
     clock = LockStep(T, 0)
     assert clock.elapse(100 * T) == 100

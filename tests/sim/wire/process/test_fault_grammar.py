@@ -1,4 +1,4 @@
-"""How faults are written, and what is said of those that are not."""
+"""Notation of faults, and messages on mistakes in it."""
 
 import pytest
 from hypothesis import given, settings
@@ -66,7 +66,7 @@ OPTIONAL = {
     ),
     "end": ({}, {"fault": st.sampled_from(["sto", "freeze", "cut", "drop"])}),
 }
-asked = st.one_of(
+faults = st.one_of(
     *(
         st.tuples(
             st.just(kind),
@@ -78,7 +78,7 @@ asked = st.one_of(
 )
 
 
-def test_every_kind_is_tried_here():
+def test_every_kind_is_tested():
     with pytest.raises(WrongUseError) as refused:
         parse_fault("none")
     known = str(refused.value).partition("choose ")[2].rstrip(".")
@@ -86,8 +86,8 @@ def test_every_kind_is_tried_here():
 
 
 @settings(max_examples=200)
-@given(asked, st.randoms())
-def test_what_is_written_is_understood_and_written_back(question, random):
+@given(faults, st.randoms())
+def test_faults_are_read_and_written_back(question, random):
     kind, values, after_s = question
     words = [
         f"{key}={value!r}" if isinstance(value, float) else f"{key}={value}"
@@ -105,7 +105,7 @@ def test_what_is_written_is_understood_and_written_back(question, random):
 
 @settings(max_examples=50)
 @given(st.text(max_size=40) | st.text(alphabet="dropfmes=,@0x1.-", max_size=20))
-def test_anything_else_is_refused_with_a_sentence(text):
+def test_other_text_is_refused_with_a_sentence(text):
     try:
         fault = parse_fault(text)
     except WrongUseError as error:
@@ -116,7 +116,7 @@ def test_anything_else_is_refused_with_a_sentence(text):
 
 
 @pytest.mark.parametrize(
-    ("spec", "said"),
+    ("spec", "message"),
     [
         ("dorp,from=drive", "unknown fault 'dorp'; choose drop, delay, corrupt, reorder, freeze"),
         ("drop", "drop needs from: drive or sensor or host"),
@@ -135,10 +135,10 @@ def test_anything_else_is_refused_with_a_sentence(text):
         ("cut@", "'@': give the seconds after enabling"),
     ],
 )
-def test_the_wrong_word_is_named(spec, said):
+def test_the_wrong_word_is_named(spec, message):
     with pytest.raises(WrongUseError) as caught:
         parse_fault(spec)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_defaults():

@@ -1,4 +1,4 @@
-"""The bus on a Unix socket and the serial line: who hears whom, torn frames, deaf clients."""
+"""The bus on a Unix socket and the serial line: distribution, torn frames, deaf clients."""
 
 import os
 import select
@@ -23,15 +23,15 @@ class Bench:
     def __init__(self, path):
         self.path = path
         self.handlers = {}
-        self.heard = []
-        self.told = []
+        self.received = []
+        self.events = []
         self.hub = links.VirtualBus(
-            path, self.handlers, self._hear, lambda *told: self.told.append(told)
+            path, self.handlers, self._receive, lambda *events: self.events.append(events)
         )
         self.links = []
 
-    def _hear(self, frames, origin):
-        self.heard += frames
+    def _receive(self, frames, origin):
+        self.received += frames
         for raw in frames:
             self.hub.send(raw, origin)
 
@@ -68,29 +68,29 @@ def read(link):
         return None
 
 
-def test_a_client_is_heard_by_the_nodes_and_by_all_other_clients(bench):
+def test_nodes_and_other_clients_receive_frames_of_a_client(bench):
     one, two, three = (bench.connect() for _ in range(3))
     one.send(frame(1) + frame(2))
     bench.turn()
-    assert bench.heard == [frame(1), frame(2)]
+    assert bench.received == [frame(1), frame(2)]
     assert read(one) is None
     assert read(two) == read(three) == frame(1) + frame(2)
 
 
-def test_a_node_is_heard_by_every_client(bench):
+def test_every_client_receives_frames_of_a_node(bench):
     one, two = bench.connect(), bench.connect()
     bench.hub.send(frame(3))
     assert read(one) == read(two) == frame(3)
 
 
 @pytest.mark.parametrize("cut", range(1, 16))
-def test_torn_frames_are_put_together(bench, cut):
+def test_torn_frames_are_joined(bench, cut):
     link = bench.connect()
     data = frame(1) + frame(2) + frame(3)
-    for piece in (data[:cut], data[cut : 16 + cut], data[16 + cut :]):
-        link.send(piece)
+    for chunk in (data[:cut], data[cut : 16 + cut], data[16 + cut :]):
+        link.send(chunk)
         bench.turn()
-    assert bench.heard == [frame(1), frame(2), frame(3)]
+    assert bench.received == [frame(1), frame(2), frame(3)]
 
 
 def test_two_torn_senders_do_not_mix(bench):
@@ -101,27 +101,27 @@ def test_two_torn_senders_do_not_mix(bench):
     bench.turn()
     one.send(frame(1)[7:])
     bench.turn()
-    assert bench.heard == [frame(2), frame(1)]
+    assert bench.received == [frame(2), frame(1)]
 
 
-def test_who_does_not_read_loses_whole_frames_and_nobody_waits(bench):
+def test_a_client_that_does_not_read_loses_whole_frames(bench):
     deaf, reading = bench.connect(), bench.connect()
     sent = 0
     while bench.hub.lost < 100:
         bench.hub.send(frame(sent))
         assert read(reading) == frame(sent)
         sent += 1
-    kept = b""
+    data = b""
     while chunk := read(deaf):
-        kept += chunk
-    assert len(kept) % 16 == 0
-    assert kept == b"".join(frame(n) for n in range(len(kept) // 16))
-    assert len(kept) // 16 == sent - bench.hub.lost
+        data += chunk
+    assert len(data) % 16 == 0
+    assert data == b"".join(frame(n) for n in range(len(data) // 16))
+    assert len(data) // 16 == sent - bench.hub.lost
     bench.hub.send(frame(sent))
     assert read(deaf) == frame(sent)
 
 
-def test_a_frame_that_went_half_is_finished_before_the_next(bench):
+def test_a_half_sent_frame_is_completed_first(bench):
     link = bench.connect()
     client = bench.hub._clients[0]
     client.unsent_bytes = frame(1)[5:]
@@ -139,7 +139,7 @@ def test_clients_come_and_go(bench):
     assert read(two) == frame(1)
     two.close()
     bench.turn()
-    assert bench.told == [
+    assert bench.events == [
         ("client 1 connected", 1),
         ("client 2 connected", 2),
         ("client 1 gone", 1),
@@ -159,7 +159,7 @@ def test_a_cut_bus_refuses_everybody(bench):
     bench.hub.close()
 
 
-def test_what_a_dead_process_left_is_replaced(tmp_path):
+def test_the_socket_of_a_dead_process_is_replaced(tmp_path):
     path = tmp_path / "bus"
     first = links.listen(path)
     first.close()
@@ -167,15 +167,15 @@ def test_what_a_dead_process_left_is_replaced(tmp_path):
     links.listen(path).close()
 
 
-def test_a_socket_that_cannot_be_made_is_told(tmp_path):
+def test_failure_to_make_the_socket_is_reported(tmp_path):
     with pytest.raises(DeviceError, match="XDG_RUNTIME_DIR"):
         links.listen(tmp_path / ("x" * 120))
     with pytest.raises(DeviceError, match="cannot make its socket"):
         links.listen(tmp_path / "no such folder" / "bus")
 
 
-# The kernel's virtual bus. Where there is none, a pair of sockets that keep packets apart takes
-# the place of it.
+# The kernel's virtual bus. Where there is none, a pair of packet sockets
+# replaces it.
 
 
 @pytest.fixture
@@ -183,24 +183,24 @@ def virtual():
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     theirs.setblocking(False)
     bus = links.VirtualCan.__new__(links.VirtualCan)
-    handlers, heard = {}, []
-    bus._use_socket(ours, handlers, lambda frames, origin: heard.append((frames, origin)))
-    yield bus, theirs, handlers, heard
+    handlers, received = {}, []
+    bus._use_socket(ours, handlers, lambda frames, origin: received.append((frames, origin)))
+    yield bus, theirs, handlers, received
     bus.close()
     theirs.close()
 
 
-def test_frames_of_a_virtual_bus_come_in_one_go(virtual):
-    bus, theirs, handlers, heard = virtual
+def test_frames_of_a_virtual_bus_are_received_together(virtual):
+    bus, theirs, handlers, received = virtual
     for n in range(3):
         theirs.send(frame(n))
     for handler in list(handlers.values()):
         handler()
         handler()
-    assert heard == [([frame(0), frame(1), frame(2)], bus)]
+    assert received == [([frame(0), frame(1), frame(2)], bus)]
 
 
-def test_a_virtual_bus_brings_frames_of_hosts_to_each_other_by_itself(virtual):
+def test_a_virtual_bus_is_not_repeated_to_other_hosts(virtual):
     bus, theirs, _, _ = virtual
     bus.send(frame(1), bus)
     bus.send(frame(2))
@@ -218,17 +218,17 @@ def test_a_full_or_cut_virtual_bus_loses_frames(virtual):
     assert handlers == {}
 
 
-def test_a_channel_that_is_not_there_is_no_virtual_bus():
+def test_a_missing_channel_is_no_virtual_bus():
     assert links.is_virtual("nocan77") is False
 
 
-def test_an_interface_that_is_not_a_virtual_bus_is_refused():
+def test_another_kind_of_interface_is_refused():
     with pytest.raises(DeviceError, match="must not answer together with real ones"):
         links.is_virtual("lo")
     assert links.interface_kind("lo") == ""
 
 
-def test_the_kernel_s_word_for_a_virtual_bus_is_understood():
+def test_the_kernel_s_name_of_a_virtual_bus_is_known():
     # RTM_NEWLINK as iproute2 shows it for "ip link add vcan0 type vcan": name, MTU, LINKINFO.
     info = bytes.fromhex("0900 0100 7663616e 00 000000".replace(" ", ""))
     linkinfo = struct.pack("=HH", 4 + len(info), 18) + info
@@ -251,13 +251,13 @@ def test_the_kernel_s_word_for_a_virtual_bus_is_understood():
 class Line:
     def __init__(self):
         self.handlers = {}
-        self.heard = b""
-        self.told = []
-        self.pty = links.PtyLine(self.handlers, self._hear, self.told.append)
+        self.received = b""
+        self.events = []
+        self.pty = links.PtyLine(self.handlers, self._receive, self.events.append)
         self.port = None
 
-    def _hear(self, data):
-        self.heard += data
+    def _receive(self, data):
+        self.received += data
 
     def open(self):
         self.port = os.open(self.pty.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -291,18 +291,18 @@ def test_bytes_go_both_ways_unchanged(line):
     assert line.read() == every
     os.write(line.port, every)
     line.turn()
-    assert line.heard == every
-    assert line.told == [True]
+    assert line.received == every
+    assert line.events == [True]
 
 
-def test_an_open_line_with_nothing_on_it_keeps_nobody_busy(line):
+def test_no_busy_wait_on_an_idle_line(line):
     line.pty.poll()
     assert line.handlers == {}
     line.open()
     assert select.select(line.handlers, (), (), 0)[0] == []
 
 
-def test_what_is_sent_while_nobody_listens_is_lost(line):
+def test_bytes_without_a_listener_are_lost(line):
     line.pty.write(b"nobody hears this")
     line.open()
     line.pty.write(b"this is heard")
@@ -310,7 +310,7 @@ def test_what_is_sent_while_nobody_listens_is_lost(line):
     assert line.pty.lost == 0
 
 
-def test_a_host_that_does_not_read_loses_bytes_and_nobody_waits(line):
+def test_a_host_that_does_not_read_loses_bytes(line):
     line.open()
     for _ in range(1000):
         line.pty.write(bytes(91))
@@ -327,8 +327,8 @@ def test_the_port_can_be_closed_and_opened_again(line):
     line.open()
     os.write(line.port, b", second")
     line.turn()
-    assert line.heard == b"first, second"
-    assert line.told == [True, False, True]
+    assert line.received == b"first, second"
+    assert line.events == [True, False, True]
 
 
 def test_a_cut_line_is_dead(line):
@@ -343,7 +343,7 @@ def test_a_cut_line_is_dead(line):
 # Delays
 
 
-def test_what_the_exchange_takes_is_not_simulated_on_top():
+def test_delays_of_the_exchange_are_not_simulated_twice():
     rig = load_profile("antenna_can").rig
     assert links.without_transport_delay(rig) is rig
     late = replace(
@@ -359,7 +359,7 @@ def test_what_the_exchange_takes_is_not_simulated_on_top():
 
 
 @pytest.mark.parametrize("device", ["encoder", "sensor"])
-def test_a_profile_that_states_less_than_the_exchange_takes_is_refused(device):
+def test_a_delay_below_that_of_the_exchange_is_refused(device):
     rig = load_profile("antenna_can").rig
     rig = replace(
         rig,

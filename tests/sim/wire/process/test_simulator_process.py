@@ -76,7 +76,7 @@ class Simulator:
 
 
 class Host:
-    """A master that knows a few frames by heart."""
+    """A master with a few fixed frames."""
 
     def __init__(self, path):
         self.link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -181,7 +181,7 @@ def connect():
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, further(signal.SIGINT)])
-def test_it_says_where_it_is_and_ends_without_a_trace(simulate, runtime, how):
+def test_the_simulator_prints_its_address_and_cleans_up(simulate, runtime, how):
     simulator = simulate()
     address = simulator.address
     assert address.pid == simulator.process.pid
@@ -193,11 +193,11 @@ def test_it_says_where_it_is_and_ends_without_a_trace(simulate, runtime, how):
     assert simulator.events()[-1]["what"] == "ended"
 
 
-def test_quiet_is_quiet(simulate):
+def test_no_output_with_quiet(simulate):
     assert simulate("antenna_can", "--quiet").end() == (0, "", "")
 
 
-def test_there_is_one_for_each_rig(simulate):
+def test_one_simulator_for_each_rig(simulate):
     first = simulate()
     second = rigd("simulate", "--profile", "antenna_can")
     assert second.returncode == 1
@@ -206,7 +206,7 @@ def test_there_is_one_for_each_rig(simulate):
     assert simulate("antenna_serial").address is not None
 
 
-def test_a_killed_one_is_not_found_and_does_not_stand_in_the_way(simulate, connect):
+def test_a_killed_simulator_does_not_prevent_the_next(simulate, connect):
     first = simulate()
     first.end(signal.SIGKILL)
     assert find_simulator("antenna_can") is None
@@ -227,7 +227,7 @@ def test_a_host_drives_the_motor(simulate, connect):
     assert per_mille == 400
     # 0.2 N·m less 0.03 of friction on some 2 to 3 g·m² for 0.1 s.
     assert 0.1 < (counts - start) * 7e-5 < 0.5
-    # What matters is in the file although it is still open; the rest comes with the end.
+    # Important entries are in the file although it is open; the others come at the end.
     (enabled,) = simulator.events("drive", "state")[-1:]
     assert enabled["state"] == "operation enabled"
     _, out, _ = simulator.end()
@@ -239,7 +239,7 @@ def test_a_host_drives_the_motor(simulate, connect):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
-def test_a_full_disk_ends_the_log_and_nothing_else(simulate, connect):
+def test_a_full_disk_ends_the_log_only(simulate, connect):
     simulator = simulate("antenna_can", "--lock-step", "--log", "/dev/full")
     connect(simulator).set_up()
     assert ask_simulator(simulator.address, {"status": True})["clients"] == 1
@@ -248,7 +248,7 @@ def test_a_full_disk_ends_the_log_and_nothing_else(simulate, connect):
     assert out.count("cannot be written any more (No space left") == 1
 
 
-def test_requests_come_as_lines_whatever_else_is_sent(simulate):
+def test_requests_are_lines_between_other_data(simulate):
     address = simulate().address
 
     def control():
@@ -257,10 +257,10 @@ def test_requests_come_as_lines_whatever_else_is_sent(simulate):
         link.settimeout(30.0)
         return link
 
-    control().close()  # only looks whether it runs
+    control().close()  # only tests whether it runs
     with control() as link, link.makefile("rb") as replies:
-        for piece in (b'{"status": true}\n{"inj', b'ect": "nonsense"}', b"\n"):
-            link.sendall(piece)
+        for chunk in (b'{"status": true}\n{"inj', b'ect": "nonsense"}', b"\n"):
+            link.sendall(chunk)
             time.sleep(0.02)
         assert json.loads(replies.readline())["rig"] == "antenna_can"
         assert "unknown fault" in json.loads(replies.readline())["error"]
@@ -271,30 +271,30 @@ def test_requests_come_as_lines_whatever_else_is_sent(simulate):
         assert json.loads(replies.readline())["rig"] == "antenna_can"
 
 
-def test_a_simulator_that_is_gone_is_told(tmp_path):
+def test_a_missing_simulator_is_an_error(tmp_path):
     address = SimulatorAddress(pid=4711, control_socket=str(tmp_path / "gone"))
     with pytest.raises(DeviceError, match="process 4711"):
         ask_simulator(address, {"status": True})
 
 
 @pytest.mark.further  # as test_lock_step.py
-def test_in_lock_step_everything_can_be_repeated(simulate, connect):
+def test_lock_step_is_reproducible(simulate, connect):
     logs, replies = [], []
     for pause_s in (0.0, 0.002):
         simulator = simulate("antenna_can", "--lock-step", "--seed", "1")
         host = connect(simulator)
         host.set_up()
         host.enable()
-        got = []
+        replies_of_host = []
         for tick in range(150):
             time.sleep(pause_s)
             host.send((0x680, b""), (0x77F, b"\x05"))
-            got.append(host.receive(0x680)[1] + host.receive(0x681)[1])
-            got.append(host.tick(0x0F, 300 if tick < 60 else -100))
+            replies_of_host.append(host.receive(0x680)[1] + host.receive(0x681)[1])
+            replies_of_host.append(host.tick(0x0F, 300 if tick < 60 else -100))
         host.tick(0x00)
         host.tick()
         simulator.end()
-        replies.append(got)
+        replies.append(replies_of_host)
         torques = simulator.events("drive", "torque")
         since = torques[0]["t_s"]
         logs.append([(round(e["t_s"] - since, 6), e["torque_nm"], e["enabled"]) for e in torques])
@@ -309,10 +309,10 @@ def test_in_lock_step_everything_can_be_repeated(simulate, connect):
 
 
 @pytest.mark.parametrize("options", [(), ("--lock-step",)])
-def test_a_drive_whose_host_is_gone_switches_off(simulate, connect, options):
+def test_a_drive_switches_off_without_its_host(simulate, connect, options):
     simulator = simulate("antenna_can", *options)
     host = connect(simulator)
-    host.set_up(50 if options else 1000)  # by the clock, the machine may stand still
+    host.set_up(50 if options else 1000)  # by the clock, the computer may pause
     host.enable()
     for _ in range(5):
         host.send((0x77F, b"\x05"))
@@ -366,7 +366,7 @@ def test_faults_are_injected_while_it_runs(simulate, connect, rigd_here):
 
 
 @pytest.mark.further  # as test_world.py
-def test_obstacles_may_be_there_from_the_start_and_come_later(simulate, rigd_here):
+def test_obstacles_from_the_start_and_later(simulate, rigd_here):
     simulate("antenna_can", "--lock-step", "--obstacle", "x=0.6,angle=0.3")
     address = find_simulator("antenna_can")
     assert address.rig["simulation.obstacles"] == ["x=0.6,angle=0.3"]
@@ -430,7 +430,7 @@ def test_long_folder_names_get_short_sockets(simulate, connect, runtime, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (("simulate", "--profile", "sim"), 2, "no bus messages"),
         (("inject", "--profile", "sim", "sto"), 2, "Use a profile of a rig with a bus"),
@@ -448,16 +448,16 @@ def test_long_folder_names_get_short_sockets(simulate, connect, runtime, tmp_pat
         (("simulate", "--profile", "antenna_can", "--fault", "knock,x=1"), 2, "needs force"),
     ],
 )
-def test_wrong_use_is_told_in_a_sentence(runtime, rigd_here, arguments, code, said):
+def test_wrong_use_is_refused_in_a_sentence(runtime, rigd_here, arguments, code, message):
     done = rigd_here(*arguments)
     assert done.returncode == code
     assert done.stderr.startswith("Error: ")
-    assert said in done.stderr
+    assert message in done.stderr
     assert "Traceback" not in done.stderr
     assert find_simulator("antenna_can") is None
 
 
-def test_a_log_takes_no_other_file_s_name(simulate, runtime, rigd_here, tmp_path):
+def test_a_log_replaces_no_other_file(simulate, runtime, rigd_here, tmp_path):
     session = tmp_path / "session.mcap"
     session.write_bytes(b"two minutes of the rig")
     nowhere = tmp_path / "link"
@@ -475,7 +475,7 @@ def test_a_log_takes_no_other_file_s_name(simulate, runtime, rigd_here, tmp_path
     assert before.log.read_bytes() == witness
 
 
-def test_a_rig_that_is_not_started_leaves_no_log(runtime, rigd_here, tmp_path):
+def test_no_log_of_a_rig_that_did_not_start(runtime, rigd_here, tmp_path):
     faults = ("--fault", "sto", "--fault", "cut,device=sensor")
     arguments = ("simulate", "--profile", "antenna_can", "--log", tmp_path / "log", *faults)
     assert rigd_here(*arguments).returncode == 2
@@ -490,7 +490,7 @@ def test_the_help_names_every_fault(rigd_here):
     assert all(f"{kind}," in shown or f"{kind}[" in shown for kind in kinds)
 
 
-def test_its_noise_differs_from_run_to_run_and_session_to_session_unless_a_seed_is_stated(simulate):
+def test_noise_differs_unless_a_seed_is_stated(simulate):
     def seeds(*options):
         simulator = simulate("antenna_can", "--lock-step", *options)
         found = [

@@ -1,4 +1,4 @@
-"""A session's devices over the wire see what the bare simulation of the same profile does.
+"""A session's devices over the wire return what the direct simulation of the same profile does.
 
 In lock-step every tick is determined, so angles have to be equal and wrenches equal but for the
 gauges' resolution: pairing, order, scaling and every delay, through the drivers of the rig.
@@ -91,7 +91,7 @@ def over_the_wire(rig, ticks):
             sensor.request(tick * PERIOD_NS)
             angle, wrench = drive.read_angle(), sensor.read_wrench()
             drive.command(torque_nm(tick) if tick >= 0 else 0.0)
-            # Replies that are taken a tick later have come by then, as they have in real time; the
+            # Replies that are read a tick later have arrived by then, as in real time; the
             # simulator serves one after the other, so its second answer is behind all of this.
             ask_simulator(address, {"status": True})
             ask_simulator(address, {"status": True})
@@ -129,20 +129,20 @@ def loads(rig, ticks):
     ]
 
 
-def test_the_load_that_is_measured_is_the_one_that_was_computed(simulated_profile):
+def test_the_measured_load_is_the_computed_one(simulated_profile):
     rig = simulated_profile("antenna_can", {})
     bus, none = loads(rig, 500)
     assert none is None  # the sensor is on the same bus
     assert bus == pytest.approx(bus_load(rig).plain, rel=0.02)
 
 
-def test_the_load_of_a_serial_line_is_what_it_streams(simulated_profile):
+def test_the_load_of_a_serial_line_is_its_stream(simulated_profile):
     rig = simulated_profile("antenna_serial", {})
     _, line = loads(rig, 500)
     assert line == pytest.approx(rig.ati_serial.stream_hz * 143 / rig.ati_serial.baud, rel=0.02)
 
 
-def bare(rig, ticks):
+def simulate_directly(rig, ticks):
     simulated = SimulatedRig(rig)
     simulated.plant.enable()
     simulated.advance(20)
@@ -179,12 +179,14 @@ def bare(rig, ticks):
 def test_the_wire_changes_nothing(simulated_profile, name, changes):
     rig = simulated_profile(name, changes)
     ticks = 120
-    expected = bare(rig, ticks)
-    got = over_the_wire(rig, ticks)
-    assert [angle for angle, _ in got] == pytest.approx([angle for angle, _ in expected], abs=1e-9)
-    assert max(abs(angle) for angle, _ in got) > 0.01
+    expected = simulate_directly(rig, ticks)
+    measured = over_the_wire(rig, ticks)
+    assert [angle for angle, _ in measured] == pytest.approx(
+        [angle for angle, _ in expected], abs=1e-9
+    )
+    assert max(abs(angle) for angle, _ in measured) > 0.01
     # The sensor's bias is its own; what counts is the change, as with a tare.
-    changes = [np.subtract(wrench, got[0][1]) for _, wrench in got]
+    changes = [np.subtract(wrench, measured[0][1]) for _, wrench in measured]
     wanted = [np.subtract(wrench, expected[0][1]) for _, wrench in expected]
     off = np.max(np.abs(np.subtract(changes, wanted)), axis=0)
     assert np.all(off <= rig.sensor.resolution)
@@ -197,7 +199,7 @@ def test_a_hum_comes_over_the_wire(simulated_profile, name):
     ticks = 120
     alone = replace(rig, simulation=replace(rig.simulation, hum_nm=0.0))
     torque = np.array([wrench[5] for _, wrench in over_the_wire(rig, ticks)])
-    hum = torque - [wrench[5] for _, wrench in bare(alone, ticks)]
+    hum = torque - [wrench[5] for _, wrench in simulate_directly(alone, ticks)]
     # Its phase at the first tick is that of the time that the simulator has been running for.
     phase = 0.1 * np.pi * np.arange(ticks)
     columns = np.column_stack([np.sin(phase), np.cos(phase), np.ones(ticks)])

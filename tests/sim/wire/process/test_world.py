@@ -46,7 +46,7 @@ def test_missed_syncs_pass_as_periods_before_the_next_one(make_world):
     assert len(rig.drive.ticks_s) == 5
 
 
-def test_without_sync_the_world_moves_by_the_clock(make_world):
+def test_the_world_moves_by_the_clock_without_sync(make_world):
     rig = make_world()
     rig.world.elapse(round(20.6 * PERIOD_NS))
     assert rig.world.rig_periods == 20
@@ -54,7 +54,7 @@ def test_without_sync_the_world_moves_by_the_clock(make_world):
     assert rig.answers() == [21]
 
 
-def test_syncs_read_together_after_a_pause_are_a_period_each(make_world):
+def test_each_sync_after_a_pause_is_a_period(make_world):
     rig = make_world()
     rig.sync(*range(1, 11))
     rig.world.receive_frames([SYNC, numbered(1), SYNC, numbered(2), SYNC], "host", 13 * PERIOD_NS)
@@ -63,7 +63,7 @@ def test_syncs_read_together_after_a_pause_are_a_period_each(make_world):
     assert rig.answers() == [*range(1, 15)]
 
 
-def test_the_loop_may_wait_until_a_sync_is_overdue_or_long_where_none_comes(make_world):
+def test_waiting_time_of_the_loop(make_world):
     rig = make_world()
     assert rig.world.wait_s(0, 0.01) == 0.01
     rig.sync(*range(1, 20))
@@ -82,7 +82,7 @@ def test_a_frozen_drive_does_not_stop_the_world(make_world):
     assert rig.answers() == [3]
 
 
-def test_in_lock_step_only_syncs_move_the_rig_while_a_host_is_there(make_world):
+def test_only_syncs_move_the_rig_in_lock_step(make_world):
     rig = make_world(lock_step=True)
     rig.simulated.plant.enable()
     rig.sync(0.1, 0.2, 700, 701)
@@ -91,7 +91,7 @@ def test_in_lock_step_only_syncs_move_the_rig_while_a_host_is_there(make_world):
     assert rig.world.rig_periods == 4
 
 
-def test_in_lock_step_a_dead_host_is_noticed(make_world):
+def test_a_dead_host_is_detected_in_lock_step(make_world):
     rig = make_world(lock_step=True)
     rig.simulated.plant.enable()
     rig.sync(1)
@@ -101,7 +101,7 @@ def test_in_lock_step_a_dead_host_is_noticed(make_world):
     assert rig.world.rig_periods == 51
 
 
-def test_in_lock_step_a_rig_at_rest_waits_while_its_nodes_are_set_up(make_world):
+def test_a_resting_rig_waits_for_set_up_in_lock_step(make_world):
     rig = make_world(lock_step=True)
     rig.world.elapse(500 * PERIOD_NS)
     assert rig.drive.ticks_s[-1] == pytest.approx(0.5)
@@ -109,7 +109,7 @@ def test_in_lock_step_a_rig_at_rest_waits_while_its_nodes_are_set_up(make_world)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_lock_step_does_not_depend_on_when_frames_come(make_world, seed):
+def test_lock_step_is_independent_of_arrival_times(make_world, seed):
     chance = random.Random(seed)
     rig = make_world(lock_step=True)
     rig.simulated.plant.enable()
@@ -132,28 +132,28 @@ def test_lock_step_does_not_depend_on_when_frames_come(make_world, seed):
 # Routing
 
 
-def test_a_host_is_heard_by_every_node_and_by_other_hosts(make_world):
+def test_nodes_and_other_hosts_receive_frames_of_a_host(make_world):
     rig = make_world()
     rig.world.receive_frames([numbered(7)], "host", 0)
-    assert rig.drive.heard == rig.sensor.heard == [(RPDO, struct.pack("<I", 7))]
+    assert rig.drive.received == rig.sensor.received == [(RPDO, struct.pack("<I", 7))]
     assert rig.sent == [(numbered(7), "host")]
 
 
-def test_nodes_hear_each_other_but_not_themselves(make_world):
+def test_nodes_receive_frames_of_others_only(make_world):
     rig = make_world()
     rig.sync(1)
     rig.world.receive_frames([frame(POLL)], "host", PERIOD_NS)
-    assert [can_id for can_id, _ in rig.sensor.heard] == [0x80, 0x181, POLL]
-    assert [can_id for can_id, _ in rig.drive.heard] == [0x80, POLL, 0x680, 0x681]
+    assert [can_id for can_id, _ in rig.sensor.received] == [0x80, 0x181, POLL]
+    assert [can_id for can_id, _ in rig.drive.received] == [0x80, POLL, 0x680, 0x681]
     assert [origin for _, origin in rig.sent] == ["host", None, "host", None, None]
 
 
-def test_what_is_no_plain_frame_is_nobody_s_business(make_world):
+def test_other_kinds_of_frames_are_dropped(make_world):
     rig = make_world()
     remote, long_id, error = 0x4000_0181, 0x8000_0080, 0x2000_0004
     flagged = [struct.pack("=IB3x8s", can_id, 0, b"") for can_id in (remote, long_id, error)]
     rig.world.receive_frames(flagged, "host", PERIOD_NS)
-    assert rig.drive.heard == []
+    assert rig.drive.received == []
 
 
 # Faults of a line
@@ -162,7 +162,7 @@ def test_what_is_no_plain_frame_is_nobody_s_business(make_world):
 def through(rig, first, last):
     for n in range(first, last):
         rig.world.receive_frames([numbered(n)], "host", n * 1000)
-    return numbers(rig.drive.heard)
+    return numbers(rig.drive.received)
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def through(rig, first, last):
         ("corrupt,from=host,byte=4", [0, 1, 2, 3, 4, 5, 6, 7]),
     ],
 )
-def test_line_faults_hit_exactly_the_frames_asked_for(make_world, spec, expected):
+def test_line_faults_hit_exactly_the_requested_frames(make_world, spec, expected):
     rig = make_world()
     rig.world.inject(parse_fault(spec))
     assert through(rig, 0, 8) == expected
@@ -195,7 +195,7 @@ def test_two_faults_hit_one_frame_after_the_other(make_world):
     assert hits == ["drop", "drop", "corrupt", "corrupt"]
 
 
-def test_other_hosts_hear_what_the_nodes_hear(make_world):
+def test_other_hosts_receive_what_the_nodes_receive(make_world):
     rig = make_world()
     rig.world.inject(parse_fault("drop,from=host"))
     rig.world.inject(parse_fault("corrupt,from=host"))
@@ -203,7 +203,7 @@ def test_other_hosts_hear_what_the_nodes_hear(make_world):
     assert [raw for raw, _ in rig.sent] == [numbered(0xFE), numbered(2)]
 
 
-def test_a_delayed_reply_comes_when_its_time_has_come(make_world):
+def test_a_delayed_reply_comes_on_time(make_world):
     rig = make_world()
     rig.sync(1)
     rig.world.inject(parse_fault("delay,from=drive,ms=0.3,frames=2"))
@@ -221,7 +221,7 @@ def test_a_delayed_reply_comes_when_its_time_has_come(make_world):
     assert rig.answers() == [1, 2, 4, 3]
 
 
-def test_in_lock_step_a_delay_is_of_simulated_time(make_world):
+def test_a_delay_is_simulated_time_in_lock_step(make_world):
     rig = make_world(lock_step=True)
     rig.world.inject(parse_fault("delay,from=drive,ms=2"))
     rig.sync(1)
@@ -232,7 +232,7 @@ def test_in_lock_step_a_delay_is_of_simulated_time(make_world):
     assert rig.answers() == [2, 3, 1]
 
 
-def test_a_lost_sync_passes_as_a_period_that_no_node_hears(make_world):
+def test_a_lost_sync_is_a_period_without_reception(make_world):
     rig = make_world(lock_step=True)
     rig.sync(1)
     rig.world.inject(parse_fault("drop,from=host,id=0x80,frames=2"))
@@ -257,7 +257,7 @@ def test_a_fault_waits_until_the_drive_is_enabled(make_world):
     ]
 
 
-def test_a_fault_that_comes_in_later_counts_from_the_enabling_too(make_world):
+def test_a_later_fault_counts_from_the_enabling(make_world):
     rig = make_world()
     rig.simulated.plant.enable()
     rig.sync(*range(1, 11))
@@ -323,7 +323,7 @@ def test_a_fault_without_an_end_is_ended(make_world, spec, device, attribute, no
     assert len(rig.log.of("fault over")) == 1
 
 
-def test_every_fault_that_lasts_is_ended_here():
+def test_every_lasting_fault_is_tested():
     with pytest.raises(WrongUseError) as refused:
         parse_fault("end,fault=none")
     lasting = str(refused.value).partition("give ")[2].rstrip(".")
@@ -342,7 +342,7 @@ def turned_into_an_obstacle(rig, ticks):
     return np.array(torques)
 
 
-def test_an_injected_obstacle_is_met_and_ended(make_world):
+def test_an_injected_obstacle_is_hit_and_ended(make_world):
     free, rig, ended = (
         make_world(lock_step=True),
         make_world(lock_step=True),
@@ -364,7 +364,7 @@ def test_an_injected_obstacle_is_met_and_ended(make_world):
     assert last[1].mean() > last[2].mean() + 0.01
 
 
-def test_an_injected_knock_comes_once(make_world):
+def test_an_injected_impact_comes_once(make_world):
     rig = make_world(lock_step=True)
     rig.simulated.plant.enable()
     rig.sync(*range(1, 20))
@@ -377,7 +377,7 @@ def test_an_injected_knock_comes_once(make_world):
     assert seen[12:] == [0.0] * len(seen[12:])
 
 
-def test_in_real_time_the_rig_goes_on_while_an_obstacle_is_made(make_world):
+def test_the_rig_continues_while_an_obstacle_is_made(make_world):
     rig = make_world()
     rig.simulated.plant.enable()
     rig.world.inject(parse_fault("knock,x=0.5,force=1,duration=0.01"))
@@ -394,7 +394,7 @@ def test_in_real_time_the_rig_goes_on_while_an_obstacle_is_made(make_world):
     assert [type(body) for body in contact.bodies] == [ImpactSpecification, Obstacle]
 
 
-def test_what_the_beam_cannot_meet_is_refused(make_world, monkeypatch):
+def test_impossible_obstacles_are_refused(make_world, monkeypatch):
     monkeypatch.setattr("rigd.sim._devices._MAX_ADDED_DISTURBANCES", 1)
     rig = make_world(lock_step=True)
     with pytest.raises(WrongUseError, match="beyond the tip"):
@@ -404,7 +404,7 @@ def test_what_the_beam_cannot_meet_is_refused(make_world, monkeypatch):
         rig.world.inject(parse_fault("knock,x=0.5,force=1,duration=0.01"))
 
 
-def test_what_two_faults_hold_stays_until_both_are_over(make_world):
+def test_the_effect_of_two_faults_lasts_until_both_end(make_world):
     rig = make_world()
     rig.sync(1)
     rig.world.inject(parse_fault("freeze,device=drive,for=0.002"))
@@ -427,7 +427,7 @@ def test_faults_of_a_line_are_ended(make_world, kind):
     assert through(rig, 0, 3) == [0, 1, 2]
 
 
-def test_what_was_cut_is_mended_once(make_world):
+def test_a_cut_line_is_mended_once(make_world):
     rig = make_world(serial=True)
     for spec in ("cut", "cut", "cut,device=sensor", "end,fault=cut", "end"):
         rig.world.inject(parse_fault(spec))
@@ -436,7 +436,7 @@ def test_what_was_cut_is_mended_once(make_world):
 
 @pytest.mark.parametrize("kind", ["restart", "power_cycle"])
 @pytest.mark.parametrize("device", ["drive", "sensor"])
-def test_a_device_starts_anew(make_world, kind, device):
+def test_a_device_restarts(make_world, kind, device):
     rig = make_world()
     rig.world.inject(parse_fault(f"{kind},device={device}"))
     assert (rig.drive.restarts, rig.sensor.restarts) == (
@@ -444,41 +444,41 @@ def test_a_device_starts_anew(make_world, kind, device):
     )
 
 
-def test_an_emergency_is_the_drive_s(make_world):
+def test_an_emergency_comes_from_the_drive(make_world):
     rig = make_world()
     rig.world.inject(parse_fault("emcy,code=0x8130,register=0x11"))
     assert rig.drive.emergencies == [(0x8130, 0x11, bytes(5))]
 
 
-def test_a_host_that_is_off_the_bus_is_told_and_neither_heard_nor_spoken_to(make_world):
+def test_a_host_off_the_bus_neither_sends_nor_receives(make_world):
     rig = make_world()
     rig.sync(1)
     rig.sent.clear()
     rig.world.inject(parse_fault("busoff,for=0.003"))
-    heard = len(rig.drive.heard)
+    received = len(rig.drive.received)
     rig.sync(2, 3)
     assert [can_id for can_id, _ in rig.from_nodes()] == [0x2000_0040]
-    assert len(rig.drive.heard) == heard
+    assert len(rig.drive.received) == received
     assert rig.world.rig_periods == 3  # the world goes on
     rig.sync(4, 5)
-    assert len(rig.drive.heard) > heard
+    assert len(rig.drive.received) > received
 
 
-def test_the_wired_stop_is_the_drive_s(make_world):
+def test_the_wired_stop_acts_on_the_drive(make_world):
     rig = make_world()
     rig.drive.sto_dropped = False
     rig.world.inject(parse_fault("sto"))
     assert rig.drive.sto_dropped
 
 
-def test_the_bus_is_cut_by_who_holds_it(make_world):
+def test_the_owner_of_the_bus_cuts_it(make_world):
     rig = make_world()
     rig.world.inject(parse_fault("cut"))
     assert rig.cuts == ["bus"]
 
 
 @pytest.mark.parametrize(
-    ("spec", "said"),
+    ("spec", "message"),
     [
         ("cut,device=sensor", "no serial line"),
         ("drop,from=sensor,bytes=3", "bytes is for a sensor on a serial line"),
@@ -488,9 +488,9 @@ def test_the_bus_is_cut_by_who_holds_it(make_world):
         ),
     ],
 )
-def test_a_fault_that_this_rig_cannot_have_is_refused(make_world, spec, said):
+def test_an_impossible_fault_is_refused(make_world, spec, message):
     rig = make_world()
-    with pytest.raises(WrongUseError, match=said):
+    with pytest.raises(WrongUseError, match=message):
         rig.world.inject(parse_fault(spec + "@5"))
 
 
@@ -511,7 +511,7 @@ def test_each_period_brings_its_records(make_world):
     assert records(rig) == [*range(28)]
 
 
-def test_a_rig_that_waits_in_lock_step_streams_nothing(make_world):
+def test_a_waiting_rig_in_lock_step_streams_nothing(make_world):
     rig = make_world(serial=True, lock_step=True)
     rig.world.elapse(500 * PERIOD_NS)
     rig.sync(501)
@@ -547,7 +547,7 @@ def test_bytes_are_lost_across_records(make_world):
     assert len(rig.written) == 7 * 13 - 16
 
 
-def test_on_a_serial_line_there_are_no_identifiers(make_world):
+def test_no_identifiers_on_a_serial_line(make_world):
     rig = make_world(serial=True)
     with pytest.raises(WrongUseError, match="id is for a sensor on CAN"):
         rig.world.inject(parse_fault("drop,from=sensor,id=1"))
