@@ -1,4 +1,4 @@
-"""What suits a record is done with it: its band, and Welch's fits only where they say something."""
+"""What suits a record: its band, and Welch's fits only where they are informative."""
 
 import json
 import os
@@ -57,7 +57,7 @@ def test_the_band_ends_at_four_tenths_of_the_rate(record_of, every, last_hz):
     )
 
 
-def test_the_band_of_a_part_is_what_it_sweeps(record_of):
+def test_band_of_a_part_is_its_sweep(record_of):
     record = record_of()
     for swept_hz, record_hz, welch_hz in (
         ((0.3, 30.0), (0.0, 30.0), (0.5875, 30.0)),  # from the beginning of the sweep
@@ -72,19 +72,19 @@ def test_the_band_of_a_part_is_what_it_sweeps(record_of):
         assert welch_exclusion_reason(part) is None
 
 
-def test_a_band_asked_for_is_of_all_fits(record_of):
+def test_requested_band_applies_to_all_fits(record_of):
     record = record_of()
     assert record_band_hz(record, (2.0, 30.0)) == (2.0, 30.0)
     assert welch_settings(record, WelchSettings(), (2.0, 30.0)).band_hz == (2.0, 30.0)
     assert remarks(record, (2.0, 30.0)) == ()
-    # A frequency response has nothing to say of 0 Hz: its next bin is the first.
+    # A frequency response is undefined at 0 Hz: its next bin is the first.
     assert welch_settings(record, WelchSettings(), (0.0, 30.0)).band_hz == (1 / 160, 30.0)
     own = WelchSettings(band_hz=(1.0, 60.0))
     assert welch_settings(record_of(10), own).band_hz == (1.0, 60.0)
 
 
 @pytest.mark.parametrize("kind", ["step", "multisine", "modes", "move", "touch"])
-def test_welch_s_method_is_for_sweeps(record_of, kind):
+def test_welch_method_is_for_sweeps(record_of, kind):
     record = record_of(excitation=kind, duration_s="4.0")
     assert kind in f"{welch_exclusion_reason(record)} modes"
     found, left_out = welch_analysis(record, WelchSettings(), optional=True)
@@ -94,7 +94,7 @@ def test_welch_s_method_is_for_sweeps(record_of, kind):
     assert welch_analysis(record, chosen, optional=True)[0] is not None
 
 
-def test_an_option_that_is_said_to_make_the_fits_makes_them(record_of):
+def test_suggested_option_makes_the_fits(record_of):
     """Of 4 s the usual segments are too long, and only an estimator without them is left."""
     record = record_of(excitation="step")
     assert "(--method welch --frf fft makes them nevertheless)" in welch_exclusion_reason(record)
@@ -106,13 +106,13 @@ def test_an_option_that_is_said_to_make_the_fits_makes_them(record_of):
     assert "(--method welch makes them nevertheless)" in welch_exclusion_reason(longer)
 
 
-def test_of_a_touch_it_is_said_that_the_fits_take_the_beam_to_be_free(record_of):
-    (said,) = remarks(record_of(excitation="touch"))
-    assert "analyze touch finds where" in said
+def test_remark_that_fits_assume_a_free_beam(record_of):
+    (remark,) = remarks(record_of(excitation="touch"))
+    assert "analyze touch finds where" in remark
     assert remarks(record_of(excitation="chirp")) == ()
 
 
-def test_a_stopped_sweep_is_not_fitted_beyond_where_it_went(record_of):
+def test_stopped_sweep_is_fitted_up_to_its_end(record_of):
     stated = {"start_hz": "0.05", "stop_hz": "50.0", "duration_s": "8.0"}
     reason = welch_exclusion_reason(record_of(**stated))
     assert "after 4 of 8 s, at 25 Hz" in reason
@@ -120,13 +120,13 @@ def test_a_stopped_sweep_is_not_fitted_beyond_where_it_went(record_of):
     # With the band narrowed so far, or nothing missing, there is nothing against it.
     assert welch_exclusion_reason(record_of(**stated), (0.5875, 25.0)) is None
     assert welch_exclusion_reason(record_of(**{**stated, "duration_s": "4.0"})) is None
-    # Downwards the low frequencies are missing, which the sentence could not tell.
+    # Downwards the low frequencies are missing, which the sentence could not state.
     assert (
         welch_exclusion_reason(record_of(**{**stated, "start_hz": "50", "stop_hz": "0.05"})) is None
     )
 
 
-def test_a_short_sweep_is_told_with_what_would_fit(record_of):
+def test_short_sweep_is_reported_with_fitting_settings(record_of):
     found, left_out = welch_analysis(record_of(), WelchSettings(), optional=True)
     assert found is None
     assert "--segment 575 --overlap 86" in left_out
@@ -180,10 +180,10 @@ def test_a_band_of_a_record_of_100_hz_is_analysed(analyze_here, tmp_path):
 
 @pytest.mark.fit
 @pytest.mark.further  # what suits a step is decided above
-def test_a_step_gets_the_whole_record_s_analysis_and_a_line(
+def test_step_gets_whole_record_analysis_and_a_remark(
     write_session, make_signals, analyze_here, tmp_path
 ):
-    """What is in the file decides, so a sweep that says that it is a step will do."""
+    """The metadata decide, so a sweep that is labelled as a step will do."""
     signals = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
     write_session(tmp_path / "step.mcap", signals, metadata={"excitation": "step"})
     result = analyze_here("step.mcap", "--json", "a.json", "--report", "r")
@@ -198,9 +198,9 @@ def test_a_step_gets_the_whole_record_s_analysis_and_a_line(
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("asked", [False, True])
-def test_warnings_of_libraries_stay_off_the_terminal(tmp_path, asked):
-    """Those of numpy and matplotlib, here and in the processes that it starts; unless asked for."""
+@pytest.mark.parametrize("always", [False, True])
+def test_warnings_of_libraries_stay_off_the_terminal(tmp_path, always):
+    """Those of numpy and matplotlib, here and in the processes that it starts; unless requested."""
     inner = "import numpy; numpy.float64(1e308) * 10"
     program = f"""
 import logging, subprocess, sys
@@ -213,13 +213,13 @@ def work():
 cli.app = work
 cli.main()
 """
-    switches = ["-W", "always"] if asked else []
+    switches = ["-W", "always"] if always else []
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"}
     done = subprocess.run(
         [sys.executable, *switches, "-c", program], cwd=tmp_path, env=environment,
         capture_output=True, text=True, timeout=300, check=True,
     )  # fmt: skip
     assert "no such font" not in done.stderr
-    assert ("overflow" in done.stderr) == asked
-    if not asked:
+    assert ("overflow" in done.stderr) == always
+    if not always:
         assert done.stderr == ""

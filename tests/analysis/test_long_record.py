@@ -22,7 +22,7 @@ def decimated(paper_file):
     return load_record(paper_file, longest_samples=LONGEST)
 
 
-def test_blocks_leave_no_trace(paper_file, decimated):
+def test_result_does_not_depend_on_blocks(paper_file, decimated):
     whole = load_record(paper_file)
     decimation = Decimation.to_band(1000.0, 50.0, 2.5)
     assert (decimation.factor, decimation.reach) == (FACTOR, REACH)
@@ -43,7 +43,7 @@ def test_blocks_leave_no_trace(paper_file, decimated):
     )  # fmt: skip
 
 
-def test_a_record_that_is_not_long_is_not_decimated(paper_file):
+def test_short_record_is_not_decimated(paper_file):
     whole, twice_read = (
         load_record(paper_file, longest_samples=longest) for longest in (10**9, 140_000)
     )
@@ -54,7 +54,7 @@ def test_a_record_that_is_not_long_is_not_decimated(paper_file):
 
 @pytest.mark.fit
 @pytest.mark.further  # of a record that is equal, as tested above
-def test_the_modes_are_those_of_the_whole_record(paper_file, decimated):
+def test_decimated_record_has_the_same_modes(paper_file, decimated):
     """Both fits are to the same time: 0.26 s at either end are inside no filter window."""
     ends_s = decimated.time_s[0], decimated.time_s[-1] + 1e-3
     whole, shorter = (
@@ -72,7 +72,7 @@ def test_the_modes_are_those_of_the_whole_record(paper_file, decimated):
             assert getattr(found, std) == pytest.approx(expected_std, rel=0.1)
 
 
-def test_a_short_gap_is_interpolated_and_a_long_one_reaches_as_far_as_the_filter(
+def test_short_gaps_are_interpolated_and_long_ones_widened(
     paper_file, paper_signals, write_session, tmp_path, decimated
 ):
     status = np.zeros(paper_signals.angle_rad.size, int)
@@ -119,7 +119,7 @@ def test_clipping_is_found_in_all_samples(
     assert measurement.torque_extremes == (largest, smallest)
 
 
-def test_a_record_that_no_analysis_has_room_for_names_the_remedies(paper_file, monkeypatch):
+def test_record_too_long_for_memory_names_remedies(paper_file, monkeypatch):
     monkeypatch.setattr("analysis.signal_decimation.MAX_DECIMATED_SAMPLES", 16_000)
     with pytest.raises(RecordError, match=r"16\d\d\d samples.*--from, --to\) or lower --band"):
         load_record(paper_file, longest_samples=LONGEST)
@@ -128,7 +128,7 @@ def test_a_record_that_no_analysis_has_room_for_names_the_remedies(paper_file, m
     assert (part.rate_hz, part.part_s) == (1000.0, (1.0, 90.0))
 
 
-def test_a_torque_that_never_changes_is_no_data_of_a_sensor(paper_signals, write_session, tmp_path):
+def test_constant_torque_is_no_sensor_data(paper_signals, write_session, tmp_path):
     silent = replace(paper_signals, torque_nm=np.full_like(paper_signals.torque_nm, 0.25))
     path = write_session(tmp_path / "silent.mcap", silent)
     with pytest.raises(RecordError, match="delivered no data"):
@@ -136,7 +136,7 @@ def test_a_torque_that_never_changes_is_no_data_of_a_sensor(paper_signals, write
 
 
 @pytest.mark.fit
-def test_a_fit_in_blocks_of_bins_finds_the_same(monkeypatch, write_session, tmp_path):
+def test_fit_in_blocks_of_bins_agrees(monkeypatch, write_session, tmp_path):
     path = write_session(tmp_path / "a.mcap", chirp_signals(sweep_s=8.0))
     measurement = Measurement.from_record(load_record(path))
     whole = fit_freest_alone(measurement, BAND_HZ)[0]

@@ -62,7 +62,7 @@ def scan(**others):
 
 
 @pytest.mark.further  # as in tests/cli/test_until.py
-def test_the_last_estimate_is_that_of_the_file(session):
+def test_last_estimate_equals_that_of_the_file(session):
     live = fed(session).estimate(whole=True)
     selection = whole_record(load_record(session.path)).selection
     assert live.headline.parameters == selection.headline.parameters
@@ -74,7 +74,7 @@ def test_the_last_estimate_is_that_of_the_file(session):
     assert live.doubt is None
 
 
-def test_the_record_is_that_of_the_file(session):
+def test_record_equals_that_of_the_file(session):
     live, record = fed(session).record(), load_record(session.path)
     for name in ("time_s", "angle_rad", "torque_nm", "reference_rad", "torque_known"):
         np.testing.assert_array_equal(getattr(live, name), getattr(record, name))
@@ -82,12 +82,12 @@ def test_the_record_is_that_of_the_file(session):
 
 
 @pytest.mark.further  # from the same record
-def test_the_quick_estimate_is_that_of_the_file(session):
+def test_quick_estimate_equals_that_of_the_file(session):
     live = fed(session).estimate()
     record = load_record(session.path)
-    told, found, _ = fit_freest_alone(Measurement.from_record(record), record_band_hz(record))
-    assert live.headline.parameters == told.parameters
-    assert live.headline.modes == told.modes
+    headline, found, _ = fit_freest_alone(Measurement.from_record(record), record_band_hz(record))
+    assert live.headline.parameters == headline.parameters
+    assert live.headline.modes == headline.modes
     assert live.findings == found
 
 
@@ -96,12 +96,12 @@ def of_four_seconds(session):
     return fed(session).estimate(4000)
 
 
-def test_an_estimate_depends_on_what_was_before_its_tick_alone(session, of_four_seconds):
+def test_estimate_depends_on_earlier_ticks_only(session, of_four_seconds):
     early = OnlineEstimator(session.metadata, session.segments)
     early.feed(session.samples[:4000])
-    asked, early = fed(session).record(4000), early.record()
-    np.testing.assert_array_equal(asked.angle_rad, early.angle_rad)
-    np.testing.assert_array_equal(asked.torque_nm, early.torque_nm)
+    requested, early = fed(session).record(4000), early.record()
+    np.testing.assert_array_equal(requested.angle_rad, early.angle_rad)
+    np.testing.assert_array_equal(requested.torque_nm, early.torque_nm)
     assert (of_four_seconds.tick, of_four_seconds.duration_s) == (4000, 4.0)
 
 
@@ -115,7 +115,7 @@ def test_an_estimate_depends_on_what_was_before_its_tick_alone(session, of_four_
     ],
 )
 @pytest.mark.parametrize("whole", [False, further(True)])
-def test_what_cannot_be_fitted_yet_says_why(session, tick, problem, whole):
+def test_record_too_short_to_fit_has_a_reason(session, tick, problem, whole):
     estimate = fed(session).estimate(tick, whole=whole)
     assert problem in estimate.problem
     assert str(session.path) not in estimate.problem
@@ -124,7 +124,7 @@ def test_what_cannot_be_fitted_yet_says_why(session, tick, problem, whole):
     json.dumps(estimate.as_json(), allow_nan=False)
 
 
-def test_a_fit_that_fails_is_a_problem_of_this_estimate_alone(session, monkeypatch):
+def test_failed_fit_affects_its_own_estimate_only(session, monkeypatch):
     fit = fed(session)
 
     def fails(*_):
@@ -150,17 +150,17 @@ def with_mass_at_tip(signals, tip_kg, damping=PAPER_DAMPING):
 
 
 @pytest.mark.parametrize("whole", [False, further(True)])
-def test_an_estimate_has_the_modes_of_a_beam_that_is_not_uniform(session, whole):
+def test_estimate_has_modes_of_nonuniform_beam(session, whole):
     """Those of the modal model, without a flag; and the plant to excite next has them."""
     beam = Plant(PAPER_BEAM, PAPER_DAMPING, tip_mass_kg=1.8e-4)
     poles = beam.poles(clamped_free_eigenvalues(3))[:, 0]
     fit = fed_with(with_mass_at_tip(scan(), 1.8e-4), session)
     estimate = fit.estimate(whole=whole)
     assert estimate.doubt is None
-    told = estimate.headline
-    assert told.uniform_beam.status == "refused"
-    assert told.parameters["density_over_stiffness"].flag
-    for mode, pole in zip(told.modes, poles, strict=True):
+    headline = estimate.headline
+    assert headline.uniform_beam.status == "refused"
+    assert headline.parameters["density_over_stiffness"].flag
+    for mode, pole in zip(headline.modes, poles, strict=True):
         assert (mode.source, mode.frequency_hz.flag, mode.damping_ratio.flag) == (
             "modal", None, None,
         )  # fmt: skip
@@ -176,14 +176,14 @@ def test_an_estimate_has_the_modes_of_a_beam_that_is_not_uniform(session, whole)
 
 
 def quantities(estimate):
-    told = estimate.headline
-    found = dict(told.parameters)
-    for mode in told.modes:
+    headline = estimate.headline
+    found = dict(headline.parameters)
+    for mode in headline.modes:
         found |= {f"f{mode.number}": mode.frequency_hz, f"xi{mode.number}": mode.damping_ratio}
     return found
 
 
-def test_a_judgement_starts_from_the_last_if_asked_to(session, monkeypatch):
+def test_analysis_starts_from_the_last_on_request(session, monkeypatch):
     headline = SimpleNamespace(
         visible_modes=(), fit=SimpleNamespace(plant=Plant(PAPER_BEAM, PAPER_DAMPING))
     )
@@ -203,7 +203,7 @@ def test_a_judgement_starts_from_the_last_if_asked_to(session, monkeypatch):
 
 
 @pytest.mark.further  # as the candidates in tests/identify/test_select.py
-def test_a_judgement_may_start_from_the_last(session, monkeypatch):
+def test_analysis_from_the_last_has_the_same_result(session, monkeypatch):
     """Without a search, and to the same minimum."""
     fit = fed_with(scan(noise_nm=5e-3), session)
     alone = fit.estimate(whole=True)
@@ -228,7 +228,7 @@ def test_a_judgement_may_start_from_the_last(session, monkeypatch):
 
 @pytest.mark.fit
 @pytest.mark.further  # as the candidates in tests/identify/test_select.py
-def test_what_the_last_judgement_does_not_explain_is_searched_for(session):
+def test_unexplained_changes_are_searched_for(session):
     """Here in vain, for it hums within the width of mode 2: as if nothing had been known."""
     signals = scan(ring_down_s=2.0)
     time_s = np.arange(signals.torque_nm.size) / 1000
@@ -249,7 +249,7 @@ def of_nine_seconds(session):
     return fed(session).estimate(9000)
 
 
-def test_what_still_runs_was_not_cut_short(of_nine_seconds):
+def test_running_session_is_not_reported_as_stopped(of_nine_seconds):
     estimate = of_nine_seconds
     assert estimate.warnings == ()
     assert [mode.shown for mode in estimate.headline.modes][:2] == [True, True]
@@ -257,14 +257,16 @@ def test_what_still_runs_was_not_cut_short(of_nine_seconds):
     assert estimate.as_json()["validity"]["uniform_beam"]["status"] == "passed"
 
 
-def test_one_mode_alone_tells_no_order(of_four_seconds):
-    told = of_four_seconds.headline
-    assert told.visible_modes == (1,)
-    assert all(told.parameters[n].flag for n in {"alpha", "lambda"} & told.parameters.keys())
-    assert told.modes[0].damping_ratio.flag is None
+def test_one_mode_does_not_determine_order(of_four_seconds):
+    headline = of_four_seconds.headline
+    assert headline.visible_modes == (1,)
+    assert all(
+        headline.parameters[n].flag for n in {"alpha", "lambda"} & headline.parameters.keys()
+    )
+    assert headline.modes[0].damping_ratio.flag is None
 
 
-def test_a_hum_is_named_and_no_doubt(session):
+def test_hum_is_reported_without_flags(session):
     signals = scan()
     time_s = np.arange(signals.torque_nm.size) / 1000
     hum = signals.torque_nm + 5e-3 * np.sin(2 * np.pi * 33 * time_s)
@@ -274,7 +276,7 @@ def test_a_hum_is_named_and_no_doubt(session):
 
 
 @pytest.mark.further  # as in tests/identify/test_impacts.py
-def test_a_blow_is_named_and_biases_nothing(session):
+def test_impact_is_reported_without_bias(session):
     signals = scan()
     time_s = np.arange(signals.torque_nm.size) / 1000
     since_s = np.maximum(time_s - 3.0, 0.0)
@@ -298,8 +300,8 @@ def test_a_blow_is_named_and_biases_nothing(session):
 @pytest.mark.further  # as in tests/identify/test_fit.py
 def test_a_beam_20_percent_off_its_data_is_found(session, density, stiffness):
     beam = Beam(0.98, density * 4.7e-3, stiffness * 0.090275)
-    told = fed_with(scan(beam=beam), session).estimate().headline
-    first, second, _ = told.modes
+    headline = fed_with(scan(beam=beam), session).estimate().headline
+    first, second, _ = headline.modes
     for mode, root in ((first, 1.875104), (second, 4.694091)):
         undamped_hz = (root / 0.98) ** 2 / np.sqrt(beam.density_over_stiffness) / (2 * np.pi)
         assert mode.shown
@@ -307,15 +309,15 @@ def test_a_beam_20_percent_off_its_data_is_found(session, density, stiffness):
         assert 0.003 < mode.damping_ratio.value < 0.011
 
 
-def test_damping_that_does_not_show_counts_as_uncertainty(session):
+def test_invisible_damping_counts_as_uncertainty(session):
     # 0.1 % of external damping at mode 1: in 5 s it decays by 8 %, and does not show.
     truth = Damping(zeta=2e-4, alpha=1.0, gamma=5e-4, lambda_=1.0)
     signals = scan(damping=truth, noise_nm=2e-2, seed=6)
     estimate = fed_with(signals, session).estimate()
-    told = estimate.headline
-    assert told.name == "IV"
+    headline = estimate.headline
+    assert headline.name == "IV"
     assert "gamma" in estimate.predictive_fit.determined
-    mode, alone = told.modes[0].damping_ratio, told.fit.modes[0]
+    mode, alone = headline.modes[0].damping_ratio, headline.fit.modes[0]
     assert mode.std > 3 * alone.damping_ratio_std
     true = 0.5 * (2e-4 * 16.1 + 5e-4 / (0.05206 * 16.1))
     assert mode.interval_95[0] < true < mode.interval_95[1]
@@ -328,7 +330,7 @@ def next_estimate(thread):
     return eventually(thread.next_estimate)
 
 
-def test_a_thread_answers_to_requests(session, of_four_seconds):
+def test_thread_responds_to_requests(session, of_four_seconds):
     thread = EstimatorThread()
     thread.feed(session.samples[:4500])
     thread.begin(session.metadata, session.segments, None)
@@ -353,12 +355,12 @@ def test_a_thread_answers_to_requests(session, of_four_seconds):
 
 @pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("from_last", [False, True])
-def test_an_estimate_is_made_as_it_is_asked_for(monkeypatch, whole, from_last):
-    asked = []
+def test_estimate_follows_requested_options(monkeypatch, whole, from_last):
+    requests = []
 
     def estimate(_, tick, **how):
-        asked.append((tick, how))
-        if len(asked) > 1:
+        requests.append((tick, how))
+        if len(requests) > 1:
             raise LookupError("of the second")
         return OnlineEstimate(tick, 1.0, whole, 0.0, problem="None here.")
 
@@ -367,7 +369,7 @@ def test_an_estimate_is_made_as_it_is_asked_for(monkeypatch, whole, from_last):
     thread.begin({}, {}, None)
     thread.request(EstimateRequest(7, 9000, whole, from_last))
     assert next_estimate(thread)["id"] == 7
-    assert asked == [(9000, {"whole": whole, "from_last": from_last})]
+    assert requests == [(9000, {"whole": whole, "from_last": from_last})]
     assert thread.next_estimate() is None
     thread.request(EstimateRequest(8, 9000, whole, from_last))
     with pytest.raises(EstimationError, match=r"fit has failed .*of the second"):
@@ -379,7 +381,7 @@ def session_noise_nm2(session) -> float:
     return float(np.var(session.samples["coupling_torque_nm"][:400]))
 
 
-def test_a_thread_estimates_unasked(monkeypatch):
+def test_thread_estimates_without_request(monkeypatch):
     fed_ticks = []
 
     def estimate(_, tick, **how):

@@ -31,7 +31,7 @@ def decay_problem(measured):
 FREE = ConstantBounds(np.array([-50.0, -50.0]), np.array([50.0, 50.0]))
 
 
-def test_finds_what_made_the_data():
+def test_finds_true_parameters():
     measured = decay([0.7, 2.0])[0]
     found = descend(decay_problem(measured), np.array([0.3, 1.5]), FREE, relative_tolerance=1e-12)
     np.testing.assert_allclose(found.x, [0.7, 2.0], rtol=1e-9)
@@ -60,7 +60,7 @@ def rosenbrock(x):
     )
 
 
-def test_follows_a_curved_valley():
+def test_follows_a_curved_minimum():
     found = descend(rosenbrock, np.array([-1.2, 1.0]), FREE, relative_tolerance=1e-14)
     np.testing.assert_allclose(found.x, 1.0, atol=1e-8)
 
@@ -93,7 +93,7 @@ def test_unknown_without_effect_stays():
     np.testing.assert_allclose(found.x, [3.0, 1.25], rtol=1e-12)
 
 
-def test_never_climbs_and_stops_when_told():
+def test_never_climbs_and_stops_on_request():
     costs = []
 
     def problem(x):
@@ -136,7 +136,7 @@ def test_large_residuals_are_descended_in_fewer_steps_than_gauss_newtons():
     assert again.evaluations < near.evaluations
 
 
-def test_the_second_part_is_what_the_second_derivatives_make_of_the_residual():
+def test_second_order_term_matches_second_derivatives():
     near = descend(
         misfit, np.array([0.3, 2.4]), FREE, relative_tolerance=1e-16,
         second_part=np.zeros((2, 2)),
@@ -149,7 +149,7 @@ def test_the_second_part_is_what_the_second_derivatives_make_of_the_residual():
     np.testing.assert_allclose(near.second_part, beyond, atol=0.1 * np.abs(beyond).max())
 
 
-def test_what_was_learnt_wrongly_does_no_harm():
+def test_wrong_second_order_term_does_no_harm():
     found = descend(
         rosenbrock, np.array([1.2, 1.3]), FREE, relative_tolerance=1e-14,
         second_part=np.array([[-900.0, 0.0], [0.0, 300.0]]),
@@ -162,13 +162,13 @@ def free(k):
 
 
 class Counted:
-    """Normal equations of real residuals; says how often it was asked."""
+    """Normal equations of real residuals; counts its evaluations."""
 
     def __init__(self, residual, jacobian):
-        self.residual, self.jacobian, self.asked = residual, jacobian, 0
+        self.residual, self.jacobian, self.calls = residual, jacobian, 0
 
     def __call__(self, x):
-        self.asked += 1
+        self.calls += 1
         r, j = self.residual(x), self.jacobian(x)
         return NormalEquations(float(r @ r), j.T @ r, j.T @ j)
 
@@ -194,8 +194,8 @@ def test_a_large_residual_costs_few_evaluations_more():
     other = scipy.optimize.least_squares(decays, start, slopes, xtol=1e-15, ftol=1e-12, gtol=1e-15)
     assert 2 * other.cost > 5
     assert found.cost == pytest.approx(2 * other.cost, rel=1e-10)
-    assert found.evaluations == ours.asked
-    assert ours.asked <= 0.6 * other.nfev
+    assert found.evaluations == ours.calls
+    assert ours.calls <= 0.6 * other.nfev
 
 
 def test_an_exact_fit_is_found_as_well():
@@ -211,7 +211,7 @@ def test_an_exact_fit_is_found_as_well():
     assert found.x == pytest.approx([1.0, 1.0], abs=1e-6)
 
 
-def test_on_a_bound_the_others_make_the_best_of_it():
+def test_other_unknowns_are_optimal_on_a_bound():
     matrix = np.array([[2.0, 1.9], [1.9, 2.0], [0.3, 0.1]])
     target = np.array([1.0, -2.0, 0.5])
     problem = Counted(lambda x: matrix @ x - target, lambda x: matrix)
@@ -222,10 +222,10 @@ def test_on_a_bound_the_others_make_the_best_of_it():
     )
     assert found.x == pytest.approx(other.x, abs=1e-6)
     assert found.x[1] == -0.5 or found.x[0] == 1.2
-    assert problem.asked < 12
+    assert problem.calls < 12
 
 
-def test_a_hopeless_descent_is_given_up_and_no_other():
+def test_only_hopeless_descents_are_stopped_early():
     start, tight = np.array([1.0, 1.5, 0.5]), 1e-12
     whole = descend(Counted(decays, slopes), start, free(3), relative_tolerance=tight)
     assert whole.evaluations > 4
@@ -242,11 +242,11 @@ def test_a_hopeless_descent_is_given_up_and_no_other():
     assert followed.x == pytest.approx(whole.x, abs=1e-12)
 
 
-def test_it_ends_where_it_is_told_to():
+def test_ends_at_the_given_limit():
     problem = Counted(decays, slopes)
     start = np.array([1.0, 1.5, 0.5])
     found = descend(problem, start, free(3), relative_tolerance=1e-12, max_evaluations=4)
-    assert problem.asked == found.evaluations == 4
+    assert problem.calls == found.evaluations == 4
     assert found.cost < problem(start).cost
     nothing = Counted(lambda x: np.ones(3), lambda x: np.zeros((3, 2)))
     assert descend(nothing, np.zeros(2), free(2), relative_tolerance=1e-9).evaluations == 1

@@ -39,14 +39,14 @@ def judgements():
 
 @pytest.fixture(scope="module")
 def chirps(short_chirps, judgements, tmp_path_factory):
-    """Both chirps in their own folder, and the looks at them in turn."""
+    """Both chirps in their own folder, and their quick looks in turn."""
     folder = tmp_path_factory.mktemp("looks")
     paths = [Path(shutil.copy(path, folder)) for path in short_chirps]
-    looks = []
+    documents = []
     for path in paths:
-        looks.append(make_quick_look(path))
-        write_quick_look(looks[-1], path)
-    return paths, looks
+        documents.append(make_quick_look(path))
+        write_quick_look(documents[-1], path)
+    return paths, documents
 
 
 @pytest.fixture(scope="module")
@@ -62,48 +62,48 @@ def selection(whole):
 
 @pytest.mark.fit
 @pytest.mark.process
-def test_the_modes_are_those_of_the_whole_judgement(chirps, selection):
-    _, (look, _) = chirps
-    assert [mode["mode"] for mode in look["modes"]] == [1, 2, 3]
-    for told, mode in zip(look["modes"], selection.headline.modes, strict=True):
-        assert told["frequency_hz"] == mode.frequency_hz.as_json()
-        assert told["damping_ratio"] == mode.damping_ratio.as_json()
-        assert told["shown"] is mode.shown
-    assert look["flags"] == [finding.sentence for finding in selection.verdict.findings]
+def test_modes_equal_those_of_the_full_analysis(chirps, selection):
+    _, (document, _) = chirps
+    assert [mode["mode"] for mode in document["modes"]] == [1, 2, 3]
+    for found, mode in zip(document["modes"], selection.headline.modes, strict=True):
+        assert found["frequency_hz"] == mode.frequency_hz.as_json()
+        assert found["damping_ratio"] == mode.damping_ratio.as_json()
+        assert found["shown"] is mode.shown
+    assert document["flags"] == [finding.sentence for finding in selection.verdict.findings]
 
 
 @pytest.mark.fit
 @pytest.mark.process
-def test_the_modes_have_their_validity(chirps, whole):
-    """The files state no slope: it is that of the whole judgement, by the fitted beam."""
-    _, (look, _) = chirps
-    assert look["validity"] == whole.validity.as_json()
-    assert look["validity"]["predicted_peak_tip_slope_rad"] > 0.05
-    assert f"  {whole.validity.sentence}" in look["text"]
+def test_modes_have_their_validity(chirps, whole):
+    """The files state no slope: it is that of the full analysis, by the fitted beam."""
+    _, (document, _) = chirps
+    assert document["validity"] == whole.validity.as_json()
+    assert document["validity"]["predicted_peak_tip_slope_rad"] > 0.05
+    assert f"  {whole.validity.sentence}" in document["text"]
 
 
 @pytest.mark.fit
 @pytest.mark.process
-def test_the_response_keeps_the_height_of_the_resonances(chirps):
-    _, (look, _) = chirps
-    response = look["response"]
+def test_response_preserves_resonance_peaks(chirps):
+    _, (document, _) = chirps
+    response = document["response"]
     hz, magnitude = (np.array(response[name]) for name in ("frequency_hz", "magnitude"))
     assert 200 < hz.size <= 400
     assert (np.diff(hz) > 0).all()
     assert {len(values) for values in response.values() if isinstance(values, list)} == {hz.size}
     assert 0.01 < response["resolution_hz"] < 1.0
-    for mode in look["modes"][:2]:
+    for mode in document["modes"][:2]:
         near = np.abs(hz - mode["frequency_hz"]["value"]) < 1.0
         assert magnitude[near].max() > 3 * np.median(magnitude)
-    low = look["coherence"]["low_bands"]
-    assert 0.4 < look["coherence"]["mean"] < 1.0
+    low = document["coherence"]["low_bands"]
+    assert 0.4 < document["coherence"]["mean"] < 1.0
     assert all(0.5 <= first < last < 51 for first, last in low)
 
 
 def test_low_bands_are_joined():
     hz = np.arange(100) * 0.1 + 10.0
     low = np.zeros(100, bool)
-    low[[5, 40, 41, 42, 45, 99]] = True  # the lone ones are narrower than what is resolved
+    low[[5, 40, 41, 42, 45, 99]] = True  # single bins are narrower than the resolution
     assert list(quick_look._join_bins(hz, low, 0.15)) == [
         (pytest.approx(14.0), pytest.approx(14.5))
     ]
@@ -124,7 +124,7 @@ def test_the_last_session_of_the_specimen_is_compared_with(chirps):
         ratio = after["damping_ratio"]["value"] / before["damping_ratio"]["value"]
         assert mode["damping_ratio_change_percent"] == pytest.approx(100 * (ratio - 1))
         assert mode["significant"] is False
-    # Asked for, an earlier one is compared with a later one too.
+    # On request, an earlier one is compared with a later one too.
     assert make_quick_look(paths[0], paths[1])["against_last"]["file"] == paths[1].name
 
 
@@ -133,7 +133,7 @@ def estimated(value, std):
     return {"value": value, "std": std, "interval_95": interval, "flag": None}
 
 
-def look_with(*hz, **others):
+def document_with(*hz, **others):
     modes = [
         {
             "mode": number,
@@ -150,17 +150,17 @@ def look_with(*hz, **others):
 @pytest.mark.parametrize(
     ("unseen", "words"), [(1, "mode 1"), (2, "modes 1 and 2"), (3, "modes 1, 2 and 3")]
 )
-def test_modes_that_do_not_show_are_listed_in_english(unseen, words):
-    look = look_with(2.5, 16.0, 44.0, session_id="now", flags=[], against_last=None)
-    look["coherence"] = quick_look._empty_coherence()
-    for mode in look["modes"][:unseen]:
+def test_invisible_modes_are_listed_in_english(unseen, words):
+    document = document_with(2.5, 16.0, 44.0, session_id="now", flags=[], against_last=None)
+    document["coherence"] = quick_look._empty_coherence()
+    for mode in document["modes"][:unseen]:
         mode["shown"] = False
-    assert f"  not visible in this record: {words}" in quick_look._text_lines(look)
+    assert f"  not visible in this record: {words}" in quick_look._text_lines(document)
 
 
 def test_a_change_counts_from_three_standard_deviations_on():
-    before = look_with(2.5, 16.0, 44.0)
-    now = look_with(2.5 + 4.1e-3, 16.0 + 4.4e-3)
+    before = document_with(2.5, 16.0, 44.0)
+    now = document_with(2.5 + 4.1e-3, 16.0 + 4.4e-3)
     now["modes"][1]["damping_ratio"] = estimated(0.0105, 1e-4)
     against = quick_look._compare_modes(modes_from_json(now["modes"]), before)
     assert [mode["significant"] for mode in against["modes"]] == [False, True]
@@ -176,19 +176,19 @@ def test_a_change_counts_from_three_standard_deviations_on():
 @pytest.mark.parametrize(
     ("name", "content", "file"),
     [
-        ("newer", look_with(2.5, start_utc_ns=7, file="newer.mcap"), "newer.mcap"),
-        ("older", look_with(2.5, start_utc_ns=3), "last.mcap"),
-        ("other", look_with(2.5, start_utc_ns=7, specimen="b"), "last.mcap"),
-        ("later", look_with(2.5, start_utc_ns=9), "last.mcap"),
-        ("without", look_with(start_utc_ns=7), "last.mcap"),
-        ("version", look_with(2.5, start_utc_ns=7, version=2), "last.mcap"),
+        ("newer", document_with(2.5, start_utc_ns=7, file="newer.mcap"), "newer.mcap"),
+        ("older", document_with(2.5, start_utc_ns=3), "last.mcap"),
+        ("other", document_with(2.5, start_utc_ns=7, specimen="b"), "last.mcap"),
+        ("later", document_with(2.5, start_utc_ns=9), "last.mcap"),
+        ("without", document_with(start_utc_ns=7), "last.mcap"),
+        ("version", document_with(2.5, start_utc_ns=7, version=2), "last.mcap"),
         ("garbage", [1], "last.mcap"),
         ("garbage", {"file": 1, "modes": {"a": 1}}, "last.mcap"),
     ],
 )
-def test_the_last_look_is_found_by_start_and_specimen(tmp_path, name, content, file):
+def test_last_quick_look_is_found_by_start_and_specimen(tmp_path, name, content, file):
     last = quick_look_path(tmp_path / "last.mcap")
-    last.write_text(json.dumps(look_with(2.5, start_utc_ns=4, file="last.mcap")))
+    last.write_text(json.dumps(document_with(2.5, start_utc_ns=4, file="last.mcap")))
     quick_look_path(tmp_path / f"{name}.mcap").write_text(json.dumps(content))
     found = quick_look._last_quick_look(tmp_path / "now.mcap", "a", 8)
     assert found["file"] == file
@@ -196,10 +196,10 @@ def test_the_last_look_is_found_by_start_and_specimen(tmp_path, name, content, f
 
 @pytest.mark.fit
 @pytest.mark.process
-def test_the_fitted_model_has_a_band_that_holds_it(chirps, selection):
+def test_fitted_model_lies_within_its_band(chirps, selection):
     """Its peak is the mode's, which Welch's segments do not resolve."""
-    _, (look, _) = chirps
-    model = {name: np.array(values) for name, values in look["model"].items()}
+    _, (document, _) = chirps
+    model = {name: np.array(values) for name, values in document["model"].items()}
     hz, magnitude = model["frequency_hz"], model["magnitude"]
     assert (np.diff(hz) > 0).all()
     assert {values.size for values in model.values()} == {hz.size}
@@ -215,97 +215,99 @@ def test_the_fitted_model_has_a_band_that_holds_it(chirps, selection):
 
 @pytest.mark.fit
 @pytest.mark.process
-def test_a_long_record_is_fitted_by_the_freest_structure_alone(chirps, selection, monkeypatch):
+def test_long_record_is_fitted_with_freest_structure(chirps, selection, monkeypatch):
     paths, _ = chirps
     monkeypatch.setattr(quick_look, "_LONGEST_FULL_ANALYSIS_S", 10.0)
-    look = make_quick_look(paths[0])
-    for told, mode in zip(look["modes"], selection.headline.modes, strict=True):
+    document = make_quick_look(paths[0])
+    for found, mode in zip(document["modes"], selection.headline.modes, strict=True):
         # The same structure is selected, under a noise spectrum that hardly differs.
         std = mode.frequency_hz.std
-        assert told["frequency_hz"]["value"] == pytest.approx(mode.frequency_hz.value, abs=std)
-        assert told["frequency_hz"]["std"] == pytest.approx(std, rel=0.3)
-        assert told["frequency_hz"]["flag"] is None
-    assert "type VI alone was fitted" in look["flags"][0]
+        assert found["frequency_hz"]["value"] == pytest.approx(mode.frequency_hz.value, abs=std)
+        assert found["frequency_hz"]["std"] == pytest.approx(std, rel=0.3)
+        assert found["frequency_hz"]["flag"] is None
+    assert "type VI alone was fitted" in document["flags"][0]
 
 
 @pytest.mark.process
-def test_the_freest_structure_alone_flags_what_it_does_not_explain(short_chirps):
+def test_freest_structure_flags_unexplained_torque(short_chirps):
     measurement = Measurement.from_record(load_record(short_chirps[0]))
     cubic = measurement.torque_nm + 4e3 * measurement.angle_rad**3
-    told, found, _ = fit_freest_alone(replace(measurement, torque_nm=cubic))
-    assert {mode.frequency_hz.flag for mode in told.modes if mode.shown} == {
+    headline, found, _ = fit_freest_alone(replace(measurement, torque_nm=cubic))
+    assert {mode.frequency_hz.flag for mode in headline.modes if mode.shown} == {
         "part of the record is unexplained"
     }
     assert found
 
 
 @pytest.mark.process
-@pytest.mark.further  # as the look at such a record
-def test_the_freest_structure_alone_flags_a_record_that_contradicts_its_file(short_chirps):
+@pytest.mark.further  # as the quick look at such a record
+def test_freest_structure_flags_contradicting_record(short_chirps):
     measurement = Measurement.from_record(load_record(short_chirps[0]))
-    told, found, _ = fit_freest_alone(replace(measurement, torque_nm=-measurement.torque_nm))
-    assert {mode.frequency_hz.flag for mode in told.modes} == {"the record contradicts its file"}
+    headline, found, _ = fit_freest_alone(replace(measurement, torque_nm=-measurement.torque_nm))
+    assert {mode.frequency_hz.flag for mode in headline.modes} == {
+        "the record contradicts its file"
+    }
     assert [finding.kind for finding in found] == ["sign"]
 
 
 @pytest.mark.fit
-def test_what_cannot_be_analysed_says_why(write_session, short_signals, signals_of, tmp_path):
+def test_quick_look_states_why_a_record_is_unusable(
+    write_session, short_signals, signals_of, tmp_path
+):
     held = replace(short_signals, metadata={"excitation": "hold", "specimen": "a"})
-    look = make_quick_look(write_session(tmp_path / "held.mcap", held))
-    assert look["modes"] == []
-    assert look["specimen"] == "a"
-    assert look["flags"][-1].startswith("No modes: the motor was held")
-    assert "No modes" in look["text"][-1]
+    document = make_quick_look(write_session(tmp_path / "held.mcap", held))
+    assert document["modes"] == []
+    assert document["specimen"] == "a"
+    assert document["flags"][-1].startswith("No modes: the motor was held")
+    assert "No modes" in document["text"][-1]
     cut = replace(short_signals, segments={"sweep": (6000, 7000)})
-    look = make_quick_look(write_session(tmp_path / "cut.mcap", cut))
-    assert look["flags"][0].startswith("segment 'sweep' covers ticks 6000 to 6999")
-    json.dumps(look, allow_nan=False)
+    document = make_quick_look(write_session(tmp_path / "cut.mcap", cut))
+    assert document["flags"][0].startswith("segment 'sweep' covers ticks 6000 to 6999")
+    json.dumps(document, allow_nan=False)
 
 
 @pytest.mark.fit
-def test_a_record_that_contradicts_its_file_has_no_band_of_a_model(
-    write_session, make_signals, tmp_path
-):
+def test_contradicting_record_has_no_model_band(write_session, make_signals, tmp_path):
     signals = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
     turned = replace(signals, torque_nm=-signals.torque_nm)
-    look = make_quick_look(write_session(tmp_path / "turned.mcap", turned))
-    assert look["model"] is None
-    assert look["response"] is not None
-    assert all(mode["frequency_hz"]["flag"] for mode in look["modes"])
+    document = make_quick_look(write_session(tmp_path / "turned.mcap", turned))
+    assert document["model"] is None
+    assert document["response"] is not None
+    assert all(mode["frequency_hz"]["flag"] for mode in document["modes"])
 
 
 @pytest.mark.fit
 @pytest.mark.process
-def test_the_text_is_for_a_terminal(chirps):
-    paths, (_, look) = chirps
-    head, *modes = look["text"]
+def test_text_suits_a_terminal(chirps):
+    paths, (_, document) = chirps
+    head, *modes = document["text"]
     assert head == f"Quick look at {paths[1].stem}; ± 95 %, statistical only:"
     assert modes[0].startswith("  mode 1: 2.5")
     assert modes[2].endswith(" kg·mm²")
     assert modes[3].startswith("  Tip slopes up to 0.")
     assert modes[4].startswith("  A uniform beam predicts the modes (p = 0.")
     assert modes[5].startswith("  mean coherence 0.")
-    assert look["text"][-1] == f"  {look['against_last']['sentence']}"
+    assert document["text"][-1] == f"  {document['against_last']['sentence']}"
 
 
-def test_a_look_is_written_whole_and_replaces_an_older_one_only(tmp_path):
+def test_quick_look_is_complete_and_replaces_older_ones_only(tmp_path):
     path = tmp_path / "a.mcap"
     place = quick_look_path(path)
-    write_quick_look(look_with(2.5, made_utc_ns=6), path)
-    write_quick_look(look_with(2.6, made_utc_ns=7), path)
+    write_quick_look(document_with(2.5, made_utc_ns=6), path)
+    write_quick_look(document_with(2.6, made_utc_ns=7), path)
     assert json.loads(place.read_text())["made_utc_ns"] == 7
-    write_quick_look(look_with(2.7, made_utc_ns=5), path)
+    write_quick_look(document_with(2.7, made_utc_ns=5), path)
     assert json.loads(place.read_text())["made_utc_ns"] == 7
     place.write_text("somebody else's")
     with pytest.raises(QuickLookError, match="move it away"):
-        write_quick_look(look_with(2.5), path)
+        write_quick_look(document_with(2.5), path)
     assert place.read_text() == "somebody else's"
     with pytest.raises(QuickLookError, match="cannot be written"):
-        write_quick_look(look_with(2.5), tmp_path / "missing" / "a.mcap")
+        write_quick_look(document_with(2.5), tmp_path / "missing" / "a.mcap")
     assert [each.name for each in tmp_path.iterdir()] == [place.name]
 
 
-def look(*arguments):
+def run_quick_look(*arguments):
     return warm_start.run(
         [sys.executable, "-m", "analysis.quick_look", *map(str, arguments)],
         capture_output=True, text=True, check=False,
@@ -313,25 +315,25 @@ def look(*arguments):
 
 
 @pytest.mark.process
-def test_the_program_writes_the_look_and_prints_it(write_session, short_signals, tmp_path):
-    held = replace(short_signals, metadata={"excitation": "hold"})  # of which little is computed
+def test_program_writes_and_prints_the_quick_look(write_session, short_signals, tmp_path):
+    held = replace(short_signals, metadata={"excitation": "hold"})  # for which little is computed
     path = write_session(tmp_path / "held.mcap", held)
-    done = look(path)
+    done = run_quick_look(path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == json.loads(quick_look_path(path).read_text())["text"]
     assert done.stderr == ""
 
 
 @pytest.mark.process
-def test_the_program_says_what_is_wrong_in_a_sentence():
-    done = look("missing.mcap")
+def test_program_reports_errors_in_one_sentence():
+    done = run_quick_look("missing.mcap")
     assert done.returncode == 1
     assert done.stderr.startswith("Error: missing.mcap cannot be read")
     assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.process
-def test_it_runs_at_a_low_priority_and_ends_with_its_parent(short_chirps, tmp_path):
+def test_runs_at_low_priority_and_ends_with_parent(short_chirps, tmp_path):
     """As it is started: below a process that is killed, suspended."""
     path = Path(shutil.copy(short_chirps[0], tmp_path))
     code = (

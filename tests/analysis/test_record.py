@@ -12,7 +12,7 @@ from rigd.session import SessionError
 from rigd.session.layout import Status
 
 
-def test_arrays_units_and_segments_come_through(tmp_path, write_session, short_signals):
+def test_arrays_units_and_segments_are_read(tmp_path, write_session, short_signals):
     path = write_session(
         tmp_path / "a.mcap", short_signals,
         metadata={"angle_delay_s": "0.001", "torque_delay_s": "-2e-4",
@@ -85,7 +85,7 @@ def test_stale_values_are_interpolated_in_their_channel_only(
 
 def test_flags_in_the_sweep_are_counted_and_warned_of(tmp_path, write_session, short_signals):
     status = np.zeros(5000, int)
-    status[:10] = Status.TORQUE_OFF  # before the sweep: nobody's concern
+    status[:10] = Status.TORQUE_OFF  # before the sweep: without effect
     status[600:603] = Status.WRENCH_SATURATED | Status.LATE
     record = load_record(write_session(tmp_path / "a.mcap", short_signals, status=status))
     assert record.flags == {"wrench saturated": 3, "late tick": 3}
@@ -143,7 +143,7 @@ def test_a_long_gap_is_refused_even_if_few_ticks_are_missing(tmp_path, write_ses
      ("reference_rad", "angle_reference_rad")],
 )  # fmt: skip
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_values_that_are_not_finite_are_refused_by_field_and_tick(
+def test_nonfinite_values_are_refused_by_field_and_tick(
     tmp_path, write_session, short_signals, field, name, value
 ):
     values = getattr(short_signals, field).copy()
@@ -176,7 +176,7 @@ def test_absurd_metadata_is_refused_by_key(tmp_path, write_session, short_signal
     ("metadata", "uniformity"),
     [({}, 1e-3), ({"uniformity_percent": "0"}, 0.0), ({"uniformity_percent": "0.3"}, 3e-3)],
 )
-def test_the_uniformity_is_that_of_the_file(
+def test_uniformity_is_read_from_the_file(
     tmp_path, write_session, short_signals, metadata, uniformity
 ):
     path = write_session(tmp_path / "a.mcap", short_signals, metadata=metadata)
@@ -187,9 +187,7 @@ def test_the_uniformity_is_that_of_the_file(
     )
 
 
-def test_a_tip_mass_and_a_tilt_that_nobody_states_are_unknown(
-    tmp_path, write_session, short_signals
-):
+def test_unstated_tip_mass_and_tilt_are_unknown(tmp_path, write_session, short_signals):
     def of(**stated):
         path = write_session(tmp_path / f"{len(stated)}.mcap", short_signals, metadata=stated)
         record = load_record(path)
@@ -203,9 +201,7 @@ def test_a_tip_mass_and_a_tilt_that_nobody_states_are_unknown(
     assert of(**stated) == (0.0, -0.4, {"tip_mass": 0.02})
 
 
-def test_a_beam_in_wrong_units_is_told_by_where_its_first_mode_would_be(
-    tmp_path, write_session, short_signals
-):
+def test_wrong_beam_units_are_found_by_the_first_mode(tmp_path, write_session, short_signals):
     """Millimetres for metres: 2.55 Hz a million times lower."""
     path = write_session(tmp_path / "a.mcap", short_signals, metadata={"beam_length_m": "980"})
     with pytest.raises(RecordError, match=r"the first mode would be at 2\.55e-06 Hz, which 5 s"):
@@ -213,7 +209,7 @@ def test_a_beam_in_wrong_units_is_told_by_where_its_first_mode_would_be(
 
 
 @pytest.mark.parametrize("value", [0.0, 1.5])
-def test_a_sensor_that_gave_nothing_is_told(tmp_path, write_session, short_signals, value):
+def test_sensor_without_data_is_reported(tmp_path, write_session, short_signals, value):
     dead = replace(short_signals, torque_nm=np.full(5000, value))
     path = write_session(tmp_path / "a.mcap", dead)
     with pytest.raises(RecordError, match=rf"is {value:g} N·m in every sample, so the sensor"):
@@ -221,7 +217,7 @@ def test_a_sensor_that_gave_nothing_is_told(tmp_path, write_session, short_signa
 
 
 @pytest.mark.parametrize("value", [1e200, -1e10])
-def test_values_that_no_rig_has_are_refused(tmp_path, write_session, short_signals, value):
+def test_impossible_values_are_refused(tmp_path, write_session, short_signals, value):
     values = short_signals.torque_nm.copy()
     values[[1234, 2000]] = value
     path = write_session(tmp_path / "a.mcap", replace(short_signals, torque_nm=values))
@@ -229,13 +225,13 @@ def test_values_that_no_rig_has_are_refused(tmp_path, write_session, short_signa
         load_record(path)
 
 
-def test_a_rate_that_the_time_stamps_contradict_is_refused(tmp_path, write_session, short_signals):
+def test_rate_that_contradicts_time_stamps_is_refused(tmp_path, write_session, short_signals):
     path = write_session(tmp_path / "a.mcap", short_signals, metadata={"rate_hz": "500"})
     with pytest.raises(RecordError, match=r"500 Hz.*1000 ticks per second"):
         load_record(path)
 
 
-def test_a_span_that_is_all_but_empty_is_refused(tmp_path, write_session, short_signals):
+def test_almost_empty_span_is_refused(tmp_path, write_session, short_signals):
     """Its grid would take tens of gigabytes."""
     two = short_signals.part(slice(2))
     path = write_session(tmp_path / "a.mcap", two, ticks=[0, 2**32 - 1], segments={})
@@ -262,9 +258,7 @@ def test_a_session_without_samples_is_refused(tmp_path, write_session, short_sig
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(missing=st.sets(st.integers(1, 3998), max_size=30))
-def test_what_was_recorded_is_kept_whatever_is_missing(
-    tmp_path_factory, write_session, signals_of, missing
-):
+def test_line_with_missing_ticks_is_recovered(tmp_path_factory, write_session, signals_of, missing):
     n = 4000
     line = 1e-3 * np.arange(n)
     present = np.ones(n, bool)
@@ -327,9 +321,7 @@ def test_a_part_with_the_rest_begins_from_it(tmp_path, write_session, short_sign
         ((6.0, None), ("beyond the record", "0 to 5 s")),
     ],
 )
-def test_a_part_that_cannot_be_analysed_is_refused(
-    tmp_path, write_session, short_signals, part_s, words
-):
+def test_unusable_part_is_refused(tmp_path, write_session, short_signals, part_s, words):
     path = write_session(tmp_path / "a.mcap", short_signals)
     with pytest.raises(RecordError) as refusal:
         load_record(path, part_s)

@@ -40,18 +40,18 @@ def test_the_normal_point_leaves_one_in_forty_on_each_side():
         (135.807, 100, 0.01),
     ],
 )
-def test_chi_square_is_that_of_the_tables(value, freedom, p_value):
+def test_chi_square_matches_tables(value, freedom, p_value):
     assert chi_square_p_value(value, freedom) == pytest.approx(p_value, rel=1e-4)
 
 
-def test_chi_squares_come_as_arrays():
+def test_chi_square_accepts_arrays():
     values = [1.0, 8.0, 60.0]
     expected = [even_p_value(value, 6) for value in values]
     assert chi_square_p_value(values, 6) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("deviate", [-30.0, -5.0, -0.1, 0.0, 2.0, 5.0, 20.0, 36.0, 37.5])
-def test_a_deviate_is_exceeded_as_rarely_as_its_chi_square(deviate):
+def test_deviate_has_the_tail_of_its_chi_square(deviate):
     """With two degrees of freedom the probability is exp(-value / 2), also beyond 1e-290."""
     value = -2 * math.log1p(-normal_p_value(-deviate)) if deviate < 0 else 0.0
     if deviate >= 0:
@@ -60,7 +60,7 @@ def test_a_deviate_is_exceeded_as_rarely_as_its_chi_square(deviate):
 
 
 @pytest.mark.parametrize("freedom", [16, 64, 888])
-def test_a_deviate_has_no_step_where_the_tail_is_taken_from_its_expansion(freedom):
+def test_deviate_is_continuous_where_the_expansion_begins(freedom):
     """At 1e-290, where a normal deviate is 36.4260 and rises by a third of a hundredth a decade."""
     below, above = _where(freedom, 1e-289), _where(freedom, 1e-291)
     first, last = chi_square_deviate(below, freedom), chi_square_deviate(above, freedom)
@@ -82,13 +82,13 @@ def _where(freedom, p_value):
 
 @pytest.mark.parametrize("freedom", [2, 16, 888])
 @pytest.mark.parametrize("value", [0.0, 1e-300, 1e9])
-def test_a_deviate_is_finite_however_far_out(value, freedom):
+def test_deviate_is_finite_far_out(value, freedom):
     deviate = chi_square_deviate(value, freedom)
     assert math.isfinite(deviate)
     assert (deviate > 0) == (value > freedom)
 
 
-def test_a_deviate_far_out_is_near_the_root_of_what_is_left():
+def test_deviate_far_out_is_near_the_asymptotic_root():
     """-2 ln p of a normal deviate z is z² + ln(2 pi z²) to 1 / z², and value of two degrees."""
     value = 1e6
     z = chi_square_deviate(value, 2)
@@ -99,7 +99,7 @@ def test_a_deviate_far_out_is_near_the_root_of_what_is_left():
     ("statistic", "p_value"),
     [(0.2, 1.0), (1.2239, 0.10), (1.3581, 0.05), (1.6276, 0.01), (1.9495, 0.001)],
 )  # N. Smirnov, Ann. Math. Stat. 19 (1948) 279-281
-def test_kolmogorov_is_that_of_the_tables(statistic, p_value):
+def test_kolmogorov_matches_tables(statistic, p_value):
     assert kolmogorov_p_value(statistic) == pytest.approx(p_value, rel=1e-3)
 
 
@@ -113,5 +113,5 @@ def test_student_s_t_of_one_and_two_degrees_of_freedom(level):
 @pytest.mark.parametrize(
     ("freedom", "point"), [(4, 2.776), (9, 2.262), (19, 2.093), (30, 2.042), (120, 1.980)]
 )  # Abramowitz and Stegun, table 26.10
-def test_student_s_t_is_that_of_the_tables(freedom, point):
+def test_student_s_t_matches_tables(freedom, point):
     assert student_t_quantile(0.95, freedom) == pytest.approx(point, abs=5e-4)

@@ -16,7 +16,7 @@ TABLE_2 = {
 }
 
 
-def test_every_type_is_there_in_order():
+def test_all_types_are_listed_in_order():
     assert list(STRUCTURES) == list(TABLE_2)
 
 
@@ -30,7 +30,7 @@ def test_fixed_and_free(name):
     assert structure.external == (name not in ("I", "IV"))
 
 
-def test_damping_takes_free_values_and_ignores_those_of_fixed_ones():
+def test_damping_ignores_values_of_fixed_parameters():
     values = {"zeta": 2e-4, "alpha": 0.7, "gamma": 0.3, "lambda": 1.2}
     assert STRUCTURES["VI"].damping(values) == Damping(2e-4, 0.7, 0.3, 1.2)
     assert STRUCTURES["VII"].damping(values) == Damping(2e-4, 1.0, 0.3, 1.2)

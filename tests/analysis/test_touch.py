@@ -28,7 +28,7 @@ def test_a_marked_touch_is_estimated(touched, touch_file):
     assert 0.6 * low < truth.stiffness_n_per_m < 1.6 * high
 
 
-def test_the_map_shows_it_where_the_obstacle_stands(touched, touch_file):
+def test_map_shows_touch_at_the_obstacle(touched, touch_file):
     (touch,) = touched.touches
     # The obstacle is met by the straight antenna at this angle; the bent one is ahead or behind.
     assert atan2(*touch.point_m[::-1]) == pytest.approx(touch_file.obstacle.angle_rad, abs=3e-3)
@@ -39,7 +39,7 @@ def test_the_map_shows_it_where_the_obstacle_stands(touched, touch_file):
 
 
 @pytest.mark.parametrize("metadata", [{}, further({"shear_projection": "0,0,0,0,0,0"})])
-def test_one_that_is_not_marked_is_found(touch_file, touch_analysis, tmp_path, metadata):
+def test_unmarked_touch_is_found(touch_file, touch_analysis, tmp_path, metadata):
     path = touch_file.write(tmp_path / "a.mcap", marked=False, metadata=metadata)
     session = touch_analysis.session(path)
     (touch,) = session.touches
@@ -47,7 +47,7 @@ def test_one_that_is_not_marked_is_found(touch_file, touch_analysis, tmp_path, m
     assert 0 < touch.tick - 1000 * touch_file.time_s < 40
 
 
-def test_before_the_touch_nothing_is_found(touch_file, touch_analysis, tmp_path):
+def test_nothing_is_found_before_the_touch(touch_file, touch_analysis, tmp_path):
     length = round(1000 * touch_file.time_s) - 1
     path = touch_file.write(tmp_path / "a.mcap", marked=False, length=length)
     session = touch_analysis.session(path)
@@ -62,7 +62,7 @@ def test_missed_ticks_are_bridged(touch_file, touch_analysis, touched, tmp_path)
     assert x_m == pytest.approx(touched.touches[0].estimate.x_m.value, abs=5e-3)
 
 
-def test_one_at_the_end_of_the_record_is_not_estimated(touch_file, touch_analysis, tmp_path):
+def test_touch_at_the_end_is_not_estimated(touch_file, touch_analysis, tmp_path):
     length = round(1000 * touch_file.time_s) + 10
     session = touch_analysis.session(touch_file.write(tmp_path / "a.mcap", length=length))
     (touch,) = session.touches
@@ -71,7 +71,7 @@ def test_one_at_the_end_of_the_record_is_not_estimated(touch_file, touch_analysi
     assert set(touch.as_dict()) >= {"number", "tick", "angle_rad"}
 
 
-def test_without_shear_it_says_so(touch_file, touch_analysis, tmp_path):
+def test_missing_shear_is_reported(touch_file, touch_analysis, tmp_path):
     path = touch_file.write(
         tmp_path / "a.mcap", marked=False, length=1000, metadata={"shear_projection": "0,0,0,0,0,0"}
     )
@@ -89,7 +89,7 @@ def test_a_wrong_projection_is_named(touch_file, touch_analysis, tmp_path, text)
 
 @pytest.mark.parametrize("profile", ["antenna_serial", "sim"])
 @pytest.mark.parametrize("kind", ["mean", "triangle"])
-def test_filters_of_the_sensor_are_those_of_its_profile(profile, kind, touch_file, tmp_path):
+def test_sensor_filters_come_from_the_profile(profile, kind, touch_file, tmp_path):
     rig = load_profile(profile).rig
     sensor = replace(rig.sensor, filter_hz=200.0, filter_order=2)
     serial, metadata = rig.ati_serial, {"torque_filter_hz": "200.0", "torque_filter_order": "2"}
@@ -118,7 +118,7 @@ def test_an_unknown_filter_is_named(touch_file, touch_analysis, tmp_path, kind, 
         touch_analysis.session(path)
 
 
-def test_without_a_profile_a_model_is_asked_for(touch_file, touch_analysis, tmp_path):
+def test_model_is_required_without_a_profile(touch_file, touch_analysis, tmp_path):
     path = touch_file.write(tmp_path / "a.mcap", profile="")
     with pytest.raises(SessionError, match=r"give --model FILE"):
         touch_analysis.session(path)

@@ -1,4 +1,4 @@
-"""The unknowns: their derivatives, their bounds, and that they are what they say."""
+"""The unknowns: their derivatives, bounds and definition."""
 
 import numpy as np
 import pytest
@@ -10,11 +10,11 @@ from rigd.beam import undamped_frequencies_rad_s
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
-@given(share=st.lists(st.floats(0.0, 1.0), min_size=4, max_size=4))
-def test_derivatives_of_the_parameters(link, name, share):
+@given(fractions=st.lists(st.floats(0.0, 1.0), min_size=4, max_size=4))
+def test_derivatives_of_the_parameters(link, name, fractions):
     unknowns = DampingUnknowns.for_beam(STRUCTURES[name], link)
     low, high = unknowns.bounds
-    x = low + np.array(share[: low.size]) * (high - low)
+    x = low + np.array(fractions[: low.size]) * (high - low)
     parameters = unknowns.parameters(x)
     derivative = unknowns.derivative_of_parameters(x)
     step = 1e-6
@@ -28,7 +28,7 @@ def test_derivatives_of_the_parameters(link, name, share):
             )
 
 
-def test_sizes_are_relative_to_stiffness_and_inertia_at_the_modes(link):
+def test_loss_factors_are_relative_to_stiffness_and_inertia(link):
     unknowns = DampingUnknowns.for_beam(STRUCTURES["VI"], link)
     x = np.array([np.log(0.03), 0.8, np.log(0.2), 1.3])
     damping = unknowns.damping(x)
@@ -40,8 +40,8 @@ def test_sizes_are_relative_to_stiffness_and_inertia_at_the_modes(link):
     assert (damping.alpha, damping.lambda_) == (0.8, 1.3)
 
 
-def test_bounds_hold_every_result_of_the_paper(link, paper_dampings):
-    """The range the paper says it swept for zeta does not."""
+def test_bounds_include_all_results_of_the_paper(link, paper_dampings):
+    """The range of zeta that the paper states does not."""
     first, second = undamped_frequencies_rad_s(link, 2)
     inertia = link.density_kg_per_m / link.bending_stiffness_n_m2 * first**2
     for (name, _), damping in paper_dampings.items():

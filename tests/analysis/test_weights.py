@@ -10,7 +10,7 @@ from analysis.models import WeightingError, weighting_name, weights
 OMEGA = 2 * np.pi * np.arange(94, 8001) / 160
 
 
-def test_the_two_of_equation_27():
+def test_both_weightings_of_equation_27():
     np.testing.assert_array_equal(weights(OMEGA, "const"), np.full(7907, 1 / 7907))
     np.testing.assert_allclose(weights(OMEGA, "omega"), 1 / OMEGA / np.sum(1 / OMEGA), rtol=1e-12)
 
@@ -28,7 +28,7 @@ def test_any_power(power):
     w = weights(OMEGA, f"omega^{power!r}")
     assert w.sum() == pytest.approx(1.0)
     assert (w >= 0).all()
-    # The ratio of neighbours in the middle of the band tells the power, whatever the size.
+    # The ratio of neighbours in the middle of the band gives the power, whatever the size.
     ratio = np.log(w[4001] / w[4000]) / np.log(OMEGA[4001] / OMEGA[4000])
     assert ratio == pytest.approx(power, rel=1e-6, abs=1e-6)
 
@@ -37,7 +37,7 @@ def test_omega_is_the_power_minus_one():
     np.testing.assert_array_equal(weights(OMEGA, "omega"), weights(OMEGA, "omega^-1"))
 
 
-def test_a_function_of_the_users():
+def test_function_of_the_user():
     def near_the_second_mode(omega):
         return np.exp(-(((omega - 100.0) / 20.0) ** 2))
 
@@ -51,7 +51,7 @@ def test_a_function_of_the_users():
 @pytest.mark.parametrize(
     "name", ["", "const2", "omega^", "omega^x", "omega^nan", "omega^inf", "w^2"]
 )
-def test_names_that_do_not_exist(name):
+def test_unknown_names_are_refused(name):
     with pytest.raises(WeightingError, match=r"no weighting .*const, omega"):
         weights(OMEGA, name)
     with pytest.raises(WeightingError):
@@ -67,17 +67,17 @@ def test_names_that_do_not_exist(name):
         lambda omega: np.where(omega < 100, -1.0, 5.0),
     ],
 )
-def test_functions_that_weigh_nothing_or_less(function):
+def test_nonpositive_weights_are_refused(function):
     with pytest.raises(WeightingError, match="not negative"):
         weights(OMEGA, function)
 
 
-def test_function_of_the_wrong_shape():
+def test_wrong_shape_is_refused():
     with pytest.raises(WeightingError, match="shape"):
         weights(OMEGA, lambda _omega: np.array(1.0))
 
 
 @pytest.mark.parametrize("power", ["1e6", "-1e6", "10.1", "-11", "nan", "inf"])
-def test_a_power_that_leaves_one_end_of_the_band_only_is_refused(power):
+def test_extreme_power_is_refused(power):
     with pytest.raises(WeightingError, match=r"from -10 to 10"):
         weights(OMEGA, f"omega^{power}")

@@ -35,14 +35,14 @@ def test_the_response_of_an_oscillator_does_not_wrap_round(transform):
     assert response == pytest.approx(direct, abs=2e-3 * np.abs(direct).max())
 
 
-def test_a_held_signal_keeps_its_last_value():
+def test_held_signal_continues_its_last_value():
     transform = CausalTransform(4 * N, RATE_HZ, 9.0)
     moved = transform.inverse(transform.forward(T_S, hold=True), 3 * N)
     assert moved[:N] == pytest.approx(T_S, abs=1e-9)
     assert moved[N:] == pytest.approx(T_S[-1], abs=1e-9)
 
 
-def test_values_between_the_samples(transform):
+def test_subsample_values_are_exact(transform):
     fine_s = np.arange(3 * N) / (3 * RATE_HZ)
     fine_wave = np.exp(-((fine_s - 3) ** 2) / 0.05)
     spectrum = transform.forward(WAVE)

@@ -16,7 +16,7 @@ from rigd.beam import (
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 LENGTH_M = BEAM.length_m
 RATE_HZ = 1000.0
-TIME_S = 200.0  # the undamped beam apart, everything has died away by then
+TIME_S = 200.0  # except for the undamped beam, all vibration has decayed by then
 
 # Table 3 of the paper, one of each type, and its best fits.
 DAMPINGS = {
@@ -55,7 +55,7 @@ def exact(frequency_hz: float, damping: Damping, x_m: np.ndarray, beam: Beam = B
 def deflection_after(
     bends: DeflectionFilter, angle_rad: np.ndarray, longest_block: int = 2000
 ) -> np.ndarray:
-    """Feed in blocks of 1 … `longest_block` samples; return what comes last."""
+    """Feed in blocks of 1 … `longest_block` samples; return the last result."""
     random = np.random.default_rng(5)
     start = 0
     while start < angle_rad.size:
@@ -82,7 +82,7 @@ def x_m(points: int = 41) -> np.ndarray:
 
 
 @pytest.mark.parametrize("frequency_hz", [0.5, 2.6, 20.0])
-def test_the_truth_of_these_tests_is_eq_25(frequency_hz):
+def test_reference_of_these_tests_is_eq_25(frequency_hz):
     """Torque is stiffness times curvature at the motor."""
     damping = DAMPINGS["VI omega"]
     s = 2j * np.pi * frequency_hz
@@ -106,12 +106,12 @@ def test_shape_is_that_of_the_boundary_value_problem(damping, frequency_hz):
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_at_a_resonance_the_beam_takes_the_shape_of_the_mode(number):
+def test_deflection_at_resonance_is_the_mode_shape(number):
     damping = Damping(gamma=0.005)
     frequency_hz = undamped_frequencies_rad_s(BEAM, number)[-1] / (2 * np.pi)
     shape = response(frequency_hz, damping)
     mode = mode_shape(number, x_m() / LENGTH_M)
-    # A quarter of a period behind the angle; what is in phase with it is the other modes.
+    # A quarter of a period behind the angle; the part in phase with it is of the other modes.
     np.testing.assert_allclose(shape.imag / shape.imag[-1], mode / mode[-1], atol=2e-3)
     assert abs(shape.imag[-1]) > 20 * np.abs(shape.real).max()
 
@@ -126,8 +126,8 @@ def test_other_beams_and_rates(beam_length_m):
         assert np.abs(shape - truth).max() < 5e-3 * np.abs(truth).max()
 
 
-def test_modes_left_out_are_there_at_low_frequency():
-    """What all others add is in the shape of the last one; the first mode alone would not do."""
+def test_omitted_modes_contribute_at_low_frequency():
+    """All other modes are in the shape of the last one; the first mode alone is not enough."""
     damping = DAMPINGS["VI omega"]
     truth = exact(5.0, damping, x_m())
     assert np.abs(response(5.0, damping, modes=1) - truth).max() < 2e-3 * np.abs(truth).max()
@@ -156,7 +156,7 @@ def test_over_damped_modes():
     assert np.abs(response(20.0, damping) - truth).max() < 1e-2 * np.abs(truth).max()
 
 
-def test_acceleration_in_the_positive_direction_bends_the_tip_to_the_negative_side():
+def test_positive_acceleration_bends_the_tip_backwards():
     """And by as much as the distributed inertial load bends a cantilever."""
     acceleration = 0.2
     time_s = np.arange(100) / RATE_HZ
@@ -173,7 +173,7 @@ def test_acceleration_in_the_positive_direction_bends_the_tip_to_the_negative_si
 
 
 @pytest.mark.parametrize("damping", [DAMPINGS["I omega"], DAMPINGS["II const"]])
-def test_steady_rotation_bends_the_beam_by_the_drag_of_the_air_only(damping):
+def test_steady_rotation_bends_the_beam_by_drag_only(damping):
     speed = 0.2
     angle_rad = speed * np.arange(100_000) / RATE_HZ
     deflection_m = deflection_after(DeflectionFilter(BEAM, damping, RATE_HZ), angle_rad)
@@ -182,7 +182,7 @@ def test_steady_rotation_bends_the_beam_by_the_drag_of_the_air_only(damping):
     np.testing.assert_allclose(deflection_m, drag_m, atol=1e-5 * speed * LENGTH_M)
 
 
-def test_a_motor_that_stands_still_does_not_bend_the_beam_wherever_it_stands():
+def test_constant_angle_does_not_bend_the_beam():
     bends = DeflectionFilter(BEAM, DAMPINGS["VI omega"], RATE_HZ)
     assert np.all(deflection_after(bends, np.full(5000, 1.234)) == 0)
     swing = 0.1 * np.sin(np.arange(3000) / 50)

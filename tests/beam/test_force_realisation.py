@@ -1,4 +1,4 @@
-"""Realisation of a force on the beam, and outputs told by the states of a realisation."""
+"""Realisation of a force on the beam, and outputs computed from the states of a realisation."""
 
 from dataclasses import replace
 from math import pi
@@ -43,7 +43,7 @@ def test_response_to_a_force_is_the_exact_one(damping, at_m, highest_rad_s):
         ]
     )
     realised = response(realise_force(BEAM, damping, at_m, TOLD_M, highest_rad_s), s)
-    # Displacement of a beam without ends: the size at a place where it happens to stand still.
+    # Displacement of a beam without ends: its size at a node.
     stiffness = 0.090275 * (1 + damping.zeta * s**damping.alpha)
     load = 4.7e-3 * s**2 + 0.090275 * damping.gamma * s**damping.lambda_
     unbounded = np.sqrt(1 / 8) / np.abs(load**0.75 * stiffness**0.25)
@@ -54,7 +54,7 @@ def test_response_to_a_force_is_the_exact_one(damping, at_m, highest_rad_s):
     assert (error < MOST).all(), error
 
 
-def test_a_force_at_rest_bends_the_beam_as_the_books_say():
+def test_static_force_bends_the_beam_as_in_textbooks():
     at_m = 0.7
     realised = realise_force(BEAM, DAMPINGS["paper"], at_m, TOLD_M, 1e4)
     static = realised.direct - realised.rows @ np.linalg.solve(realised.a, realised.b)
@@ -72,41 +72,41 @@ def test_an_order_that_is_too_high_is_refused_where_it_damps():
 
 @pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
 @pytest.mark.parametrize("x_m", [0.1, 0.7])
-def test_displacement_told_by_the_states(damping, x_m):
+def test_displacement_as_output_of_the_states(damping, x_m):
     realisation = realise(Plant(BEAM, damping))
-    told = state_output(
+    output = state_output(
         realisation,
         lambda s: PointForceGrid(s, BEAM, damping).displacement_per_angle(x_m),
         inertial=False,
     )
-    assert told.output_per_acceleration == 0
-    assert errors(realisation, told, damping, lambda grid: grid.displacement_per_angle(x_m)) < 2e-3
+    assert output.output_per_acceleration == 0
+    assert errors(realisation, output, damping, lambda grid: grid.displacement_per_angle(x_m)) < 2e-3
 
 
 @pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
-def test_shear_told_by_the_states(damping):
+def test_shear_as_output_of_the_states(damping):
     realisation = realise(Plant(BEAM, damping))
-    told = state_output(
+    output = state_output(
         realisation, lambda s: PointForceGrid(s, BEAM, damping).shear_per_angle(), inertial=True
     )
-    assert errors(realisation, told, damping, lambda grid: grid.shear_per_angle()) < 2e-3
+    assert errors(realisation, output, damping, lambda grid: grid.shear_per_angle()) < 2e-3
 
 
-def with_output(realisation, told):
-    """Put another output in the place of the realisation's torque."""
+def with_output(realisation, output):
+    """Replace the torque of the realisation by another output."""
     return replace(
         realisation,
-        c=told.c,
-        direct_inertia_kg_m2=told.output_per_acceleration,
-        direct_viscosity_nm_s_per_rad=told.output_per_velocity,
-        direct_stiffness_nm_per_rad=told.output_per_angle,
+        c=output.c,
+        direct_inertia_kg_m2=output.output_per_acceleration,
+        direct_viscosity_nm_s_per_rad=output.output_per_velocity,
+        direct_stiffness_nm_per_rad=output.output_per_angle,
     )
 
 
-def errors(realisation, told, damping, response_of):
+def errors(realisation, output, damping, response_of):
     s = 2j * pi * np.geomspace(0.05, 400, 2000)
     exact = response_of(PointForceGrid(s, BEAM, damping))
-    realised = with_output(realisation, told).transfer(s)
+    realised = with_output(realisation, output).transfer(s)
     return (np.abs(realised - exact) / np.abs(exact)).max()
 
 
@@ -115,12 +115,12 @@ def test_torque_of_a_force_is_the_displacement_of_an_angle(at_m):
     damping = DAMPINGS["paper"]
     s = 2j * pi * np.geomspace(0.05, 300, 1000)
     realisation = realise(Plant(BEAM, damping))
-    told = state_output(
+    output = state_output(
         realisation,
         lambda s: PointForceGrid(s, BEAM, damping).displacement_per_angle(at_m),
         inertial=False,
     )
-    displacement = with_output(realisation, told).transfer(s)
+    displacement = with_output(realisation, output).transfer(s)
     torque = response(realise_force(BEAM, damping, at_m, np.array([at_m]), 1e4), s)[:, -2]
     assert (np.abs(torque + displacement) / (np.abs(displacement) + 0.01 * at_m)).max() < 2e-3
 

@@ -47,9 +47,9 @@ def test_mode_shape(number):
     shape = mode_shape(number, x)
     z = clamped_free_eigenvalues(number)[-1]
     assert np.sum(weight * shape**2) == pytest.approx(1, abs=1e-11)
-    # The participation is the shape's share of a rigid rotation.
-    share = np.sum(weight * x * shape) ** 2 * PAPER_BEAM.length_m**3
-    assert share == pytest.approx(participation(PAPER_BEAM, number)[-1], rel=1e-7)
+    # The participation is the fraction of a rigid rotation in the shape.
+    fraction = np.sum(weight * x * shape) ** 2 * PAPER_BEAM.length_m**3
+    assert fraction == pytest.approx(participation(PAPER_BEAM, number)[-1], rel=1e-7)
     np.testing.assert_allclose(mode_shape(number, [0.0, 1.0]), [0.0, 2.0], atol=1e-12)
     # Clamped: neither deflection nor slope.
     near = 1e-4 / z

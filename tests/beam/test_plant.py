@@ -33,7 +33,7 @@ PLANTS = pytest.mark.parametrize("plant", [UNIFORM, HEAVY, UNEVEN])
 
 
 @PLANTS
-def test_a_plant_is_what_its_parameters_and_its_json_object_say(plant):
+def test_plant_matches_its_parameters_and_json(plant):
     again = Plant.from_parameters(plant.beam.length_m, plant.parameters)
     assert again.beam.density_kg_per_m == pytest.approx(plant.beam.density_kg_per_m, rel=1e-14)
     assert replace(again, beam=plant.beam) == plant
@@ -43,7 +43,7 @@ def test_a_plant_is_what_its_parameters_and_its_json_object_say(plant):
 
 
 @PLANTS
-def test_every_parameter_is_in_the_table_and_changes_alone(plant):
+def test_all_parameters_are_in_the_table_and_independent(plant):
     for name, value in plant.parameters.items():
         assert parameter_named(name).is_valid(value)
         changed = plant.with_parameters({name: 1.25 * value}).parameters
@@ -55,7 +55,7 @@ def test_every_parameter_is_in_the_table_and_changes_alone(plant):
         )
 
 
-def test_what_no_plant_has_is_refused_by_name():
+def test_unknown_parameter_is_refused_by_name():
     for name in ("drag", "length_m"):
         with pytest.raises(ValueError, match=f"'{name}' is not a parameter"):
             UNIFORM.with_parameters({name: 1.0})
@@ -101,7 +101,7 @@ def test_a_uniform_cantilever_has_the_exact_transfer_function():
     assert nearly.tip_slope(s) == pytest.approx(UNIFORM.tip_slope(s), rel=1e-6)
 
 
-def test_the_poles_of_each_kind_of_plant_move_as_their_derivatives_say():
+def test_pole_derivatives_match_for_every_variant():
     for plant in (UNIFORM, HEAVY, UNEVEN):
         step = 1e-6 * plant.damping.gamma
         after, before = (

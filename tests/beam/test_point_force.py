@@ -27,7 +27,7 @@ def stiffness_and_load(s, damping):
 
 @pytest.mark.parametrize("line", S)
 @pytest.mark.parametrize("damping", [FRACTIONAL, HALF])
-def test_without_a_force_the_torque_is_that_of_eq_25(line, damping):
+def test_torque_without_force_is_that_of_eq_25(line, damping):
     grid = PointForceGrid(S[line], BEAM, damping)
     exact = transfer(S[line], BEAM, damping)
     assert np.abs(grid.torque_per_angle() / exact - 1).max() < 1e-12
@@ -41,7 +41,7 @@ def test_torque_of_a_force_is_the_displacement_of_an_angle(line, damping):
     assert np.abs(grid.torque_per_force(PLACES_M) / displacement + 1).max() < 1e-12
 
 
-def test_forces_and_displacements_change_places():
+def test_forces_and_displacements_are_reciprocal():
     grid = PointForceGrid(S["axis"], BEAM, FRACTIONAL)
     there = grid.displacement_per_force(PLACES_M[:, None], PLACES_M)
     assert there.shape == (801, 4, 4)
@@ -73,8 +73,8 @@ def test_derivatives_along_the_beam(order):
     grid = PointForceGrid(2j * pi * np.array([0.1, 2.0, 40.0, 400.0]), BEAM, FRACTIONAL)
     x, h = np.array([0.1, 0.33, 0.8]), 1e-5
 
-    def differences(told):
-        return (told(x + h, order - 1) - told(x - h, order - 1)) / (2 * h)
+    def differences(derivative):
+        return (derivative(x + h, order - 1) - derivative(x - h, order - 1)) / (2 * h)
 
     assert grid.displacement_per_angle(x, order) == pytest.approx(
         differences(grid.displacement_per_angle), rel=1e-5
@@ -97,7 +97,7 @@ def test_series_and_waves_meet():
         assert curve[0] == pytest.approx(curve[1], rel=1e-6)
 
 
-def test_at_rest():
+def test_static_deflection():
     grid = PointForceGrid([0.0], BEAM, FRACTIONAL)
     ei = BEAM.bending_stiffness_n_m2
     assert grid.displacement_per_force(PLACES_M, PLACES_M)[0] == pytest.approx(
@@ -108,7 +108,7 @@ def test_at_rest():
     assert grid.shear_per_force(PLACES_M)[0] == pytest.approx(-1.0)
 
 
-def test_a_beam_on_a_rigid_obstacle_at_its_tip_has_the_frequencies_of_a_pinned_one():
+def test_rigid_obstacle_at_tip_gives_pinned_frequencies():
     for z in (3.926602, 7.068583, 10.210176):
         omega = (z * (1 + np.array([-1e-5, 1e-5])) / BEAM.length_m) ** 2
         s = 1j * omega / np.sqrt(BEAM.density_over_stiffness)
@@ -126,7 +126,7 @@ def test_shapes():
     assert grid.displacement_per_force(PLACES_M, PLACES_M).shape == (2, 3, 4)
 
 
-def test_one_point():
+def test_single_point():
     grid = PointForceGrid(5j, BEAM, FRACTIONAL)
     assert grid.torque_per_angle() == pytest.approx(transfer(5j, BEAM, FRACTIONAL))
     assert grid.displacement_per_force(0.2, 0.5).shape == ()

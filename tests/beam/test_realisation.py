@@ -1,4 +1,4 @@
-"""The real-time realisation against Eq. 25, and what it refuses."""
+"""The real-time realisation against Eq. 25, and its refusals."""
 
 import numpy as np
 import pytest
@@ -38,8 +38,8 @@ def measured_error(realisation, beam, damping):
         hz.append(mode.frequency_hz + width * np.linspace(-2, 2, 41))
     hz = np.concatenate(hz)
     s = 2j * np.pi * hz[(hz > 0.05) & (hz < 100)]
-    apart = [abs(s - mode.poles_rad_s[0]) > 1e-6 * abs(s) for mode in modes(beam, damping, 4)]
-    s = s[np.all(apart, axis=0)]
+    separate = [abs(s - mode.poles_rad_s[0]) > 1e-6 * abs(s) for mode in modes(beam, damping, 4)]
+    s = s[np.all(separate, axis=0)]
     return np.max(np.abs(realisation.transfer(s) / transfer(s, beam, damping) - 1))
 
 
@@ -61,7 +61,7 @@ def test_table_3(name):
     ],
     ids=["VI", "III", "IV"],
 )
-def test_plants_that_the_analysis_is_proved_on(damping):
+def test_plants_of_the_analysis_tests(damping):
     """EI is known to 4e-4 from 20 pooled chirps or from one session of narrow sweeps."""
     assert measured_error(realise(Plant(PAPER_BEAM, damping)), PAPER_BEAM, damping) < 5e-5
 
@@ -71,8 +71,8 @@ def test_random_beams_and_dampings(count):
     for beam, damping in random_rigs(count, seed=1):
         realisation = realise(Plant(beam, damping))
         assert measured_error(realisation, beam, damping) < 3 * realisation.relative_error + 1e-9
-        for share in (0.1, 1.0, 10.0):
-            motor = couple(realisation, motor_inertia_kg_m2=share * beam.inertia_kg_m2)
+        for fraction in (0.1, 1.0, 10.0):
+            motor = couple(realisation, motor_inertia_kg_m2=fraction * beam.inertia_kg_m2)
             assert np.linalg.eigvals(motor.a).real.max() < 1e-2
 
 
@@ -108,14 +108,14 @@ def test_direct_terms_dissipate_or_store():
         assert realisation.direct_stiffness_nm_per_rad >= 0, name
 
 
-def test_refusal_names_the_error_achieved():
+def test_refusal_states_the_achieved_error():
     achieved = realise(Plant(PAPER_BEAM, SETS["VI-omega"])).relative_error
     with pytest.raises(RealisationError, match=rf"{achieved:.1e}.*1\.0e-07 was requested"):
         realise(Plant(PAPER_BEAM, SETS["VI-omega"]), max_relative_error=1e-7)
     assert realise(Plant(PAPER_BEAM, SETS["VI-omega"]), max_relative_error=1.01 * achieved)
 
 
-def test_refusal_of_what_would_make_a_motor_unstable(monkeypatch):
+def test_realisation_that_destabilises_a_motor_is_refused(monkeypatch):
     """No damping is known that fails this check; the undamped beam does under a stricter limit."""
     monkeypatch.setattr("rigd.beam.realisation.MAX_GROWTH_PER_S", 1e-6)
     with pytest.raises(RealisationError, match="without friction would be unstable"):
@@ -144,24 +144,24 @@ def test_a_beam_of_too_many_modes_is_refused_at_once():
         realise(Plant(millimetres_for_metres, Damping()))
 
 
-@pytest.mark.parametrize("share", [0.95, *map(further, (0.98, 1.02, 1.05))])
-def test_a_beam_of_another_stiffness_has_as_many_states(share):
+@pytest.mark.parametrize("fraction", [0.95, *map(further, (0.98, 1.02, 1.05))])
+def test_number_of_states_does_not_depend_on_stiffness(fraction):
     # At 1200 Hz, where no more modes are realised, and at critical damping a mode changes sides.
     for length_m in np.linspace(0.5, 1.5, 21):
         for damping in (Damping(7.1e-5, 0.996, 0.055, 0.594), Damping(zeta=1.075e-3)):
             beam = Beam(length_m, 4.7e-3, 0.090275)
-            other = Beam(length_m, 4.7e-3, share * 0.090275)
+            other = Beam(length_m, 4.7e-3, fraction * 0.090275)
             one, two = realise(Plant(beam, damping)), realise(Plant(other, damping), modes_of=beam)
             assert one.b.size == two.b.size
             assert np.array_equal(np.unique(one.modes), np.unique(two.modes))
             of_first = two.poles_rad_s[two.modes == 0] / one.poles_rad_s[one.modes == 0]
             assert of_first.imag == pytest.approx(0.0, abs=1e-2)
-            assert of_first.real == pytest.approx(share**0.5, rel=1e-2)
+            assert of_first.real == pytest.approx(fraction**0.5, rel=1e-2)
             own = realise(Plant(beam, damping), modes_of=beam)
             assert np.array_equal(own.c, one.c)
 
 
-def test_modes_of_quite_another_beam_are_refused():
+def test_modes_of_a_very_different_beam_are_refused():
     with pytest.raises(RealisationError, match="does not have the modes of"):
         realise(
             Plant(Beam(0.98, 4.7e-3, 0.090275), Damping(zeta=1.075e-3)),

@@ -1,4 +1,4 @@
-"""The free end: closed form against the modes, and what the paper's chirp does with it."""
+"""The free end: closed form against the modes, and its motion in the paper's chirp."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def test_the_closed_form_is_the_sum_of_the_modes(damping):
         load = elastic * (z / BEAM.length_m) ** 4
         leverage = 2 * BEAM.length_m * (-1.0) ** i / z**2
         total -= leverage * float(mode_shape(i + 1, 1.0)) * inertial / (load + inertial)
-    # What the modes after the fortieth add grows with the square of the frequency.
+    # The part of the modes after the fortieth grows with the square of the frequency.
     displacement, _ = Plant(BEAM, damping).tip_response(s)
     assert np.abs(displacement + BEAM.length_m - total).max() < 1e-3
 
@@ -33,7 +33,7 @@ def test_displacement_and_slope_solve_the_boundary_value_problem(damping):
     found = []
     for wave_number in (-inertial / elastic) ** 0.25:
         roots = wave_number * np.array([1, 1j, -1, -1j])
-        # Waves that grow are told by what they are at the tip.
+        # Growing waves are normalised to their value at the tip.
         at_root = np.exp(-np.maximum(roots.real, 0) * BEAM.length_m)
         at_tip = np.exp(roots * BEAM.length_m) * at_root
         matrix = np.array([at_root, roots * at_root, roots**2 * at_tip, roots**3 * at_tip])
@@ -46,13 +46,13 @@ def test_displacement_and_slope_solve_the_boundary_value_problem(damping):
     assert slope == pytest.approx(np.array(found)[:, 1], rel=1e-9)
 
 
-def test_a_standing_angle_turns_the_tip_and_does_not_bend_it():
+def test_constant_angle_turns_the_tip_without_bending():
     displacement, slope = Plant(BEAM, Damping()).tip_response(np.array([1e-3 + 0j]))
     assert displacement[0] == pytest.approx(0.0, abs=1e-6)
     assert slope[0] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_an_angle_that_stays_where_it_ends_shakes_nothing():
+def test_angle_that_stays_at_its_end_excites_nothing():
     """A slow turn to 20 mrad, held to the last sample."""
     rate_hz = 1000.0
     x = np.clip(np.arange(6000) / (2 * rate_hz), 0, 1)
@@ -63,17 +63,19 @@ def test_an_angle_that_stays_where_it_ends_shakes_nothing():
     )
 
 
-@pytest.mark.parametrize(("frequency_hz", "slope_of_share"), [(2.5536, 1.3765), (16.003, 4.781)])
-def test_the_same_deflection_slopes_more_in_a_higher_mode(frequency_hz, slope_of_share):
+@pytest.mark.parametrize(
+    ("frequency_hz", "slope_per_deflection"), [(2.5536, 1.3765), (16.003, 4.781)]
+)
+def test_equal_deflection_slopes_more_in_higher_modes(frequency_hz, slope_per_deflection):
     """Modes of the clamped beam; the tip's slope over its deflection relative to the length."""
     t = np.arange(8000) / 1000.0
     angle = 1e-3 * np.minimum(t, 1) * np.sin(2 * np.pi * frequency_hz * t)
     motion = tip_motion(Plant(BEAM, VI), angle, 1000.0)
-    share = motion.deflection_m / BEAM.length_m
-    assert motion.slope_rad == pytest.approx(slope_of_share * share, rel=0.02)
+    relative_deflection = motion.deflection_m / BEAM.length_m
+    assert motion.slope_rad == pytest.approx(slope_per_deflection * relative_deflection, rel=0.02)
 
 
-def test_the_largest_deflection_is_that_of_the_shape_as_it_happens():
+def test_largest_deflection_is_that_of_the_true_shape():
     rate_hz = 1000.0
     t = np.arange(12_000) / rate_hz
     angle = 0.025 * np.sin(2 * np.pi * (0.05 + 0.21 * t) * t)
@@ -89,18 +91,18 @@ def test_a_tip_mass_and_a_clamp_are_in_the_motion_of_the_tip():
     """A slow turn: the mass bends the beam by its own inertia, and the clamp yields."""
     t = np.arange(4000) / 1000.0
     angle_rad = 0.05 * np.sin(2 * np.pi * 0.2 * t) * np.minimum(t, 1.0) ** 2
-    bare = tip_motion(Plant(BEAM, VI), angle_rad, 1000.0)
+    free = tip_motion(Plant(BEAM, VI), angle_rad, 1000.0)
     same = tip_motion(Plant(BEAM, VI, tip_mass_kg=1e-12), angle_rad, 1000.0)
-    assert same.deflection_m == pytest.approx(bare.deflection_m, rel=1e-3)
-    assert same.speed_m_s == pytest.approx(bare.speed_m_s, rel=1e-3)
+    assert same.deflection_m == pytest.approx(free.deflection_m, rel=1e-3)
+    assert same.speed_m_s == pytest.approx(free.speed_m_s, rel=1e-3)
     heavy = tip_motion(Plant(BEAM, VI, tip_mass_kg=1e-3), angle_rad, 1000.0)
-    assert heavy.slope_rad > 1.3 * bare.slope_rad
+    assert heavy.slope_rad > 1.3 * free.slope_rad
     soft = tip_motion(Plant(BEAM, VI, root_compliance_rad_per_nm=0.5), angle_rad, 1000.0)
-    assert soft.slope_rad == pytest.approx(bare.slope_rad, rel=0.3)
-    assert soft.speed_m_s == pytest.approx(bare.speed_m_s, rel=0.1)
+    assert soft.slope_rad == pytest.approx(free.slope_rad, rel=0.3)
+    assert soft.speed_m_s == pytest.approx(free.speed_m_s, rel=0.1)
 
 
-def test_the_motion_in_a_long_record_is_that_of_its_largest_part():
+def test_motion_of_a_long_record_is_that_of_its_largest_part():
     """The sweep passes mode 1 late in the record, whose chunks are computed one by one."""
     t = np.arange(60_000) / 1000.0
     sweep_rad = 0.02 * np.sin(2 * np.pi * (1.0 + 0.02 * t) * t)

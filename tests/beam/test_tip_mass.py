@@ -57,8 +57,8 @@ def solved(s, damping, tip_mass_kg, compliance):
         found.append(-stiffness * (amplitudes @ roots**2))
         slopes.append(amplitudes @ (roots * waves) - 1)
     rigid = np.array(found)
-    share = 1 / (1 + compliance * rigid)
-    return rigid * share, np.array(slopes) * share
+    factor = 1 / (1 + compliance * rigid)
+    return rigid * factor, np.array(slopes) * factor
 
 
 @pytest.mark.parametrize(("mass", "compliance"), ENDS)
@@ -85,15 +85,15 @@ def offset(compliance):
 
 
 @pytest.mark.parametrize("compliance", [0.0, 0.05])
-def test_modes_of_their_own_stiffness_replace_those_of_the_uniform_beam(compliance):
+def test_modes_with_own_stiffness_replace_uniform_ones(compliance):
     """By the sum of the modes: each of the first four with its own stiffness."""
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 100, 60)
     loaded = offset(compliance)
     elastic, inertial = loaded.elastic_and_inertial_factors(s)
     response = transfer(s, BEAM, DAMPINGS["fractional"])
-    for z, share in zip(clamped_free_eigenvalues(4)[1:], OFFSETS, strict=True):
+    for z, stiffness_offset in zip(clamped_free_eigenvalues(4)[1:], OFFSETS, strict=True):
         k4, stiffness = (z / BEAM.length_m) ** 4, BEAM.bending_stiffness_n_m2
-        for sign, own in ((-1, k4), (1, k4 * (1 + share))):
+        for sign, own in ((-1, k4), (1, k4 * (1 + stiffness_offset))):
             # Of a mode a² EI p - a² EI p²/(p + c k⁴): the first part is the rigid link's.
             weight = 4 * BEAM.length_m**3 / z**4 * stiffness
             response = response - sign * weight * inertial**2 / (inertial + elastic * own)
@@ -109,7 +109,7 @@ def test_modes_of_their_own_stiffness_replace_those_of_the_uniform_beam(complian
 
 
 @pytest.mark.parametrize("compliance", [0.0, 0.05])
-def test_their_poles_are_found_and_realised(compliance):
+def test_poles_of_modes_with_own_stiffness_are_realised(compliance):
     loaded = offset(compliance)
     at_poles = loaded.poles(clamped_free_eigenvalues(6))[:, 0]
     far, near = (np.abs(loaded.transfer(at_poles * (1 + h))) for h in (1e-4, 1e-8))
@@ -117,19 +117,19 @@ def test_their_poles_are_found_and_realised(compliance):
     made = realise(loaded)
     s = 2j * np.pi * np.geomspace(0.1, 90, 200)
     assert made.transfer(s) == pytest.approx(loaded.transfer(s), rel=1e-3)
-    # The residues are those of the realisation: half of what both states of a pair contribute.
+    # The residues are those of the realisation: half of the contribution of both states of a pair.
     of_states = made.c[: 2 * at_poles.size].reshape(-1, 2)
     assert 2 * np.abs(loaded.residues(at_poles)) == pytest.approx(np.hypot(*of_states.T), rel=1e-4)
 
 
-def test_what_modes_of_their_own_stiffness_do_not_define_is_refused():
+def test_quantities_undefined_for_own_stiffness_are_refused():
     with pytest.raises(ValueError, match="the shear is not known"):
         offset(0.0).shear(np.array([1j]))
     with pytest.raises(ValueError, match="exclude each other"):
         replace(offset(0.0), tip_mass_kg=1e-4)
 
 
-def test_their_tip_moves_as_the_sum_of_the_modes():
+def test_tip_of_modes_with_own_stiffness_is_their_sum():
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 80, 40)
     loaded = offset(0.0)
     elastic, inertial = loaded.elastic_and_inertial_factors(s)
@@ -152,7 +152,7 @@ def test_their_tip_moves_as_the_sum_of_the_modes():
 
 
 @pytest.mark.parametrize("compliance", [0.0, 0.05])
-def test_they_are_differentiated_as_those_of_the_uniform_beam(compliance):
+def test_derivatives_of_modes_with_own_stiffness(compliance):
     loaded = offset(compliance)
     names = ("zeta", "lambda", "ln_density_over_stiffness", "root_compliance_rad_per_nm")
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 80, 40)
@@ -173,7 +173,7 @@ def test_they_are_differentiated_as_those_of_the_uniform_beam(compliance):
         assert moved[:, row] == pytest.approx(by_step, rel=1e-3, abs=1e-4), row
 
 
-def test_a_beam_is_given_the_frequencies_of_modes():
+def test_beam_takes_given_mode_frequencies():
     wanted_hz = offset(0.0).poles(clamped_free_eigenvalues(3))[:, 0].imag / (2 * np.pi)
     heavier = replace(BEAM, density_kg_per_m=1.2 * BEAM.density_kg_per_m)
     found = Plant(heavier, DAMPINGS["fractional"]).with_frequencies(wanted_hz)
@@ -184,7 +184,7 @@ def test_a_beam_is_given_the_frequencies_of_modes():
 
 
 @pytest.mark.parametrize(("mass", "compliance"), ENDS)
-def test_the_slope_of_the_tip_is_that_of_the_boundary_value_problem(mass, compliance):
+def test_slope_of_the_tip_solves_the_boundary_value_problem(mass, compliance):
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 80, 60)
     loaded = Plant(BEAM, DAMPINGS["fractional"], **ends(mass, compliance))
     exact = solved(s, DAMPINGS["fractional"], mass, compliance)[1]
@@ -220,7 +220,7 @@ def changed(loaded, name, step):
 
 @pytest.mark.parametrize("name", STEPS)
 @pytest.mark.parametrize(("mass", "compliance"), [(5e-5, 0.002), (5e-4, 0.05)])
-def test_the_derivatives_are_those_of_differences(mass, compliance, name):
+def test_derivatives_match_differences(mass, compliance, name):
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 60, 40)
     loaded = Plant(BEAM, DAMPINGS["fractional"], **ends(mass, compliance))
     step, z = STEPS[name], clamped_free_eigenvalues(3)
@@ -236,7 +236,7 @@ def test_the_derivatives_are_those_of_differences(mass, compliance, name):
 
 
 @pytest.mark.parametrize("mass", [0.0, 5e-5])
-def test_next_to_the_pole_on_a_rigid_clamp_the_derivatives_are_those_of_differences(mass):
+def test_derivatives_match_differences_near_a_pole(mass):
     loaded, z = Plant(BEAM, DAMPINGS["fractional"], tip_mass_kg=mass), clamped_free_eigenvalues(3)
     for name in ("zeta", "ln_density_over_stiffness", "tip_mass_kg"):
         step = STEPS[name]
@@ -247,38 +247,38 @@ def test_next_to_the_pole_on_a_rigid_clamp_the_derivatives_are_those_of_differen
 
 @pytest.mark.parametrize("stiffness", [3.224590545296398e-06, 3.352924149249553e-05, 0.090275])
 @pytest.mark.parametrize("damping", [Damping(), Damping(zeta=7e-5)])
-def test_poles_of_a_bare_beam_move_with_its_ends_where_the_response_is_infinite(stiffness, damping):
-    """Without a warning, and by what is the beam's own as in the bare beam's closed form."""
+def test_pole_derivatives_by_the_ends_match_the_response(stiffness, damping):
+    """Without a warning, and by the beam's own terms as in the uniform beam's closed form."""
     beam = Beam(0.98, 4.7e-3, stiffness)
     own, ends = ("zeta", "ln_density_over_stiffness"), ("tip_mass_kg", "root_compliance_rad_per_nm")
     loaded, z = Plant(beam, damping), clamped_free_eigenvalues(3)
     poles = loaded.poles(z)[:, 0]
     moved = loaded.pole_gradients(poles, (*own, *ends))
-    for bare, row in zip(loaded.mode_poles(3, own), moved, strict=True):
-        np.testing.assert_allclose(row[:2], bare.derivative, rtol=1e-6)
+    for uniform, row in zip(loaded.mode_poles(3, own), moved, strict=True):
+        np.testing.assert_allclose(row[:2], uniform.derivative, rtol=1e-6)
         assert np.isfinite(row).all()
         # Both make the mode slower.
         assert (row[2:].imag < 0).all()
 
 
-def test_without_either_it_is_the_bare_beam():
+def test_plant_without_mass_and_clamp_is_the_uniform_beam():
     s = 2j * np.pi * np.geomspace(0.01, 400, 300)
-    bare = Plant(BEAM, DAMPINGS["fractional"])
-    assert bare.transfer(s) == pytest.approx(transfer(s, BEAM, DAMPINGS["fractional"]), rel=1e-9)
+    uniform = Plant(BEAM, DAMPINGS["fractional"])
+    assert uniform.transfer(s) == pytest.approx(transfer(s, BEAM, DAMPINGS["fractional"]), rel=1e-9)
     z = clamped_free_eigenvalues(5)
-    assert (bare.poles(z) == poles(BEAM, DAMPINGS["fractional"], 5)).all()
+    assert (uniform.poles(z) == poles(BEAM, DAMPINGS["fractional"], 5)).all()
 
 
 @pytest.mark.parametrize(("mass", "compliance"), ENDS[1:])
 @pytest.mark.parametrize("name", DAMPINGS)
-def test_the_response_is_infinite_at_the_poles_and_nought_at_the_zeros(name, mass, compliance):
+def test_response_has_its_poles_and_zeros(name, mass, compliance):
     loaded = Plant(BEAM, DAMPINGS[name], **ends(mass, compliance))
     at_poles = loaded.poles(clamped_free_eigenvalues(4))[:, 0]
-    beside = loaded.transfer(at_poles * (1 + 1e-4))
-    assert (np.abs(loaded.transfer(at_poles * (1 + 1e-9))) > 1e4 * np.abs(beside)).all()
+    nearby = loaded.transfer(at_poles * (1 + 1e-4))
+    assert (np.abs(loaded.transfer(at_poles * (1 + 1e-9))) > 1e4 * np.abs(nearby)).all()
     at_zeros = loaded.zeros(np.pi * np.arange(1.25, 4))[:, 0]
-    beside = loaded.transfer(at_zeros * (1 + 1e-4))
-    assert (np.abs(loaded.transfer(at_zeros * (1 + 1e-9))) < 1e-4 * np.abs(beside)).all()
+    nearby = loaded.transfer(at_zeros * (1 + 1e-4))
+    assert (np.abs(loaded.transfer(at_zeros * (1 + 1e-9))) < 1e-4 * np.abs(nearby)).all()
 
 
 @pytest.mark.parametrize(("mass", "compliance"), ENDS[1:])

@@ -80,7 +80,7 @@ def test_derivatives(case, name):
         assert wanted.any() or not gradient.any()
 
 
-def test_gradient_comes_in_the_order_asked_for_with_the_value_of_transfer():
+def test_gradient_has_the_requested_order():
     s = 2j * np.pi * np.geomspace(1e-3, 5e3, 500)
     damping = Damping(7e-5, 0.996, 0.055, 0.594)
     g, gradient = transfer_and_gradient(s, PAPER_BEAM, damping, GRADIENT_NAMES)
@@ -138,7 +138,7 @@ def test_undamped_low_frequency_is_the_inertia_of_a_rigid_beam(beam):
 
 
 @given(beam=beams, zeta=st.floats(0, 1e-2), gamma=st.floats(0, 1.0))
-def test_order_one_is_the_integer_model(beam, zeta, gamma):
+def test_order_one_equals_the_integer_model(beam, zeta, gamma):
     s = 1j * np.geomspace(0.1, 2e3, 300)
     c = 1 + zeta * s
     z = (-(beam.length_m**4) * (beam.density_over_stiffness * s**2 + gamma * s) / c) ** 0.25
@@ -149,13 +149,13 @@ def test_order_one_is_the_integer_model(beam, zeta, gamma):
         * (np.sin(z) * np.cosh(z) - np.cos(z) * np.sinh(z)) / (1 + np.cos(z) * np.cosh(z))
     )  # fmt: skip
     g = transfer(s, beam, Damping(zeta, 1.0, gamma, 1.0))
-    apart = (np.abs(z) > 1) & (np.abs(np.log10(np.abs(textbook / z**4))) < 3)
-    np.testing.assert_allclose(g[apart], textbook[apart], rtol=1e-9)
+    compared = (np.abs(z) > 1) & (np.abs(np.log10(np.abs(textbook / z**4))) < 3)
+    np.testing.assert_allclose(g[compared], textbook[compared], rtol=1e-9)
 
 
 @given(beam=beams, damping=dampings)
-def test_passive(beam, damping):
-    """The beam takes power whatever the motor's motion: Re(G / s) >= 0 on the imaginary axis."""
+def test_beam_is_passive(beam, damping):
+    """The beam takes power in any motion of the motor: Re(G / s) >= 0 on the imaginary axis."""
     s = 1j * np.geomspace(1e-2, 1e4, 300)
     impedance = transfer(s, beam, damping) / s
     assert np.all(impedance.real >= -1e-9 * np.abs(impedance))

@@ -1,4 +1,4 @@
-"""The benchmark of headlines goes on where it ended, and judges what it says it judges."""
+"""The benchmark of headlines resumes where it ended, and scores the document."""
 
 import json
 import sys
@@ -32,17 +32,17 @@ def held(cell: str, seed: int) -> Scored:
 
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
-    """Judge nothing, but keep what was asked for."""
-    asked = []
+    """Score nothing, but record the requests."""
+    requested = []
 
     def instead(cell: str, seed: int) -> Scored:
-        asked.append((cell, seed))
+        requested.append((cell, seed))
         if seed == 13:
             raise ValueError("a record that cannot be judged")
         return held(cell, seed)
 
     monkeypatch.setattr(bench_headlines, "judged", instead)
-    return asked
+    return requested
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *options: object) -> int:
@@ -54,7 +54,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *options: object) -> int:
     return 0
 
 
-def test_every_cell_that_is_asked_for_is_there():
+def test_all_requested_cells_exist():
     plain = [name for name in CELLS if name.startswith("alpha")]
     assert len(plain) == 7 * 3 * 3
     for kind in ("ringing", "undeclared", "not uniform", "one mode"):
@@ -94,7 +94,7 @@ def test_kinds_of_cells():
     assert [*by_kind({"shipped rig": []})] == ["shipped rig"]
 
 
-def test_it_goes_on_where_it_ended(
+def test_benchmark_resumes_where_it_ended(
     judge: list[tuple[str, int]],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
@@ -115,7 +115,7 @@ def test_it_goes_on_where_it_ended(
     assert len(judge) == 4
 
 
-def test_a_record_that_cannot_be_judged_is_told_and_stops_nothing(
+def test_failed_record_is_reported_without_stopping(
     judge: list[tuple[str, int]],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
@@ -126,22 +126,30 @@ def test_a_record_that_cannot_be_judged_is_told_and_stops_nothing(
     assert run(monkeypatch, *options) == 1
     assert len(judge) == 2
     assert len(file.read_text().splitlines()) == 1
-    told = capsys.readouterr()
-    assert "cannot be judged" in told.err
-    assert "orders told, one mode" in told.out  # what `held` says of an order
+    printed = capsys.readouterr()
+    assert "cannot be judged" in printed.err
+    assert "orders told, one mode" in printed.out  # as `held` has an order
 
 
 @pytest.mark.fit
 @pytest.mark.further  # as make bench
-def test_a_record_is_judged_from_the_document_alone():
+def test_record_is_scored_from_the_document_alone():
     name = f"undeclared, {NAME}"
     its = judged(name, 1)
     assert (its.cell, its.seed) == (name, 1)
-    told = {each.name: each for each in its.told}
-    assert {"zeta", "lambda", "delay_s", "internal size", "f3", "xi3", "loss factor"} <= told.keys()
-    assert told["delay_s"].truth == 3e-4
+    reported = {each.name: each for each in its.told}
+    assert {
+        "zeta",
+        "lambda",
+        "delay_s",
+        "internal size",
+        "f3",
+        "xi3",
+        "loss factor",
+    } <= reported.keys()
+    assert reported["delay_s"].truth == 3e-4
     assert sum(each.holds for each in its.told) > 0.7 * len(its.told)
-    assert its.own.keys() >= told.keys() - {"tool_inertia_kg_m2"}
+    assert its.own.keys() >= reported.keys() - {"tool_inertia_kg_m2"}
     assert its.structures["VI"] == "selected"
     assert Scored.from_line(its.line()) == its
 

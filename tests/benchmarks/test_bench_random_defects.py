@@ -1,4 +1,4 @@
-"""The benchmark of random defects goes on where it ended, and judges what the program prints."""
+"""The benchmark of random defects resumes where it ended, and scores the program's output."""
 
 import json
 import sys
@@ -23,7 +23,7 @@ RIGHT = ScoredDefect(
 
 @pytest.fixture
 def judged(monkeypatch: pytest.MonkeyPatch) -> list[DefectTask]:
-    """Judge nothing, but collect the tasks."""
+    """Score nothing, but collect the tasks."""
     tasks = []
 
     def instead(task: DefectTask) -> ScoredDefect:
@@ -44,7 +44,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *options: object) -> int:
     return 0
 
 
-def test_it_goes_on_where_it_ended(
+def test_benchmark_resumes_where_it_ended(
     judged: list[DefectTask],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
@@ -67,21 +67,21 @@ def test_kinds_are_drawn_in_turn(judged: list[DefectTask], monkeypatch: pytest.M
     assert judged[-1].seed == 100_000
 
 
-def test_a_record_without_a_result_counts_and_ends_nothing(
+def test_record_without_a_result_counts_without_stopping(
     judged: list[DefectTask],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ):
     assert run(monkeypatch, "--records", 2, "--first-seed", 13) == 1
     assert len(judged) == 2
-    said = capsys.readouterr().out
-    assert "records without a result: seeds [13]" in said
-    assert "ValueError: no record" in said
+    printed = capsys.readouterr().out
+    assert "records without a result: seeds [13]" in printed
+    assert "ValueError: no record" in printed
 
 
 @pytest.mark.further  # as tests/identify/test_mode_starts.py
 @pytest.mark.fit
-def test_a_mode_that_the_beam_loses_is_given():
+def test_lost_mode_is_reported():
     """With these relaxations the best beam has an order of 0.1, and mode 1 is overdamped in it."""
     found = judge(DefectTask(100329, "relaxations", command_line=False, documents=None))
     assert found.not_given == ()
@@ -106,7 +106,7 @@ def test_a_step_in_time_is_no_nonlinear_stiffness(seed: int, tmp_path: Path):
 
 @pytest.mark.further
 @pytest.mark.fit
-def test_an_external_order_of_an_uneven_beam_is_no_fact():
+def test_external_order_of_a_nonuniform_beam_is_no_fact():
     found = judge(DefectTask(100330, "tip mass", command_line=False, documents=None))
     assert found.gate == "refused"
     assert not found.false_facts
@@ -117,7 +117,7 @@ def test_an_external_order_of_an_uneven_beam_is_no_fact():
 
 @pytest.mark.further
 @pytest.mark.fit
-def test_an_internal_order_that_a_taper_contradicts_is_flagged():
+def test_internal_order_contradicted_by_a_taper_is_flagged():
     found = judge(DefectTask(200019, None, command_line=False, documents=None))
     assert (found.kind, found.gate) == ("taper", "refused")
     assert not found.wrong
@@ -127,7 +127,7 @@ def test_an_internal_order_that_a_taper_contradicts_is_flagged():
 
 @pytest.mark.further
 @pytest.mark.fit
-def test_noise_that_begins_beside_a_mode_flags_nothing():
+def test_noise_that_begins_near_a_mode_flags_nothing():
     found = judge(DefectTask(300060, None, command_line=False, documents=None))
     assert found.coloured
     assert not found.not_given
@@ -136,7 +136,7 @@ def test_noise_that_begins_beside_a_mode_flags_nothing():
 
 @pytest.mark.fit
 @pytest.mark.parametrize("seconds", [SECONDS, further(136.0)])
-def test_a_record_is_judged_from_the_document(
+def test_record_is_scored_from_the_document(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float
 ):
     def drawn(seed: int, kind: str) -> DefectRecord:
@@ -161,7 +161,7 @@ def test_a_record_is_judged_from_the_document(
 
 @pytest.mark.fit
 @pytest.mark.further  # as `make bench`
-def test_the_program_prints_the_same_document(tmp_path: Path):
+def test_program_prints_the_same_document(tmp_path: Path):
     write_record(draw(0, "none"), tmp_path / "record.mcap")
     here, there = (
         json.loads(judged_text(tmp_path / "record.mcap", command_line=command_line)[0])

@@ -9,7 +9,7 @@ from rigd.profile import load_profile
 pytestmark = pytest.mark.further
 
 
-def test_the_rig_of_finite_elements_keeps_momentum_and_stops_in_air():
+def test_finite_element_rig_conserves_momentum():
     rig = load_profile("sim").rig
     beam = draw_uneven(1, 11).modal_beam()
     plant = Plant(rig, beam)

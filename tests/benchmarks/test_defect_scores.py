@@ -1,4 +1,4 @@
-"""Scores of random defects: what counts as wrong, as false, and as not given."""
+"""Scores of random defects: wrong, false, and missing results."""
 
 import copy
 import math
@@ -105,7 +105,7 @@ def headline(truth: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def test_a_right_document_has_nothing_against_it(truth: dict[str, Any], headline: dict[str, Any]):
+def test_correct_document_has_no_errors(truth: dict[str, Any], headline: dict[str, Any]):
     found = score_document(truth, headline, 1.0)
     assert not found.wrong
     assert not found.false_facts
@@ -129,9 +129,7 @@ def test_documents_without_the_newer_keys_are_read(truth: dict[str, Any], headli
     assert not any(number.group == "exact geometry" for number in found.numbers)
 
 
-def test_a_number_far_off_is_wrong_unless_it_has_a_flag(
-    truth: dict[str, Any], headline: dict[str, Any]
-):
+def test_number_far_off_is_wrong_without_a_flag(truth: dict[str, Any], headline: dict[str, Any]):
     headline["parameters"]["gamma"] = quantity(0.064, 0.002)
     (wrong,) = score_document(truth, headline, 1.0).wrong
     assert (wrong.name, wrong.deviation) == ("gamma", pytest.approx(4.5, rel=1e-3))
@@ -147,7 +145,9 @@ def test_a_number_far_off_is_wrong_unless_it_has_a_flag(
     assert replace(found, shift=1.5).moved
 
 
-def test_values_within_a_range_of_truths_are_right(truth: dict[str, Any], headline: dict[str, Any]):
+def test_values_within_a_range_of_truths_are_correct(
+    truth: dict[str, Any], headline: dict[str, Any]
+):
     truth["ranges"]["bending_stiffness_n_m2"] = [0.088, 0.092]
     for value, far in ((0.0899, False), (0.0925, True), (0.0922, False)):
         headline["parameters"]["bending_stiffness_n_m2"] = quantity(value, 1e-4)
@@ -169,7 +169,7 @@ def test_a_visible_mode_with_a_flag_is_not_given(
 
 
 def test_modes_are_matched_by_frequency(truth: dict[str, Any], headline: dict[str, Any]):
-    # Whoever sees only modes 2 and 3 may count them from 1.
+    # If only modes 2 and 3 are visible, they may be counted from 1.
     headline["modes"] = headline["modes"][1:]
     for number, mode in enumerate(headline["modes"], start=1):
         mode["mode"] = number
@@ -179,9 +179,7 @@ def test_modes_are_matched_by_frequency(truth: dict[str, Any], headline: dict[st
     assert not found.wrong
 
 
-def test_after_a_step_in_time_a_mode_is_what_it_was_before_or_after(
-    truth: dict[str, Any], headline: dict[str, Any]
-):
+def test_mode_with_a_step_has_two_true_values(truth: dict[str, Any], headline: dict[str, Any]):
     mode = truth["modes"][2]
     mode["later_frequency_hz"] = 1.002 * mode["frequency_hz"]
     mode["later_damping_ratio"] = mode["damping_ratio"]
@@ -212,7 +210,7 @@ def test_an_order_that_excludes_the_truth_is_a_false_fact(
     assert bool(score_document(truth, headline, 1.0).false_facts) == false
 
 
-def test_a_fractional_order_of_a_material_with_relaxations_is_a_false_fact(
+def test_fractional_order_of_a_relaxing_material_is_false(
     truth: dict[str, Any], headline: dict[str, Any]
 ):
     truth["law"] |= {"zeta": None, "alpha": None, "relaxations": [[0.01, 0.02]]}
@@ -240,7 +238,7 @@ def test_a_fractional_order_of_a_material_with_relaxations_is_a_false_fact(
         ("delay", 1e-4, 1e-6, True),
     ],
 )
-def test_an_effect_that_the_rig_has_not_is_a_false_fact(
+def test_absent_effect_is_a_false_fact(
     truth: dict[str, Any], headline: dict[str, Any], what: str, value: float, half: float,
     false: bool,
 ):  # fmt: skip
@@ -254,7 +252,7 @@ def test_an_effect_that_the_rig_has_not_is_a_false_fact(
     assert not score_document(truth, headline, 1.0).false_facts
 
 
-def test_an_effect_that_the_rig_has_is_none(truth: dict[str, Any], headline: dict[str, Any]):
+def test_present_effect_is_no_false_fact(truth: dict[str, Any], headline: dict[str, Any]):
     truth["effects"] = ["drifting stiffness"]
     entry = {"what": "drifting stiffness", "value": 0.01, "sentence": "It drifts."}
     headline["named"] = [entry | {"interval_95": [0.005, 0.015]}]
@@ -280,7 +278,7 @@ def test_beam_data_are_compared_with_what_the_file_states(
         assert bool(score_document(truth, headline, 1.0).false_facts) == false
 
 
-def test_a_structure_that_the_beam_is_a_case_of_must_not_be_excluded(
+def test_structure_that_includes_the_beam_must_not_be_excluded(
     truth: dict[str, Any], headline: dict[str, Any]
 ):
     headline["structures"] = [{"type": "III", "status": "excluded"}]
@@ -306,9 +304,7 @@ def test_limits(truth: dict[str, Any], headline: dict[str, Any]):
     assert any("seeds [1]" in line for line in complaints([failed]))
 
 
-def test_a_uniform_beam_is_not_shifted_and_others_are(
-    truth: dict[str, Any], headline: dict[str, Any]
-):
+def test_only_nonuniform_beams_are_shifted(truth: dict[str, Any], headline: dict[str, Any]):
     assert headline_shift(truth, headline, 0.0) == pytest.approx(0.0, abs=0.05)
     slightly = copy.deepcopy(truth)
     slightly["modes"][2]["damping_ratio"] *= 1.003

@@ -95,7 +95,7 @@ def test_the_response_from_poles_is_that_of_the_elements():
 
 
 @pytest.mark.parametrize("ratio", [0.01, 0.2, 1.0])
-def test_a_tip_mass_lowers_the_frequencies_as_the_frequency_equation_has_it(ratio: float):
+def test_tip_mass_lowers_frequencies_by_the_frequency_equation(ratio: float):
     masses = (PointMass(LENGTH_M, ratio * MASS_KG),)
     for omega in undamped(masses=masses)[:4]:
         z = np.sqrt(omega)
@@ -134,7 +134,7 @@ def test_beams_that_taper_to_a_point(
     assert found[:3] == pytest.approx(expected, rel=2e-4)
 
 
-def test_a_column_buckles_under_its_own_weight_where_greenhill_says():
+def test_column_buckles_at_greenhills_length():
     # S. P. Timoshenko, J. M. Gere, Theory of Elastic Stability, section 2.12: 7.837 EI/L³.
     critical = 7.8373 * STIFFNESS_N_M2 / (DENSITY_KG_PER_M * LENGTH_M**3)
     standing = undamped(gravity_m_s2=-critical)[0]

@@ -1,4 +1,4 @@
-"""Benchmarks judge their rows: one beyond its limit, or not measured, makes the exit code 1."""
+"""Benchmarks check their rows: one beyond its limit, or not measured, makes the exit code 1."""
 
 import argparse
 import ast
@@ -58,12 +58,12 @@ def test_a_row_beyond_its_limit_fails_and_report_only_prints(
     assert f"time: {time:.3g} times the peer (at most 2)" in capsys.readouterr().out
 
 
-def test_of_a_part_only_what_is_measured_is_judged(monkeypatch: pytest.MonkeyPatch):
+def test_part_is_checked_by_measured_rows_only(monkeypatch: pytest.MonkeyPatch):
     assert judged(monkeypatch, {"time": 1.0}, part=True) == 0
     assert judged(monkeypatch, {"time": 3.0}, part=True) == 1
 
 
-def test_a_row_needs_a_limit_and_a_name_that_is_declared(monkeypatch: pytest.MonkeyPatch):
+def test_row_needs_a_limit_and_a_declared_name(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(ValueError, match="needs a limit"):
         Row("time")
     with pytest.raises(KeyError):
@@ -71,7 +71,7 @@ def test_a_row_needs_a_limit_and_a_name_that_is_declared(monkeypatch: pytest.Mon
     assert math.isnan(percent(0, 0))
 
 
-def test_the_summary_names_what_is_wrong(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_summary_names_the_failures(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     file = tmp_path / "rows.json"
     judged(monkeypatch, {"time": 3.0, "coverage": math.nan}, "--json", str(file))
     found = json.loads(file.read_text())
@@ -102,7 +102,7 @@ def test_a_release_is_appended_and_replaces_itself():
 
 
 @pytest.mark.parametrize("name", run_all.names())
-def test_every_benchmark_declares_rows_and_judges_them(name: str):
+def test_every_benchmark_declares_and_checks_rows(name: str):
     tree = ast.parse((FOLDER / f"bench_{name}.py").read_text("utf-8"))
     declared = [
         target.id
@@ -125,7 +125,7 @@ def test_every_benchmark_declares_rows_and_judges_them(name: str):
 
 
 @pytest.mark.further  # imports all benchmarks
-def test_the_page_has_the_rows_that_are_declared():
+def test_page_has_the_declared_rows():
     for name in run_all.names():
         declared = [row.name for row in run_all.rows_of(name)]
         assert declared

@@ -1,4 +1,4 @@
-"""Scores of headlines: what counts as held, as wide, and as said falsely."""
+"""Scores of headlines: coverage, widths, and false statements."""
 
 import math
 from dataclasses import replace
@@ -48,7 +48,7 @@ def session(*numbers: Told, own: dict[str, float | None] | None = None, **other:
     return replace(PLAIN, told=numbers, own=own or {}, **other)  # type: ignore[arg-type]
 
 
-def test_wilson_against_values_of_the_literature():
+def test_wilson_interval_matches_the_literature():
     # R. G. Newcombe, Statistics in Medicine 17 (1998) 857-872, table I, method 3.
     assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
     assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=5e-5)
@@ -56,7 +56,7 @@ def test_wilson_against_values_of_the_literature():
     assert wilson(0, 0) == (0.0, 1.0)
 
 
-def test_every_number_of_a_headline_has_its_truth():
+def test_all_numbers_of_a_headline_have_a_truth():
     omega = 120.0
     headline = {
         "parameters": {"zeta": quantity(7.0e-5, 2e-6), "lambda": quantity(0.7, 0.01, "why not")},
@@ -89,7 +89,7 @@ def test_every_number_of_a_headline_has_its_truth():
     assert not found["xi2"].holds
 
 
-def test_of_the_loss_factor_only_what_rests_on_data_counts():
+def test_loss_factor_counts_in_the_supported_band_only():
     frequency_hz = [0.3 * 1.1**i for i in range(60)]
     true = PAPER.loss_factor(frequency_hz).tolist()
     curves = {
@@ -116,7 +116,7 @@ def test_of_the_loss_factor_only_what_rests_on_data_counts():
     assert loss_told({**curves, "loss_factor_supported_hz": None}, PAPER) == []
 
 
-def test_flags_and_missing_intervals_are_counted_apart():
+def test_flags_and_missing_intervals_are_counted_separately():
     sessions = [
         session(Told("f1", 1.0, 1.01, (0.9, 1.1)), own={"f1": 0.1}),
         session(Told("f1", 1.0, 1.11, (1.01, 1.21)), own={"f1": 0.2}),
@@ -133,7 +133,7 @@ def test_flags_and_missing_intervals_are_counted_apart():
     assert "1/2" in shown("a cell", sessions)
 
 
-def test_the_table_has_a_place_for_each_quantity_and_group():
+def test_table_has_a_cell_for_each_quantity_and_group():
     facts = [
         session(Told("f1", 2.0 if i == 0 else 1.0, 1.0, (0.9, 1.1)), own={"f1": 0.1})
         for i in range(10)
@@ -147,7 +147,7 @@ def test_the_table_has_a_place_for_each_quantity_and_group():
     assert len(lines) == 4
 
 
-def test_what_the_true_structure_would_have_said_stands_beside_a_miss():
+def test_result_of_the_true_structure_is_shown_with_a_miss():
     sessions = [
         replace(session(Told("f1", 2.0, 1.0, (0.9, 1.1))), own_holds={"f1": float(i % 2)})
         for i in range(20)
@@ -156,7 +156,7 @@ def test_what_the_true_structure_would_have_said_stands_beside_a_miss():
     assert "own 50 %" in str(score("f1", sessions))
 
 
-def test_widths_of_sizes_compare_relative_to_their_values():
+def test_widths_of_loss_factors_are_compared_relatively():
     # At another frequency the size is another number.
     its = score(
         "internal size",
@@ -190,7 +190,7 @@ def test_widths_have_limits_of_their_own(name: str, own: float, missed: bool):
     ] * missed
 
 
-def test_what_a_truth_is_a_case_of():
+def test_structures_that_include_a_truth():
     integer, half = replace(PAPER, alpha=1.0, lambda_=1.0), replace(PAPER, alpha=1.0)
     assert containing(PAPER) == ("VI",)
     assert containing(half) == ("VII", "VI")
@@ -198,7 +198,7 @@ def test_what_a_truth_is_a_case_of():
     assert containing(replace(integer, offsets=(0.006, -0.013))) == ()
 
 
-def test_statements_that_are_false():
+def test_false_statements_are_found():
     true = session(contains=("VII", "VI"), orders={"alpha": [1.0, "compatible", None]})
     assert true.excluded_falsely == []
     assert true.fractional_falsely == []
@@ -213,7 +213,7 @@ def test_statements_that_are_false():
     assert len(complaints({"a": [true] * 45 + [fractional] * 5})) == 1
 
 
-def test_of_one_mode_nothing_is_said_of_orders():
+def test_orders_are_not_scored_for_one_mode():
     silent = session(orders={"alpha": [1.0, "not identifiable", None]})
     assert silent.statements == []
     assert complaints({"one mode, a": [silent]}) == []
@@ -227,7 +227,7 @@ def test_a_session_outlives_its_line():
     assert Scored.from_line(one.line()) == one
 
 
-def test_a_flag_that_leaves_only_what_fails_is_seen_through():
+def test_flags_cannot_hide_failures():
     good = session(Told("f1", 1.0, 1.0, (0.9, 1.1), "doubtful"))
     bad = session(Told("f1", 2.0, 1.0, (0.9, 1.1)))
     its = score("f1", [good] * 45 + [bad] * 5)

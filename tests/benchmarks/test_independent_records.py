@@ -42,14 +42,14 @@ def test_closed_form_agrees_with_the_series_that_the_rig_uses(alpha: float):
     assert np.abs(truth.torque_per_angle(s) / theirs - 1).max() < 1e-10
 
 
-def test_poles_are_where_the_denominator_vanishes():
+def test_poles_are_zeros_of_the_denominator():
     truth = Truth(**PAPER)
     for found in modes(LINK, Damping(**PAPER), 3):
         assert truth.frequency_hz(found.number) == pytest.approx(found.frequency_hz, rel=1e-10)
         assert truth.damping_ratio(found.number) == pytest.approx(found.damping_ratio, rel=1e-8)
 
 
-def test_a_mode_that_is_stiffer_resonates_higher():
+def test_stiffer_mode_resonates_higher():
     plain, uneven = Truth(**PAPER), Truth(**PAPER, offsets=(0.006, -0.013))
     ratios = [uneven.frequency_hz(n) / plain.frequency_hz(n) for n in (1, 2, 3, 4)]
     assert ratios == pytest.approx([1.0, 1.006**0.5, 0.987**0.5, 1.0], abs=2e-5)
@@ -110,10 +110,10 @@ def test_noise_is_white_and_differs_by_seed(still: Exact):
     assert np.abs(angle_rad - still.angle_rad).max() <= 3.5e-5 * (1 + 1e-9)
 
 
-def test_a_beam_that_was_shaken_rings_when_the_record_begins(still: Exact):
+def test_shaken_beam_rings_at_the_start(still: Exact):
     ringing = exact(Truth(**PAPER), ringing=True)
     assert np.abs(still.torque_nm[:900]).max() < 1e-9
     before = np.abs(ringing.torque_nm[:900]).max()
     assert 0.02 < before < 0.5
-    # What rings decays: at the end both are alike.
+    # Ringing decays: at the end both are alike.
     assert np.abs(ringing.torque_nm - still.torque_nm)[-15_000:].max() < 1e-3 * before

@@ -1,4 +1,4 @@
-"""Records of random defects: what is drawn, and that the signals obey the equations of motion."""
+"""Records of random defects: their distribution, and signals that obey the equations of motion."""
 
 import json
 from collections import Counter
@@ -55,7 +55,7 @@ def plain() -> DefectRecord:
     return record()
 
 
-def test_every_kind_is_drawn_with_every_amplitude_damping_and_noise():
+def test_all_kinds_are_drawn_with_all_settings():
     drawn = [draw_defect(seed) for seed in range(150)]
     kinds = Counter(defect.kind for defect, *_ in drawn)
     assert set(kinds) == set(KINDS)
@@ -68,7 +68,7 @@ def test_every_kind_is_drawn_with_every_amplitude_damping_and_noise():
         assert defect.linear_constant == (defect.kind in CONTROL | LINEAR)
 
 
-def test_a_seed_draws_the_same_rig_again():
+def test_seed_determines_the_rig():
     (one, *rest), (again, *rest_again) = draw_defect(7), draw_defect(7)
     assert (one.kind, one.size, one.damping, rest) == (
         again.kind, again.size, again.damping, rest_again,
@@ -78,7 +78,7 @@ def test_a_seed_draws_the_same_rig_again():
 
 
 @pytest.mark.parametrize("seconds", [SECONDS, pytest.param(136.0, marks=pytest.mark.further)])
-def test_a_uniform_beam_records_what_the_closed_form_has(seconds: float):
+def test_record_of_a_uniform_beam_matches_the_closed_form(seconds: float):
     channel = TorqueChannel(delay_s=3e-4, tool_inertia_kg_m2=1e-5)
     found = record(replace(RIG, channel=channel), seconds)
     truth = Truth(7.1e-5, 1.0, 0.012, 1.0, delay_s=3e-4, tool_inertia_kg_m2=1e-5)
@@ -91,7 +91,7 @@ def test_a_uniform_beam_records_what_the_closed_form_has(seconds: float):
     assert visible == ([1, 2, 3] if seconds > 120 else visible)
 
 
-def test_modes_are_those_of_the_closed_form_delay_included(plain: DefectRecord):
+def test_modes_match_the_closed_form_with_delay(plain: DefectRecord):
     delayed = record(replace(RIG, channel=TorqueChannel(delay_s=3e-4, tool_inertia_kg_m2=1e-5)))
     truth = Truth(7.1e-5, 1.0, 0.012, 1.0)
     assert [mode.mode for mode in plain.modes] == [1, 2, 3, 4]
@@ -178,7 +178,7 @@ def test_a_step_of_stiffness_conserves_the_state(plain: DefectRecord):
         )
 
 
-def test_drag_is_that_of_the_equations_of_motion(plain: DefectRecord):
+def test_drag_matches_the_equations_of_motion(plain: DefectRecord):
     found = record(replace(RIG, drag_m=1e-3))
     expected = marched(drag_m=1e-3) - marched()
     difference = (found.torque_nm - plain.torque_nm)[::_EVERY]
@@ -218,18 +218,18 @@ def test_truths_are_ranges_where_a_property_varies():
 def shape(number: int, xi: Real) -> Real:
     """Clamped-free eigenfunction."""
     z = characteristic(number)
-    share = (np.cos(z) + np.cosh(z)) / (np.sin(z) + np.sinh(z))
-    return np.cosh(z * xi) - np.cos(z * xi) - share * (np.sinh(z * xi) - np.sin(z * xi))
+    ratio = (np.cos(z) + np.cosh(z)) / (np.sin(z) + np.sinh(z))
+    return np.cosh(z * xi) - np.cos(z * xi) - ratio * (np.sinh(z * xi) - np.sin(z * xi))
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_small_defects_shift_frequencies_as_rayleigh_has_it(number: int):
+def test_small_defects_shift_frequencies_by_rayleigh(number: int):
     xi = np.linspace(0, 1, 20_001)
     y = shape(number, xi)
     plain = RIG.beam.undamped()[0][number - 1] ** 2
-    share = np.trapezoid(np.where(xi > 0.5, y**2, 0.0), xi) / np.trapezoid(y**2, xi)
+    fraction = np.trapezoid(np.where(xi > 0.5, y**2, 0.0), xi) / np.trapezoid(y**2, xi)
     heavier = heavier_half().beam.undamped()[0][number - 1] ** 2
-    assert heavier / plain == pytest.approx(1 / (1 + 0.03 * share), abs=3e-4)
+    assert heavier / plain == pytest.approx(1 / (1 + 0.03 * fraction), abs=3e-4)
     slope = np.gradient(y, xi)
     tension = 9.81 * np.sin(np.radians(2)) / LENGTH_M * (1 - xi)
     stiffer = np.trapezoid(tension * slope**2, xi) / np.trapezoid(y**2, xi)

@@ -84,7 +84,7 @@ def done(short_sessions, other_beam, settings, tmp_path_factory, computed_once):
     """The campaign of four that agree and two files that do not belong to it; its progress."""
 
     class Workers(Here):
-        """Workers that need not analyse the other beam: what is found of it is excluded."""
+        """Workers that need not analyse the other beam: its result is excluded."""
 
         def run(self, function, tasks, on_done):
             if function is not analyse_session:
@@ -135,7 +135,7 @@ class Prepared(Here):
 
 @pytest.fixture(scope="session")
 def campaign_of():
-    """Make the campaign of results that a test made up, of which there are no files to predict."""
+    """Make the campaign of invented results, without files to predict."""
 
     def made(results, *, validated=False, **options):
         with pytest.MonkeyPatch.context() as patch:
@@ -148,7 +148,7 @@ def campaign_of():
 
 @pytest.fixture(scope="session")
 def as_text():
-    """Return what a terminal of 120 columns shows, as plain text."""
+    """Return the output of a terminal of 120 columns as plain text."""
 
     def text(shown):
         console = Console(width=120, color_system=None, force_terminal=False)
@@ -161,7 +161,7 @@ def as_text():
 
 @pytest.fixture(scope="session")
 def in_this_process():
-    """A context in which campaigns start no workers: where that is not what is tested."""
+    """A context in which campaigns start no workers, for tests of other behaviour."""
 
     @contextmanager
     def pool(_count):
@@ -185,7 +185,7 @@ def welch_fit(structure, weighting, at_bounds=(), **free):
 
 
 def record_estimate(structure, values, covariance, determined, at_bounds=(), cost=100.0, bic=0.0):
-    """Estimate with the link's own settings where `values` says nothing."""
+    """Estimate with the link's own settings where `values` has no entry."""
     every = Plant(LINK, Damping()).parameters | dict(STRUCTURES[structure].fixed) | values
     beam = Beam(
         LINK.length_m,

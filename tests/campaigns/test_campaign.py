@@ -23,7 +23,7 @@ from rigd.beam import Plant, modes, transfer
 pytestmark = pytest.mark.fit
 
 
-def test_sessions_keep_their_order_and_failures_are_told(done, short_sessions, other_beam):
+def test_order_of_sessions_and_failures_are_reported(done, short_sessions, other_beam):
     found, progress = done
     assert [each.path for each in found.sessions] == short_sessions
     torn, other = found.failures
@@ -37,7 +37,7 @@ def test_sessions_keep_their_order_and_failures_are_told(done, short_sessions, o
 
 @pytest.mark.process
 @pytest.mark.further  # as test_validation.py, where workers predict sessions
-def test_workers_find_what_this_process_finds(done, short_sessions, settings):
+def test_workers_agree_with_this_process(done, short_sessions, settings):
     task = SessionTask(settings, ("I", "III"), (), None)
     with process_pool(1) as pool:
         (there,) = pool.run(analyse_session, [(short_sessions[2], task)])
@@ -72,8 +72,8 @@ def test_left_out_sessions_are_predicted_to_within_noise(done):
     assert min(wrong) > 1.5 * max(e.error for e in right)
 
 
-def test_a_left_out_session_has_no_say_in_its_own_forecast(done):
-    """With another last session, what is said of it stays the same."""
+def test_left_out_session_does_not_affect_its_prediction(done):
+    """With another last session, its prediction stays the same."""
     found, _ = done
     sessions = list(found.sessions)
     strange = replace(
@@ -92,7 +92,7 @@ def test_a_left_out_session_has_no_say_in_its_own_forecast(done):
     assert [each.plant for each in before] == [each.plant for each in after]
 
 
-def test_error_of_a_forecast_is_that_of_the_torque(done, short_sessions, truth):
+def test_error_of_a_prediction_is_that_of_the_torque(done, short_sessions, truth):
     """The true plant leaves the noise, a plant without torque leaves everything."""
     found, _ = done
     (forecast, *_) = models_without_session(found.sessions, 0)
@@ -196,7 +196,7 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     verdict = found.verdict
     assert (verdict.structure, verdict.sessions) == ("III", 4)
     assert verdict.adequate == 4
-    # Of those asked for III has the lowest BIC; the numbers are the freest structure's.
+    # Of the requested types III has the lowest BIC; the numbers are the freest structure's.
     assert verdict.headline == "VI"
     for order in (verdict.alpha, verdict.lambda_):
         assert order.status == "compatible"
@@ -279,7 +279,7 @@ def test_indices_of_a_whole_record_estimate_are_of_its_response(done):
         assert each.indices.md == pytest.approx(away.max(), rel=1e-6)
 
 
-def test_the_terminal_shows_pooled_modes_and_parameters_unless_asked_for_more(done, as_text):
+def test_terminal_shows_pooled_results_only_by_default(done, as_text):
     found, _ = done
     short = as_text(campaign_tables(found, verbose=False))
     assert found.verdict.sentences[2][:60] in short
@@ -290,7 +290,7 @@ def test_the_terminal_shows_pooled_modes_and_parameters_unless_asked_for_more(do
         assert more in as_text(campaign_tables(found))
 
 
-def test_fit_and_leave_one_out_error_stand_beside_each_other(done):
+def test_fit_and_leave_one_out_error_are_in_one_table(done):
     found, _ = done
     of_three = [e for e in found.validation if (e.method, e.name) == ("record", "III")]
     (row,) = (
@@ -310,7 +310,7 @@ def test_fit_and_leave_one_out_error_stand_beside_each_other(done):
     assert session["error"] == trial.error
 
 
-def test_the_fit_is_that_of_a_single_report(done, short_sessions):
+def test_fit_equals_that_of_a_single_report(done, short_sessions):
     """But for hum and free decay, which a report counts as explained: here are none."""
     found, _ = done
     measured = Measurement.from_record(load_record(short_sessions[0]))
@@ -324,7 +324,7 @@ def test_the_fit_is_that_of_a_single_report(done, short_sessions):
     assert 100 * (1 - trial.own_error) == pytest.approx(analysis.fit_percent(fit), abs=0.2)
 
 
-def test_added_metadata_stand_in_the_table_of_sessions(done):
+def test_added_metadata_are_in_the_table_of_sessions(done):
     found, _ = done
     first, *others = found.sessions
     added = {"temperature_c": 21.5, "batch": "B 7"}
@@ -339,14 +339,14 @@ def test_added_metadata_stand_in_the_table_of_sessions(done):
     assert table.rows[0]["meta_temperature_c"].text == "21.5"
 
 
-def test_the_paper_s_numbers_stand_beside_only_on_request(done):
+def test_numbers_of_the_paper_are_shown_on_request_only(done):
     found, _ = done
     assert campaign_tables(found)
     assert "the paper's" not in campaign_text(found)
     assert "(1.33)" in campaign_text(found, with_paper=True)
 
 
-def test_no_session_left(tmp_path, settings, in_this_process):
+def test_error_without_any_usable_session(tmp_path, settings, in_this_process):
     no_session = pytest.raises(CampaignError, match=r"(?s)No session could be.*none\.mcap")
     with in_this_process(), no_session:
         campaign([tmp_path / "none.mcap"], settings)

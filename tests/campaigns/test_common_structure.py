@@ -1,4 +1,4 @@
-"""One structure for all sessions: what noise makes each of them select does not part them."""
+"""One structure for all sessions: different selections due to noise do not separate them."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ FREE = {"zeta": 7.1e-5, "alpha": 0.996, "gamma": 0.055, "lambda": 0.594}
 FREQUENCY_HZ = 44.8132
 STD_HZ = 3e-4
 SHIFT_HZ = 26e-4
-"""What type VII makes of mode 3 where alpha is 0.996: nine standard deviations of type VI."""
+"""Mode 3 of type VII where alpha is 0.996: nine standard deviations from type VI."""
 
 
 def moved_mode(mode, by_hz):
@@ -42,7 +42,7 @@ def sessions(make_estimate, make_session):
     return [make(number) for number in range(40)]
 
 
-def test_forty_sessions_that_differ_in_noise_alone_are_of_one_specimen(sessions, campaign_of):
+def test_forty_sessions_with_different_noise_are_of_one_specimen(sessions, campaign_of):
     selected = {min(each.record_estimates, key=lambda one: one.bic).name for each in sessions}
     assert selected == {"VI", "VII"}
     found = campaign_of(sessions).homogeneity
@@ -50,7 +50,7 @@ def test_forty_sessions_that_differ_in_noise_alone_are_of_one_specimen(sessions,
     assert found.scatter_of("frequency_hz_1").chance > 0.01
 
 
-def test_another_beam_among_them_is_still_told_apart(sessions, campaign_of):
+def test_another_beam_is_still_distinguished(sessions, campaign_of):
     moved = []
     for number, session in enumerate(sessions):
         by = 5e-4 * FREQUENCY_HZ if number >= 20 else 0.0
@@ -64,7 +64,7 @@ def test_another_beam_among_them_is_still_told_apart(sessions, campaign_of):
     assert sorted(map(len, found.leading.groups)) == [20, 20]
 
 
-def test_a_structure_that_some_sessions_lack_compares_none(sessions, make_session, campaign_of):
+def test_structure_missing_from_some_sessions_is_not_compared(sessions, make_session, campaign_of):
     first, *others = sessions
     without_six = replace(first, record_estimates=first.record_estimates[1:])
     assert campaign_of([without_six, *others]).homogeneity.structure == "VII"

@@ -44,7 +44,7 @@ def test_an_error_of_a_task_is_none_of_the_cluster(cluster):
 
 @pytest.mark.fit
 @pytest.mark.process
-def test_a_campaign_finds_what_it_finds_here(cluster, short_sessions, settings, monkeypatch):
+def test_campaign_agrees_with_a_local_one(cluster, short_sessions, settings, monkeypatch):
     """From another folder than the workers', by relative paths."""
     monkeypatch.chdir(short_sessions[0].parent)
     paths = [Path(path.name) for path in short_sessions[:2]]
@@ -56,34 +56,34 @@ def test_a_campaign_finds_what_it_finds_here(cluster, short_sessions, settings, 
 
 
 class Elsewhere:
-    """A client whose one worker says this of its versions."""
+    """A client whose one worker reports these versions."""
 
-    def __init__(self, said):
-        self.said = said
+    def __init__(self, versions):
+        self.versions = versions
 
     def wait_for_workers(self, *_, **__):
         pass
 
     def run(self, *_, **__):
-        return {"tcp://10.0.0.7:1": self.said}
+        return {"tcp://10.0.0.7:1": self.versions}
 
 
 @pytest.mark.parametrize(
-    ("said", "words"),
+    ("versions", "words"),
     [
         (versions() | {"rigd": "9.9"}, f"7:1 has rigd 9.9 and not {versions()['rigd']}: install"),
         (ModuleNotFoundError("no", name="analysis"), "7:1 has no module analysis: install rigd"),
         (OSError("no"), "7:1 cannot be used: no"),
     ],
 )
-def test_a_worker_of_other_versions_is_told(said, words):
+def test_worker_of_other_versions_is_reported(versions, words):
     with pytest.raises(CampaignError, match=re.escape(words)):
-        dask_workers._check_workers(Elsewhere(said), "tcp://10.0.0.5:8786")
+        dask_workers._check_workers(Elsewhere(versions), "tcp://10.0.0.5:8786")
     dask_workers._check_workers(Elsewhere(versions()), "tcp://10.0.0.5:8786")
 
 
 @pytest.mark.process
-def test_a_cluster_without_workers_is_told(monkeypatch):
+def test_cluster_without_workers_is_reported(monkeypatch):
     import distributed
 
     monkeypatch.setattr(dask_workers, "_FIRST_WORKER_TIMEOUT_S", 0.5)
@@ -96,7 +96,7 @@ def test_a_cluster_without_workers_is_told(monkeypatch):
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1:9", "nobody", "tcp://[::1]:9"])
-def test_a_scheduler_that_is_not_there_is_told(address):
+def test_missing_scheduler_is_reported(address):
     with (
         pytest.raises(CampaignError, match=rf"No Dask scheduler answers at {re.escape(address)}"),
         dask_cluster(address),
@@ -104,7 +104,7 @@ def test_a_scheduler_that_is_not_there_is_told(address):
         pass
 
 
-def test_without_dask_it_is_said_what_to_install(monkeypatch):
+def test_missing_dask_is_reported_with_its_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(CampaignError, match=r"pip install 'rigd\[dask\]'"), dask_cluster("tcp://x"):
         pass
@@ -112,7 +112,7 @@ def test_without_dask_it_is_said_what_to_install(monkeypatch):
 
 @pytest.mark.process
 @pytest.mark.further  # as test_workers.py
-def test_a_worker_that_is_lost_takes_one_task_with_it_and_no_more():
+def test_lost_worker_loses_one_task_only():
     import dask
     import distributed
 
@@ -137,7 +137,7 @@ def until_it_is_gone(number):
 
 
 @pytest.mark.process
-def test_a_scheduler_that_goes_away_is_told():
+def test_lost_scheduler_is_reported():
     import distributed
 
     GONE.clear()
@@ -146,7 +146,7 @@ def test_a_scheduler_that_goes_away_is_told():
     )
 
     def close(_done):
-        # A worker that closes ends what it does, and begins nothing else.
+        # A closing worker finishes its task, and begins no other.
         threading.Timer(1.0, GONE.set).start()
         processes.close()
 

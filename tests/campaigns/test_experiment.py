@@ -1,4 +1,4 @@
-"""What belongs to a campaign: one experiment on one specimen, each session once."""
+"""The sessions of a campaign: one experiment on one specimen, each session once."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ def chirps(make_session, make_experiment):
     return make
 
 
-def test_the_odd_one_is_left_out_though_it_comes_first(of_one_experiment, chirps):
+def test_odd_session_is_left_out_even_if_first(of_one_experiment, chirps):
     odd = chirps("odd.mcap", excitation="multisine")
     good = [chirps(f"{n}.mcap") for n in range(3)]
     sessions, (failure,) = of_one_experiment([odd, *good])
@@ -46,27 +46,25 @@ def test_the_odd_one_is_left_out_though_it_comes_first(of_one_experiment, chirps
         ({"stop_hz": 20.0}, None),  # the others do not state it: no reason to doubt
     ],
 )
-def test_what_differs_is_named(of_one_experiment, chirps, facts, words):
+def test_differences_are_reported(of_one_experiment, chirps, facts, words):
     found, failures = of_one_experiment([chirps("0.mcap"), chirps("1.mcap"), chirps("2", **facts)])
     assert len(found) == 2 + (words is None)
     assert words is None or words in failures[0].message
 
 
-def test_a_search_belongs_to_any_excitation_and_does_not_bring_two_together(
-    of_one_experiment, chirps
-):
+def test_search_joins_any_excitation_but_never_two(of_one_experiment, chirps):
     search = {"excitation": "until", "amplitude_rad": 0.035, "start_hz": 0.5}
     searches = [chirps(f"until{n}.mcap", **search) for n in range(3)]
     small = chirps("small.mcap", amplitude_rad=0.0125)
-    kept, left_out = of_one_experiment([*searches, chirps("chirp.mcap"), small])
-    assert [each.path.name for each in kept] == [*(s.path.name for s in searches), "chirp.mcap"]
+    used, left_out = of_one_experiment([*searches, chirps("chirp.mcap"), small])
+    assert [each.path.name for each in used] == [*(s.path.name for s in searches), "chirp.mcap"]
     assert "amplitude_rad is 0.0125 rad, but 0.025 rad in chirp.mcap" in left_out[0].message
     assert of_one_experiment(searches)[1] == []
     other = chirps("other.mcap", beam_length_m=0.8, **search)
     assert "beam_length_m is 0.8 m" in of_one_experiment([*searches, other])[1][0].message
 
 
-def test_another_experiment_is_the_reason_where_the_analysis_failed_too(
+def test_other_experiment_is_reported_before_a_failed_analysis(
     of_one_experiment, chirps, make_experiment
 ):
     """A hold is too short for a Welch segment, but that is not why it does not belong here."""
@@ -87,7 +85,7 @@ def test_no_session_counts_twice(of_one_experiment, chirps):
     assert "copy.mcap: it is the same session as 0.mcap" in failure.message
 
 
-def test_a_sweep_that_ended_early_is_left_out_and_one_stopped_after_it_is_not(make_experiment):
+def test_session_stopped_within_its_sweep_is_left_out(make_experiment):
     assert "20 s of 120 s (outcome: stopped)" in make_experiment(
         sweep_s=20.0, duration_s=120.0
     ).unfinished_sweep_reason("stopped")
@@ -99,48 +97,44 @@ def test_a_sweep_that_ended_early_is_left_out_and_one_stopped_after_it_is_not(ma
     assert make_experiment(sweep_s=240.0, **both).unfinished_sweep_reason("complete") == ""
 
 
-def test_a_stopped_session_says_so_and_not_that_it_is_short(make_file, settings, tmp_path):
-    """20 s of sweep where the file says that 120 s were planned."""
+def test_stopped_session_is_not_reported_as_short(make_file, settings, tmp_path):
+    """20 s of sweep where the file states 120 s."""
     path = make_file(tmp_path / "stopped.mcap", 0, duration_s="120.0", excitation="chirp")
     failure = analyse_session(path, SessionTask(settings, (), (), None))
     assert "stopped.mcap: its sweep ended after 20 s of 120 s" in failure.message
     assert failure.experiment.facts["excitation"] == "chirp"
 
 
-def test_specimens_are_told_apart_by_their_labels_before_anything_else(
-    of_one_experiment, chirps, campaign_of
-):
+def test_specimens_are_distinguished_by_label_first(of_one_experiment, chirps, campaign_of):
     sessions = [chirps(f"{number}.mcap", specimen=label) for number, label in enumerate("AABBB")]
-    kept, left_out = of_one_experiment(sessions)
-    assert [each.path.name for each in kept] == ["2.mcap", "3.mcap", "4.mcap"]
+    used, left_out = of_one_experiment(sessions)
+    assert [each.path.name for each in used] == ["2.mcap", "3.mcap", "4.mcap"]
     assert "specimen is “A”, but “B” in 2.mcap" in left_out[0].message
     first, second = campaign_of(sessions).homogeneity.specimens
     assert (first.facts["specimen"], second.facts["specimen"]) == ("B", "A")
 
 
-def test_files_of_one_name_are_told_apart_by_their_folders(of_one_experiment, chirps):
+def test_files_of_one_name_are_distinguished_by_folder(of_one_experiment, chirps):
     paths = ["/a/x.mcap", "/b/c/x.mcap", "/d/c/x.mcap", "/a/y.mcap", "/e/z.mcap", "/e/z.mcap"]
-    kept, (twice,) = of_one_experiment([chirps(path) for path in paths])
-    assert [each.name for each in kept] == [
+    used, (twice,) = of_one_experiment([chirps(path) for path in paths])
+    assert [each.name for each in used] == [
         "a/x.mcap", "b/c/x.mcap", "d/c/x.mcap", "y.mcap", "/e/z.mcap",
     ]  # fmt: skip
     assert twice.name == "/e/z.mcap"
 
 
-def test_a_session_without_a_label_is_of_the_only_labelled_specimen_or_of_none(
-    of_one_experiment, chirps
-):
-    one, two, bare = chirps("1.mcap", specimen="A"), chirps("2.mcap", specimen="A"), "3.mcap"
-    kept, left_out = of_one_experiment([one, two, chirps(bare)])
-    assert (len(kept), left_out) == (3, [])
-    # With two labels nobody knows of which it is, and it must not bring the two together.
+def test_unlabelled_session_belongs_to_the_only_specimen(of_one_experiment, chirps):
+    one, two, unlabelled = chirps("1.mcap", specimen="A"), chirps("2.mcap", specimen="A"), "3.mcap"
+    used, left_out = of_one_experiment([one, two, chirps(unlabelled)])
+    assert (len(used), left_out) == (3, [])
+    # With two labels its specimen is unknown, and it must not join the two.
     other = chirps("4.mcap", specimen="B")
-    kept, left_out = of_one_experiment([chirps(bare), one, two, other])
-    assert [each.path.name for each in kept] == ["1.mcap", "2.mcap"]
+    used, left_out = of_one_experiment([chirps(unlabelled), one, two, other])
+    assert [each.path.name for each in used] == ["1.mcap", "2.mcap"]
     assert any("specimen is not stated, but “A”" in each.message for each in left_out)
 
 
-def test_as_in_most_is_said_of_a_majority_only(of_one_experiment, chirps):
+def test_as_in_most_is_reported_for_a_majority_only(of_one_experiment, chirps):
     first, odd, third = chirps("0.mcap"), chirps("1.mcap", excitation="step"), chirps("2.mcap")
     (failure,) = of_one_experiment([first, odd])[1]
     assert "excitation is step, but chirp in 0.mcap; a campaign" in failure.message

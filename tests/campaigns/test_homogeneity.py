@@ -1,4 +1,4 @@
-"""Whether sessions are of one specimen: by what files state, and by what their records show."""
+"""Whether sessions are of one specimen: by metadata, and by the modes of the records."""
 
 import math
 import xml.etree.ElementTree as ET
@@ -51,29 +51,31 @@ def test_scatter_by_hand(of_frequencies):
     assert found.mixed
     assert not found.is_mixed("damping_ratio_1")  # the same of all
     assert not found.scatter_of("damping_ratio_1").mixed
-    said, where = specimen_sentences.specimens(found)
-    assert said.startswith("The sessions are not of one specimen in one state: frequency of mode 1")
-    assert "5.69 of its own standard deviations" in said
+    sentence, where = specimen_sentences.specimens(found)
+    assert sentence.startswith(
+        "The sessions are not of one specimen in one state: frequency of mode 1"
+    )
+    assert "5.69 of its own standard deviations" in sentence
     assert "2.450 Hz in 2 files (0.mcap, 2.mcap); 2.550 Hz in 2 files" in where
 
 
-def test_sessions_that_repeat_are_of_one_specimen(of_frequencies):
+def test_repeatable_sessions_are_of_one_specimen(of_frequencies):
     """Of 100 campaigns of five: one false alarm in a hundred, and as many more as chance has it."""
     rng = np.random.default_rng(3)
     alarms = sum(of_frequencies(rng.normal(2.5, 0.01, 5), 0.01).mixed for _ in range(100))
     assert alarms <= 3
 
 
-def test_a_scatter_like_their_own_uncertainty_is_no_mixture(of_frequencies):
-    """It is what the random-effects model is for: significant in many, but no other specimen."""
+def test_scatter_within_uncertainty_is_no_mixture(of_frequencies):
+    """The case of the random-effects model: significant in many, but no other specimen."""
     rng = np.random.default_rng(4)
     found = [of_frequencies(rng.normal(2.5, 0.015, 20), 0.01) for _ in range(20)]
     assert sum(each.scatter_of("frequency_hz_1").chance < 0.01 for each in found) > 10
     assert not any(each.mixed for each in found)
 
 
-def test_one_of_twenty_that_is_another_is_named(of_frequencies):
-    """Its share of the variance is small, the gap is not."""
+def test_one_different_session_of_twenty_is_reported(of_frequencies):
+    """Its fraction of the variance is small, the gap is not."""
     values = np.random.default_rng(5).normal(2.5, 0.01, 20)
     values[7] = 2.62
     found = of_frequencies(values, 0.01)
@@ -82,14 +84,14 @@ def test_one_of_twenty_that_is_another_is_named(of_frequencies):
     assert "1 file (7.mcap)" in specimen_sentences.specimens(found)[1]
 
 
-@pytest.mark.parametrize(("apart_hz", "slight"), [(0.002, True), (0.02, False)])
-def test_many_standard_deviations_may_be_a_slight_change(of_frequencies, apart_hz, slight):
-    """Both 20 standard deviations apart, but 0.08 % and 0.8 % of the frequency."""
-    values = [2.5, 2.5, 2.5 + apart_hz, 2.5 + apart_hz]
-    found = of_frequencies(values, apart_hz / 20)
+@pytest.mark.parametrize(("distance_hz", "slight"), [(0.002, True), (0.02, False)])
+def test_many_standard_deviations_may_be_a_slight_change(of_frequencies, distance_hz, slight):
+    """Both differ by 20 standard deviations, but by 0.08 % and 0.8 % of the frequency."""
+    values = [2.5, 2.5, 2.5 + distance_hz, 2.5 + distance_hz]
+    found = of_frequencies(values, distance_hz / 20)
     assert found.mixed
-    said = " ".join(specimen_sentences.specimens(found))
-    assert ("temperature or clamp changes" in said) == slight
+    sentences = " ".join(specimen_sentences.specimens(found))
+    assert ("temperature or clamp changes" in sentences) == slight
 
 
 @pytest.mark.parametrize(
@@ -101,13 +103,13 @@ def test_many_standard_deviations_may_be_a_slight_change(of_frequencies, apart_h
         ([0.0, 10.0, 20.0, 30.0, 40.0, 50.0], ()),
     ],
 )
-def test_groups_are_told_only_where_gaps_are_clear(of_frequencies, values, parts):
+def test_groups_are_reported_only_with_clear_gaps(of_frequencies, values, parts):
     found = of_frequencies(2.5 + 1e-3 * np.array(values), 1e-3)
     names = tuple(tuple(f"{number}.mcap" for number in part) for part in parts)
     assert found.scatter_of("frequency_hz_1").groups == names
 
 
-def test_files_of_one_name_in_two_folders_are_two(make_session, make_estimate, campaign_of):
+def test_files_of_one_name_in_two_folders_are_distinct(make_session, make_estimate, campaign_of):
     sessions = []
     for folder, value in zip("abcd", (2.5, 2.6, 2.5, 2.6), strict=True):
         estimate = make_estimate("I", {"zeta": 1e-4}, [[1e-4]], ("zeta",))
@@ -118,9 +120,7 @@ def test_files_of_one_name_in_two_folders_are_two(make_session, make_estimate, c
     assert "2.500 Hz in 2 files (a/x.mcap, c/x.mcap); 2.600 Hz in 2 files" in where
 
 
-def test_files_are_grouped_by_the_specimen_that_they_state(
-    make_session, make_experiment, campaign_of
-):
+def test_files_are_grouped_by_stated_specimen(make_session, make_experiment, campaign_of):
     results = [
         replace(make_session(name), experiment=make_experiment(name, tool_inertia_kg_m2=inertia))
         for name, inertia in (("a", 0.0), ("b", 1e-5), ("c", 0.0))
@@ -129,12 +129,12 @@ def test_files_are_grouped_by_the_specimen_that_they_state(
     found = campaign_of([*results[:2], torn, results[2]]).homogeneity
     first, second = found.specimens
     assert (first.files, second.files) == (("a", "c"), ("b",))
-    (said,) = specimen_sentences.specimens(found)
+    (sentences,) = specimen_sentences.specimens(found)
     assert (
         "2 different specimens: tool_inertia_kg_m2 0 kg·m² in 2 files (a, c); tool_inertia_kg_m2 "
-        in said
+        in sentences
     )
-    assert "1e-05 kg·m² in 1 file (b)" in said
+    assert "1e-05 kg·m² in 1 file (b)" in sentences
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +161,7 @@ def mixture(
 
 
 @pytest.mark.further  # as made by hand above
-def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):
+def test_verdict_begins_with_several_specimens(mixture):
     stated, differing, where, _, structure, *_ = mixture.verdict.sentences
     assert "2 different specimens: beam_length_m 0.98 m in 4 files (0.mcap, 1.mcap" in stated
     assert "beam_length_m 1 m in 1 file (longer.mcap)" in stated
@@ -176,24 +176,24 @@ def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):
 
 
 @pytest.mark.further  # as made by hand above
-def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
+def test_distance_of_groups_is_that_of_their_frequencies(mixture, truth):
     """Frequencies go with the root of the stiffness: the truth, not the estimate, is the peer."""
     link, _ = truth
     (first_rad_s,) = undamped_frequencies_rad_s(link, 1)
-    apart_hz = first_rad_s / (2 * np.pi) * (math.sqrt(STIFFER) - 1)
+    distance_hz = first_rad_s / (2 * np.pi) * (math.sqrt(STIFFER) - 1)
     frequency = mixture.homogeneity.scatter_of("frequency_hz_1")
     values = {name: value for name, value, _ in frequency.values}
     soft, stiff = (np.mean([values[name] for name in part]) for part in frequency.groups)
     # The difference of two means of two: as uncertain as one session.
     own_hz = math.sqrt(np.mean([std**2 for _, _, std in frequency.values]))
-    assert stiff - soft == pytest.approx(apart_hz, abs=3 * own_hz)
-    # Of two equal groups d apart the variance of four is d²/3, nearly all of it between sessions.
+    assert stiff - soft == pytest.approx(distance_hz, abs=3 * own_hz)
+    # Of two equal groups at a distance d the variance of four is d²/3, nearly all between sessions.
     assert frequency.between_std == pytest.approx((stiff - soft) / math.sqrt(3), rel=0.01)
     assert frequency.between_std_in_own_stds > 10
 
 
 @pytest.mark.further  # as made by hand above
-def test_what_agrees_is_not_marked_as_a_mixture(mixture, tmp_path):
+def test_agreeing_quantities_are_not_marked_as_a_mixture(mixture, tmp_path):
     """Both beams are damped alike; their stiffness is not the same."""
     rows = [row for row in campaign_document(mixture)["pooled"] if row["type"] == "III"]
     mixed = {row["parameter"] for row in rows if row["mixture"]}
@@ -212,7 +212,7 @@ def test_what_agrees_is_not_marked_as_a_mixture(mixture, tmp_path):
 
 
 @pytest.mark.further  # as made by hand above
-def test_page_and_json_tell_it_too(mixture):
+def test_page_and_json_report_the_mixture(mixture):
     content = campaign_document(mixture)
     assert content["one_specimen"] is False
     assert content["groups"]["files"] == [["0.mcap", "1.mcap"], ["stiff20.mcap", "stiff21.mcap"]]
@@ -226,7 +226,7 @@ def test_page_and_json_tell_it_too(mixture):
 
 
 @pytest.mark.further  # as made by hand above
-def test_a_structure_that_none_selects_nor_determines_has_its_row(mixture):
+def test_unselected_structure_has_its_row(mixture):
     """Type IV has no external damping: the internal one is driven to the edge of its range."""
     rows = {each.name: each for each in mixture.structures}
     four = rows["IV"]

@@ -1,4 +1,4 @@
-"""Campaigns of which one session is left, or one whole record: nothing is there to be pooled."""
+"""Campaigns of which one session is left, or one whole record: there is nothing to pool."""
 
 import json
 import math
@@ -27,9 +27,7 @@ def errors(result):
     return [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
 
 
-def test_the_one_session_is_reported_by_itself_beside_the_other_s_error(
-    run_here, short_sessions, tmp_path
-):
+def test_single_session_is_reported_with_the_error_of_the_other(run_here, short_sessions, tmp_path):
     shutil.copy(short_sessions[0], tmp_path / "ok.mcap")
     result = run_here("ok.mcap", "nosuch.mcap", "--method", "welch", "--json", "all.json")
     assert result.returncode == 1
@@ -42,12 +40,12 @@ def test_the_one_session_is_reported_by_itself_beside_the_other_s_error(
     assert not (tmp_path / "campaign.report").exists()
     content = json.loads((tmp_path / "all.json").read_text())
     assert {fit["file"] for fit in content["fits"]} == {"ok.mcap"}
-    (told,) = content["errors"]
-    assert told["file"] == "nosuch.mcap"
-    assert told["message"] in error
+    (failure,) = content["errors"]
+    assert failure["file"] == "nosuch.mcap"
+    assert failure["message"] in error
 
 
-def test_a_file_given_twice_is_called_that(run_here, short_sessions, tmp_path):
+def test_file_given_twice_is_reported_as_such(run_here, short_sessions, tmp_path):
     shutil.copy(short_sessions[0], tmp_path / "ok.mcap")
     result = run_here("ok.mcap", "./ok.mcap", "--method", "welch", "--report", "r")
     assert result.returncode == 1
@@ -55,9 +53,7 @@ def test_a_file_given_twice_is_called_that(run_here, short_sessions, tmp_path):
     assert (tmp_path / "r" / "figures" / "welch_frf.svg").exists()
 
 
-def test_samples_that_two_files_have_in_common_count_once(
-    run_here, make_file, short_sessions, tmp_path
-):
+def test_common_samples_of_two_files_count_once(run_here, make_file, short_sessions, tmp_path):
     """Another name, identity and time do not make another session of the same noise."""
     shutil.copy(short_sessions[0], tmp_path / "whole.mcap")
     make_file(tmp_path / "again.mcap", 0, id="another", start_utc_ns="1800000000000000000")
@@ -68,10 +64,8 @@ def test_samples_that_two_files_have_in_common_count_once(
     assert "whole.mcap is reported alone" in result.stderr
 
 
-def test_one_whole_record_of_several_sessions_is_ranked_by_itself(
-    make_estimate, make_session, campaign_of
-):
-    """The others' could not be used; with nothing to share, BIC is the session's own."""
+def test_single_whole_record_is_ranked_alone(make_estimate, make_session, campaign_of):
+    """The others' could not be used; with no common value, BIC is the session's own."""
     one = make_estimate(
         "III", {"zeta": 3e-4, "gamma": 0.2}, np.diag([1e-12, 1e-6]), ("zeta", "gamma"), cost=90.0
     )

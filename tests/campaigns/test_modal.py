@@ -58,7 +58,7 @@ def sessions_of(make_session, make_experiment):
     return make
 
 
-def test_noise_averages_out_and_an_unevenness_does_not(sessions_of, pooled_modal):
+def test_noise_averages_out_but_nonuniformity_does_not(sessions_of, pooled_modal):
     five, forty = (pooled_modal(sessions_of(count, uniformity=3e-3)) for count in (5, 40))
     for few, many in zip(five.modes, forty.modes, strict=True):
         assert many.frequency_std_hz < 0.5 * few.frequency_std_hz
@@ -68,7 +68,7 @@ def test_noise_averages_out_and_an_unevenness_does_not(sessions_of, pooled_modal
     assert stiffness[1] > 2e-3 * PAPER_BEAM.bending_stiffness_n_m2
 
 
-def test_modes_are_those_of_the_sessions_whatever_the_beam(sessions_of, pooled_modal):
+def test_modes_are_those_of_the_sessions(sessions_of, pooled_modal):
     found = pooled_modal(sessions_of(20, TRUE + UNEVEN, uniformity=0.0))
     rows = (TRUE + UNEVEN).reshape(-1, len(MODE_CONSTANT_NAMES))
     for mode, (ln_frequency, ln_ratio, *_) in zip(found.modes, rows, strict=True):
@@ -78,7 +78,7 @@ def test_modes_are_those_of_the_sessions_whatever_the_beam(sessions_of, pooled_m
         assert 0 < mode.participation_std_kg_m2 < 0.01 * mode.participation_kg_m2
 
 
-def test_a_uniform_beam_passes_and_an_uneven_one_does_not(sessions_of, pooled_modal):
+def test_only_a_uniform_beam_passes(sessions_of, pooled_modal):
     even, uneven = (pooled_modal(sessions_of(12, each)) for each in (TRUE, TRUE + UNEVEN))
     assert even.uniform_beam.status == "passed"
     assert even.leads
@@ -86,28 +86,28 @@ def test_a_uniform_beam_passes_and_an_uneven_one_does_not(sessions_of, pooled_mo
     assert uneven.uniform_beam.status == "refused"
     assert uneven.uniform_beam.p_value < 1e-10
     assert "does not predict" in uniformity(uneven.uniform_beam)[0]
-    # Losses are the same, and the tolerance covers what the places of the modes would say.
+    # Losses are the same, and the tolerance covers the differences of the mode frequencies.
     for name, true in PLANT.parameters.items():
         if name in ("alpha", "lambda"):
             low, high = uneven.tolerant.interval[name]
             assert low < true < high
 
 
-def test_the_largest_stated_uniformity_counts_and_is_named(sessions_of, pooled_modal, verdict_of):
+def test_largest_stated_uniformity_is_used_and_reported(sessions_of, pooled_modal, verdict_of):
     zero = pooled_modal(sessions_of(4, uniformity=0.0))
     assert zero.tolerant is None
     assert not zero.leads
     every = [*sessions_of(3, uniformity=0.0), *sessions_of(3, first=3)]
     assert pooled_modal(every).tolerant.uniformity == 1e-3
-    said = " ".join(verdict_of(every).sentences)
-    assert "to 0.1 %, the largest of the 0 and 0.1 % that the files state" in said
-    # An uneven beam stated to be exact: nothing is said of orders on that condition.
+    sentences = " ".join(verdict_of(every).sentences)
+    assert "to 0.1 %, the largest of the 0 and 0.1 % that the files state" in sentences
+    # An uneven beam stated to be exact: no order is reported on that condition.
     uneven = pooled_modal(sessions_of(4, TRUE + UNEVEN, uniformity=0.0))
     assert uneven.tolerant is None
     assert uneven.leads
 
 
-def test_a_mode_that_few_sessions_show_is_left_out(sessions_of, pooled_modal):
+def test_mode_visible_in_few_sessions_is_left_out(sessions_of, pooled_modal):
     first, *others = sessions_of(4, uniformity=0.0)
     two = replace(first, modal=replace(first.modal, numbers=(1, 2, 0)).restrict_to_visible_modes())
     assert two.modal.constants.size == 2 * len(MODE_CONSTANT_NAMES)
@@ -148,7 +148,7 @@ def test_a_falling_sweep_is_the_same_experiment(make_experiment):
 
 
 @pytest.mark.parametrize("count", [further(1), 3])
-def test_opposite_sweeps_that_agree_say_that_nothing_changed(sessions_of, verdict_of, count):
+def test_agreeing_opposite_sweeps_exclude_a_change(sessions_of, verdict_of, count):
     found = verdict_of([*sessions_of(count, **UP), *sessions_of(count, first=50, **DOWN)])
     sweeps = found.sweeps
     assert (sweeps.rising, sweeps.falling, sweeps.changed) == (count, count, ())
@@ -156,14 +156,14 @@ def test_opposite_sweeps_that_agree_say_that_nothing_changed(sessions_of, verdic
     assert found.experiments == ()
 
 
-def test_sweeps_of_one_direction_say_nothing_of_changes(sessions_of, verdict_of):
+def test_sweeps_of_one_direction_do_not_exclude_changes(sessions_of, verdict_of):
     found = verdict_of(sessions_of(3, **UP))
     assert found.sweeps is None
     assert not any("changed along" in each for each in found.sentences)
 
 
 @pytest.mark.parametrize("count", [further(1), 3])
-def test_opposite_sweeps_name_the_mode_that_changed(sessions_of, verdict_of, count):
+def test_opposite_sweeps_report_the_changed_mode(sessions_of, verdict_of, count):
     """The stiffness of mode 2 falls by 0.4 % after the rising sweep has passed it."""
     later = TRUE.copy()
     later[len(MODE_CONSTANT_NAMES)] -= 2e-3
@@ -172,13 +172,13 @@ def test_opposite_sweeps_name_the_mode_that_changed(sessions_of, verdict_of, cou
     (changed,) = found.sweeps.changed
     assert changed.mode == 2
     assert abs(changed.frequency + 2e-3) < 4 * changed.frequency_std
-    said = " ".join(found.sentences)
-    assert re.search(r"mode 2 \(falling: frequency 0\.(19|20)\d* ± 0\.0\d+ % lower", said)
+    sentences = " ".join(found.sentences)
+    assert re.search(r"mode 2 \(falling: frequency 0\.(19|20)\d* ± 0\.0\d+ % lower", sentences)
     (advice,) = found.experiments
     assert "half the amplitude" in advice
 
 
-def test_a_refused_beam_in_sweeps_of_one_direction_asks_for_the_other(sessions_of, verdict_of):
+def test_refused_beam_in_one_direction_suggests_the_other(sessions_of, verdict_of):
     every = sessions_of(4, TRUE + UNEVEN, uniformity=0.0, **UP)
     (advice,) = verdict_of(every).experiments
     assert advice.startswith("Add falling sweeps")
@@ -207,7 +207,7 @@ def verdict_of(make_estimate, campaign_of):
     return judge
 
 
-def test_an_order_is_the_slope_of_a_loss_and_an_exact_value_a_condition(sessions_of, verdict_of):
+def test_order_is_the_slope_of_a_loss(sessions_of, verdict_of):
     found = verdict_of(sessions_of(8))
     for order, exact in ((found.alpha, found.alpha.exact), (found.lambda_, found.lambda_.exact)):
         low, high = order.interval
@@ -234,7 +234,7 @@ def test_exact_values_are_withheld_where_a_uniform_beam_is_refused(sessions_of, 
     assert "1 is excluded" not in " ".join(exact.sentences)
 
 
-def test_a_beam_far_from_uniform_has_numbers_by_its_losses_alone(sessions_of, verdict_of):
+def test_numbers_of_strongly_nonuniform_beam_follow_its_losses(sessions_of, verdict_of):
     text = " ".join(verdict_of(sessions_of(4, TRUE + 40 * UNEVEN)).sentences)
     assert "by damping ratios and residue phases alone: the frequencies are not those of" in text
     assert "each mode lies where" not in text

@@ -31,7 +31,7 @@ def test_scatter_between_sessions_is_recovered(make_estimate):
     assert math.log(zeta.next_interval[1] / zeta.value) == pytest.approx(2.0 * 0.05, rel=0.25)
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say(make_estimate):
+def test_intervals_have_their_nominal_coverage(make_estimate):
     """Few sessions, where a normal interval would be too narrow; 200 campaigns of 5."""
     held = 0
     for seed in range(200):
@@ -40,7 +40,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(make_estimate):
     assert 0.91 < held / 200 < 0.99
 
 
-def test_sessions_that_differ_by_noise_alone_are_found_to_repeat(make_estimate):
+def test_sessions_with_different_noise_are_repeatable(make_estimate):
     chances = [
         each.chance
         for seed in range(40)
@@ -50,7 +50,7 @@ def test_sessions_that_differ_by_noise_alone_are_found_to_repeat(make_estimate):
     assert np.mean(np.array(chances) < 0.05) < 0.12
 
 
-def test_a_session_that_does_not_determine_the_damping_is_left_out(make_estimate):
+def test_session_without_determined_damping_is_left_out(make_estimate):
     good = list(estimates_of(make_estimate, 3, 0.0, seed=1))
     values = {"zeta": 1e-9, "alpha": 1.9}
     lost = make_estimate("IV", values, [[1e-4]], ("alpha",), at_bounds=("zeta",))
@@ -60,7 +60,7 @@ def test_a_session_that_does_not_determine_the_damping_is_left_out(make_estimate
     assert pool_estimates([good[0], lost]) is None
 
 
-def test_a_setting_on_its_bound_in_some_session_gets_the_plain_mean(make_estimate):
+def test_setting_on_a_bound_gets_the_plain_mean(make_estimate):
     names = ("zeta", "tool_inertia_kg_m2")
     free = make_estimate(
         "I", {"zeta": 1e-4, "tool_inertia_kg_m2": 3e-7}, np.diag([1e-4, 1e-16]), names
@@ -75,7 +75,7 @@ def test_a_setting_on_its_bound_in_some_session_gets_the_plain_mean(make_estimat
 
 
 def evidence(make_estimate, alphas, std):
-    """Types I and IV on sessions of 1000 values: what an alpha of 1 costs each of them."""
+    """Types I and IV on sessions of 1000 values: the cost of an alpha of 1 in each of them."""
     cov = np.diag([1e-4, std**2])
     one = [
         make_estimate(
@@ -90,7 +90,7 @@ def evidence(make_estimate, alphas, std):
     return one, free
 
 
-def test_all_sessions_tell_what_none_can_alone(make_estimate):
+def test_pooling_determines_what_no_session_does(make_estimate):
     """An alpha 1.5 standard deviations from 1, twenty times: 45 of deviance for one parameter."""
     rng = np.random.default_rng(5)
     one, free = evidence(make_estimate, rng.normal(0.985, 0.01, 20), 0.01)
@@ -99,7 +99,7 @@ def test_all_sessions_tell_what_none_can_alone(make_estimate):
     assert pooled_bic(free) < pooled_bic(one) - 10
 
 
-def test_an_order_of_one_is_not_made_fractional_by_many_sessions(make_estimate):
+def test_many_sessions_do_not_make_order_one_fractional(make_estimate):
     """A hundred campaigns of twenty: the simpler structure wins but for chance."""
     wins = 0
     for seed in range(100):
@@ -109,13 +109,13 @@ def test_an_order_of_one_is_not_made_fractional_by_many_sessions(make_estimate):
     assert wins >= 97
 
 
-def test_what_sharing_a_value_costs(make_estimate):
+def test_cost_of_a_common_value(make_estimate):
     """Two sessions a and b of one std: (a-b)²/2 of it², and ln of the number of all data."""
     _, free = evidence(make_estimate, [1.00, 1.01], 0.01)
     assert pooled_bic(free) == pytest.approx(2000.0 + 0.5 + 2 * math.log(200), abs=1e-9)
 
 
-def test_what_a_session_leaves_undetermined_counts_in_each(make_estimate):
+def test_undetermined_parameters_count_in_each_session(make_estimate):
     _, (good, _) = evidence(make_estimate, [1.0, 1.0], 0.01)
     lost = make_estimate(
         "IV", {"zeta": 1e-4, "alpha": 0.0}, [[1e-4]], ("zeta",), ("alpha",), cost=1000.0

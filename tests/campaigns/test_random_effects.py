@@ -9,7 +9,7 @@ def one_dimension(values, variances):
 
 
 def test_equal_variances_by_hand():
-    """Mean 3, variance (4 + 1 + 0 + 9) / 3; between sessions is what 0.5 does not explain."""
+    """Mean 3, variance (4 + 1 + 0 + 9) / 3; between sessions the part beyond 0.5."""
     found = one_dimension([1.0, 2.0, 3.0, 6.0], [0.5] * 4)
     assert found.mean == pytest.approx([3.0])
     assert found.cochran_q == pytest.approx([28.0])
@@ -27,14 +27,14 @@ def test_unequal_variances_by_hand():
     assert found.covariance[0, 0] == pytest.approx(1 / w.sum())
 
 
-def test_sessions_that_agree_are_weighted_by_their_precision():
+def test_agreeing_sessions_are_weighted_by_precision():
     found = one_dimension([2.0, 2.01, 1.99], [1.0, 2.0, 4.0])
     assert found.between_std == 0
     assert found.mean == pytest.approx([(2.0 + 2.01 / 2 + 1.99 / 4) / 1.75])
     assert found.covariance[0, 0] == pytest.approx(1 / 1.75)
 
 
-def test_correlated_estimates_of_unequal_precision_go_by_the_whole_covariance():
+def test_correlated_estimates_are_weighted_by_full_covariance():
     """Where nothing scatters between sessions: generalised least squares, written out."""
     good = np.array([[1.0, -0.9], [-0.9, 1.0]])
     covariances = np.array([good, 9 * good + np.eye(2)])
@@ -73,5 +73,5 @@ def test_scatter_between_sessions_is_recovered_from_correlated_estimates():
         error = campaign.mean - mean
         squares.append(error @ np.linalg.solve(campaign.covariance, error))
     assert np.mean(found, axis=0) == pytest.approx(np.diag(between), rel=0.12)
-    # Chi-square of two degrees of freedom: the covariance says how wrong the mean is.
+    # Chi-square of two degrees of freedom: the covariance gives the error of the mean.
     assert np.mean(squares) == pytest.approx(2.0, abs=1.0)

@@ -65,7 +65,7 @@ def test_deviation_of_peaks_by_hand():
 
 
 @pytest.mark.fit
-def test_nominal_model_is_of_the_mean_parameters(make_fit, make_session, campaign_of, truth):
+def test_nominal_model_has_the_mean_parameters(make_fit, make_session, campaign_of, truth):
     link, _ = truth
     frequency_hz = np.array([1.0, 2.0])
     damping = STRUCTURES["III"].damping({"zeta": 2e-4, "gamma": 0.2})
@@ -77,26 +77,26 @@ def test_nominal_model_is_of_the_mean_parameters(make_fit, make_session, campaig
     (model,) = campaign_of(sessions).nominal
     assert model.response == pytest.approx(exact)
     assert model.indices[0].mse == pytest.approx(0.0)
-    # A deviation of 3 everywhere, whatever the weights.
+    # A deviation of 3 everywhere, for any weights.
     one = model.indices[1]
     assert (one.mse, one.wmse, one.md) == pytest.approx((9.0, 9.0, 3.0))
     assert model.mean_wmse == pytest.approx(4.5)
     assert best_models([model]) == (model,)
 
 
-def test_the_paper_s_numbers_are_those_of_the_reference():
+def test_published_numbers_match_the_reference():
     with (DATA / "paper_table3.csv").open() as file:
         for row in csv.DictReader(file):
-            told = published_table3()[row["type"], row["weighting"], row["parameter"]]
+            published = published_table3()[row["type"], row["weighting"], row["parameter"]]
             for name in ("mean", "median", "std", "min", "max"):
-                assert getattr(told, name) == float(row[name])
+                assert getattr(published, name) == float(row[name])
     assert len(published_table3()) == 24
     assert len(published_table4()) == 72
     assert published_table4()["VI", "const", "frequency_rad_s", 2] == 0.190
     assert published_wmse() == {("III", "omega"): 4.491, ("VI", "omega"): 3.469}
 
 
-def test_table_4_follows_from_table_3_s_means(truth):
+def test_table_4_follows_from_means_of_table_3(truth):
     """The definition of the deviation, on the paper's own numbers; peaks read from its figures.
 
     Parameters are printed with three digits and each session has its own peaks, so not all can
@@ -122,8 +122,8 @@ def test_table_4_follows_from_table_3_s_means(truth):
         peaks = resonant_peaks(frequency_hz, response, mode_hz)
         for deviation in mean_deviations(measured, peaks):
             for quantity in ("frequency_rad_s", "magnitude_db"):
-                told = published_table4()[structure, weighting, quantity, deviation.mode]
-                off.append(abs(getattr(deviation, quantity) - told))
+                published = published_table4()[structure, weighting, quantity, deviation.mode]
+                off.append(abs(getattr(deviation, quantity) - published))
     assert len(off) == 72
     assert sum(each <= 0.1 for each in off) >= 40
     assert sum(each <= 0.5 for each in off) >= 67

@@ -62,7 +62,7 @@ def shaken(request, short_sessions, settings, done):
 
 
 @pytest.mark.process
-def test_a_trial_whose_worker_is_killed_is_lost_and_the_others_are_done(shaken):
+def test_killed_worker_loses_its_trial_only(shaken):
     assert shaken.failures == ()
     (lost,) = shaken.failed_predictions
     assert (lost.path.name, shaken.trials) == ("1.mcap", 4)
@@ -71,16 +71,18 @@ def test_a_trial_whose_worker_is_killed_is_lost_and_the_others_are_done(shaken):
 
 
 @pytest.mark.process
-def test_the_verdict_says_over_how_many_a_prediction_is(shaken):
+def test_verdict_states_the_number_of_predictions(shaken):
     (foresight,) = (s for s in shaken.verdict.sentences if s.startswith("Leave-one-out error"))
     assert "mean of 3 of 4 sessions" in foresight
-    told = shaken.verdict.sentences[-1]
-    assert told.startswith("Of 4 sessions to be predicted from the others, 3 were and 1 was not")
-    assert "(1.mcap: its worker process ended by itself twice" in told
+    sentence = shaken.verdict.sentences[-1]
+    assert sentence.startswith(
+        "Of 4 sessions to be predicted from the others, 3 were and 1 was not"
+    )
+    assert "(1.mcap: its worker process ended by itself twice" in sentence
 
 
 @pytest.mark.process
-def test_terminal_page_and_files_account_for_it(shaken):
+def test_terminal_page_and_files_report_the_lost_trial(shaken):
     lines = campaign_text(shaken).splitlines()
     (row,) = (line for line in lines if line.startswith("record   III "))
     assert "3 of 4" in row
@@ -97,7 +99,7 @@ def test_terminal_page_and_files_account_for_it(shaken):
 
 @pytest.mark.process
 @pytest.mark.further  # as terminal and page
-def test_the_figure_accounts_for_it(shaken, tmp_path):
+def test_figure_reports_the_lost_trial(shaken, tmp_path):
     write_campaign(shaken, tmp_path / "report", with_paper=False)
     texts = ET.parse(tmp_path / "report" / "figures" / "validation.svg").iter(
         "{http://www.w3.org/2000/svg}text"
@@ -106,7 +108,7 @@ def test_the_figure_accounts_for_it(shaken, tmp_path):
 
 
 @pytest.mark.process
-def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tmp_path, capsys):
+def test_command_reports_the_lost_trial_and_fails(shaken, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("analysis.campaigns.campaign", lambda *_, **__: shaken)
     monkeypatch.setattr("analysis.report.campaign_report.write_campaign", lambda *_, **__: None)
     paths = [each.path for each in shaken.sessions]
@@ -116,14 +118,14 @@ def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tm
     assert "1.mcap is not predicted from the others: its worker" in capsys.readouterr().err
 
 
-def test_sessions_that_cannot_be_read_any_more_are_lost_with_the_reason(make_session, campaign_of):
+def test_unreadable_sessions_are_lost_with_the_reason(make_session, campaign_of):
     found = campaign_of([make_session(f"gone{number}.mcap") for number in range(3)], validated=True)
     assert found.validation == ()
     for number, lost in enumerate(found.failed_predictions):
         assert f"gone{number}.mcap" in lost.reason
 
 
-def test_what_was_found_is_kept_though_all_workers_go(make_session):
+def test_results_remain_if_all_workers_are_lost(make_session):
     sessions = [make_session(f"{n}.mcap") for n in range(3)]
 
     class Going:
@@ -138,7 +140,7 @@ def test_what_was_found_is_kept_though_all_workers_go(make_session):
     assert {each.reason for each in found.failed_predictions} == {"The Dask scheduler went away."}
 
 
-def test_nothing_is_said_where_nothing_was_asked(done, campaign_of):
+def test_no_report_without_validation(done, campaign_of):
     found = campaign_of(done[0].sessions[:2], structures=())
     assert (found.trials, found.validation, found.failed_predictions) == (0, (), ())
     assert "predicted" not in campaign_text(found)

@@ -1,4 +1,4 @@
-"""The verdict on a campaign from made-up estimates: what it may say, and what it must not."""
+"""The verdict on a campaign from invented estimates: statements that it may and must not make."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -15,7 +15,9 @@ from analysis.statistics import student_t_quantile
 ALIKE = Homogeneity((), ())
 
 
-def said(structure="VI", alpha="fractional", adequate=True, modes=(1, 2, 3), findings=()):
+def session_verdict(
+    structure="VI", alpha="fractional", adequate=True, modes=(1, 2, 3), findings=()
+):
     return SimpleNamespace(
         structure=structure, adequate=adequate, visible_modes=modes,
         findings=findings, experiments=("Sweep longer.",),
@@ -30,8 +32,8 @@ def estimates_of(make_estimate):
     def make(structure, deviance, alpha=0.8, std=0.01):
         values = {"zeta": 1e-4, "alpha": alpha, "gamma": 0.1, "lambda": 0.6}
         fixed = {"I": {"alpha": 1.0}, "IV": {}, "VI": {}, "VII": {"alpha": 1.0}}[structure]
-        kept = ("zeta", "alpha") if structure in ("I", "IV") else tuple(values)
-        names = [name for name in kept if name not in fixed]
+        available = ("zeta", "alpha") if structure in ("I", "IV") else tuple(values)
+        names = [name for name in available if name not in fixed]
         covariance = np.diag([(std if n == "alpha" else 0.01) ** 2 for n in names])
         return [
             make_estimate(
@@ -47,18 +49,21 @@ def ranked(*groups):
     return sorted(map(pool_estimates, groups), key=lambda each: each.bic)
 
 
-def test_the_modes_have_student_s_interval_as_the_figure_of_them(estimates_of):
+def test_modes_have_the_student_interval_of_the_figure(estimates_of):
     """Of four sessions it is 3.18 standard deviations to either side, and not 1.96."""
     found = pool_estimates(estimates_of("VI", 100.0))
     std = found.modes[0].damping_ratio_std
-    (said_of,) = sentences.describe_modes(found.modes, found.sessions, mixed=False)
-    half = float(said_of.split("± ")[1].split(" %")[0]) / 100
+    (sentence,) = sentences.describe_modes(found.modes, found.sessions, mixed=False)
+    half = float(sentence.split("± ")[1].split(" %")[0]) / 100
     assert half == pytest.approx(student_t_quantile(0.95, 3) * std, rel=0.05)
 
 
-def test_an_order_that_all_share_and_no_integer_explains_is_reported(estimates_of):
+def test_common_fractional_order_is_reported(estimates_of):
     order = pooled_order(
-        "alpha", ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0)), [said()] * 4, ALIKE
+        "alpha",
+        ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0)),
+        [session_verdict()] * 4,
+        ALIKE,
     )
     assert order.status == "fractional"
     assert order.value == pytest.approx(0.8)
@@ -69,12 +74,17 @@ def test_an_order_that_all_share_and_no_integer_explains_is_reported(estimates_o
 @pytest.mark.parametrize(
     ("rival", "verdict", "status", "reason"),
     [
-        (101.5, said(), "open", None),  # an integer explains as much: 6 in BIC, less one ln 400
-        (150.0, said(adequate=False), "open", "unexplained"),
-        (150.0, said(modes=(1,)), "not identifiable", "a single mode determines"),
+        (
+            101.5,
+            session_verdict(),
+            "open",
+            None,
+        ),  # an integer explains as much: 6 in BIC, less one ln 400
+        (150.0, session_verdict(adequate=False), "open", "unexplained"),
+        (150.0, session_verdict(modes=(1,)), "not identifiable", "a single mode determines"),
     ],
 )
-def test_an_order_is_not_called_fractional(estimates_of, rival, verdict, status, reason):
+def test_uncertain_order_is_not_called_fractional(estimates_of, rival, verdict, status, reason):
     order = pooled_order(
         "alpha", ranked(estimates_of("VI", 100.0), estimates_of("VII", rival)), [verdict] * 4, ALIKE
     )
@@ -89,30 +99,30 @@ def mixed_in(quantity):
 
 
 @pytest.mark.parametrize("alpha", [0.8, 1.0])
-def test_an_order_in_which_sessions_differ_in_kind_is_withheld(estimates_of, alpha):
+def test_order_that_differs_between_sessions_is_withheld(estimates_of, alpha):
     groups = ranked(estimates_of("VI", 100.0, alpha), estimates_of("VII", 150.0))
-    order = pooled_order("alpha", groups, [said()] * 4, mixed_in("alpha"))
+    order = pooled_order("alpha", groups, [session_verdict()] * 4, mixed_in("alpha"))
     assert (order.status, order.mixture) == ("open", True)
     assert "not of one specimen and do not all share it" in sentences.describe_order(order)
 
 
-def test_an_order_that_all_beams_of_a_mixture_share_is_reported(estimates_of):
+def test_common_order_of_a_mixture_is_reported(estimates_of):
     """Beams of several lengths of one material; but not if one of them does not determine it."""
     groups = ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0))
     mixed = mixed_in("frequency_hz_1")
-    assert pooled_order("alpha", groups, [said()] * 4, mixed).status == "fractional"
-    assert pooled_order("alpha", groups, [said()] * 5, mixed).reason is not None
+    assert pooled_order("alpha", groups, [session_verdict()] * 4, mixed).status == "fractional"
+    assert pooled_order("alpha", groups, [session_verdict()] * 5, mixed).reason is not None
 
 
-def test_one_session_in_ten_may_hold_something_else(estimates_of):
+def test_one_session_in_ten_may_differ(estimates_of):
     groups = ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0))
-    verdicts = [*[said()] * 9, said(adequate=False)]
+    verdicts = [*[session_verdict()] * 9, session_verdict(adequate=False)]
     assert pooled_order("alpha", groups, verdicts, ALIKE).status == "fractional"
 
 
-def test_an_order_that_could_be_anything_is_not_identifiable(estimates_of):
+def test_undetermined_order_is_not_identifiable(estimates_of):
     groups = ranked(estimates_of("VI", 100.0, std=0.5), estimates_of("VII", 101.0))
-    order = pooled_order("alpha", groups, [said()] * 4, ALIKE)
+    order = pooled_order("alpha", groups, [session_verdict()] * 4, ALIKE)
     assert (order.status, order.value, order.interval) == ("not identifiable", None, None)
     assert "not identifiable" in sentences.describe_order(order)
 
@@ -121,10 +131,10 @@ def test_an_order_that_could_be_anything_is_not_identifiable(estimates_of):
     ("alpha", "rival", "status"),
     [(1.005, 99.0, "compatible"), (0.97, 101.0, "open"), (0.97, 97.5, "open")],
 )
-def test_nothing_is_1_that_excludes_1(estimates_of, alpha, rival, status):
+def test_order_that_excludes_1_is_not_reported_as_1(estimates_of, alpha, rival, status):
     """1 inside the interval; outside, though VII has the lower BIC; outside, and VI has it."""
     groups = ranked(estimates_of("VI", rival, alpha), estimates_of("VII", 100.0))
-    order = pooled_order("alpha", groups, [said("VII", "integer")] * 4, ALIKE)
+    order = pooled_order("alpha", groups, [session_verdict("VII", "integer")] * 4, ALIKE)
     assert order.status == status
     assert order.value == pytest.approx(alpha)
     assert order.interval[0] < alpha < order.interval[1]
@@ -132,12 +142,10 @@ def test_nothing_is_1_that_excludes_1(estimates_of, alpha, rival, status):
 
 
 @pytest.mark.fit
-def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(
-    estimates_of, make_session, campaign_of
-):
+def test_numbers_are_those_of_the_freest_structure(estimates_of, make_session, campaign_of):
     six, seven = estimates_of("VI", 100.0, 0.996), estimates_of("VII", 95.0)
     sessions = [
-        make_session(f"{n}.mcap", estimates=pair, verdict=said("VII", "integer"))
+        make_session(f"{n}.mcap", estimates=pair, verdict=session_verdict("VII", "integer"))
         for n, pair in enumerate(zip(six, seven, strict=True))
     ]
     found = campaign_of(sessions).verdict
@@ -153,8 +161,10 @@ def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(
     assert freest_estimate([pool_estimates(seven), few]).structure == "VII"
 
 
-def test_damping_that_no_session_needs_is_absent(estimates_of):
-    order = pooled_order("lambda", ranked(estimates_of("IV", 100.0)), [said("IV")] * 4, ALIKE)
+def test_unneeded_damping_is_absent(estimates_of):
+    order = pooled_order(
+        "lambda", ranked(estimates_of("IV", 100.0)), [session_verdict("IV")] * 4, ALIKE
+    )
     assert (order.status, order.value) == ("absent", None)
     assert "No external damping was found" in sentences.describe_order(order)
 
@@ -174,11 +184,13 @@ def stiffening(mode):
 
 
 @pytest.mark.fit
-def test_findings_are_counted_over_the_sessions(make_session, estimates_of, campaign_of):
+def test_findings_are_counted_over_sessions(make_session, estimates_of, campaign_of):
     six = estimates_of("VI", 100.0)
     sessions = [
         make_session(
-            f"{number}.mcap", estimates=six[:1], verdict=said(findings=(delay(value), *more))
+            f"{number}.mcap",
+            estimates=six[:1],
+            verdict=session_verdict(findings=(delay(value), *more)),
         )
         for number, (value, more) in enumerate(
             [(0.29e-3, ()), (0.31e-3, (stiffening(1),)), (0.30e-3, (stiffening(2),))]
@@ -196,26 +208,26 @@ def test_findings_are_counted_over_the_sessions(make_session, estimates_of, camp
 
 
 @pytest.mark.fit
-def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimates_of, campaign_of):
+def test_dissenting_session_is_reported(make_session, estimates_of, campaign_of):
     six, seven = estimates_of("VI", 100.0), estimates_of("VII", 150.0)
     sessions = [
-        make_session(f"{n}.mcap", estimates=pair, verdict=said())
+        make_session(f"{n}.mcap", estimates=pair, verdict=session_verdict())
         for n, pair in enumerate(zip(six, seven, strict=True))
     ]
     other = (replace(six[0], bic=180.0), seven[0])
-    sessions[2] = make_session("2.mcap", estimates=other, verdict=said("VII"))
+    sessions[2] = make_session("2.mcap", estimates=other, verdict=session_verdict("VII"))
     found = campaign_of(sessions).verdict
     assert found.structure == "VI"
     assert found.alone == {"VI": 3, "VII": 1}
     ((name, structure, margin),) = [(d.file, d.structure, d.margin) for d in found.dissent]
     assert (name, structure, margin) == ("2.mcap", "VII", 30.0)
-    (told,) = (s for s in found.sentences if "is excluded by" in s)
-    assert "2.mcap (type VII)" in told
+    (sentence,) = (s for s in found.sentences if "is excluded by" in s)
+    assert "2.mcap (type VII)" in sentence
     assert found.experiments == ("Sweep longer.",)
     assert campaign_of([make_session(f"{n}.mcap") for n in range(2)]).verdict is None
 
 
-def test_words_about_scatter_and_misfit(estimates_of):
+def test_sentences_on_scatter_and_misfit(estimates_of):
     (best,) = ranked(estimates_of("VI", 100.0))
     assert "No significant between-session variance" in sentences.describe_scatter(best)
     assert "τ" not in sentences.describe_scatter(best)

@@ -47,7 +47,7 @@ def biases_of(campaign_of):
     return found
 
 
-def test_a_bias_is_the_difference_of_the_means_and_not_the_scatter(make_sessions, biases_of):
+def test_bias_is_the_difference_of_means(make_sessions, biases_of):
     freest, (found,) = biases_of(make_sessions(0.068, 0.001))
     by_name = {each.parameter: each for each in found.parameters}
     bias = by_name["lambda"]
@@ -71,7 +71,7 @@ def test_a_difference_within_the_scatter_is_no_bias(make_sessions, biases_of):
     assert sentences.describe_welch_bias(freest, (found,), (), comparable=True) == []
 
 
-def test_a_structure_that_leaves_more_than_noise_is_no_reference(make_sessions, biases_of):
+def test_inadequate_structure_is_no_reference(make_sessions, biases_of):
     _, found = biases_of(make_sessions(0.068, 0.001, cost=900.0))
     assert found == ()
 

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.fit
 
 @pytest.fixture(scope="module")
 def found(make_file, tmp_path_factory, campaign_of):
-    """Two sessions of a file that says that its excitation is a multisine."""
+    """Two sessions of a file that states a multisine as its excitation."""
     path = make_file(
         tmp_path_factory.mktemp("multisine") / "0.mcap", 0, excitation="multisine", specimen="A",
         operator="Eve", note="[clamp] <b>new</b>",
@@ -30,7 +30,7 @@ def found(make_file, tmp_path_factory, campaign_of):
     return campaign_of([first, other], structures=("III",))
 
 
-def test_the_whole_records_are_pooled_and_nothing_else(found, truth):
+def test_only_whole_records_are_pooled(found, truth):
     assert found.failures == ()
     assert (found.nominal, found.statistics) == ((), ())
     assert found.headline.name == "VI"
@@ -41,7 +41,7 @@ def test_the_whole_records_are_pooled_and_nothing_else(found, truth):
         assert session.warnings[-1].startswith("Welch fits left out: a multisine")
 
 
-@pytest.mark.further  # as what is pooled
+@pytest.mark.further  # as the pooled estimate
 def test_the_folder_has_no_table_or_figure_of_the_paper(found, tmp_path):
     write_campaign(found, tmp_path)
     names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}
@@ -55,7 +55,7 @@ def test_the_folder_has_no_table_or_figure_of_the_paper(found, tmp_path):
     json.loads((tmp_path / "campaign.json").read_text())
 
 
-def test_a_warning_that_sessions_share_is_told_once(found):
+def test_common_warning_is_reported_once(found):
     text = " ".join(campaign_text(found).split())
     assert text.count("Welch fits left out") == 1
     assert "Warning: all 2 files: Welch fits left out: a multisine" in text
@@ -63,24 +63,24 @@ def test_a_warning_that_sessions_share_is_told_once(found):
     assert page.count("Welch fits left out") == 1
 
 
-def test_sessions_are_listed_with_what_their_files_say(found):
+def test_sessions_are_listed_with_their_metadata(found):
     line = next(each for each in campaign_text(found).splitlines() if each.startswith("0.mcap "))
-    for said in ("A", "Eve", "[clamp] <b>new</b>", "yes"):
-        assert said in line
+    for value in ("A", "Eve", "[clamp] <b>new</b>", "yes"):
+        assert value in line
     page = campaign_page(found, (), datetime(2026, 1, 1, tzinfo=UTC), with_paper=False)
     assert "[clamp] &lt;b&gt;new&lt;/b&gt;" in page
     assert "<b>" not in page
 
 
-def test_an_odd_session_is_set_aside_and_does_not_cost_the_others_theirs(make_session, campaign_of):
+def test_odd_session_is_set_aside_without_affecting_others(make_session, campaign_of):
     sessions = [make_session(f"{number}.mcap") for number in range(3)]
     odd = replace(
         sessions[0].without_welch(), path=Path("odd.mcap"), warnings=("Welch fits left out: x.",),
         experiment=replace(sessions[0].experiment, identity=("odd",)),
     )  # fmt: skip
     found = campaign_of([*sessions, odd])
-    kept, (failure,) = found.sessions, found.failures
-    assert [each.path for each in kept] == [each.path for each in sessions]
+    used, (failure,) = found.sessions, found.failures
+    assert [each.path for each in used] == [each.path for each in sessions]
     assert "odd.mcap: Welch fits left out: x. Most others have them" in failure.message
     found = campaign_of([sessions[0], odd])
     both, none = found.sessions, found.failures
@@ -88,9 +88,7 @@ def test_an_odd_session_is_set_aside_and_does_not_cost_the_others_theirs(make_se
     assert [each.frequency_hz.size for each in both] == [0, 0]
 
 
-def test_a_search_beside_chirps_counts_and_all_do_without(
-    make_session, make_experiment, campaign_of
-):
+def test_search_with_chirps_counts_and_disables_welch(make_session, make_experiment, campaign_of):
     chirps = [make_session(f"{number}.mcap") for number in range(3)]
     search = replace(
         chirps[0].without_welch(),
@@ -98,9 +96,9 @@ def test_a_search_beside_chirps_counts_and_all_do_without(
         experiment=make_experiment("until.mcap", excitation="until"),
     )
     found = campaign_of([*chirps, search])
-    kept, none = found.sessions, found.failures
+    used, none = found.sessions, found.failures
     assert none == ()
-    assert [each.frequency_hz.size for each in kept] == [0, 0, 0, 0]
+    assert [each.frequency_hz.size for each in used] == [0, 0, 0, 0]
 
 
 def test_a_session_with_a_wrong_unit_is_set_aside(make_file, tmp_path, settings):

@@ -24,7 +24,7 @@ def test_results_come_in_order_and_progress_as_they_are_done(monkeypatch):
     assert os.environ["OMP_NUM_THREADS"] == "7"
 
 
-def test_a_worker_that_dies_is_told():
+def test_dead_worker_is_reported():
     with (
         process_pool(1) as pool,
         pytest.raises(CampaignError, match="worker processes ended") as it,
@@ -33,7 +33,7 @@ def test_a_worker_that_dies_is_told():
     assert "--jobs" in str(it.value)
 
 
-def test_one_task_whose_worker_dies_is_told_and_the_others_are_done():
+def test_dead_worker_loses_one_task_only():
     with process_pool(2) as pool:
         found = pool.run(end_at_zero, [(n,) for n in (5, 4, 3, 0, 2, 1)])
     (lost,) = (each for each in found if isinstance(each, FailedTask))
@@ -43,7 +43,7 @@ def test_one_task_whose_worker_dies_is_told_and_the_others_are_done():
 
 
 @pytest.mark.parametrize("jobs", [1, further(2)])
-def test_the_first_task_of_all_may_be_the_one(jobs):
+def test_first_task_may_be_the_lost_one(jobs):
     with process_pool(jobs) as pool:
         lost, *others = pool.run(end_at_zero, [(n,) for n in (0, 1, 2)])
     assert isinstance(lost, FailedTask)
@@ -51,12 +51,12 @@ def test_the_first_task_of_all_may_be_the_one(jobs):
 
 
 @pytest.mark.further  # as one that dies after others are done
-def test_a_second_worker_that_dies_before_anything_is_done_ends_all():
+def test_second_death_before_any_result_ends_all():
     with process_pool(1) as pool, pytest.raises(CampaignError, match="worker processes ended"):
         pool.run(end_at_zero, [(0,), (0,), (1,)])
 
 
-def test_a_worker_that_ends_with_nothing_to_do_is_replaced():
+def test_idle_worker_that_ends_is_replaced():
     before = set(multiprocessing.active_children())
     with process_pool(1) as pool:
         assert pool.run(abs, [(-1,)]) == [1]
@@ -70,7 +70,7 @@ def interrupt(_number):
     raise KeyboardInterrupt
 
 
-def test_work_under_way_is_dropped_when_the_operator_stops():
+def test_running_work_is_dropped_on_interrupt():
     before = set(multiprocessing.active_children())
     with pytest.raises(KeyboardInterrupt), process_pool(2) as pool:
         pool.run(time.sleep, [(0.0,), (1000.0,)], interrupt)

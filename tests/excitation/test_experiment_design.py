@@ -1,4 +1,4 @@
-"""Designed pieces: joints, limits with what rings, what they tell, and when all is reached."""
+"""Designed segments: joints, limits with ringing, information, and duration."""
 
 from dataclasses import replace
 
@@ -32,28 +32,30 @@ def design(rig, scanned):
 
 @pytest.mark.further  # as tests/cli/test_until.py
 def test_angle_speed_and_acceleration_are_zero_at_the_joints(design):
-    """Against the largest of the session: what a step there would be like."""
+    """Compared with the largest values of the session, which a step there would have."""
 
     def derivatives(path):
         speed = np.diff(path) * RATE_HZ
         return path, speed, np.diff(speed) * RATE_HZ
 
     largest = [np.abs(values).max() for values in derivatives(design.reference_rad)]
-    for piece in design.segments:
-        path = np.concatenate([np.zeros(3), piece.reference_rad, np.zeros(3)])
-        for values, most, share in zip(derivatives(path), largest, (1e-5, 1e-4, 2e-3), strict=True):
-            assert np.abs(values[:5]).max() < share * most
-            assert np.abs(values[-5:]).max() < share * most
+    for segment in design.segments:
+        path = np.concatenate([np.zeros(3), segment.reference_rad, np.zeros(3)])
+        for values, most, fraction in zip(
+            derivatives(path), largest, (1e-5, 1e-4, 2e-3), strict=True
+        ):
+            assert np.abs(values[:5]).max() < fraction * most
+            assert np.abs(values[-5:]).max() < fraction * most
 
 
-def test_the_loop_with_an_estimate_is_computed_once(rig):
+def test_loop_of_an_estimate_is_computed_once(rig):
     plant = rig.plant_with(ESTIMATE.plant)
     assert rig.plant_with(replace(ESTIMATE.plant)) is plant
     assert rig.plant_with(replace(ESTIMATE.plant, damping=Damping(zeta=7e-5))) is not plant
     assert rig.plant_with(replace(ESTIMATE.plant, tip_mass_kg=3e-4)) is not plant
 
 
-def test_everything_asked_is_reached_soon_and_the_time_is_kept(design):
+def test_all_targets_are_reached_within_the_time(design):
     assert all(each.reached for each in design.expected)
     assert not all(each.reached for each in design.segments[0].now)
     assert design.reference_rad.size < 15.0 * RATE_HZ
@@ -61,7 +63,7 @@ def test_everything_asked_is_reached_soon_and_the_time_is_kept(design):
     assert [each.target.mode for each in design.expected] == [1, 2, 3]
 
 
-def test_the_whole_session_keeps_the_limits_and_the_small_slopes(rig):
+def test_session_stays_within_limits_and_small_slopes(rig):
     """By another way: the whole reference through the loop, the tip from the whole angle."""
     plant = rig.plant_with(ESTIMATE.plant)
     alone = design_excitation(ESTIMATE, rig, DAMPING, 6.0)
@@ -69,7 +71,7 @@ def test_the_whole_session_keeps_the_limits_and_the_small_slopes(rig):
     torque = np.abs(response.torque_nm).max() + plant.friction_nm
     assert torque < 1.05 * LIMIT_FRACTION * (plant.peak_torque_nm + plant.friction_nm)
     slope = tip_motion(ESTIMATE.plant, response.angle_rad, RATE_HZ).slope_rad
-    # Ringing moves the motor a little, which no piece knows: the share left over is for that.
+    # Ringing moves the motor a little, which no segment knows: the remaining fraction is for that.
     assert 0.8 * 0.9 * 0.14 < slope < 0.14
 
 
@@ -77,47 +79,47 @@ def stds_of(covariance):
     return np.sqrt(np.diag(covariance))
 
 
-def test_the_expected_covariance_is_that_of_the_record(scanned, design):
+def test_expected_covariance_is_that_of_the_record(scanned, design):
     angle = np.concatenate([scanned, design.angle_rad])
     whole = covariance_of(information(angle, ESTIMATE, RATE_HZ))
     np.testing.assert_allclose(stds_of(design.covariance), stds_of(whole), rtol=0.02)
 
 
 @pytest.mark.further  # a record of a whole number of the design's steps is tested above
-def test_pieces_add_up_at_whatever_tick_the_record_ends(rig, scanned):
+def test_information_is_additive_at_any_tick(rig, scanned):
     angle = scanned[:5003]
     made = design_excitation(ESTIMATE, rig, DAMPING, 30.0, angle_rad_so_far=angle)
     whole = covariance_of(information(np.concatenate([angle, made.angle_rad]), ESTIMATE, RATE_HZ))
     np.testing.assert_allclose(stds_of(made.covariance), stds_of(whole), rtol=0.02)
 
 
-@pytest.mark.further  # as the limits are kept
+@pytest.mark.further  # as the limits of the session
 def test_a_tighter_limit_lowers_the_amplitude(rig, scanned):
     free, held = (
         next_segment(ESTIMATE, np.zeros(1000), DAMPING, rig, 10.0, tip_slope_rad=slope)
         for slope in (0.14, 0.07)
     )
     slopes = [
-        tip_motion(ESTIMATE.plant, piece.angle_rad, RATE_HZ).slope_rad for piece in (free, held)
+        tip_motion(ESTIMATE.plant, segment.angle_rad, RATE_HZ).slope_rad for segment in (free, held)
     ]
     assert slopes[1] < 0.064
     assert slopes[0] < 0.13
     assert slopes[1] < 0.7 * slopes[0]
 
 
-def test_a_fraction_of_the_limits_is_kept(rig):
-    piece = next_segment(ESTIMATE, np.zeros(1000), DAMPING, rig, 3.0, limit_fraction=0.4)
-    assert 0.2 < piece.fraction_of_limits <= 0.4 * LIMIT_FRACTION + 1e-9
+def test_fraction_of_the_limits_is_respected(rig):
+    segment = next_segment(ESTIMATE, np.zeros(1000), DAMPING, rig, 3.0, limit_fraction=0.4)
+    assert 0.2 < segment.fraction_of_limits <= 0.4 * LIMIT_FRACTION + 1e-9
 
 
-def test_it_takes_no_longer_than_is_left(rig, scanned):
-    piece = next_segment(ESTIMATE, scanned, DAMPING, rig, 1.2)
-    assert piece.reference_rad.size <= 1200
+def test_segment_fits_in_the_remaining_time(rig, scanned):
+    segment = next_segment(ESTIMATE, scanned, DAMPING, rig, 1.2)
+    assert segment.reference_rad.size <= 1200
     with pytest.raises(ExcitationError, match=r"fits into 0\.4 s"):
         next_segment(ESTIMATE, scanned, DAMPING, rig, 0.4)
 
 
-def test_what_cannot_be_reached_is_said_with_the_reason(rig, scanned, design):
+def test_unreachable_target_is_reported_with_the_reason(rig, scanned, design):
     hard = next_segment(ESTIMATE, scanned, [parse_target("damping", "0.01%")], rig, 60.0).forecast
     assert hard.seconds > 1000
     assert "60 s are left" in hard.reason
@@ -137,21 +139,21 @@ def test_what_cannot_be_reached_is_said_with_the_reason(rig, scanned, design):
     assert "mode 7 is not below 50 Hz" in beyond.forecast.reason
 
 
-def test_the_forecast_is_about_what_a_design_takes(design):
+def test_predicted_duration_is_near_that_of_a_design(design):
     taken_s = design.reference_rad.size / RATE_HZ
     assert 0.4 < design.segments[0].forecast.seconds / taken_s < 2.5
 
 
-def test_one_mode_asked_for_is_the_one_that_is_driven(rig):
-    piece = next_segment(
+def test_only_the_requested_mode_is_driven(rig):
+    segment = next_segment(
         ESTIMATE, np.zeros(1000), [parse_target("frequency", "3:0.01%")], rig, 10.0
     )
-    power = np.abs(np.fft.rfft(piece.angle_rad, 8000)) ** 2
+    power = np.abs(np.fft.rfft(segment.angle_rad, 8000)) ** 2
     hz = np.fft.rfftfreq(8000, 1 / RATE_HZ)
     assert power[np.abs(hz - 44.8) < 4].sum() > 0.5 * power.sum()
 
 
-def test_a_mode_that_has_to_be_driven_is_driven_whatever_else_tells_more(rig, scanned):
+def test_required_mode_is_driven_first(rig, scanned):
     def driven(*through):
         name = next_segment(ESTIMATE, scanned, DAMPING, rig, 3.0, through=through).name
         return set(name.partition(",")[0].split())
@@ -162,7 +164,7 @@ def test_a_mode_that_has_to_be_driven_is_driven_whatever_else_tells_more(rig, sc
         assert number in driven(int(number))
 
 
-def test_nothing_asked_and_nothing_to_drive_are_refused(rig, scanned):
+def test_no_target_and_no_mode_are_refused(rig, scanned):
     with pytest.raises(ExcitationError, match="No precision is requested"):
         next_segment(ESTIMATE, scanned, [], rig, 10.0)
     stiff = replace(ESTIMATE, plant=replace(ESTIMATE.plant, beam=Beam(0.1, 4.7e-3, 0.090275)))

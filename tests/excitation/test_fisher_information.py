@@ -45,12 +45,12 @@ def scan():
     """Sweep over all modes whose beginning and end are smooth: nothing lies beyond the band."""
     t = np.arange(9000) / RATE_HZ
     phase = 2 * np.pi * (0.5 * t + 0.5 * (46.0 - 0.5) * t**2 / 8.0)
-    # Mode 3 rings down in the record's last second: a fit leaves out what its filter reaches.
+    # Mode 3 rings down in the record's last second: a fit leaves out the reach of its filter.
     window = np.where(t < 8.0, np.minimum(1.0, 12.0 * np.sin(np.pi * t / 8.0)) ** 4, 0.0)
     return 0.02 * window * np.sin(phase)
 
 
-def test_it_is_the_gram_matrix_of_finite_differences():
+def test_information_is_the_gram_matrix_of_differences():
     angle = scan()
     steps = dict.fromkeys(UNIFORM, 1e-5) | {"delay_s": 1e-7, "tool_inertia_kg_m2": 1e-9}
     rows = np.array(
@@ -73,7 +73,7 @@ def test_it_is_the_gram_matrix_of_finite_differences():
     )
 
 
-def test_a_steady_sine_tells_of_the_stiffness_in_closed_form():
+def test_information_of_a_sine_on_stiffness_in_closed_form():
     """Far from the modes: half the squared amplitude over the noise's density, per second."""
     alone = replace(ESTIMATE, names=("bending_stiffness_n_m2",))
     alone = replace(alone, plant=replace(alone.plant, delay_s=0.0))
@@ -81,7 +81,7 @@ def test_a_steady_sine_tells_of_the_stiffness_in_closed_form():
     ramp = np.minimum(1.0, t / 5.0)
     angle = 0.02 * ramp * np.sin(2 * np.pi * 8.0 * t)
     s = 2j * np.pi * 8.0
-    # The stiffness, at the same density over stiffness, scales what the beam does.
+    # The stiffness, at the same density over stiffness, scales the torque.
     size = abs(transfer(np.array([s]), alone.plant.beam, alone.plant.damping)[0]) * 0.02
     per_s = size**2 / alone.noise_nm2_per_hz[0]
     longer, shorter = (
@@ -91,7 +91,7 @@ def test_a_steady_sine_tells_of_the_stiffness_in_closed_form():
 
 
 @pytest.mark.fit
-def test_it_predicts_what_a_fit_states():
+def test_predicted_uncertainty_is_that_of_a_fit():
     angle = scan()
     torque = moved(angle, ESTIMATE)
     noise = np.random.default_rng(5).normal(scale=NOISE_NM, size=torque.size)
@@ -104,7 +104,7 @@ def test_it_predicts_what_a_fit_states():
         assert spread == pytest.approx(np.sqrt(predicted[place, place]), rel=0.25), name
 
 
-def test_twice_the_noise_tells_a_quarter():
+def test_twice_the_noise_gives_a_quarter_of_information():
     angle = scan()
     loud = replace(ESTIMATE, noise_nm2_per_hz=4.0 * ESTIMATE.noise_nm2_per_hz)
     np.testing.assert_allclose(
@@ -145,6 +145,6 @@ def test_an_estimate_is_read_from_json():
         ({"delay_s": float("nan")}, "delay_s = nan"),
     ],
 )
-def test_an_estimate_of_no_use_is_refused(change, message):
+def test_unusable_estimate_is_refused(change, message):
     with pytest.raises(ExcitationError, match=message):
         BeamEstimate.from_dict({**DOCUMENT, **change})

@@ -1,4 +1,4 @@
-"""Narrow sweeps: joints, bands, duration, limits, and what the split of the time is worth."""
+"""Narrow sweeps: joints, bands, duration, limits, and the benefit of the split of the time."""
 
 import json
 from dataclasses import replace
@@ -42,7 +42,7 @@ def made(make):
     return make()
 
 
-def test_it_takes_the_time_asked_for_to_the_tick(made):
+def test_duration_is_the_requested_one_to_the_tick(made):
     assert made.segments == {
         "rest": (0, 2000),
         "sweep": (2000, 33_234),
@@ -54,7 +54,7 @@ def test_it_takes_the_time_asked_for_to_the_tick(made):
     assert abs(made.reference_rad[-1]) < 1e-6
 
 
-def test_angle_and_speed_are_zero_at_the_joints_and_jump_nowhere(made):
+def test_angle_and_speed_are_continuous_and_zero_at_joints(made):
     rows = bands_of(made)
     joints = 2000 + np.round(1000 * np.cumsum([0.0, *(row[3] for row in rows)])).astype(int)
     speed = np.diff(made.reference_rad) * 1000
@@ -67,7 +67,7 @@ def test_angle_and_speed_are_zero_at_the_joints_and_jump_nowhere(made):
     assert np.abs(np.diff(speed)).max() < 1.05 * 2 * np.pi * highest_hz / 1000 * fastest
 
 
-def test_each_sweep_covers_its_band_and_little_else(document):
+def test_each_sweep_covers_only_its_band(document):
     made = excitation.modes(rate_hz=1000.0, path=document(), duration_s=90.0, widths=3.0)
     frequency_hz = np.fft.rfftfreq(30_000, 1e-3)
     first = 1000
@@ -86,7 +86,7 @@ def test_each_sweep_covers_its_band_and_little_else(document):
         first += ticks
 
 
-def test_a_band_is_half_power_widths_and_the_uncertainty_to_either_side():
+def test_band_has_half_power_widths_and_uncertainty():
     band = Band.around_mode(FoundMode(16.0, 0.005, 0.1), widths=2.0)
     assert (band.start_hz, band.stop_hz) == pytest.approx((16 - 0.42, 16 + 0.42))
     assert band.decay_s == pytest.approx(1 / (2 * np.pi * 16 * 0.005))
@@ -94,7 +94,7 @@ def test_a_band_is_half_power_widths_and_the_uncertainty_to_either_side():
     assert 0 < heavy.start_hz < heavy.stop_hz
 
 
-def test_what_rings_longest_comes_first_and_modes_above_are_left_out(document):
+def test_longest_ringing_mode_comes_first(document):
     made = excitation.modes(rate_hz=1000.0, path=document(), stop_hz=20.0)
     assert [row[0] < mode < row[1] for row, mode in zip(bands_of(made), (2.57, 16.01), strict=True)]
     assert len(bands_of(made)) == 2
@@ -103,7 +103,7 @@ def test_what_rings_longest_comes_first_and_modes_above_are_left_out(document):
 
 
 @pytest.mark.parametrize("amplitude_rad", [further(0.025), 0.3])
-def test_the_planning_lets_the_amplitudes_through(document, profile, amplitude_rad):
+def test_amplitudes_pass_the_planning(document, profile, amplitude_rad):
     options = {"path": document(), "amplitude_rad": amplitude_rad, "duration_s": 24.0}
     made = excitation_for(profile, "modes", options)
     plan = plan_session(profile, made)
@@ -115,7 +115,7 @@ def test_the_planning_lets_the_amplitudes_through(document, profile, amplitude_r
         assert peak > 0.8
 
 
-def test_a_tighter_limit_lowers_the_amplitude_of_the_band_that_reaches_it(document, profile):
+def test_tighter_limit_lowers_the_affected_amplitude(document, profile):
     # Behind the motor loop the angle is small at the third mode, and the error the whole amplitude.
     limits = replace(profile.limits, tracking_error_rad=0.02)
     profile, tight = (with_tip_slope(replace(profile, limits=each), 10.0) for each in
@@ -129,7 +129,7 @@ def test_a_tighter_limit_lowers_the_amplitude_of_the_band_that_reaches_it(docume
 
 
 @pytest.mark.parametrize("limit_rad", [further(None), 0.05, further(0.4)])
-def test_the_amplitudes_keep_the_limit_of_the_tip_s_slope(document, profile, limit_rad):
+def test_amplitudes_stay_within_the_tip_slope(document, profile, limit_rad):
     """Each of the three sweeps comes as near to it as it may."""
     rig = with_tip_slope(profile, limit_rad)
     options = {"path": document(), "duration_s": 24.0}
@@ -140,7 +140,7 @@ def test_the_amplitudes_keep_the_limit_of_the_tip_s_slope(document, profile, lim
     assert 0.8 * limit_rad < plan.prediction.tip.slope_rad <= 0.91 * limit_rad
 
 
-def test_the_split_is_the_best_there_is(rig):
+def test_split_of_the_time_is_optimal(rig):
     """Against all splits of a grid, by the information computed in another way."""
     modes = [
         FoundMode(2.57, 0.0091, 0.0),
@@ -180,7 +180,7 @@ def test_the_split_is_the_best_there_is(rig):
     assert spread(shares) < spread([1 / 3] * 3) - 0.3
 
 
-def test_damping_that_gives_the_modes_their_ratios():
+def test_damping_reproduces_the_ratios_of_modes():
     omega = 2 * np.pi * np.array([2.57, 16.01, 44.8])
     for zeta, gamma in ((5.4e-5, 0.02), (5.4e-5, 0.0), (0.0, 0.03)):
         ratio = 0.5 * (zeta * omega + gamma / (LINK.density_over_stiffness * omega))
@@ -192,7 +192,7 @@ def test_damping_that_gives_the_modes_their_ratios():
 
 
 @pytest.mark.parametrize("count", [1, further(2)])
-def test_few_modes_get_a_session_too(document, rig, count):
+def test_few_modes_are_enough_for_a_session(document, rig, count):
     modes = [{"frequency_hz": f, "damping_ratio": 0.005} for f in (2.6, 16.0)][:count]
     rows = bands_of(
         excitation.modes(rate_hz=1000.0, path=document(modes), duration_s=40.0, rig=rig)
@@ -234,7 +234,7 @@ def test_absurd_options_are_refused(document, options, words):
     assert all(word in str(refused.value) for word in words), str(refused.value)
 
 
-def test_without_a_rig_the_bands_get_equal_times_and_the_full_amplitude(document):
+def test_bands_without_a_rig_get_equal_times(document):
     made = make_excitation("modes", {"path": document(), "amplitude_rad": 0.04}, 1000.0)
     assert {(row[2], row[3]) for row in bands_of(made)} == {(0.04, 40.0)}
     assert KINDS["modes"] is excitation.modes

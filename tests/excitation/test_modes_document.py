@@ -1,4 +1,4 @@
-"""The modes' document: what is read of it, and what is said of one that is not as it should be."""
+"""The modes' document: values that are read, and messages on invalid ones."""
 
 import json
 import os
@@ -25,7 +25,7 @@ def test_modes_come_lowest_first_with_two_deviations(document):
     assert read_modes(path) == (FoundMode(2.58, 0.009, 0.0), FoundMode(16.0, 0.004, 0.02))
 
 
-def test_several_fits_of_a_mode_are_one_and_one_bad_fit_moves_nothing(document):
+def test_one_bad_fit_of_a_mode_has_no_effect(document):
     frequencies = [16.0, 16.01, 16.02, 16.03, 17.2]
     ratios = [0.004, 0.005, 0.0045, 0.005, 0.04]
     entries = [
@@ -37,7 +37,7 @@ def test_several_fits_of_a_mode_are_one_and_one_bad_fit_moves_nothing(document):
     assert mode.uncertainty_hz == pytest.approx(2 * 1.4826 * 0.01, rel=1e-6)
 
 
-def test_whole_record_fits_go_before_the_others(document):
+def test_whole_record_fits_are_preferred(document):
     entries = [
         {"frequency_hz": 16.5, "damping_ratio": 0.02, "estimator": "welch"},
         {"frequency_hz": 16.0, "damping_ratio": 0.004, "estimator": "record"},
@@ -45,7 +45,7 @@ def test_whole_record_fits_go_before_the_others(document):
     assert read_modes(document(entries)) == (FoundMode(16.0, 0.004, 0.0),)
 
 
-def test_modes_of_the_modal_model_go_before_those_of_fits(document):
+def test_modes_of_the_modal_model_are_preferred(document):
     """Which are of beams, and may be off by more than the width of a mode."""
     reported = {
         "frequency_hz": {"value": 16.3, "std": 0.01, "flag": None},
@@ -64,7 +64,7 @@ def test_modes_of_the_modal_model_go_before_those_of_fits(document):
         read_modes(path)
 
 
-def test_modes_that_a_fit_does_not_have_are_passed_over(document):
+def test_modes_missing_from_a_fit_are_skipped(document):
     entries = [
         {"frequency_hz": None, "damping_ratio": None},
         {"frequency_hz": 0.0, "damping_ratio": 1.3},
@@ -99,7 +99,7 @@ def test_modes_that_a_fit_does_not_have_are_passed_over(document):
         ),
     ],
 )
-def test_a_bad_value_is_named_with_its_remedy(document, modes, words):
+def test_bad_value_is_reported_with_its_remedy(document, modes, words):
     path = document(modes)
     with pytest.raises(ExcitationError) as refused:
         read_modes(path)
@@ -121,7 +121,7 @@ def test_a_bad_value_is_named_with_its_remedy(document, modes, words):
         (b'{"modes": [{"frequency_hz": ' + b"9" * 5000 + b"}]}", ("JSON",)),
     ],
 )
-def test_a_file_that_is_no_such_document_is_refused(tmp_path, content, words):
+def test_other_document_is_refused(tmp_path, content, words):
     path = tmp_path / "fits.json"
     path.write_bytes(content)
     with pytest.raises(ExcitationError) as refused:
@@ -130,7 +130,7 @@ def test_a_file_that_is_no_such_document_is_refused(tmp_path, content, words):
     assert all(word in str(refused.value) for word in words), str(refused.value)
 
 
-def test_what_is_no_plain_file_is_refused(tmp_path):
+def test_special_file_is_refused(tmp_path):
     with pytest.raises(ExcitationError, match="cannot be read"):
         read_modes(tmp_path / "nothing.json")
     with pytest.raises(ExcitationError, match=r"cannot be read|not a file"):
@@ -142,7 +142,7 @@ def test_what_is_no_plain_file_is_refused(tmp_path):
 
 @pytest.mark.process
 @pytest.mark.further  # its plan is tested below
-def test_a_session_is_run_and_says_what_it_did(document, tmp_path):
+def test_session_runs_and_reports_its_excitation(document, tmp_path):
     command = [sys.executable, "-m", "rigd", "run", "modes", str(document()), "--fast", "--json"]
     command += ["--duration", "14", "--ring-down", "1", "--output", str(tmp_path)]
     done = warm_start.run(command, capture_output=True, text=True, timeout=300, check=False)
@@ -155,21 +155,21 @@ def test_a_session_is_run_and_says_what_it_did(document, tmp_path):
     assert metadata["duration_s"] == "14.0"
 
 
-def test_the_command_refuses_in_one_sentence(rigd_here, tmp_path):
+def test_command_refuses_in_one_sentence(rigd_here, tmp_path):
     done = rigd_here("run", "modes", tmp_path / "no.json", "--fast")
     assert done.returncode == 2
     assert "no.json: cannot be read" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_the_daemon_takes_the_options_and_no_rig(document):
-    def asked(**parameters):
+def test_daemon_takes_options_without_a_rig(document):
+    def parsed_request(**parameters):
         request = {"command": "start", "excitation": "modes", "parameters": parameters}
         return parse_request(json.dumps(request).encode())
 
     path = document()
-    assert asked(path=str(path), widths=2).parameters == {"path": path, "widths": 2.0}
+    assert parsed_request(path=str(path), widths=2).parameters == {"path": path, "widths": 2.0}
     with pytest.raises(RequestError, match=r"rig.* is not a parameter of modes.*amplitude_rad"):
-        asked(path=str(path), rig="/dev/null")
+        parsed_request(path=str(path), rig="/dev/null")
     with pytest.raises(RequestError, match=r"parameters\.path is missing"):
-        asked()
+        parsed_request()

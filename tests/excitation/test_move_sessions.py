@@ -1,4 +1,4 @@
-"""Moves as sessions: what they refuse, the identified beam, and one through the real engine."""
+"""Moves as sessions: refusals, the identified beam, and one through the real engine."""
 
 import json
 from dataclasses import replace
@@ -49,7 +49,7 @@ def test_the_move_is_planned_for_the_beam_of_the_analysis(analysed, profile):
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         ({}, "either angle_rad or by_rad"),
         ({"angle_rad": 0.1, "by_rad": 0.1}, "either angle_rad or by_rad"),
@@ -61,12 +61,12 @@ def test_the_move_is_planned_for_the_beam_of_the_analysis(analysed, profile):
         ({"angle_rad": 0.1, "robust": 2}, "neither 0 nor 1"),
     ],
 )
-def test_a_move_that_cannot_be_is_refused(profile, options, says):
-    with pytest.raises(ExcitationError, match=says):
+def test_impossible_move_is_refused(profile, options, message):
+    with pytest.raises(ExcitationError, match=message):
         excitation_for(profile, "move", options, start_rad=0.2)
 
 
-def test_a_move_knows_where_it_starts(profile):
+def test_move_starts_at_the_current_angle(profile):
     made = excitation_for(profile, "move", {"by_rad": -0.4}, start_rad=1.2)
     assert made.stays
     assert made.kind == "move"
@@ -81,7 +81,7 @@ def test_a_move_knows_where_it_starts(profile):
         move(rate_hz=1000.0, angle_rad=0.1)
 
 
-def test_a_move_is_run_once(profile, tmp_path):
+def test_move_runs_once(profile, tmp_path):
     made = excitation_for(profile, "move", {"by_rad": -0.4}, start_rad=1.2)
     with pytest.raises(RefusedError, match="--repeat 2"):
         Series(profile, made, tmp_path, repeat=2)
@@ -89,7 +89,7 @@ def test_a_move_is_run_once(profile, tmp_path):
 
 @pytest.mark.process
 @pytest.mark.further  # as with an identified tip mass
-def test_a_move_through_the_engine_leaves_nothing_that_rings(rigd, tmp_path):
+def test_move_through_the_engine_leaves_no_vibration(rigd, tmp_path):
     """Friction, noise and quantisation included, against the quintic of the same time."""
     options = ("--fast", "--seed", "1", "--json", "--ring-down", "3", "--output", tmp_path)
     done = rigd("run", "move", "-0.5", *options)
@@ -118,8 +118,8 @@ def amplitude_nm(samples, first, hz):
 
 
 @pytest.mark.process
-def test_a_move_with_an_identified_tip_mass_leaves_what_its_plan_states(rigd, analysed, tmp_path):
-    """The rig has 0.3 g at its tip, of which its profile knows nothing and the model does."""
+def test_residual_vibration_with_tip_mass_is_as_planned(rigd, analysed, tmp_path):
+    """The rig has 0.3 g at its tip, which the model contains but not the profile."""
     heavy = write_profile(tmp_path, {"simulation.tip_mass_kg": 3e-4})
     model = analysed(tip_mass_kg={"value": 3e-4, "std": 2e-6})
     done = rigd(
@@ -145,17 +145,15 @@ def test_a_move_with_an_identified_tip_mass_leaves_what_its_plan_states(rigd, an
 
 
 @pytest.mark.parametrize(
-    ("kind", "effect", "says"),
+    ("kind", "effect", "message"),
     [
         ("move", "clock_rate_difference", "clocks of different rates, which a move does not"),
         ("touch", "tip_mass_kg", "a mass at the tip, which a search for touches does not"),
     ],
 )
-def test_a_model_with_an_effect_that_its_use_does_not_take_is_refused(
-    profile, analysed, kind, effect, says
-):
+def test_model_with_an_unsupported_effect_is_refused(profile, analysed, kind, effect, message):
     path = analysed(**{effect: {"value": 1e-4}})
-    with pytest.raises(IdentifiedBeamError, match=says) as refused:
+    with pytest.raises(IdentifiedBeamError, match=message) as refused:
         excitation_for(profile, kind, {"angle_rad": 0.5, "path": path})
     assert f"headlines[0].parameters.{effect}.value = 0.0001" in str(refused.value)
 
@@ -166,7 +164,7 @@ OFFSETS = {"stiffness_offset_2": {"value": -0.1}, "stiffness_offset_3": {"value"
 
 
 @pytest.mark.parametrize("effect", [TIP_MASS, COMPLIANCE, OFFSETS])
-def test_the_poles_of_a_move_are_those_of_the_beam_as_identified(profile, analysed, effect):
+def test_poles_of_a_move_are_those_of_the_identified_beam(profile, analysed, effect):
     plant = RigPreview(profile).move_plant(analysed(**effect), MOVE)
     assert plant.model is not None
     locked = plant.model.plant.poles(clamped_free_eigenvalues(3))[:, 0]
@@ -174,7 +172,7 @@ def test_the_poles_of_a_move_are_those_of_the_beam_as_identified(profile, analys
 
 
 @pytest.mark.parametrize("effect", [further(TIP_MASS), further(COMPLIANCE), OFFSETS])
-def test_a_move_of_the_beam_as_identified_leaves_nothing(profile, analysed, effect):
+def test_move_of_the_identified_beam_leaves_no_vibration(profile, analysed, effect):
     plant = RigPreview(profile).move_plant(analysed(**effect), MOVE)
     made = excitation_for(profile, "move", {"by_rad": 0.1, "path": analysed(**effect)})
     path = made.reference_rad[slice(made.segments["sweep"][0] - 1, made.segments["sweep"][1])]
@@ -184,7 +182,7 @@ def test_a_move_of_the_beam_as_identified_leaves_nothing(profile, analysed, effe
     assert plan.prediction.tip is not None
 
 
-def test_a_plan_says_when_a_wrong_frequency_would_leave_more(profile):
+def test_plan_warns_of_sensitivity_to_frequency(profile):
     """The frequencies of a profile's beam are uncertain by 1 %."""
     made = excitation_for(profile, "move", {"by_rad": 0.8})
     off_nm = float(made.parameters["frequency_residual_nm"])
@@ -193,7 +191,7 @@ def test_a_plan_says_when_a_wrong_frequency_would_leave_more(profile):
     assert f"{1e3 * off_nm:.2g} mN·m if the beam's frequencies are wrong" in words
 
 
-def test_a_quiet_sensor_shows_what_friction_leaves(profile):
+def test_quiet_sensor_shows_vibration_by_friction(profile):
     """The vibration is stated in numbers where the sensor shows it, and grows with the friction."""
     left = []
     for coulomb_nm in (0.03, 0.09):
@@ -215,7 +213,7 @@ def test_a_quiet_sensor_shows_what_friction_leaves(profile):
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         ({"angle_rad": 0.2}, r"angle_rad = 0\.2 rad is where the motor stands"),
         ({"angle_rad": 0.5, "speed_rad_s": 0.0}, r"speed_rad_s = 0 rad/s must be more than 0"),
@@ -223,6 +221,6 @@ def test_a_quiet_sensor_shows_what_friction_leaves(profile):
         ({"angle_rad": 0.5, "passes": 0}, r"passes = 0 must be at least 1"),
     ],
 )
-def test_a_search_for_obstacles_that_cannot_be_is_refused(profile, options, says):
-    with pytest.raises(ExcitationError, match=says):
+def test_impossible_search_for_obstacles_is_refused(profile, options, message):
+    with pytest.raises(ExcitationError, match=message):
         excitation_for(profile, "touch", options, start_rad=0.2)

@@ -1,4 +1,4 @@
-"""Moves: what they leave in the modes, judged by the exact model; limits, and braking."""
+"""Moves: residual vibration by the exact model; limits, and braking."""
 
 from dataclasses import replace
 
@@ -56,7 +56,7 @@ def vibration_nm(torque_nm):
     return 0.5 * np.ptp(torque_nm - np.polyval(np.polyfit(t, torque_nm, 3), t))
 
 
-def test_the_torque_of_a_mode_is_what_the_exact_model_rings_with(plant, ring_down_nm):
+def test_torque_of_a_mode_matches_the_exact_model(plant, ring_down_nm):
     """The predicted amplitude against the exact model's, for a quintic that excites mode 1."""
     path = 0.5 * quintic(0.2, RATE_HZ)
     state = modal_state(np.concatenate([[0.0], path]), RATE_HZ, plant.poles_rad_s)
@@ -66,7 +66,7 @@ def test_the_torque_of_a_mode_is_what_the_exact_model_rings_with(plant, ring_dow
 
 
 @pytest.mark.parametrize("duration_s", [0.5, 0.8, 2.0])
-def test_a_still_path_ends_at_1_and_leaves_nothing(plant, ring_down_nm, duration_s):
+def test_vibration_free_path_ends_at_1(plant, ring_down_nm, duration_s):
     path = vibration_free_path(duration_s, RATE_HZ, plant.poles_rad_s)
     assert path.size == duration_s * RATE_HZ
     assert path[-1] == pytest.approx(1.0, abs=1e-12)
@@ -77,19 +77,19 @@ def test_a_still_path_ends_at_1_and_leaves_nothing(plant, ring_down_nm, duration
         assert left < 0.1 * vibration_nm(ring_down_nm(0.1 * quintic(duration_s, RATE_HZ)))
 
 
-def test_a_still_path_that_is_too_short_is_the_quintic(plant):
+def test_too_short_path_is_the_quintic(plant):
     path = vibration_free_path(0.1, RATE_HZ, plant.poles_rad_s)
     assert np.array_equal(path, quintic(0.1, RATE_HZ))
 
 
 @pytest.mark.parametrize("distance_rad", [further(0.1), -0.5, further(1.2)])
-def test_the_shortest_move_leaves_no_vibration_and_keeps_the_limits(
+def test_shortest_move_leaves_no_vibration_within_limits(
     plant, profile, ring_down_nm, distance_rad
 ):
     move = shortest_move(plant, distance_rad)
     usual = distance_rad * quintic(move.duration_s, RATE_HZ)
     assert move.reference_rad[-1] == pytest.approx(distance_rad, rel=1e-9)
-    # What the exact model leaves is the memory of the fractional damping.
+    # The residual of the exact model is the memory of the fractional damping.
     assert vibration_nm(ring_down_nm(move.reference_rad)) < 0.02 * vibration_nm(ring_down_nm(usual))
     held = np.full(200, distance_rad)
     response = close_loop(profile.loop_model()).simulate(
@@ -115,7 +115,7 @@ def test_the_shortest_move_is_not_much_slower_than_the_bound(plant, plain):
     assert search._least_limit_fraction(round(0.95 * plain.reference_rad.size))[0] > 1.0
 
 
-def test_a_robust_move_bears_frequencies_that_are_wrong(plant, plain, profile, ring_down_nm):
+def test_robust_move_tolerates_frequency_errors(plant, plain, profile, ring_down_nm):
     beam = replace(
         profile.rig.beam,
         bending_stiffness_n_m2=profile.rig.beam.bending_stiffness_n_m2 * 1.02,
@@ -132,7 +132,7 @@ def test_a_robust_move_bears_frequencies_that_are_wrong(plant, plain, profile, r
 
 
 @pytest.mark.parametrize("robust", [False, further(True)])
-def test_a_move_takes_out_what_rings_at_its_start(plant, ring_down_nm, robust):
+def test_move_removes_initial_vibration(plant, ring_down_nm, robust):
     before = 0.1 * quintic(0.15, RATE_HZ)
     ringing = modal_state(np.concatenate([[0.0], before]), RATE_HZ, plant.poles_rad_s)
     move = shortest_move(plant, 0.5, robust=robust, ringing=ringing)
@@ -171,7 +171,7 @@ def test_a_move_stays_within_the_angle(plant, monkeypatch):
         shortest_move(replace(plant, velocity_rad_s=0.1), 1.0)
 
 
-def test_a_slew_goes_at_its_speed_without_vibration(plant, ring_down_nm):
+def test_slew_has_its_speed_without_vibration(plant, ring_down_nm):
     path = slew(
         -0.8, speed_rad_s=1.0, acceleration_rad_s2=20.0, rate_hz=RATE_HZ,
         poles_rad_s=plant.poles_rad_s,
@@ -214,7 +214,7 @@ def test_a_braking_path_continues_angle_speed_and_acceleration():
     assert braking.duration_s == 0.2
 
 
-def test_braking_keeps_the_torque_from_everywhere_on_a_slew(plant, profile):
+def test_braking_respects_the_torque_anywhere_on_a_slew(plant, profile):
     path = slew(
         3.0,
         speed_rad_s=12.0,
@@ -243,7 +243,7 @@ def test_braking_keeps_the_torque_from_everywhere_on_a_slew(plant, profile):
     assert peak_nm(gentle) <= 1.02 * limit_nm / 2 < peak_nm(braking)
 
 
-def test_what_cannot_be_braked_is_said(plant):
+def test_error_if_motion_cannot_be_braked(plant):
     path = np.linspace(0.0, 50.0, 1000)
     with pytest.raises(ExcitationError, match=r"motor\.peak_torque_nm"):
         shortest_braking(replace(plant, peak_torque_nm=0.04), path)

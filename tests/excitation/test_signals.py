@@ -21,7 +21,7 @@ from rigd.excitation import (
 )
 
 
-def test_the_papers_chirp_to_the_last_bit():
+def test_chirp_of_the_paper_to_the_last_bit():
     excitation = chirp(rate_hz=1000.0)
     reference = excitation.reference_rad
     assert reference.shape == (136_000,)
@@ -41,7 +41,7 @@ def test_the_papers_chirp_to_the_last_bit():
         reference[0] = 1.0
 
 
-def test_chirp_has_the_frequencies_it_says():
+def test_chirp_has_its_stated_frequencies():
     reference = chirp(
         rate_hz=1000.0, start_hz=2.0, stop_hz=20.0, duration_s=30.0, rest_s=0.0, ring_down_s=0.0
     ).reference_rad
@@ -51,7 +51,7 @@ def test_chirp_has_the_frequencies_it_says():
     np.testing.assert_allclose(frequency_hz, 2.0 + 18.0 * at_s / 30.0, rtol=0.05)
 
 
-def test_there_and_back_is_the_chirp_and_its_frequencies_backwards():
+def test_double_chirp_returns_through_its_frequencies():
     options = {"rate_hz": 1000.0, "start_hz": 2.0, "stop_hz": 20.0, "duration_s": 30.0}
     plain, both = chirp(**options), chirp(**options, there_and_back=1)
     assert plain.parameters | {"there_and_back": 1} == both.parameters
@@ -71,7 +71,7 @@ def test_there_and_back_is_the_chirp_and_its_frequencies_backwards():
 
 @pytest.mark.parametrize("duration_s", [10.0, 9.9871, 3.33333])
 def test_angle_and_speed_are_continuous_where_the_sweep_turns(duration_s):
-    """Whatever the phase there: differences of ticks stay those of a sine of the stop frequency."""
+    """For any phase there: differences of ticks stay those of a sine of the stop frequency."""
     excitation = chirp(rate_hz=1000.0, duration_s=duration_s, there_and_back=1)
     turn = excitation.segments["back"][0]
     around = excitation.reference_rad[turn - 100 : turn + 100]
@@ -87,7 +87,7 @@ def test_angle_and_speed_are_continuous_where_the_sweep_turns(duration_s):
      ({"there_and_back": 1, "duration_s": 2000.0}, "4016 s; 4000 s is the most"),
      ({"there_and_back": 1, "duration_s": 10.0, "taper_s": 11.0}, "duration_s = 20 s")],
 )  # fmt: skip
-def test_what_does_not_go_there_and_back_is_refused(options, words):
+def test_unsupported_double_sweep_is_refused(options, words):
     with pytest.raises(ExcitationError, match=words):
         chirp(rate_hz=1000.0, **options)
 
@@ -158,7 +158,7 @@ def test_csv_with_times_is_interpolated(tmp_path):
 
 
 @pytest.mark.parametrize("heading", ["", "angle_rad\n", "\ufeffangle_rad\r\n"])
-def test_csv_of_one_column_is_one_angle_a_tick(tmp_path, heading):
+def test_csv_of_one_column_is_one_angle_per_tick(tmp_path, heading):
     path = tmp_path / "angles.csv"
     path.write_text(heading + "0.0\n0.1\n0.3\n", encoding="utf-8")
     excitation = from_csv(path, rate_hz=1000.0, rest_s=0.0, ring_down_s=0.0)
@@ -208,7 +208,7 @@ def test_bad_csv_files_are_refused_with_their_line(tmp_path, text, complaint):
         ("# time_s angle_rad\n0 0\n0.1 0.5\n", "utf-8-sig"),
     ],
 )
-def test_other_separators_heads_and_encodings_are_read(tmp_path, text, encoding):
+def test_other_separators_headers_and_encodings_are_read(tmp_path, text, encoding):
     path = tmp_path / "path.csv"
     path.write_bytes(text.encode(encoding))
     excitation = from_csv(path, rate_hz=100.0, rest_s=0.0, ring_down_s=0.0)
@@ -238,7 +238,7 @@ def test_only_plain_files_are_read(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", None])
-def test_files_that_cannot_be_read_are_named(tmp_path, content):
+def test_unreadable_files_are_named(tmp_path, content):
     path = tmp_path / "bad.csv"
     if content is not None:
         path.write_bytes(content)

@@ -1,4 +1,4 @@
-"""What is asked: texts of options, and their standard deviations by the delta method."""
+"""Targets: texts of options, and their standard deviations by the delta method."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from rigd.excitation.targets import Quantities, Target, parse_target
 
 
 @pytest.mark.parametrize(
-    ("quantity", "text", "target", "told"),
+    ("quantity", "text", "target", "printed"),
     [
         ("damping", "1%", Target("damping", 0.01, True), "damping to 1 %"),
         ("damping", "2:0.5%", Target("damping", 0.005, True, 2), "damping of mode 2 to 0.5 %"),
@@ -23,9 +23,9 @@ from rigd.excitation.targets import Quantities, Target, parse_target
         ("alpha", "0.01", Target("alpha", 0.01, False), "alpha to 0.01"),
     ],
 )
-def test_an_option_is_read(quantity, text, target, told):
+def test_an_option_is_read(quantity, text, target, printed):
     assert parse_target(quantity, text) == target
-    assert told is None or str(target) == told
+    assert printed is None or str(target) == printed
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_an_option_is_read(quantity, text, target, told):
         ("frequency", "1:0.1mHz", "a number in Hz"),
     ],
 )
-def test_another_text_is_refused_with_a_remedy(quantity, text, message):
+def test_invalid_text_is_refused_with_a_remedy(quantity, text, message):
     with pytest.raises(ExcitationError, match=message) as refused:
         parse_target(quantity, text)
     assert "\n" not in str(refused.value)
@@ -62,7 +62,7 @@ def test_another_text_is_refused_with_a_remedy(quantity, text, message):
         ("density_over_stiffness", 1e-6),
     ],
 )
-def test_a_mode_moves_as_the_model_says(name, step):
+def test_derivatives_of_modes_match_the_model(name, step):
     """Derivatives of damping ratio and frequency, against differences of the model's own modes."""
     place, value = UNIFORM.index(name), ESTIMATE.values[name]
 
@@ -79,9 +79,9 @@ def test_a_mode_moves_as_the_model_says(name, step):
         assert mode.frequency_derivative_hz[place] == pytest.approx(hz, rel=1e-4, abs=1e-6)
 
 
-def test_every_mode_in_the_band_is_asked_for_unless_one_is_named():
-    asked = [parse_target("damping", "1%"), parse_target("frequency", "2:0.1%")]
-    quantities = Quantities.linearised([*asked, parse_target("zeta", "5%")], ESTIMATE)
+def test_target_holds_for_all_modes_by_default():
+    targets = [parse_target("damping", "1%"), parse_target("frequency", "2:0.1%")]
+    quantities = Quantities.linearised([*targets, parse_target("zeta", "5%")], ESTIMATE)
     names = [each.target.name for each in quantities.items]
     assert names == [*(f"damping of mode {n}" for n in (1, 2, 3)), "frequency of mode 2", "zeta"]
     covariance = np.diag(np.full(len(UNIFORM), 1e-4))
@@ -91,7 +91,7 @@ def test_every_mode_in_the_band_is_asked_for_unless_one_is_named():
     np.testing.assert_allclose(quantities.ratios(covariance), [each.ratio for each in found])
 
 
-def test_a_share_of_nothing_is_impossible():
+def test_relative_target_of_zero_is_impossible():
     none = replace(
         ESTIMATE,
         plant=replace(ESTIMATE.plant, damping=Damping()),

@@ -1,4 +1,4 @@
-"""Drag on a beam solved apart from the package's own way: speeds in closed form, steps in time.
+"""Drag on a beam, solved independently of the package: speeds in closed form, steps in time.
 
 The speeds that the motor makes come from the boundary value problem along the beam, frequency by
 frequency; the modes' equations under the force are integrated by Runge and Kutta's method.

@@ -32,7 +32,7 @@ PLANTS = {
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """What the instruments would give, without noise."""
+    """Signals of ideal instruments, without noise."""
 
     angle_rad: NDArray[np.float64]
     torque_nm: NDArray[np.float64]
@@ -75,16 +75,16 @@ class Session:
 
 
 def beyond_uniform(s, beam, damping, offsets):
-    """Modes 2, 3, … with another stiffness in place of their own."""
+    """Modes 2, 3, … with another stiffness instead of their own."""
     p = beam.density_kg_per_m * s**2
     p = p + damping.gamma * beam.bending_stiffness_n_m2 * s**damping.lambda_
     q = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
     shares = participation(beam, 1 + len(offsets))[1:]
     of_modes = (clamped_free_eigenvalues(1 + len(offsets))[1:] / beam.length_m) ** 4
     more = 0
-    for share, k, offset in zip(shares, of_modes, offsets, strict=True):
+    for fraction, k, offset in zip(shares, of_modes, offsets, strict=True):
         loose = k * (1 + offset)
-        more = more + share * p * q * (loose / (q * loose + p) - k / (q * k + p))
+        more = more + fraction * p * q * (loose / (q * loose + p) - k / (q * k + p))
     return more
 
 
@@ -131,7 +131,7 @@ def session(
 ) -> Session:
     """One second of rest, 0.05-50 Hz, 10 s of ring-down; if shaken, 5 s of that before.
 
-    With `multisine`, 391 lines from 1 to 40 Hz in place of the sweep.
+    With `multisine`, 391 lines from 1 to 40 Hz instead of the sweep.
     """
     before = 5.0 if shaken else 0.0
     t = np.arange(round((before + sweep_s + 11) * RATE_HZ)) / RATE_HZ - before - 1
@@ -170,7 +170,7 @@ def moved_unseen():
 
 @pytest.fixture(scope="session")
 def references():
-    """Angle asked for in a session, at a number of ticks from its start."""
+    """Requested angle of a session, at a number of ticks from its start."""
 
     def reference(n: int, multisine: bool = False) -> NDArray[np.float64]:
         t = np.arange(n) / RATE_HZ - 1
@@ -212,8 +212,8 @@ def link():
 def step(name, amplitude_rad, delay_s=0.0, rest_s=1.0, held_s=10.0):
     """Step of the motor, held until the record ends."""
     t = np.arange(round((rest_s + held_s) * RATE_HZ)) / RATE_HZ - rest_s
-    asked_rad = np.where(t >= 0, amplitude_rad, 0.0)
-    return response(asked_rad, PLANTS[name], LINK, delay_s, 0.0, ())
+    requested_rad = np.where(t >= 0, amplitude_rad, 0.0)
+    return response(requested_rad, PLANTS[name], LINK, delay_s, 0.0, ())
 
 
 @pytest.fixture(scope="session")
@@ -224,7 +224,7 @@ def steps():
 
 @cache
 def extra_torque(name, rise, sweep_s=SWEEP_S):
-    """What mode 1 of plant `name` (damping of order 1) adds when its stiffness rises by `rise`.
+    """Additional torque of mode 1 of plant `name` (damping of order 1), stiffer by `rise`.
 
     Runge and Kutta's method on the mode's equation of motion, in y = r + angle:
     ``rho/EI y'' + gamma y' + k (r + zeta r' + rise r³ / R²) = 0``.
@@ -259,8 +259,8 @@ def extra_torque(name, rise, sweep_s=SWEEP_S):
         return forces, np.abs(deflections).max()
 
     linear, largest = run(0.0)
-    share = float(participation(beam, 1)[0]) * beam.bending_stiffness_n_m2
-    return -share * (run(rise / largest**2)[0] - linear)
+    fraction = float(participation(beam, 1)[0]) * beam.bending_stiffness_n_m2
+    return -fraction * (run(rise / largest**2)[0] - linear)
 
 
 @pytest.fixture(scope="session")

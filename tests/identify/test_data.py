@@ -30,7 +30,7 @@ RECORD = SimpleNamespace(
 )
 
 
-def test_a_record_is_taken_over():
+def test_record_is_read():
     measurement = Measurement.from_record(RECORD)
     assert measurement.name == "session.mcap"
     assert measurement.delay_s == pytest.approx(3e-4)  # by how much the torque is older
@@ -56,9 +56,9 @@ def counts_used(counts, reference_rad):
 
 def test_an_encoder_between_two_counts_at_rest_is_at_the_edge():
     counts = np.repeat([0, 5, 5, 6, 5, 6, 5, 6, 6, 6], 30)
-    settled = counts.astype(float)
-    settled[90:210] = 5.5
-    assert counts_used(counts, np.zeros(300)) == pytest.approx(settled)
+    expected = counts.astype(float)
+    expected[90:210] = 5.5
+    assert counts_used(counts, np.zeros(300)) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -75,13 +75,13 @@ def test_an_encoder_that_shows_motion_is_read_as_it_is(pattern, reference_rad):
     assert counts_used(counts, reference_rad) == pytest.approx(counts)
 
 
-def test_a_motor_that_was_held_excites_nothing():
+def test_held_motor_excites_nothing():
     held = SimpleNamespace(**vars(RECORD) | {"metadata": {"excitation": "hold"}})
     with pytest.raises(MeasurementError, match="the motor was held"):
         Measurement.from_record(held)
 
 
-def test_its_masks_and_its_first_angle():
+def test_masks_and_first_angle():
     known = np.arange(300) % 10 != 3
     masks = {"angle_known": known, "torque_known": known}
     measurement = Measurement.from_record(

@@ -1,4 +1,4 @@
-"""Drag of the air: found where it is, with nothing false beside it; not looked for elsewhere."""
+"""Drag of the air: found where it exists, with no false finding; not searched for elsewhere."""
 
 from dataclasses import replace
 
@@ -41,8 +41,8 @@ def refitted(uniform):
     return found.with_leading_candidate(found.freest)
 
 
-@pytest.mark.further  # of what the tests below show in parts
-def test_drag_is_named_and_nothing_else(braked):
+@pytest.mark.further  # together what the tests below show in parts
+def test_only_drag_is_reported(braked):
     verdict = select(braked.measured(noise_nm=NOISE_NM, seed=61)).verdict
     assert (verdict.structure, verdict.adequate) == ("III", True)
     (found,) = verdict.findings
@@ -59,13 +59,13 @@ def test_drag_leaves_noise_only(uniform, refitted):
     assert sorted(names) == sorted(STRUCTURES)
 
 
-def test_drag_is_as_large_as_it_is(refitted):
+def test_size_of_drag_is_right(refitted):
     drag = refitted.drag
     assert abs(drag.value_m - DRAG_M) < 3 * drag.std_m
     assert drag.std_m < 0.04 * DRAG_M
 
 
-def test_the_beam_beside_the_drag_is_that_without_air(refitted, plants, link):
+def test_beam_parameters_with_drag_are_right(refitted, plants, link):
     fit, damping = refitted.freest.fit, plants["III"]
     truth = {
         "zeta": damping.zeta,
@@ -80,7 +80,7 @@ def test_the_beam_beside_the_drag_is_that_without_air(refitted, plants, link):
         assert abs(value - middle) < 3 / 1.96 * half, name
 
 
-def test_without_drag_nothing_is_fitted_for_it(sessions, candidates_of):
+def test_drag_is_not_fitted_without_air(sessions, candidates_of):
     measured = sessions("VI").measured(noise_nm=NOISE_NM, seed=62)
     field = candidates_of(measured)
     assert refit_with_air_drag(field) is field
@@ -95,20 +95,20 @@ def test_damping_grows_with_the_amplitude(refitted, link):
     assert large[0] > ratios[0]
     assert ratios[0] == refitted.best.fit.modes[0].damping_ratio
     # By 4/(3 pi) rho_air/2 C_D d A kappa / rho, with kappa = 0.739 of a clamped beam's first mode.
-    share = 4 / (3 * 3.14159) * 0.6 * DRAG_M * 0.739 / link.density_kg_per_m
-    wanted = rows[-1].tip_amplitude_m * share
+    fraction = 4 / (3 * 3.14159) * 0.6 * DRAG_M * 0.739 / link.density_kg_per_m
+    wanted = rows[-1].tip_amplitude_m * fraction
     assert ratios[-1] - ratios[0] == pytest.approx(wanted, abs=3 * rows[-1].std + 0.02 * wanted)
 
 
 @pytest.mark.further  # with external damping it is above
-def test_drag_without_external_damping_is_as_large_as_it_is():
+def test_size_of_drag_without_external_damping_is_right():
     """Where that vanishes, with an order at its edge, each step promises more than it saves."""
     wire = Drag(replace(RIGS["III"], gamma=0.0), 2e-3, 0.0125, cylinder=True)
     (made,) = drags([wire], [9523])
-    told = select(made.measurement()).headline
-    drag, speed_m_s = told.parameters["drag"], told.drag_speed_m_s
+    headline = select(made.measurement()).headline
+    drag, speed_m_s = headline.parameters["drag"], headline.drag_speed_m_s
     assert abs(drag.value - wire.true_m(speed_m_s)) < 3.5 * drag.std
-    for mode, ratio in zip(told.modes, wire.rig.damping_ratios.tolist(), strict=True):
+    for mode, ratio in zip(headline.modes, wire.rig.damping_ratios.tolist(), strict=True):
         assert abs(mode.damping_ratio.value - ratio) < 3.5 * mode.damping_ratio.std
 
 
@@ -117,7 +117,7 @@ def test_drag_without_external_damping_is_as_large_as_it_is():
 
 @pytest.mark.parametrize("mode", [1, 2])
 @pytest.mark.parametrize(("number", "power"), [(0, 2.0), (1, 4 / 3)])
-def test_the_air_takes_as_much_as_linear_damping_of_that_ratio(mode, number, power):
+def test_air_dissipates_as_equivalent_linear_damping(mode, number, power):
     omega, amplitude, density = 16.0, 0.05, 4.7e-3
     x = (np.arange(2000) + 0.5) / 2000
     turn = 2 * np.pi * (np.arange(720) + 0.5) / 720
@@ -129,5 +129,5 @@ def test_the_air_takes_as_much_as_linear_damping_of_that_ratio(mode, number, pow
     assert taken == pytest.approx(linear, rel=1e-3)
 
 
-def test_at_rest_the_air_takes_nothing():
+def test_air_dissipates_nothing_at_rest():
     assert damping_ratio_by_drag_law(1, 16.0, 0.0, 4.7e-3) == pytest.approx([0.0, 0.0])

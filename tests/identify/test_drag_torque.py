@@ -26,10 +26,13 @@ def swept(duration_s, stop_hz, amplitude_rad=0.025, rest_s=1.0, after_s=3.0):
     n = round((rest_s + duration_s + after_s) * RATE_HZ)
     t = np.arange(n) / RATE_HZ - rest_s
     phase = 2 * np.pi * (0.05 * t + (stop_hz - 0.05) * t**2 / (2 * duration_s))
-    asked = np.where((t >= 0) & (t < duration_s), amplitude_rad * np.sin(phase), 0.0)
+    reference_rad = np.where((t >= 0) & (t < duration_s), amplitude_rad * np.sin(phase), 0.0)
     decay = np.exp(-6 * np.arange(n) / n)
     s = 6 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(2 * n, 1 / RATE_HZ)
-    return np.fft.irfft(np.fft.rfft(asked * decay, 2 * n) / (1 + s / 80) ** 2, 2 * n)[:n] / decay
+    return (
+        np.fft.irfft(np.fft.rfft(reference_rad * decay, 2 * n) / (1 + s / 80) ** 2, 2 * n)[:n]
+        / decay
+    )
 
 
 def compared(angle_rad):
@@ -49,7 +52,7 @@ def deviation(one, other):
 
 
 @pytest.mark.parametrize("law", [further(DragLaw(2.3e-3)), WHITE])
-def test_the_torque_is_that_of_steps_in_time(brake, law):
+def test_torque_agrees_with_time_stepping(brake, law):
     angle_rad = swept(8.0, 20.0)
     damping = Damping(zeta=5.4e-5, alpha=1.0, gamma=0.02, lambda_=1.0)
     comparison = compared(angle_rad)
@@ -65,7 +68,7 @@ def test_the_torque_is_that_of_steps_in_time(brake, law):
 
 @pytest.mark.further  # another law and record than above
 def test_a_rod_in_air_halves_the_peaks_of_the_papers_chirp():
-    """The rod that stiffness and density say, without other external damping."""
+    """The rod of this stiffness and density, without other external damping."""
     comparison = compared(swept(120.0, 50.0, after_s=15.0))
     plant = Plant(LINK, Damping(zeta=5.4e-5, alpha=1.0, gamma=0.0, lambda_=1.0))
     linear = comparison.prediction.torque(plant)[0]
@@ -114,8 +117,10 @@ def test_derivatives_by_the_beam_go_through_its_poles(short, name, value, step, 
     poles = [p.mode_poles(3, ()) for p in plants]
     foreseen = np.zeros(above.size)
     for one, other in zip(*poles, strict=True):
-        apart = one.at_rad_s - other.at_rad_s
-        foreseen += np.array([apart.real, apart.imag]) @ here.pole_derivatives[one.mode]
+        distance_rad_s = one.at_rad_s - other.at_rad_s
+        foreseen += (
+            np.array([distance_rad_s.real, distance_rad_s.imag]) @ here.pole_derivatives[one.mode]
+        )
     if name == "gamma":
         foreseen += 2 * step * here.external_derivatives[:, 1].sum(axis=0)
     if name == "density":
@@ -138,7 +143,7 @@ def test_a_small_drag_is_the_first_order(short):
         (plant(gamma=5e-4), plant(gamma=0.0)),
     ],
 )
-def test_the_torque_that_was_taken_out_comes_back_beside_the_beam(short, here, there):
+def test_removed_torque_returns_with_another_beam(short, here, there):
     """A fit's residual with another beam than that of the drag, against recomputed drag."""
     torque_nm = short.prediction.torque(there)[0]
     torque_nm = torque_nm + response(short, there).torque(LAW).torque_nm[short.retained]
@@ -154,19 +159,19 @@ def test_the_torque_that_was_taken_out_comes_back_beside_the_beam(short, here, t
     assert np.linalg.norm(linear + taken + change - truth) < 0.05 * moved
 
 
-def test_a_filter_of_the_torque_filters_that_of_the_drag():
+def test_filter_applies_to_drag_torque():
     comparison = compared(swept(6.0, 20.0))
     plant = Plant(LINK, Damping(zeta=7.1e-5, alpha=1.0, gamma=5.5e-2, lambda_=1.0))
     law, constant_s = DragLaw(2.3e-3), 3e-3
-    bare, filtered = (
+    unfiltered, filtered = (
         comparison.spectrum(response(comparison, each).torque(law).torque_nm[comparison.retained])
         for each in (plant, replace(plant, filter_time_constant_s=constant_s))
     )
     divisor = 1 + 2j * np.pi * comparison.frequency_hz * constant_s
-    assert deviation(filtered, bare / divisor) < 2e-2
+    assert deviation(filtered, unfiltered / divisor) < 2e-2
 
 
-def test_drag_that_cannot_be_followed_is_given_up():
+def test_drag_that_does_not_converge_is_abandoned():
     """Without a warning: they are errors here."""
     comparison = compared(swept(6.0, 20.0))
     light = replace(LINK, density_kg_per_m=1e-7, bending_stiffness_n_m2=1e-6)
@@ -205,7 +210,7 @@ def test_the_torque_has_the_measured_phase_of_each_mode(short):
     assert lag_rad(lambda _: without_external_damping) == pytest.approx(-0.24, abs=0.02)
 
 
-def test_modes_beyond_those_that_drag_moves_are_left_out(short):
+def test_modes_that_drag_does_not_move_are_left_out(short):
     soft_beam = replace(LINK, bending_stiffness_n_m2=0.004)
     soft = Plant(soft_beam, Damping(zeta=7e-5, alpha=1.0))
     poles = {pole.mode: pole.at_rad_s for pole in soft.mode_poles(7, ())}

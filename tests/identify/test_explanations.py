@@ -1,6 +1,6 @@
-"""Causes of modes that are no uniform beam's: named with their sizes, from constants made apart.
+"""Causes of modes of a nonuniform beam: reported with their sizes, from independent constants.
 
-The constants are those of finite elements, which share nothing with the analyzer's shapes.
+The constants are those of finite elements, which are independent of the analyzer's shapes.
 """
 
 import math
@@ -29,7 +29,7 @@ ELEMENTS = 32
 
 @dataclass
 class Elements:
-    """Beam of Hermite elements on a hub that is held, with what differs from a uniform one."""
+    """Beam of Hermite elements on a locked hub, with deviations from a uniform one."""
 
     density: tuple = (1.0, 1.0)  # factors of the inner and the outer half
     stiffness: tuple = (1.0, 1.0)
@@ -206,7 +206,7 @@ TILT = 9.81 * math.sin(math.radians(2))
         pytest.param("relaxation", Elements(relaxation=(0.03, 0.01)), 0.03, 0.1, id="relaxation"),
     ],
 )
-def test_cause_is_named_with_its_size(name, beam, size, within):
+def test_cause_is_reported_with_its_size(name, beam, size, within):
     fit = fitted(beam.constants())
     assert uniform_beam_test(fit, NOMINAL).status == "refused"
     found = {each.name: each for each in explanations(uniform_beam_test(fit, NOMINAL))}
@@ -230,7 +230,7 @@ def test_cause_is_named_with_its_size(name, beam, size, within):
         ("sensor resonance", second_order(200.0, 20.0), 200.0),
     ],
 )
-def test_instrument_is_named_with_its_frequency(plain, name, channel, hz):
+def test_instrument_is_reported_with_its_frequency(plain, name, channel, hz):
     fit = fitted(through(plain, channel))
     found = {each.name: each for each in explanations(uniform_beam_test(fit, NOMINAL))}
     assert found[name].size == pytest.approx(hz, rel=0.1)
@@ -248,14 +248,14 @@ def test_rig_with_the_cause_predicts_the_modes():
     assert min(np.abs(each).max() for each in off) < 4
 
 
-def test_what_is_weighed_is_part_of_the_plain_beam():
+def test_weighed_tip_mass_belongs_to_the_plain_beam():
     fit = fitted(Elements(masses=((ELEMENTS, 3e-4),)).constants())
     assert uniform_beam_test(fit, NOMINAL).status == "refused"
     assert uniform_beam_test(fit, replace(NOMINAL, tip_mass_kg=3e-4)).status == "passed"
     assert uniform_beam_test(fit, replace(NOMINAL, tip_mass_kg=1e-4)).status == "refused"
 
 
-def test_tilt_that_is_measured_is_part_of_the_plain_beam():
+def test_measured_tilt_belongs_to_the_plain_beam():
     fit = fitted(Elements(gravity_m_s2=TILT, masses=((ELEMENTS, 1e-4),)).constants())
     weighed = replace(NOMINAL, tip_mass_kg=1e-4)
     assert uniform_beam_test(fit, weighed).status == "refused"
@@ -264,7 +264,7 @@ def test_tilt_that_is_measured_is_part_of_the_plain_beam():
 
 
 @pytest.mark.further
-def test_tilt_is_found_beside_a_weighed_mass():
+def test_tilt_is_found_with_a_weighed_mass():
     fit = fitted(Elements(gravity_m_s2=TILT, masses=((ELEMENTS, 1e-4),)).constants())
     weighed = replace(NOMINAL, tip_mass_kg=1e-4)
     (tilt,) = (
@@ -273,40 +273,40 @@ def test_tilt_is_found_beside_a_weighed_mass():
     assert tilt.size == pytest.approx(2.0, rel=0.1)
 
 
-def test_no_simple_cause_is_named_for_modes_of_nothing_on_the_list(plain):
+def test_unlisted_causes_are_not_reported(plain):
     moved = plain.copy()
     moved[4] += 0.1  # mode 2 alone, by a tenth
     fit = fitted(moved)
     assert explanations(uniform_beam_test(fit, NOMINAL)) == ()
-    said = finding(uniform_beam_test(fit, NOMINAL), ())
-    assert "None of the simple causes" in said.sentence
-    assert (said.kind, said.value, said.interval) == ("rival explanations", None, None)
+    report = finding(uniform_beam_test(fit, NOMINAL), ())
+    assert "None of the simple causes" in report.sentence
+    assert (report.kind, report.value, report.interval) == ("rival explanations", None, None)
 
 
-def test_causes_are_named_and_never_facts():
+def test_causes_are_reported_and_never_facts():
     fit = fitted(Elements(gravity_m_s2=TILT).constants())
     test = uniform_beam_test(fit, NOMINAL)
     found = explanations(test)
     assert 2 <= len(found) <= 5
     assert {each.name: each.size for each in found}["tilt"] == pytest.approx(2.0, rel=0.1)
     assert [each.p_value for each in found] == sorted((e.p_value for e in found), reverse=True)
-    said = finding(test, found, StiffnessStep(25.0, 70.2, -0.0021))
-    assert (said.kind, said.value, said.interval) == ("rival explanations", None, None)
-    assert "an axis 2° off plumb (the tip at rest lower than the axis)" in said.sentence
-    assert "a step of the stiffness by about -0.2 % near 70 s" in said.sentence
-    assert "None is established by this record" in said.sentence
+    report = finding(test, found, StiffnessStep(25.0, 70.2, -0.0021))
+    assert (report.kind, report.value, report.interval) == ("rival explanations", None, None)
+    assert "an axis 2° off plumb (the tip at rest lower than the axis)" in report.sentence
+    assert "a step of the stiffness by about -0.2 % near 70 s" in report.sentence
+    assert "None is established by this record" in report.sentence
     assert "step of" not in finding(test, found, StiffnessStep(13.0, 70.2, -0.0021)).sentence
     alone = finding(test, found[:1]).sentence
     assert "It is not established by this record" in alone
 
 
-def test_two_modes_leave_nothing_to_compare_causes_by():
+def test_two_modes_cannot_distinguish_causes():
     fit = fitted(Elements(gravity_m_s2=TILT).constants())
     two = replace(fit, numbers=(1, 2, 0))  # the third is of something else
     assert explanations(uniform_beam_test(two, NOMINAL)) == ()
 
 
-def test_losses_of_a_beam_that_is_not_uniform_have_a_tolerance():
+def test_losses_of_nonuniform_beam_have_a_tolerance():
     uneven = fitted(Elements(density=(1.0, 1.004)).constants())
     assert uniform_beam_test(uneven, NOMINAL).status == "refused"
     omega_rad_s = 2 * np.pi * 40.0
@@ -333,7 +333,7 @@ def test_losses_of_a_beam_that_is_not_uniform_have_a_tolerance():
         {"relaxation": (0.02, 0.01), "sensor_lag": (3e-4, 0.5)},
     ],
 )
-def test_derivatives_of_modal_constants_are_those_of_differences(plain, altered):
+def test_derivatives_of_modal_constants_match_differences(plain, altered):
     fit, rig = fitted(plain), replace(NOMINAL, filter_time_constant_s=2e-4, delay_s=1e-3)
     problem = UniformBeamProblem(fit, fit.visible, rig)
     terms = galerkin_mode_terms(Alteration(**altered), rig.beam, problem.modes)

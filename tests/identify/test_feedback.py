@@ -61,7 +61,7 @@ def deviates(found, name="tool_inertia_kg_m2", value=CLAMP):
     return (found.parameters[name] - value) / found.std[name]
 
 
-def test_what_follows_is_found_through_a_lag_and_noise():
+def test_coherent_part_is_found_through_lag_and_noise():
     n, rng = 20_000, np.random.default_rng(1)
     reference = rng.normal(size=n) * np.hanning(n)
     lag = np.exp(-np.arange(200) / 10.0)
@@ -71,12 +71,12 @@ def test_what_follows_is_found_through_a_lag_and_noise():
     assert np.std(found - follows) < 0.2 * noise.std()
 
 
-def test_an_angle_that_is_its_own_reference_follows_it_all():
+def test_angle_equal_to_reference_is_fully_coherent():
     angle = np.random.default_rng(2).normal(size=5000)
     assert reference_coherent_part(angle, angle, 125.0) == pytest.approx(angle, abs=1e-6)
 
 
-def test_nothing_follows_a_reference_that_stands_still():
+def test_no_part_is_coherent_with_constant_reference():
     assert not reference_coherent_part(np.ones(500), np.zeros(500), 125.0).any()
 
 
@@ -107,7 +107,7 @@ def test_a_reference_may_end_anywhere():
 
 
 @pytest.mark.fit
-def test_a_drift_does_not_keep_the_reference_from_being_followed(controlled):
+def test_drift_does_not_reduce_the_coherent_part(controlled):
     measured = controlled("III", 2)
     drift = np.linspace(0.0, 0.2, measured.angle_rad.size)
     comparison = Comparison.from_measurement(
@@ -117,7 +117,7 @@ def test_a_drift_does_not_keep_the_reference_from_being_followed(controlled):
 
 
 @pytest.mark.fit
-def test_unknown_torques_do_not_count_under_a_controller_either(controlled):
+def test_unknown_torques_do_not_count_with_a_controller(controlled):
     unknown = np.concatenate([np.arange(10_000, 10_050), np.arange(20_000, 30_000, 100)])
     every = fit(controlled("III", 5), "III")
     found = fit(controlled("III", 5, unknown_torque=unknown), "III")
@@ -127,7 +127,7 @@ def test_unknown_torques_do_not_count_under_a_controller_either(controlled):
 
 
 @pytest.mark.fit
-def test_a_reference_that_does_not_explain_the_angle_is_not_believed(sessions, references):
+def test_unrelated_reference_is_not_used(sessions, references):
     measured = sessions("III").measured()
     other = np.random.default_rng(0).normal(size=measured.angle_rad.size)
     comparison = Comparison.from_measurement(replace(measured, reference_rad=other), (0.0, 50.0))
@@ -140,7 +140,7 @@ def test_a_reference_that_does_not_explain_the_angle_is_not_believed(sessions, r
 
 @pytest.mark.fit
 @pytest.mark.further  # as a hum that moves the motor, and a multisine in test_hum.py
-def test_between_the_lines_of_a_multisine_there_is_noise_only(controlled, true_parameters):
+def test_only_noise_between_lines_of_a_multisine(controlled, true_parameters):
     """It moves the motor there too: no response, no hum, and no other structure."""
     measured = controlled("VI", 7, multisine=True)
     found = fit_record(measured, [STRUCTURES[name] for name in ("III", "VI", "VII")])
@@ -177,7 +177,7 @@ def in_narrow_bands():
             window = np.clip(np.sin(np.pi * (t - begins) / 5.0), 0.0, 1.0) ** 2
             window[(t < begins) | (t > begins + 5.0)] = 0.0
             reference += 0.008 * window * np.sin(pole.imag * (t - begins))
-    # A first look at all modes, too short to tell them from those of another beam.
+    # A first estimate of all modes, too short to distinguish them from those of another beam.
     sweep = np.sin(2 * np.pi * (0.5 * t + 5.0 * t**2)) * np.clip(np.sin(np.pi * t / 5.0), 0.0, 1.0)
     reference += 0.02 * np.where(t < 5.0, sweep, 0.0)
     s = 6.0 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(4 * n, 1 / RATE_HZ)
@@ -194,8 +194,8 @@ def in_narrow_bands():
 
 
 @pytest.mark.fit
-def test_a_first_wrong_beam_does_not_decide_what_followed_no_reference(in_narrow_bands):
-    """What rings turns the motor in far narrower bands than its following is smoothed over."""
+def test_wrong_first_beam_does_not_decide_the_incoherent_part(in_narrow_bands):
+    """Ringing modes turn the motor in much narrower bands than the smoothing of the estimate."""
     headline, _, _ = fit_freest_alone(in_narrow_bands, (0.0, 50.0))
     poles = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4).poles(clamped_free_eigenvalues(3))[:, 0]
     for mode, pole in zip(headline.modes, poles, strict=True):
@@ -206,7 +206,7 @@ def test_a_first_wrong_beam_does_not_decide_what_followed_no_reference(in_narrow
 
 
 @pytest.mark.fit
-def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
+def test_coherent_part_is_reestimated_after_a_wrong_beam(controlled):
     unknown = np.arange(15_000, 15_050)
     measured = controlled("III", 1, unknown_torque=unknown)
     comparison = Comparison.from_measurement(measured, (0.0, 50.0))
@@ -228,7 +228,7 @@ def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
 
 
 @pytest.mark.fit
-def test_what_rings_in_narrow_bands_is_followed_with_the_torque_it_makes(in_narrow_bands):
+def test_narrow_band_ringing_is_followed_with_its_torque(in_narrow_bands):
     loaded = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4)
     plant = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4)
     first = Comparison.from_measurement(in_narrow_bands, (0.0, 50.0)).use_reference_coherent_angle(
@@ -236,7 +236,9 @@ def test_what_rings_in_narrow_bands_is_followed_with_the_torque_it_makes(in_narr
     )
     noise = fit_record(in_narrow_bands, [STRUCTURES["III"]]).noise
     wrong = first.with_reestimated_angle(Plant(LINK, DAMPED), noise)
-    told = wrong.with_reestimated_angle(plant, noise)
+    reestimated = wrong.with_reestimated_angle(plant, noise)
     assert loaded.tip_mass_kg == plant.tip_mass_kg
-    rest, told_rest = (np.std(each.incoherent_rad[each.retained]) for each in (first, told))
-    assert told_rest < 0.2 * rest
+    first_std, reestimated_std = (
+        np.std(each.incoherent_rad[each.retained]) for each in (first, reestimated)
+    )
+    assert reestimated_std < 0.2 * first_std

@@ -1,4 +1,4 @@
-"""What is found is a fact only beside a model that explains the record."""
+"""A finding is a fact only with a model that explains the record."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from analysis.identify._model_check import mark_doubtful_findings
 
 
 @pytest.mark.parametrize(
-    ("sentence", "bare"),
+    ("sentence", "without_interval"),
     [
         (
             "The torque comes 0.3 ms later than the file says (0.28 to 0.32 ms; 95 %): a delay.",
@@ -23,20 +23,20 @@ from analysis.identify._model_check import mark_doubtful_findings
         ),
     ],
 )
-def test_a_doubted_finding_is_no_fact_and_has_no_interval(sentence, bare):
+def test_doubtful_finding_is_no_fact_and_has_no_interval(sentence, without_interval):
     found = with_doubt(Finding("delay", sentence, 1.0, (0.9, 1.1), "s", "Look."), "it rains")
-    assert found.sentence == f"Not established, because it rains: {bare}"
+    assert found.sentence == f"Not established, because it rains: {without_interval}"
     assert (found.value, found.interval, found.remedy) == (1.0, None, "Look.")
 
 
 @pytest.mark.parametrize("kind", sorted(MODEL_INDEPENDENT_KINDS))
-def test_what_is_seen_in_the_record_stays_a_fact(kind):
+def test_model_independent_finding_stays_a_fact(kind):
     found = Finding(kind, "It is there (1 to 2; 95 %).", 1.0, (1.0, 2.0), "1", "")
     assert with_doubt(found, "it rains") is found
 
 
 def test_a_finding_on_a_flagged_parameter_is_no_fact():
-    """What the headline flags is flagged in the findings as well, for the same reason."""
+    """Flags of the headline hold for the findings as well, for the same reason."""
     late, tool = (
         Finding(kind, "It is there (1 to 2; 95 %).", 1.0, (1.0, 2.0), parameters=(name,))
         for kind, name in (("delay", "delay_s"), ("tool inertia", "tool_inertia_kg_m2"))

@@ -25,7 +25,7 @@ def fit(measurement, name, **options):
 
 def assert_exact(found, expected, relative=1e-6):
     for name, value in expected.items():
-        absolute = 1e-4 * relative  # of what is nought: delay in s, inertia in kg m²
+        absolute = 1e-4 * relative  # for values of zero: delay in s, inertia in kg m²
         assert found.parameters[name] == pytest.approx(value, rel=relative, abs=absolute), name
 
 
@@ -36,14 +36,14 @@ def assert_within(found, expected, errors=4.0):
 
 
 @pytest.mark.parametrize("name", ["VI", further("III"), further("IV")])
-def test_without_noise_the_plant_itself(sessions, true_parameters, name):
+def test_exact_plant_without_noise(sessions, true_parameters, name):
     found = fit(sessions(name).measured(), name)
     assert_exact(found, true_parameters(name))
     assert found.parameters["tool_inertia_kg_m2"] == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("name", ["VI", further("III"), further("IV")])
-def test_without_noise_beam_delay_and_clamp_that_nobody_declared(sessions, true_parameters, name):
+def test_undeclared_beam_delay_and_clamp_without_noise(sessions, true_parameters, name):
     undeclared = {"beam": OTHER, "delay_s": 3e-4, "tool_inertia_kg_m2": 1e-5}
     found = fit(sessions(name, **undeclared).measured(), name)
     assert_exact(found, true_parameters(name, **undeclared))
@@ -51,7 +51,7 @@ def test_without_noise_beam_delay_and_clamp_that_nobody_declared(sessions, true_
 
 
 @pytest.mark.parametrize("name", ["VI", "III", further("IV")])
-def test_with_noise_within_its_own_error(sessions, true_parameters, name):
+def test_error_with_noise_is_within_its_std(sessions, true_parameters, name):
     undeclared = {"beam": OTHER, "delay_s": 3e-4, "tool_inertia_kg_m2": 1e-5}
     found = fit(sessions(name, **undeclared).measured(noise_nm=1e-2, seed=31), name)
     assert_within(found, true_parameters(name, **undeclared))
@@ -63,7 +63,7 @@ def test_with_noise_within_its_own_error(sessions, true_parameters, name):
     assert not found.ringing.is_significant
 
 
-def test_a_far_wrong_beam_is_found(sessions, true_parameters):
+def test_beam_far_from_its_data_is_found(sessions, true_parameters):
     nominal = Beam(0.98, 4.7e-3 * 0.85, 0.090275 * 1.1)
     found = fit(sessions("VI").measured(noise_nm=1e-2, seed=5, beam=nominal), "VI")
     assert_within(found, true_parameters("VI"))
@@ -78,7 +78,7 @@ def test_strong_damping_of_orders_far_from_1(sessions, true_parameters, plant):
     assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.06)
 
 
-def test_what_is_fixed_stays_and_more_is_known_of_the_rest(sessions):
+def test_fixed_parameters_stay_and_reduce_other_uncertainties(sessions):
     measurement = sessions("VI").measured(noise_nm=1e-2, seed=7)
     free = fit(measurement, "VI")
     fixed = fit(measurement, "VI", fixed=SETTINGS)
@@ -91,7 +91,7 @@ def test_what_is_fixed_stays_and_more_is_known_of_the_rest(sessions):
     assert one.std["delay_s"] == 0.0 < one.std["bending_stiffness_n_m2"]
 
 
-def test_errors_that_are_held_fixed_are_read_as_damping(sessions):
+def test_errors_of_fixed_parameters_appear_as_damping(sessions):
     wrong = sessions("VI", beam=OTHER, delay_s=3e-4).measured()
     found = fit(wrong, "VI", fixed=["density_over_stiffness"])
     assert abs(found.parameters["alpha"] - 0.996) > 0.1
@@ -130,7 +130,7 @@ def test_unknown_ticks_do_not_count(sessions, true_parameters):
     assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.05)
     assert found.degrees_of_freedom < every.degrees_of_freedom
     for name in ("zeta", "gamma"):
-        # The noise is estimated from what is known, to a hundredth.
+        # The noise is estimated from the known samples, to a hundredth.
         assert 0.98 * every.std[name] < found.std[name] < 1.5 * every.std[name]
 
 
@@ -152,7 +152,7 @@ def test_coloured_noise_is_whitened(sessions, true_parameters):
     assert np.mean(np.abs(high) ** 2) == pytest.approx(2.0, rel=0.2)
 
 
-def test_a_hum_is_named_and_moves_nothing(sessions):
+def test_hum_is_reported_without_bias(sessions):
     session = sessions("VI")
     t = np.arange(session.torque_nm.size) / 1000
     humming = type(session)(
@@ -194,7 +194,7 @@ def test_a_hum_is_no_ringing(sessions, name, hz, amplitude_nm):
 
 @pytest.mark.parametrize("seed", [further(4), 7, further(9)])
 @pytest.mark.further  # as a hum on the mode
-def test_a_railway_s_hum_beside_the_second_mode(sessions, seed):
+def test_hum_near_the_second_mode(sessions, seed):
     """Its skirts reach over the resonance, which lies at 16.03 Hz and is compared all the same."""
     session = sessions("IV")
     t = np.arange(session.torque_nm.size) / 1000
@@ -210,21 +210,21 @@ def test_a_railway_s_hum_beside_the_second_mode(sessions, seed):
 
 
 @pytest.mark.parametrize("seed", [0, 1, *map(further, range(2, 10))])
-def test_no_hum_is_found_where_there_is_none(sessions, seed):
-    """What a rough start leaves at a sharp mode once passed for one, and stayed unfitted."""
+def test_no_hum_is_found_without_one(sessions, seed):
+    """The residual of a rough start at a sharp mode once passed for a hum, and stayed unfitted."""
     session = sessions("IV", shaken=True).cut(5000)
     analysis = fit_record(session.measured(noise_nm=1e-2, seed=seed), [STRUCTURES["IV"]])
     assert analysis.lines == ()
     assert analysis.compared.all()
 
 
-def test_what_a_wrong_structure_leaves_is_no_hum(sessions):
+def test_residual_of_a_wrong_structure_is_no_hum(sessions):
     analysis = fit_record(sessions("VI").measured(noise_nm=1e-2, seed=9), [STRUCTURES["II"]])
     assert analysis.lines == ()
     assert analysis.fits[0].cost > 2 * analysis.fits[0].degrees_of_freedom
 
 
-def test_a_beam_that_is_not_uniform_passes_for_an_order_of_the_damping(sessions):
+def test_nonuniform_beam_appears_as_a_damping_order(sessions):
     session = sessions("III", offsets=(0.006, -0.013))
     as_if = fit(session.measured(noise_nm=1e-2, seed=17), "VI")
     assert abs(as_if.parameters["alpha"] - 1) > 10 * as_if.std["alpha"]
@@ -236,7 +236,7 @@ def all_seven(sessions):
     return {found.structure.name: found for found in fit_record(measurement).fits}
 
 
-def test_more_freedom_never_costs(all_seven):
+def test_more_freedom_never_increases_cost(all_seven):
     assert list(all_seven) == list(STRUCTURES)
     for wider, narrower in [
         ("III", "I"), ("III", "II"), ("IV", "I"), ("V", "II"), ("VII", "III"), ("VI", "VII"),
@@ -252,7 +252,7 @@ def test_the_wrong_structures_are_far_off(all_seven):
 
 
 @pytest.mark.parametrize("name", [further("IV"), further("V"), "VI", further("VII")])
-def test_no_descent_from_elsewhere_ends_lower(sessions, name):
+def test_other_starts_do_not_end_lower(sessions, name):
     measurement = sessions("VI").measured(noise_nm=1e-2, seed=9)
     analysis = fit_record(measurement, [STRUCTURES[name]])
     comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
@@ -281,20 +281,20 @@ def test_no_descent_from_elsewhere_ends_lower(sessions, name):
 )
 def test_a_wrong_structure_takes_few_evaluations(sessions, monkeypatch, plant, wrong):
     """By the whole record; with straight Gauss-Newton steps types IV and V took 50 to 100."""
-    asked = []
+    calls = []
     linearise = Objective._linearise
     monkeypatch.setattr(
-        Objective, "_linearise", lambda self, x: asked.append(1) or linearise(self, x)
+        Objective, "_linearise", lambda self, x: calls.append(1) or linearise(self, x)
     )
     measurement = sessions(plant).measured(noise_nm=1e-2, seed=1)
     for name in (plant, *wrong):
-        asked.clear()
+        calls.clear()
         fit(measurement, name)
-        assert len(asked) <= (12 if name == plant else 40), name
+        assert len(calls) <= (12 if name == plant else 40), name
 
 
 def test_a_tool_without_inertia(sessions):
-    """It cannot be negative: of the symmetric interval, what is possible."""
+    """It cannot be negative: the possible part of the symmetric interval."""
     session = sessions("III")
     resting = 0
     for seed in range(5):
@@ -311,7 +311,7 @@ def test_a_tool_without_inertia(sessions):
     assert 0 < low < 1e-5 < high
 
 
-def test_intervals_correlations_and_what_follows(all_seven, true_parameters):
+def test_intervals_correlations_and_derived_values(all_seven, true_parameters):
     found = all_seven["VI"]
     for name in found.determined:
         low, high = found.interval[name]
@@ -379,7 +379,7 @@ def test_too_much_unknown(sessions, spoil, message):
         fit(sessions("VI").measured(**spoil), "III")
 
 
-def test_what_moved_in_a_gap_of_the_angle_biases_nothing(sessions, moved_unseen, true_parameters):
+def test_motion_in_an_angle_gap_causes_no_bias(sessions, moved_unseen, true_parameters):
     gaps = ((9000, 9012), (15_000, 15_040), (25_000, 25_100))
     ticks = np.concatenate([np.arange(*gap) for gap in gaps])
     unseen = {"unknown_angle": ticks, "unknown_torque": ticks}
@@ -389,27 +389,27 @@ def test_what_moved_in_a_gap_of_the_angle_biases_nothing(sessions, moved_unseen,
     assert_within(found, true_parameters("VI"))
     counts = analysis.noise.is_compared
     assert whiteness(found.residual[counts], analysis.comparison.frequency_hz[counts]).is_white
-    # Nothing of what moved counts as noise.
+    # No motion counts as noise.
     at_rest = fit(sessions("VI").measured(noise_nm=5e-4, **unseen), "VI")
     for name in found.determined:
         assert found.std[name] == pytest.approx(at_rest.std[name], rel=0.1)
 
 
-def test_values_that_are_not_finite(sessions):
+def test_nonfinite_values_are_refused(sessions):
     measurement = sessions("VI").measured()
     measurement.torque_nm[70] = np.inf
     with pytest.raises(MeasurementError, match="torque is inf N·m at tick 70"):
         fit(measurement, "III")
 
 
-def test_nothing_moved(sessions):
+def test_standstill_is_refused(sessions):
     measurement = sessions("VI").measured()
     measurement.angle_rad[:] = 1.0
     with pytest.raises(MeasurementError, match="angle never changes"):
         fit(measurement, "III")
 
 
-def test_too_short_or_no_band(sessions):
+def test_too_short_record_or_band_is_refused(sessions):
     session = sessions("VI")
     with pytest.raises(MeasurementError, match=r"0\.9 s of record are too short"):
         fit(session.cut(1000, 1900).measured(), "III")
@@ -420,7 +420,7 @@ def test_too_short_or_no_band(sessions):
             fit(session.measured(), "III", band_hz=band)
 
 
-def test_lengths_that_differ(sessions):
+def test_different_lengths_are_refused(sessions):
     session = sessions("VI")
     whole, part = session.measured(), session.cut(0, 40_000).measured()
     mixed = type(whole)(
@@ -431,6 +431,6 @@ def test_lengths_that_differ(sessions):
         fit(mixed, "III")
 
 
-def test_no_such_setting(sessions):
+def test_unknown_setting_is_refused(sessions):
     with pytest.raises(ValueError, match="'mass'"):
         fit(sessions("VI").measured(), "III", fixed=["mass"])

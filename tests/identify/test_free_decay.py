@@ -27,7 +27,7 @@ def test_poles_and_their_derivatives(damping):
     assert [pole.at_rad_s for pole in found] == pytest.approx(flat)
     for i, name in enumerate(NAMES):
         if damping is OVER_DAMPED and name in ("alpha", "lambda"):
-            continue  # beside order 1 the real poles are no longer such
+            continue  # for orders other than 1 the real poles become complex
         step = np.zeros(6)
         step[i] = 1e-6 * (abs(values[i]) or 1.0)
         after, before = (at(values + s).mode_poles(3, ()) for s in (step, -step))
@@ -118,7 +118,7 @@ def test_no_mode_no_column():
         Plant(BEAM, FRACTIONAL, tip_mass_kg=1e-12),
     ],
 )
-def test_where_the_poles_are_expected_changes_none_of_them(plant):
+def test_expected_poles_do_not_change_the_result(plant):
     found = plant.mode_poles(3, ("zeta",))
     first, second, third = (pole.at_rad_s for pole in found)
     expectations = {

@@ -18,7 +18,7 @@ ALPHA = LikelihoodProfile(
 
 @dataclass(frozen=True)
 class Fitted:
-    """What is asked of a candidate here."""
+    """The properties of a candidate that are used here."""
 
     name: str
     bic: float
@@ -31,19 +31,19 @@ class Fitted:
         object.__setattr__(self, "structure", STRUCTURES[self.name])
 
 
-def test_the_first_flag_stays():
+def test_first_flag_is_retained():
     number = Estimate(0.98, 0.01, (0.96, 1.0))
     assert number.with_flag(None) is number
-    told = number.with_flag(ORDER_NOT_DETERMINED_REASON).with_flag(
+    flagged = number.with_flag(ORDER_NOT_DETERMINED_REASON).with_flag(
         "part of the record is unexplained"
     )
-    assert told.flag == ORDER_NOT_DETERMINED_REASON
-    assert (told.value, told.std, told.interval_95) == (0.98, 0.01, (0.96, 1.0))
+    assert flagged.flag == ORDER_NOT_DETERMINED_REASON
+    assert (flagged.value, flagged.std, flagged.interval_95) == (0.98, 0.01, (0.96, 1.0))
 
 
 @pytest.mark.fit
 @pytest.mark.parametrize(("doubt", "status"), [(None, "fractional"), ("it rains", "open")])
-def test_a_doubt_leaves_an_order_open(candidates, doubt, status):
+def test_doubtful_order_is_undecided(candidates, doubt, status):
     found = order_verdict(
         candidates(Fitted("VI", 0.0, -71.0)), ALPHA, (1, 2, 3), doubt_reason=doubt
     )
@@ -51,7 +51,7 @@ def test_a_doubt_leaves_an_order_open(candidates, doubt, status):
 
 
 @pytest.mark.fit
-def test_what_fixes_an_order_that_is_excluded_is_excluded_with_it(candidates):
+def test_structures_with_an_excluded_order_are_excluded(candidates):
     """By all that it lacks, type III would still do: two orders at once may cost more than one."""
     rig = candidates(Fitted("VI", 0.0, -71.0), Fitted("III", -1.0, -58.0, parameters=6))
     assert dict(structures(rig, frozenset()))["III"] == "compatible"

@@ -1,6 +1,6 @@
-"""Hum on a sharp mode: told from the beam's own doing by lasting, and taken out of the fit.
+"""Hum on a sharp mode: distinguished from the beam's motion by its duration, and removed.
 
-Over 12 other seeds, with 3 mN·m on the mode and 50 mN·m 0.1 Hz beside it, the largest errors were
+Over 12 other seeds, with 3 mN·m on the mode and 50 mN·m 0.1 Hz from it, the largest errors were
 6.6e-4 Hz (2e-3 allowed), 0.26 mN·m (0.3), 0.63 standard deviations of a parameter (1), and 0.047 of
 the cost over its degrees of freedom (0.1).
 """
@@ -43,7 +43,7 @@ def quiet(sessions):
 
 @pytest.mark.parametrize("offset_hz", [0.0, further(0.1), further(0.4)])
 @pytest.mark.parametrize("amplitude_nm", [3e-3, further(5e-2)])
-def test_a_hum_on_a_mode_is_found_and_moves_nothing(sessions, quiet, offset_hz, amplitude_nm):
+def test_hum_on_a_mode_is_found_without_bias(sessions, quiet, offset_hz, amplitude_nm):
     hz = MODE_2_HZ + offset_hz
     analysis = analysed(humming(sessions("VI"), hz, amplitude_nm))
     (found,), (line,) = analysis.fits, analysis.lines
@@ -57,7 +57,7 @@ def test_a_hum_on_a_mode_is_found_and_moves_nothing(sessions, quiet, offset_hz, 
 
 
 def test_the_hum_s_amplitude_counts_as_unknown(sessions, quiet):
-    """Standard deviations grow by what the hum hides of the resonance, and by no more."""
+    """Standard deviations grow by the part of the resonance that the hum hides, and by no more."""
     found = analysed(humming(sessions("VI"), MODE_2_HZ, 0.01)).fits[0]
     assert found.degrees_of_freedom == quiet.degrees_of_freedom - 4
     ratio = found.std["density_over_stiffness"] / quiet.std["density_over_stiffness"]
@@ -80,7 +80,7 @@ def test_a_hum_while_the_beam_rings(sessions):
     assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_mode_that_a_fit_has_beyond_the_band(sessions):
+def test_fitted_mode_beyond_the_band(sessions):
     comparison = Comparison.from_measurement(
         sessions("VI").measured(noise_nm=NOISE_NM, seed=21), (0.0, 50.0)
     )
@@ -94,8 +94,8 @@ def test_a_mode_that_a_fit_has_beyond_the_band(sessions):
 
 @pytest.mark.parametrize("structure", ["II", further("VI")])
 @pytest.mark.parametrize("plant", ["VI", further("III"), further("IV")])
-def test_what_a_model_leaves_of_a_multisine_is_no_hum(sessions, plant, structure):
-    """The beam is driven all the time: what a wrong model leaves is as steady as a hum."""
+def test_residual_of_a_multisine_is_no_hum(sessions, plant, structure):
+    """The beam is driven all the time: the residual of a wrong model is as steady as a hum."""
     assert analysed(sessions(plant, multisine=True), structure).lines == ()
 
 
@@ -106,7 +106,7 @@ def test_a_burst_at_a_mode_is_no_hum(sessions):
     assert analysed(with_torque(session, burst)).comparison.hum == ()
 
 
-def test_what_rings_down_slowly_is_no_hum(sessions):
+def test_slow_ring_down_is_no_hum(sessions):
     """As mode 1 of plant IV does, in 57 s, for a model that has it ring down in 2."""
     session = sessions("VI")
     t = np.arange(session.torque_nm.size) / 1000

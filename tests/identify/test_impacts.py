@@ -1,4 +1,4 @@
-"""A knock on the beam is named with its instant, and biases nothing; forces by the exact model."""
+"""An impact on the beam is reported with its time, without bias; forces by the exact model."""
 
 from dataclasses import replace
 from functools import cache
@@ -17,7 +17,7 @@ BAND_HZ = (0.0, 50.0)
 
 
 def struck(session, plants, link, force_n, at_s, duration_s=0.02, x_m=0.6):
-    """Add what half a sine of force does to the torque of the root."""
+    """Add the response of the root torque to half a sine of force."""
     n = session.torque_nm.size
     t = np.arange(n) / RATE_HZ
     decay = np.exp(-5.0 * np.arange(n) / n)
@@ -36,7 +36,7 @@ def plain(sessions):
 
 
 @pytest.fixture(scope="module")
-def knocked(sessions, plants, link):
+def struck_session(sessions, plants, link):
     def make(force_n, at_s, sweep_s=30, **more):
         return struck(sessions("III", sweep_s=sweep_s), plants, link, force_n, at_s, **more)
 
@@ -44,17 +44,17 @@ def knocked(sessions, plants, link):
 
 
 @pytest.fixture(scope="module")
-def analysed(knocked):
+def analysed(struck_session):
     @cache
     def of(force_n, at_s, duration_s, sweep_s):
-        made = knocked(force_n, at_s, sweep_s, duration_s=duration_s)
+        made = struck_session(force_n, at_s, sweep_s, duration_s=duration_s)
         measurement = made.measured(NOISE_NM, 1)
         return fit_freest_alone(measurement, BAND_HZ)
 
     return of
 
 
-def told(headline, plants, link):
+def largest_deviation(headline, plants, link):
     """Largest deviation of modes from the truth, in their own standard deviations."""
     true = modes(link, plants["III"], 3)
     return max(
@@ -76,7 +76,7 @@ def told(headline, plants, link):
         further(0.3, 40.0, 0.3, 60),
     ],
 )
-def test_a_knock_is_named_with_its_instant(
+def test_impact_is_reported_with_its_time(
     analysed, plants, link, force_n, at_s, duration_s, sweep_s
 ):
     headline, (finding,), analysis = analysed(force_n, at_s, duration_s, sweep_s)
@@ -87,34 +87,34 @@ def test_a_knock_is_named_with_its_instant(
     assert high - low < 0.04 + 2 * duration_s
     assert headline.flags.keys() <= {"lambda", "gamma", "alpha", "zeta"}
     assert all(mode.damping_ratio.flag is None for mode in headline.modes)
-    assert told(headline, plants, link) < 4
+    assert largest_deviation(headline, plants, link) < 4
     assert len(analysis.comparison.measurement.impacts) == 1
 
 
 @pytest.mark.further
-def test_a_knock_with_torque_missing(knocked, plants, link):
+def test_impact_with_missing_torque(struck_session, plants, link):
     missing = np.random.default_rng(2).choice(40_000, 250, replace=False)
-    measurement = knocked(1.0, 20.0).measured(NOISE_NM, 1, unknown_torque=missing)
+    measurement = struck_session(1.0, 20.0).measured(NOISE_NM, 1, unknown_torque=missing)
     headline, found, _ = fit_freest_alone(measurement, BAND_HZ)
     assert [each.kind for each in found] == ["knock"]
-    assert told(headline, plants, link) < 4
+    assert largest_deviation(headline, plants, link) < 4
 
 
 @pytest.mark.fit
-def test_the_whole_judgement_says_so(analysed):
-    """Where the knock has been found: it is searched for as above."""
+def test_full_analysis_reports_the_impact(analysed):
+    """With the impact already found: it is searched for as above."""
     _, _, analysis = analysed(1.0, 12.3456, 0.005, 30)
-    assert_knock_is_told(select(analysis.comparison.measurement).verdict, 12.3)
+    assert_impact_is_reported(select(analysis.comparison.measurement).verdict, 12.3)
 
 
 @pytest.mark.fit
 @pytest.mark.further  # as the search above
-def test_the_whole_judgement_finds_it(knocked):
-    verdict = select(knocked(1.0, 30.0, 60).cut(0, 40_000).measured(NOISE_NM, 1)).verdict
-    assert_knock_is_told(verdict, 30.0)
+def test_full_analysis_finds_the_impact(struck_session):
+    verdict = select(struck_session(1.0, 30.0, 60).cut(0, 40_000).measured(NOISE_NM, 1)).verdict
+    assert_impact_is_reported(verdict, 30.0)
 
 
-def assert_knock_is_told(verdict, at_s):
+def assert_impact_is_reported(verdict, at_s):
     assert verdict.adequate
     assert verdict.structure == "III"
     (finding,) = verdict.findings
@@ -123,12 +123,12 @@ def assert_knock_is_told(verdict, at_s):
 
 
 @pytest.mark.fit
-def test_noise_is_no_knock(plain, freest_of):
+def test_noise_is_no_impact(plain, freest_of):
     assert find_impact(freest_of(plain.measured(NOISE_NM, 0))) is None
 
 
 @pytest.mark.fit
-def test_a_disturbed_sensor_is_no_knock(plain):
+def test_disturbed_sensor_is_no_impact(plain):
     measurement = plain.measured(NOISE_NM, 1)
     measurement.torque_nm[15_000:15_020] += 5.0
     _, found, _ = fit_freest_alone(measurement, BAND_HZ)

@@ -9,7 +9,7 @@ from analysis.identify import ModeEstimate
 from analysis.identify._record_model import fit_modal_model
 
 
-def test_a_mode_that_is_overdamped_in_the_best_beam_is_searched_at_a_uniform_beam_s(monkeypatch):
+def test_overdamped_mode_starts_at_uniform_beam_frequency(monkeypatch):
     monkeypatch.setattr(
         "analysis.identify._record_model.fit_modes", lambda _data, _noise, starts, _spectra: starts
     )

@@ -46,8 +46,8 @@ def test_a_delay_delays_the_column(forces, plants, link):
     ("kind", "multiples"),
     [("cubic stiffness", {1, 3}), ("quadratic stiffness", {2}), ("quadratic drag", {1, 3})],
 )
-def test_which_harmonics_a_force_makes(link, plants, kind, multiples):
-    """Driven at 2 Hz: what remains once the start has rung down."""
+def test_harmonics_of_a_force(link, plants, kind, multiples):
+    """Driven at 2 Hz: the response after the start has rung down."""
     t = np.arange(60_000) / 1000
     rise = 1 - np.exp(-((t / 2) ** 2))
     angle = 0.05 * np.sin(4 * np.pi * t) * rise
@@ -66,7 +66,7 @@ def test_which_harmonics_a_force_makes(link, plants, kind, multiples):
     assert made == multiples
 
 
-def test_a_force_too_large_to_substitute_has_no_column(forces):
+def test_too_large_force_has_no_column(forces):
     """Without a warning: they are errors here."""
     _, modal = forces
     column = modal.torque_spectrum(MODE_1, 1e3)

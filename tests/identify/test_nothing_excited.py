@@ -19,7 +19,7 @@ pytestmark = pytest.mark.fit
         ({}, np.full(1000, 0.1), "the angle never changes"),
     ],
 )
-def test_the_plain_reason_comes_first(metadata, angle_rad, words):
+def test_simplest_reason_comes_first(metadata, angle_rad, words):
     """The record is too short for a Welch segment as well."""
     record = SimpleNamespace(
         path="a.mcap",

@@ -41,7 +41,7 @@ def test_derivatives(name, free):
         assert derivative == pytest.approx(numeric, abs=1e-8)
 
 
-def test_damping_that_a_plant_lacks_comes_in_small_and_of_order_one():
+def test_absent_damping_starts_small_with_order_one():
     plant = Plant(NOMINAL.beam, Damping(zeta=7e-5, alpha=0.9), 2e-4, 2e-5)
     unknowns = Unknowns.for_structure(STRUCTURES["VI"], NOMINAL, SETTINGS)
     found = unknowns.plant(unknowns.vector(plant))
@@ -54,7 +54,7 @@ def test_damping_that_a_plant_lacks_comes_in_small_and_of_order_one():
             assert found.parameters[name] == pytest.approx(value, rel=1e-9), name
 
 
-def test_what_is_not_free_stays_as_it_is():
+def test_fixed_parameters_do_not_change():
     unknowns = Unknowns.for_structure(STRUCTURES["III"], NOMINAL, ())
     plant = unknowns.plant(start(unknowns))
     assert plant.beam.density_kg_per_m == pytest.approx(NOMINAL.beam.density_kg_per_m)
@@ -63,7 +63,7 @@ def test_what_is_not_free_stays_as_it_is():
     assert (plant.damping.alpha, plant.damping.lambda_) == (1.0, 1.0)
 
 
-def test_an_order_alone_leaves_loss_and_stiffness_at_the_mode():
+def test_order_alone_preserves_loss_and_stiffness_at_the_mode():
     unknowns = Unknowns.for_structure(STRUCTURES["VI"], NOMINAL, SETTINGS)
     x = start(unknowns)
     first, second = undamped_frequencies_rad_s(NOMINAL.beam, 2)

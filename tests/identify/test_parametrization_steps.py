@@ -1,4 +1,4 @@
-"""Steps that keep what a record shows: the phase of stiffness and inertia with their damping."""
+"""Steps preserve what a record determines: phase of stiffness and inertia with their damping."""
 
 import math
 
@@ -33,7 +33,7 @@ def phases(x):
 
 
 @given(losses, orders, losses, orders, st.lists(st.floats(-1.0, 1.0), min_size=8, max_size=8))
-def test_a_short_step_goes_straight(zeta, alpha, gamma, lambda_, direction):
+def test_short_step_is_straight(zeta, alpha, gamma, lambda_, direction):
     x = np.array([zeta, alpha, gamma, lambda_, *REST])
     away = [abs(phase - math.pi / 2 * o) for phase, o in zip(phases(x), x[[1, 3]], strict=True)]
     sizes = [math.exp(x[i]) / math.sin(math.pi / 2 * x[j]) for i, j in ((0, 1), (2, 3))]
@@ -59,7 +59,7 @@ def test_no_step_leaves_the_bounds(zeta, alpha, gamma, lambda_, step):
 
 
 @pytest.mark.parametrize(("i", "j", "before", "after"), [(0, 1, 0.02, 0.3), (2, 3, 1.98, 1.7)])
-def test_an_order_goes_far_and_the_phase_stays(i, j, before, after):
+def test_large_order_step_preserves_the_phase(i, j, before, after):
     x = np.array([-4.5, 1.0, -4.0, 1.0, *REST])
     x[i], x[j] = -3.5, before
     size = math.exp(x[i]) / math.sin(math.pi / 2 * before)
@@ -75,7 +75,7 @@ def test_an_order_goes_far_and_the_phase_stays(i, j, before, after):
     assert abs(x[i] + step[i] - end[i]) > 10  # a straight step would have lost it
 
 
-def test_beyond_the_largest_loss_the_order_gives_way():
+def test_order_is_limited_by_the_largest_loss():
     x = np.array([-4.0, 1.9, -4.0, 1.95, *REST])
     step = np.zeros(8)
     step[2] = 3.0
@@ -84,10 +84,10 @@ def test_beyond_the_largest_loss_the_order_gives_way():
     assert end[2] == STEPS.upper[2]
     assert STEPS.lower[3] < end[3] < x[3] + step[3]
     most = math.pi / 2 * (2 - (x[3] + step[3]))
-    assert phases(end)[1] > most > phases(x)[1]  # no loss shows as much at the order asked for
+    assert phases(end)[1] > most > phases(x)[1]  # no loss is so visible at the requested order
 
 
-def test_what_all_but_vanishes_may_vanish_and_keeps_its_order():
+def test_almost_absent_damping_may_vanish_at_constant_order():
     x = np.array([-12.0, 0.5, -4.0, 1.0, *REST])
     step = np.zeros(8)
     step[0] = -1.5
@@ -101,7 +101,7 @@ def test_what_all_but_vanishes_may_vanish_and_keeps_its_order():
     assert STEPS.end(large, step)[0] == pytest.approx(-6.5, abs=0.01)
 
 
-def test_without_a_free_order_steps_are_straight():
+def test_steps_without_a_free_order_are_straight():
     steps = StepRule.for_unknowns(Unknowns.for_structure(STRUCTURES["III"], NOMINAL, SETTINGS))
     x, step = np.array([1.0, 1.0, *REST]), np.array([2.0, -3.0, 0.1, 0.1, 0.1, 0.1])
     assert steps.damping_indices == ()
@@ -110,7 +110,7 @@ def test_without_a_free_order_steps_are_straight():
 
 
 @pytest.mark.parametrize("structure", ["VI", "III"])
-def test_from_next_to_nothing_a_loss_grows_by_what_is_asked_of_it(structure):
+def test_tiny_loss_grows_by_the_requested_step(structure):
     unknowns = Unknowns.for_structure(STRUCTURES[structure], NOMINAL, SETTINGS)
     steps = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
     place = unknowns.names.index("zeta")

@@ -24,7 +24,7 @@ def link():
 @pytest.mark.parametrize(
     "more", [{}, {"delay_s": 3e-4, "tool_inertia_kg_m2": 1e-5}, {"offsets": OFFSETS}]
 )
-def test_the_torque_of_an_independent_synthesis(sessions, link, plant, more):
+def test_torque_agrees_with_independent_synthesis(sessions, link, plant, more):
     compared = Comparison.from_measurement(sessions("VI", **more).measured(), (0.0, 50.0))
     renamed = {name.replace("offsets", "stiffness_offsets"): value for name, value in more.items()}
     torque, _ = compared.prediction.torque(Plant(link, plant.damping, **renamed))
@@ -65,7 +65,7 @@ def test_derivatives(plant, name):
 
 
 @pytest.mark.fit
-def test_between_the_samples_it_is_the_same(plant, decimation):
+def test_subsamples_agree(plant, decimation):
     noise = np.random.default_rng(1).normal(size=3200)
     angle = decimation.apply(noise)
     prediction = TorquePredictor(angle, 125.0, slice(0, 400))
@@ -76,7 +76,7 @@ def test_between_the_samples_it_is_the_same(plant, decimation):
 
 
 @pytest.mark.parametrize("factor", [2, 3, 8])
-def test_between_the_samples_it_is_that_of_more_samples(plant, factor):
+def test_subsamples_agree_with_a_higher_rate(plant, factor):
     def angle(rate_hz):
         time_s = np.arange(round(3.2 * rate_hz)) / rate_hz
         waves = np.sin(2 * np.pi * 7.3 * time_s) + np.cos(2 * np.pi * 31.0 * time_s)
@@ -88,5 +88,5 @@ def test_between_the_samples_it_is_that_of_more_samples(plant, factor):
     coarse = TorquePredictor(angle(125.0), 125.0, slice(0, 400))
     at, gradient_at = coarse.torque_at_fine_samples(plant, factor, places, WRT)
     assert np.abs(at - torque[places]).max() < 1e-6 * torque.std()
-    apart = np.abs(gradient_at - gradient[:, places]).max(axis=1)
-    assert (apart < 1e-6 * gradient.std(axis=1)).all()
+    difference = np.abs(gradient_at - gradient[:, places]).max(axis=1)
+    assert (difference < 1e-6 * gradient.std(axis=1)).all()

@@ -55,7 +55,7 @@ def test_derivatives(plant, name):
 
 
 @pytest.mark.parametrize("plant", [BARE, ALL], ids=["bare", "all"])
-def test_poles_move_as_differences_say(plant):
+def test_pole_derivatives_match_differences(plant):
     for i, pole in enumerate(plant.mode_poles(3, WRT)):
         for name, derivative in zip(WRT, pole.derivative, strict=True):
             step = STEPS.get(name, 1e-7)
@@ -65,7 +65,7 @@ def test_poles_move_as_differences_say(plant):
             assert derivative == pytest.approx((after - before) / (2 * step), rel=1e-4, abs=1e-5)
 
 
-def test_between_the_samples_it_is_the_same():
+def test_subsamples_agree():
     angle = np.random.default_rng(1).normal(size=400)
     prediction = TorquePredictor(np.convolve(angle, np.hanning(9), "same"), 125.0, slice(0, 400))
     torque, gradient = prediction.torque(ALL, WRT)
@@ -74,7 +74,7 @@ def test_between_the_samples_it_is_the_same():
     assert gradient_at == pytest.approx(gradient, rel=1e-6, abs=1e-6 * np.abs(gradient).max())
 
 
-def test_a_filter_that_the_file_states_is_part_of_the_model(sessions):
+def test_stated_filter_is_part_of_the_model(sessions):
     measurement = replace(sessions("III").measured(), filter_time_constant_s=1e-3)
     assert measurement.nominal.filter_time_constant_s == 1e-3
     unknowns = Unknowns.for_structure(STRUCTURES["III"], measurement.nominal, SETTINGS)

@@ -21,7 +21,7 @@ def objective(sessions):
     return Objective(comparison, Unknowns.for_structure(STRUCTURES["VI"], NOMINAL, SETTINGS))
 
 
-def test_the_gradient_is_that_of_the_cost(objective):
+def test_gradient_is_that_of_the_cost(objective):
     weight = np.linspace(1.0, 2.0, objective.comparison.frequency_hz.size)
     x = objective.unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8]))
     x[-1] = 0.01
@@ -31,7 +31,7 @@ def test_the_gradient_is_that_of_the_cost(objective):
         assert 2 * here.gradient[k] == pytest.approx((after - before) / 2e-6, rel=2e-4)
 
 
-def test_a_descent_goes_on_as_one_begun_there_but_evaluates_once_less(objective, monkeypatch):
+def test_continued_descent_saves_one_evaluation(objective, monkeypatch):
     comparison, unknowns = objective.comparison, objective.unknowns
     bins = comparison.frequency_hz.size
     noise = NoiseSpectrum(np.full(bins, 1e-2), np.ones(bins, dtype=bool), ())
@@ -52,7 +52,7 @@ def test_a_descent_goes_on_as_one_begun_there_but_evaluates_once_less(objective,
     assert going_on == len(evaluated) - 1 == 3
 
 
-def test_the_cost_at_the_end_of_a_descent_is_that_of_its_noise(objective):
+def test_final_cost_is_that_of_its_noise(objective):
     bins = objective.comparison.frequency_hz.size
     noise, louder = (
         NoiseSpectrum(np.full(bins, power), np.ones(bins, dtype=bool), ()) for power in (1e-2, 4e-2)
@@ -67,9 +67,7 @@ def test_the_cost_at_the_end_of_a_descent_is_that_of_its_noise(objective):
 @pytest.mark.parametrize(
     ("most", "hopeless", "again"), [(5, None, False), (60, (5, 0.0), False), (60, None, True)]
 )
-def test_torques_are_put_anew_where_a_descent_has_ended(
-    sessions, monkeypatch, most, hopeless, again
-):
+def test_torques_are_replaced_after_a_descent(sessions, monkeypatch, most, hopeless, again):
     lost = np.arange(2000, 2100, 7)
     measurement = sessions("VI", shaken=True).cut(5000).measured(noise_nm=1e-2, unknown_torque=lost)
     comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
@@ -93,7 +91,7 @@ def test_torques_are_put_anew_where_a_descent_has_ended(
     assert again or found.evaluations == 5
 
 
-def test_neither_free_decay_nor_a_drifting_zero_counts(objective):
+def test_free_decay_and_drifting_zero_do_not_count(objective):
     x = objective.unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8]))
     at = objective.linearise(x)
     projected = objective.project(at, 2.0)
@@ -107,6 +105,6 @@ def test_neither_free_decay_nor_a_drifting_zero_counts(objective):
     assert np.abs((columns.conj() @ again.residual).real).max() < 1e-6 * np.abs(columns).max() ** 2
 
 
-def test_a_point_seen_lately_costs_nothing(objective):
+def test_recent_point_is_not_evaluated_again(objective):
     x = objective.unknowns.start(np.array([-4.6, 1.0, -3.0, 0.8]))
     assert objective.linearise(x) is objective.linearise(x.copy())

@@ -1,4 +1,4 @@
-"""Valleys of a profile: which values the 95 % limit admits, and how many explain it equally."""
+"""Local minima of a profile: values that the 95 % limit admits, and their number."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def profile_of(values, deviance):
     )  # fmt: skip
 
 
-def test_one_valley():
+def test_one_minimum():
     found = profile_of(VALUES, double(30.0))
     half = 0.05 * CHI_SQUARE_95**0.5
     assert found.local_minima == pytest.approx([0.6])
@@ -39,7 +39,7 @@ def test_one_valley():
     assert found.identifiable
 
 
-def test_a_second_valley_within_the_limit_leaves_the_order_open():
+def test_second_minimum_within_the_limit_leaves_order_undecided():
     found = profile_of(VALUES, double(0.8))
     assert found.local_minima == pytest.approx([0.6, 1.3])  # the lower one first
     reach = 0.08 * (CHI_SQUARE_95 - 0.8) ** 0.5
@@ -47,23 +47,23 @@ def test_a_second_valley_within_the_limit_leaves_the_order_open():
     assert not found.identifiable
 
 
-def test_narrow_valleys_close_together_are_two_all_the_same():
+def test_narrow_adjacent_minima_are_distinguished():
     deviance = np.minimum(((VALUES - 0.9) / 0.01) ** 2, ((VALUES - 1.1) / 0.01) ** 2 + 1)
     found = profile_of(VALUES, deviance)
     assert found.relative_width < 0.15
     assert not found.identifiable
 
 
-def test_a_valley_beyond_the_limit_does_not_count():
+def test_minimum_beyond_the_limit_does_not_count():
     assert local_minima(VALUES, double(CHI_SQUARE_95 + 0.1)) == pytest.approx((0.6,))
 
 
-def test_ripples_part_no_valley():
+def test_ripples_do_not_split_a_minimum():
     ripples = ((VALUES - 0.8) / 0.2) ** 2 + 0.1 * np.sin(VALUES * 200)
     assert len(local_minima(VALUES, ripples - ripples.min())) == 1
 
 
-def test_a_curve_that_never_reaches_the_limit_is_open():
+def test_curve_below_the_limit_is_open():
     interval, below, above = admitted_interval(VALUES, (VALUES - 1) ** 2)
     assert (interval, below, above) == ((0.1, 1.9), True, True)
 
@@ -72,7 +72,7 @@ def test_the_crossing_of_a_parabola_is_exact():
     assert limit_crossing(1.0, 3.0, 1.0, 9.0) == pytest.approx(CHI_SQUARE_95**0.5)
 
 
-def test_places_to_look_at_lie_outside_of_what_is_known():
+def test_proposed_points_lie_outside_known_ones():
     places = values_outside_known([0.5, 0.9], (0.0, 2.0), 0.2)
     assert all(place < 0.5 or place > 0.9 for place in places)
     assert (min(places), max(places)) == pytest.approx((0.1, 1.9))

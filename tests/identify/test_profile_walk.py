@@ -1,4 +1,4 @@
-"""Walks along an order: a second valley beyond a high ridge is found."""
+"""Walks along an order: a second minimum beyond a high maximum is found."""
 
 import math
 from types import SimpleNamespace
@@ -25,7 +25,7 @@ def cost(order):
 
 
 class DoubleWell(OrderProfiler):
-    """A walk on a deviance that is known, begun in one of its valleys."""
+    """A walk on a deviance that is known, begun in one of its minima."""
 
     def __init__(self, start):
         self.order, self.structure = "lambda", None
@@ -45,7 +45,7 @@ class DoubleWell(OrderProfiler):
 
 
 @pytest.mark.parametrize("start", BOTTOMS)
-def test_both_valleys_are_found_from_either(start):
+def test_both_minima_are_found_from_either(start):
     walk = DoubleWell(start)
     walk.extend_both_ways()
     assert len(local_minima(*walk.curve())) == 1
@@ -60,8 +60,8 @@ def test_both_valleys_are_found_from_either(start):
 
 
 @pytest.mark.parametrize(("behind", "found"), [(1.0, True), (5.0, False)])
-def test_a_special_case_that_is_as_good_begins_a_walk(behind, found):
-    """As where order 1 fits as well, beyond a ridge that no refit crosses."""
+def test_equally_good_special_case_starts_a_walk(behind, found):
+    """As where order 1 fits as well, beyond a maximum that no refit crosses."""
     at = 1.4
     walk = DoubleWell(0.6)
     walk.structure, walk._kind = STRUCTURES["VI"], "a rig"
@@ -93,7 +93,7 @@ class Astray(DoubleWell):
         return SimpleNamespace(x=np.array([1.4]), cost=cost(1.5))
 
 
-def test_an_order_is_not_excluded_because_a_descent_went_astray():
+def test_failed_descent_does_not_exclude_an_order():
     walk = Astray(1.4)
     near = walk._refits[1.4]
     assert walk._refit_at(1.95, near) == pytest.approx((deviance(1.95) - deviance(1.4)) ** 0.5)
@@ -110,7 +110,7 @@ class TangentAstray(DoubleWell):
         raise AssertionError("there is a lower minimum with the damping")
 
 
-def test_the_damping_stays_where_only_the_tangent_went_astray():
+def test_failed_tangent_alone_leaves_the_damping():
     walk = TangentAstray(1.4)
     near = walk._refits[1.4]
     assert walk._refit_at(1.45, near) == pytest.approx((deviance(1.45) - deviance(1.4)) ** 0.5)

@@ -1,4 +1,4 @@
-"""Modes of measured responses agree with what others published of them.
+"""Modes of measured responses agree with published values.
 
 `ESTIMATORS` are compared with the published values: vector fitting of the response, and the modal
 model of the analyzer, fitted to a record that has this response.
@@ -90,7 +90,7 @@ def test_periodic_record_has_the_measured_response():
     assert rest.max() < 1e-9 * np.abs(spectra[1]).max()
 
 
-def test_periods_that_are_no_whole_samples_are_refused():
+def test_period_of_fractional_samples_is_refused():
     with pytest.raises(ValueError, match="no whole number of samples"):
         periodic_record(RESPONSE, 250.3, 1, slowdown=10)
     with pytest.raises(ValueError, match="beyond half the rate"):

@@ -1,4 +1,4 @@
-"""The tests of a residual, each on signals of which the answer is known."""
+"""The tests of a residual, each on signals with a known answer."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def noise(seed, count=BINS):
     return parts[0] + 1j * parts[1]
 
 
-def test_noise_is_white_and_the_band_means_what_it_says():
+def test_noise_is_white_within_its_band():
     found = [whiteness(noise(seed), HZ) for seed in range(300)]
     outside = np.mean([test.distance > test.band for test in found])
     assert 0.01 < outside < 0.10
@@ -31,19 +31,19 @@ def test_noise_is_white_and_the_band_means_what_it_says():
 
 
 @pytest.mark.parametrize("draws", [200, further(1000)])
-def test_noise_whose_spectrum_is_estimated_is_not_loud(draws):
+def test_noise_with_estimated_spectrum_is_not_loud(draws):
     """The spectrum is estimated from the noise itself, as the modal fit does it."""
     drawn = (noise(seed) for seed in range(draws))
     found = [whiteness(each * np.sqrt(2 / smooth_power(each, finely=True)), HZ) for each in drawn]
     assert not any(test.loud for test in found)
 
 
-def test_the_cumulative_periodogram_is_the_share_of_the_power():
+def test_cumulative_periodogram_is_a_fraction_of_power():
     residual = noise(1)
-    share = cumulative_periodogram(residual)
+    fraction = cumulative_periodogram(residual)
     third = np.abs(residual[: BINS // 3]) ** 2
-    assert share[BINS // 3 - 1] == pytest.approx(third.sum() / np.sum(np.abs(residual) ** 2))
-    assert share[-1] == pytest.approx(1.0)
+    assert fraction[BINS // 3 - 1] == pytest.approx(third.sum() / np.sum(np.abs(residual) ** 2))
+    assert fraction[-1] == pytest.approx(1.0)
 
 
 def test_a_tilted_spectrum_is_not_white():
@@ -52,7 +52,7 @@ def test_a_tilted_spectrum_is_not_white():
     assert found.distance > 2 * found.band
 
 
-def test_what_is_loud_is_found_where_it_is():
+def test_loud_band_is_located():
     residual = noise(3)
     residual[1600:1616] *= 4
     found = whiteness(residual, HZ)
@@ -76,7 +76,7 @@ def sweep():
     return np.sin(phase), phase, t
 
 
-def test_linear_dynamics_that_remain_are_told_from_noise_and_hum():
+def test_linear_residual_is_distinguished_from_noise_and_hum():
     angle = np.fft.rfft(sweep()[0])[1 : BINS + 1]
     assert not any(input_relation(noise(seed), angle, HZ).related for seed in range(40))
     resonance = 1 / (1 - (HZ / 20) ** 2 + 0.01j * HZ / 20)
@@ -90,7 +90,7 @@ def test_linear_dynamics_that_remain_are_told_from_noise_and_hum():
     assert not input_relation(hum, angle, HZ).related
 
 
-def test_noise_that_the_loop_feeds_back_is_no_dynamics():
+def test_noise_fed_back_by_the_loop_is_no_dynamics():
     """Between the lines of a multisine the motor only follows the noise of the torque."""
     for seed in range(20):
         residual = noise(seed)
@@ -111,7 +111,7 @@ def test_an_echo_is_found_with_its_lag():
 
 
 @pytest.mark.parametrize("multiple", [2, 3])
-def test_a_harmonic_of_the_sweep_is_found_and_its_like_alone(multiple):
+def test_only_harmonics_of_the_sweep_are_found(multiple):
     angle, phase, t = sweep()
     residual = in_time(noise(8), t.size)
     assert residual.std() == pytest.approx(0.8**0.5, rel=0.03)  # of the band to 62.5 Hz
@@ -132,6 +132,6 @@ def test_noise_ringing_and_the_drive_itself_are_no_harmonic():
         assert not any(one.present for one in harmonics(angle, residual, 125.0, (0.0, 50.0)))
 
 
-def test_without_a_sweep_there_is_no_harmonic_to_look_for():
+def test_no_harmonics_without_a_sweep():
     angle = np.random.default_rng(9).normal(size=10_000)
     assert harmonics(angle, angle, 125.0, (0.0, 50.0)) == ()

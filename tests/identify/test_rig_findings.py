@@ -1,4 +1,4 @@
-"""Rigs that are not as assumed are named as what they are; beams by the textbook's closed form."""
+"""Deviations of a rig are reported with their cause; beams by the textbook's closed form."""
 
 from dataclasses import replace
 from functools import cache
@@ -88,7 +88,7 @@ def judged(measurement):
         further({"filter_hz": 120.0}, {}, "low-pass filter of first order at 120 Hz"),
     ],
 )
-def test_a_rig_that_is_otherwise_has_its_cause_named_and_no_fact(more, ends, words):
+def test_deviating_rig_has_its_cause_reported_without_facts(more, ends, words):
     selection = select(record(**more))
     (named,) = selection.verdict.findings
     assert named.kind == "rival explanations"
@@ -113,18 +113,18 @@ def test_clocks_of_different_rates_are_found_with_their_difference(candidates_of
 
 
 @pytest.mark.further  # as other rigs that are no uniform beam
-def test_clocks_that_hardly_differ_leave_the_modes_right_and_refuse_the_uniform_beam():
+def test_slightly_different_clocks_refuse_the_uniform_beam():
     """A delay that rises along a sweep is one that rises with the frequency."""
     selection = select(record(clock=1e-5))
-    told = selection.headline
+    headline = selection.headline
     assert selection.verdict.adequate
-    assert told.uniform_beam.status == "refused"
+    assert headline.uniform_beam.status == "refused"
     assert all(finding.interval is None for finding in selection.verdict.findings)
-    assert_modes(told)
+    assert_modes(headline)
 
 
 @pytest.mark.further  # as other changes in one sweep
-def test_clocks_that_differ_much_are_named_and_leave_no_number_without_a_flag():
+def test_very_different_clocks_flag_every_number():
     selection = select(record(clock=1e-4))
     found = {finding.kind: finding for finding in selection.verdict.findings}
     assert "ppm) would explain the record as well" in found["clock rate difference"].sentence
@@ -145,25 +145,25 @@ def test_clocks_that_differ_much_are_named_and_leave_no_number_without_a_flag():
         (0.8, []),
     ],
 )
-def test_a_sign_and_a_unit_are_seen_at_once(factor, kinds):
+def test_wrong_sign_and_unit_are_found_immediately(factor, kinds):
     comparison = Comparison.from_measurement(record(factor), (0.0, 50.0))
     assert [finding.kind for finding in sign_and_unit_findings(comparison)] == kinds
 
 
 def test_a_wrong_sign_comes_first():
     found = select(record(-1.0), band_hz=(0.0, 20.0))
-    verdict, told = found.verdict, found.headline
+    verdict, headline = found.verdict, found.headline
     assert [finding.kind for finding in verdict.findings] == ["sign"]
     assert verdict.sentences == (verdict.findings[0].sentence,)
     assert verdict.experiments == (verdict.findings[0].remedy,)
     assert not verdict.adequate
-    quantities = [*told.parameters.values(), *(mode.frequency_hz for mode in told.modes)]
+    quantities = [*headline.parameters.values(), *(mode.frequency_hz for mode in headline.modes)]
     assert {each.flag for each in quantities} == {CONTRADICTED_FILE_REASON}
 
 
 @pytest.fixture(scope="module")
 def slightly_clipped():
-    """Even where so little is cut off that what remains is noise."""
+    """Even where so little is cut off that the residual is noise."""
     made = record()
     most = np.sort(np.abs(made.torque_nm))[-12]
     return replace(made, torque_nm=np.clip(made.torque_nm, -most, most))
@@ -175,13 +175,13 @@ def assert_flagged(headline, findings):
     assert all(mode.damping_ratio.flag for mode in headline.modes)
 
 
-def test_a_clipped_torque_leaves_no_number_without_a_flag(slightly_clipped):
+def test_clipped_torque_flags_every_number(slightly_clipped):
     headline, findings, _ = fit_freest_alone(slightly_clipped, (0.0, 10.0))
     assert_flagged(headline, findings)
 
 
 @pytest.mark.further  # as the freest structure alone
-def test_a_clipped_torque_leaves_a_judgement_without_a_number(slightly_clipped):
+def test_clipped_torque_withholds_numbers(slightly_clipped):
     found = select(slightly_clipped, band_hz=(0.0, 20.0))
     assert_flagged(found.headline, found.verdict.findings)
     assert not any("no unmodelled effect" in sentence for sentence in found.verdict.sentences)
@@ -197,14 +197,14 @@ def test_a_torque_flat_at_its_extremes_is_clipped():
     assert not any(clipping_findings(replace(made, torque_nm=coarse)))
 
 
-def test_a_motor_that_stands_still_when_asked_to_move():
+def test_motor_standstill_despite_reference():
     made = record()
     stopped = made.angle_rad.copy()
     stopped[20_000:22_000] = stopped[20_000]
-    asked = replace(made, reference_rad=made.angle_rad)
-    (finding,) = standstill_findings(replace(asked, angle_rad=stopped))
+    requested = replace(made, reference_rad=made.angle_rad)
+    (finding,) = standstill_findings(replace(requested, angle_rad=stopped))
     assert finding.value == pytest.approx(4.0, abs=1.0)
-    assert not any(standstill_findings(asked))
+    assert not any(standstill_findings(requested))
 
 
 @pytest.mark.further  # as other residuals
@@ -287,7 +287,7 @@ def changing_record(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, back=Fals
     )  # fmt: skip
 
 
-def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted(candidates_of):
+def test_hopeless_changes_are_not_fitted(candidates_of):
     uniform = candidates_of(changing_record(damping=0.2))
     with_change, (change,) = find_temporal_changes(uniform)
     assert change.effect == "damping"
@@ -318,7 +318,7 @@ def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted(candid
         further("damping", 0.0),
     ],
 )
-def test_what_drifts_in_one_sweep_is_no_fact(what, change):
+def test_drift_in_one_sweep_is_no_fact(what, change):
     """Time and frequency vary together there."""
     selection = select(changing_record(**{what: change}))
     found = selection.verdict.findings
@@ -329,9 +329,9 @@ def test_what_drifts_in_one_sweep_is_no_fact(what, change):
 @pytest.mark.parametrize(
     ("what", "change"), [("stiffness", 0.01), ("damping", 0.3), ("damping", 0.0)]
 )
-@pytest.mark.further  # what makes it a fact is tested above
-def test_what_drifts_while_the_motor_sweeps_there_and_back_is_named(what, change):
-    """A mode rings for seconds: it does not follow at once what its frequency and decay become."""
+@pytest.mark.further  # the condition for a fact is tested above
+def test_drift_during_a_double_sweep_is_reported(what, change):
+    """A mode rings for seconds: it does not follow changes of its frequency and decay at once."""
     selection = select(changing_record(**{what: change}, seconds=40.0, back=True))
     verdict, numbers = selection.verdict, selection.headline.parameters
     found = {finding.kind: finding for finding in verdict.findings}

@@ -1,4 +1,4 @@
-"""Scales that no session shows: what goes with them, and the intervals that include them."""
+"""Scales that no session determines: values that change with them, intervals that include them."""
 
 import math
 
@@ -48,7 +48,7 @@ def plant_of(values, length_m):
     "extras",
     [{"stiffness_offsets": (0.02,)}, {"filter_time_constant_s": 1e-3}],
 )
-def test_every_parameter_goes_with_the_scales_as_stated(extras):
+def test_parameters_change_with_scales_as_stated(extras):
     """Exactly: no frequency response shows a wrong torque scale or length."""
     plant = Plant(LINK, DAMPING, delay_s=2e-4, tool_inertia_kg_m2=1e-5, **extras)
     grid = ResponseGrid(0.02 + 2j * np.pi * np.linspace(0.3, 60.0, 400))
@@ -60,7 +60,7 @@ def test_every_parameter_goes_with_the_scales_as_stated(extras):
     np.testing.assert_allclose(found, true, rtol=1e-9)
 
 
-def test_drag_goes_with_the_scales_as_stated():
+def test_drag_changes_with_scales_as_stated():
     time_s = np.arange(4000) / 200.0
     angle_rad = 0.3 * np.sin(2 * np.pi * 2.4 * time_s) * np.sin(np.pi * time_s / 20) ** 2
     plant = Plant(LINK, DAMPING)
@@ -94,7 +94,7 @@ def fits(sessions):
 
 
 @pytest.mark.fit
-def test_fits_to_scaled_data_go_with_the_scales(fits):
+def test_fits_to_scaled_data_follow_the_scales(fits):
     right, wrong = fits
     expected = scaled(right.parameters, TORQUE_SCALE, LENGTH_SCALE)
     for name, value in expected.items():
@@ -106,15 +106,15 @@ def test_fits_to_scaled_data_go_with_the_scales(fits):
 
 
 def test_intervals_include_the_scales_in_quadrature():
-    def told(value, relative):
+    def estimate(value, relative):
         ends = value * math.exp(-1.96 * relative), value * math.exp(1.96 * relative)
         return Estimate(value, relative * value, ends)
 
     parameters = {
-        "zeta": told(7e-5, 0.02),
-        "gamma": told(0.05, 0.003),
-        "density_over_stiffness": told(0.052, 4e-5),
-        "bending_stiffness_n_m2": told(0.09, 7e-4),
+        "zeta": estimate(7e-5, 0.02),
+        "gamma": estimate(0.05, 0.003),
+        "density_over_stiffness": estimate(0.052, 4e-5),
+        "bending_stiffness_n_m2": estimate(0.09, 7e-4),
         "tool_inertia_kg_m2": Estimate(1e-6, 2e-6, (0.0, 1e-6 + 1.96 * 2e-6)),
         "tip_mass_kg": Estimate(1e-3, None, None, "the record does not determine it"),
     }
@@ -143,7 +143,7 @@ def test_intervals_include_the_scales_in_quadrature():
 
 
 @pytest.mark.fit
-def test_intervals_with_scales_hold_the_truth(fits):
+def test_intervals_with_scales_include_the_truth(fits):
     """Scales that are off by their standard uncertainties, which noise alone never is."""
     _, wrong = fits
     uncertainty = {"torque_scale": 0.03, "length": 0.02}
@@ -167,7 +167,7 @@ def test_intervals_with_scales_hold_the_truth(fits):
 
 
 @pytest.mark.fit
-def test_what_is_held_fixed_does_not_make_up_for_a_scale(sessions):
+def test_fixed_parameters_do_not_compensate_a_scale(sessions):
     measurement = sessions("III").measured(noise_nm=1e-2, seed=1)
 
     def fixed(*names):

@@ -1,4 +1,4 @@
-"""Verdicts on sessions of known plants: the structure, its orders, and whatever else is there."""
+"""Verdicts on sessions of known plants: the structure, its orders, and other effects."""
 
 import json
 from dataclasses import replace
@@ -31,7 +31,7 @@ def type_iii(sessions):
     return select(sessions("III").measured(noise_nm=NOISE_NM, seed=41))
 
 
-def test_the_verdict_on_a_plant_of_type_iii(type_iii):
+def test_verdict_on_a_plant_of_type_iii(type_iii):
     verdict = type_iii.verdict
     assert (verdict.structure, verdict.adequate) == ("III", True)
     assert verdict.findings == ()
@@ -41,62 +41,62 @@ def test_the_verdict_on_a_plant_of_type_iii(type_iii):
         assert order.interval[0] < 1 < order.interval[1]
 
 
-def test_the_numbers_are_those_of_the_freest_structure(type_iii):
-    told = type_iii.headline
-    assert told.fit is type_iii.fit
-    assert told.fit.structure is STRUCTURES["VI"]
-    assert told.flags == {}
-    status = dict(told.structures)
-    assert [name for name, its in told.structures if its == "selected"] == ["VI"]
+def test_numbers_are_those_of_the_freest_structure(type_iii):
+    headline = type_iii.headline
+    assert headline.fit is type_iii.fit
+    assert headline.fit.structure is STRUCTURES["VI"]
+    assert headline.flags == {}
+    status = dict(headline.structures)
+    assert [name for name, its in headline.structures if its == "selected"] == ["VI"]
     assert (status["III"], status["VII"]) == ("compatible", "compatible")
     assert {status[name] for name in ("I", "II", "IV", "V")} == {"excluded"}
     truth = {"zeta": 0.54e-4, "alpha": 1.0, "gamma": 0.02, "lambda": 1.0, "delay_s": 0.0}
     for name, value in truth.items():
-        quantity = told.parameters[name]
+        quantity = headline.parameters[name]
         assert abs(quantity.value - value) < 4 * quantity.std, name
         low, high = quantity.interval_95
         assert low < quantity.value < high
-    assert told.parameters["alpha"].interval_95 == type_iii.verdict.alpha.interval
+    assert headline.parameters["alpha"].interval_95 == type_iii.verdict.alpha.interval
 
 
-def test_a_loss_factor_is_known_far_better_than_its_coefficient(type_iii, link):
-    told = type_iii.headline
-    internal, external = told.sizes
+def test_loss_factor_is_more_accurate_than_its_coefficient(type_iii, link):
+    headline = type_iii.headline
+    internal, external = headline.sizes
     for size, coefficient, truth in (
         (internal, "zeta", 0.54e-4 * internal.omega_rad_s),
         (external, "gamma", 0.02 / (link.density_over_stiffness * external.omega_rad_s)),
     ):
-        quantity, known = size.size, told.parameters[coefficient]
+        quantity, known = size.size, headline.parameters[coefficient]
         assert quantity.std / quantity.value < 0.7 * known.std / known.value
         assert abs(quantity.value - truth) < 4 * quantity.std
 
 
-def test_what_a_simpler_structure_gives_is_a_condition(type_iii):
+def test_result_of_a_simpler_structure_is_conditional(type_iii):
     simpler = type_iii.headline.simpler
     assert (simpler.name, simpler.fixed) == ("III", {"alpha": 1.0, "lambda": 1.0})
     assert simpler.parameters["zeta"].value == pytest.approx(0.54e-4, rel=0.02)
     assert simpler.parameters["zeta"].std < 0.5 * type_iii.headline.parameters["zeta"].std
-    (said,) = [each for each in type_iii.verdict.sentences if "if true" in each]
-    assert said.startswith("Alpha = 1 and lambda = 1 are not excluded; if true (type III)")
+    (sentence,) = [each for each in type_iii.verdict.sentences if "if true" in each]
+    assert sentence.startswith("Alpha = 1 and lambda = 1 are not excluded; if true (type III)")
 
 
 @pytest.fixture(scope="module")
 def nearly_one(sessions):
-    """Type VI of Table 5, where alpha is 0.996: no record tells that from 1."""
+    """Type VI of Table 5, where alpha is 0.996: no record distinguishes that from 1."""
     return select(sessions("VI").measured(noise_nm=NOISE_NM, seed=3))
 
 
 @pytest.mark.further  # as two orders of 1 above
-def test_an_order_close_to_1_spoils_no_number(nearly_one):
-    told, (low, high) = nearly_one.headline, nearly_one.verdict.alpha.interval
+def test_order_close_to_1_flags_no_number(nearly_one):
+    headline, (low, high) = nearly_one.headline, nearly_one.verdict.alpha.interval
     assert nearly_one.verdict.structure == "VII"
     assert low < 0.996 < high
-    low, high = told.parameters["zeta"].interval_95
+    low, high = headline.parameters["zeta"].interval_95
     assert low < 7.1e-5 < high
     assert nearly_one.verdict.lambda_.status == "fractional"
-    assert dict(told.structures)["VII"] == "compatible"
-    low, high = told.simpler.parameters["zeta"].interval_95
-    assert not low < 7.1e-5 < high  # which is why it is told as a condition only
+    assert dict(headline.structures)["VII"] == "compatible"
+    low, high = headline.simpler.parameters["zeta"].interval_95
+    assert not low < 7.1e-5 < high  # which is why it is reported as a condition only
 
 
 def test_the_headline_is_json(type_iii):
@@ -160,7 +160,7 @@ def test_a_fractional_order_that_the_data_support(undeclared):
     assert (lambda_.status, lambda_.value) == ("absent", None)
 
 
-def test_delay_clamp_and_beam_data_are_named(undeclared):
+def test_delay_clamp_and_beam_data_are_reported(undeclared):
     assert kinds(undeclared) == {"delay", "tool inertia", "beam data"}
     found = {finding.kind: finding for finding in undeclared.findings}
     assert found["delay"].value == pytest.approx(3e-4, abs=2e-5)
@@ -177,8 +177,8 @@ def one_mode(sessions):
     return select(sessions("III").measured(noise_nm=NOISE_NM, seed=44), band_hz=(0.0, 10.0))
 
 
-def test_one_mode_tells_no_order(one_mode):
-    told, one_mode = one_mode.headline, one_mode.verdict
+def test_one_mode_does_not_determine_order(one_mode):
+    headline, one_mode = one_mode.headline, one_mode.verdict
     assert one_mode.visible_modes == (1,)
     assert one_mode.alpha.status == "not identifiable"
     assert one_mode.alpha.value is None
@@ -186,21 +186,23 @@ def test_one_mode_tells_no_order(one_mode):
     assert one_mode.lambda_.status == "not identifiable"
     assert one_mode.lambda_.value is None
     for name in ("alpha", "lambda"):
-        assert any(name in said and "not identifiable" in said for said in one_mode.sentences)
+        assert any(
+            name in sentence and "not identifiable" in sentence for sentence in one_mode.sentences
+        )
         assert name not in one_mode.parameters
-    for name in told.parameters.keys() & {"zeta", "alpha", "gamma", "lambda"}:
-        assert "a single mode determines" in told.parameters[name].flag
-    assert all("one mode alone" in each.size.flag for each in told.sizes)
-    # Nor is a stiffness told from a damping of a low order, or an inertia from one of a high order.
+    for name in headline.parameters.keys() & {"zeta", "alpha", "gamma", "lambda"}:
+        assert "a single mode determines" in headline.parameters[name].flag
+    assert all("one mode alone" in each.size.flag for each in headline.sizes)
+    # A low order of damping resembles a stiffness, a high order an inertia.
     for name in ("density_over_stiffness", "bending_stiffness_n_m2"):
-        assert "damping of unknown order" in told.parameters[name].flag
-        assert told.parameters[name].interval_95 is not None
-    assert told.modes[0].frequency_hz.flag is None
-    (mode,) = told.modes
+        assert "damping of unknown order" in headline.parameters[name].flag
+        assert headline.parameters[name].interval_95 is not None
+    assert headline.modes[0].frequency_hz.flag is None
+    (mode,) = headline.modes
     assert mode.damping_ratio.flag is None
     assert mode.damping_ratio.value == pytest.approx(0.01245, rel=0.03)
     assert any("excite the second mode" in what for what in one_mode.experiments)
-    assert kinds(one_mode) <= {"air drag"}  # from which one mode is hardly told
+    assert kinds(one_mode) <= {"air drag"}  # from which one mode hardly differs
 
 
 @pytest.mark.parametrize(
@@ -212,30 +214,36 @@ def test_one_mode_tells_no_order(one_mode):
         ("VI", 2, None),
     ],
 )
-def test_so_many_modes_tell_the_orders_of_a_structure_or_do_not(structure, modes, reason):
+def test_orders_determined_by_number_of_modes(structure, modes, reason):
     found = too_few_modes(STRUCTURES[structure], modes)
     assert found is reason if reason is None else found.startswith(reason)
 
 
-@pytest.mark.further  # what that means for the numbers is above, of one mode
-def test_of_two_modes_one_damping_that_is_enough_tells_no_order(sessions):
+@pytest.mark.further  # the consequences for the numbers are above, for one mode
+def test_two_modes_with_one_damping_do_not_determine_order(sessions):
     """Its two numbers explain any two loss factors, those of two dampings too.
 
-    What three modes tell of it is above.
+    The result of three modes is above.
     """
     done = select(sessions("IV").measured(noise_nm=NOISE_NM, seed=44), band_hz=(0.0, 30.0))
-    verdict, told = done.verdict, done.headline
+    verdict, headline = done.verdict, done.headline
     assert verdict.visible_modes == (1, 2)
-    assert told.fit.structure.name == "IV"
+    assert headline.fit.structure.name == "IV"
     for order in (verdict.alpha, verdict.lambda_):
         assert (order.status, order.reason) == ("not identifiable", SECOND_DAMPING_REASON)
-    assert told.parameters["zeta"].flag == told.parameters["alpha"].flag == SECOND_DAMPING_REASON
-    assert all(each.size.flag for each in told.sizes)
-    assert all(mode.damping_ratio.flag is None for mode in told.modes)
-    assert any(said.startswith("Internal damping alone would do.") for said in verdict.sentences)
+    assert (
+        headline.parameters["zeta"].flag
+        == headline.parameters["alpha"].flag
+        == SECOND_DAMPING_REASON
+    )
+    assert all(each.size.flag for each in headline.sizes)
+    assert all(mode.damping_ratio.flag is None for mode in headline.modes)
+    assert any(
+        sentence.startswith("Internal damping alone would do.") for sentence in verdict.sentences
+    )
 
 
-def test_what_cannot_be_told_apart_is_said(one_mode):
+def test_indistinguishable_structures_are_reported(one_mode):
     verdict = one_mode.verdict
     close = [row.structure for row in verdict.table[1:] if row.delta_bic < BIC_TIE]
     assert close
@@ -246,17 +254,17 @@ def test_what_cannot_be_told_apart_is_said(one_mode):
 
 
 @pytest.mark.further  # as each alone
-def test_hum_and_a_stiffness_that_rises_become_neither_mode_nor_order(sessions, stiffening):
+def test_hum_and_rising_stiffness_do_not_appear_as_damping(sessions, stiffening):
     made = sessions("III", sweep_s=60)
     t = np.arange(made.torque_nm.size) / 1000
     hum = 0.03 * np.sin(2 * np.pi * 50.02 * t)  # beyond the band, and leaking into it
     torque = made.torque_nm + stiffening("III", 0.02, 60) + hum
     spoilt = type(made)(made.angle_rad, torque)
     selection = select(spoilt.measured(noise_nm=NOISE_NM, seed=45))
-    verdict, told = selection.verdict, selection.headline
-    assert all("depends on the deflection" in mode.frequency_hz.flag for mode in told.modes)
-    assert all(mode.damping_ratio.flag is None for mode in told.modes)
-    assert set(told.flags) == {"density_over_stiffness"}
+    verdict, headline = selection.verdict, selection.headline
+    assert all("depends on the deflection" in mode.frequency_hz.flag for mode in headline.modes)
+    assert all(mode.damping_ratio.flag is None for mode in headline.modes)
+    assert set(headline.flags) == {"density_over_stiffness"}
     assert (verdict.structure, verdict.adequate) == ("III", True)
     assert kinds(verdict) == {"hum", "nonlinear stiffness"}
     line, force = verdict.findings
@@ -274,18 +282,18 @@ def field(sessions, candidates_of):
 
 
 @pytest.mark.further  # as an elastic clamp in test_rig_findings.py
-def test_a_beam_that_is_not_uniform_is_no_fractional_order(sessions, link, plants):
+def test_nonuniform_beam_is_no_fractional_order(sessions, link, plants):
     offsets = (0.006, -0.013)
     made = sessions("III", offsets=offsets)
     selection = select(made.measured(noise_nm=NOISE_NM, seed=46))
-    told, verdict = selection.headline, selection.verdict
-    assert told.uniform_beam.status == "refused"
+    headline, verdict = selection.headline, selection.verdict
+    assert headline.uniform_beam.status == "refused"
     assert verdict.adequate
     assert kinds(verdict) <= {"rival explanations"}
     assert "fractional" not in (verdict.alpha.status, verdict.lambda_.status)
     loaded = Plant(link, plants["III"], stiffness_offsets=offsets)
     poles = loaded.poles(clamped_free_eigenvalues(3))[:, 0]
-    for mode, pole in zip(told.modes, poles, strict=True):
+    for mode, pole in zip(headline.modes, poles, strict=True):
         for quantity, value in (
             (mode.frequency_hz, pole.imag / (2 * np.pi)),
             (mode.damping_ratio, -pole.real / abs(pole)),
@@ -295,7 +303,7 @@ def test_a_beam_that_is_not_uniform_is_no_fractional_order(sessions, link, plant
 
 
 @pytest.mark.further  # each by itself is above
-def test_a_fractional_order_on_a_beam_that_is_not_uniform(sessions):
+def test_fractional_order_on_a_nonuniform_beam(sessions):
     made = sessions("IV", offsets=(0.006, -0.013))
     selection = select(made.measured(noise_nm=NOISE_NM, seed=47))
     verdict = selection.verdict
@@ -320,7 +328,7 @@ def test_a_refit_at_the_minimum_stays_there(field):
     assert field.refit(best).cost == pytest.approx(best.fit.cost, rel=1e-7)
 
 
-def test_the_profile_crosses_where_a_fit_with_the_order_held_says(type_iii, sessions):
+def test_profile_agrees_with_a_fit_of_fixed_order(type_iii, sessions):
     profile = type_iii.verdict.alpha.profile
     held = [
         replace(STRUCTURES["VI"], fixed={"alpha": value})
@@ -355,6 +363,6 @@ def test_candidates_start_from_those_of_a_part(
     assert {"zeta", "gamma"} <= set(fit.determined)
     for name in fit.determined:
         assert abs(fit.parameters[name] - truth[name]) < 4 * fit.std[name], name
-    hum_nm = 2e-2 * np.sin(2 * np.pi * 16.4 * np.arange(13_000) / 1000)  # beside mode 2
+    hum_nm = 2e-2 * np.sin(2 * np.pi * 16.4 * np.arange(13_000) / 1000)  # near mode 2
     humming = replace(whole, torque_nm=whole.torque_nm + hum_nm)
     assert candidates.refit_from_earlier(earlier, humming, (), (0.0, 50.0)) is None

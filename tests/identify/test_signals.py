@@ -27,7 +27,7 @@ def test_gaps_of_a_band_limited_signal_are_closed():
     assert closed[-1] == pytest.approx(signal[-1], abs=2e-3)
 
 
-def test_without_a_gap_nothing_changes():
+def test_signal_without_gaps_is_unchanged():
     values = np.random.default_rng(2).normal(size=50)
     assert (interpolate_gaps(values, np.ones(50, dtype=bool), 0.05) == values).all()
 
@@ -35,31 +35,31 @@ def test_without_a_gap_nothing_changes():
 @pytest.mark.parametrize(
     ("rate_hz", "highest_hz", "factor"), [(1000, 50, 8), (1000, 20, 20), (250, 80, 1)]
 )
-def test_decimation_keeps_the_band_and_nothing_else(rate_hz, highest_hz, factor):
+def test_decimation_passes_only_the_band(rate_hz, highest_hz, factor):
     decimation = Decimation.to_band(rate_hz, highest_hz)
     assert decimation.factor == factor
     n = 20_000
     t = np.arange(n) / rate_hz
     for hz in (0.0, 0.3 * highest_hz, highest_hz):
-        kept = decimation.apply(np.cos(2 * np.pi * hz * t + 0.4))
+        decimated = decimation.apply(np.cos(2 * np.pi * hz * t + 0.4))
         inside = decimation.samples_inside_record(n)
-        at = (np.arange(kept.size) - decimation.reach) / decimation.rate_hz
+        at = (np.arange(decimated.size) - decimation.reach) / decimation.rate_hz
         expected = np.cos(2 * np.pi * hz * at + 0.4)
-        assert np.abs(kept - expected)[inside].max() < 2e-5
+        assert np.abs(decimated - expected)[inside].max() < 2e-5
     beyond_hz = 1.01 * decimation.rate_hz / 2
     if beyond_hz < rate_hz / 2:
-        kept = decimation.apply(np.cos(2 * np.pi * beyond_hz * t))
-        assert np.abs(kept[decimation.samples_inside_record(n)]).max() < 2e-5
+        decimated = decimation.apply(np.cos(2 * np.pi * beyond_hz * t))
+        assert np.abs(decimated[decimation.samples_inside_record(n)]).max() < 2e-5
 
 
-def test_inside_is_where_the_edges_do_not_reach():
+def test_inside_excludes_edge_effects():
     decimation = Decimation.to_band(1000.0, 50.0)
     n = 5001
-    kept = decimation.apply(np.ones(n))
+    decimated = decimation.apply(np.ones(n))
     inside = decimation.samples_inside_record(n)
-    assert kept[inside] == pytest.approx(1.0, abs=1e-12)
-    assert kept[inside.start - 1] != pytest.approx(1.0, abs=1e-12)
-    assert kept[inside.stop] != pytest.approx(1.0, abs=1e-12)
+    assert decimated[inside] == pytest.approx(1.0, abs=1e-12)
+    assert decimated[inside.start - 1] != pytest.approx(1.0, abs=1e-12)
+    assert decimated[inside.stop] != pytest.approx(1.0, abs=1e-12)
 
 
 def test_fast_lengths():
@@ -71,7 +71,7 @@ def noise(shape, seed):
     return shape * (rng.normal(size=shape.size) + 1j * rng.normal(size=shape.size)) / np.sqrt(2)
 
 
-def test_coloured_noise_without_what_is_no_noise():
+def test_coloured_noise_without_lines_and_modes():
     n = 6800
     shape = np.linspace(3.0, 1.0, n) / (1 + np.arange(n) / 300)
     residual = noise(shape, 4)
@@ -120,7 +120,7 @@ def test_a_hum_is_a_line(hz, amplitude):
     assert np.sum(np.abs(rest) ** 2) == pytest.approx(2 * np.sum(noise.is_compared), rel=0.05)
 
 
-def test_what_comes_and_goes_is_no_line():
+def test_intermittent_signal_is_no_line():
     decay = np.where(TIME_S > 40, np.exp(-0.5 * np.maximum(TIME_S - 40, 0)), 0)
     passing = decay * np.sin(2 * np.pi * 16 * TIME_S)
     noise = estimate_noise(
@@ -138,7 +138,7 @@ def test_white_noise_has_no_lines():
         assert np.mean(noise.power) == pytest.approx(SAMPLES * 4e-3**2, rel=0.06)
 
 
-def test_what_is_not_known_is_no_less_noise():
+def test_unknown_samples_do_not_lower_the_noise():
     half = np.where(np.arange(SAMPLES) % 2 == 0, white(3), 0)
     noise = estimate_noise(spectrum(half), FREQUENCY_HZ, SAMPLES, known_fraction=0.5)
     assert np.mean(noise.power) == pytest.approx(SAMPLES * 4e-3**2, rel=0.06)
@@ -152,19 +152,19 @@ def test_a_resonance_is_never_left_out():
         assert noise.is_compared.all()
 
 
-def test_a_peak_of_the_noise_continues_towards_a_mode_and_does_not_begin_there():
+def test_noise_peak_continues_but_does_not_begin_at_a_mode():
     bins = 4000
     parts = np.random.default_rng(3).normal(size=(2, bins))
     residual = parts[0] + 1j * parts[1]
-    residual[1000:1100] *= 4  # begins beside the mode, and reaches into its surroundings
+    residual[1000:1100] *= 4  # begins next to the mode, and reaches into its surroundings
     residual[1150:1160] *= 8  # of the mode itself
     residual[1210:1230] *= 4  # within its surroundings alone
     level = np.full(bins, 2.0)
     bin_number = np.arange(bins)
     surroundings, resonance = abs(bin_number - 1155) < 120, abs(bin_number - 1155) < 40
     found = noise_power_with_peaks(residual, level, ~surroundings, ~resonance)
-    beside, within = found[1006:1034], found[1042:1094]  # of the surroundings
-    assert beside.mean() == pytest.approx(32, rel=0.6)
+    outside, within = found[1006:1034], found[1042:1094]  # of the surroundings
+    assert outside.mean() == pytest.approx(32, rel=0.6)
     assert within.mean() == pytest.approx(32, rel=0.4)
     assert (found[1150:1160] == 2).all()
     assert (found[1210:1230] == 2).all()

@@ -1,4 +1,4 @@
-"""Effects beside a linear antenna whose first order in their size suffices."""
+"""Effects in addition to a linear antenna for which the first order in their size suffices."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def rubbed(made, friction_nm, sliding_rad_s):
 
 
 @pytest.mark.parametrize("sliding_rad_s", [0.003, further(0.03)])
-def test_dry_friction_is_named_and_leaves_the_modes_right(sessions, plants, link, sliding_rad_s):
+def test_dry_friction_is_reported_without_bias_of_modes(sessions, plants, link, sliding_rad_s):
     """A torque of known sign that grows with nothing: no harmonic, no order, no stiffness."""
     selection = select(rubbed(sessions("III"), 0.01, sliding_rad_s).measured(NOISE_NM, 3))
     (finding,) = selection.verdict.findings

@@ -25,7 +25,7 @@ def responding(force, omega, ratio):
 
 
 def slipped_torque(angle_rad, beam, damping):
-    """Torque that modes of another stiffness add from an instant on, whatever its size."""
+    """Torque that modes of another stiffness add from an instant on, for steps of any size."""
     assert damping.alpha == damping.lambda_ == 1
     later = np.arange(angle_rad.size) * PERIOD_S >= AT_S
     push = -np.gradient(np.gradient(angle_rad, PERIOD_S), PERIOD_S)
@@ -64,7 +64,7 @@ def test_step_of_the_stiffness_is_found(score_of, sessions, plants, link):
     assert step.relative_change == pytest.approx(CHANGE, rel=0.5)
 
 
-def test_none_is_named_where_nothing_changes(score_of, sessions):
+def test_no_step_is_reported_without_a_change(score_of, sessions):
     step = score_of(sessions("III"))
     assert not step.is_significant
     assert step.score < 13

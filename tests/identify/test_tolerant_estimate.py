@@ -39,7 +39,7 @@ def estimate_with():
     ("interval", "deviance", "rests"),
     [((0.05, 0.15), 0.25, True), ((0.5, 0.7), 30.0, False), ((0.9, 1.1), 0.0, False)],
 )
-def test_an_order_that_only_the_frequencies_support_flags_the_internal_damping(
+def test_order_from_frequencies_alone_flags_internal_damping(
     estimate_with, interval, deviance, rests
 ):
     estimate = estimate_with(interval, deviance)

@@ -1,4 +1,4 @@
-"""Which modes a record shows: by what a response without their resonance would leave."""
+"""Which modes a record shows: by the residual of a response without their resonance."""
 
 from types import SimpleNamespace
 
@@ -33,15 +33,15 @@ def seen(sessions):
     return of
 
 
-def test_a_sharp_mode_shows_in_strong_noise(seen):
+def test_sharp_mode_is_visible_in_strong_noise(seen):
     assert {1, 2} <= set(seen(STRONG_NM))
 
 
-def test_a_mode_drowned_in_noise_does_not_show(seen):
+def test_mode_below_the_noise_is_invisible(seen):
     assert 2 not in seen(2.0)
 
 
-def test_all_modes_of_the_band_show_in_the_usual_noise(seen):
+def test_all_modes_are_visible_in_usual_noise(seen):
     assert seen(0.01) == (1, 2, 3)
 
 
@@ -53,7 +53,7 @@ def test_noise_alone_is_no_mode(seen):
     ("highest_hz", "covered"),
     [(50.0, True), (10.0, False)],
 )
-def test_whether_a_sweep_reached_the_second_mode(sessions, highest_hz, covered):
+def test_sweep_reached_the_second_mode_or_not(sessions, highest_hz, covered):
     made = sessions("III")
     n = made.angle_rad.size
     t = np.arange(n) / 1000 - 1
@@ -71,13 +71,13 @@ def test_a_step_is_no_sweep_over_the_second_mode(sessions):
     assert not is_excited(Comparison.from_measurement(measured, (0.0, 50.0)), 16.0, 2.55)
 
 
-def test_a_sweep_that_covered_the_mode_is_to_be_louder_not_wider(sessions):
+def test_louder_sweep_is_advised_if_the_mode_was_covered(sessions):
     measured = sessions("III").measured(noise_nm=1.0, seed=52)
     analysis = fit_record(measured, [STRUCTURES["III"]])
     best = SimpleNamespace(fit=analysis.fits[0])
     field = SimpleNamespace(comparison=analysis.comparison, best=best)
     unknown = SimpleNamespace(order="alpha", status="not identifiable")
-    (said,) = experiments(field, (unknown,), (1,), (), ())
-    assert "increase the amplitude" in said
-    assert "a wider band does not help" in said
-    assert "sweep up to" not in said
+    (advice,) = experiments(field, (unknown,), (1,), (), ())
+    assert "increase the amplitude" in advice
+    assert "a wider band does not help" in advice
+    assert "sweep up to" not in advice

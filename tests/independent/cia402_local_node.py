@@ -1,9 +1,9 @@
 """A CiA 402 drive made from any EDS on canopen's LocalNode: an independent witness of rigd.
 
-It shares no code with rigd. Objects are those of the file, absent, read-only or limited as the file
-has them; PDOs are those that the master maps, by the rules of CiA 301. It writes down what it was
-told and what it did. Run as a process: `cia402_local_node.py SETTINGS.json`, with orders as lines
-of JSON on its standard input, each answered with a line.
+It has no code in common with rigd. Objects are those of the file, absent, read-only or limited as
+the file has them; PDOs are those that the master maps, by the rules of CiA 301. It records the
+orders that it received and its actions. Run as a process: `cia402_local_node.py SETTINGS.json`,
+with orders as lines of JSON on its standard input, each answered with a line.
 """
 
 import configparser
@@ -54,7 +54,7 @@ OPERATIONAL, STOPPED, PRE_OPERATIONAL = "OPERATIONAL", "STOPPED", "PRE-OPERATION
 
 @dataclass
 class Settings:
-    """What the file does not say."""
+    """Settings that the file does not state."""
 
     eds: str
     socket: str
@@ -68,12 +68,12 @@ class Settings:
     gear: float = 100.0
     rad_per_count: float = 7.0e-5
     stored: dict[str, int] = field(default_factory=dict)
-    """What somebody saved in the drive before: "1800:3" → value, in place of the file's."""
+    """Values saved in the drive before: "1800:3" → value, instead of the file's."""
     pre_operational: str = "abort"
     """NMT pre-operational while enabled: "abort" acts as 6007 says, "keeps on" changes the NMT
     state and leaves the torque on, "ignored" does not even that."""
     without_6007: int = 1
-    """What a drive without 6007 does when the connection is lost, in the numbers of 6007."""
+    """Reaction of a drive without 6007 to a lost connection, in the numbers of 6007."""
     torque_lag_s: float = 0.0
     """First-order lag of 6077 behind the torque."""
     follows_bit: bool = True
@@ -116,7 +116,7 @@ class DriveNode(canopen.LocalNode):
     def set_data(
         self, index: int, subindex: int, data: bytes, check_writable: bool = False
     ) -> None:
-        told = {"index": f"{index:04X}:{subindex}", "data": bytes(data).hex()}
+        entry = {"index": f"{index:04X}:{subindex}", "data": bytes(data).hex()}
         try:
             found = self._find_object(index, subindex)
             if check_writable and not found.writable:
@@ -134,10 +134,10 @@ class DriveNode(canopen.LocalNode):
             super().set_data(index, subindex, data, check_writable)
         except SdoAbortedError as error:
             if self.drive is not None:
-                self.drive.log.note("write refused", **told, abort=f"0x{error.code:08X}")
+                self.drive.log.note("write refused", **entry, abort=f"0x{error.code:08X}")
             raise
         if self.drive is not None and check_writable:
-            self.drive.log.note("write", **told)
+            self.drive.log.note("write", **entry)
             self.drive.after_write(index, subindex)
 
 
@@ -153,7 +153,7 @@ class Pdo:
     timeout_s: float
     syncs: int = 0
     sent_s: float = -1e9
-    heard_s: float | None = None
+    received_s: float | None = None
     waiting: bytes | None = None
 
     @property
@@ -206,8 +206,12 @@ class Drive:
                 if each.value is None and each.default is None:
                     blank = bytes(len(each) // 8) if each.data_type in od.NUMBER_TYPES else b"?"
                     self._store(each.index, each.subindex, blank)
-        told = node.object_dictionary.device_information
-        numbers = (told.vendor_number, told.product_number, told.revision_number)
+        consumer_entry = node.object_dictionary.device_information
+        numbers = (
+            consumer_entry.vendor_number,
+            consumer_entry.product_number,
+            consumer_entry.revision_number,
+        )
         for sub, number in enumerate(numbers, 1):
             if self._has(0x1018, sub) and not self._get(0x1018, sub) and number:
                 self._put(0x1018, sub, number)
@@ -263,7 +267,7 @@ class Drive:
         return None
 
     def before_write(self, index: int, sub: int, value: int) -> None:
-        """Refuse what the rules of CiA 301 and 402 forbid."""
+        """Refuse writes that CiA 301 and 402 forbid."""
         if 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00:
             self._check_mapping(index, sub, value)
         elif 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
@@ -271,8 +275,8 @@ class Drive:
         elif index == 0x1016 and sub and value & 0xFFFF:
             for other in range(1, 128):
                 same = other != sub and self._has(0x1016, other)
-                told = self._get(0x1016, other) if same else 0
-                if told & 0xFFFF and told >> 16 & 0x7F == value >> 16 & 0x7F:
+                consumer_entry = self._get(0x1016, other) if same else 0
+                if consumer_entry & 0xFFFF and consumer_entry >> 16 & 0x7F == value >> 16 & 0x7F:
                     raise SdoAbortedError(INCOMPATIBLE)
         elif index == 0x6060 and value:
             bit = MODE_BITS.get(value)
@@ -316,7 +320,7 @@ class Drive:
             raise SdoAbortedError(OUT_OF_RANGE)
 
     def after_write(self, index: int, sub: int) -> None:
-        """Act on what was written."""
+        """Apply a written value."""
         if 0x1400 <= index < 0x1C00:
             self._read_pdos()
         elif index == 0x1016:
@@ -345,9 +349,9 @@ class Drive:
         if data[0] == 0x80 and self.settings.pre_operational == "ignored":
             return
         was = self.nmt
-        keeps = data[0] == 0x80 and self.settings.pre_operational == "keeps on"
+        remains_enabled = data[0] == 0x80 and self.settings.pre_operational == "keeps on"
         self.node.nmt.on_command(can_id, data, at_s)
-        if was == OPERATIONAL and self.nmt != OPERATIONAL and not keeps:
+        if was == OPERATIONAL and self.nmt != OPERATIONAL and not remains_enabled:
             self._lose_connection(0)
         if data[0] in (0x81, 0x82):
             self.state, self.error_code = SWITCH_ON_DISABLED, 0
@@ -387,7 +391,7 @@ class Drive:
                 timeout_s=self._get_or(index, 5, 0) * 1e-3,
             )
             if index in before:
-                pdo.heard_s = before[index].heard_s
+                pdo.received_s = before[index].received_s
             if index >= 0x1800:
                 self._tpdos.append(pdo)
             else:
@@ -421,7 +425,7 @@ class Drive:
         pdo = self._rpdos.get(can_id)
         if pdo is None or self.nmt != OPERATIONAL:
             return
-        now_s = pdo.heard_s = time.monotonic()
+        now_s = pdo.received_s = time.monotonic()
         if len(data) < pdo.length:
             self._alarm(PDO_TOO_SHORT, 0x11)
             return
@@ -449,13 +453,13 @@ class Drive:
     # Guards
 
     def _read_guards(self) -> None:
-        """Watch the nodes of 1016; each from the first heartbeat on that is heard of it."""
+        """Watch the nodes of 1016; each from its first received heartbeat on."""
         for node_id in self._guarded:
             self.network.unsubscribe(0x700 + node_id, self._on_heartbeat)
         self._guarded = {}
         for sub in range(1, 128):
-            told = self._get(0x1016, sub) if self._has(0x1016, sub) else 0
-            node_id, patience_s = told >> 16 & 0x7F, (told & 0xFFFF) * 1e-3
+            consumer_entry = self._get(0x1016, sub) if self._has(0x1016, sub) else 0
+            node_id, patience_s = consumer_entry >> 16 & 0x7F, (consumer_entry & 0xFFFF) * 1e-3
             if node_id and patience_s:
                 self._guarded[node_id] = (patience_s, None)
                 self.network.subscribe(0x700 + node_id, self._on_heartbeat)
@@ -465,7 +469,7 @@ class Drive:
         self._guarded[can_id - 0x700] = (patience_s, time.monotonic())
 
     def _lose_connection(self, code: int) -> None:
-        """Act as objects 1029 and 6007 say."""
+        """Act according to objects 1029 and 6007."""
         self.log.note("connection lost", code=code)
         if code:
             self._alarm(code, 0x11)
@@ -483,17 +487,17 @@ class Drive:
             self._go(QUICK_STOP)
 
     def watch(self) -> None:
-        """Look at the clocks; called often."""
+        """Check the timeouts; called often."""
         now_s = time.monotonic()
         self._move(now_s)
-        for node_id, (patience_s, heard_s) in self._guarded.items():
-            if heard_s is not None and now_s - heard_s > patience_s:
+        for node_id, (patience_s, received_s) in self._guarded.items():
+            if received_s is not None and now_s - received_s > patience_s:
                 self._guarded[node_id] = (patience_s, None)
                 self._lose_connection(HEARTBEAT_LOST)
         for pdo in self._rpdos.values():
-            late = pdo.heard_s is not None and pdo.timeout_s
-            if late and now_s - pdo.heard_s > pdo.timeout_s:
-                pdo.heard_s = None
+            late = pdo.received_s is not None and pdo.timeout_s
+            if late and now_s - pdo.received_s > pdo.timeout_s:
+                pdo.received_s = None
                 self._lose_connection(RPDO_TIMEOUT)
         if self._quick_stop_until_s is not None and now_s > self._quick_stop_until_s:
             self._quick_stop_until_s = None
@@ -589,8 +593,8 @@ class Drive:
         self.shaft.advance(now_s, exerted_nm)
         step_s, self._shown_s = now_s - self._shown_s, now_s
         lag_s = self.settings.torque_lag_s
-        share = min(1.0, step_s / lag_s) if lag_s else 1.0
-        self.shown_per_mille += share * (self.torque_per_mille - self.shown_per_mille)
+        fraction = min(1.0, step_s / lag_s) if lag_s else 1.0
+        self.shown_per_mille += fraction * (self.torque_per_mille - self.shown_per_mille)
 
     def _position(self) -> int:
         counts = round(self.shaft.angle_rad / self.settings.rad_per_count) * self._sense(7)
@@ -603,7 +607,7 @@ class Drive:
     # Orders from outside the bus
 
     def obey(self, order: dict[str, object]) -> dict[str, object]:
-        """Have something happen in the drive; return how it stands."""
+        """Cause an event in the drive; return its state."""
         what = order.get("do")
         if what == "fault":
             code = int(order.get("code", 0x2310))  # type: ignore[call-overload]

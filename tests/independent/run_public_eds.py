@@ -4,11 +4,11 @@
 
 A drive with cyclic synchronous torque mode has to pass `rigd check`, a chirp, a fault in
 mid-session, `rigd reset` and the next chirp; left on by a killed host it has to be off within 0.2 s
-of the first frame of `rigd reset`, or that has to fail and say so. Any other drive has to be
+of the first frame of `rigd reset`, or that has to fail and report it. Any other drive has to be
 refused by the name of the object, on paper within a second and on the bus.
 
 Every row of `rigd check` counts; `--ignore-timing` leaves out those on times, which a computer that
-is busy with other things spoils, and the summary says so.
+is busy with other things spoils, and the summary reports it.
 """
 
 import argparse
@@ -36,12 +36,12 @@ LEFT_ON = ("keeps on", "ignored")
 
 @dataclass
 class Paper:
-    """What `rigd check --eds` says."""
+    """Verdict of `rigd check --eds`."""
 
     usable: bool
     seconds: float
     cpu_s: float
-    """What it took of the processor, whatever else the computer did meanwhile."""
+    """Processor time, independent of other load."""
     why: str
     accept: list[str]
     absent: set[str]
@@ -49,12 +49,12 @@ class Paper:
 
 @dataclass
 class Verdict:
-    """What came of one file."""
+    """Result of one file."""
 
     name: str
     paper: Paper
     steps: dict[str, str] = field(default_factory=dict)
-    """Step to "ok" or to what was wrong with it; what begins with "(" says why it was left out."""
+    """Step to "ok" or to its error; a text that begins with "(" states why it was left out."""
 
     @property
     def complaints(self) -> list[str]:
@@ -62,7 +62,7 @@ class Verdict:
 
     @property
     def outcome(self) -> str:
-        """What it counts as in the summary."""
+        """Category in the summary."""
         if self.complaints:
             return "with complaints"
         if any(result.startswith("(") for result in self.steps.values()):
@@ -71,7 +71,7 @@ class Verdict:
 
 
 def on_paper(eds: Path) -> Paper:
-    """Ask `rigd check --eds`, which connects to nothing."""
+    """Run `rigd check --eds`, which connects to nothing."""
     began_s, before = time.monotonic(), os.times()
     done = subprocess.run(
         [RIGD, "check", "--eds", eds, "--json"],
@@ -93,7 +93,7 @@ def on_paper(eds: Path) -> Paper:
 
 
 def profile_for(paper: Paper, eds: Path) -> dict[str, object]:
-    """Return what an operator writes into the profile after reading `rigd check --eds`."""
+    """Return the settings that an operator takes from `rigd check --eds`."""
     values: dict[str, object] = {"cia402.eds": str(eds)}
     if paper.accept:
         values["cia402.accept_without"] = paper.accept
@@ -106,21 +106,21 @@ def profile_for(paper: Paper, eds: Path) -> dict[str, object]:
 
 
 def complete(done: Done) -> str:
-    return "ok" if done.code == 0 and "Complete: " in done.said else f"{done.code}: {done.last}"
+    return "ok" if done.code == 0 and "Complete: " in done.printed else f"{done.code}: {done.last}"
 
 
 def play_session_with_fault(scene: Scene) -> str:
-    """Let the drive fail in mid-session; return "ok" or what was wrong."""
+    """Let the drive fail in mid-session; return "ok" or the error."""
     process = scene.start_chirp()
     try:
         scene.await_torque()
     except RuntimeError as error:
         return f"{error}: {scene.finish(process).last}"
-    stands = scene.order(do="fault", code=FAULT)
+    state = scene.order(do="fault", code=FAULT)
     done = scene.finish(process)
-    if stands["per_mille"] or scene.state()["per_mille"]:
+    if state["per_mille"] or scene.state()["per_mille"]:
         return "the node has a torque in fault"
-    if done.code != 1 or f"0x{FAULT:04X}" not in done.said or "Traceback" in done.said:
+    if done.code != 1 or f"0x{FAULT:04X}" not in done.printed or "Traceback" in done.printed:
         return f"{done.code}: {done.last}"
     return "ok"
 
@@ -176,7 +176,7 @@ def _refused(scene: Scene) -> str:
     enabled = [e for e in scene.log("state") if e["state"] == "operation enabled"]
     if enabled:
         return "it was enabled"
-    if done.code != 1 or "Traceback" in done.said or not _OBJECT.search(done.last):
+    if done.code != 1 or "Traceback" in done.printed or not _OBJECT.search(done.last):
         return f"{done.code}: {done.last}"
     frames = [e["t_s"] for e in scene.log("sdo", "nmt")]
     took_s = frames[-1] - frames[0] if frames else 0.0
@@ -193,14 +193,14 @@ def play_left_on(
     with Scene(eds, node=given, profile=profile) as scene:
         scene.order(do="leave on", per_mille=150)
         done = scene.reset()
-        heard = [e["t_s"] for e in scene.log("sdo", "nmt")]
+        received_s = [e["t_s"] for e in scene.log("sdo", "nmt")]
         off = [e["t_s"] for e in scene.log("torque") if not e["enabled"]]
-        if "Traceback" in done.said:
+        if "Traceback" in done.printed:
             return done.last
         if not off:
             warned = done.code != 0 and re.search(r"turn|torque|enabled|may be on", done.last)
             return f"ok: warned: {done.last}" if warned else f"{done.code}, still on: {done.last}"
-        after_s = off[0] - heard[0]
+        after_s = off[0] - received_s[0]
         if after_s > OFF_WITHIN_S:
             return f"off after {after_s:.3f} s: {done.last}"
         return f"ok: off {after_s:.3f} s, exit {done.code}"

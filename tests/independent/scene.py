@@ -31,7 +31,7 @@ _STARTED_S = 60.0
 _COMMAND_S = 90.0
 
 # A computer that is busy with other things misses ticks, and a reply comes late: a slow loop with
-# wide limits is to run all the same. Torque off in time is judged by the node's own log.
+# wide limits is to run all the same. Torque off in time is checked by the node's own log.
 VALUES: dict[str, object] = {
     "name": NAME,
     "rig.rate_hz": 250.0,
@@ -97,16 +97,16 @@ def commissioned(eds: Path) -> int:
 
 @dataclass(frozen=True)
 class Done:
-    """What a command came to."""
+    """Result of a command."""
 
     code: int
-    said: str
+    printed: str
     seconds: float
 
     @property
     def last(self) -> str:
-        """What it said at the end, in one line."""
-        lines = [line.strip() for line in self.said.splitlines() if line.strip()]
+        """Last message in one line."""
+        lines = [line.strip() for line in self.printed.splitlines() if line.strip()]
         errors = [line for line in lines if line.startswith(("Error", "fault", "Traceback"))]
         return (errors or lines or ["nothing"])[-1]
 
@@ -144,8 +144,8 @@ class Scene:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         try:
-            if "ended" in (told := self._answer()):
-                raise RuntimeError(told["ended"])
+            if "ended" in (answer := self._answer()):
+                raise RuntimeError(answer["ended"])
             values = VALUES | {"can.channel": channel, "cia402.node_id": node_id}
             values |= profile or {}
             self.profile = self.folder / f"{NAME}.toml"
@@ -165,12 +165,12 @@ class Scene:
         line = self._node.stdout.readline()
         if not line:
             assert self._node.stderr is not None
-            told = self._node.stderr.read().strip().splitlines()
-            raise RuntimeError(f"the node ended: {told[-1] if told else 'nothing said'}")
+            errors = self._node.stderr.read().strip().splitlines()
+            raise RuntimeError(f"the node ended: {errors[-1] if errors else 'nothing said'}")
         return dict(json.loads(line))
 
     def order(self, **what: object) -> dict[str, Any]:
-        """Have something happen in the node; return how it stands."""
+        """Cause an event in the node; return its state."""
         assert self._node.stdin is not None
         self._node.stdin.write(json.dumps(what) + "\n")
         self._node.stdin.flush()
@@ -180,7 +180,7 @@ class Scene:
         return self.order(do="nothing")
 
     def log(self, *kinds: str) -> list[dict[str, Any]]:
-        """Return what the node noted, as far as it has been written down."""
+        """Return the log of the node so far."""
         self.state()
         lines = self._log.read_text("utf-8").splitlines()
         entries = [json.loads(line) for line in lines]
@@ -200,17 +200,17 @@ class Scene:
     def finish(self, process: subprocess.Popen[str], started_s: float | None = None) -> Done:
         began_s = time.monotonic() if started_s is None else started_s
         try:
-            said, _ = process.communicate(timeout=_COMMAND_S)
+            printed, _ = process.communicate(timeout=_COMMAND_S)
         except subprocess.TimeoutExpired:
             process.kill()
-            said, _ = process.communicate()
-            said += f"\nError: not done after {_COMMAND_S:g} s"
-        return Done(process.returncode, said, time.monotonic() - began_s)
+            printed, _ = process.communicate()
+            printed += f"\nError: not done after {_COMMAND_S:g} s"
+        return Done(process.returncode, printed, time.monotonic() - began_s)
 
     def check(self, *, ignore_timing: bool = False) -> list[str]:
-        """Return what `rigd check` finds wrong; without TIMES where those are to be ignored."""
+        """Return the errors of `rigd check`; without TIMES if those are to be ignored."""
         done = self.run("check", "--profile", self.profile, "--json")
-        found = [line for line in done.said.splitlines() if line.startswith("{")]
+        found = [line for line in done.printed.splitlines() if line.startswith("{")]
         if not found:
             return [done.last]
         return [

@@ -3,7 +3,7 @@
 `SeqpacketHub` is the bus itself, in the process of the devices; `can.Bus(interface="seqpacket",
 channel=PATH)` is a participant. python-can finds the interface by the entry point that
 `announce` writes into a folder of PYTHONPATH, as it finds one that is installed. Frames arrive
-whole and in order; who does not read loses them, and nobody waits for it.
+whole and in order; a participant that does not read loses them.
 """
 
 import contextlib
@@ -76,7 +76,7 @@ class SeqpacketBus(can.BusABC):
 
 
 class SeqpacketHub(can.BusABC):
-    """The bus: what one participant sends all others get, and the owner of the hub, too."""
+    """The bus: all others and the owner of the hub get the frames of a participant."""
 
     def __init__(self, path: str) -> None:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -88,7 +88,7 @@ class SeqpacketHub(can.BusABC):
         super().__init__(channel=path)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        self._tell(_pack(msg), but=None)
+        self._distribute(_pack(msg), but=None)
 
     def poll(self, timeout_s: float, *others: int) -> tuple[list[can.Message], list[int]]:
         """Wait for frames; return them, and those of the other descriptors that are ready."""
@@ -103,17 +103,17 @@ class SeqpacketHub(can.BusABC):
         return messages, [source for source in ready if isinstance(source, int)]
 
     def _take(self, source: socket.socket) -> list[can.Message]:
-        """Take the next frame of a participant, and hand it on: one at a time keeps the order."""
+        """Take and distribute the next frame of a participant: one at a time preserves the order."""
         with contextlib.suppress(ConnectionError):
             raw = source.recv(_FRAME.size)
             if len(raw) == _FRAME.size:
-                self._tell(raw, but=source)
+                self._distribute(raw, but=source)
                 return [_unpack(raw)]
         self._participants.remove(source)
         source.close()
         return []
 
-    def _tell(self, raw: bytes, but: socket.socket | None) -> None:
+    def _distribute(self, raw: bytes, but: socket.socket | None) -> None:
         for each in list(self._participants):
             if each is not but:
                 try:

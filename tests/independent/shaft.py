@@ -23,7 +23,7 @@ class Shaft:
     angle_rad: float = 0.0
     speed_rad_s: float = 0.0
     coupling_nm: float = 0.0
-    """What the hub exerts on the beam."""
+    """Torque of the hub on the beam."""
     _beam_rad: float = field(default=0.0, init=False)
     _beam_rad_s: float = field(default=0.0, init=False)
     _time_s: float | None = field(default=None, init=False)
@@ -46,7 +46,7 @@ class Shaft:
         drag_nm = self.viscous_nm_s_per_rad * before
         free = before + _STEP_S * (torque_nm - spring_nm - drag_nm) / inertia
         grip = _STEP_S * self.coulomb_nm / inertia
-        # Dry friction takes what speed there is, and no more.
+        # Dry friction stops the motion and does not reverse it.
         self.speed_rad_s = 0.0 if abs(free) <= grip else free - grip * (1 if free > 0 else -1)
         self.angle_rad += _STEP_S * self.speed_rad_s
         self._beam_rad_s += _STEP_S * spring_nm / self.mode_kg_m2

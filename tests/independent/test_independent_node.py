@@ -1,4 +1,4 @@
-"""rigd against a drive that shares no code with it, made from EDS files of different restrictions.
+"""rigd against an independent drive, made from EDS files of different restrictions.
 
 The whole of it, with files of real drives, is `run_public_eds.py`.
 """
@@ -49,7 +49,7 @@ RESTRICTED = {"x60E0": (6, "ro", 50000), "x60E1": (6, "ro", 50000), "x1800_3": (
 SPARSE = ("1005", "1006", "1007", "1019", "1029", "1400:5", "60B2", "60C2", "60E0", "60E1")
 
 
-# As tests/wire/test_drives_by_eds.py has it of the simulated drive; what follows is of this one.
+# As in tests/wire/test_drives_by_eds.py for the simulated drive; the rest is of this one.
 @pytest.mark.slow
 def test_session_fault_reset_session(trial, eds_file):
     # The machine that runs tests has other things to do.
@@ -70,16 +70,16 @@ def test_session_fault_reset_session(trial, eds_file):
         ),
     ],
 )
-def test_session_on_a_drive_that_lacks_objects(trial, eds_file, without, accepted):
+def test_session_on_a_drive_without_optional_objects(trial, eds_file, without, accepted):
     path = eds_file(without=without)
     paper = trial.on_paper(path)
     assert paper.usable, paper.why
     assert paper.accept == accepted
     with trial.Scene(path, profile=trial.profile_for(paper, path)) as scene:
         done = scene.chirp()
-        stands = scene.state()
+        state = scene.state()
     assert trial.complete(done) == "ok"
-    assert (stands["state"], stands["per_mille"]) == ("switch-on disabled", 0)
+    assert (state["state"], state["per_mille"]) == ("switch-on disabled", 0)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_session_on_a_drive_that_lacks_objects(trial, eds_file, without, accepte
         further({"without": ("1016", "1400:5")}, "1016"),
     ],
 )
-def test_a_drive_that_cannot_be_used_is_refused_by_the_object(trial, eds_file, changes, named):
+def test_unusable_drive_is_refused_with_the_object(trial, eds_file, changes, named):
     path = eds_file(**changes)
     paper = trial.on_paper(path)
     with trial.Scene(path, profile={"cia402.eds": str(path)}) as scene:
@@ -110,22 +110,22 @@ def test_reset_switches_off_a_drive_that_a_killed_host_left_on(trial, eds_file, 
 
 
 @pytest.mark.further  # by script in tests/devices/cia402/test_cia402_setup.py
-def test_reset_says_so_of_a_drive_that_does_not_switch_off(trial, eds_file):
+def test_reset_reports_a_drive_that_does_not_switch_off(trial, eds_file):
     """A drive that takes no controlword by SDO: nothing but its STO is left."""
     path = eds_file(x6040=(6, "ro", 0))
     with trial.Scene(path, node={"pre_operational": "ignored"}) as scene:
         scene.order(do="leave on", per_mille=150)
         done = scene.reset()
-        stands = scene.state()
-    assert stands["per_mille"] == 150
+        state = scene.state()
+    assert state["per_mille"] == 150
     assert done.code == 1
-    assert "next session can be started" not in done.said
-    assert "Traceback" not in done.said
+    assert "next session can be started" not in done.printed
+    assert "Traceback" not in done.printed
 
 
 @pytest.mark.further  # a rule of this folder's own node
 def test_the_node_enforces_the_rules_of_pdos(trial, eds_file):
-    """What a master that set PDOs up in the wrong order would be told."""
+    """Errors of a master that sets PDOs up in the wrong order."""
     import can
     import canopen
 
@@ -156,21 +156,21 @@ def test_the_node_enforces_the_rules_of_pdos(trial, eds_file):
                 node.sdo[0x6041].raw = 1
             node.sdo[0x1800][2].raw = 1
             node.sdo[0x1800][1].raw = 0x185
-            heard: list[can.Message] = []
-            network.subscribe(0x185, lambda can_id, data, at: heard.append(bytes(data)))
+            received: list[can.Message] = []
+            network.subscribe(0x185, lambda can_id, data, at: received.append(bytes(data)))
             node.nmt.state = "OPERATIONAL"
             network.sync.transmit()
             deadline = 200
-            while not heard and deadline:
+            while not received and deadline:
                 node.sdo[0x6041].raw  # noqa: B018, one turn of the bus
                 deadline -= 1
-            assert heard == [bytes(4)]
+            assert received == [bytes(4)]
         finally:
             network.disconnect()
 
 
 @pytest.mark.further  # as its other rules
-def test_a_silent_master_costs_the_torque(trial, eds_file):
+def test_silent_master_switches_torque_off(trial, eds_file):
     """1016 and 6007 of the node act by themselves, on the time that is written there."""
     import canopen
 

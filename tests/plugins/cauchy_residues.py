@@ -1,4 +1,4 @@
-"""Modal constants of any plant by Cauchy's integral, apart from the closed form of the analyzer."""
+"""Modal constants of any plant by Cauchy's integral, independent of the analyzer's closed form."""
 
 from collections.abc import Sequence
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 FILES = Path(__file__).parents[1] / "data" / "eds"
 WITH_TORQUE = ("elmo_gold", "epos4_0110", "epos4_0170", "e35")
-"""Drives that have cyclic synchronous torque mode; elmo_gold and epos4_0170 do not tell it."""
+"""Drives that have cyclic synchronous torque mode; elmo_gold and epos4_0170 do not state it."""
 WITHOUT_TORQUE = ("elmo_simpliq", "pilz_prbt", "schunk", "ros_slave", "ipos")
 
 TYPES = {"b": 1, "i8": 2, "i16": 3, "i32": 4, "u8": 5, "u16": 6, "u32": 7, "text": 9}
@@ -91,9 +91,11 @@ COMPLETE = """
 def without(*places: str) -> str:
     """The complete table without some objects, given as in the table."""
     lines = COMPLETE.splitlines()
-    kept = [line for line in lines if not line.strip().startswith(tuple(p + " " for p in places))]
-    assert len(kept) == len(lines) - len(places)
-    return "\n".join(kept)
+    remaining = [
+        line for line in lines if not line.strip().startswith(tuple(p + " " for p in places))
+    ]
+    assert len(remaining) == len(lines) - len(places)
+    return "\n".join(remaining)
 
 
 def changed(place: str, line: str) -> str:

@@ -1,6 +1,6 @@
 """Files of measurements as people and programs write them, with their everyday mistakes.
 
-`everyday_file(folder, seed)` writes one file whose samples are known, and says how it is imported.
+`everyday_file(folder, seed)` writes one file of known samples, and states how it is imported.
 The mistakes are those of the file or of the user: separators, decimal signs, cells too many or too
 few at any line, heads, units, byte order marks, time bases, start times, scales.
 """
@@ -22,7 +22,7 @@ RATES_HZ = (500.0, 1000.0, 1024.0, 2000.0)
 
 @dataclass
 class EverydayFile:
-    """A file, how a user imports it, and what is in it."""
+    """A file, how a user imports it, and its contents."""
 
     path: Path
     story: str
@@ -32,13 +32,13 @@ class EverydayFile:
     plan: dict[str, Any] = field(default_factory=dict)
     """Arguments for the plan of an import: `angle`, `torque`, and `time` or `rate_hz`."""
     ticks: np.ndarray | None = None
-    """Places of the samples where some are missing."""
+    """Ticks of the samples if some are missing."""
     torque_later: float = 0.0
     """Samples by which the torque's first value is later than the angle's."""
     must: str = "either"
     """"read", "refuse", or "either"."""
     names: tuple[str, ...] = ()
-    """What a refusal has to name one of: a line, a channel, a scale."""
+    """Words of which a refusal has to name one: a line, a channel, a scale."""
     digits: float = 1e-6
     """Largest error of a value by the digits in the file, in the unit of the channel."""
 
@@ -542,7 +542,7 @@ def _other_separator_in_a_line(made: EverydayFile, table: _Table, rng: np.random
 
 
 def _commas_in_titles(made: EverydayFile, table: _Table, rng: np.random.Generator) -> None:
-    """Titles with commas of their own beside decimal commas, so that the counts agree."""
+    """Titles with commas in addition to decimal commas, so that the counts agree."""
     table.separator = ","
     table.titles = ["t", " s", "angle", " rad", "torque", " Nm"]
     table.rows = [
@@ -866,9 +866,9 @@ def _mat(made: EverydayFile, folder: Path, rng: np.random.Generator) -> None:
         contents = {
             name: {
                 "Time": late * time_s, "Data": values, "TimeInfo": {"Units": unit},
-                "DataInfo": {"Units": said},
+                "DataInfo": {"Units": data_unit},
             }
-            for name, values, said in (("q", angle, "rad"), ("T", torque, "N*m"))
+            for name, values, data_unit in (("q", angle, "rad"), ("T", torque, "N*m"))
         }  # fmt: skip
         made.plan = {"angle": "q.Data:rad", "torque": "T.Data:N.m"}
         if by_rate:
@@ -897,9 +897,9 @@ def _mat(made: EverydayFile, folder: Path, rng: np.random.Generator) -> None:
     elif mistake == "single":
         contents["angle"], made.digits = angle.astype(np.float32), 1e-6
     elif mistake == "gaps":
-        kept = np.delete(np.arange(len(angle)), np.s_[100:105])
-        contents = {"t": time_s[kept], "angle": angle[kept], "torque": torque[kept]}
-        made.ticks = kept
+        present = np.delete(np.arange(len(angle)), np.s_[100:105])
+        contents = {"t": time_s[present], "angle": angle[present], "torque": torque[present]}
+        made.ticks = present
         if by_rate:
             made.must, made.names = "refuse", ("'t'",)
     elif mistake == "backward":

@@ -14,7 +14,7 @@ START_UTC_NS = 1_700_000_000_000_000_000
 
 @pytest.fixture
 def record_briefly(tmp_path):
-    """Write a session of a second to the folder, with what its metadata is to say."""
+    """Write a session of a second to the folder, with the given metadata."""
 
     def write(name, *, day=0.0, outcome="complete", **metadata):
         writer = SessionWriter(tmp_path / f"{name}.mcap")

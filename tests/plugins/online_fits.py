@@ -1,4 +1,4 @@
-"""Fits of a running session, as the fit answers them and a search adds what is asked."""
+"""Fits of a running session, as the fit answers them and a search adds its targets."""
 
 
 def quantity(value, std, flag=None):

@@ -1,4 +1,4 @@
-"""What tests wait for, and what they see of other processes: children, signals, sockets."""
+"""Waiting, and the state of other processes: children, signals, sockets."""
 
 import contextlib
 import re
@@ -19,7 +19,7 @@ def eventually(
 ) -> Met | None:
     """Whether a condition comes true: its last answer. The limit only ends a test that fails.
 
-    Whoever is asked for it may be too busy to answer: that is not an answer yet.
+    The other process may be too busy to answer: that is not an answer yet.
     """
     deadline = time.monotonic() + within_s
     while True:
@@ -32,7 +32,7 @@ def eventually(
 
 
 def children(pid: int) -> list[int]:
-    """Return what any thread of a process has started; none if it has ended."""
+    """Return the children of all threads of a process; none if it has ended."""
     listed = ""
     with contextlib.suppress(FileNotFoundError, ProcessLookupError):
         for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -88,7 +88,7 @@ def ignores(pid: int, number: int) -> bool:
 class Socket(NamedTuple):
     """One end of TCP, as /proc/net/tcp writes it.
 
-    By its number two are told apart: that of a port that was given back may be another test's by
+    Its number distinguishes two: that of a port that was given back may be another test's by
     now.
     """
 

@@ -1,7 +1,7 @@
-"""In a fresh checkout the workers share the rewriting of the tests' assertions.
+"""In a fresh checkout the workers divide the rewriting of the tests' assertions.
 
 Each of them would rewrite every file otherwise, at the same time as the others: 10 s of a processor
-each. What is rewritten is kept beside the tests by pytest itself, and read by all.
+each. pytest itself stores the result next to the tests, and all read it.
 """
 
 import contextlib
@@ -17,14 +17,14 @@ def pytest_collection(session: pytest.Session) -> None:
     if worker is None or sys.dont_write_bytecode:
         return
     files = sorted(Path(__file__).parents[1].rglob("test_*.py"))
-    share = files[int(worker["workerid"].removeprefix("gw")) :: worker["workercount"]]
+    own_files = files[int(worker["workerid"].removeprefix("gw")) :: worker["workercount"]]
     # Nothing of it is public; with a pytest that has it otherwise, each rewrites all as before.
     with contextlib.suppress(ImportError, AttributeError, TypeError, ValueError, OSError):
         from _pytest.assertion import rewrite
 
         state = session.config.stash[rewrite.assertstate_key]
-        for path in share:
-            kept = rewrite.get_cache_dir(path) / f"{path.stem}{rewrite.PYC_TAIL}"
-            if rewrite._read_pyc(path, kept) is None and rewrite.try_makedirs(kept.parent):
+        for path in own_files:
+            cached = rewrite.get_cache_dir(path) / f"{path.stem}{rewrite.PYC_TAIL}"
+            if rewrite._read_pyc(path, cached) is None and rewrite.try_makedirs(cached.parent):
                 source, code = rewrite._rewrite_test(path, session.config)
-                rewrite._write_pyc(state, code, source, kept)
+                rewrite._write_pyc(state, code, source, cached)

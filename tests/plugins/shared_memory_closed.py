@@ -1,6 +1,6 @@
 """Tests of rings and boards give back the shared memory that they have made.
 
-Nothing else closes a bare descriptor, and `select`, which pyserial waits with, takes none beyond
+Nothing else closes a raw descriptor, and `select`, which pyserial waits with, takes none beyond
 1023: a worker that got most of these tests could open no serial line afterwards.
 """
 

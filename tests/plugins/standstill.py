@@ -1,7 +1,7 @@
-"""A test that fails while the machine stands still is run once more, and that is told.
+"""A test that fails during a standstill of the machine is run once more and reported.
 
 A virtual machine may get no processor for tenths of a second: a measurement made meanwhile is no
-measurement. The tests are written to bear it; this is for what nobody thought of. What fails on a
+measurement. The tests are written to tolerate it; this is for the unforeseen rest. What fails on a
 machine that does not stand still, or fails again, has failed.
 """
 

@@ -54,5 +54,5 @@ def cut(struck, after, *, shear=True, noticed=NOTICED):
 
 
 def begin_s(struck, noticed=NOTICED):
-    """Time of the first sample of what `cut` returns."""
+    """Time of the first sample that `cut` returns."""
     return (int(struck.touch_s * 1000) + noticed - HISTORY) / 1000

@@ -53,7 +53,7 @@ CHIRP = {"excitation": "chirp", "start_hz": "0.05", "stop_hz": "50.0"}
 
 @pytest.fixture
 def short_signals():
-    """Five seconds of a sine: what the record, not the estimate, is tested with."""
+    """Five seconds of a sine, for tests of the record, not of the estimate."""
     n = 5000
     t = np.arange(n) / RATE_HZ
     return Signals(

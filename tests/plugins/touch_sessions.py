@@ -109,5 +109,5 @@ def touch_analysis():
 
 @pytest.fixture(scope="session")
 def touched(touch_file, touch_analysis):
-    """Return what the analysis makes of the file."""
+    """Return the analysis of the file."""
     return touch_analysis.session(touch_file.path)

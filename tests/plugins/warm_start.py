@@ -2,7 +2,7 @@
 
 The imports of one `rigd` take half a second of a processor, a copy takes a twentieth. `run` is used
 like that of `subprocess`, `start` like its `Popen`. The processes that a copy starts, such as those
-of a session, are copies of it in turn. What depends on how Python itself starts is tested with
+of a session, are copies of it in turn. Behaviour at the start of Python itself is tested with
 `subprocess`, and so are a session and an analysis from end to end. Within `children_copied` the
 processes of a rig that the test's own process starts are copies of the latter.
 """
@@ -51,13 +51,13 @@ def run(command, *, capture_output=False, timeout=None, check=False, input=None,
         options["stdin"] = PIPE
     with start(command, **options) as process:
         try:
-            said, errors = process.communicate(input, timeout=timeout)
+            output, errors = process.communicate(input, timeout=timeout)
         except BaseException:
             process.kill()
             raise
     if check and process.returncode:
-        raise CalledProcessError(process.returncode, command, said, errors)
-    return CompletedProcess(command, process.returncode, said, errors)
+        raise CalledProcessError(process.returncode, command, output, errors)
+    return CompletedProcess(command, process.returncode, output, errors)
 
 
 def _settings_of_python(environment):
@@ -70,13 +70,13 @@ _OWN_SETTINGS = _settings_of_python(os.environ)
 _FILTERS = [
     ("ignore", None, category, None, 0) for category in (DeprecationWarning, ResourceWarning)
 ]
-"""Warnings of a new process, of which a test runner makes errors."""
+"""Warnings of a new process, which a test runner turns into errors."""
 
 
 def start(command, *, env=None, packages=None, **options):
     """Start a command, in a new process if its environment changes how Python itself starts.
 
-    What is in the folder `packages` is installed for it.
+    Packages in the folder `packages` are installed for it.
     """
     env = dict(os.environ if env is None else env)
     if _settings_of_python(env) != _OWN_SETTINGS:
@@ -87,7 +87,7 @@ def start(command, *, env=None, packages=None, **options):
 
 
 class Copy:
-    """A command in a copy of the warm process, with what tests use of `subprocess.Popen`."""
+    """A command in a copy of the warm process, with the used part of `subprocess.Popen`."""
 
     def __init__(
         self, command, env, *, cwd=None, stdin=None, stdout=None, stderr=None, text=False,
@@ -156,22 +156,22 @@ class Copy:
 
     def communicate(self, input=None, timeout=None):  # noqa: A002
         if not self._communicated:
-            said = {}
+            outputs = {}
             streams = [stream for stream in (self.stdout, self.stderr) if stream]
-            jobs = [functools.partial(_read_all, stream, said) for stream in streams]
+            jobs = [functools.partial(_read_all, stream, outputs) for stream in streams]
             if self.stdin:
                 jobs.append(functools.partial(_write_all, self.stdin, input))
             threads = [threading.Thread(target=job, daemon=True) for job in jobs]
-            self._communicated = [threads, said]
+            self._communicated = [threads, outputs]
             for thread in threads:
                 thread.start()
-        threads, said = self._communicated
+        threads, outputs = self._communicated
         for thread in threads:
             thread.join(timeout)
             if thread.is_alive():
                 raise TimeoutExpired(self.args, timeout)
         self.wait(timeout)
-        return said.get(self.stdout), said.get(self.stderr)
+        return outputs.get(self.stdout), outputs.get(self.stderr)
 
     def send_signal(self, number):
         if self.poll() is None:
@@ -184,8 +184,8 @@ class Copy:
         self.send_signal(signal.SIGKILL)
 
 
-def _read_all(stream, said):
-    said[stream] = stream.read()
+def _read_all(stream, outputs):
+    outputs[stream] = stream.read()
     stream.close()
 
 
@@ -240,7 +240,7 @@ def _serve(requests):
 
 
 def _finish(pidfd, pid, status, imported):
-    """Report how a copy ended; later ones need not import what it had to import itself."""
+    """Report how a copy ended; later ones need not import the same modules."""
     os.close(pidfd)
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     with os.fdopen(status, "wb") as stream:
@@ -254,7 +254,7 @@ def _finish(pidfd, pid, status, imported):
 
 
 def _become_new_process(job, descriptors, importing):
-    """Make this copy what a process is that has just started; returns its command."""
+    """Make this copy like a process that has just started; return its command."""
     command, folder, environment, start_new_session = job
     os.environ.clear()
     os.environ.update(environment)
@@ -352,7 +352,7 @@ class _PopenOfCopy(subprocess.Popen):
 
 def _be_child(command, given):
     """Run a command in this copy of a copy, as a new process would, and end it."""
-    gc.freeze()  # what is garbage here has descriptors whose numbers will be others'
+    gc.freeze()  # garbage here has descriptors whose numbers will be reused
     exit_code = 1
     try:
         before = frozenset(sys.modules)
@@ -373,7 +373,7 @@ def _be_child(command, given):
     except BaseException:
         traceback.print_exc()
     finally:
-        os._exit(exit_code)  # the finalizers are of what is the parent's
+        os._exit(exit_code)  # the finalizers belong to objects of the parent
 
 
 @contextlib.contextmanager
@@ -391,7 +391,7 @@ _streams_of_parent = []
 
 
 def _forget_parent(given):
-    """Undo what a process does not inherit from its parent, and set what it is given."""
+    """Undo settings that a process does not inherit from its parent, and set those given."""
     atexit._clear()
     faulthandler.disable()
     signal.set_wakeup_fd(-1)
@@ -449,7 +449,7 @@ def _addresses_of_process(first, end):
 
 
 def _set_command_memory(first, end):
-    """Have the process table show what is in a part of the memory."""
+    """Show a part of the memory in the process table."""
     code, code_end, stack = _addresses_of_process(26, 29)
     data, data_end, heap = _addresses_of_process(45, 48)
     environment = _addresses_of_process(50, 52)

@@ -79,8 +79,8 @@ def modal_result(record_result, computed_once):
 
 
 @pytest.fixture(scope="session")
-def retold():
-    """Replace parts of what was selected for a record."""
+def with_selection():
+    """Replace parts of the selection of a record."""
 
     def made(result, **parts):
         selection = replace(result.whole.selection, **parts)
@@ -91,7 +91,7 @@ def retold():
 
 @pytest.fixture(scope="session")
 def as_text():
-    """Return what a terminal of 120 columns shows, as plain text."""
+    """Return the output of a terminal of 120 columns as plain text."""
 
     def text(shown):
         console = Console(width=120, color_system=None, force_terminal=False)

@@ -43,7 +43,7 @@ def refused(result, code, *words):
 
 @pytest.fixture(scope="module")
 def short_file(make_signals, write_session, tmp_path_factory):
-    """Session of a third of a minute, in place of two."""
+    """Session of 20 s instead of two minutes."""
     signals = make_signals(rest_s=0.5, sweep_s=20.0, ring_down_s=1.0)
     return write_session(tmp_path_factory.mktemp("command") / "a.mcap", signals)
 
@@ -59,9 +59,7 @@ def long_session(paper_file, tmp_path):
 
 
 @pytest.mark.fit
-def test_a_part_of_a_session_becomes_a_report_that_states_it(
-    session, tmp_path, analyze_here, without_drawing
-):
+def test_report_states_the_analysed_part(session, tmp_path, analyze_here, without_drawing):
     with without_drawing():
         result = analyze_here(
             session.name, "--to", "20", "--json", "fits.json", "--segment", "5000"
@@ -76,7 +74,7 @@ def test_a_part_of_a_session_becomes_a_report_that_states_it(
     assert result.stdout.startswith(from_record["verdict"][0])
     page = (tmp_path / "session.report" / "report.html").read_text()
     assert "0 to 20 s of the session" in page
-    # The sweep is at 48.75 Hz then, and no fit uses what lies beyond.
+    # The sweep is at 48.75 Hz then, and no fit uses frequencies above.
     assert any("48.75" in warning for warning in file["warnings"])
     frequencies_hz = [mode["frequency_hz"]["value"] for mode in headline["modes"]]
     assert frequencies_hz == pytest.approx([2.57, 16.01, 44.83], abs=0.02)
@@ -84,7 +82,7 @@ def test_a_part_of_a_session_becomes_a_report_that_states_it(
 
 @pytest.mark.process
 @pytest.mark.further  # as a shorter one
-def test_one_session_from_end_to_end(long_session, tmp_path):
+def test_session_from_end_to_end(long_session, tmp_path):
     result = subprocess.run(
         [sys.executable, "-m", "analysis", long_session.name, "--json", "fits.json"],
         cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
@@ -96,7 +94,7 @@ def test_one_session_from_end_to_end(long_session, tmp_path):
     of_paper = [fit for fit in content["fits"] if fit["estimator"] == "welch"]
     best = min(of_paper, key=lambda fit: fit["indices"]["wmse"])
     assert (best["type"], best["weighting"]) == ("VI", "omega")
-    # Welch's windows bias the damping by a third; the whole record tells the plant's.
+    # Welch's windows bias the damping by a third; the whole record gives the plant's.
     (from_record,) = content["records"]
     (selected,) = (
         fit for fit in content["fits"] if fit.get("candidate") == from_record["selected"]
@@ -143,7 +141,7 @@ def assert_whole(result, folder):
         (("--to", "9", "other.mcap"), ("--to", "add --each")),
     ],
 )
-def test_times_that_select_no_part_are_wrong_use(tmp_path, analyze_here, options, words):
+def test_times_without_samples_are_wrong_use(tmp_path, analyze_here, options, words):
     result = analyze_here("session.mcap", *options)
     assert result.returncode == 2
     assert all(word in result.stderr for word in words), result.stderr
@@ -151,7 +149,7 @@ def test_times_that_select_no_part_are_wrong_use(tmp_path, analyze_here, options
 
 
 @pytest.mark.fit
-def test_json_on_standard_output_is_alone_there(session, tmp_path, analyze_here, without_drawing):
+def test_json_is_alone_on_standard_output(session, tmp_path, analyze_here, without_drawing):
     named = session.rename(tmp_path / "ζ.mcap")
     with without_drawing():
         result = analyze_here(
@@ -160,7 +158,7 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path, analyze_here,
             "--segment", "5000",
         )  # fmt: skip
     assert result.returncode == 0, result.stderr
-    assert result.stdout.isascii()  # whatever the stream's encoding is
+    assert result.stdout.isascii()  # for any encoding of the stream
     content = json.loads(result.stdout)
     assert content["files"][0]["file"] == "ζ.mcap"
     names = [(fit["type"], fit["weighting"], fit["frf"]) for fit in content["fits"]]
@@ -173,7 +171,7 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path, analyze_here,
 
 @pytest.mark.fit
 @pytest.mark.further  # as in a campaign
-def test_several_files_with_one_that_fails(session, tmp_path, analyze_here):
+def test_one_of_several_files_fails(session, tmp_path, analyze_here):
     shutil.copy(session, tmp_path / "other.mcap")
     before = tmp_path / "session.report"
     before.mkdir()
@@ -223,7 +221,7 @@ def broken_file(kind, path, good):
 @pytest.mark.parametrize(
     "kind", ["missing", "empty", "no container", "truncated", "magic only", "foreign", "a folder"]
 )
-def test_a_file_that_is_no_session_is_refused(short_file, tmp_path, analyze_here, kind):
+def test_non_session_file_is_refused(short_file, tmp_path, analyze_here, kind):
     path = tmp_path / "bad.mcap"
     broken_file(kind, path, short_file)
     before = sorted(tmp_path.iterdir())
@@ -233,18 +231,18 @@ def test_a_file_that_is_no_session_is_refused(short_file, tmp_path, analyze_here
 
 @pytest.mark.fit
 @pytest.mark.parametrize("folder", [".", "/", ""])
-def test_a_folder_in_place_of_a_file_is_refused(tmp_path, analyze_here, folder):
+def test_folder_instead_of_a_file_is_refused(tmp_path, analyze_here, folder):
     refused(analyze_here(folder), 1, folder)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.fit
-def test_a_session_too_short_for_the_segments_says_what_fits(
+def test_too_short_session_is_refused_with_fitting_segments(
     write_session, short_signals, tmp_path, analyze_here
 ):
     write_session(tmp_path / "a.mcap", short_signals)
-    asked = analyze_here("a.mcap", "--method", "welch")
-    refused(asked, 1, "4000 samples", "17266", "--segment 575 --overlap 86")
+    done = analyze_here("a.mcap", "--method", "welch")
+    refused(done, 1, "4000 samples", "17266", "--segment 575 --overlap 86")
     # Segments that were chosen are not dropped in silence.
     refused(analyze_here("a.mcap", "--segment", "5000"), 1, "4000 samples", "5000")
 
@@ -312,7 +310,7 @@ def test_no_file_is_wrong_use(tmp_path):
 
 
 @pytest.mark.fit
-def test_nothing_that_exists_is_overwritten(session, tmp_path, analyze_here):
+def test_existing_files_are_not_overwritten(session, tmp_path, analyze_here):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "frf.svg").write_text("mine")
     (tmp_path / "fits.json").write_text("mine")
@@ -324,13 +322,13 @@ def test_nothing_that_exists_is_overwritten(session, tmp_path, analyze_here):
 
 
 @pytest.mark.fit
-def test_a_report_that_cannot_be_written_is_refused(session, tmp_path, analyze_here):
+def test_unwritable_report_is_refused(session, tmp_path, analyze_here):
     (tmp_path / "file").write_text("")
     refused(analyze_here(session.name, *QUICK, "--report", "file/out"), 1, "file/out")
 
 
 @pytest.mark.process
-def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):
+def test_ctrl_c_ends_with_130_without_partial_files(session, tmp_path):
     process = warm_start.start(
         [sys.executable, "-m", "analysis", *([session.name] * 60),
          "--each", *QUICK, "--report", "out"],
@@ -373,7 +371,7 @@ def run_as_is(module, cwd):
     "body",
     [
         further(f"    exec('{CTRL_C.format(30)}')", id="code made from text"),
-        # What is raised at the end of an object's life is dropped.
+        # Exceptions in destructors are dropped.
         pytest.param(
             "    class Ending:\n"
             f"        def __del__(self): {CTRL_C.format(0)}\n"
@@ -383,19 +381,19 @@ def run_as_is(module, cwd):
         ),
     ],
 )
-def test_ctrl_c_inside_what_python_does_itself_ends_with_130_too(tmp_path, body):
+def test_ctrl_c_inside_the_interpreter_ends_with_130(tmp_path, body):
     (tmp_path / "stopped.py").write_text("import time\n" + STOPPED.format(body=body))
     assert run_as_is("stopped", tmp_path) == (130, "", "Stopped.\n")
 
 
 @pytest.mark.process
-def test_ctrl_c_while_it_is_being_imported_ends_with_130_and_without_traceback(tmp_path):
+def test_ctrl_c_during_import_ends_with_130(tmp_path):
     (tmp_path / "typer.py").write_text(CTRL_C.format(30))
     assert run_as_is("analysis", tmp_path) == (130, "", "")
 
 
 @pytest.mark.process
-def test_ctrl_c_while_options_are_made_ready_ends_with_130_and_without_traceback(tmp_path):
+def test_ctrl_c_while_parsing_options_ends_with_130(tmp_path):
     (tmp_path / "early.py").write_text(
         "import analysis.cli.app\n"
         f"def app(): {CTRL_C.format(30)}\n"
@@ -405,11 +403,14 @@ def test_ctrl_c_while_options_are_made_ready_ends_with_130_and_without_traceback
     assert run_as_is("early", tmp_path) == (130, "", "")
 
 
-def test_a_folder_stands_for_the_sessions_in_it(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr("analysis.cli.app.session_command", lambda files, *_: asked.append(files))
+def test_folder_means_its_sessions(tmp_path, monkeypatch):
+    analysed = []
     monkeypatch.setattr(
-        "analysis.cli.campaign.campaign_command", lambda files, *_, **__: asked.append(files) or 0
+        "analysis.cli.app.session_command", lambda files, *_: analysed.append(files)
+    )
+    monkeypatch.setattr(
+        "analysis.cli.campaign.campaign_command",
+        lambda files, *_, **__: analysed.append(files) or 0,
     )
     folder = tmp_path / "sessions"
     folder.mkdir()
@@ -423,12 +424,14 @@ def test_a_folder_stands_for_the_sessions_in_it(tmp_path, monkeypatch):
         CliRunner().invoke(app, [str(folder)])
     CliRunner().invoke(app, ["first.mcap", str(folder), "--each"])
     of_folder = [folder / "a.mcap", folder / "b.mcap"]
-    assert asked == [of_folder[1:], of_folder, [Path("first.mcap"), *of_folder]]
+    assert analysed == [of_folder[1:], of_folder, [Path("first.mcap"), *of_folder]]
 
 
-def test_the_newest_session_of_a_folder_can_be_asked_for(record_briefly, tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr("analysis.cli.app.session_command", lambda files, *_: asked.append(files))
+def test_newest_session_of_a_folder_on_request(record_briefly, tmp_path, monkeypatch):
+    analysed = []
+    monkeypatch.setattr(
+        "analysis.cli.app.session_command", lambda files, *_: analysed.append(files)
+    )
     monkeypatch.chdir(tmp_path)
     nothing = CliRunner().invoke(app, ["--latest"])
     assert nothing.exit_code == 1
@@ -436,13 +439,13 @@ def test_the_newest_session_of_a_folder_can_be_asked_for(record_briefly, tmp_pat
     for name, day in (("zulu", 1), ("alpha", 3), ("mike", 2)):
         record_briefly(name, day=day)
     CliRunner().invoke(app, ["--latest", "."])
-    assert asked == [[Path("alpha.mcap")]]
+    assert analysed == [[Path("alpha.mcap")]]
     two = CliRunner().invoke(app, ["--latest", ".", "sessions"])
     assert two.exit_code == 2
     assert "it takes one folder, and 2 were given" in two.stderr
 
 
-def test_without_a_file_the_command_says_what_it_takes():
+def test_usage_without_a_file():
     refused = CliRunner().invoke(app, [])
     assert refused.exit_code == 2
     assert "Error: Missing argument 'FILE'. Name session files, or take --latest." in refused.stderr
@@ -461,9 +464,11 @@ def test_a_campaign_is_announced_before_it_starts(tmp_path, monkeypatch):
     )
 
 
-def test_completion_of_the_shell_can_be_installed():
-    asked = {"_ANALYZE_COMPLETE": "source_bash"}  # as the option does, for a shell that it finds
-    shown = CliRunner().invoke(app, [], prog_name="analyze", env=asked)
+def test_shell_completion_can_be_installed():
+    environment = {
+        "_ANALYZE_COMPLETE": "source_bash"
+    }  # as the option does, for a shell that it finds
+    shown = CliRunner().invoke(app, [], prog_name="analyze", env=environment)
     assert shown.exit_code == 0
     assert "_ANALYZE_COMPLETE=complete_bash" in shown.stdout
     words = {"_ANALYZE_COMPLETE": "complete_bash", "COMP_WORDS": "analyze --la", "COMP_CWORD": "1"}
@@ -473,22 +478,22 @@ def test_completion_of_the_shell_can_be_installed():
 
 @pytest.mark.fit
 @pytest.mark.further  # as test_folder.py
-def test_a_second_look_replaces_the_first_and_nothing_else(session, tmp_path, analyze_here):
-    look = (session.name, "--json", "fits.json", "--report", "out", "--overwrite")
-    assert analyze_here(*look, *QUICK).returncode == 0
+def test_second_analysis_replaces_only_the_first(session, tmp_path, analyze_here):
+    command = (session.name, "--json", "fits.json", "--report", "out", "--overwrite")
+    assert analyze_here(*command, *QUICK).returncode == 0
     (tmp_path / "out" / "notes.txt").write_text("mine")
     quick = (*QUICK, "--types", "II")
-    assert analyze_here(*look, *quick).returncode == 0
+    assert analyze_here(*command, *quick).returncode == 0
     for path in ("fits.json", "out/analysis.json"):
         (fit,) = json.loads((tmp_path / path).read_text())["fits"]
         assert fit["type"] == "II"
     assert (tmp_path / "out" / "notes.txt").read_text() == "mine"
-    # Without a name it is the report beside the file, under the same name again.
+    # Without a name it is the report next to the file, under the same name again.
     for _ in range(2):
         assert analyze_here(session.name, "--overwrite", *quick).returncode == 0
     assert [path.name for path in tmp_path.glob("session.report*")] == ["session.report"]
     (tmp_path / "fits.json").write_text('{"mine": 1}')
-    refused(analyze_here(*look, *quick), 2, "fits.json", "does not hold results")
+    refused(analyze_here(*command, *quick), 2, "fits.json", "does not hold results")
 
 
 @pytest.mark.process
@@ -512,7 +517,7 @@ def test_help_and_wrong_options_import_nothing_heavy(tmp_path):
 
 
 @pytest.mark.parametrize("files", [["a.mcap"], ["a.mcap", "b.mcap"]])
-def test_options_of_one_record_hold_in_a_campaign_too(monkeypatch, files):
+def test_options_of_one_record_hold_in_a_campaign(monkeypatch, files):
     fixed, formats, uniformity = [], [], []
 
     def run(_files, options, *_):

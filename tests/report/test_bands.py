@@ -19,7 +19,7 @@ def fit(record_result):
 
 
 def drawn(fit, draws):
-    """Parameters as the covariance says, by name, shape (draws,) each."""
+    """Parameters drawn from the covariance, by name, shape (draws,) each."""
     mean = [
         np.log(fit.parameters[name]) if name in LOGARITHMIC_PARAMETERS else fit.parameters[name]
         for name in fit.determined
@@ -31,7 +31,7 @@ def drawn(fit, draws):
     }
 
 
-def test_response_band_is_what_draws_scatter(fit):
+def test_response_band_matches_scatter_of_draws(fit):
     draws = 3000
     s = 2j * np.pi * FREQUENCY_HZ
     values = drawn(fit, draws)
@@ -44,7 +44,7 @@ def test_response_band_is_what_draws_scatter(fit):
         responses[i] = transfer(s, beam, damping) + at["tool_inertia_kg_m2"] * s**2
     band = response_band(fit, FREQUENCY_HZ)
     deviation = np.log(responses / band.response)
-    # Of 3000 draws, a standard deviation is known to 1.3 %, a share of 95 % to 0.4 %.
+    # Of 3000 draws, a standard deviation is known to 1.3 %, a fraction of 95 % to 0.4 %.
     np.testing.assert_allclose(band.log_magnitude_std, deviation.real.std(axis=0), rtol=0.05)
     np.testing.assert_allclose(band.phase_std_rad, deviation.imag.std(axis=0), rtol=0.05)
     low, high = band.magnitude_limits()
@@ -53,7 +53,7 @@ def test_response_band_is_what_draws_scatter(fit):
 
 
 @pytest.mark.further  # as the response's
-def test_loss_factor_bands_are_what_draws_scatter(fit):
+def test_loss_factor_bands_match_scatter_of_draws(fit):
     factors = loss_factors(fit, FREQUENCY_HZ)
     s = 2j * np.pi * FREQUENCY_HZ
     values = {name: each[:, np.newaxis] for name, each in drawn(fit, 50_000).items()}
@@ -72,7 +72,7 @@ def test_loss_factor_bands_are_what_draws_scatter(fit):
         np.testing.assert_allclose(inside.mean(axis=0), 0.95, atol=0.004)
 
 
-def test_at_a_mode_the_total_is_twice_the_damping_ratio(record_result):
+def test_total_at_a_mode_is_twice_the_damping_ratio(record_result):
     for name in ("III", "VI", "VII"):
         fit = record_result.whole.fits[name]
         at_hz = np.array([mode.frequency_hz for mode in fit.modes])
@@ -85,14 +85,14 @@ def test_at_a_mode_the_total_is_twice_the_damping_ratio(record_result):
         np.testing.assert_allclose(total.value * total.log_std, 2 * stds, rtol=0.04)
 
 
-def test_what_a_structure_lacks_has_no_loss_factor(record_result):
+def test_absent_damping_has_no_loss_factor(record_result):
     only_internal = loss_factors(record_result.whole.fits["I"], FREQUENCY_HZ)
     assert only_internal.external is None
     np.testing.assert_array_equal(only_internal.total.value, only_internal.internal.value)
     assert np.all(only_internal.total.log_std > 0)
 
 
-def test_the_band_leaves_the_delay_out(fit):
+def test_band_excludes_the_delay(fit):
     band = response_band(fit, FREQUENCY_HZ)
     undelayed = replace(fit, plant=replace(fit.plant, delay_s=0.0))
     np.testing.assert_array_equal(

@@ -19,7 +19,7 @@ def content(paper_analysis):
     return document([by_welch(paper_analysis)], {"bad.mcap": "bad.mcap is empty."})
 
 
-def test_fits_have_what_the_format_promises(content, paper_file):
+def test_fits_have_the_keys_of_the_format(content, paper_file):
     assert len(content["fits"]) == 6
     for fit in content["fits"]:
         assert fit["file"] == str(paper_file)
@@ -32,7 +32,7 @@ def test_fits_have_what_the_format_promises(content, paper_file):
     assert [fit["type"] for fit in content["fits"]] == ["I", "I", "III", "III", "VI", "VI"]
 
 
-def test_numbers_are_the_analysis_s_own(content, paper_analysis):
+def test_numbers_are_those_of_the_analysis(content, paper_analysis):
     for fit, model in zip(content["fits"], paper_analysis.models, strict=True):
         assert fit["parameters"] == model.fit.parameters
         assert fit["indices"]["wmse"] == model.indices.wmse
@@ -68,7 +68,7 @@ def test_files_versions_and_errors(content):
     assert content["errors"] == [{"file": "bad.mcap", "message": "bad.mcap is empty."}]
 
 
-def test_it_is_json_without_nan(content, paper_analysis):
+def test_document_is_json_without_nan(content, paper_analysis):
     assert json.loads(document_text(content)) == content
     model = paper_analysis.models[0]
     fit = replace(model.fit, std={**model.fit.parameters, "zeta": math.nan}, cost=math.inf)

@@ -1,4 +1,4 @@
-"""The model as an equation: the terms that were selected, in both languages, and what they mean."""
+"""The model as an equation: the selected terms, in both languages, and their definitions."""
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.fit
 
 
 @pytest.fixture
-def told(record_result):
+def whole_record(record_result):
     """Whole record whose numbers are of one type, and maybe of more parameters."""
 
     def made(name, **extras):
@@ -43,8 +43,8 @@ def told(record_result):
         ("VII", r"( 1 + \zeta s )", r"+ \gamma s^{\lambda}"),
     ],
 )
-def test_the_terms_are_those_of_the_type(told, name, elastic, inertial):
-    _, response, beta = (each.tex for each in equations(told(name)))
+def test_terms_are_those_of_the_type(whole_record, name, elastic, inertial):
+    _, response, beta = (each.tex for each in equations(whole_record(name)))
     assert response.startswith(f"G ( s ) = - E I {elastic}".rstrip() + r" \beta \frac{\sin")
     assert (r"\zeta" in response) == (r"\zeta" in beta) == bool(elastic)
     assert (r"\gamma" in beta) == bool(inertial)
@@ -64,19 +64,19 @@ def test_the_terms_are_those_of_the_type(told, name, elastic, inertial):
         ("drag", "G ( s )", "½ ρ_air C_D d"),
     ],
 )
-def test_what_was_fitted_beside_the_beam_stands_in_it(told, extra, tex, words):
-    found = told("VI", **{extra: 1e-3})
+def test_additional_parameters_are_in_the_equation(whole_record, extra, tex, words):
+    found = whole_record("VI", **{extra: 1e-3})
     assert tex in equations(found)[0].tex
     assert words in definitions(found)
-    assert words not in definitions(told("VI"))
+    assert words not in definitions(whole_record("VI"))
 
 
 @pytest.mark.parametrize("name", [further(name) if name != "VI" else name for name in STRUCTURES])
-def test_both_languages_can_be_read(told, name):
+def test_both_languages_are_readable(whole_record, name):
     extras = dict.fromkeys(
         ("filter_time_constant_s", "second_order_filter_time_constant_s", "tip_mass_kg"), 1e-3
     )
-    for whole in (told(name), told(name, **extras)):
+    for whole in (whole_record(name), whole_record(name, **extras)):
         found = equations(whole)
         for formula in found:
             root = ET.fromstring(mathml(formula))
@@ -88,7 +88,7 @@ def test_both_languages_can_be_read(told, name):
         assert latex(found).count("&=") == 3
 
 
-def test_every_type_is_defined_and_the_selected_one_marked(record_result):
+def test_all_types_are_defined_and_the_selected_marked(record_result):
     table = types_table(record_result.whole)
     rows = {row["type"]: row for row in table.rows}
     assert list(rows) == list(STRUCTURES)

@@ -62,7 +62,7 @@ def test_a_figure_shows_its_lines(paper_analysis, tmp_path, draw, colours):
 
 
 @pytest.mark.fit
-def test_colours_tell_what_they_show(paper_analysis, tmp_path):
+def test_colours_match_their_meaning(paper_analysis, tmp_path):
     """Without the fits with omega weights, no dashed line of their colour is left."""
     fits = tuple(m for m in paper_analysis.models if m.fit.weighting == "const")
     alone = replace(
@@ -77,7 +77,7 @@ def test_colours_tell_what_they_show(paper_analysis, tmp_path):
 
 
 @pytest.mark.fit
-def test_one_panel_a_type(paper_analysis):
+def test_one_panel_per_type(paper_analysis):
     with style.figure_style():
         figure = frf_figure(paper_analysis)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
@@ -116,7 +116,7 @@ def test_any_choice_of_types_and_weightings_can_be_drawn(
 
 
 @pytest.mark.fit
-def test_the_torque_of_the_true_structure_is_followed(paper_analysis):
+def test_true_structure_follows_the_torque(paper_analysis):
     assert best_model(paper_analysis).fit.structure.name == "VI"
     with style.figure_style():
         figure = torque_figure(paper_analysis)
@@ -130,7 +130,7 @@ def test_the_torque_of_the_true_structure_is_followed(paper_analysis):
 @pytest.mark.parametrize(
     "draw", [further(paper_signals_figure), frf_figure, further(torque_figure)]
 )
-def test_no_figure_has_the_name_of_a_file(paper_analysis, draw):
+def test_figure_texts_contain_no_file_name(paper_analysis, draw):
     with style.figure_style():
         figure = draw(paper_analysis)
     words = [text.get_text() for text in figure.findobj(Text)]
@@ -168,7 +168,7 @@ def lines(*values):
     return [style.Illustration(f"v1.{value}", partial(drawn, value), "A line.") for value in values]
 
 
-def test_a_picture_is_written_in_the_formats_asked_for(tmp_path):
+def test_figure_is_written_in_the_requested_formats(tmp_path):
     (picture,) = style.save_pictures(lines(1), tmp_path, ("pdf",))
     assert [path.name for path in tmp_path.iterdir()] == ["v1.1.pdf"]
     assert picture.name == "v1.1"
@@ -202,7 +202,7 @@ def test_a_page_shows_a_format_that_is_written_and_no_huge_svg(
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="COPY NOT TESTED: not Linux")
 @pytest.mark.parametrize("copy", ["draws", "fails", further("none")])
-def test_pictures_are_the_same_whoever_draws_them(monkeypatch, tmp_path, copy):
+def test_figures_do_not_depend_on_the_process(monkeypatch, tmp_path, copy):
     own_pid, drawn_here, done = os.getpid(), [], []
 
     def render(figure, file_format, rendered=style.render_figure):
@@ -225,7 +225,7 @@ def test_pictures_are_the_same_whoever_draws_them(monkeypatch, tmp_path, copy):
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="COPY NOT TESTED: not Linux")
-def test_no_copy_is_left_when_drawing_fails(monkeypatch, tmp_path):
+def test_failed_drawing_leaves_no_copy(monkeypatch, tmp_path):
     def fail():
         raise ZeroDivisionError
 
@@ -243,20 +243,20 @@ def test_no_copy_is_left_when_drawing_fails(monkeypatch, tmp_path):
         os.waitpid(copy, os.WNOHANG)
 
 
-def test_a_title_that_is_no_text_is_no_obstacle(tmp_path):
+def test_title_with_invalid_text_is_drawn(tmp_path):
     with style.figure_style():
         style.save(style.new_figure(6.0, 4.0, "caf\udce9.mcap", "—"), tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_long_name_and_many_words_fit(tmp_path):
+def test_long_names_and_texts_fit(tmp_path):
     with style.figure_style():
         image = pixels(style.new_figure(10, 3, "name" * 60, "many words " * 30), tmp_path / "a.png")
     assert image[:, :20].min() == image[:, -20:].min() == 255
     assert (image[:100, 20:-20].min(axis=(0, 2)) < 200).mean() > 0.6
 
 
-def test_an_envelope_keeps_extremes_and_bounds_the_points():
+def test_envelope_preserves_extremes_and_limits_points():
     x = np.linspace(0.0, 10.0, 100_001)
     y = np.sin(2 * np.pi * 50 * x)
     y[[12_345, 60_000]] = 7.0, -9.0
@@ -283,7 +283,7 @@ def test_a_picture_is_never_overwritten(paper_analysis, tmp_path):
 
 @pytest.mark.parametrize("span", [8.0, 150.0, 900.0, 1e4])
 @pytest.mark.parametrize("height_in", [0.5, 3.0])
-def test_labels_of_a_logarithmic_axis_stand_apart(span, height_in):
+def test_labels_of_a_logarithmic_axis_do_not_overlap(span, height_in):
     """The width of a band is drawn in half an inch, where 1, 2 and 5 of two decades overlap."""
     with style.figure_style():
         figure = style.new_figure(8.0, 4.0)
@@ -309,7 +309,7 @@ MODES_HZ = np.array([2.5537, 16.003, 44.810])
 
 
 @pytest.mark.fit
-def test_each_mode_has_a_stretch_round_the_moment_the_chirp_passes_it(paper_analysis):
+def test_each_mode_has_an_enlargement_at_its_passage(paper_analysis):
     record = paper_analysis.record
     moments = resonance_intervals(record, 3)
     assert [moment.name for moment in moments] == [
@@ -358,7 +358,7 @@ def test_the_fit_in_per_cent_is_that_of_the_torque_in_time(record_result):
 
 
 @pytest.mark.fit
-def test_the_model_s_torque_has_no_step_where_the_record_ends_off_its_zero(record_result):
+def test_model_torque_is_continuous_at_a_nonzero_end(record_result):
     """A motor that is held where the sweep ended does not return after the record."""
     whole = record_result.whole
     record = whole.record
@@ -371,13 +371,13 @@ def test_the_model_s_torque_has_no_step_where_the_record_ends_off_its_zero(recor
 
 @pytest.mark.fit
 @pytest.mark.parametrize("factor", [further(1.0), 0.01])
-def test_labels_of_the_uniformity_figure_are_whole(modal_result, retold, factor):
+def test_labels_of_the_uniformity_figure_are_whole(modal_result, with_selection, factor):
     """A frequency that is known to a ten thousandth of a per cent has long numbers at its axis."""
-    told = modal_result.whole.headline
-    test = told.uniform_beam
+    headline = modal_result.whole.headline
+    test = headline.uniform_beam
     predicted = test.measured + factor * (test.predicted - test.measured)
     test = replace(test, predicted=predicted, std=factor * test.std)
-    result = retold(modal_result, headline=replace(told, uniform_beam=test))
+    result = with_selection(modal_result, headline=replace(headline, uniform_beam=test))
     (drawn,) = (each for each in illustrations(result.whole) if each.name == "uniform_beam")
     with style.figure_style():
         figure = drawn.draw()

@@ -15,7 +15,7 @@ from analysis.report.folder import (
 )
 
 
-def test_default_folders_are_beside_the_files_and_new(tmp_path):
+def test_default_folders_are_new_and_next_to_the_files(tmp_path):
     files = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     assert [f.name for f in report_folders(files, None)] == ["a.report", "b.report"]
     (tmp_path / "a.report").mkdir()
@@ -23,7 +23,7 @@ def test_default_folders_are_beside_the_files_and_new(tmp_path):
     assert [f.name for f in report_folders(files, None)] == ["a.report-3", "b.report"]
 
 
-def test_the_folder_asked_for_holds_one_report_or_one_folder_a_file(tmp_path):
+def test_requested_folder_holds_a_report_or_one_per_file(tmp_path):
     one, two = tmp_path / "a.mcap", tmp_path / "sub" / "a.mcap"
     assert report_folders([one], tmp_path / "out") == [tmp_path / "out"]
     assert report_folders([one, two], tmp_path / "out") == [
@@ -32,7 +32,7 @@ def test_the_folder_asked_for_holds_one_report_or_one_folder_a_file(tmp_path):
     ]
 
 
-def test_a_folder_with_contents_is_refused_and_an_empty_one_used(tmp_path):
+def test_only_an_empty_folder_is_used(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     assert report_folders([tmp_path / "a.mcap"], out) == [out]
@@ -50,7 +50,7 @@ def test_a_folder_is_complete_or_absent(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_appears_meanwhile_is_kept(tmp_path):
+def test_folder_that_appears_meanwhile_is_preserved(tmp_path):
     out = tmp_path / "out"
     with pytest.raises(OutputExistsError, match="meanwhile"), new_folder(out) as part:
         (part / "x").write_text("mine")
@@ -60,13 +60,13 @@ def test_a_folder_that_appears_meanwhile_is_kept(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_a_folder_that_cannot_be_is_an_error(tmp_path):
+def test_impossible_folder_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"), new_folder(tmp_path / "file" / "out"):
         pass
 
 
-def test_a_new_file_is_new(tmp_path):
+def test_new_file_must_not_exist(tmp_path):
     path = tmp_path / "deep" / "a.json"
     check_new_file(path, "--json")
     write_new(path, "1")
@@ -94,7 +94,7 @@ def contents(folder):
 
 
 @pytest.mark.process
-def test_a_report_lists_its_files_as_sha256sum_does(tmp_path):
+def test_report_lists_its_files_like_sha256sum(tmp_path):
     out = tmp_path / "out"
     write_report(out, overwrite=False, a="1", sub_in_b="2")
     check = [shutil.which("sha256sum"), "--check", "--strict", CHECKSUM_LIST_NAME]
@@ -102,7 +102,7 @@ def test_a_report_lists_its_files_as_sha256sum_does(tmp_path):
     assert len((out / CHECKSUM_LIST_NAME).read_text().splitlines()) == 2
 
 
-def test_a_report_is_replaced_and_what_others_put_there_stays(tmp_path):
+def test_replacement_preserves_files_of_others(tmp_path):
     out = tmp_path / "out"
     write_report(out, a="1", sub_in_b="2", gone_in_c="3")
     (out / "notes").write_text("mine")
@@ -118,7 +118,7 @@ def test_a_report_is_replaced_and_what_others_put_there_stays(tmp_path):
 
 
 @pytest.mark.parametrize("change", ["edited", "a link", "a folder", "foreign"])
-def test_a_file_that_is_not_as_it_was_written_stops_the_replacement(tmp_path, change):
+def test_changed_file_stops_the_replacement(tmp_path, change):
     out, other = tmp_path / "out", tmp_path / "other"
     write_report(out, a="1", b="2")
     other.write_text("1")
@@ -147,7 +147,7 @@ def test_a_list_cannot_reach_beyond_its_folder(tmp_path):
     assert outside.read_text() == "1"
 
 
-def test_a_replacement_that_was_cut_short_is_taken_up_again(tmp_path, monkeypatch):
+def test_interrupted_replacement_is_resumed(tmp_path, monkeypatch):
     out = tmp_path / "out"
     write_report(out, a="1", b="2")
     replace, calls = Path.replace, []
@@ -167,7 +167,7 @@ def test_a_replacement_that_was_cut_short_is_taken_up_again(tmp_path, monkeypatc
     assert contents(out) == {"a": "5", "b": "6"}
 
 
-def test_a_folder_that_is_no_report_is_not_replaced(tmp_path):
+def test_non_report_folder_is_not_replaced(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "a").write_text("mine")
@@ -178,7 +178,7 @@ def test_a_folder_that_is_no_report_is_not_replaced(tmp_path):
         report_folders([tmp_path / "x.mcap"], None, overwrite=True)
 
 
-def test_earlier_results_are_replaced_and_nothing_else(tmp_path):
+def test_only_earlier_results_are_replaced(tmp_path):
     path = tmp_path / "a.json"
     write_new(path, '{"versions": {}, "headlines": [], "fits": []}', overwrite=True)
     write_new(path, '{"versions": {}, "headlines": [], "fits": [1]}', overwrite=True)

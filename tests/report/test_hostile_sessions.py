@@ -1,4 +1,4 @@
-"""Sessions that claim, hold or state what none does: one message, and memory that stays bounded."""
+"""Sessions with impossible claims or contents: one message, and bounded memory."""
 
 import struct
 import subprocess
@@ -24,19 +24,19 @@ def peak():
     print(int(status["VmHWM"].split()[0]) // 1024)
 atexit.register(peak)
 from rigd.session import limits
-limits.MAX_STEPS //= {share}
+limits.MAX_STEPS //= {divisor}
 from analysis.cli.app import main
 main()
 """
 
 
-def refused(path, share=1):
+def refused(path, divisor=1):
     """Analyse in its own process; return its message and the most memory it took, in MB.
 
-    It is given a `share`-th of the work that a file may take.
+    It is given one `divisor`-th of the work that a file may take.
     """
     before = sorted(path.parent.iterdir())
-    program = ANALYZE.replace("{share}", str(share))
+    program = ANALYZE.replace("{divisor}", str(divisor))
     result = subprocess.run(
         [sys.executable, "-c", program, path.name, "--method", "welch"],
         cwd=path.parent, capture_output=True, text=True, timeout=300, check=False,
@@ -112,7 +112,7 @@ def in_turn(count):
 
 @pytest.mark.process
 @pytest.mark.parametrize(
-    ("parts", "message_", "share"),
+    ("parts", "message_", "divisor"),
     [
         (lambda: [chunk(message(1), claimed=10 << 30)], "claims 10737418240 bytes", 1),
         further(lambda: repeated(channel(1), 10_000_000, 4), "made of so many small parts", 1),
@@ -131,15 +131,15 @@ def in_turn(count):
     ],
     ids=["ten gigabytes", "channels", "metadata", "empty messages", "messages in turn", "longest"],
 )
-def test_a_small_file_of_too_much(tmp_path, parts, message_, share):
+def test_oversized_content_in_a_small_file_is_refused(tmp_path, parts, message_, divisor):
     path = write(tmp_path / "a.mcap", channel(1), channel(2), SESSION, *parts())
     assert path.stat().st_size < 1_000_000
-    line, megabytes = refused(path, share)
+    line, megabytes = refused(path, divisor)
     assert message_ in line
     assert megabytes < MEGABYTES
 
 
-def test_values_that_are_no_numbers(tmp_path, write_session, short_signals):
+def test_nonnumeric_values_are_refused(tmp_path, write_session, short_signals):
     torque = short_signals.torque_nm.copy()
     torque[[77, 1234]] = -np.inf, np.nan
     path = write_session(tmp_path / "a.mcap", replace(short_signals, torque_nm=torque))
@@ -157,9 +157,7 @@ def test_values_that_are_no_numbers(tmp_path, write_session, short_signals):
         (4999, 2**63 - 1, "rate_hz is 1000 Hz, but the time stamps t_ns advance at"),
     ],
 )
-def test_time_that_goes_backwards_or_stands_or_leaps(
-    tmp_path, write_session, short_signals, place, t_ns, message_
-):
+def test_invalid_times_are_refused(tmp_path, write_session, short_signals, place, t_ns, message_):
     times_ns = np.arange(5000) * 1_000_000
     times_ns[place] = t_ns
     path = write_session(tmp_path / "a.mcap", short_signals, t_ns=times_ns)
@@ -168,7 +166,7 @@ def test_time_that_goes_backwards_or_stands_or_leaps(
     assert message_ in str(error.value)
 
 
-def test_ticks_that_go_backwards(tmp_path, write_session, short_signals):
+def test_decreasing_ticks_are_refused(tmp_path, write_session, short_signals):
     ticks = np.arange(5000)
     ticks[2000:] -= 5
     times_ns = np.arange(5000) * 1_000_000
@@ -177,7 +175,7 @@ def test_ticks_that_go_backwards(tmp_path, write_session, short_signals):
         load_record(path)
 
 
-def test_a_span_that_is_too_long(tmp_path, monkeypatch, write_session, short_signals):
+def test_too_long_span_is_refused(tmp_path, monkeypatch, write_session, short_signals):
     """Nine in ten ticks missing, outside the sweep: the grid would be ten times the file."""
     ticks = np.arange(5000) * 9
     path = write_session(tmp_path / "a.mcap", short_signals, ticks=ticks, segments={})
@@ -186,7 +184,7 @@ def test_a_span_that_is_too_long(tmp_path, monkeypatch, write_session, short_sig
         load_record(path)
 
 
-def test_a_session_that_is_too_long(tmp_path, monkeypatch, write_session, short_signals):
+def test_too_long_session_is_refused(tmp_path, monkeypatch, write_session, short_signals):
     path = write_session(tmp_path / "a.mcap", short_signals)
     monkeypatch.setattr("analysis.record.MAX_SAMPLES", 4999)
     with pytest.raises(SessionError, match=r"more than the 4999 .* Give a shorter session"):

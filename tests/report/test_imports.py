@@ -1,4 +1,4 @@
-"""What writes no page needs nothing of pages: notebooks and clusters start without them."""
+"""Output without pages imports nothing of pages: notebooks and clusters start without them."""
 
 import pickle
 import subprocess
@@ -58,8 +58,8 @@ print(*sys.modules)
 """
 
 
-def test_the_way_from_file_to_page_is_short(record_result, tmp_path):
-    """Beside the estimators, and without a campaign."""
+def test_page_needs_few_imports(record_result, tmp_path):
+    """In addition to the estimators, and without a campaign."""
     whole = tmp_path / "whole.pickle"
     whole.write_bytes(pickle.dumps(record_result.whole))
     path = record_result.record.path

@@ -23,7 +23,7 @@ from analysis.report.table import Cell, Column, Table, latex_table, latex_text, 
         ("µs", r"$\mu$s"),
     ],
 )  # fmt: skip
-def test_text_becomes_latex(text, expected):
+def test_text_is_escaped_for_latex(text, expected):
     assert latex_text(text) == expected
 
 
@@ -33,7 +33,7 @@ def body(source):
 
 
 @pytest.mark.fit
-def test_tables_of_a_report_hold_what_the_page_shows(record_result):
+def test_tables_of_a_report_match_the_page(record_result):
     modes, tables, of_paper = report_tables(record_result)
     for table in (modes, *tables, *of_paper):
         source = latex_table(table)

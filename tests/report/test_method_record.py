@@ -21,7 +21,7 @@ def brief_signals(make_signals):
 
 @pytest.fixture(scope="module", autouse=True)
 def fitted_once():
-    """Have the record of these tests fitted once, whatever its file says of the excitation."""
+    """Have the record of these tests fitted once, for any excitation stated in its file."""
     first = []
 
     def fitted(record, fixed, band_hz):
@@ -71,19 +71,19 @@ def test_the_report_has_no_figure_of_the_paper(done):
     assert "a.mcap: verdict" in (report / "tables.txt").read_text()
 
 
-def test_options_without_effect_are_told(done):
+def test_options_without_effect_are_reported(done):
     (warning,) = done[0].stderr.splitlines()
     assert warning.startswith("Warning: --weights concerns the Welch fits alone, which --method")
 
 
-def test_the_band_is_the_whole_record_s(done):
+def test_band_is_that_of_the_whole_record(done):
     (record,) = done[2]["records"]
     assert record["band_hz"] == [1.0, 20.0]
     assert {mode["mode"] for mode in done[2]["modes"]} == {1, 2}
 
 
 @pytest.mark.parametrize("method", ["all", further("record")])
-def test_warnings_are_told_where_welch_s_fits_are_not_made(
+def test_warnings_are_reported_without_welch_fits(
     write_session, brief_signals, tmp_path, monkeypatch, without_drawing, method
 ):
     """They went to page and JSON alone."""
@@ -96,7 +96,7 @@ def test_warnings_are_told_where_welch_s_fits_are_not_made(
     assert result.output.count("Welch fits left out") == (method == "all")
 
 
-def test_a_warning_that_files_share_is_printed_once(
+def test_common_warning_is_printed_once(
     write_session, brief_signals, tmp_path, monkeypatch, without_drawing
 ):
     monkeypatch.chdir(tmp_path)

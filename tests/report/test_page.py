@@ -34,7 +34,7 @@ IMAGES = ("data:image/png;base64,", "data:image/svg+xml;base64,")
 
 
 class Reader(HTMLParser):
-    """Checks that elements nest and collects what the tests look at."""
+    """Checks that elements nest and collects the contents that the tests check."""
 
     def __init__(self):
         super().__init__(convert_charrefs=True)
@@ -86,7 +86,7 @@ def read_page(source):
     return read(source)
 
 
-def test_it_is_one_well_formed_document(source, read_page):
+def test_page_is_well_formed(source, read_page):
     assert source.startswith('<!DOCTYPE html>\n<html lang="en">')
     assert read_page.tags.count("main") == 1
     assert next(tag for tag in read_page.tags if re.fullmatch("h[1-6]", tag)) == "h1"
@@ -97,7 +97,7 @@ def test_it_is_one_well_formed_document(source, read_page):
     assert used <= set(identifiers)
 
 
-def test_nothing_comes_from_outside_and_nothing_runs(source, read_page):
+def test_page_loads_and_runs_nothing(source, read_page):
     assert "://" not in source
     assert not {"script", "link", "iframe", "object", "embed", "base"} & set(read_page.tags)
     for _, attributes in read_page.attributes:
@@ -108,7 +108,7 @@ def test_nothing_comes_from_outside_and_nothing_runs(source, read_page):
     assert len(source.encode()) < LIMIT_BYTES
 
 
-def test_what_the_operator_wrote_stays_text(read_page, record_result, hostile_note):
+def test_operator_input_stays_text(read_page, record_result, hostile_note):
     text = "".join(read_page.text)
     assert f"Note: {hostile_note}" in text
     assert text.count(hostile_note) == 2
@@ -118,7 +118,7 @@ def test_what_the_operator_wrote_stays_text(read_page, record_result, hostile_no
     assert read_page.tags.count("b") == read_page.tags.count("i") == 0
 
 
-def test_it_is_readable_without_sight_and_on_paper(source, read_page):
+def test_page_is_accessible_and_printable(source, read_page):
     figures = [a for tag, a in read_page.attributes if tag == "img"]
     assert len(figures) == len(SHOWN)
     assert all(len(figure["alt"]) > 60 for figure in figures)
@@ -135,7 +135,7 @@ def test_it_is_readable_without_sight_and_on_paper(source, read_page):
 @pytest.mark.process
 @pytest.mark.further  # nothing begins a page
 @pytest.mark.skipif(not shutil.which("chromium"), reason="no browser to print with")
-def test_on_paper_no_page_is_half_empty(report, tmp_path):
+def test_printed_pages_are_not_half_empty(report, tmp_path):
     """All of it fits on six pages; with a break before every part it takes nine."""
     printed = tmp_path / "report.pdf"
     subprocess.run(
@@ -148,7 +148,7 @@ def test_on_paper_no_page_is_half_empty(report, tmp_path):
     assert 4 <= pages <= 6
 
 
-def test_figures_of_the_page_are_the_files_and_their_text_is_text(report, read_page):
+def test_page_shows_the_figure_files_with_text(report, read_page):
     sources = [a["src"] for tag, a in read_page.attributes if tag == "img"]
     words = set()
     for name, source in zip(SHOWN, sources, strict=True):
@@ -160,7 +160,7 @@ def test_figures_of_the_page_are_the_files_and_their_text_is_text(report, read_p
     assert {"Coupling torque", "Frequency (Hz)", "total", "Mode 1"} <= words
 
 
-def test_the_verdict_comes_first_with_its_intervals(read_page, record_result):
+def test_verdict_with_intervals_comes_first(read_page, record_result):
     text = " ".join("".join(read_page.text).split())
     first_mode = record_result.whole.fit.modes[0]
     assert f"The antenna's damping ratio is {100 * first_mode.damping_ratio:.2f}"[:-1] in text
@@ -221,7 +221,7 @@ def test_csv_and_page_hold_the_same_numbers(report, read_page, record_result):
         assert in_csv == read_page.rows[table.name][1:]
 
 
-def test_what_is_shown_is_the_number_rounded(record_result):
+def test_shown_number_is_the_rounded_one(record_result):
     modes, tables, of_paper = report_tables(record_result)
     shown = {"modes": (1.0, 1.0, 1.0, 100.0, 100.0, 100.0, 100.0)}
     for row in modes.shown_rows:
@@ -244,23 +244,23 @@ def picture(name):
 
 
 @pytest.fixture
-def page_of(record_result, retold):
+def page_of(record_result, with_selection):
     """Return the text of the page with another headline."""
 
     def text(headline):
-        result = retold(record_result, headline=headline)
+        result = with_selection(record_result, headline=headline)
         modes, tables, _ = report_tables(result)
         made_at = datetime(2026, 1, 1, tzinfo=UTC)
         page = record_page(result, [picture("one")], modes, tables, made_at)
-        # What is said of the damping comes before the sentences of the verdict.
+        # The damping is reported before the sentences of the verdict.
         return "".join(read(page).text).partition("Both orders are fractional.")[0]
 
     return text
 
 
-def test_orders_that_the_data_do_not_support_are_not_told(record_result, retold):
+def test_unsupported_orders_are_not_reported(record_result, with_selection):
     reason = "the record does not determine the order"
-    careful = retold(
+    careful = with_selection(
         record_result,
         headline=headline_of_fit("VI", record_result.whole.fit, (1, 2, 3), {"alpha": reason}),
         verdict=replace(record_result.whole.verdict, sentences=("Nothing is sure.",)),
@@ -268,45 +268,45 @@ def test_orders_that_the_data_do_not_support_are_not_told(record_result, retold)
     modes, tables, _ = report_tables(careful)
     pictures = [picture(name) for name in ("one", "two")]
     text = record_page(careful, pictures, modes, tables, datetime(2026, 1, 1, tzinfo=UTC))
-    told = "".join(read(text).text)
-    assert "its order α is not known" in told
-    assert reason in told
+    content = "".join(read(text).text)
+    assert "its order α is not known" in content
+    assert reason in content
     (row,) = [row for row in tables[1].shown_rows if row[0].text == "α"]
     assert all(cell.doubtful and cell.value is not None for cell in row[3:7])
     assert 'href="#paper"' not in text
 
 
-def test_a_size_for_an_order_that_was_only_assumed_is_not_told(record_result, page_of):
+def test_loss_factor_of_an_assumed_order_is_not_reported(record_result, page_of):
     fit = record_result.whole.fits["VII"]
     flagged = headline_of_fit(
         "VII", fit, (1, 2, 3), {"alpha": "the record does not determine the order"}
     )
-    told = page_of(flagged)
-    assert "internal damping" not in told
-    assert "The external damping has a loss factor of" in told
+    content = page_of(flagged)
+    assert "internal damping" not in content
+    assert "The external damping has a loss factor of" in content
     known = page_of(headline_of_fit("VII", fit, (1, 2, 3)))
     assert "of the fixed order α\u00a0=\u00a01." in known
 
 
-def test_what_is_unexplained_makes_every_number_a_condition(record_result, retold, page_of):
+def test_unexplained_residual_makes_numbers_conditional(record_result, with_selection, page_of):
     spoilt = headline_of_fit(
         "VI", record_result.whole.fit, (1, 2, 3), unexplained_reason="part is unexplained"
     )
-    told = page_of(spoilt).partition("the antenna's damping ratio would be ")[2]
-    assert told
-    assert "(" not in told[:60]  # no interval
-    modes, tables, _ = report_tables(retold(record_result, headline=spoilt))
+    content = page_of(spoilt).partition("the antenna's damping ratio would be ")[2]
+    assert content
+    assert "(" not in content[:60]  # no interval
+    modes, tables, _ = report_tables(with_selection(record_result, headline=spoilt))
     for table in (modes, tables[0], tables[1]):
         for row in table.shown_rows:
             shown = [cell for cell in row if cell.is_number]
             assert sum(cell.doubtful for cell in shown) >= len(shown) - 1
 
 
-def test_a_simpler_structure_stands_beside_the_freest(record_result, retold):
+def test_simpler_structure_is_shown_with_the_freest(record_result, with_selection):
     taken = headline_of_fit("VII", record_result.whole.fits["VII"], (1, 2, 3)).parameters
     simpler = ConditionalEstimate("VII", {"alpha": 1.0}, taken)
-    told = replace(record_result.whole.headline, simpler=simpler)
-    _modes, tables, _ = report_tables(retold(record_result, headline=told))
+    headline = replace(record_result.whole.headline, simpler=simpler)
+    _modes, tables, _ = report_tables(with_selection(record_result, headline=headline))
     (table,) = [table for table in tables if table.name == "on_condition"]
     assert "If α = 1 is assumed: type VII" in table.caption
     row = {row["parameter"].text: row for row in table.rows}["ζ"]
@@ -314,7 +314,7 @@ def test_a_simpler_structure_stands_beside_the_freest(record_result, retold):
     assert row["free_value"].value == record_result.whole.fits["VI"].parameters["zeta"]
 
 
-def test_a_band_that_begins_beyond_a_mode_is_drawn(record_result):
+def test_band_that_begins_above_a_mode_is_drawn(record_result):
     found = [each.name for each in illustrations(replace(record_result.whole, band_hz=(5.0, 50.0)))]
     assert found == WITHOUT_TEST
 
@@ -327,14 +327,14 @@ def test_figures_are_svg_files_with_text(report):
         assert "<text" in svg
 
 
-def test_a_taken_name_is_told_and_left_alone(report, record_result, without_drawing):
+def test_existing_name_is_reported_and_preserved(report, record_result, without_drawing):
     before = (report / "report.html").stat().st_mtime_ns
     with without_drawing(), pytest.raises(OutputExistsError, match=r"welch_frf\.svg exists"):
         write_report(record_result, report)
     assert (report / "report.html").stat().st_mtime_ns == before
 
 
-def test_entries_hold_bands_round_their_curves(record_result):
+def test_bands_surround_their_curves(record_result):
     (record,) = document([record_result])["records"]
     curves = record["curves"]
     assert record["selected"] == "VI"

@@ -37,7 +37,7 @@ def plain(fit, record, measured, delay_s):
     return fit_indices(s.imag, measured.response, model * np.exp(-s * delay_s))
 
 
-def test_they_are_those_of_eq_25_with_the_delay_that_was_found(record_result):
+def test_indices_use_eq_25_with_the_estimated_delay(record_result):
     welch, fit = record_result.welch, record_result.whole.fit
     found = indices_of_selected(record_result)
     for indices, measured in zip(found, (welch.response, welch.whole_record), strict=True):
@@ -53,7 +53,7 @@ def test_they_are_those_of_eq_25_with_the_delay_that_was_found(record_result):
     assert again[0]["mse"] == pytest.approx(found[0]["mse"], rel=1e-9)
 
 
-def test_the_document_has_both_of_every_fit(record_result):
+def test_document_has_both_indices_of_every_fit(record_result):
     content = document([record_result])
     for fit in content["fits"]:
         for key in ("indices", "indices_whole_record"):
@@ -68,7 +68,7 @@ def test_the_document_has_both_of_every_fit(record_result):
         expected = fit_indices(s.imag, welch.whole_record.response, curve)
         for name, value in indices.items():
             assert value == pytest.approx(getattr(expected, name), rel=1e-9)
-    # Welch's estimate is biased: what suits it best is not what was there.
+    # Welch's estimate is biased: its best fit is not the true structure.
     paper = min(of_welch, key=lambda each: each["wmse"])
     (record,) = [fit for fit in content["fits"] if fit.get("selected")]
     assert record["indices_whole_record"]["wmse"] < paper["wmse"]
@@ -76,7 +76,7 @@ def test_the_document_has_both_of_every_fit(record_result):
     assert record["indices"]["wmse"] > best
 
 
-def test_without_the_paper_s_route_they_are_null(record_result):
+def test_indices_are_null_without_the_paper_method(record_result):
     alone = replace(record_result, welch=None)
     content = document([alone])
     assert {value for fit in content["fits"] for value in fit["indices"].values()} == {None}

@@ -27,17 +27,17 @@ REASON = "order 1 on another beam explains as much"
 
 
 @pytest.fixture(scope="module")
-def careful(record_result, retold):
+def careful(record_result, with_selection):
     """Type VI whose alpha the data do not support, on a record that shows two modes."""
     order = SimpleNamespace(order="alpha", status="open", value=1.05, interval=(0.9, 1.2))
-    told = headline_of_fit(
+    headline = headline_of_fit(
         "VI", record_result.whole.fit, (1, 2), {"alpha": REASON}, {"alpha": (0.9, 1.2)}
     )
     verdict = replace(record_result.whole.verdict, alpha=order)
-    return retold(record_result, headline=told, verdict=verdict)
+    return with_selection(record_result, headline=headline, verdict=verdict)
 
 
-def test_an_order_takes_its_coefficient_with_it():
+def test_flag_of_an_order_flags_its_coefficient():
     assert unreported_parameters(STRUCTURES["VI"], ALPHA) == {"alpha", "zeta"}
     assert unreported_parameters(STRUCTURES["III"], {"lambda", "alpha"}) == {
         "zeta", "alpha", "gamma", "lambda"
@@ -46,7 +46,7 @@ def test_an_order_takes_its_coefficient_with_it():
     assert unreported_parameters(STRUCTURES["VI"], ()) == frozenset()
 
 
-def test_tables_mark_every_such_number_and_no_other(careful):
+def test_tables_mark_flagged_numbers_only(careful):
     modes, (_sizes, parameters, _correlations, structures), (welch, _peaks) = report_tables(careful)
     shown = {row["parameter"].text: row for row in parameters.rows}
     for symbol, name in (("ζ", "zeta"), ("α", "alpha")):
@@ -74,12 +74,12 @@ def test_tables_mark_every_such_number_and_no_other(careful):
     assert "does not show" in modes.notes[-1]
 
 
-def test_of_absent_damping_no_fit_tells_the_order(record_result, retold):
+def test_order_of_absent_damping_is_not_determined(record_result, with_selection):
     """Selected is a structure without external damping: types V, VI and VII have a lambda."""
     absent = SimpleNamespace(order="lambda", status="absent", value=None, interval=None)
     known = SimpleNamespace(order="alpha", status="fractional", value=0.8, interval=(0.7, 0.9))
     verdict = replace(record_result.whole.verdict, alpha=known, lambda_=absent)
-    result = retold(record_result, verdict=verdict)
+    result = with_selection(record_result, verdict=verdict)
     assert not result.whole.withheld_orders
     assert result.unsupported_orders == {"lambda"}
     _modes, (*_others, structures), (welch, _peaks) = report_tables(result)
@@ -95,7 +95,7 @@ def test_of_absent_damping_no_fit_tells_the_order(record_result, retold):
         assert fit["withheld"] == ([] if fit["type"] in ("I", "IV") else ["gamma", "lambda"])
 
 
-def test_nothing_is_marked_where_all_is_supported(record_result):
+def test_supported_numbers_are_not_marked(record_result):
     modes, tables, of_paper = report_tables(record_result)
     for table in (modes, *tables, *of_paper):
         assert NOT_REPORTED_MARK not in csv_text(table) + "".join(table.notes)
@@ -123,7 +123,7 @@ def test_page_terminal_and_text_tables_show_the_mark(careful, as_text):
     assert NOT_REPORTED_MARK not in as_text(result_text(replace(careful, whole=None), verbose=True))
 
 
-def test_the_document_flags_and_keeps_the_numbers(careful):
+def test_document_has_flags_and_numbers(careful):
     content = document([careful])
     for fit in content["fits"]:
         expected = [] if fit["type"] in ("II", "V") else ["alpha", "zeta"]
@@ -145,19 +145,19 @@ def test_the_document_flags_and_keeps_the_numbers(careful):
     assert visible == {1: True, 2: True, 3: False}
 
 
-def test_of_modes_that_do_not_show_no_damping_is_told(careful, retold, as_text):
+def test_damping_of_invisible_modes_is_not_reported(careful, with_selection, as_text):
     def verdict(result):
         shown = as_text(result_text(replace(result, welch=None), verbose=True))
         return shown.partition("Modes with locked hub")[0]
 
-    told = verdict(careful)
-    assert "at 2.57 Hz and" in told
-    assert "44.8" not in told
+    text = verdict(careful)
+    assert "at 2.57 Hz and" in text
+    assert "44.8" not in text
     none = headline_of_fit("VI", careful.whole.fit, ())
-    assert "damping ratio is" in told
-    assert "damping ratio" not in verdict(retold(careful, headline=none))
+    assert "damping ratio is" in text
+    assert "damping ratio" not in verdict(with_selection(careful, headline=none))
     misread = careful.whole.headline.with_flag_on_all(CONTRADICTED_FILE_REASON)
-    assert "damping ratio" not in verdict(retold(careful, headline=misread))
+    assert "damping ratio" not in verdict(with_selection(careful, headline=misread))
 
 
 def loss_axes(result):
@@ -165,7 +165,7 @@ def loss_axes(result):
     return found.draw().axes[0], found.description
 
 
-def test_the_loss_factor_is_drawn_where_the_data_support_it(careful, record_result):
+def test_loss_factor_is_drawn_in_the_supported_band(careful, record_result):
     axes, description = loss_axes(careful)
     labels = [line.get_label() for line in axes.get_lines()]
     assert "total" in labels
@@ -182,8 +182,8 @@ def test_the_loss_factor_is_drawn_where_the_data_support_it(careful, record_resu
     assert "do not support" not in description
 
 
-def test_one_mode_has_a_point_and_no_curve(careful, retold):
-    one = retold(
+def test_one_mode_has_a_point_and_no_curve(careful, with_selection):
+    one = with_selection(
         careful, headline=headline_of_fit("VI", careful.whole.fit, (1,), {"alpha": REASON})
     )
     assert supported_band_hz(one.whole) is None
@@ -192,7 +192,7 @@ def test_one_mode_has_a_point_and_no_curve(careful, retold):
     assert point == careful.whole.fit.modes[0].frequency_hz
 
 
-def test_the_excited_band_ends_where_the_sweep_does(careful):
+def test_excited_band_ends_with_the_sweep(careful):
     """Of a chirp of 0.05 to 50 Hz nearly all; of noise alone nothing."""
     first_hz, last_hz = excited_band_hz(careful.record, careful.whole.analysis)
     assert first_hz < 2.0

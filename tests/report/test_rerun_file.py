@@ -38,7 +38,7 @@ SAMPLES = 10_000
 
 @pytest.fixture(scope="module")
 def brief_sessions():
-    """Have ten seconds of each session drawn, in place of two minutes."""
+    """Have ten seconds of each session drawn, instead of two minutes."""
 
     def read(path):
         session = read_session(path)
@@ -57,7 +57,7 @@ def written(paper_analysis, tmp_path_factory, brief_sessions):
 
 
 class Canvas:
-    """Where a chart's own tick labels say that values are: read from the file, not computed."""
+    """Positions of values by the tick labels of a chart: read from the file, not computed."""
 
     def __init__(self, chunks, entity):
         labels = [str(text) for text in value(chunks[f"{entity}/labels"], "Points2D:labels")]
@@ -69,14 +69,14 @@ class Canvas:
             for text, place in zip(labels, places, strict=True)
             if text.replace("−", "").replace(".", "").isdigit()
         }
-        # Beside the frame stand the ticks of the vertical axis, below it those of the other.
+        # Next to the frame are the ticks of the vertical axis, below it those of the other.
         upright = {t: p for t, p in numbers.items() if p[0] < self.left}
         across = {t: p for t, p in numbers.items() if p[1] > self.bottom - 5 and p[0] >= self.left}
         self.hz = np.array([[float(t), p[0]] for t, p in across.items()])
         self.values = np.array([[float(t.replace("−", "-")), p[1]] for t, p in upright.items()])
 
     def points(self, strips):
-        """Return frequencies in Hz and values (n, 2) from what is drawn."""
+        """Return frequencies in Hz and values (n, 2) from the drawing."""
         drawn = np.concatenate([np.asarray(strip, dtype=float) for strip in strips])
         inside = (drawn[:, 1] > self.top + 0.01) & (drawn[:, 1] < self.bottom - 0.01)
         drawn = drawn[inside]
@@ -169,7 +169,7 @@ def test_the_estimate_of_the_fits_is_shown_with_its_coherence(paper_analysis, wr
     )  # fmt: skip
 
 
-def test_it_has_the_session_the_numbers_and_a_tab_for_each(paper_analysis, written):
+def test_file_has_session_numbers_and_tabs(paper_analysis, written):
     chunks, path = written
     assert sum(b.num_rows for b in chunks["/signals"]) == SAMPLES
     text = value(chunks["/fits/tables"], "TextDocument:text")[0]
@@ -234,7 +234,7 @@ def test_torque_model_and_residual_run_over_the_session(record_result, from_reco
     np.testing.assert_allclose(times.astype(np.int64), 1e9 * record.time_s, atol=1)
 
 
-def test_the_verdict_is_read_first(record_result, from_record):
+def test_verdict_comes_first(record_result, from_record):
     chunks, path = from_record
     text = value(chunks["/whole_record/verdict"], "TextDocument:text")[0]
     for sentence in record_result.whole.verdict.sentences:
@@ -258,7 +258,7 @@ def titles(path):
     return found
 
 
-def test_weightings_of_ones_own_and_an_estimate_without_coherence(session, tmp_path):
+def test_user_weightings_and_estimate_without_coherence(session, tmp_path):
     settings = WelchSettings(
         estimator="fft", types=("III",), weightings=("omega", "omega^0.5", "omega^-0.5")
     )
@@ -283,7 +283,7 @@ def session(write_session, short_signals, tmp_path):
     return write_session(tmp_path / "session.mcap", short_signals)
 
 
-def test_a_file_that_cannot_be_written_is_told(paper_analysis, brief_sessions):
+def test_unwritable_file_is_reported(paper_analysis, brief_sessions):
     with pytest.raises(OutputError, match=r"^/proc/fits.rrd cannot be written: [A-Z][^:]*\.$"):
         write_rerun_file(
             RecordResult(paper_analysis.record, welch=paper_analysis), Path("/proc/fits.rrd")
@@ -294,15 +294,15 @@ def run(application, *arguments):
     return CliRunner().invoke(application, list(map(str, arguments)))
 
 
-def test_the_command_writes_it_and_never_over_another(session, tmp_path, monkeypatch):
+def test_command_never_overwrites_another_file(session, tmp_path, monkeypatch):
     # The figures take longer than all the rest, and are tested elsewhere.
     monkeypatch.setattr("analysis.report.record_report.write_report", lambda *_, **__: None)
     out = tmp_path / "new" / "fits.rrd"
     quick = ("--types", "I", "--weights", "const", "--method", "welch", "--segment", "1000")
     done = run(app, session, *quick, "--rerun", out)
     assert done.exit_code == 0, done.output
-    said = " ".join(done.stdout.split())
-    assert f"Session and fits for Rerun: {out} (rigd replay {out})" in said
+    printed = " ".join(done.stdout.split())
+    assert f"Session and fits for Rerun: {out} (rigd replay {out})" in printed
     assert "/fits/type_I/magnitude/model_const" in batches(out)
     before = out.read_bytes()
     for options, words in (
@@ -315,7 +315,7 @@ def test_the_command_writes_it_and_never_over_another(session, tmp_path, monkeyp
         assert "--rerun" in done.stderr
         assert words in done.stderr
     assert out.read_bytes() == before
-    # `rigd replay` takes it for what it is.
+    # `rigd replay` recognises it.
     done = run(rigd, "replay", out, "--save", tmp_path / "copy.rrd")
     assert done.exit_code == 2
     assert "is a recording for Rerun already" in done.stderr

@@ -1,4 +1,4 @@
-"""What a report says of the scales, and of the fit in per cent."""
+"""The scales and the fit in per cent in a report."""
 
 import json
 from dataclasses import replace
@@ -37,7 +37,7 @@ def stated(record_result):
     return made
 
 
-def test_without_statement_intervals_are_called_statistical(stated):
+def test_intervals_without_scales_are_called_statistical(stated):
     table = parameters_table(stated())
     assert "combined_low_95" not in table.keys
     notes = " ".join(table.notes)
@@ -51,7 +51,7 @@ def test_without_statement_intervals_are_called_statistical(stated):
     assert "statistical only" in modes.notes[0]
 
 
-def test_stated_uncertainties_stand_beside_the_statistical_intervals(stated):
+def test_stated_uncertainties_are_shown_with_statistical_intervals(stated):
     whole = stated(**ALL)
     table = parameters_table(whole)
     rows = {row["parameter"].text: row for row in table.rows}
@@ -70,20 +70,20 @@ def test_stated_uncertainties_stand_beside_the_statistical_intervals(stated):
     assert "They agree." in notes
 
 
-def test_what_is_not_stated_is_named(stated):
+def test_unstated_uncertainties_are_listed(stated):
     notes = notes_of(stated(torque_scale=0.01))
     assert "relative standard uncertainty of torque scale 1 %" in notes
     assert "Not included: the uncertainty of length, which the file does not state" in notes
 
 
-def test_a_density_that_contradicts_is_told(stated):
+def test_contradicting_density_is_reported(stated):
     whole = stated(**ALL)
     beam = replace(whole.record.beam, density_kg_per_m=1.05 * whole.record.beam.density_kg_per_m)
     whole = replace(whole, record=replace(whole.record, beam=beam))
     assert "check torque scale and length" in notes_of(whole)
 
 
-def test_what_is_held_leaves_no_combined_interval(stated):
+def test_fixed_parameter_has_no_combined_interval(stated):
     whole = stated(**ALL)
     fit = whole.fit
     interval = {k: v for k, v in fit.interval.items() if k != "bending_stiffness_n_m2"}
@@ -97,20 +97,20 @@ def test_what_is_held_leaves_no_combined_interval(stated):
     assert "the file's values of EI, which were held" in notes_of(held)
 
 
-def test_the_document_has_both(stated):
+def test_document_has_both_intervals(stated):
     def headline(whole):
         (found,) = document([RecordResult(whole.record, whole)])["headlines"]
         return json.loads(json.dumps(found, allow_nan=False))
 
-    told = headline(stated(**ALL))
-    assert told["scale_uncertainty"] == ALL
-    assert told["combined"].keys() == {
+    content = headline(stated(**ALL))
+    assert content["scale_uncertainty"] == ALL
+    assert content["combined"].keys() == {
         "gamma", "density_over_stiffness", "bending_stiffness_n_m2", "tool_inertia_kg_m2",
     }  # fmt: skip
-    for name, each in told["combined"].items():
-        low, high = told["parameters"][name]["interval_95"]
+    for name, each in content["combined"].items():
+        low, high = content["parameters"][name]["interval_95"]
         assert each["interval_95"][0] <= low < high < each["interval_95"][1]
-        assert each["value"] == told["parameters"][name]["value"]
+        assert each["value"] == content["parameters"][name]["value"]
     assert headline(stated())["combined"] == {}
 
 

@@ -1,4 +1,4 @@
-"""A warning that several files share is reported once, with their number and a few names."""
+"""A warning common to several files is reported once, with their number and a few names."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def test_each_warning_is_reported_once(warnings: list[tuple[str, ...]], lines: l
     assert shared_warnings(of_files(*warnings)) == lines
 
 
-def test_the_path_in_a_warning_makes_no_difference():
+def test_warnings_are_compared_without_their_paths():
     files = of_files(("folder/0.mcap: no memory",), ("folder/1.mcap: no memory",), ("alone",))
     assert shared_warnings(files) == [
         "2 of 3 files (0.mcap, 1.mcap): no memory",

@@ -16,7 +16,7 @@ ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega")
 
 @pytest.fixture(scope="module")
 def cut(write_session, make_signals, tmp_path_factory):
-    """Make a session of which so many samples are left, of a sweep past the first mode."""
+    """Make a session cut to a number of samples, of a sweep past the first mode."""
     folder = tmp_path_factory.mktemp("cut")
     whole = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
 
@@ -30,7 +30,7 @@ def cut(write_session, make_signals, tmp_path_factory):
 
 
 @pytest.mark.fit
-def test_what_there_is_is_reported(cut, analyze_here, tmp_path, without_drawing):
+def test_available_results_are_reported(cut, analyze_here, tmp_path, without_drawing):
     """A record with fewer bins than tests have neighbours, figures stretches; none at a mode."""
     with without_drawing():
         result = analyze_here(cut(1700), *ONE_FIT, "--report", "r", "--json", "r.json")
@@ -45,7 +45,7 @@ def test_what_there_is_is_reported(cut, analyze_here, tmp_path, without_drawing)
 
 
 @pytest.mark.fit
-def test_too_short_for_the_whole_record_is_told(cut, analyze_here, without_drawing):
+def test_too_short_record_is_reported(cut, analyze_here, without_drawing):
     with without_drawing():
         result = analyze_here(cut(1200), *ONE_FIT, "--report", "r")
     assert result.returncode == 0
@@ -57,7 +57,7 @@ def test_too_short_for_the_whole_record_is_told(cut, analyze_here, without_drawi
 
 
 @pytest.mark.fit
-def test_a_transform_that_cannot_show_a_mode_is_told(cut):
+def test_transform_too_coarse_for_a_mode_is_reported(cut):
     settings = WelchSettings(estimator="fft", types=("I",), weightings=("const",))
     (warning,) = (w for w in analyse(load_record(cut(390)), settings).warnings if "resolves" in w)
     assert (
@@ -66,9 +66,7 @@ def test_a_transform_that_cannot_show_a_mode_is_told(cut):
     assert not [w for w in analyse(load_record(cut(2200)), settings).warnings if "resolves" in w]
 
 
-def test_a_record_too_short_for_any_mode_is_not_the_metadatas_fault_alone(
-    write_session, short_signals, tmp_path
-):
+def test_record_too_short_for_any_mode_names_all_causes(write_session, short_signals, tmp_path):
     few = replace(short_signals.part(slice(0, 30)), segments={})
     with pytest.raises(
         RecordError, match=r"which 0\.03 s at 1000 Hz cannot show; record longer, or"
@@ -76,7 +74,7 @@ def test_a_record_too_short_for_any_mode_is_not_the_metadatas_fault_alone(
         load_record(write_session(tmp_path / "few.mcap", few))
 
 
-def test_a_file_name_that_is_no_text_is_no_obstacle(tmp_path):
+def test_file_name_with_invalid_text_is_accepted(tmp_path):
     name = "caf\udce9.mcap"
     write_new(tmp_path / "a.json", document_text({"file": name}))
     assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == {"file": name}

@@ -63,9 +63,7 @@ def unread():
 
 
 @pytest.mark.further  # as on a full disk
-def test_a_stream_that_is_not_utf_8_gets_question_marks_and_the_file_everything(
-    short_file, tmp_path
-):
+def test_non_utf_8_stream_gets_question_marks(short_file, tmp_path):
     environment = {**os.environ, "PYTHONIOENCODING": "cp1252", "PYTHONUTF8": "0"}
     result = analyze(
         short_file, *QUICK, "--report", tmp_path / "r", "--json", tmp_path / "j.json",
@@ -87,7 +85,7 @@ runpy.run_module("analysis", run_name="__main__", alter_sys=True)
 
 
 @needs_full
-def test_a_full_disk_behind_a_stream_is_told_and_what_is_written_is_kept(short_file, tmp_path):
+def test_full_disk_is_reported_and_written_files_remain(short_file, tmp_path):
     options = [short_file, *QUICK, "--report", tmp_path / "r", "--json", tmp_path / "j.json"]
     with FULL.open("w") as full:
         result = python(WITHOUT_DRAWING, *options, stdout=full)
@@ -113,7 +111,7 @@ def test_help_and_errors_on_a_full_disk_end_without_a_traceback(stream):
 
 
 @pytest.mark.further  # as with a full disk behind the stream
-def test_the_work_is_done_and_counts_though_nobody_reads(short_file, tmp_path, unread):
+def test_work_completes_without_a_reader(short_file, tmp_path, unread):
     result = analyze(
         short_file, *QUICK, "--report", tmp_path / "r", "--json", tmp_path / "j.json",
         stdout=unread,
@@ -122,7 +120,7 @@ def test_the_work_is_done_and_counts_though_nobody_reads(short_file, tmp_path, u
     assert json.loads((tmp_path / "j.json").read_text(encoding="utf-8"))["fits"]
 
 
-def test_the_exit_code_is_that_of_the_work(unread):
+def test_exit_code_is_that_of_the_work(unread):
     result = python(GREEK, stdout=unread)
     assert (result.returncode, result.stderr) == (3, "")
 
@@ -133,6 +131,6 @@ def test_everything_is_written_before_the_end():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell closes streams")
-def test_a_stream_that_is_closed_is_nothing_to_complain_of():
+def test_closed_stream_is_no_error():
     command = f'"{sys.executable}" -m analysis --help >&- 2>&-'
     assert subprocess.run(command, shell=True, timeout=300, check=False).returncode == 0

@@ -34,7 +34,7 @@ from rigd.beam import modes
         (3.0, float("nan"), "3"),
     ],
 )
-def test_a_value_shows_the_digits_its_spread_leaves(value, std, text, as_text):
+def test_digits_of_a_value_follow_its_spread(value, std, text, as_text):
     columns = (Column("value", "value"), Column("std", "std", std_of_previous=True))
     table = Table.from_rows("name", "", columns, [estimate_cells((value, std), std)])
     assert as_text(terminal_table(table)).split("\n")[2].strip() == text
@@ -46,7 +46,7 @@ def by_welch(analysis):
 
 @pytest.fixture(scope="module")
 def tables_text(as_text):
-    """Return what a terminal shows of Welch fits, with everything."""
+    """Return the complete terminal output of Welch fits."""
     return lambda analysis: as_text(result_text(by_welch(analysis), verbose=True))
 
 
@@ -57,7 +57,7 @@ def rows(text, *starts):
 
 
 @pytest.mark.fit
-def test_the_tables_hold_every_fit_with_its_numbers(paper_analysis, tables_text):
+def test_tables_contain_every_fit_with_its_numbers(paper_analysis, tables_text):
     text = tables_text(paper_analysis)
     for model in paper_analysis.models:
         fits, peaks, modes = rows(text, model.fit.structure.name, model.fit.weighting)
@@ -77,7 +77,7 @@ def test_the_tables_hold_every_fit_with_its_numbers(paper_analysis, tables_text)
 
 
 @pytest.mark.fit
-def test_absent_and_fixed_parameters_are_told_apart(paper_analysis, tables_text):
+def test_absent_and_fixed_parameters_are_distinguished(paper_analysis, tables_text):
     text = tables_text(paper_analysis)
     internal_only = rows(text, "I", "const")[0]
     assert internal_only[4:7] == ["1", "–", "–"]
@@ -112,9 +112,7 @@ def modes_rows(text):
 
 
 @pytest.mark.fit
-def test_modes_that_do_not_vibrate_are_left_out(
-    write_session, short_signals, tmp_path, tables_text
-):
+def test_overdamped_modes_are_left_out(write_session, short_signals, tmp_path, tables_text):
     """One segment of a short sweep, to which type II answers with a damping ratio of 8."""
     record = load_record(write_session(tmp_path / "a.mcap", short_signals))
     settings = WelchSettings(segment_length=4000, types=("II",), weightings=("const",))
@@ -135,7 +133,7 @@ def test_modes_that_do_not_vibrate_are_left_out(
 
 
 @pytest.mark.fit
-def test_modes_that_left_their_resonance_are_marked(paper_analysis, tables_text):
+def test_shifted_modes_are_marked(paper_analysis, tables_text):
     text, (first, last) = modes_rows(tables_text(paper_analysis))
     assert "‡" not in text
     assert [float(hz) for hz in last[:3]] == sorted(float(hz) for hz in last[:3])
@@ -178,7 +176,7 @@ def test_one_table_is_shown_in_its_units_and_written_in_full(as_text):
     ]
 
 
-def test_rows_that_belong_together_are_ruled_off(as_text):
+def test_groups_of_rows_are_separated(as_text):
     columns = (Column("type", "type", TEXT_FORMAT), Column("n", "n"))
     table = Table.from_rows("name", "", columns, [("I", 1), ("I", 2), ("II", 3)], grouped=True)
     lines = [line.strip() for line in as_text(terminal_table(table)).splitlines()]

@@ -1,4 +1,4 @@
-"""`analyze touch`: table, JSON, report, and what it says of wrong requests."""
+"""`analyze touch`: table, JSON, report, and messages on wrong requests."""
 
 import csv
 import io
@@ -31,7 +31,7 @@ def analyze(monkeypatch, touch_analysis, touch_file, touched):
     return lambda *arguments: CliRunner().invoke(app, ["touch", *map(str, arguments)])
 
 
-def test_it_tells_touches_and_writes_them_as_json(analyze, touch_file, tmp_path):
+def test_touches_are_printed_and_written_as_json(analyze, touch_file, tmp_path):
     out = tmp_path / "touches.json"
     result = analyze(touch_file.path, "--json", out)
     assert result.exit_code == 0, result.output
@@ -44,13 +44,13 @@ def test_it_tells_touches_and_writes_them_as_json(analyze, touch_file, tmp_path)
     assert (touch["number"], touch["kind"], touch["detected"]) == (1, "rigid", "loop")
 
 
-def test_json_may_go_to_standard_output_alone(analyze, touch_file):
+def test_json_alone_on_standard_output(analyze, touch_file):
     result = analyze(touch_file.path, "--json", "-")
     assert len(json.loads(result.stdout)["touches"]) == 1
     assert "1 touch" in result.stderr
 
 
-def test_a_file_that_cannot_be_read_does_not_take_the_others_along(analyze, touch_file, tmp_path):
+def test_unreadable_file_does_not_stop_the_others(analyze, touch_file, tmp_path):
     result = analyze(touch_file.path, tmp_path / "none.mcap", "--json", tmp_path / "a.json")
     assert result.exit_code == 1
     assert "Error: " in result.stderr
@@ -68,7 +68,7 @@ def test_nothing_is_overwritten(analyze, touch_file, tmp_path, option):
     assert result.stderr.startswith(f"Error: {option} ")
 
 
-def test_a_wrong_model_ends_it(touch_file, tmp_path):
+def test_wrong_model_ends_the_command(touch_file, tmp_path):
     (tmp_path / "m.json").write_text("[]")
     arguments = ["touch", str(touch_file.path), "--model", str(tmp_path / "m.json")]
     result = CliRunner().invoke(app, arguments)
@@ -105,7 +105,7 @@ def test_the_report_has_a_map_and_the_evidence(touched, tmp_path, without_drawin
     )
 
 
-def test_of_a_lopsided_interval_the_ends_are_told(touched, tmp_path):
+def test_ends_of_an_asymmetric_interval_are_reported(touched, tmp_path):
     (touch,) = touched.touches
     x_m = replace(touch.estimate.x_m, value=0.92, interval_95=(0.48, 0.94))
     estimate = replace(touch.estimate, x_m=x_m, kind="unknown", force_history_n=np.empty(0))

@@ -21,16 +21,16 @@ TOLERANT = "if each mode lies where that of a uniform beam does, to 0.1 %"
 
 
 @pytest.fixture(scope="module")
-def unexplained_losses(modal_result, retold):
+def unexplained_losses(modal_result, with_selection):
     """The same, were its losses those of no beam with two orders."""
-    told = modal_result.whole.headline
+    headline = modal_result.whole.headline
     reason = "no beam explains the losses"
-    test = replace(told.uniform_beam, status="refused", p_value=2e-18)
-    parameters = {name: each.with_flag(reason) for name, each in told.parameters.items()}
-    tolerant = replace(told.tolerant, basis="none")
-    return retold(
+    test = replace(headline.uniform_beam, status="refused", p_value=2e-18)
+    parameters = {name: each.with_flag(reason) for name, each in headline.parameters.items()}
+    tolerant = replace(headline.tolerant, basis="none")
+    return with_selection(
         modal_result,
-        headline=replace(told, uniform_beam=test, tolerant=tolerant, parameters=parameters),
+        headline=replace(headline, uniform_beam=test, tolerant=tolerant, parameters=parameters),
     )
 
 
@@ -48,7 +48,7 @@ def model_of(constants, background):
     return ModalModel(tuple(poles), tuple(residues), tuple(background))
 
 
-def test_the_band_of_the_modal_model_is_what_draws_scatter(modal_result):
+def test_band_of_the_modal_model_matches_scatter_of_draws(modal_result):
     modal = modal_result.whole.headline.modal
     frequency_hz = np.array([1.5, 2.55, 5.0, 11.0, 16.0, 30.0, 44.0, 48.0])
     band = modal_response_band(modal, frequency_hz)
@@ -69,7 +69,7 @@ def test_the_band_of_the_modal_model_is_what_draws_scatter(modal_result):
     assert scatter.imag.std(axis=0) == pytest.approx(band.phase_std_rad, rel=0.2)
 
 
-def test_what_is_shown_first_is_the_modal_model(modal_result):
+def test_modal_model_is_shown_first(modal_result):
     whole = modal_result.whole
     model = ShownModel.from_headline(whole.headline, whole.record)
     assert model.transfer is whole.headline.modal.model
@@ -142,13 +142,13 @@ def test_the_page_has_a_section_on_the_uniformity(modal_result, page):
     assert modal_result.whole.headline.uniform_beam.summary.sentence in text
 
 
-def test_a_turn_of_a_phase_is_no_deviation(modal_result, retold):
+def test_full_turn_of_a_phase_is_no_deviation(modal_result, with_selection):
     headline = modal_result.whole.headline
     at = MODE_CONSTANT_NAMES.index("residue_phase_rad")
     measured = headline.uniform_beam.measured.copy()
     measured[at] += 2 * np.pi
     test = replace(headline.uniform_beam, measured=measured)
-    turned = retold(modal_result, headline=replace(headline, uniform_beam=test))
+    turned = with_selection(modal_result, headline=replace(headline, uniform_beam=test))
     one, other = (
         uniformity_tables(each.whole)[0].rows[at]["deviation_std"].value
         for each in (modal_result, turned)
@@ -156,7 +156,7 @@ def test_a_turn_of_a_phase_is_no_deviation(modal_result, retold):
     assert one == pytest.approx(other, abs=1e-6)
 
 
-def test_losses_that_no_beam_explains_are_points_alone(unexplained_losses):
+def test_unexplained_losses_are_points_without_a_curve(unexplained_losses):
     assert loss_estimate(unexplained_losses.whole) is None
     figures = drawn(unexplained_losses)
     labels = [handle.get_label() for handle in figures["loss_factor"].draw().axes[0].get_lines()]

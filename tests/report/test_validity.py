@@ -1,4 +1,4 @@
-"""No number of a record stands without its validity, whatever is written; found by search.
+"""Every output with a number of a record has its validity; found by search.
 
 The record of these tests states no slope: the tip slopes by 0.4 rad, which follows from its angle.
 """
@@ -64,7 +64,7 @@ def test_every_output_with_a_damping_has_its_validity(record_result, report, as_
     assert not [name for name in found if not stated.search(searched[name])]
 
 
-def test_the_slope_is_computed_from_a_record_that_states_none(record_result):
+def test_unstated_slope_is_computed_from_the_record(record_result):
     from_record = record_result.validity.predicted_peak_tip_slope_rad
     assert from_record == pytest.approx(0.41, rel=0.1)
     error = record_result.validity.linear_model_error
@@ -75,7 +75,7 @@ def test_the_slope_is_computed_from_a_record_that_states_none(record_result):
 
 
 @pytest.mark.parametrize("slope", ["", "none", "nan", "-1", "inf", "1e300"])
-def test_a_statement_that_is_no_slope_does_not_count(record_result, slope):
+def test_invalid_slope_statement_is_ignored(record_result, slope):
     from_record = record_result.validity
     assert with_stated(record_result, slope).validity == from_record
     unknown = with_stated(RecordResult(record_result.record), slope)
@@ -91,7 +91,7 @@ def test_a_statement_that_is_no_slope_does_not_count(record_result, slope):
         ("1.8", "Tip slopes up to 1.8 rad: the linear model does not hold there (error above"),
     ],
 )
-def test_what_the_file_states_is_in_verdict_and_document(record_result, slope, words):
+def test_stated_slope_is_in_verdict_and_document(record_result, slope, words):
     result = with_stated(record_result, slope)
     assert result.whole.verdict.sentences[1].startswith(words)
     content = document([result])
