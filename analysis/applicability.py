@@ -30,7 +30,7 @@ _WELCH_EXCLUSIONS: Final = {
     "modes": "narrow sweeps excite the modes alone, and the response between them is noise",
     "until": "a search excites little beside the modes, and the response between them is noise",
 }
-"""Reason why Welch's method is not applicable, by the name of the excitation."""
+"""Reasons why Welch's method is not applicable to a session, by the name of its excitation."""
 
 _TOUCH_REMARK: Final = (
     "The session is a touch, but the fits take the beam to be free: they hold only if it met "
@@ -123,14 +123,17 @@ def welch_settings(
     if requested_hz is None and settings.band_hz != PAPER_BAND_HZ:
         requested_hz = settings.band_hz
     first_hz, last_hz = requested_hz or _limit_band(PAPER_BAND_HZ, record)
-    settings = _at_analysed_rate(settings, record)
+    settings = _scale_to_decimated_rate(settings, record)
     if first_hz == 0.0:
         first_hz = record.rate_hz / settings.segmentation(record.rate_hz).nfft
     return replace(settings, band_hz=(first_hz, last_hz))
 
 
-def _at_analysed_rate(settings: WelchSettings, record: Record) -> WelchSettings:
-    """Return settings whose requested lengths are in samples of a decimated record."""
+def _scale_to_decimated_rate(settings: WelchSettings, record: Record) -> WelchSettings:
+    """Convert segment, overlap and FFT length from samples of the file to samples of the record.
+
+    They differ if the record was decimated while it was read.
+    """
     ratio = record.rate_hz / record.full_rate.rate_hz
     if ratio == 1:
         return settings
@@ -282,9 +285,9 @@ def _metadata_number(record: Record, key: str) -> float | None:
 
 
 def _limit_band(band_hz: Band, record: Record) -> Band:
-    """Return a band limited by a record's rate and, for a part of a sweep, its frequencies.
+    """Restrict a band to frequencies below the limit of the rate and within the recorded sweep.
 
-    The whole band is returned if nothing would remain.
+    The whole band is returned if nothing remains.
     """
     first_hz, last_hz = band_hz
     limit_hz = min(last_hz, LARGEST_FRACTION_OF_RATE * record.rate_hz)

@@ -31,7 +31,7 @@ NEIGHBOUR_REACH_PERIODS: Final = 2.0
 the highest frequency."""
 
 _BANDWIDTH_MARGIN: Final = 1.2
-"""Bandwidth of the signal that the interpolation of gaps assumes, over its highest frequency."""
+"""Bandwidth that the interpolation of gaps assumes, relative to the signal's highest frequency."""
 
 _RELATIVE_NOISE_POWER: Final = 1e-6
 """Power of white noise that the interpolation of gaps assumes, relative to the power of the signal.
@@ -44,9 +44,9 @@ def interpolate_gaps(
     """Estimate the unknown values of a band-limited signal from their known neighbours.
 
     This is the best linear estimate for a signal with a flat spectrum up to its highest frequency
-    and a little white noise (N. Wiener; here over two periods to either side). In a gap of a
-    quarter of a period its error is less than 1e-3 of the signal; that of a straight line would be
-    a third.
+    and a little white noise (N. Wiener), from the values within two periods to either side of a
+    gap. In a gap of a quarter of a period, its error is less than 0.1 % of the signal; linear
+    interpolation would have an error of a third.
 
     Parameters
     ----------
@@ -87,11 +87,10 @@ def interpolate_gaps(
 def _interpolation_weights(
     neighbour_offsets: tuple[int, ...], gap_length: int, cycles_per_sample: float
 ) -> NDArray[np.float64]:
-    """Return the weights by which known values around a gap estimate the values in it.
+    """Return the weights of known neighbours in the estimates of a gap's values.
 
-    The shape is (gap length, neighbours). `cycles_per_sample` is the bandwidth of the signal.
-
-    `neighbour_offsets` are the indices of the known values relative to the start of the gap.
+    The shape is (gap length, neighbours). `neighbour_offsets` are the indices of the neighbours
+    relative to the start of the gap, and `cycles_per_sample` is the bandwidth of the signal.
     """
     offsets = np.array(neighbour_offsets)
     neighbour_covariance = np.sinc(2 * cycles_per_sample * np.subtract.outer(offsets, offsets))
@@ -105,8 +104,8 @@ def _interpolation_weights(
 
 def runs_of_true(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the start index of each run of True in a mask, and the index after its end."""
-    outside = np.zeros(1, np.int8)  # of the mask's own size: a long record has many values
-    run_edges = np.diff(np.concatenate((outside, mask.astype(np.int8), outside)))
+    edge_value = np.zeros(1, np.int8)  # of the mask's own size: a long record has many values
+    run_edges = np.diff(np.concatenate((edge_value, mask.astype(np.int8), edge_value)))
     return np.flatnonzero(run_edges == 1), np.flatnonzero(run_edges == -1)
 
 
@@ -116,7 +115,7 @@ _STOP_BAND_ATTENUATION_DB: Final = 100.0
 """Attenuation of the decimation filter in its stop band, in decibels."""
 
 _FACTOR_TOLERANCE: Final = 1e-9
-"""Tolerance for the rounding of a ratio of rates."""
+"""Tolerance for the rounding error of the ratio of two sampling rates."""
 
 _MIN_RATE_OVER_BAND: Final = 2.4
 """Minimum decimated sampling rate relative to the highest frequency: at lower rates the decimation
@@ -134,7 +133,7 @@ class Decimation:
     ----------
     factor : int
         One sample in `factor` is retained.
-    kernel : ndarray, shape (2 reach factor + 1,)
+    kernel : ndarray, shape (2 * reach * factor + 1,)
         Impulse response of the filter: it passes `highest_hz`, and attenuates by 100 dB from half
         the new rate on.
     reach : int
@@ -205,11 +204,11 @@ class Decimation:
 
 
 def fast_length(at_least: int) -> int:
-    """Return the least number not below `at_least` (1 or more) with prime factors up to 11.
+    """Return the smallest integer from `at_least` (1 or more) on with prime factors up to 11.
 
-    Fourier transforms of such a length are fast. Transforms of real values are a fifth faster with
-    factors up to 5 (``real=True``), which makes no fit faster. The grid of the Laplace variable
-    depends on the length (`TorquePredictor`), and with it the last digits of every estimate.
+    Fourier transforms of such a length are fast. With prime factors up to 5 (``real=True`` in
+    SciPy), transforms of real values would be a fifth faster, but no fit. The length determines the
+    grid of the Laplace variable (`TorquePredictor`) and so the last digits of every estimate.
 
     Examples
     --------
@@ -223,7 +222,7 @@ def fast_length(at_least: int) -> int:
 
 
 def fast_length_below(at_most: int) -> int:
-    """Return the largest number not above `at_most` (1 or more) with prime factors up to 11.
+    """Return the largest integer up to `at_most` (1 or more) with prime factors up to 11.
 
     Fourier transforms of such a length are fast.
     """

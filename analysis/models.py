@@ -76,8 +76,8 @@ class Structure:
         ``logarithmic`` one is fitted by its logarithm.
     factors : callable
         Function of s (complex, rad/s) and of the parameters by name. It returns c and e: the
-        stiffness relative to EI, and the external damping in 1/m⁴. Derivatives by the parameters
-        are finite differences, so it must be smooth in them.
+        stiffness relative to EI, and the external damping in 1/m⁴. It must be a smooth function of
+        the parameters, because finite differences approximate its derivatives.
     fixed : mapping of str to float
         Values of the parameters that are not fitted. A damping that types I to VII lack has
         coefficient and order 0.
@@ -164,12 +164,12 @@ class Structure:
                 for factor in self.factors(s, values)
             )
         if not (np.isfinite(elastic).all() and np.isfinite(external).all()):
-            raise ValueError(f"its damping is not finite at {described(values)}.")
+            raise ValueError(f"its damping is not finite at {parameters_text(values)}.")
         return elastic, external
 
 
-def described(values: Mapping[str, float]) -> str:
-    """Return names and values of parameters as a text."""
+def parameters_text(values: Mapping[str, float]) -> str:
+    """Return parameters as a text, such as ``zeta = 7e-05, alpha = 1``."""
     return ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
 
 
@@ -181,7 +181,7 @@ def _fractional_factors(s: NDArray[np.complex128], values: Mapping[str, float]) 
     )
 
 
-def _fractional(name: str, description: str, fixed_values: dict[str, float]) -> Structure:
+def _fractional_structure(name: str, description: str, fixed_values: dict[str, float]) -> Structure:
     """Return a structure of fractional damping with given fixed parameters."""
     return Structure(
         name,
@@ -192,25 +192,33 @@ def _fractional(name: str, description: str, fixed_values: dict[str, float]) -> 
     )
 
 
-_NO_INTERNAL: Final = {"zeta": 0.0, "alpha": 0.0}
-"""Values of the parameters of absent internal damping."""
-_NO_EXTERNAL: Final = {"gamma": 0.0, "lambda": 0.0}
-"""Values of the parameters of absent external damping."""
+_NO_INTERNAL_DAMPING: Final = {"zeta": 0.0, "alpha": 0.0}
+"""Parameter values that mean no internal damping."""
+_NO_EXTERNAL_DAMPING: Final = {"gamma": 0.0, "lambda": 0.0}
+"""Parameter values that mean no external damping."""
 
-UNDAMPED: Final = _fractional("undamped", "No damping", _NO_INTERNAL | _NO_EXTERNAL)
-"""Structure without damping, which leaves the parameters of beam and rig."""
+UNDAMPED: Final = _fractional_structure(
+    "undamped", "No damping", _NO_INTERNAL_DAMPING | _NO_EXTERNAL_DAMPING
+)
+"""Structure without damping: only the parameters of beam and rig are fitted."""
 
 STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
     {
         structure.name: structure
         for structure in (
-            _fractional("I", "Internal damping only", {"alpha": 1.0, **_NO_EXTERNAL}),
-            _fractional("II", "External damping only", {**_NO_INTERNAL, "lambda": 1.0}),
-            _fractional("III", "Internal and external damping", {"alpha": 1.0, "lambda": 1.0}),
-            _fractional("IV", "Internal damping only", _NO_EXTERNAL),
-            _fractional("V", "External damping only", _NO_INTERNAL),
-            _fractional("VI", "Internal and external damping", {}),
-            _fractional("VII", "Internal and external damping", {"alpha": 1.0}),
+            _fractional_structure(
+                "I", "Internal damping only", {"alpha": 1.0, **_NO_EXTERNAL_DAMPING}
+            ),
+            _fractional_structure(
+                "II", "External damping only", {**_NO_INTERNAL_DAMPING, "lambda": 1.0}
+            ),
+            _fractional_structure(
+                "III", "Internal and external damping", {"alpha": 1.0, "lambda": 1.0}
+            ),
+            _fractional_structure("IV", "Internal damping only", _NO_EXTERNAL_DAMPING),
+            _fractional_structure("V", "External damping only", _NO_INTERNAL_DAMPING),
+            _fractional_structure("VI", "Internal and external damping", {}),
+            _fractional_structure("VII", "Internal and external damping", {"alpha": 1.0}),
         )
     }
 )
@@ -271,7 +279,7 @@ def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[n
                 f"{omega_rad_s.shape} frequencies; it must give one value for each."
             )
     else:
-        p = omega_rad_s ** _exponent(weighting)
+        p = omega_rad_s ** _weighting_exponent(weighting)
     weight_sum = float(p.sum())
     if not (math.isfinite(weight_sum) and weight_sum > 0 and float(p.min()) >= 0):
         raise WeightingError(
@@ -297,11 +305,11 @@ def weighting_name(weighting: Weighting) -> str:
     """
     if callable(weighting):
         return str(getattr(weighting, "__name__", type(weighting).__name__))
-    _exponent(weighting)
+    _weighting_exponent(weighting)
     return weighting
 
 
-def _exponent(weighting: str) -> float:
+def _weighting_exponent(weighting: str) -> float:
     """Return the exponent K of a named weighting omega^K; raise if the name is not valid."""
     if weighting == "const":
         return 0.0
@@ -327,7 +335,7 @@ RECORD_BAND_HZ: Final = (0.0, 50.0)
 """Default frequency band of the whole-record fits, if the sampling rate is high enough."""
 
 LARGEST_FRACTION_OF_RATE: Final = 0.4
-"""Highest fitted frequency relative to the sampling rate; filters need the range above it."""
+"""Highest frequency of a fit relative to the sampling rate; filters roll off above it."""
 
 PAPER_BAND_HZ: Final = (0.5875, 50.0)
 """Frequency band of the Welch fits in the reference paper."""
@@ -383,13 +391,14 @@ class WelchSettings:
         transforms of the whole record.
     segment_length, overlap, nfft : int, optional
         Lengths of segment, overlap and FFT in samples. None selects the durations of the reference
-        paper; if only the segment is given, the overlap is 15 % of it and the FFT no shorter.
+        paper; if only the segment is given, the overlap is 15 % of it, and the FFT is at least as
+        long as the segment.
     band_hz : tuple of float
         First and last fitted frequency, both included.
     types : tuple of str
-        Names of the fitted structures, from `analysis.models.STRUCTURES`.
+        Names of the damping structures to fit, from `analysis.models.STRUCTURES`.
     weightings : tuple of str
-        Names of weightings, as for `analysis.models.weights`.
+        Names of the weightings with which each structure is fitted (`analysis.models.weights`).
     """
 
     estimator: Estimator = "h1"
@@ -438,7 +447,7 @@ ORDER_RANGE: Final = (0.001, 1.999)
 """Range of the orders alpha and lambda, as in the reference paper."""
 
 SIZE_RANGE: Final = (1e-9, 1e3)
-"""Range of the damping relative to stiffness or inertia, from too small to be visible to too large
+"""Range of damping relative to stiffness or inertia, from too small to be visible to too large
 for a vibration. It is much wider than the range of the reference paper, which its own results
 exceed (type IV with 1/omega weights has zeta = 2.4e-3, but the range ends at 3.05e-4)."""
 
@@ -453,11 +462,11 @@ class DampingUnknowns:
     structure: Structure
     """Damping structure, which defines the free parameters."""
     ln_internal_rad_s: float
-    """Logarithm of the undamped second mode's frequency, the reference of internal damping."""
+    """Logarithm of the undamped second mode's frequency, at which internal damping is stated."""
     ln_external_rad_s: float
-    """Logarithm of the undamped first mode's frequency, the reference of external damping."""
+    """Logarithm of the undamped first mode's frequency, at which external damping is stated."""
     ln_external_unit: float
-    """Logarithm of ``rho/EI omega²``, the inertia at the first mode, relative to stiffness."""
+    """Logarithm of ``rho/EI omega²`` at the first mode, the unit of external damping."""
 
     @classmethod
     def for_beam(cls, structure: Structure, beam: Beam) -> DampingUnknowns:
@@ -512,7 +521,7 @@ class DampingUnknowns:
         return self.structure.damping(self.parameters(x))
 
     def derivative_of_parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the derivatives of the free parameters by the unknowns, shape (k, k).
+        """Return the derivatives of the free parameters with respect to the unknowns, (k, k).
 
         Rows are parameters, columns unknowns. An order also changes its coefficient, because the
         damping at the reference frequency is constant.

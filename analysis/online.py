@@ -41,7 +41,7 @@ class OnlineEstimate:
     Attributes
     ----------
     tick : int
-        First excluded tick.
+        First tick whose sample was not used any more.
     duration_s : float
         Duration of the record used.
     whole : bool
@@ -54,7 +54,7 @@ class OnlineEstimate:
     orders : tuple of OrderVerdict
         Verdicts on alpha and lambda; empty unless `whole`.
     findings : tuple of Finding
-        Effects in addition to the beam, and reasons against the estimates.
+        Effects in the record that the beam does not explain, and reasons to doubt the estimates.
     analysis : RecordAnalysis or None
         Fits with the noise spectrum; None without a fit.
     warnings : tuple of str
@@ -64,8 +64,8 @@ class OnlineEstimate:
     validity : Validity
         Validity of the linear model for the record.
     fit_in_air : RecordFit or None
-        If air drag was fitted, a fit without it, whose damping is that at the amplitude of the
-        record: from this fit the next excitation is planned.
+        Linear fit, from which the next excitation is planned, if the reported fit includes air
+        drag. Its damping is valid at the amplitude of the record. None without air drag.
     """
 
     tick: int
@@ -85,7 +85,7 @@ class OnlineEstimate:
     def doubt(self) -> str | None:
         """Reason to doubt all estimates, or None if at least one has no flag.
 
-        Without estimates it is the problem that prevented them.
+        If there is no fit, it is `problem`.
         """
         headline = self.headline
         if headline is None:
@@ -105,8 +105,8 @@ class OnlineEstimate:
     def predictive_fit(self) -> RecordFit | None:
         """Fit from which the next excitation is planned; None without a fit.
 
-        It has internal and external damping. A damping that is insignificant, or whose order is not
-        identifiable (so that it may be a stiffness or an inertia), has order 1.
+        The fit has internal and external damping. Damping has order 1 if it is insignificant, or if
+        its order is not identifiable, so that it might be a stiffness or an inertia.
         """
         from analysis.identify import ORDER_ONE_STRUCTURE
         from rigd.beam import COEFFICIENT_OF
@@ -135,8 +135,8 @@ class OnlineEstimate:
     def plant(self) -> Plant | None:
         """Model of beam and rig from which the next excitation is planned; None without a fit.
 
-        It is that of the fit `predictive_fit`. If a uniform beam does not predict the modal
-        constants, each mode has its own measured stiffness.
+        It is the plant of `predictive_fit`. If a uniform beam does not predict the modal constants,
+        each mode has its own measured stiffness.
         """
         headline, fit = self.headline, self.predictive_fit
         if headline is None or fit is None:
@@ -297,8 +297,8 @@ class OnlineEstimator:
             Whether every structure is tested, as in `analysis.select`, which takes four times as
             long.
         from_last : bool
-            Whether such an estimate may start from the last one, if that explains these samples,
-            too. This takes a third of the time, but may miss one of several minima.
+            Whether an estimate with `whole` may start from the last one, if the last one explains
+            the new samples. This takes a third of the time, but may miss one of several minima.
 
         Returns
         -------

@@ -113,7 +113,7 @@ class Region(Protocol):
         """Upper bounds of the unknowns."""
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the smallest and largest step from `x` of each unknown, shape (k,)."""
+        """Return the lower and upper limits of a step from `x`, for each unknown, (k,) each."""
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the end point of a step within the bounds, shape (k,).
@@ -129,10 +129,10 @@ class Region(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ConstantBounds:
-    """Constant bounds, at which each unknown of a step is clipped.
+    """Constant bounds, to which each unknown is clipped after a step.
 
-    The other unknowns of a clipped step are not optimised again, as they are in `_compute_step`
-    within limits: the fits to a frequency response would need 7 % more evaluations.
+    If one unknown is clipped, the others are not optimised again (as `_compute_step` would do for
+    limits of the step): the fits to a frequency response would need 7 % more evaluations.
     """
 
     lower: NDArray[np.float64]
@@ -141,7 +141,7 @@ class ConstantBounds:
     """Upper bounds, shape (k,)."""
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return infinite limits for the change of each unknown, because `end` clips the step."""
+        """Return infinite limits of a step for each unknown, because `end` clips the step."""
         return np.full(x.size, -np.inf), np.full(x.size, np.inf)
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -162,12 +162,12 @@ class ConstantBounds:
 _FIRST_DAMPING: Final = 1e-3
 """Damping of the first step, relative to the curvature."""
 _LARGEST_DAMPING: Final = 1e16
-"""Damping at which a descent ends without improvement."""
+"""Damping above which a descent ends, because even tiny steps do not reduce the cost."""
 _SMALLEST_DAMPING_FACTOR: Final = 0.1
 """Smallest factor by which the damping is multiplied after a successful step."""
 
 _SHORTEST_STEP: Final = 1e-13
-"""Length of a step, relative to the unknowns, below which it is as small as rounding errors."""
+"""Length of a step relative to the unknowns, below which rounding errors dominate the step."""
 _SMALLEST_CURVATURE: Final = 1e-14
 """Smallest curvature used in the damping, relative to the largest one. It prevents huge steps of an
 unknown without effect."""
@@ -199,9 +199,9 @@ def descend(
     max_evaluations : int
         Largest number of evaluations of `problem`; the best point is then returned.
     second_part : ndarray, shape (k, k), optional
-        Second part of the Hessian, estimated by a descent on a similar problem, for the first
-        step. With the estimate from a few points of a frequency response, fits to all points need
-        39 evaluations instead of 57.
+        Estimate of the second part of the Hessian for the first step, from a descent on a similar
+        problem. With an estimate from a few points of a frequency response, fits to all points
+        need 39 evaluations instead of 57.
     hopeless : tuple of int and float, optional
         Number of evaluations, and a cost. The descent ends if its cost is still higher after this
         number of evaluations, because other descents explain the data better.
@@ -281,9 +281,10 @@ def _compute_step(
     damping: float,
     step_limits: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64] | None:
-    """Return the step to the minimum of a damped quadratic model, (k,); None if not convex.
+    """Return the step to the minimum of the damped quadratic model of the cost, shape (k,).
 
     An unknown that would exceed its limit is set to the limit, and the others are optimised again.
+    Return None if the model is not convex.
     """
     smallest_step, largest_step = step_limits
     step = np.zeros(is_free.size)
@@ -359,7 +360,7 @@ class RecentValues(Generic[_Value]):
     Parameters
     ----------
     points : int
-        Number of points; with two, the last step of a descent may have been rejected.
+        Number of stored points. One is not enough, because a descent may reject its last step.
     """
 
     __slots__ = ("_points", "_values")
@@ -383,7 +384,7 @@ class RecentValues(Generic[_Value]):
         compute : callable
             Function that returns the value at a point.
         owner : object, optional
-            Object whose function it is, if the cache is that of several.
+            Object to which `compute` belongs, if several objects use the same cache.
         """
         key = owner, x.tobytes()
         if key not in self._values:

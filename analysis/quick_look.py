@@ -51,8 +51,8 @@ _LONGEST_FULL_ANALYSIS_S: Final = 300.0
 structures take 15 ms, the freest structure alone 4 ms."""
 
 _JOIN_DISTANCE: Final = 0.1
-"""Distance of two bands of low coherence, relative to their frequency, up to which they are joined
-to one band."""
+"""Largest gap between two bands of low coherence, relative to their frequency, across which they
+are joined to one band."""
 
 
 class QuickLookError(ValueError):
@@ -81,7 +81,7 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
     Raises
     ------
     rigd.session.SessionError, QuickLookError
-        The session file, or the quick look of `last`, does not exist.
+        The session file does not exist, or there is no quick look of the session `last`.
     """
     from analysis.record import RecordError, load_record
     from analysis.results import finite
@@ -188,8 +188,8 @@ def _model_document(
 ) -> dict[str, Any] | None:
     """Return the model's frequency response with its 95 % band, at the excited frequencies.
 
-    Return None if the model does not explain the record or depends on the amplitude, as with drag,
-    because there is no such band then.
+    Return None if the model does not explain the record, or depends on the amplitude because of
+    drag: then the band would be wrong.
     """
     import numpy as np
 
@@ -358,7 +358,10 @@ def _stored_quick_look(session_path: Path) -> dict[str, Any]:
 
 
 def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
-    """Return the last quick look of a specimen before a time, from a session's folder."""
+    """Return the newest quick look of a specimen before a time; None without one with modes.
+
+    The folder of the session file `path` is searched, except for that session's own quick look.
+    """
     path_and_document = last_quick_look(
         path.parent,
         specimen,
@@ -370,7 +373,7 @@ def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str,
 
 
 def _compare_modes(modes: list[EstimatedMode], other_document: Mapping[str, Any]) -> dict[str, Any]:
-    """Compare the modes of a session with those of an earlier one, if visible in both.
+    """Compare the modes that are visible both in a session and in an earlier one.
 
     Return the comparison as a section of the JSON document.
     """
@@ -475,7 +478,7 @@ def _round_digits(numbers: Real) -> list[float]:
 
 
 def _parse_integer(number_text: str) -> int:
-    """Return the integer in a text, or 0 if it is none."""
+    """Return the integer in a text, or 0 if the text is not an integer."""
     return int(number_text) if number_text.isascii() and number_text.isdigit() else 0
 
 
@@ -507,7 +510,7 @@ def write_quick_look(document: Mapping[str, Any], path: Path) -> Path:
     Raises
     ------
     QuickLookError
-        The file cannot be written, or its name belongs to another file.
+        The file cannot be written, or a file of that name is no quick look.
     """
     quick_look_file = quick_look_path(path)
     existing_document = read_quick_look(quick_look_file)

@@ -45,19 +45,19 @@ _MAX_DELAY_S: Final = 1.0
 MAX_TIP_MASS_KG: Final = 1e3
 """Largest plausible mass at the tip."""
 MAX_AXIS_TILT_DEG: Final = 90.0
-"""Largest inclination of the plane of motion."""
+"""Largest angle by which the resting beam may point downhill or uphill."""
 MAX_UNCERTAINTY_PERCENT: Final = 50.0
 """Largest relative standard uncertainty that a file may state."""
 MAX_UNIFORMITY_PERCENT: Final = 10.0
-"""Largest deviation of mode frequencies that a model of a uniform beam allows."""
+"""Largest deviation of mode frequencies from a uniform beam's for which its model is used."""
 _DEFAULT_UNIFORMITY_PERCENT: Final = 0.1
 """Deviation of mode frequencies of a carefully made antenna."""
 _FIRST_EIGENVALUE: Final = 1.8751040687119611
 """First root of 1 + cos z cosh z: mode 1 is at (root / length)² √(EI/rho) rad/s."""
 
 _LEAST_MODE_PERIODS: Final = 0.1
-"""Least number of periods of the first mode in a record. It tolerates a frequency of the stated
-beam that is wrong by a factor of ten."""
+"""Least number of periods of the stated beam's first mode in a record. It is so small because the
+stated beam's frequency may be wrong by a factor of ten."""
 
 
 def stated_rate_hz(session: Session) -> float:
@@ -89,7 +89,7 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
     Raises
     ------
     RecordError
-        A value, or the frequency of the first mode that follows, is impossible.
+        A property of the beam, or the frequency of its first mode, is impossible.
     """
     beam_values = []
     for key, (low, upper_limit) in _BEAM_RANGES.items():
@@ -160,15 +160,16 @@ def stated_tip_mass_kg(session: Session) -> float | None:
     Raises
     ------
     RecordError
-        The mass is negative, or implausibly large.
+        If the mass is negative, or implausibly large.
     """
     return _stated_in_range(session, "tip_mass_kg", 0.0, MAX_TIP_MASS_KG)
 
 
 def stated_axis_tilt_deg(session: Session) -> float | None:
-    """Return the inclination of the plane of motion at rest in degrees, or None if not stated.
+    """Return the angle in degrees by which the resting beam points downhill; None if not stated.
 
-    It is positive if the tip is lower than the motor's axis.
+    It is positive if the tip is lower than the motor's axis. The beam moves in a plane that is
+    inclined by this angle along the resting beam.
 
     Raises
     ------
@@ -179,7 +180,7 @@ def stated_axis_tilt_deg(session: Session) -> float | None:
 
 
 def _stated_in_range(session: Session, key: str, low: float, high: float) -> float | None:
-    """Return a number in the metadata, or None if not stated; raise if it is outside a range."""
+    """Return the number of a metadata key, or None if not stated; raise if not in a range."""
     if key not in session.metadata:
         return None
     stated_number = session.number(key)
@@ -264,7 +265,7 @@ def stated_uncertainty(session: Session) -> dict[str, float]:
 
 
 def stated_uniformity(session: Session) -> float:
-    """Return the relative standard deviation of mode frequencies from those of a uniform beam.
+    """Return the standard deviation of mode frequencies from a uniform beam's, relative to these.
 
     If not stated, it is 0.001, which is typical of a carefully made antenna.
 
@@ -294,15 +295,15 @@ def _invalid_value_error(
 # Samples
 
 MAX_UNKNOWN_FRACTION = 0.05
-"""Largest fraction of angle or torque that may be missing or flagged, in import, loading and
-estimation. Whole-record fits remain within their uncertainty at 4.5 %."""
+"""Largest fraction of a channel's samples that may be missing or flagged, in import, loading and
+estimation. With 4.5 %, whole-record fits were still correct within their stated uncertainty."""
 
 MAX_GAP_S = 0.1
 """Longest gap in the sweep that is interpolated, in seconds; a longer one raises an error."""
 
 MAX_TICKS_PER_SAMPLE = 10
-"""Largest number of ticks per recorded sample. A file with almost no samples in its span would only
-fill the memory, and no sweep in it could be analysed."""
+"""Largest mean number of ticks per recorded sample. A file with almost no samples in its span would
+only fill the memory, and no sweep in it could be analysed."""
 
 MAX_TICKS = MAX_SAMPLES
 """Longest record in ticks, including missing ones, which are interpolated."""
@@ -448,7 +449,7 @@ def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
 
 
 def check_fillable(
-    path: Path, channel: str, unknown: NDArray[np.bool_], first_tick: int, rate_hz: float
+    path: Path, channel: str, is_unknown: NDArray[np.bool_], first_tick: int, rate_hz: float
 ) -> None:
     """Raise if too many samples of a channel in the sweep would have to be interpolated.
 
@@ -460,19 +461,19 @@ def check_fillable(
         File that messages name.
     channel : str
         Name of the channel in messages.
-    unknown : ndarray of bool, shape (n,)
-        Samples of the sweep without a new value.
+    is_unknown : ndarray of bool, shape (n,)
+        Whether each sample of the sweep has no new value.
     first_tick : int
         First tick of the sweep.
     rate_hz : float
         Sampling rate.
     """
     fraction_message = unknown_fraction_message(
-        f"the {channel} in the sweep", int(unknown.sum()), len(unknown)
+        f"the {channel} in the sweep", int(is_unknown.sum()), len(is_unknown)
     )
     if fraction_message:
         raise RecordError(f"{path}: {fraction_message}")
-    gap_ticks, gap_start = longest_run(unknown)
+    gap_ticks, gap_start = longest_run(is_unknown)
     if gap_ticks > MAX_GAP_S * rate_hz:
         raise RecordError(
             f"{path}: {gap_ticks} ticks of the {channel} in a row are missing or stale from tick "

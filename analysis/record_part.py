@@ -31,7 +31,7 @@ def part_of_session(
 ) -> tuple[Session, tuple[float, float]]:
     """Return the part of a session between two times, and these times.
 
-    The segments of the result end where the part does, and those outside it are left out.
+    Segments are cut at the limits of the part, and segments outside the part are omitted.
 
     Parameters
     ----------
@@ -123,9 +123,9 @@ def check_part_length(path: object, part_s: tuple[float, float], beam: Beam) -> 
 def swept_frequencies_hz(
     session: Session, first_tick: int, end_tick: int
 ) -> tuple[float, float] | None:
-    """Return the lowest and highest frequency that a linear sweep has between two ticks.
+    """Return the lowest and highest frequency that a linear sweep covers between two ticks.
 
-    Return None if the session states no linear sweep there.
+    Return None if the session has no linear sweep there.
 
     Parameters
     ----------

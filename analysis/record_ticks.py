@@ -1,4 +1,4 @@
-"""Grid of a session's ticks, with missing and stale samples, flags and the sweep; and its signals.
+"""Grid of a session's ticks (missing and stale samples, flags, sweep), and signals on this grid.
 
 The grid needs no signals, so that a long record can be checked before its signals are read.
 """
@@ -68,7 +68,7 @@ class Gaps:
     sweep_missing_ticks
         Missing ticks inside the sweep.
     sweep_stale_angles, sweep_stale_torques
-        Recorded samples of the sweep whose angle or torque is flagged as held from an earlier tick.
+        Recorded samples of the sweep whose angle or torque is flagged as a repeated older value.
     """
 
     missing_ticks: int
@@ -97,7 +97,7 @@ class TickGrid:
     is_missing : ndarray of bool, shape (count,)
         Whether a tick has no sample.
     sweep : slice
-        Ticks with the excitation.
+        Ticks of the segment ``sweep``, relative to the first tick; all ticks without this segment.
     unrecorded_ticks : int
         Number of ticks of the sweep before the first and after the last sample.
     """
@@ -205,7 +205,7 @@ class TickGrid:
         Parameters
         ----------
         outcome : mapping of str to str
-            End of the session as the file states it.
+            Metadata record ``outcome`` of the file, which states how the session ended.
         """
         return _describe_faults(
             self.gaps(), self.flag_counts(), self.unrecorded_ticks, outcome, self.rate_hz,
@@ -214,7 +214,7 @@ class TickGrid:
 
 
 def _sweep_range(session: Session, first_tick: int, tick_count: int) -> tuple[slice, int]:
-    """Return the range of the sweep's samples, and the number of ticks not recorded at its ends."""
+    """Return the sweep's range of ticks, and the number of its ticks outside the record."""
     if "sweep" not in session.segments:
         return slice(0, tick_count), 0
     first_sweep_tick, end_sweep_tick = session.segments["sweep"]
@@ -299,7 +299,7 @@ class TorqueExtreme:
     values : int
         Number of samples with exactly this torque.
     repeated : int
-        Number of these samples that are next to another one.
+        Number of these samples whose neighbour also has this torque.
     """
 
     limit_nm: float
@@ -308,7 +308,9 @@ class TorqueExtreme:
 
 
 class ExtremeCount:
-    """Count of the samples at the extreme of a torque that arrives in blocks; NaN is unknown.
+    """Counter of the samples at the maximum (or minimum) of a torque that arrives in blocks.
+
+    NaN marks an unknown torque.
 
     Parameters
     ----------
@@ -433,7 +435,7 @@ class FullRateSignals:
 def samples_on_grid(
     grid: TickGrid, samples: NDArray[np.void]
 ) -> tuple[NDArray[np.void], NDArray[np.int64]]:
-    """Return the samples on a grid, and their ticks relative to its first.
+    """Return the samples whose ticks are on a grid, and their ticks relative to its first tick.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ FigureFormat = Literal["png", "svg", "pdf"]
 FIGURE_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg", "pdf")
 """File formats in which figures can be written."""
 DEFAULT_FORMATS: Final[tuple[FigureFormat, ...]] = ("svg",)
-"""Default file formats of the figures: that of the page. PNG and PDF take as long again each."""
+"""Default file formats of figures: that of the page. PNG and PDF would each double the time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +140,8 @@ class WholeRecord:
     def verdict(self) -> Verdict:
         """Verdict on the record, in sentences for the operator.
 
-        The second sentence states the validity of the estimates. If the record is a part of the
-        session, a sentence before them states it.
+        The second sentence states the validity of the estimates. If only a part of the session was
+        analysed, an additional first sentence states which part.
         """
         verdict = self.selection.verdict
         first_sentence, other_sentences = verdict.sentences[:1], verdict.sentences[1:]
@@ -173,7 +173,7 @@ class WholeRecord:
 
     @property
     def withheld_orders(self) -> frozenset[str]:
-        """Orders of the reported fit that are not to be reported: their estimate has a flag."""
+        """Orders of the damping whose estimate must not be reported, because it has a flag."""
         return frozenset(_ORDER_NAMES & self.headline.flags.keys())
 
     @property
@@ -214,9 +214,9 @@ class WholeRecord:
         }
 
     def _covariance_json(self) -> dict[str, Any]:
-        """Return the parameter names of the fit and their covariance matrix, as JSON values.
+        """Return the covariance matrix of the fit's parameters, and their names, for JSON.
 
-        The prefix ``ln_`` of a name states that the covariance is that of the logarithm.
+        A name with the prefix ``ln_`` denotes the logarithm of a parameter.
         """
         from rigd.beam import LOGARITHMIC_PARAMETERS
 
@@ -230,9 +230,9 @@ class WholeRecord:
 
     @property
     def unsupported_orders(self) -> frozenset[str]:
-        """Orders that the record does not support.
+        """Orders of damping that the record does not support.
 
-        These have a flag for an exactly uniform beam, or belong to absent damping.
+        Their estimate for an exactly uniform beam has a flag, or their damping was not found.
         """
         exact_parameters = (self.headline.exact or self.headline).parameters
         flagged_orders = {
@@ -289,12 +289,12 @@ class RecordResult:
 
     @property
     def unsupported_orders(self) -> frozenset[str]:
-        """Orders that the whole record does not support; empty without whole-record fits."""
+        """Orders of damping that the record does not support; empty without whole-record fits."""
         return frozenset() if self.whole is None else self.whole.unsupported_orders
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences on weaknesses of the record and, if there are Welch fits, of these."""
+        """Sentences on weaknesses of the record, and of the Welch fits if there are any."""
         return self.record.warnings if self.welch is None else self.welch.warnings
 
 
@@ -334,7 +334,7 @@ def whole_record(
 
 def record_result(
     path: Path,
-    routes: AnalysisOptions,
+    options: AnalysisOptions,
     *,
     on_step: Callable[[str], None] = lambda _done: None,
     warn: Callable[[str], None] = lambda _text: None,
@@ -345,10 +345,10 @@ def record_result(
     ----------
     path : Path
         Session file.
-    routes : AnalysisOptions
+    options : AnalysisOptions
         Selected analyses and their settings.
     on_step : callable, optional
-        Called with the name of each step after it.
+        Called after each step with the step's name.
     warn : callable, optional
         Called with a sentence on each omitted analysis.
 
@@ -369,23 +369,23 @@ def record_result(
     from analysis.record import load_record
     from rigd.runtime.computations import computed_meanwhile
 
-    record = load_record(path, routes.part_s, highest_hz=highest_frequency_hz(routes.band_hz))
-    record = with_uniformity(record, routes.uniformity)
-    record = _add_warnings(record, remarks(record, routes.band_hz))
+    record = load_record(path, options.part_s, highest_hz=highest_frequency_hz(options.band_hz))
+    record = with_uniformity(record, options.uniformity)
+    record = _add_warnings(record, remarks(record, options.band_hz))
     on_step("read")
-    if not routes.paper:
-        check_record_band(record, routes.band_hz)
+    if not options.paper:
+        check_record_band(record, options.band_hz)
         on_step("whole record")
-        return RecordResult(record, _fit_whole_record(record, routes, warn))
+        return RecordResult(record, _fit_whole_record(record, options, warn))
     fit_welch = partial(
-        welch_analysis, record, routes.settings, routes.band_hz, optional=routes.whole_record
+        welch_analysis, record, options.settings, options.band_hz, optional=options.whole_record
     )
-    if not routes.whole_record:
+    if not options.whole_record:
         on_step("Welch fits")
         return RecordResult(record, None, fit_welch()[0])
     on_step("Welch fits and whole record")
     computation: AbstractContextManager[Callable[[], tuple[WelchAnalysis | None, str | None]]]
-    if routes.settings.are_from_paper:
+    if options.settings.are_from_paper:
         computation = computed_meanwhile(fit_welch)
     else:  # chosen settings may not suit the record, which is reported before the other fits
         welch_of_settings = fit_welch()
@@ -393,7 +393,7 @@ def record_result(
     whole_fits, measurement_error = None, None
     with computation as welch_fits:
         try:
-            whole_fits = _fit_whole_record(record, routes, warn)
+            whole_fits = _fit_whole_record(record, options, warn)
         except MeasurementError as error:
             measurement_error = error
         welch_results, omission_remark = welch_fits()
@@ -412,11 +412,11 @@ def record_result(
 
 
 def _fit_whole_record(
-    record: Record, routes: AnalysisOptions, warn: Callable[[str], None]
+    record: Record, options: AnalysisOptions, warn: Callable[[str], None]
 ) -> WholeRecord:
-    """Run the fits to a whole record, with those of packages' structures."""
-    whole_fits = whole_record(record, routes.fixed, routes.band_hz)
-    return _with_structures(whole_fits, routes.structures, warn)
+    """Fit all structures to a whole record, including the selected ones of installed packages."""
+    whole_fits = whole_record(record, options.fixed, options.band_hz)
+    return _with_structures(whole_fits, options.structures, warn)
 
 
 def _with_structures(
@@ -424,7 +424,7 @@ def _with_structures(
     structures: tuple[AddedStructure, ...],
     warn: Callable[[str], None],
 ) -> WholeRecord:
-    """Return the fits with those of packages' structures; warn of each that cannot be fitted."""
+    """Return the fits with those of added structures; warn of each that cannot be fitted."""
     if not structures:
         return whole_fits
     from analysis.identify import fit_structure
@@ -448,7 +448,7 @@ def _with_structures(
 
 
 def with_uniformity(record: Record, uniformity: float | None) -> Record:
-    """Return a record with another uniformity of the beam.
+    """Return a record whose stated uniformity of the beam is replaced.
 
     Parameters
     ----------
@@ -474,7 +474,7 @@ def finite(json_value: Any) -> Any:  # noqa: ANN401 - any JSON value
     from numpy import generic
 
     def copy_value(json_value: Any) -> Any:  # noqa: ANN401
-        """Return a copy of one value, recursively."""
+        """Return a deep copy of a JSON value."""
         if isinstance(json_value, dict):
             return {
                 str(key).rstrip("_"): copy_value(json_item) for key, json_item in json_value.items()

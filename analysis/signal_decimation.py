@@ -6,8 +6,8 @@ Each block overlaps its neighbours by the length of the filter, so that the resu
 on where a block ends. Reference, angle and torque pass the same filter, which leaves the response
 from angle to torque unchanged.
 
-Values in short gaps are interpolated before the filter. A longer gap makes those samples unknown
-whose filter window contains it.
+Values in short gaps are interpolated before the filter. A decimated sample is marked as unknown if
+its filter window contains a longer gap.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class SignalDecimation:
         Parameters
         ----------
         samples : ndarray of `rigd.session.layout.SAMPLE_DTYPE`, shape (n,)
-            Samples in the order of their ticks; others than those of the grid are ignored.
+            Samples in the order of their ticks. Samples outside the grid are ignored.
 
         Raises
         ------
@@ -131,11 +131,11 @@ class SignalDecimation:
             extreme.add(measured_nm)
         self._end_tick = end_tick
 
-    def _filter_block(self, *, last: bool = False) -> None:
+    def _filter_block(self, *, is_last_block: bool = False) -> None:
         """Filter the ticks in the buffer, and retain those on which later samples depend."""
         factor, reach_ticks = self._decimation.factor, self._reach_ticks
         end_tick = self._end_tick
-        usable_end = end_tick if last else end_tick - (self._margin_ticks - reach_ticks)
+        usable_end = end_tick if is_last_block else end_tick - (self._margin_ticks - reach_ticks)
         # Sample i is at the tick (i + reach) factor; its window ends `reach_ticks` later.
         end_sample = min((usable_end - 1 - 2 * reach_ticks) // factor + 1, self._results.shape[1])
         if end_sample <= self._done:
@@ -155,9 +155,11 @@ class SignalDecimation:
         self._done = end_sample
         next_tick = max((self._done + self._decimation.reach) * factor - self._margin_ticks, 0)
         next_tick -= next_tick % factor
-        remaining = self._buffer[:, next_tick - self._buffer_tick : end_tick - self._buffer_tick]
-        self._buffer[:, : remaining.shape[1]] = remaining.copy()
-        self._buffer[:, remaining.shape[1] :] = 0.0
+        remaining_values = self._buffer[
+            :, next_tick - self._buffer_tick : end_tick - self._buffer_tick
+        ]
+        self._buffer[:, : remaining_values.shape[1]] = remaining_values.copy()
+        self._buffer[:, remaining_values.shape[1] :] = 0.0
         self._buffer_tick = next_tick
 
     def finish(self) -> RecordSignals:
@@ -166,11 +168,11 @@ class SignalDecimation:
         Raises
         ------
         RecordError
-            The torque is constant, or the file has fewer samples than before.
+            The torque is constant, or the file was changed while it was read.
         """
         path = self.grid.session.path
         check_sensor(path, np.array(self._torque_range_nm))
-        self._filter_block(last=True)
+        self._filter_block(is_last_block=True)
         if self._done < self._results.shape[1]:
             raise RecordError(f"{path} was changed while it was read; analyse it again.")
         angle_known, torque_known = self._known_samples()

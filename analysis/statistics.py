@@ -1,4 +1,4 @@
-"""p-values and quantiles of the distributions used in tests, limits of BIC; the fit in per cent.
+"""p-values and quantiles of test statistics, thresholds of BIC differences, and fit in per cent.
 
 They use `scipy.special`, since `scipy.stats` takes four times as long to import. It is imported on
 first use, since a command that prints its help needs none.
@@ -53,7 +53,7 @@ def chi_square_p_value(value: ArrayLike, degrees_of_freedom: float) -> NDArray[n
 
 
 def chi_square_deviate(value: float, degrees_of_freedom: float) -> float:
-    """Return the standard normal deviate with the same upper tail probability as a chi-square.
+    """Return the standard normal deviate with the upper tail probability of a chi-square value.
 
     The deviate is finite for any `value`, even if the probability underflows.
 
@@ -131,7 +131,7 @@ def nrmse_percent(residual: NDArray[Any], measured: NDArray[Any]) -> float:
     Parameters
     ----------
     residual : ndarray, shape (n,)
-        Measured less modelled values, real or complex.
+        Measured minus modelled values, real or complex.
     measured : ndarray, shape (n,)
         Measured values without their mean, such as a spectrum without its first bin.
 

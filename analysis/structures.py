@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from analysis.models import STRUCTURES, Structure, described
+from analysis.models import STRUCTURES, Structure, parameters_text
 from rigd.beam import PARAMETERS, Parameter
 from rigd.plugins import Plugin, Registry, load_declaration, plugin_errors
 from rigd.printable import listed, printable
@@ -26,14 +26,14 @@ _MAX_STARTS: Final = 64
 _CHECKED_OMEGA_RAD_S: Final = np.geomspace(0.1, 1e4, 60)
 """Angular frequencies at which the damping of a package's structure is checked."""
 _LOSS_TOLERANCE: Final = 1e-9
-"""Largest gain of energy, relative to the factor, that rounding can cause."""
+"""Largest negative imaginary part of a factor, relative to it, that rounding errors can cause."""
 
 
 def check_structure(structure: Structure) -> None:
     """Raise ValueError if the declaration of a package's structure is not valid.
 
-    Checked are the words, the parameters with their units, ranges and starts, and the damping
-    at each start: finite, a loss at all frequencies, and real in time, as a causal force is.
+    Name and description are checked, and the units, ranges and start values of the parameters. At
+    each start the damping must be finite, dissipate energy at all frequencies and be real in time.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def check_structure(structure: Structure) -> None:
 
 
 def _check_damping(structure: Structure, values: Mapping[str, float]) -> None:
-    """Raise ValueError if the damping at some values is not finite, lossy and real in time."""
+    """Raise ValueError unless the damping at given parameters is valid (`check_structure`)."""
     s = (1j * _CHECKED_OMEGA_RAD_S).astype(np.complex128)
     factors = structure.finite_factors(s, values)
     structure.finite_factors(1.0 + s, values)  # causal responses are computed there
@@ -73,13 +73,13 @@ def _check_damping(structure: Structure, values: Mapping[str, float]) -> None:
         if gains.size:
             raise ValueError(
                 f"its {name} gains energy at {_CHECKED_OMEGA_RAD_S[gains[0]]:.3g} rad/s with "
-                f"{described(values)}: the imaginary part is negative."
+                f"{parameters_text(values)}: the imaginary part is negative."
             )
-    mirrored = structure.finite_factors(s.conj(), values)
-    for factor, at_conjugate in zip(factors, mirrored, strict=True):
+    conjugate_factors = structure.finite_factors(s.conj(), values)
+    for factor, at_conjugate in zip(factors, conjugate_factors, strict=True):
         if not np.allclose(at_conjugate, factor.conj(), rtol=1e-9, atol=0.0):
             raise ValueError(
-                f"its damping is not real in time with {described(values)}: at the conjugate "
+                f"its damping is not real in time with {parameters_text(values)}: at the conjugate "
                 "of s it must be the conjugate, which no causal force violates."
             )
 
@@ -150,7 +150,7 @@ def added_structures(names: Sequence[str]) -> tuple[AddedStructure, ...]:
     Raises
     ------
     LookupError
-        If no package adds a structure of such a name; the message names those there are.
+        If no package adds a structure of such a name; the message lists the available ones.
     PluginError
         If a package cannot be used.
     """
@@ -158,10 +158,12 @@ def added_structures(names: Sequence[str]) -> tuple[AddedStructure, ...]:
     for name in names:
         plugin = _REGISTRY.owner(name)
         if plugin is None:
-            there = [each.name for each in _REGISTRY.added() if not each.problem]
+            available_names = [
+                registered.name for registered in _REGISTRY.added() if not registered.problem
+            ]
             raise LookupError(
                 f"no installed package adds a structure '{printable(name, 40)}'; "
-                f"{'there are ' + listed(there) if there else 'none adds any'}."
+                f"{'there are ' + listed(available_names) if available_names else 'none adds any'}."
             )
         structures.append(AddedStructure(_REGISTRY.load(plugin), plugin))
     return tuple(structures)

@@ -62,15 +62,15 @@ if TYPE_CHECKING:
     Real = NDArray[np.float64]
 
 _MIN_BEFORE_S: Final = 0.3
-"""Least duration of the record before a detection that an estimate needs."""
+"""Least duration that must be recorded before a detection for an estimate of the touch."""
 _MIN_AFTER_S: Final = 0.02
-"""Least duration of the record after a detection that an estimate needs."""
+"""Least duration that must be recorded after a detection for an estimate of the touch."""
 _MIN_REST_S: Final = 0.5
-"""Least duration at the start from which the test estimates the noise."""
+"""Least duration of rest at the start of a record, from which the noise is estimated."""
 _MIN_PAUSE_S: Final = 0.5
-"""Time without a detection after which the next one is another touch, as the beam bounces."""
+"""Pause between two detections from which they count as different touches: the beam may bounce."""
 _LONGEST_FILTER_TICKS: Final = 0.99
-"""Limit of the averaging filter's span in ticks, which is that of a hundred records per tick."""
+"""Longest span in ticks of the filter that averages sensor records: that of 100 in a tick."""
 _MAX_TOUCHES: Final = 20
 """Largest number of touches found in a record; with more, the model does not fit the record."""
 _LARGEST_CHI2_PER_DEGREE: Final = 5.0
@@ -109,7 +109,7 @@ class Touch:
         shape (points, 2).
     point_m
         Point of contact in this plane, shape (2,); None if it is not known.
-    ends_m
+    interval_ends_m
         Ends of the 95 % interval of the point of contact, shape (2, 2); None if it is not known.
     """
 
@@ -121,7 +121,7 @@ class Touch:
     estimate: TouchEstimate | None = None
     antenna_m: Real | None = None
     point_m: Real | None = None
-    ends_m: Real | None = None
+    interval_ends_m: Real | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the touch and its estimate as a JSON document."""
@@ -147,8 +147,8 @@ class SessionTouches:
         Session file.
     touches
         Touches in the order of time.
-    found
-        Source of the detections: ``loop`` during the session, or ``record`` for this analysis.
+    detection_source
+        Where touches were detected: in the control ``loop``, or in the ``record`` by this analysis.
     model
         Model of the beam used for the estimates.
     rate_hz
@@ -163,7 +163,7 @@ class SessionTouches:
 
     path: Path
     touches: tuple[Touch, ...]
-    found: str
+    detection_source: str
     model: TouchModel
     rate_hz: float
     has_shear: bool
@@ -286,8 +286,8 @@ class TouchAnalysis:
         if touch_estimate.time_s is not None:
             time_s = touch_estimate.time_s.value
         angle_rad = float(np.interp(time_s, np.arange(angles_rad.size) / rate_hz, angles_rad))
-        x_m = prepared_model.free.x_m
-        deflection_m = _free_deflection_m(prepared_model.free, samples_record, time_s)
+        x_m = prepared_model.free_beam.x_m
+        deflection_m = _free_deflection_m(prepared_model.free_beam, samples_record, time_s)
         contact_point_m = interval_ends_m = None
         if touch_estimate.x_m is not None:
             positions_m = np.array([touch_estimate.x_m.value, *touch_estimate.x_m.interval_95])
@@ -308,7 +308,7 @@ class TouchAnalysis:
         )
 
     def _prepare_model(self, touch_model: TouchModel, rate_hz: float) -> _PreparedModel:
-        """Return touch estimator and free motion of a beam model, computed at the first use."""
+        """Return touch estimator and freely moving beam of a model, made at the first use."""
         key = (touch_model.plant, touch_model.angle_delay_s, touch_model.sensor_filter, rate_hz)
         if key not in self._prepared:
             x_m = np.linspace(0.0, touch_model.plant.beam.length_m, _ANTENNA_POINTS)
@@ -322,10 +322,10 @@ class TouchAnalysis:
 
 @dataclass(frozen=True, slots=True)
 class _PreparedModel:
-    """Estimator of touches and free motion of one model, computed once for all touches."""
+    """Touch estimator and freely moving beam of one model, made once for all touches."""
 
     estimator: TouchEstimator
-    free: FreeBeam
+    free_beam: FreeBeam
 
 
 # What the file states
@@ -353,7 +353,7 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
     angle_delay_s = stated_delay_s(session, "angle_delay_s")
-    stated = Plant(
+    undamped_plant = Plant(
         beam,
         Damping(),
         delay_s=stated_delay_s(session, "torque_delay_s") - angle_delay_s,
@@ -361,7 +361,7 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
     )
     sensor_filter = _sensor_filter(session, rate_hz)
     if model_path is not None:
-        return TouchModel.from_analysis(model_path, stated, angle_delay_s, sensor_filter)
+        return TouchModel.from_analysis(model_path, undamped_plant, angle_delay_s, sensor_filter)
     attached_files = (
         session.attachments.get(attachment_name, b"") for attachment_name in _DAMPING_ATTACHMENTS
     )
@@ -371,7 +371,9 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
             f"{session.path}: no profile.toml with [beam.damping] is attached, so the damping is "
             "not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
         )
-    return TouchModel.assumed(replace(stated, damping=damping), angle_delay_s, sensor_filter)
+    return TouchModel.assumed(
+        replace(undamped_plant, damping=damping), angle_delay_s, sensor_filter
+    )
 
 
 def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
@@ -402,10 +404,10 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:
-    """Return the factors of fx, fy, fz, tx, ty, tz that yield the shear force at the base.
+    """Return the six coefficients of the base shear force as a sum of fx, fy, fz, tx, ty, tz.
 
-    The six values are the forces and torques of the sensor. Return None if the session states no
-    factors or only zeros.
+    These are the forces and torques of the sensor. Return None if the session states no
+    coefficients or only zeros.
     """
     projection_text = session.metadata.get("shear_projection", "")
     if not projection_text:
@@ -494,9 +496,9 @@ def _white_noise_std(signal_values: Real) -> float:
 
 def _angle_noise_std(angle_rad: Real, is_at_rest: NDArray[np.bool_]) -> float:
     """Return the standard deviation of the angle's noise, from rest or from its resolution."""
-    angle_steps_rad = np.abs(np.diff(angle_rad))
-    angle_steps_rad = angle_steps_rad[angle_steps_rad > _MIN_NOISE_STD]
-    resolution_rad = float(angle_steps_rad.min()) if angle_steps_rad.size else 0.0
+    angle_increments_rad = np.abs(np.diff(angle_rad))
+    angle_increments_rad = angle_increments_rad[angle_increments_rad > _MIN_NOISE_STD]
+    resolution_rad = float(angle_increments_rad.min()) if angle_increments_rad.size else 0.0
     return max(_white_noise_std(angle_rad[is_at_rest]), resolution_rad / sqrt(12))
 
 
@@ -537,8 +539,8 @@ def _number_list(numbers: Sequence[int]) -> str:
 def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, time_s: float) -> Real:
     """Return the deflection in metres of a beam that moves freely, relative to its undeformed line.
 
-    `free_beam` has the free motion at points along the beam, the first at the motor's axis. The
-    vibration is fitted to the samples of `record` before `time_s`, which counts from its start.
+    `free_beam` computes the motion at points along the beam, the first at the motor's axis. Its
+    vibration is fitted to the samples of `record` before `time_s` (since the record's start).
     """
     fit_samples = min(max(int(time_s * record.rate_hz) - 1, _MIN_FIT_SAMPLES), record.detected)
     free_motion = free_beam.motion(record, fit_samples, fit_samples - 4)

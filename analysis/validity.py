@@ -88,7 +88,7 @@ def combined_validity(validities: Iterable[Validity]) -> Validity:
 
 
 def _validity_of_slope(slope_rad: float) -> Validity:
-    """Return the validity for a tip slope in rad; unknown if the slope is not valid."""
+    """Return the validity at a tip slope in rad; unknown if the slope is negative or infinite."""
     if not 0.0 <= slope_rad < math.inf:
         return Validity()
     model_error = linear_model_error(slope_rad)

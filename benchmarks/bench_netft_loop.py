@@ -24,7 +24,7 @@ from pathlib import Path
 
 from gate import Gate, Row
 from loop_rounds import in_turn, lateness_ratio, median_difference, median_work_us, show
-from rigd_netft.protocol import STOP, STREAM
+from rigd_netft.protocol import STOP_REQUEST, STREAM_REQUEST
 from rigd_netft.settings import NetFtSettings
 
 from rigd.bench import _loops as loops
@@ -117,9 +117,9 @@ def measure(name: str, seconds: float, cores: set[int]) -> LoopMeasurement:
     with box(cores) as port, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reader:
         if name == STREAMING:
             reader.connect(("127.0.0.1", port))
-            reader.send(STREAM)
+            reader.send(STREAM_REQUEST)
             measurement = loops.run_session(name, plain, seconds, lambda: None)
-            reader.send(STOP)
+            reader.send(STOP_REQUEST)
             return measurement
         settings = NetFtSettings("127.0.0.1", port=port, counts_per_n=1e6, counts_per_nm=1e6)
         profile = with_sensor("distant_netft", settings)

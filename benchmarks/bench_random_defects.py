@@ -130,9 +130,9 @@ def judged_text(path: Path, *, command_line: bool) -> tuple[str, float]:
             check=True, capture_output=True, text=True,
         )  # fmt: skip
         return done.stdout, time.monotonic() - start
-    routes = AnalysisOptions(WelchSettings(), paper=False, whole_record=True, fixed=())
+    options = AnalysisOptions(WelchSettings(), paper=False, whole_record=True, fixed=())
     start = time.process_time()
-    result = record_result(path, routes)
+    result = record_result(path, options)
     spent_s = time.process_time() - start
     return document_text(document([result]), ascii_only=True), spent_s
 

@@ -121,7 +121,7 @@ class Peer:
         residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
         residual *= self.weight
         poles = plant.mode_poles(comparison.visible_modes, ())
-        columns = comparison.decays.columns(poles) * self.weight
+        columns = comparison.decays.spectra(poles) * self.weight
         gram = (columns.conj() @ columns.T).real
         projection = (columns.conj() @ residual).real
         scale = np.sqrt(np.diag(gram))

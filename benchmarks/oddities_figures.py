@@ -46,7 +46,7 @@ def weights(folder: Path, found: Parameters, made: Session) -> None:
         for panel, name in zip(axes, ("I", "IV", "III"), strict=True):
             panel.plot(
                 *style.envelope(h1.frequency_hz, _db(h1.response), logarithmic=True),
-                color=style.FAINT, linewidth=2.4, label="Welch's estimate, one session",
+                color=style.LIGHT_GREY, linewidth=2.4, label="Welch's estimate, one session",
             )  # fmt: skip
             texts = []
             for weighting, line in LINES.items():
@@ -174,7 +174,7 @@ def order(
             label="whole record, twice the damping ratio",
         )  # fmt: skip
         for mode, mark in enumerate(np.array([16.045, 100.55, 281.55]) / (2 * np.pi), start=1):
-            right.axvline(mark, color=style.FAINT, linewidth=0.8, zorder=0)
+            right.axvline(mark, color=style.LIGHT_GREY, linewidth=0.8, zorder=0)
             right.text(mark, 6.6, f"mode {mode}", ha="center", fontsize=7.5, color=style.GREY)
         style.frequency_axis(right, (1.0, 50.0))
         right.set_ylim(0, 7)

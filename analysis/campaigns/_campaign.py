@@ -83,7 +83,7 @@ class CampaignResult:
         Pooled estimates of the structures that two sessions or more determine, the lowest BIC
         first; empty without whole-record fits.
     modal : PooledModalModel or None
-        Modal model of all sessions, and the nearly uniform beam estimated from it; None unless two
+        Modal model of all sessions, and the nearly uniform beam estimated from it; None if no two
         sessions show a common mode.
     verdict : CampaignVerdict or None
         Structure that the data support, and further findings; None without pooled estimates.
@@ -111,7 +111,7 @@ class CampaignResult:
 
     @property
     def headline(self) -> PooledEstimate | None:
-        """Pooled estimate whose parameters are reported (`freest_estimate`); None without one."""
+        """Pooled estimate whose parameters are reported (`freest_estimate`), or None."""
         return freest_estimate(self.pooled)
 
     @property
@@ -128,7 +128,7 @@ class CampaignResult:
 
     @property
     def trials(self) -> int:
-        """Number of sessions whose torque was to be predicted by models of the other sessions."""
+        """Number of sessions that were to be predicted from the others, failures included."""
         return len(self.sessions) if len(self.sessions) >= MIN_SESSIONS else 0
 
 
@@ -225,7 +225,8 @@ def campaign(
         )
         if not sessions:
             raise CampaignError(
-                "No session could be analysed:\n" + "\n".join(f.message for f in failures)
+                "No session could be analysed:\n"
+                + "\n".join(failure.message for failure in failures)
             )
         validation: tuple[LeaveOneOutResult, ...] = ()
         lost_sessions: tuple[FailedPrediction, ...] = ()
@@ -349,17 +350,19 @@ def _separate_experiments(
 def _equalize_welch_fits(
     sessions: list[SessionAnalysis], failures: list[SessionFailure]
 ) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
-    """Use Welch's method for all sessions or for none.
+    """Make all used sessions have Welch fits, or none of them.
 
-    If only a few sessions have no Welch fits, these sessions are excluded; otherwise, the fits of
-    all sessions are omitted. A session that planned its own excitation is never excluded, because
-    its record is as informative as any other.
+    If fewer than half of the sessions have no Welch fits, these sessions become failures; otherwise
+    the Welch fits of all sessions are dropped. A session that planned its own excitation is never
+    excluded, because its record is as informative as any other.
     """
     without_fits = [session for session in sessions if not session.frequency_hz.size]
     if not without_fits:
         return sessions, failures
-    has_searching = any(session.experiment.is_planned_during_session for session in without_fits)
-    if has_searching or 2 * len(without_fits) >= len(sessions):
+    any_planned_during_session = any(
+        session.experiment.is_planned_during_session for session in without_fits
+    )
+    if any_planned_during_session or 2 * len(without_fits) >= len(sessions):
         return [session.without_welch() for session in sessions], failures
     new_failures = [
         SessionFailure(
@@ -379,7 +382,7 @@ def _equalize_welch_fits(
 def _complete_labels(
     session_results: Sequence[SessionAnalysis | SessionFailure],
 ) -> list[SessionAnalysis | SessionFailure]:
-    """Return the results with the specimens' labels completed (see `complete_labels`)."""
+    """Return the results with the specimen labels of their experiments set by `complete_labels`."""
     completed_experiments = iter(
         complete_labels(
             [
@@ -405,8 +408,8 @@ def _exclusion_reason(
 ) -> str | None:
     """Return why a session does not belong to the campaign, or None if it does.
 
-    `common_session` is a session of the most common experiment. `accepted` are the sessions
-    accepted before. `majority_text` says in words whether most sessions agree with
+    `common_session` is a session of the most common experiment, `accepted` are the sessions
+    accepted so far. The reason contains `majority_text`, which says so if most sessions agree with
     `common_session`.
     """
     experiment = session_result.experiment

@@ -25,7 +25,7 @@ class RecordEstimate:
     bic : float
         Bayesian information criterion of this session alone.
     values : int
-        Number of real values compared.
+        Number of real values of the record that the fit is compared with.
     indices : FitIndices
         Fit indices relative to the session's response by Welch's method, on the same bins as for
         the Welch fits. They contain the bias of that method.
@@ -44,7 +44,7 @@ class RecordEstimate:
 
     @classmethod
     def from_candidate(cls, candidate: Candidate, indices: FitIndices) -> RecordEstimate:
-        """Return what a campaign retains of a whole-record fit.
+        """Return a candidate's whole-record fit without its residual, and its statistics.
 
         Parameters
         ----------

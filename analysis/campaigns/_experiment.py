@@ -66,16 +66,15 @@ _SPECIMEN_KEYS: Final = (LABEL_KEY, "beam_length_m", "beam_density_kg_per_m",
                          "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
 """Keys of the specimen in a session file that must agree over a campaign."""
 _SWEEP_END_KEYS: Final = ("start_hz", "stop_hz")
-"""Keys of the ends of a sweep. The same band in the other direction is the same experiment."""
+"""Keys of a sweep's start and stop frequency; sweeps that differ in their order count as equal."""
 
 _SWEEP_NAME: Final = "chirp"
 """Name of the excitation by a sweep."""
 _SEARCH_NAME: Final = "until"
-"""Name of the excitation that is planned while it runs, so that each such session has its own."""
+"""Name of the excitation that is planned while it runs, and so differs in each session."""
 
 _COMPLETE_FRACTION: Final = 0.99
-"""Fraction of the planned sweep from which it counts as complete, as samples may be missing at its
-end."""
+"""Smallest recorded fraction of a sweep that counts as complete: the last samples may be lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +88,7 @@ class Experiment:
     sweep_s : float
         Duration of the recorded sweep in seconds.
     identity : tuple of str
-        Identity of the session, the same in a copy of the file; the file's path without one.
+        Identifiers of the session, equal in copies of its file; the path of a file without them.
     start_utc : str
         Start of the recording in UTC, to the second; empty if the file does not state it.
     operator, note : str
@@ -137,19 +136,19 @@ class Experiment:
 
     @property
     def label(self) -> str:
-        """Label of the specimen stated in the file; empty without a label."""
+        """Label of the specimen stated in the file; empty if the file states none."""
         return str(self.facts.get(LABEL_KEY, ""))
 
     @property
     def is_planned_during_session(self) -> bool:
         """Whether the excitation was planned during the session.
 
-        Such an excitation agrees with any other.
+        In comparisons of experiments, such an excitation counts as equal to any other.
         """
         return self.facts.get("excitation") == _SEARCH_NAME
 
     def unfinished_sweep_reason(self, outcome: str) -> str:
-        """Return the end of a sentence about a sweep that ended early; empty if it was complete."""
+        """Return why a sweep that ended early is not used; an empty text if it was complete."""
         planned_s = self.facts.get("duration_s")
         if not isinstance(planned_s, float):
             return ""
@@ -164,7 +163,7 @@ class Experiment:
 
     def difference(self, other_experiment: Experiment) -> str | None:
         """Describe the first difference from another experiment; None if there is no difference."""
-        excitation_free = (
+        ignores_excitation = (
             self.is_planned_during_session or other_experiment.is_planned_during_session
         )
         other_facts = dict(other_experiment.facts)
@@ -177,7 +176,7 @@ class Experiment:
         for key, own_value in self.facts.items():
             other_value = (
                 own_value
-                if excitation_free and key in _EXCITATION_KEYS
+                if ignores_excitation and key in _EXCITATION_KEYS
                 else other_facts.get(key, own_value)
             )
             if not _equal_values(other_value, own_value):
@@ -186,7 +185,7 @@ class Experiment:
 
     @property
     def rising(self) -> bool | None:
-        """Whether the sweep rises in frequency; None without a sweep or with both directions."""
+        """Whether the frequency of the sweep rises; None if it also falls, or without a sweep."""
         if self.facts.get("excitation") != _SWEEP_NAME or "there_and_back" in self.facts:
             return None
         start_hz, stop_hz = (self.facts.get(key) for key in _SWEEP_END_KEYS)
@@ -257,7 +256,7 @@ class StatedSpecimen:
 def stated_specimens(
     stated_experiments: Iterable[tuple[str, Experiment | None]], campaign_experiment: Experiment
 ) -> tuple[StatedSpecimen, ...]:
-    """Group files by the specimen that they state, the specimen of the campaign first.
+    """Group files by the specimen named in them; the specimen of the campaign comes first.
 
     Parameters
     ----------
@@ -286,10 +285,10 @@ def stated_specimens(
 
 
 def complete_labels(experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Give sessions without a specimen label an empty label, if there are several labels.
+    """Return the experiments; if their specimen labels differ, add an empty one to those without.
 
-    With a single label in the campaign, a session without a label is taken to be of that specimen.
-    With several labels, its specimen is unknown.
+    The specimen of an experiment without a label is then unknown, and the empty label differs from
+    every other. If all stated labels are equal, it is taken to be the same specimen.
     """
     if len({experiment.label for experiment in experiments if experiment.label}) < 2:
         return list(experiments)
@@ -312,16 +311,18 @@ def differing_fact_keys(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
 
 
 def most_common_index(experiments: Sequence[Experiment]) -> int:
-    """Return the index of the first experiment with which most other experiments agree.
+    """Return the index of the experiment that agrees with most others; the first of several.
 
-    A session that planned its own excitation agrees with any other, so it is no candidate.
+    An experiment planned during its session agrees with any other, so it is no candidate.
     """
     candidate_indices = [
         i for i, experiment in enumerate(experiments) if not experiment.is_planned_during_session
     ]
     return max(
         candidate_indices or range(len(experiments)),
-        key=lambda i: sum(experiments[i].difference(two) is None for two in experiments),
+        key=lambda i: sum(
+            experiments[i].difference(other_experiment) is None for other_experiment in experiments
+        ),
     )
 
 
@@ -350,7 +351,7 @@ def fact_text(key: str, fact_value: str | float) -> str:
 
 
 def _utc_text(utc_ns: str) -> str:
-    """Format nanoseconds since 1970 in UTC as ISO 8601, to the second; empty if not a time."""
+    """Format nanoseconds since 1970 in UTC as ISO 8601, to the second; empty if not a number."""
     try:
         return f"{datetime.fromtimestamp(int(utc_ns) // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}"
     except (ValueError, OverflowError, OSError):

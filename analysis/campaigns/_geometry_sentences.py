@@ -1,4 +1,4 @@
-"""Sentences on modes and damping estimated from all sessions with a tolerance of the geometry."""
+"""Sentences on modes and damping estimated from all sessions for a beam that may be uneven."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify.tolerant_estimate import TolerantEstimate
 
-_OTHER_BASES: Final = {
+_FREQUENCY_FREE_BASES: Final = {
     "losses": "damping ratios and residue phases alone",
     "none": "no beam with one order of each damping, which do not explain the losses",
 }
-"""Descriptions of the estimates that do not rely on the frequencies of a uniform beam."""
+"""Phrases for the bases of estimates that do not use the frequencies of a uniform beam."""
 
 
 def p_value_text(p_value: float) -> str:
@@ -37,7 +37,7 @@ def p_value_text(p_value: float) -> str:
 
 
 def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate) -> str:
-    """Describe the basis of the parameters and the tolerated deviation from a uniform beam."""
+    """Describe from what the parameters are estimated, and the tolerated unevenness of the beam."""
     largest_stated = modal_model.stated[-1]
     tolerance_text = f"{100 * largest_stated:g} % as the files state it"
     if len(modal_model.stated) > 1:
@@ -51,7 +51,7 @@ def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate
     )
     if estimate.basis != "geometry":
         return (
-            f"{basis_sentence}, by {_OTHER_BASES[estimate.basis]}: the frequencies are "
+            f"{basis_sentence}, by {_FREQUENCY_FREE_BASES[estimate.basis]}: the frequencies are "
             f"not those of a uniform beam to {tolerance_text}, nor with a wider tolerance."
         )
     used_text = tolerance_text
@@ -65,12 +65,12 @@ def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate
 
 
 def describe_slope(pooled_order: PooledOrder, modal_model: PooledModalModel) -> str:
-    """Describe an order of the damping as the slope of a loss over the visible modes.
+    """Describe an order of the damping as the slope of a loss against frequency.
 
     Parameters
     ----------
     pooled_order : PooledOrder
-        Order estimated with a tolerance of the geometry.
+        Order estimated for a beam that may be uneven.
     modal_model : PooledModalModel
         Modal model of all sessions, with the estimate `tolerant`.
     """
@@ -86,12 +86,12 @@ def describe_slope(pooled_order: PooledOrder, modal_model: PooledModalModel) -> 
             "identifiable: "
             f"{pooled_order.reason}. {sessions_sentence}"
         )
-    shown_hz = [mode.frequency_hz for mode in modal_model.modes]
+    mode_frequencies_hz = [mode.frequency_hz for mode in modal_model.modes]
     slope_sentence = loss_slope_sentence(
         pooled_order.order,
         pooled_order.value,
         pooled_order.interval,
-        shown_hz,
+        mode_frequencies_hz,
         estimate,
         pooled_order.status,
         pooled_order.reason,
@@ -119,7 +119,7 @@ def describe_orders_if_exact(
         ):
             continue
         half_width = (exact_order.interval[1] - exact_order.interval[0]) / 2
-        value_text, low, high_text = to_uncertainty(
+        value_text, low_text, high_text = to_uncertainty(
             (exact_order.value, *exact_order.interval), exact_order.std or half_width
         )
         conclusions = {
@@ -128,7 +128,7 @@ def describe_orders_if_exact(
             "open": "1 would be doubtful",
         }
         orders_shown.append(
-            f"{order.order} {value_text} (95 %: {low} to {high_text}; "
+            f"{order.order} {value_text} (95 %: {low_text} to {high_text}; "
             f"{conclusions[exact_order.status]})"
         )
     return (
@@ -148,7 +148,7 @@ def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
     """Describe whether rising and falling sweeps show the same modes."""
     if sweeps is None:
         return []
-    sweep_counts = f"{sweeps.rising} rising and {sweeps.falling} falling sweeps"
+    sweeps_text = f"{sweeps.rising} rising and {sweeps.falling} falling sweeps"
     if not sweeps.changed:
         lowest_p_value = min(mode_change.chance for mode_change in sweeps.modes)
         largest_change = max(
@@ -156,20 +156,20 @@ def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
             for mode_change in sweeps.modes
         )
         return [
-            f"Nothing changed along the records: {sweep_counts} have the same modal constants "
+            f"Nothing changed along the records: {sweeps_text} have the same modal constants "
             "(lowest "
             f"{p_value_text(lowest_p_value)}; frequencies to {100 * largest_change:.1g} %)."
         ]
-    mode_change = "; ".join(map(_describe_mode_change, sweeps.changed))
+    changes_text = "; ".join(map(_describe_mode_change, sweeps.changed))
     return [
-        f"Something changes along the records, or with the direction of the sweep: {sweep_counts} "
+        f"Something changes along the records, or with the direction of the sweep: {sweeps_text} "
         "differ "
-        f"in {mode_change}. Each mode is as it was when the sweep passed it."
+        f"in {changes_text}. Each mode is as it was when the sweep passed it."
     ]
 
 
 def _describe_mode_change(mode_change: ModeInSweeps) -> str:
-    """Describe how one mode differs in falling sweeps from rising ones."""
+    """Describe how one mode differs between falling and rising sweeps."""
 
     def change_text(value: float, std: float) -> str:
         """Format a relative change in per cent, with its 95 % interval and direction."""
@@ -191,10 +191,10 @@ def recommend_sweeps(
 ) -> list[str]:
     """Recommend further sweeps that show whether the specimen changes during the records."""
     if sweeps is not None and sweeps.changed:
-        mode_numbers = listed([str(mode_change.mode) for mode_change in sweeps.changed])
+        modes_text = listed([str(mode_change.mode) for mode_change in sweeps.changed])
         return [
             "To tell a change in time from one with amplitude, repeat both sweeps with half the "
-            f"amplitude: a difference in mode {mode_numbers} that stays is a change in time. "
+            f"amplitude: a difference in mode {modes_text} that stays is a change in time. "
             "Then check clamp and temperature."
         ]
     sweep_directions = {session.experiment.rising for session in sessions}

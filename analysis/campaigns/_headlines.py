@@ -31,7 +31,7 @@ _ON_BOUND_FLAG: Final = "the unweighted mean: at its bound in at least one sessi
 _NOT_SHOWN_FLAG: Final = "computed from the model: too few records show this mode"
 """Flag of a mode that too few records show."""
 _ADEQUATE_FRACTION: Final = 0.9
-"""Fraction of the sessions whose residual must be noise for estimates without a flag."""
+"""Smallest fraction of sessions with a residual of mere noise at which estimates get no flag."""
 
 
 def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
@@ -144,7 +144,7 @@ def _add_flags(
 def _simpler_estimate(
     campaign: CampaignResult, reported_estimate: PooledEstimate
 ) -> ConditionalEstimate | None:
-    """Return the estimate of the lowest BIC; it is valid if its fixed orders are true.
+    """Return the estimate of the lowest BIC, which is valid if the orders that it fixes are true.
 
     Return None if that estimate is the reported one.
     """

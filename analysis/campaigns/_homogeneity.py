@@ -32,18 +32,18 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooling import PooledEstimate
 
 SessionValues = tuple[tuple[str, float, float], ...]
-"""Types of file, estimate and its standard deviation, one entry for each session."""
+"""File, estimate, and standard deviation of the estimate; one entry for each session."""
 
 SIGNIFICANCE_LEVEL: Final = 0.01
 """Significance level of all quantities together: one false alarm in a hundred campaigns of one
 specimen."""
 
 _MIXTURE_I_SQUARED: Final = 0.9
-"""I² from which sessions count as a mixture: a scatter of three times a session's own standard
-deviation."""
+"""Smallest I² at which sessions count as a mixture: they scatter by three times a session's own
+standard deviation."""
 
 _CLEAR_GAP_STDS: Final = 5.0
-"""Gap from which groups are distinguished, in standard deviations within groups."""
+"""Smallest gap that separates two groups, in units of the standard deviation within a group."""
 
 _MIN_SESSIONS: Final = 2
 """Smallest number of sessions that can be compared."""
@@ -66,9 +66,9 @@ class Heterogeneity:
     mean : float
         Pooled mean; the geometric mean of a positive parameter.
     between_std : float
-        Standard deviation between sessions beyond their own uncertainties, tau.
+        Standard deviation between sessions that their own uncertainties do not explain, tau.
     cochran_q : float
-        Cochran's Q; about `degrees_of_freedom` without such scatter.
+        Cochran's Q; about `degrees_of_freedom` if tau is 0.
     chance : float
         p-value of `cochran_q`.
     mixed : bool
@@ -118,8 +118,8 @@ class Homogeneity:
     quantities : tuple of Heterogeneity
         Scatter of the modes, then of the parameters.
     structure : str or None
-        Structure by which the sessions are compared, as named in tables; None without whole-record
-        fits.
+        Damping structure whose parameters are compared between sessions, as named in tables; None
+        if there are no whole-record fits.
     """
 
     specimens: tuple[StatedSpecimen, ...]
@@ -157,7 +157,7 @@ class Homogeneity:
         return len(self.specimens) < _MIN_SESSIONS and not self.mixed
 
     def scatter_of(self, quantity: str) -> Heterogeneity | None:
-        """Return the between-session scatter of a quantity, or None if it is not known."""
+        """Return the between-session scatter of a quantity, or None if it was not tested."""
         return next((scatter for scatter in self.quantities if scatter.quantity == quantity), None)
 
     def is_mixed(self, quantity: str) -> bool:
@@ -171,7 +171,7 @@ def homogeneity(
     pooled_fits: Sequence[PooledEstimate],
     specimens: Sequence[StatedSpecimen],
 ) -> Homogeneity:
-    """Test whether sessions are of one specimen, by their fits of one damping structure.
+    """Test whether sessions are of one specimen by comparing their fits of one damping structure.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def homogeneity(
 def _mode_values(
     estimates: Sequence[tuple[str, RecordEstimate]],
 ) -> Iterator[tuple[str, SessionValues]]:
-    """Yield frequencies and damping ratios of the modes that all sessions have."""
+    """Yield name and session values of each quantity of the modes that all sessions have."""
     mode_count = min((len(estimate.fit.modes) for _, estimate in estimates), default=0)
     for quantity, std in _MODE_QUANTITIES.items():
         for mode_index in range(mode_count):
@@ -230,7 +230,7 @@ def _mode_values(
 def _parameter_values(
     sessions: Sequence[SessionAnalysis], freest_fit: PooledEstimate
 ) -> Iterator[tuple[str, SessionValues]]:
-    """Yield the estimates of each pooled parameter, one for each session."""
+    """Yield name and session values of each pooled parameter."""
     for parameter in freest_fit.parameters:
         parameter_name = parameter.name
         session_values = (
@@ -247,7 +247,7 @@ def _parameter_values(
 
 
 def _with_known_std(session_values: Iterator[tuple[str, float, float]]) -> SessionValues:
-    """Return the entries with a finite and positive standard deviation."""
+    """Return the entries whose standard deviation is finite and positive."""
     return tuple(entry for entry in session_values if math.isfinite(entry[2]) and entry[2] > 0)
 
 
@@ -286,7 +286,8 @@ def split_groups(
 ) -> tuple[tuple[int, ...], ...]:
     """Split estimates at clear gaps into groups of session indices, the lowest values first.
 
-    There are at most half as many groups as sessions, so that at least one group has two members.
+    There are at most half as many groups as sessions, rounded up, so that one group or more has two
+    members.
     A gap is clear if it exceeds `_CLEAR_GAP_STDS` times the standard deviation within the groups,
     or the standard deviation of a single session if this is larger. Without clear gaps, there are
     no groups.
@@ -305,7 +306,8 @@ def split_groups(
         cut_indices = np.sort(np.argsort(value_gaps)[1 - group_count :]) + 1
         candidate_groups = np.split(sorted_indices, cut_indices)
         squared_deviations = sum(
-            float(((estimates[p] - estimates[p].mean()) ** 2).sum()) for p in candidate_groups
+            float(((estimates[group] - estimates[group].mean()) ** 2).sum())
+            for group in candidate_groups
         )
         group_std = max(
             math.sqrt(squared_deviations / (sorted_indices.size - group_count)), session_std

@@ -1,4 +1,4 @@
-"""Modal constants of all sessions together, and a beam with a tolerance of the geometry.
+"""Modal constants pooled over all sessions, and a nearly uniform beam estimated from them.
 
 The noise of the sessions averages out. An unevenness of the specimen is common to all sessions and
 does not, so the geometry tolerance is added to the covariance of the pooled constants, whatever the
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _MIN_SESSIONS: Final = 2
 """Smallest number of sessions that can be pooled."""
 _COMMON_MODE_FRACTION: Final = 0.9
-"""Fraction of the sessions that must show a mode for it to be pooled."""
+"""Smallest fraction of the sessions that must show a mode for the mode to be pooled."""
 
 _SIGNIFICANCE_LEVEL: Final = 0.01
 """Level, for all modes together, at which rising and falling sweeps differ significantly."""
@@ -56,12 +56,13 @@ class PooledModalModel(ModalEstimate):
     between_std : ndarray, shape (4 n,)
         Scatter of each modal constant between sessions beyond their own uncertainties.
     stated : tuple of float
-        Different uniformities stated in the files, in increasing order.
+        Distinct values stated in the files for the relative deviation of mode frequencies from
+        those of a uniform beam, in increasing order.
     uniform_beam : UniformBeamTest
         Test of whether a uniform beam predicts the pooled constants.
     tolerant : TolerantEstimate or None
-        Parameters estimated with the largest stated uniformity as tolerance. None if all files
-        state a uniformity of 0, or with a single mode.
+        Parameters estimated with the largest value of `stated` as tolerance. None if all files
+        state 0, or if there is a single mode.
     """
 
     sessions: int
@@ -72,12 +73,12 @@ class PooledModalModel(ModalEstimate):
 
     @property
     def half_width(self) -> float:
-        """Half width of a 95 % interval in standard deviations, by Student's t."""
+        """Ratio of the half width of a 95 % interval to the standard deviation, by Student's t."""
         return student_t_quantile(0.95, self.sessions - 1)
 
     @property
     def leads(self) -> bool:
-        """Whether the report has the modes of this modal model, and not those of a uniform beam."""
+        """Whether the report shows the modes of this model instead of those of a uniform beam."""
         return self.tolerant is not None or self.uniform_beam.status == "refused"
 
     @property
@@ -107,7 +108,7 @@ class PooledModalModel(ModalEstimate):
 
 
 def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None:
-    """Pool the modal constants of the sessions; None unless two sessions show a common mode.
+    """Return the modal model of all sessions, or None if no two sessions show a common mode.
 
     Parameters
     ----------
@@ -166,7 +167,7 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None
 def _modal_estimate(
     modes: tuple[int, ...], joint_values: NDArray[np.float64], joint_covariance: NDArray[np.float64]
 ) -> ModalEstimate:
-    """Return the modal estimate of some modes from the vector of constants and background."""
+    """Return the modal estimate of some modes, whose constants and background are one vector."""
     constants, background = np.split(joint_values, [len(modes) * len(MODE_CONSTANT_NAMES)])
     modal_model = ModalModel.from_constants(constants, background.tolist())
     return ModalEstimate(modal_model, modes, constants, joint_covariance)
@@ -189,9 +190,9 @@ def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
 
 
 def _pooled_constants(estimates: Sequence[ModalEstimate], modes: Sequence[int]) -> RandomEffects:
-    """Pool the `MODE_CONSTANT_NAMES` of some modes, and the background, over estimates.
+    """Pool the constants of some modes, and the background, over the estimates of all sessions.
 
-    Whole turns are removed from the phase differences to the first estimate.
+    Residue phases are first shifted by whole turns to be nearest to those of the first estimate.
     """
     session_values, session_covariances = map(
         np.array, zip(*(_constants_and_background(e, modes) for e in estimates), strict=True)
@@ -206,7 +207,7 @@ def _pooled_constants(estimates: Sequence[ModalEstimate], modes: Sequence[int]) 
 def _constants_and_background(
     estimate: ModalEstimate, modes: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return modal constants and background of a session as one vector, and its covariance."""
+    """Return the modal constants and the background of a session in one vector, with covariance."""
     constant_indices = estimate.rows(modes)
     indices = np.concatenate(
         [constant_indices, np.arange(estimate.constants.size, len(estimate.joint_covariance))]
@@ -268,7 +269,7 @@ class OppositeSweeps:
 
 
 def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | None:
-    """Compare the modes of rising and falling sweeps; None without both directions.
+    """Compare rising with falling sweeps by the modes of both; None if they have none in common.
 
     Parameters
     ----------

@@ -29,10 +29,10 @@ PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "
 _UNEXPLAINED_REASON: Final = "part of the records is unexplained"
 """Reason for doubt in an order if too many sessions have a residual that is not noise."""
 _ADEQUATE_FRACTION: Final = 0.9
-"""Fraction of the sessions whose residual must be noise before an order is reported."""
+"""Smallest fraction of sessions with a residual of mere noise at which an order is reported."""
 
 _EXCLUSION_LEVEL: Final = 0.999
-"""Confidence level at which 1 must be excluded: one false exclusion in a thousand campaigns."""
+"""Confidence level at which an order of 1 is excluded: one false exclusion in 1000 campaigns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +56,11 @@ class PooledOrder:
     std : float or None
         Standard deviation of the order; None in the same cases as `interval`.
     exact : PooledOrder or None
-        The order on condition that the beam is uniform to 1e-5; None if this object states it.
+        The order on condition that the beam is uniform to 1e-5; None if this is that order itself.
     reason : str or None
         Why the value is not a property of the specimen; None if it is.
     alone : mapping of str to int
-        Number of sessions with each status by themselves.
+        Number of sessions by the status that the order has in the session alone.
     mixture : bool
         Whether `reason` is that the sessions differ significantly in this order, or that they are
         of different specimens and do not all determine it.
@@ -110,7 +110,7 @@ def pooled_order(
         verdict.alpha if order == "alpha" else verdict.lambda_ for verdict in verdicts
     ]
     single_statuses: dict[str, int] = dict(
-        Counter(str(one.status) for one in session_orders).most_common()
+        Counter(str(session_order.status) for session_order in session_orders).most_common()
     )
     freest_fit = freest_estimate(ranked_estimates)
     assert freest_fit is not None
@@ -209,7 +209,7 @@ def _status_and_reason(
     verdicts: Sequence[Verdict],
     single_statuses: Mapping[str, int],
 ) -> tuple[PooledStatus, str | None]:
-    """Return the status of an order of the damping, and the reason against it or None."""
+    """Return the status of an order of the damping, and the reason to doubt the order or None."""
     structure = STRUCTURES[freest_fit.structure]
     usual_mode_count = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[
         0
@@ -238,23 +238,25 @@ def _status_and_reason(
         for estimate in (ranked_estimates[0], *rival_estimates(ranked_estimates, BIC_DECISIVE))
         if _has_order_one(estimate, order)
     ]
-    low, upper_limit = parameter.interval
-    if low <= 1 <= upper_limit:
+    lower_limit, upper_limit = parameter.interval
+    if lower_limit <= 1 <= upper_limit:
         return "compatible", None
     is_one_excluded = not integer_rivals and _excludes_one(parameter, freest_fit.sessions)
     return ("fractional" if is_one_excluded else "open"), None
 
 
 def _has_order_one(estimate: PooledEstimate, order: OrderName) -> bool:
-    """Return whether a damping structure has this kind of damping with a fixed order of 1."""
+    """Return whether the damping structure of an estimate fixes an order at 1."""
     return STRUCTURES[estimate.structure].fixed.get(order) == 1.0
 
 
-def _excludes_one(order: PooledParameter, sessions: int) -> bool:
+def _excludes_one(order: PooledParameter, session_count: int) -> bool:
     """Return whether an order differs from 1 at the level `_EXCLUSION_LEVEL`."""
-    return abs(order.value - 1) > student_t_quantile(_EXCLUSION_LEVEL, sessions - 1) * order.std
+    return (
+        abs(order.value - 1) > student_t_quantile(_EXCLUSION_LEVEL, session_count - 1) * order.std
+    )
 
 
 def _relative_width(order_interval: tuple[float, float]) -> float:
-    """Return the width of an interval as a fraction of the range of orders."""
+    """Return the width of an interval as a fraction of the range searched for orders."""
     return (order_interval[1] - order_interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])

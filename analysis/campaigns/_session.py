@@ -39,7 +39,7 @@ _NO_RESPONSE: Final = FrequencyResponse(
 _PAPER_SETTINGS: Final = WelchSettings()
 """Welch settings of the paper."""
 _NO_INDICES: Final = FitIndices(math.nan, math.nan, math.nan)
-"""Fit indices of a model without a measured response."""
+"""Fit indices (NaN) of a model if there is no measured response to compare it with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +63,11 @@ class SessionAnalysis:
     peaks : tuple of Peak or None
         Measured resonant peaks, one for each mode.
     welch_models : tuple of FittedModel
-        Welch fits by type, then by weighting, without their responses, which would take most of
-        the memory of a campaign; empty if Welch's method is not applicable.
+        Welch fits by damping structure, then by weighting, without their responses, which would
+        take most of the memory of a campaign; empty if Welch's method is not applicable.
     record_estimates : tuple of RecordEstimate
-        Whole-record fits by type; empty if none was requested, or the record could not be used.
+        Whole-record fits by damping structure; empty if none was requested, or the record could
+        not be used.
     verdict : Verdict or None
         Verdict on the whole record of this session alone; None without estimates.
     warnings : tuple of str
@@ -132,7 +133,7 @@ class SessionAnalysis:
 
     @property
     def selected(self) -> str | None:
-        """Name of the damping structure that this session selects; None without a verdict."""
+        """Name of the damping structure that this session selects; None if it has no verdict."""
         if self.verdict is None:
             return None
         return min(self.record_estimates, key=lambda estimate: estimate.bic).name
@@ -233,7 +234,7 @@ def _session_result(
     experiment: Experiment,
     warnings: tuple[str, ...],
 ) -> SessionAnalysis:
-    """Return the results of a session that a campaign retains."""
+    """Return the part of a session's results that a campaign stores."""
     from analysis.applicability import record_band_hz, welch_settings
 
     record, whole_fits, welch_results = (
@@ -294,7 +295,7 @@ def _record_estimates(
     response_grid = ResponseGrid(1j * omega)
 
     def estimate_of(candidate: Candidate) -> RecordEstimate:
-        """Return the retained results of a fit, with its fit indices."""
+        """Return the results of a fit that the campaign stores, with their fit indices."""
         # The delay stated in the file is removed from the measured response.
         plant = candidate.fit.plant
         plant = replace(plant, delay_s=plant.delay_s - delay_s)

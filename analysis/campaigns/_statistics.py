@@ -60,9 +60,12 @@ class ParameterStatistics:
 def fits_by_model(
     sessions: Sequence[SessionAnalysis],
 ) -> dict[tuple[str, str], tuple[FittedModel, ...]]:
-    """Return the Welch fits of all sessions by damping structure and weighting."""
+    """Return the Welch fits of all sessions, keyed by damping structure and weighting."""
     fits_per_model = zip(*(session.welch_models for session in sessions), strict=True)
-    return {(row[0].fit.structure.name, row[0].fit.weighting): row for row in fits_per_model}
+    return {
+        (model_fits[0].fit.structure.name, model_fits[0].fit.weighting): model_fits
+        for model_fits in fits_per_model
+    }
 
 
 def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[ParameterStatistics, ...]:
@@ -97,15 +100,15 @@ PAPER_BEST_MODELS: Final = (("III", "omega"), ("VI", "omega"))
 
 @dataclass(frozen=True, slots=True)
 class MeanPeakDeviation:
-    """Mean deviation of a nominal model's resonant peak from the sessions' (Eqs. 31 and 32).
+    """Mean absolute deviation of a model's resonant peak from the sessions' (Eqs. 31 and 32).
 
     Attributes
     ----------
     mode : int
         Number of the mode, from 1.
     frequency_rad_s, magnitude_db : float
-        Mean deviation of the peak's frequency and magnitude; NaN if no session or the model has no
-        such peak.
+        Mean deviation of the peak's frequency and magnitude; NaN if the model or every session
+        lacks the peak.
     sessions : int
         Number of sessions that have the peak.
     """
@@ -186,7 +189,7 @@ def best_models(models: Sequence[NominalModel]) -> tuple[NominalModel, ...]:
 def mean_deviations(
     measured_peaks: Sequence[Sequence[Peak | None]], model_peaks: Sequence[Peak | None]
 ) -> tuple[MeanPeakDeviation, ...]:
-    """Return the mean deviation of each resonant peak over the sessions (Eqs. 31 and 32).
+    """Return the deviation of each resonant peak, averaged over the sessions (Eqs. 31 and 32).
 
     Parameters
     ----------
@@ -260,12 +263,12 @@ def _mean_parameters(welch_models: Sequence[FittedModel]) -> dict[str, float]:
 
 
 def _wmse_key(model: NominalModel) -> float:
-    """Return the mean weighted mean square error of a model, as a key for sorting."""
+    """Return the sorting key of a model: its weighted mean square error, averaged over sessions."""
     return model.mean_wmse
 
 
 def _mean_or_nan(values: Sequence[float]) -> float:
-    """Return the mean of values, or NaN without values."""
+    """Return the mean of values, or NaN if there are none."""
     return float(np.mean(values)) if values else float("nan")
 
 
@@ -283,12 +286,12 @@ class RankedStructure:
     fitted : int
         Number of sessions to which the structure was fitted.
     determined : int
-        Number of these sessions that determine the structure's damping.
+        Number of the sessions fitted that determine the structure's damping.
     selected_alone : int
         Number of sessions that select the structure by themselves.
     misfit : float
         Misfit of the pooled estimate (see `PooledEstimate`). If the structure is not pooled, the
-        same median over the sessions to which it was fitted.
+        median misfit of the sessions to which it was fitted.
     bic_above_lowest : float or None
         BIC of all sessions together less the lowest BIC of a pooled structure; None if the
         structure was fitted to some sessions only. Negative if the structure fits better, but too
@@ -342,7 +345,11 @@ def ranked_structures(
             determined=sum(map(determines_damping, estimates)),
             selected_alone=single_selections[structure_name],
             misfit=misfit_by_name.get(structure_name)
-            or float(np.median([one.fit.cost / one.fit.degrees_of_freedom for one in estimates])),
+            or float(
+                np.median(
+                    [estimate.fit.cost / estimate.fit.degrees_of_freedom for estimate in estimates]
+                )
+            ),
             bic_above_lowest=bic[structure_name] - lowest_bic if structure_name in bic else None,
             pooled=structure_name in misfit_by_name,
         )

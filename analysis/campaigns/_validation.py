@@ -45,8 +45,8 @@ class LeaveOneOutResult:
         Root mean square of predicted minus measured torque, divided by that of the measured
         torque, in the band and without means.
     own_error : float or None
-        The same error of the session's own whole-record fit of that structure; None with "welch".
-        It contains the noise, too, so an `error` that is no larger shows that the sessions agree.
+        Error of the session's own whole-record fit of that structure; None with "welch". Both
+        errors include the noise, so the sessions agree if `error` is no larger than `own_error`.
     """
 
     path: Path
@@ -69,13 +69,13 @@ class FailedPrediction:
 
 @dataclass(frozen=True, slots=True)
 class PlantPrediction:
-    """Model estimated from the other sessions, with which one session is predicted."""
+    """Model of the other sessions that is to predict one session, and that session's own model."""
 
     method: str
     name: str
     weighting: str | None
     plant: Plant
-    own: Plant | None
+    own_plant: Plant | None
 
 
 def models_without_session(
@@ -136,7 +136,7 @@ def leave_one_out_results(
 ) -> tuple[LeaveOneOutResult, ...] | FailedPrediction:
     """Return the error of each model in predicting a session's torque from its angle.
 
-    An error of one session is returned, not raised, because the others are still usable.
+    A session that cannot be predicted raises no error, because the others are still usable.
     """
     from analysis.applicability import highest_frequency_hz, record_band_hz
     from analysis.identify import Comparison
@@ -168,7 +168,9 @@ def leave_one_out_results(
             name=prediction.name,
             weighting=prediction.weighting,
             error=prediction_error(prediction.plant),
-            own_error=None if prediction.own is None else prediction_error(prediction.own),
+            own_error=None
+            if prediction.own_plant is None
+            else prediction_error(prediction.own_plant),
         )
         for prediction in predictions
     )

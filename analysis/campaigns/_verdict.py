@@ -191,7 +191,7 @@ class CampaignVerdict:
 
     @property
     def withheld_orders(self) -> frozenset[str]:
-        """Orders that are not to be reported for an exactly uniform beam."""
+        """Orders whose estimate for an exactly uniform beam must not be reported."""
         return _withheld_orders(self.alpha, self.lambda_)
 
 
@@ -242,7 +242,7 @@ def campaign_verdict(
     adequate_count = sum(verdict.adequate for verdict in verdicts)
     dissenting_sessions = _dissenting_sessions(sessions, lowest_bic_estimate)
     advice_counts = Counter(
-        common_advice for verdict in verdicts for common_advice in verdict.experiments
+        experiment for verdict in verdicts for experiment in verdict.experiments
     )
     common_advice = [
         experiment
@@ -300,7 +300,7 @@ def campaign_verdict(
 def _final_order(
     exact_order: PooledOrder, verdicts: Sequence[Verdict], modal_model: PooledModalModel | None
 ) -> PooledOrder:
-    """Return an order estimated from the modal constants, or from a uniform beam without them."""
+    """Return an order estimated from the modal constants or, without them, for a uniform beam."""
     if modal_model is None:
         return exact_order
     if modal_model.tolerant is not None:
@@ -352,27 +352,27 @@ def _describe_modes(
 def _describe_slopes(
     alpha: PooledOrder, lambda_: PooledOrder, modal: PooledModalModel | None
 ) -> tuple[str, str]:
-    """Describe both orders of the damping, as slopes of the losses if a tolerance is used."""
+    """Describe both orders of the damping, as slopes of the losses if the beam may be uneven."""
     if modal is None or modal.tolerant is None:
         return sentences.describe_order(alpha), sentences.describe_order(lambda_)
     return geometry.describe_slope(alpha, modal), geometry.describe_slope(lambda_, modal)
 
 
 def _withheld_orders(*orders: PooledOrder) -> frozenset[str]:
-    """Return the orders with a reason against reporting them for an exactly uniform beam."""
+    """Return the orders with a reason to doubt their estimate for an exactly uniform beam."""
     return frozenset(order.order for order in orders if (order.exact or order).reason is not None)
 
 
 def _dissenting_sessions(
     sessions: Sequence[SessionAnalysis], lowest_bic_estimate: PooledEstimate
 ) -> tuple[DissentingSession, ...]:
-    """Return the sessions that alone exclude the damping structure of the lowest common BIC."""
+    """Return the sessions that alone exclude the structure of the lowest BIC over all sessions."""
     dissents = []
     for session in sessions:
         estimates_by_name = {estimate.name: estimate for estimate in session.record_estimates}
         if estimates_by_name:
-            own = min(estimates_by_name.values(), key=lambda estimate: estimate.bic)
-            bic_margin = estimates_by_name[lowest_bic_estimate.name].bic - own.bic
+            own_estimate = min(estimates_by_name.values(), key=lambda estimate: estimate.bic)
+            bic_margin = estimates_by_name[lowest_bic_estimate.name].bic - own_estimate.bic
             if bic_margin > BIC_DECISIVE:
-                dissents.append(DissentingSession(session.name, own.name, bic_margin))
+                dissents.append(DissentingSession(session.name, own_estimate.name, bic_margin))
     return tuple(sorted(dissents, key=lambda dissenter: -dissenter.margin))

@@ -29,7 +29,7 @@ records."""
 _CONFIDENCE_LEVEL: Final = 0.999
 """Confidence level at which a bias is significant."""
 _MIN_SESSIONS: Final = 2
-"""Smallest number of sessions with Welch fits."""
+"""Smallest number of sessions with Welch fits for which a bias is estimated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class ParameterBias:
 
 @dataclass(frozen=True, slots=True)
 class WelchBias:
-    """Bias of the Welch fits of one type and weighting.
+    """Bias of the Welch fits of one damping structure and weighting.
 
     Attributes
     ----------
@@ -109,14 +109,14 @@ def welch_biases(
     Returns
     -------
     tuple of WelchBias
-        Biases by type, then by weighting. A type whose whole-record residual is more than noise is
-        left out, because its pooled estimate is no reference.
+        Biases by damping structure, then by weighting. A structure whose whole-record residual is
+        more than noise is left out, because its pooled estimate is no reference.
     """
     biases = []
     pooled_by_name = {
-        record_estimate.name: record_estimate
-        for record_estimate in pooled
-        if record_estimate.misfit <= LARGEST_MISFIT
+        pooled_estimate.name: pooled_estimate
+        for pooled_estimate in pooled
+        if pooled_estimate.misfit <= LARGEST_MISFIT
     }
     for (structure, weighting), welch_models in fits_by_model(sessions).items():
         pooled_estimate = pooled_by_name.get(structure)
@@ -169,5 +169,5 @@ def welch_biases(
 
 
 def _mean_or_nan(numbers: Sequence[float]) -> float:
-    """Return the mean of values, or NaN without values."""
+    """Return the mean of numbers, or NaN if there are none."""
     return float(np.mean(numbers)) if numbers else math.nan

@@ -65,7 +65,7 @@ def symbol_with_unit(quantity: str) -> str:
 
 
 def probability(p_value: float) -> str:
-    """Format a p-value, with a lower bound for values that are too small to be shown.
+    """Format a p-value; "< 1e-99" for values that are too small to be shown.
 
     Examples
     --------
@@ -104,5 +104,9 @@ def first_few(texts: Sequence[str], separator: str = ", ") -> str:
     >>> first_few(["a.mcap", "b.mcap"]), first_few("abcdefg")
     ('a.mcap, b.mcap', 'a, b, c, d, e and 2 more')
     """
-    listed_texts, more = separator.join(texts[:_MAX_LISTED]), len(texts) - _MAX_LISTED
-    return f"{listed_texts}{separator.strip(', ')} and {more} more" if more > 0 else listed_texts
+    listed_texts, unlisted_count = separator.join(texts[:_MAX_LISTED]), len(texts) - _MAX_LISTED
+    return (
+        f"{listed_texts}{separator.strip(', ')} and {unlisted_count} more"
+        if unlisted_count > 0
+        else listed_texts
+    )

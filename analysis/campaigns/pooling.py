@@ -1,10 +1,11 @@
 """Pooled whole-record estimates of all sessions, by a random-effects model.
 
 The estimates y_k of session k follow ``y_k ~ N(mu, S_k + diag(tau²))``. S_k is the covariance that
-session k states for its estimates. tau is the scatter of each parameter between sessions, by the
-moments of DerSimonian and Laird [1]_. A full matrix instead of ``diag(tau²)`` would have more
-elements than a campaign has sessions. By maximum likelihood, it would show a scatter of two thirds
-of the standard deviation in each of eight parameters for five sessions without any scatter.
+session k states for its estimates. tau is the scatter of each parameter between sessions, estimated
+by the method of moments of DerSimonian and Laird [1]_. A full matrix instead of ``diag(tau²)``
+would have more elements than a campaign has sessions; estimated by maximum likelihood, it would
+show a scatter of two thirds of the standard deviation in each of eight parameters for five sessions
+without any scatter.
 
 References
 ----------
@@ -171,7 +172,7 @@ class PooledMode:
 
 
 def pool_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
-    """Pool frequency and damping ratio, separately, of each mode that all sessions have."""
+    """Pool the frequency and, separately, the damping ratio of each mode that all sessions have."""
     pooled_list = []
     for session_modes in zip(*(estimate.fit.modes for estimate in estimates), strict=False):
         pooled_frequency = _pool_quantity(
@@ -188,7 +189,7 @@ def pool_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
 
 
 def _pool_quantity(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, float] | None:
-    """Return the mean of a quantity, its standard deviation, and its scatter between sessions.
+    """Return the mean of a quantity, the mean's standard deviation, and the scatter of sessions.
 
     Return None if a session has no standard deviation.
     """
@@ -302,12 +303,10 @@ class PooledEstimate:
                 coefficient, order, plant_values, parameter_names, self.covariance, first_rad_s
             )
             if loss_factor is not None:
-                factor = math.exp(t * loss_factor.std / loss_factor.value)
-                interval = loss_factor.value / factor, loss_factor.value * factor
-                order_name = Estimate(loss_factor.value, loss_factor.std, interval)
-                loss_factors.append(
-                    ReportedLossFactor(damping, loss_factor.omega_rad_s, order_name)
-                )
+                interval_factor = math.exp(t * loss_factor.std / loss_factor.value)
+                interval = loss_factor.value / interval_factor, loss_factor.value * interval_factor
+                estimate = Estimate(loss_factor.value, loss_factor.std, interval)
+                loss_factors.append(ReportedLossFactor(damping, loss_factor.omega_rad_s, estimate))
         return tuple(loss_factors)
 
     @property
@@ -374,8 +373,8 @@ def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None
     p_values = chi_square_p_value(pooled_effects.cochran_q, len(used_estimates) - 1)
     pooled_statistics = (pooled_effects.mean, std, within_std, pooled_effects.between_std, p_values)
     parameters = tuple(
-        _pooled_parameter(parameter_name, t, *row)
-        for parameter_name, row in zip(
+        _pooled_parameter(parameter_name, t, *statistics)
+        for parameter_name, statistics in zip(
             determined_names, np.transpose(pooled_statistics).tolist(), strict=True
         )
     )
@@ -446,7 +445,7 @@ def _stack_estimates(
 
 def _pooled_parameter(
     parameter_name: str,
-    t: float,
+    t_quantile: float,
     mean: float,
     std: float,
     within_std: float,
@@ -460,11 +459,13 @@ def _pooled_parameter(
         name=parameter_name,
         value=pooled_value,
         std=std_factor * std,
-        interval=_parameter_interval(parameter_name, mean, t * std),
+        interval=_parameter_interval(parameter_name, mean, t_quantile * std),
         within_std=std_factor * within_std,
         between_std=std_factor * between_std,
         chance=p_value,
-        next_interval=_parameter_interval(parameter_name, mean, t * math.hypot(std, between_std)),
+        next_interval=_parameter_interval(
+            parameter_name, mean, t_quantile * math.hypot(std, between_std)
+        ),
     )
 
 
@@ -507,8 +508,8 @@ def _pooled_plant(estimate: RecordEstimate, parameter_values: dict[str, float]) 
 # intervals of the freest structure are valid for any simpler structure, too.
 
 _DETERMINING_FRACTION: Final = 0.9
-"""Fraction of the sessions determining the structure of the lowest BIC that must determine a freer
-structure for it to be reported."""
+"""Smallest number of sessions that must determine the reported structure, as a fraction of those
+that determine the structure of the lowest BIC."""
 
 
 def freest_estimate(pooled_estimates: Sequence[PooledEstimate]) -> PooledEstimate | None:

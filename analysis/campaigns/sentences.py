@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 _DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
-"""Name of the damping whose order each parameter is."""
+"""Name of the damping that has each order."""
 _ORDER_NAMES: Final[tuple[OrderName, ...]] = ("alpha", "lambda")
 """Names of the orders of internal and of external damping."""
 _CLASSICAL_STRUCTURE: Final = "III"
@@ -107,7 +107,7 @@ def _order_clause(pooled_order: PooledOrder) -> str:
 
 
 def _value_and_half_width(pooled_order: PooledOrder) -> str | None:
-    """Return an order as "value ± half width of its interval", or None if not established."""
+    """Return "value ± half width of the interval" of an order, or None if the order is doubtful."""
     value, interval = pooled_order.value, pooled_order.interval
     if value is None or interval is None or pooled_order.reason is not None:
         return None
@@ -116,7 +116,7 @@ def _value_and_half_width(pooled_order: PooledOrder) -> str | None:
 
 
 def _slope_clause(pooled_order: PooledOrder) -> str:
-    """Describe how one loss grows with frequency over the visible modes, as a clause."""
+    """Describe how fast one loss grows with frequency, as a clause of a sentence."""
     loss_name = LOSS_NAMES[pooled_order.order]
     slope_text = _value_and_half_width(pooled_order)
     if slope_text is None:
@@ -172,12 +172,12 @@ def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[st
             loss_factor.size.std and loss_factor.size.interval_95
         ):
             continue
-        value_text, low, high_text = to_uncertainty(
+        value_text, low_text, high_text = to_uncertainty(
             (loss_factor.size.value, *loss_factor.size.interval_95), loss_factor.size.std
         )
         remark = f", {loss_factor.size.flag}" if loss_factor.size.flag else ""
         factor_texts.append(
-            f"{loss_factor.damping} {value_text} (95 %: {low} to {high_text}) at "
+            f"{loss_factor.damping} {value_text} (95 %: {low_text} to {high_text}) at "
             f"{loss_factor.omega_rad_s / (2 * np.pi):.3g} Hz{remark}"
         )
     return (
@@ -191,7 +191,7 @@ def describe_selection(
     ranked_estimates: Sequence[PooledEstimate],
     rival_estimates: Sequence[PooledEstimate],
     single_selections: Mapping[str, int],
-    sessions: int,
+    session_count: int,
 ) -> str:
     """Describe which damping structure all sessions together, and single sessions, select.
 
@@ -203,7 +203,7 @@ def describe_selection(
         Estimates whose BIC is not distinguishable from the lowest.
     single_selections : mapping of str to int
         Number of sessions that select each structure by themselves.
-    sessions : int
+    session_count : int
         Number of sessions.
     """
     lowest_bic_estimate = ranked_estimates[0]
@@ -220,13 +220,15 @@ def describe_selection(
             f" Next: type {ranked_estimates[1].name}, ΔBIC {bic_margin:.3g} (10 = decisive)."
         )
     selection_counts = {
-        f"type {structure_name}": session_count
-        for structure_name, session_count in single_selections.items()
+        f"type {structure_name}": selection_count
+        for structure_name, selection_count in single_selections.items()
     }
-    return f"{bic_sentence} {describe_single_sessions(selection_counts, sessions)}"
+    return f"{bic_sentence} {describe_single_sessions(selection_counts, session_count)}"
 
 
-def describe_residual(pooled_estimate: PooledEstimate, adequate_count: int, sessions: int) -> str:
+def describe_residual(
+    pooled_estimate: PooledEstimate, adequate_count: int, session_count: int
+) -> str:
     """Describe whether the residual of a damping structure's fit is noise.
 
     Parameters
@@ -235,7 +237,7 @@ def describe_residual(pooled_estimate: PooledEstimate, adequate_count: int, sess
         Pooled estimate of the structure.
     adequate_count : int
         Number of sessions whose residual is noise.
-    sessions : int
+    session_count : int
         Number of sessions.
     """
     if pooled_estimate.misfit > LARGEST_MISFIT:
@@ -243,45 +245,47 @@ def describe_residual(pooled_estimate: PooledEstimate, adequate_count: int, sess
             f"Its residual is {pooled_estimate.misfit:.3g} times the noise: no structure fitted "
             "describes the beam, and standard deviations are meaningless."
         )
-    return describe_noise_sessions(adequate_count, sessions)
+    return describe_noise_sessions(adequate_count, session_count)
 
 
-def describe_noise_sessions(adequate_count: int, sessions: int) -> str:
+def describe_noise_sessions(adequate_count: int, session_count: int) -> str:
     """State in how many sessions the residual of the fit is noise.
 
     Parameters
     ----------
     adequate_count : int
         Number of sessions whose residual is noise.
-    sessions : int
+    session_count : int
         Number of sessions.
     """
-    if adequate_count == sessions:
+    if adequate_count == session_count:
         return "The residual is noise in every session: the model suffices for these records."
     return (
-        f"The residual is noise in {adequate_count} of {sessions} sessions; in the others "
+        f"The residual is noise in {adequate_count} of {session_count} sessions; in the others "
         "something is unexplained."
     )
 
 
-def describe_modes(pooled_modes: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[str]:
+def describe_modes(
+    pooled_modes: Sequence[PooledMode], session_count: int, *, mixed: bool
+) -> list[str]:
     """Describe frequency and damping ratio of each mode.
 
     Parameters
     ----------
     pooled_modes : sequence of PooledMode
         Modes pooled over the sessions.
-    sessions : int
+    session_count : int
         Number of sessions.
     mixed : bool
         Whether the sessions are of several specimens.
     """
     if not pooled_modes:
         return []
-    t = student_t_quantile(0.95, sessions - 1)
+    t = student_t_quantile(0.95, session_count - 1)
     mode_clauses = "; ".join(_mode_clause(mode, t) for mode in pooled_modes)
-    of = "the sessions, a mixture" if mixed else "the sessions"
-    return [f"Modes: {mode_clauses} (± 95 % of the mean over {of})."]
+    sessions_text = "the sessions, a mixture" if mixed else "the sessions"
+    return [f"Modes: {mode_clauses} (± 95 % of the mean over {sessions_text})."]
 
 
 def describe_order(pooled_order: PooledOrder) -> str:
@@ -306,16 +310,16 @@ def describe_order(pooled_order: PooledOrder) -> str:
             f"{pooled_order.reason}.{sessions_text}"
         )
     half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
-    value_text, low, high_text = to_uncertainty(
+    value_text, low_text, high_text = to_uncertainty(
         (pooled_order.value, *pooled_order.interval), pooled_order.std or half_width
     )
     order_statement = (
         f"The order {order_name} of the {damping_name} is {value_text} "
-        f"(95 %: {low} to {high_text}, between-session variance included)"
+        f"(95 %: {low_text} to {high_text}, between-session variance included)"
     )
     if pooled_order.reason is not None:
-        would_be = order_statement.replace(" is ", " would be ", 1)
-        return f"{would_be}, but {pooled_order.reason}; do not interpret it.{sessions_text}"
+        conditional_text = order_statement.replace(" is ", " would be ", 1)
+        return f"{conditional_text}, but {pooled_order.reason}; do not interpret it.{sessions_text}"
     conclusion = {
         "compatible": "consistent with 1",
         "fractional": "1 is excluded",
@@ -342,8 +346,8 @@ def describe_welch_bias(
     withheld_orders : collection of str
         Orders that are not reported; their coefficients are not reported either.
     comparable : bool
-        Whether the sessions are of one specimen and a uniform beam predicts its modes. If not,
-        there is no reference for the Welch fits.
+        Whether the sessions are of one specimen whose modes a uniform beam predicts. If not, there
+        is no reference for the Welch fits.
     """
     if not comparable:
         return []
@@ -355,7 +359,9 @@ def describe_welch_bias(
     sentences = []
     for bias in best_model_biases or type_biases[:1]:
         significant_parameters = [
-            one for one in bias.significant_parameters if one.parameter not in omitted_parameters
+            parameter_bias
+            for parameter_bias in bias.significant_parameters
+            if parameter_bias.parameter not in omitted_parameters
         ]
         if not significant_parameters:
             continue
@@ -402,23 +408,25 @@ def _bias_clause(parameter_bias: ParameterBias) -> str:
 
 
 def describe_dissent(
-    sessions: Sequence[tuple[str, str]], lowest_bic_estimate: PooledEstimate
+    dissenting_sessions: Sequence[tuple[str, str]], lowest_bic_estimate: PooledEstimate
 ) -> list[str]:
     """List the sessions that alone exclude the damping structure selected by all together.
 
     Parameters
     ----------
-    sessions : sequence of tuple
+    dissenting_sessions : sequence of tuple
         File of each such session, and the structure that it selects.
     lowest_bic_estimate : PooledEstimate
         Estimate of the structure that all sessions select together.
     """
-    if not sessions:
+    if not dissenting_sessions:
         return []
-    session_texts = [f"{file_name} (type {structure})" for file_name, structure in sessions]
+    session_texts = [
+        f"{file_name} (type {structure})" for file_name, structure in dissenting_sessions
+    ]
     return [
-        f"Type {lowest_bic_estimate.name} is excluded by {len(sessions)} single "
-        f"session{'s' if len(sessions) > 1 else ''}: "
+        f"Type {lowest_bic_estimate.name} is excluded by {len(dissenting_sessions)} single "
+        f"session{'s' if len(dissenting_sessions) > 1 else ''}: "
         f"{first_few(session_texts)}. Check their reports (analyze --each) before relying on the "
         "mean."
     ]
@@ -457,7 +465,7 @@ def describe_scatter(pooled_estimate: PooledEstimate) -> str:
 
 
 def describe_prediction_errors(
-    pooled_estimate: PooledEstimate, validation: Sequence[LeaveOneOutResult], sessions: int
+    pooled_estimate: PooledEstimate, validation: Sequence[LeaveOneOutResult], session_count: int
 ) -> list[str]:
     """Describe how well a damping structure predicts a session from the other sessions.
 
@@ -467,7 +475,7 @@ def describe_prediction_errors(
         Estimate of the structure.
     validation : sequence of LeaveOneOutResult
         Errors of sessions predicted from the others.
-    sessions : int
+    session_count : int
         Number of sessions.
     """
     structure_errors = [
@@ -490,7 +498,9 @@ def describe_prediction_errors(
         else "the others predict a session worse than its own fit, as the parameters vary"
     )
     sessions_remark = (
-        f"; mean of {len(own_errors)} of {sessions} sessions" if len(own_errors) < sessions else ""
+        f"; mean of {len(own_errors)} of {session_count} sessions"
+        if len(own_errors) < session_count
+        else ""
     )
     return [
         f"Leave-one-out error of the torque {100 * mean_error:.2f} % rms (in-sample "
@@ -498,41 +508,44 @@ def describe_prediction_errors(
     ]
 
 
-def failed_predictions(lost_sessions: Sequence[FailedPrediction], requested: int) -> list[str]:
+def failed_predictions(
+    lost_sessions: Sequence[FailedPrediction], requested_count: int
+) -> list[str]:
     """List the sessions that could not be predicted from the others, with the reasons.
 
     Parameters
     ----------
     lost_sessions : sequence of FailedPrediction
         Sessions that were not predicted.
-    requested : int
+    requested_count : int
         Number of sessions that were to be predicted.
     """
     if not lost_sessions:
         return []
     reasons = [f"{lost_trial.path.name}: {lost_trial.reason}" for lost_trial in lost_sessions]
     return [
-        f"Of {requested} sessions to be predicted from the others, "
-        f"{requested - len(lost_sessions)} "
-        f"{'was' if requested - len(lost_sessions) == 1 else 'were'} and {len(lost_sessions)} "
+        f"Of {requested_count} sessions to be predicted from the others, "
+        f"{requested_count - len(lost_sessions)} "
+        f"{'was' if requested_count - len(lost_sessions) == 1 else 'were'} and "
+        f"{len(lost_sessions)} "
         f"{'was' if len(lost_sessions) == 1 else 'were'} not ({first_few(reasons, '; ')}). "
         "Prediction errors are averaged over those predicted."
     ]
 
 
-def describe_single_sessions(conclusion_counts: Mapping[str, int], sessions: int) -> str:
+def describe_single_sessions(conclusion_counts: Mapping[str, int], session_count: int) -> str:
     """State how many sessions by themselves reach each conclusion.
 
     Parameters
     ----------
     conclusion_counts : mapping of str to int
         Number of sessions by their conclusion, the most common first.
-    sessions : int
+    session_count : int
         Number of sessions.
     """
     (first_conclusion, first_count), *other_conclusions = conclusion_counts.items()
     other_texts = "".join(f", {conclusion} in {n}" for conclusion, n in other_conclusions)
-    return f"Single sessions: {first_conclusion} in {first_count} of {sessions}{other_texts}."
+    return f"Single sessions: {first_conclusion} in {first_count} of {session_count}{other_texts}."
 
 
 def _describe_damping(structure: str) -> str:
@@ -549,9 +562,9 @@ def _describe_damping(structure: str) -> str:
     return " and ".join(damping_texts)
 
 
-def _mode_clause(mode: PooledMode, t: float) -> str:
+def _mode_clause(mode: PooledMode, t_quantile: float) -> str:
     """Describe the frequency and the damping ratio of one mode."""
-    half_width = t * 100 * mode.damping_ratio_std
+    half_width = t_quantile * 100 * mode.damping_ratio_std
     decimal_digits = decimals(max(half_width, 1e-9))
     return (
         f"{mode.frequency_hz:.5g} Hz with a damping ratio of "

@@ -26,8 +26,8 @@ MIXTURE_NOTE: Final = (
 )
 """Footnote that explains `MIXTURE_MARK`."""
 _SLIGHT_FREQUENCY_SCATTER: Final = 2e-3
-"""Relative scatter of a frequency that one beam may show: ten kelvin change the stiffness of steel
-by 0.3 %."""
+"""Largest relative scatter of a frequency that a single beam may show: ten kelvin change the
+stiffness of steel by 0.3 %."""
 
 
 def specimens(homogeneity: Homogeneity) -> list[str]:
@@ -49,7 +49,7 @@ def title(text: str, homogeneity: Homogeneity) -> str:
     Parameters
     ----------
     text : str
-        Title without the mark.
+        Title without the addition.
     homogeneity : Homogeneity
         Whether the sessions are of one specimen.
     """
@@ -137,7 +137,7 @@ def _describe_heterogeneity(scatter: Heterogeneity) -> str:
 
 
 def _describe_groups(scatter: Heterogeneity) -> str:
-    """Describe the groups of sessions, or the sessions of lowest and highest value."""
+    """Describe the groups of sessions or, if there are none, the sessions with extreme values."""
     quantity_label, _, _ = label(scatter.quantity)
     values_by_file = {
         file_name: (session_value, std) for file_name, session_value, std in scatter.values
@@ -149,11 +149,11 @@ def _describe_groups(scatter: Heterogeneity) -> str:
             for group in scatter.groups
         )
         return f"By the {quantity_label} they are {len(scatter.groups)} groups: {groups_text}."
-    low, high = _extreme_sessions(scatter.values)
+    lowest_session, highest_session = _extreme_sessions(scatter.values)
     return (
         f"There are no clear groups: the {quantity_label} goes from "
-        f"{_mean_text([low[1]], scatter)} in {low[0]} "
-        f"to {_mean_text([high[1]], scatter)} in {high[0]}."
+        f"{_mean_text([lowest_session[1]], scatter)} in {lowest_session[0]} "
+        f"to {_mean_text([highest_session[1]], scatter)} in {highest_session[0]}."
     )
 
 

@@ -39,8 +39,8 @@ _PRESENCE_CHECK_INTERVAL_S: Final = 2.0
 """Interval in seconds at which the presence of worker processes is checked."""
 
 _MIN_LOST_TASKS: Final = 2
-"""Number of lost tasks, with none finished, from which the workers and not the tasks are at
-fault."""
+"""Number of lost tasks at which, if none has finished, the workers and not the tasks are at fault.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +83,13 @@ class Workers:
 
     _process_end_error: type[Exception] = BrokenExecutor
     """Exception by which the executor reports that the process of a task ended."""
-    _max_in_progress: int | None = None
-    """Most tasks in progress at once; the fewer, the fewer have to run again after a process
-    ended."""
+    _max_tasks_in_progress: int | None = None
+    """Largest number of tasks in progress at once, all of which may have to run again if a process
+    ends; None for no limit."""
     _failed_task_reason: str
     """Reason reported for a task whose process ended twice."""
     _no_workers_message: str | None = None
-    """Message of the error raised if no task survives; None: each lost task is reported by
-    itself."""
+    """Message of the error raised if all tasks are lost; None to report each task separately."""
 
     def __init__(self, executor: Executor) -> None:
         self._executor = executor
@@ -106,7 +105,7 @@ class Workers:
         Parameters
         ----------
         function : callable
-            Function that worker processes can import, as are its arguments and its result.
+            Function that worker processes can import; arguments and result must be picklable.
         arguments : sequence of tuple
             Arguments of each call.
         on_done : callable, optional
@@ -120,7 +119,7 @@ class Workers:
         Raises
         ------
         CampaignError
-            There are no workers any more.
+            All workers are lost.
         """
         task_results: dict[int, Result | FailedTask] = {}
 
@@ -162,15 +161,17 @@ class Workers:
     ) -> list[int]:
         """Run queued tasks until a worker process ends.
 
-        Return the indices of the tasks that its end interrupted; the list is empty if all tasks
-        ran.
+        Return the indices of the tasks that the end of the process interrupted; the list is empty
+        if all tasks finished.
         """
         in_progress: dict[Future[Result], int] = {}
         interrupted_tasks: list[int] = []
         last_seen_s = time.monotonic()
         while in_progress or (task_queue and not interrupted_tasks):
             while (
-                task_queue and not interrupted_tasks and len(in_progress) != self._max_in_progress
+                task_queue
+                and not interrupted_tasks
+                and len(in_progress) != self._max_tasks_in_progress
             ):
                 try:
                     in_progress[submit_task(task_queue[0])] = task_queue[0]
@@ -197,7 +198,7 @@ class Workers:
         """
 
     def _convert_errors(self) -> AbstractContextManager[None]:
-        """Convert other errors that mean the loss of all workers to `CampaignError`."""
+        """Convert an executor's own errors on the loss of all workers to `CampaignError`."""
         return nullcontext()
 
     def _check_presence(self, last_seen_s: float) -> float:
@@ -250,12 +251,12 @@ class _LocalWorkers(Workers):
 
     def __init__(self, jobs: int) -> None:
         super().__init__(_spawn_pool(jobs))
-        self._max_in_progress = jobs
+        self._max_tasks_in_progress = jobs
 
     def _replace_executor(self, *, alone: bool = False) -> None:
         """Start a new pool after a worker process ended, with a single process if `alone`."""
         self.close()
-        self._executor = _spawn_pool(1 if alone else self._max_in_progress)
+        self._executor = _spawn_pool(1 if alone else self._max_tasks_in_progress)
 
     def close(self, *, wait: bool = True) -> None:
         """Start no more tasks, and end the processes after their present tasks."""
@@ -336,7 +337,7 @@ def dask_cluster(address: str) -> Iterator[Workers]:
 
 @contextmanager
 def _suppress_dask_messages() -> Iterator[None]:
-    """Suppress Dask's own messages on failures and different versions, which are reported here."""
+    """Suppress Dask's messages on failures and different versions, as this module reports them."""
     log = logging.getLogger("distributed.client")
     log_level = log.level
     log.setLevel(logging.CRITICAL)
@@ -365,7 +366,8 @@ def _check_scheduler(address: str) -> None:
 class _DaskWorkers(Workers):
     """Workers of a Dask cluster.
 
-    The scheduler repeats a task at another worker if its worker ended, and drops it after several.
+    The scheduler repeats a task at another worker if its worker ended, and drops the task after
+    several workers ended.
     """
 
     _failed_task_reason = (
@@ -425,7 +427,7 @@ def _import_distributed() -> Any:  # noqa: ANN401 - Dask has no types
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the packages on which results and the exchange of objects depend."""
+    """Return the versions of the packages that must agree between this process and the workers."""
     import numpy as np
 
     import rigd
@@ -438,7 +440,7 @@ def versions() -> dict[str, str]:
 
 
 def _check_workers(client: Any, address: str) -> None:  # noqa: ANN401 - Dask has no types
-    """Raise if a cluster has no workers, or a worker lacks this package or its versions."""
+    """Raise if a cluster has no workers, or a worker lacks the versions installed here."""
     try:
         client.wait_for_workers(1, timeout=_FIRST_WORKER_TIMEOUT_S)
     except TimeoutError as error:

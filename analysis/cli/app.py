@@ -19,7 +19,7 @@ import rigd
 from analysis.cli.exchange import IMPORT_EPILOG, export_app, import_command
 from analysis.cli.sessions import (
     NoSessionsError,
-    Outputs,
+    OutputOptions,
     latest_session,
     session_command,
     session_files,
@@ -52,13 +52,13 @@ if TYPE_CHECKING:
 DEFAULT_COMMAND: Final = "default"
 """Name of the command that runs if the first argument is not the name of a command."""
 _COMPLETION_OPTIONS: Final = (["--install-completion"], ["--show-completion"])
-"""Options of the group, which Typer adds to it."""
+"""Options that Typer adds to the command group."""
 
 
 class DefaultCommandGroup(TyperGroup):
     """Command group whose default command runs if the first argument names no command.
 
-    Usage, help and errors of the default command are then those of a command without subcommands.
+    Its usage, help and errors then read as if the program were a single command.
     """
 
     # Some versions of Typer contain their own click, others use the package click, so the type of
@@ -83,7 +83,7 @@ class DefaultCommandGroup(TyperGroup):
             return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
 
 
-class CommandWithOthers(TyperCommand):
+class DefaultCommand(TyperCommand):
     """Default command, whose help also lists the other commands."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
@@ -98,7 +98,7 @@ class CommandWithOthers(TyperCommand):
 
 
 def _names_of_added_structures() -> list[tuple[str, str]]:
-    """Return name and package of each damping structure that a package adds; none is imported."""
+    """Return name and package of each damping structure of packages, without importing them."""
     from rigd.plugins import installed_plugins
 
     return [
@@ -197,7 +197,7 @@ def _suppress_library_warnings() -> None:
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
-@app.command(DEFAULT_COMMAND, epilog=_HELP_EPILOG, cls=CommandWithOthers)
+@app.command(DEFAULT_COMMAND, epilog=_HELP_EPILOG, cls=DefaultCommand)
 def analyze(
     context: typer.Context,
     files: Annotated[
@@ -387,7 +387,7 @@ def analyze(
         )
     _check_part(from_s, to_s, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
-    run_routes = AnalysisOptions(
+    options = AnalysisOptions(
         settings,
         paper=method != "record",
         whole_record=method != "welch",
@@ -398,14 +398,14 @@ def analyze(
         structures=_added_structures(structure),
         part_s=None if from_s is None and to_s is None else (from_s, to_s),
     )
-    output_options = Outputs(report, json, overwrite, verbose)
+    output_options = OutputOptions(report, json, overwrite, verbose)
     try:
         if json is not None and not output_options.json_to_stdout:
             check_new_file(json, "--json", overwrite=overwrite)
         if rerun is not None:
             _check_rerun(rerun, files)
         if not is_campaign:
-            exit_code = session_command(files, run_routes, output_options, rerun)
+            exit_code = session_command(files, options, output_options, rerun)
         else:
             from analysis.campaigns import CampaignError, SingleSessionError
             from analysis.cli.campaign import campaign_command
@@ -419,12 +419,12 @@ def analyze(
             try:
                 exit_code = campaign_command(
                     files, settings, output_options,
-                    structures=tuple(STRUCTURES) if run_routes.whole_record else (),
-                    fixed=run_routes.fixed, band_hz=run_routes.band_hz, jobs=jobs, dask=dask,
-                    uniformity=run_routes.uniformity, with_paper=paper, formats=run_routes.figures,
+                    structures=tuple(STRUCTURES) if options.whole_record else (),
+                    fixed=options.fixed, band_hz=options.band_hz, jobs=jobs, dask=dask,
+                    uniformity=options.uniformity, with_paper=paper, formats=options.figures,
                 )  # fmt: skip
             except SingleSessionError as single:
-                exit_code = _report_single_session(single, run_routes, output_options)
+                exit_code = _report_single_session(single, options, output_options)
             except CampaignError as error:
                 print_error(str(error))
                 exit_code = 1
@@ -475,10 +475,10 @@ def _check_part(from_s: float | None, to_s: float | None, *, is_campaign: bool) 
 
 
 def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
-    """Check the options of an analysis by whole-record fits alone.
+    """Check the other options if --method selects only the whole-record fits.
 
     Raise a usage error for a campaign, which needs Welch fits. Otherwise print a warning if options
-    of the Welch fits are given, as these have no effect.
+    of the Welch fits are given, which then have no effect.
     """
     if is_campaign:
         raise typer.BadParameter(
@@ -505,7 +505,7 @@ def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
 
 
 def _report_single_session(
-    single_session_error: SingleSessionError, routes: AnalysisOptions, outputs: Outputs
+    single_session_error: SingleSessionError, options: AnalysisOptions, outputs: OutputOptions
 ) -> int:
     """Print the errors of a campaign's unusable files, and report its only usable session."""
     for failure in single_session_error.failures:
@@ -515,7 +515,7 @@ def _report_single_session(
     )
     other_errors = {str(failure.path): failure.message for failure in single_session_error.failures}
     return max(
-        1, session_command([single_session_error.path], routes, outputs, others=other_errors)
+        1, session_command([single_session_error.path], options, outputs, other_errors=other_errors)
     )
 
 
@@ -554,7 +554,7 @@ def _added_structures(option_text: str) -> tuple[AddedStructure, ...]:
 
 
 def _relative_uniformity(uniformity_percent: float) -> float:
-    """Return the uniformity as a fraction; raise a usage error outside its range."""
+    """Return the uniformity of the beam as a fraction; raise a usage error if not in its range."""
     from analysis.record_checks import MAX_UNIFORMITY_PERCENT
 
     if not 0.0 <= uniformity_percent <= MAX_UNIFORMITY_PERCENT:
@@ -583,7 +583,7 @@ def _figure_formats(option_text: str) -> tuple[FigureFormat, ...]:
 def _check_rerun(rerun_file: Path, files: Sequence[Path]) -> None:
     """Raise a usage error if --rerun is given with several sessions.
 
-    Raise the error of `check_new_file` if its file already exists.
+    Raise the error of `check_new_file` if the file of --rerun already exists.
     """
     from analysis.report import check_rerun_file
     from rigd.extras import MissingExtraError, require_extra

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from analysis.campaigns import CampaignResult
-    from analysis.cli.sessions import Outputs
+    from analysis.cli.sessions import OutputOptions
     from analysis.identify import Setting
     from analysis.models import WelchSettings
     from analysis.results import FigureFormat
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 _DEFAULT_NAME: Final = "campaign"
 """Default name of a campaign, for its report folder."""
 _MAX_FIGURES: Final = 8
-"""Largest number of figures, for the progress bar; each takes about half as long as a session."""
+"""Number of progress steps for drawing: the largest number of a campaign's figures."""
 
 
 def campaign_command(
     files: Sequence[Path],
     settings: WelchSettings,
-    outputs: Outputs,
+    outputs: OutputOptions,
     *,
     structures: Sequence[str],
     fixed: Sequence[Setting] = (),
@@ -46,13 +46,13 @@ def campaign_command(
         Session files.
     settings : WelchSettings
         Settings of the Welch fits.
-    outputs : Outputs
+    outputs : OutputOptions
         Files to be written. The default report folder is ``campaign.report`` next to the first
         file, or ``campaign.report-2`` and so on if that exists.
     structures : sequence of str
         Structures fitted to the whole records.
     fixed : sequence of str
-        Parameters that the whole-record fits take from the files.
+        Parameters of beam and rig that stay at the files' values in the whole-record fits.
     band_hz : tuple of float, optional
         Frequency band of all fits; by default chosen for each record.
     jobs : int, optional
@@ -88,12 +88,12 @@ def campaign_command(
 
     folder_source = files[0] if outputs.report is not None else files[0].with_name(_DEFAULT_NAME)
     (report_folder,) = report_folders([folder_source], outputs.report, overwrite=outputs.overwrite)
-    run = partial(
+    run_campaign = partial(
         campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
         dask=dask, uniformity=uniformity,
     )  # fmt: skip
     campaign_result = _analyse_and_write(
-        run, len(files), report_folder, outputs, with_paper=with_paper, formats=formats
+        run_campaign, len(files), report_folder, outputs, with_paper=with_paper, formats=formats
     )
     text_lines = [f"Report of the campaign: {report_folder / 'report.html'}"]
     if outputs.json is not None and not outputs.json_to_stdout:
@@ -111,10 +111,10 @@ def campaign_command(
 
 
 def _analyse_and_write(
-    run: Callable[..., CampaignResult],
+    run_campaign: Callable[..., CampaignResult],
     file_count: int,
     report_folder: Path,
-    outputs: Outputs,
+    outputs: OutputOptions,
     *,
     with_paper: bool,
     formats: Sequence[FigureFormat],
@@ -134,7 +134,7 @@ def _analyse_and_write(
             )
 
         with new_folder(report_folder, overwrite=outputs.overwrite) as partial_folder:
-            campaign_result = run(on_progress=on_progress)
+            campaign_result = run_campaign(on_progress=on_progress)
             if len(campaign_result.sessions) == 1:
                 raise SingleSessionError(campaign_result.sessions[0].path, campaign_result.failures)
             write_campaign(

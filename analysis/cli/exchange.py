@@ -408,7 +408,7 @@ def _parse_order(option_text: str) -> int | None:
 
 
 def _parse_rate(option_text: str) -> float | None:
-    """Return the rate in Hz in --rate, or None for continuous; raise if invalid."""
+    """Return the sampling rate of --rate in Hz, or None for continuous time; raise if invalid."""
     if option_text == "continuous":
         return None
     try:
@@ -431,7 +431,7 @@ _RATE_RANGE_HZ: Final = (1.0, 1e6)
 
 
 def _exit_code(run_command: Callable[[], None]) -> int:
-    """Run a command's function, print its error if it raises one, and return the exit code."""
+    """Run the function of a command; print an error that it raises, and return the exit code."""
     from numpy.linalg import LinAlgError
 
     from analysis.exchange import ExchangeError, TargetError
@@ -464,7 +464,7 @@ def _exit_code(run_command: Callable[[], None]) -> int:
 
 
 def _parse_channel(option: str, option_text: str, quantity: str) -> ChannelChoice:
-    """Return the channel and unit of an option; raise a usage error for an invalid text."""
+    """Return the channel and unit in an option's text; raise a usage error if it is invalid."""
     from analysis.exchange import ExchangeError, parse_choice
 
     try:
@@ -474,11 +474,11 @@ def _parse_channel(option: str, option_text: str, quantity: str) -> ChannelChoic
 
 
 _LATEST_END_S: Final = 1e6
-"""Latest end of a segment in seconds, more than the duration of any record that is read."""
+"""Latest end of a segment in seconds: longer than any record that can be imported."""
 
 
 def _parse_interval(option: str, option_text: str) -> tuple[float, float]:
-    """Return begin and end of a segment in seconds, from an option; raise if invalid."""
+    """Return begin and end of a segment in seconds from an option's text; raise if invalid."""
     try:
         begin_s, end_s = (float(number_text) for number_text in option_text.split(","))
     except ValueError:

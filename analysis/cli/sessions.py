@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 _TEXT_WIDTH_CHARACTERS: Final = 120
 """Width in characters of texts that are printed to a file or a pipe."""
 _STEPS_PER_FIGURE: Final = 4
-"""Approximate duration of drawing a figure relative to another step, for the progress bar."""
+"""Number of progress steps of a figure, which takes about as long as this many other steps."""
 
 
 class NoSessionsError(ValueError):
-    """Error on a folder that contains no session."""
+    """Error if a folder contains no session."""
 
 
 @dataclass(frozen=True, slots=True)
-class Outputs:
-    """Options of a command on the files to be written and the tables to be printed.
+class OutputOptions:
+    """Options of a command that select the files to be written and the tables to be printed.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Outputs:
         return self.json is not None and str(self.json) == "-"
 
     def console(self) -> Console:
-        """Return the console for texts, with a fixed width unless it is a terminal."""
+        """Return the console to which texts are printed: of fixed width unless a terminal."""
         from rich.console import Console
 
         console = Console(stderr=self.json_to_stdout, highlight=False)
@@ -136,10 +136,10 @@ def latest_session(folder: Path = Path("sessions")) -> Path:
 
 def session_command(
     files: Sequence[Path],
-    routes: AnalysisOptions,
-    outputs: Outputs,
+    options: AnalysisOptions,
+    outputs: OutputOptions,
     rerun: Path | None = None,
-    others: Mapping[str, str] | None = None,
+    other_errors: Mapping[str, str] | None = None,
 ) -> int:
     """Analyse the files one after the other, write a report of each, and print the tables.
 
@@ -147,15 +147,16 @@ def session_command(
     ----------
     files : sequence of Path
         Session files.
-    routes : AnalysisOptions
+    options : AnalysisOptions
         Analyses to be run, and their settings.
-    outputs : Outputs
+    outputs : OutputOptions
         Files to be written. The report folder contains the report of a single file, or one folder
         for each of several files.
     rerun : Path, optional
         New file with the session and its fits for Rerun's viewer; for a single session.
-    others : mapping of str to str, optional
-        Messages by the names of files that could not be used, for the errors in the results.
+    other_errors : mapping of str to str, optional
+        Error messages of further files that could not be used, by file name. They are added to the
+        errors in the JSON results.
 
     Returns
     -------
@@ -171,15 +172,15 @@ def session_command(
     from analysis.report.folder import report_folders, write_new
 
     folders = report_folders(files, outputs.report, overwrite=outputs.overwrite)
-    record_results, errors, exit_code = _analyse_all(files, folders, routes, rerun, outputs)
+    record_results, errors, exit_code = _analyse_all(files, folders, options, rerun, outputs)
     if not record_results:
         return exit_code
-    results_document = document(record_results, {**(others or {}), **errors})
+    results_document = document(record_results, {**(other_errors or {}), **errors})
     if outputs.json is not None and not outputs.json_to_stdout:
         # The file is written before any output, because the streams may be closed.
         write_new(outputs.json, document_text(results_document), overwrite=outputs.overwrite)
     console = outputs.console()
-    _print_tables(console, record_results, single=len(files) == 1, verbose=outputs.verbose)
+    _print_tables(console, record_results, is_single_file=len(files) == 1, verbose=outputs.verbose)
     if outputs.json_to_stdout:
         typer.echo(document_text(results_document, ascii_only=True), nl=False)
     elif outputs.json is not None:
@@ -197,7 +198,7 @@ def session_command(
 
 
 def _print_tables(
-    console: Console, record_results: Sequence[RecordResult], *, single: bool, verbose: bool
+    console: Console, record_results: Sequence[RecordResult], *, is_single_file: bool, verbose: bool
 ) -> None:
     """Print the tables of a single file, or a summary of several files."""
     from analysis.report import result_text, shown_warnings, summary_table, warning_lines
@@ -205,7 +206,7 @@ def _print_tables(
     welch_results = [
         record_result for record_result in record_results if record_result.welch is not None
     ]
-    if single:
+    if is_single_file:
         for record_result in record_results:
             console.print(result_text(record_result, verbose=verbose))
     elif not welch_results:
@@ -230,13 +231,13 @@ def _print_tables(
 def _analyse_all(
     files: Sequence[Path],
     folders: Sequence[Path],
-    routes: AnalysisOptions,
+    options: AnalysisOptions,
     rerun_file: Path | None,
-    outputs: Outputs,
+    outputs: OutputOptions,
 ) -> tuple[list[RecordResult], dict[str, str], int]:
     """Analyse and report each file; return results, error messages by file, and exit code.
 
-    Warnings of several files are printed after the last one, each once.
+    With several files, their warnings are printed after the last file, each warning once.
     """
     from numpy.linalg import LinAlgError
 
@@ -257,7 +258,7 @@ def _analyse_all(
         def warn_now(warning_text: str) -> None:
             print_message(f"Warning: {warning_text}")
 
-        step_count = _count_steps(routes, rerun_file)
+        step_count = _count_steps(options, rerun_file)
         progress_task = file_progress.add_task("", total=len(files) * step_count)
         for file_number, (session_file, report_folder) in enumerate(
             zip(files, folders, strict=True), start=1
@@ -274,7 +275,7 @@ def _analyse_all(
                     _analyse_file(
                         session_file,
                         report_folder,
-                        routes,
+                        options,
                         rerun_file,
                         on_step,
                         file_warnings[file_number - 1].append if len(files) > 1 else warn_now,
@@ -313,16 +314,16 @@ def _error_message(session_file: Path, error: Exception) -> str:
     return str(error)
 
 
-def _count_steps(routes: AnalysisOptions, rerun_file: Path | None) -> int:
+def _count_steps(options: AnalysisOptions, rerun_file: Path | None) -> int:
     """Return the number of progress steps of the analysis of one file."""
     from analysis.report import FIGURES as RECORD_FIGURES
     from analysis.report.record_report import welch_figure_names
 
     figure_names = welch_figure_names(
-        with_paper_figures=routes.paper, has_whole_record=routes.whole_record
+        with_paper_figures=options.paper, has_whole_record=options.whole_record
     )
     figure_count = (
-        len(figure_names) + routes.whole_record * len(RECORD_FIGURES) + (rerun_file is not None)
+        len(figure_names) + options.whole_record * len(RECORD_FIGURES) + (rerun_file is not None)
     )
     return 2 + _STEPS_PER_FIGURE * figure_count  # reading, and all fits
 
@@ -330,7 +331,7 @@ def _count_steps(routes: AnalysisOptions, rerun_file: Path | None) -> int:
 def _analyse_file(
     session_file: Path,
     report_folder: Path,
-    routes: AnalysisOptions,
+    options: AnalysisOptions,
     rerun_file: Path | None,
     on_step: Callable[[str], None],
     warn: Callable[[str], None],
@@ -342,9 +343,9 @@ def _analyse_file(
     from analysis.report.record_report import write_report
     from analysis.results import record_result
 
-    file_result = record_result(session_file, routes, on_step=on_step, warn=warn)
+    file_result = record_result(session_file, options, on_step=on_step, warn=warn)
     with new_folder(report_folder, overwrite=overwrite) as partial_folder:
-        write_report(file_result, partial_folder, on_step, formats=routes.figures)
+        write_report(file_result, partial_folder, on_step, formats=options.figures)
     if rerun_file is not None:
         from analysis.report import write_rerun_file
 

@@ -29,7 +29,7 @@ def print_error(message: str) -> None:
 
 
 def print_readable(console: Console, message: str) -> None:
-    """Print a message about a file above the progress bar."""
+    """Print a message to a console above its progress bar, with control characters escaped."""
     console.print(readable_message(message), markup=False, soft_wrap=True)
 
 
@@ -85,7 +85,7 @@ def standard_streams() -> Iterator[None]:
 
 
 def _pipe_tolerant_stream(stream: io.TextIOWrapper) -> io.TextIOWrapper:
-    """Return a text stream on the same descriptor that ignores a closed pipe."""
+    """Return a text stream to the same file descriptor that ignores a closed pipe."""
     stream.flush()
     raw: io.RawIOBase = _PipeTolerantDescriptor(stream.fileno(), "wb", closefd=False)
     return io.TextIOWrapper(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from analysis.cli.sessions import NoSessionsError, Outputs, session_files
+from analysis.cli.sessions import NoSessionsError, OutputOptions, session_files
 from analysis.cli.standard_streams import print_error, print_readable
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def touch_command(
     )
     from rigd.identified_beam import IdentifiedBeamError
 
-    output_options = Outputs(report, json)
+    output_options = OutputOptions(report, json)
     try:
         files = session_files(files)
         if json is not None and not output_options.json_to_stdout:
@@ -80,7 +80,7 @@ def touch_command(
     raise typer.Exit(exit_code)
 
 
-def _run_analysis(files: Sequence[Path], model_file: Path | None, outputs: Outputs) -> int:
+def _run_analysis(files: Sequence[Path], model_file: Path | None, outputs: OutputOptions) -> int:
     """Analyse the files, print and write the results, and return the exit code."""
     from analysis.report import document_text
     from analysis.report.folder import new_folder, write_new

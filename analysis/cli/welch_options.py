@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from analysis.models import WelchSettings
 
 _MAX_NFFT_SAMPLES: Final = 2**22
-"""Longest FFT in samples: 26 times the paper's, which takes seconds and a few 100 MB."""
+"""Longest FFT in samples, which takes seconds and a few 100 MB; the paper's is 26 times shorter."""
 
 
 _ChoiceName = TypeVar("_ChoiceName", bound=str)
@@ -98,7 +98,7 @@ def welch_settings(
 def parse_option_choice(
     option_text: str, choices: Sequence[_ChoiceName], option_name: str
 ) -> _ChoiceName:
-    """Return the choice that a text names, ignoring case; raise a usage error for others."""
+    """Return the choice that a text names, ignoring case; raise a usage error if it names none."""
     for candidate in choices:
         if candidate == option_text.lower():
             return candidate
@@ -156,7 +156,7 @@ def _parse_weightings(option_text: str) -> tuple[str, ...]:
 
 
 def _split_list(list_text: str) -> tuple[str, ...]:
-    """Return the different names in a comma-separated list, in their order."""
+    """Return the names in a comma-separated list in their order, each once."""
     return tuple(
         dict.fromkeys(
             list_entry.strip() for list_entry in list_text.split(",") if list_entry.strip()

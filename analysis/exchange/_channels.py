@@ -84,7 +84,7 @@ def canonical_unit(unit_text: str) -> str | None:
 
 
 def unit_factor(quantity: str, unit: str) -> float:
-    """Return the size of a unit of a quantity in the base unit: rad, N·m, N or s.
+    """Return the size of a unit of a quantity in the base unit of the quantity: rad, N·m, N or s.
 
     Parameters
     ----------
@@ -118,14 +118,14 @@ def unit_factor(quantity: str, unit: str) -> float:
 
 
 def stated_unit(unit: str) -> str:
-    """Return a unit as spelled in `UNIT_SIZES`, with its number unless this is 1."""
+    """Return a unit as spelled in `UNIT_SIZES`, preceded by its number if this is not 1."""
     unit_count, stated_name = _split_number(unit)
     unit_name = canonical_unit(stated_name) or stated_name
     return unit_name if unit_count == 1.0 else f"{unit_count!r} {unit_name}"
 
 
 def unit_in_brackets(channel_name: str) -> str | None:
-    """Return the unit in brackets after a name, as in ``Angle [deg]``; None without one."""
+    """Return the unit in brackets after a name, as in ``Angle [deg]``, or None."""
     bracket_match = _BRACKETS_PATTERN.search(channel_name)
     return canonical_unit(bracket_match[1]) if bracket_match else None
 
@@ -258,23 +258,22 @@ def parse_choice(text: str, quantity: str) -> ChannelChoice:
 # Time base
 
 MAX_JITTER: Final = 0.1
-"""Largest distance of a time stamp from its tick, in sample periods. A larger distance makes the
-sample's position doubtful."""
+"""Largest permitted distance of a time stamp from its tick, in sample periods. Beyond it, the tick
+of the sample is doubtful."""
 
 MAX_TICKS_PER_SAMPLE: Final = 10
-"""Largest number of ticks per sample, as for the analysis: beyond it, most of the record is
+"""Largest permitted ratio of ticks to samples, as in the analysis: beyond it, most samples are
 missing."""
 
 MAX_GAP_FRACTION: Final = 0.05
-"""Largest fraction of the steps between samples that are longer than one tick. With more such
-steps, the times are too coarse to determine the rate, as milliseconds are for a record at 700
-Hz."""
+"""Largest permitted fraction of the steps between samples that are longer than one tick. With more,
+the times are too coarse to determine the rate, as whole milliseconds are at 700 Hz."""
 
 RATE_RANGE_HZ: Final = (0.1, 1e6)
 """Lowest and highest sampling rate of a session."""
 
 _RATE_DIGITS: Final = 9
-"""Digits to which time stamps determine a rate: 1000.0000000002 is read as 1000."""
+"""Number of digits to which a rate from time stamps is rounded: 1000.0000000002 becomes 1000."""
 
 
 @dataclass(frozen=True, slots=True)

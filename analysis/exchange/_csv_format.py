@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 # Reading
 
 
-def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read columns from a text file (see `analysis.exchange.read_source`).
 
     A column is named by its title, or by its number: ``#3`` is the third. An empty cell is NaN.
     """
     try:
         with path.open("rb") as stream:
-            table = read_table(stream, names, max_rows=MAX_SAMPLES)
+            table = read_table(stream, channel_names, max_rows=MAX_SAMPLES)
     except TableError as error:
         raise ExchangeError(f"{path}: {error}") from error
     file_times = None

@@ -79,8 +79,8 @@ def export_frf(
 ) -> ExportTable:
     """Write the estimated frequency response of a session to a file for another program.
 
-    It is the response that an analysis with the same settings and band fits. The function raises
-    the errors of `export_record` and those of the estimate.
+    An analysis with the same settings and band fits the same response. The function raises the
+    errors of `export_record` and those of the estimate.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Comparison of a file's statements (units, rate, times, starts, scales) with the user's.
+"""Comparison of what a file states (units, rate, times, starts, scales) with the import plan.
 
 A contradiction raises an error that quotes both statements. With `ImportPlan.ignore_file_metadata`
 the user's statement is used, and the contradiction becomes a warning and part of the session's
@@ -35,15 +35,15 @@ IGNORE_OPTION: Final = "--ignore-file-metadata"
 """Option by which the user's statements override the file's."""
 
 _RATE_TOLERANCE: Final = 2e-5
-"""Largest relative difference between the rate stated by the user and the file's; UFF58 has six
-digits."""
+"""Largest relative difference between the file's rate and the user's that is no contradiction;
+UFF58 files state six digits."""
 
 _COARSE_TOLERANCE: Final = 1e-3
-"""Largest relative difference between the stated rate and the rate of times that have too few
-digits for a time base."""
+"""Largest relative difference that is no contradiction between the user's rate and that of times
+with too few digits for a time base."""
 
 _DEFAULT_RATE_HZ: Final = 1.0
-"""Rate that LabVIEW and other programs write if none was given."""
+"""Sampling rate that LabVIEW and other programs write if the user has given them none."""
 
 _TIME_UNITS_S: Final = (1.0, 1e-3, 1e-6, 1e-9)
 """Units in seconds that times without a stated unit may have."""
@@ -54,7 +54,7 @@ _NO_UNIT_TEXTS: Final = ("", "NONE", "none", "-")
 """Texts by which files state that a channel has no unit."""
 
 _REPORTED_SHIFT: Final = 0.01
-"""Shift between channels, in sample periods, below which it is not reported."""
+"""Smallest time shift between channels that is reported, in sample periods."""
 
 
 def plan_timebase(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
@@ -88,7 +88,7 @@ class FileStatements:
     ignored: list[str] = field(default_factory=list)
 
     def report_contradiction(self, statement: str, remedy: str) -> None:
-        """Raise an error on a contradiction, or record that the plan overrides the file."""
+        """Raise an error for a contradiction, or record that the plan overrides the file."""
         if not self.plan.ignore_file_metadata:
             raise ExchangeError(
                 f"{self.path}: {statement}; {remedy}, or let your options count with "
@@ -103,7 +103,7 @@ class FileStatements:
         Raises
         ------
         ExchangeError
-            If the file clearly states another unit.
+            If the file states another unit than the user, and the plan does not override it.
         """
         for choice in self.plan.choices:
             unit_label = channels[choice.channel].unit_label.strip()
@@ -129,7 +129,7 @@ class FileStatements:
                 )
 
     def check_scales(self, channels: Mapping[str, SourceChannel]) -> None:
-        """Raise if the file states a scale that could not be applied to the values."""
+        """Report a contradiction if the file states a scale that could not be applied."""
         for name, channel in channels.items():
             if channel.unapplied_scale:
                 self.report_contradiction(
@@ -139,12 +139,12 @@ class FileStatements:
                 )
 
     def timebase(self, channels: Mapping[str, SourceChannel]) -> Timebase:
-        """Return the time base, after comparing it with rate and times in the file.
+        """Return the time base after comparing it with the rate and the times that the file states.
 
         Raises
         ------
         ExchangeError
-            If the times are no time base, or the file states another rate than the user.
+            If the times give no uniform time base, or the file states another rate than the user.
         """
         time_choice = self.plan.time
         timebase = plan_timebase(self.path, self.plan, channels)
@@ -164,7 +164,7 @@ class FileStatements:
     def _report_rate_difference(
         self, source_name: str, file_rate_hz: float, rate_hz: float
     ) -> None:
-        """Warn of a rate in the file that differs from the one used, or raise an error."""
+        """Report that the file states another rate than the one used, as a warning or an error."""
         time_choice = self.plan.time
         statement = f"the file says that '{source_name}' was sampled at {file_rate_hz:.6g} Hz"
         is_default = file_rate_hz == _DEFAULT_RATE_HZ
@@ -228,8 +228,7 @@ class FileStatements:
             float(np.median(time_steps[time_steps > 0.0])) if (time_steps > 0.0).any() else 0.0
         )
         if (time_steps == 0.0).any() and any(
-            abs(rate_hz * typical_step * best_unit_s - 1) < _COARSE_TOLERANCE
-            for best_unit_s in units_s
+            abs(rate_hz * typical_step * unit_s - 1) < _COARSE_TOLERANCE for unit_s in units_s
         ):
             self.report_contradiction(
                 f"the time {times_name} of sample {int(np.argmax(time_steps == 0.0)) + 2} is that "
@@ -278,13 +277,13 @@ class FileStatements:
         channels : mapping of str to SourceChannel
             Channels of equal length.
         delays_s : mapping of str to float
-            Age in seconds of each channel's values relative to the angle of the same index: the
-            remainder after cutting whole samples.
+            Time in seconds by which each channel's values are older than the angle of the same
+            index: the fraction of a sample period that remains after cutting whole samples.
 
         Raises
         ------
         ExchangeError
-            If the channels have no common interval, or different lengths without a reason.
+            If the channels have no common interval, or different lengths but the same start.
         """
         time_choice, plan = self.plan.time, self.plan
         starts_ns = {n: c.start_ns for n, c in channels.items() if c.start_ns is not None}
@@ -367,16 +366,16 @@ class FileStatements:
         delays_s: Mapping[str, float],
         rate_hz: float,
     ) -> None:
-        """Warn of cut samples and added delays; raise if a channel cannot have a delay."""
+        """Warn of cut samples and of added delays; raise if a delay cannot be stored."""
         channels_with_delay = {
             self.plan.channels[name].channel for name in ("angle_rad", "coupling_torque_nm")
         }
         for name, delay_s in delays_s.items():
-            rest_s = abs(delay_s) * rate_hz
+            shift = abs(delay_s) * rate_hz
             is_time = self.plan.time is not None and name == self.plan.time.channel
-            if rest_s > MAX_JITTER and name not in channels_with_delay and not is_time:
+            if shift > MAX_JITTER and name not in channels_with_delay and not is_time:
                 self.report_contradiction(
-                    f"{statement}, and '{name}' lies {rest_s:.2g} periods between the samples "
+                    f"{statement}, and '{name}' lies {shift:.2g} periods between the samples "
                     "of the "
                     "angle",
                     "leave this channel out: no analysis needs it",
@@ -399,14 +398,13 @@ class FileStatements:
 
 
 _EARLIEST_DATE_NS: Final = 10**17
-"""Times in ns above this value (from 1973 on) are dates; smaller ones are relative to the
-record."""
+"""Smallest time in ns that is a date (from 1973 on); smaller ones are relative to the record."""
 
 
 def _time_text(time_ns: int) -> str:
-    """Format a start time in nanoseconds.
+    """Format a start time in nanoseconds: as a date if it counts from 1970, else in seconds.
 
-    It is shown as a date if it counts from 1970, and in seconds if it is an offset.
+    Times below `_EARLIEST_DATE_NS` are offsets, which do not count from 1970.
     """
     if abs(time_ns) < _EARLIEST_DATE_NS:
         return f"{time_ns / 1e9:.9g} s"

@@ -22,8 +22,8 @@ class ImportPlan:
     Attributes
     ----------
     channels : mapping of str to ChannelChoice
-        Channel and unit by the field of a sample (`analysis.exchange.QUANTITIES`). The fields in
-        `REQUIRED_FIELDS` must be present.
+        Channel and unit for each field of a sample (key of `analysis.exchange.QUANTITIES`). The
+        fields in `REQUIRED_FIELDS` must be present.
     specimen : SpecimenFile
         Beam and clamp.
     time : ChannelChoice, optional
@@ -31,10 +31,10 @@ class ImportPlan:
     rate_hz : float, optional
         Sampling rate of a record without gaps; required if `time` is not given.
     segments_s : mapping of str to (float, float)
-        Begin and end, in seconds after the first sample, by the segment's name: rest, sweep or
+        Start and end, in seconds after the first sample, by the segment's name: rest, sweep or
         ring_down.
     angle_delay_s, torque_delay_s : float
-        Age of the angle and of the torque at their time stamps.
+        Time by which the angle and the torque lag their time stamps.
     reverse_torque : bool
         Whether the sign of the coupling torque is reversed, because the sensor measures the
         reaction.

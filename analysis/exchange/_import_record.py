@@ -61,7 +61,7 @@ class ImportedRecord:
 
 
 _REPORTED_JITTER: Final = 0.01
-"""Distance of a time stamp from its tick, in sample periods, above which it is reported."""
+"""Distance of a time stamp from its tick, in sample periods, above which the user is warned."""
 
 
 def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecord:
@@ -104,7 +104,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     )
     si_columns = _si_columns(plan, channels)
     del channels  # frees up to a quarter of a gigabyte
-    channel_titles = {column_name: choice.channel for column_name, choice in plan.channels.items()}
+    channel_titles = {field_name: choice.channel for field_name, choice in plan.channels.items()}
     si_columns, status_bits, first_sample = hold_last_values(source, channel_titles, si_columns)
     ticks = timebase.ticks[first_sample:]
     is_after_gap = np.diff(ticks, prepend=-1) > 1
@@ -150,10 +150,10 @@ _LATEST_START_NS: Final = 2**63 - 1
 
 def _session_start(source: Path, duration_s: float) -> tuple[int, str]:
     """Return the file's modification time in ns, or the present time with a warning."""
-    changed_ns = source.stat().st_mtime_ns
-    if changed_ns >= 0 and changed_ns + duration_s * 1e9 < _LATEST_START_NS:
-        return changed_ns, ""
-    modification_year = 1970 + changed_ns / (365.2425 * 86_400e9)
+    modification_ns = source.stat().st_mtime_ns
+    if modification_ns >= 0 and modification_ns + duration_s * 1e9 < _LATEST_START_NS:
+        return modification_ns, ""
+    modification_year = 1970 + modification_ns / (365.2425 * 86_400e9)
     return time.time_ns(), (
         f"By its time stamp the file was changed about the year {modification_year:.0f}, which a "
         "session cannot state; the time of this import is used as the session's start."
@@ -189,7 +189,7 @@ def _check_duration(path: Path, plan: ImportPlan, timebase: Timebase) -> list[st
 def _si_columns(
     plan: ImportPlan, channels: Mapping[str, SourceChannel]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the channels of the record in SI units, including values that are not finite."""
+    """Return the values of each field in SI units, including those that are not finite."""
     si_columns = {}
     with np.errstate(over="ignore"):
         for field_name, choice in plan.channels.items():
@@ -203,16 +203,16 @@ def _si_columns(
 def _segment_ticks(
     path: Path, segments_s: Mapping[str, tuple[float, float]], rate_hz: float, ticks: int
 ) -> dict[str, tuple[int, int]]:
-    """Return first and end tick of each segment; raise if one is not inside the record."""
+    """Return first and end tick of each segment; raise if a segment is not inside the record."""
     ticks_by_name = {}
     for segment_name, (start_s, end_s) in segments_s.items():
-        first_tick, end = round(start_s * rate_hz), round(end_s * rate_hz)
-        if not 0 <= first_tick < end <= ticks:
+        first_tick, end_tick = round(start_s * rate_hz), round(end_s * rate_hz)
+        if not 0 <= first_tick < end_tick <= ticks:
             raise ExchangeError(
                 f"{path}: the segment {segment_name} from {start_s:g} to {end_s:g} s is not inside "
                 f"the record, which lasts {ticks / rate_hz:g} s; count from the first sample."
             )
-        ticks_by_name[segment_name] = (first_tick, end)
+        ticks_by_name[segment_name] = (first_tick, end_tick)
     return ticks_by_name
 
 
@@ -229,14 +229,14 @@ def _describe_missing_samples(
             f"The first {omitted_samples} samples were left out: angle or torque is not finite "
             "there."
         )
-    for stale_flag, field_name in (
+    for stale_flag, channel in (
         (Status.ANGLE_STALE, channel_titles["angle_rad"]),
         (Status.WRENCH_STALE, channel_titles["coupling_torque_nm"]),
     ):
         flagged_count = int(np.count_nonzero(status_bits & stale_flag))
         if flagged_count:
             sentences.append(
-                f"{flagged_count} samples of '{field_name}' are not finite; they were flagged as "
+                f"{flagged_count} samples of '{channel}' are not finite; they were flagged as "
                 "stale."
             )
     tick_steps = np.diff(ticks)
@@ -252,7 +252,7 @@ def _describe_missing_samples(
 def _interpolate_gaps(
     ticks: NDArray[np.int64], known_values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values at all ticks, interpolated in gaps."""
+    """Return values at all ticks from the values at known ticks, by interpolation in gaps."""
     if ticks[-1] - ticks[0] + 1 == len(ticks):
         return known_values
     return np.interp(np.arange(ticks[0], ticks[-1] + 1), ticks, known_values)
@@ -261,7 +261,7 @@ def _interpolate_gaps(
 def _session_metadata(
     source: Path, target: Path, file_format: str, plan: ImportPlan, rate_hz: float
 ) -> dict[str, str]:
-    """Return the metadata of the new session, including those of its source file."""
+    """Return the metadata of the new session, with name and checksum of its source file."""
     beam = plan.specimen.beam
     rig_numbers = {
         "rate_hz": rate_hz,
@@ -274,9 +274,9 @@ def _session_metadata(
         **{f"uncertainty_{k}_percent": v for k, v in plan.specimen.uncertainty_percent.items()},
     }
     for key in ("uniformity_percent", "tip_mass_kg", "axis_tilt_deg"):
-        stated_texts = getattr(plan.specimen, key)
-        if stated_texts is not None:
-            rig_numbers[key] = stated_texts
+        stated_number = getattr(plan.specimen, key)
+        if stated_number is not None:
+            rig_numbers[key] = stated_number
     with source.open("rb") as stream:
         file_digest = hashlib.file_digest(stream, "sha256").hexdigest()
     channel_texts = {
@@ -286,10 +286,7 @@ def _session_metadata(
         channel_texts["import_coupling_torque_nm"] += ", reversed"
     return {
         "id": target.stem,
-        **{
-            field_name: repr(float(number_value))
-            for field_name, number_value in rig_numbers.items()
-        },
+        **{key: repr(float(number_value)) for key, number_value in rig_numbers.items()},
         **{
             key: stated_text
             for key, stated_text in (
@@ -314,7 +311,7 @@ _STALE_FLAGS: Final = {
     "angle_rad": Status.ANGLE_STALE,
     "coupling_torque_nm": Status.WRENCH_STALE,
 }
-"""Flag that marks a held value, by the field of a sample."""
+"""Status flag of a sample in which the last finite value is held, by the field of the value."""
 
 
 def hold_last_values(
@@ -322,15 +319,15 @@ def hold_last_values(
 ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.uint32], int]:
     """Replace values that are not finite by the last finite value, and flag them as stale.
 
-    `channel_names` are the names of the fields' channels in the file. Return the fields, shape
-    (n - first_sample,), the bits of `rigd.session.layout.Status`, and the number
+    `channel_names` has the channel in the file of each field, for messages. Return the fields,
+    shape (n - first_sample,), the bits of `rigd.session.layout.Status`, and the number
     `first_sample` of initial samples that are left out because no finite value precedes them. Raise
     ExchangeError if too many values are not finite, or if the field of such a value has no flag.
     """
-    bad = {
+    bad_by_field = {
         field_name: ~np.isfinite(field_values) for field_name, field_values in si_columns.items()
     }
-    for field_name, is_bad in bad.items():
+    for field_name, is_bad in bad_by_field.items():
         bad_count = int(is_bad.sum())
         if bad_count and field_name not in _STALE_FLAGS:
             raise ExchangeError(
@@ -347,15 +344,15 @@ def hold_last_values(
                 f"{path}: {bad_message} Or choose another channel, or cut the session out of the "
                 "file."
             )
-    first_sample = max(int(np.argmin(is_bad)) for is_bad in bad.values())
+    first_sample = max(int(np.argmin(is_bad)) for is_bad in bad_by_field.values())
     filled_columns = {
-        field_name: _hold_last(field_values, bad[field_name])[first_sample:]
+        field_name: _hold_last(field_values, bad_by_field[field_name])[first_sample:]
         for field_name, field_values in si_columns.items()
     }
     status_bits = np.zeros(len(next(iter(filled_columns.values()))), dtype=np.uint32)
     for field_name, stale_flag in _STALE_FLAGS.items():
-        if field_name in bad:
-            status_bits[bad[field_name][first_sample:]] |= np.uint32(stale_flag)
+        if field_name in bad_by_field:
+            status_bits[bad_by_field[field_name][first_sample:]] |= np.uint32(stale_flag)
     return filled_columns, status_bits, first_sample
 
 
@@ -370,22 +367,22 @@ def _hold_last(samples: NDArray[np.float64], is_bad: NDArray[np.bool_]) -> NDArr
 # Plausibility of the torque
 
 _CHECK_BANDS: Final = ((0.25, 0.6), (1.5, 3.5))
-"""Frequency bands of the torque check, as multiples of the first natural frequency. They lie on
-either side of the first resonance, far enough from it and from the first antiresonance (at 4.4) for
-damping not to matter, and above the frequencies at which the paper's external damping exceeds the
-inertia."""
+"""Frequency bands of the torque check, as multiples of the first natural frequency. They are on
+both sides of the first resonance, far enough from it and from the first antiresonance (at 4.4) for
+damping not to matter, and above the frequencies at which the paper's external damping torque
+exceeds the inertial torque."""
 
 _SIGNIFICANT_STDS: Final = 6.0
-"""Smallest significant ratio of torque to model, in standard deviations. A motion that does not
-excite the bands gives no significant ratio."""
+"""Smallest ratio of measured to modelled torque that is significant, in standard deviations of the
+ratio. It is not significant if the motion does not excite the bands."""
 
 _TAPER_FRACTION: Final = 0.05
-"""Fraction of the record that is tapered at either end: a record may begin and end in motion, and
-the paper's chirp passes the bands early."""
+"""Fraction of the record that is tapered at each end, as a record may begin and end in motion. It
+is short, because the paper's chirp passes the bands early."""
 
 _LARGEST_RATIO: Final = 3.0
-"""Largest ratio of torque to model that damping and a wrong mass may explain. Units that are easily
-confused differ by more than ten."""
+"""Largest ratio of measured to modelled torque that damping and a wrong mass may explain. Units
+that are easily confused differ by a factor of more than ten."""
 
 
 def torque_anomaly(
@@ -396,14 +393,14 @@ def torque_anomaly(
 ) -> str | None:
     """Check sign and size of the torque against the undamped beam near its first resonance.
 
-    `angle_rad` and `torque_nm` are the whole record with finite values. Return a sentence with
+    `angle_rad` and `torque_nm` are the whole record, all values finite. Return a sentence with
     anomaly and remedy, or None if the torque is plausible or the motion too small for the check.
     """
     frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
     first_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)
     in_band = np.zeros(frequency_hz.shape, dtype=np.bool_)
-    for low, high_ratio in _CHECK_BANDS:
-        in_band |= (frequency_hz >= low * first_hz) & (frequency_hz <= high_ratio * first_hz)
+    for low_ratio, high_ratio in _CHECK_BANDS:
+        in_band |= (frequency_hz >= low_ratio * first_hz) & (frequency_hz <= high_ratio * first_hz)
     s = 2j * np.pi * frequency_hz[in_band]
     centre_distance = np.abs(
         np.linspace(-1.0, 1.0, len(angle_rad))
@@ -459,8 +456,8 @@ def write_session(
 ) -> None:
     """Write a record of another program as a session file.
 
-    The reason for the end of the record is not known, so the outcome only has the numbers of
-    samples. If writing fails, no file remains.
+    The outcome in the file has only the numbers of samples, because it is not known why the record
+    ended. If writing fails, no file remains.
 
     Parameters
     ----------
@@ -487,15 +484,15 @@ def write_session(
         for first_row in range(0, len(ticks), _BLOCK_SAMPLES):
             row_slice = slice(first_row, first_row + _BLOCK_SAMPLES)
             sample_block = {
-                segment_name: column_values[row_slice]
-                for segment_name, column_values in samples.items()
+                field_name: column_values[row_slice]
+                for field_name, column_values in samples.items()
             }
             sample_block["t_ns"] = np.rint(np.multiply(sample_block["tick"], 1e9 / rate_hz))
             writer.write_samples(encode_samples(sample_block))
         scheduled_ticks = int(ticks[-1]) + 1
         counts = {"scheduled": scheduled_ticks, "recorded": len(ticks), "missed": 0}
         counts["lost"] = scheduled_ticks - len(ticks)
-        writer.close({segment_name: str(row_count) for segment_name, row_count in counts.items()})
+        writer.close({count_name: str(row_count) for count_name, row_count in counts.items()})
     except BaseException:
         # The source still exists, so an incomplete copy of it is useless.
         try:

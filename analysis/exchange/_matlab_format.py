@@ -39,7 +39,7 @@ _HDF5_OFFSETS: Final = (0, 512)  # MATLAB writes its own header of 512 bytes bef
 """Offsets at which an HDF5 file may begin."""
 
 
-def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read vectors from a MATLAB file (see `analysis.exchange.read_source`).
 
     A channel is a variable ``angle``, a field of a struct ``log.angle``, a field of an element of a
@@ -51,8 +51,8 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
         first_bytes[magic_offset : magic_offset + len(_HDF5_MAGIC)] == _HDF5_MAGIC
         for magic_offset in _HDF5_OFFSETS
     ):
-        return _read_hdf5(path, names)
-    return _read_mat(path, names)
+        return _read_hdf5(path, channel_names)
+    return _read_mat(path, channel_names)
 
 
 def _read_mat(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
@@ -81,13 +81,13 @@ def _read_channels(
 ) -> dict[str, SourceChannel]:
     """Load the requested variables after checking their listed sizes, and return the channels."""
     shape_by_name = {
-        channel_name: variable_shape for channel_name, variable_shape, _ in variable_list
+        variable_name: variable_shape for variable_name, variable_shape, _ in variable_list
     }
-    variables = {
+    variable_names = {
         channel_name: _split_element(_split_name(channel_name, shape_by_name)[0])[0]
         for channel_name in channel_names
     }
-    for channel_name, variable_name in variables.items():
+    for channel_name, variable_name in variable_names.items():
         if variable_name not in shape_by_name:
             raise no_such_channel_error(path, channel_name, shape_by_name)
         check_samples(
@@ -99,12 +99,12 @@ def _read_channels(
         if states_time(n) and max(shape_by_name[n], default=0) <= MAX_SAMPLES
     }
     file_variables = load_variables(
-        path, variable_names=sorted(time_variables | set(variables.values()))
+        path, variable_names=sorted(time_variables | set(variable_names.values()))
     )
     loaded_variables = {
-        channel_name: file_variables[channel_name]
-        for channel_name in shape_by_name
-        if channel_name in file_variables
+        variable_name: file_variables[variable_name]
+        for variable_name in shape_by_name
+        if variable_name in file_variables
     }
 
     def names_in(parent: str) -> Sequence[str]:
@@ -132,16 +132,16 @@ def _read_channels(
 
 
 def _vector_from(path: Path, variables: Mapping[str, Any], channel_name: str) -> NDArray[Any]:
-    """Return the values of a channel; `functools.partial` fills the arguments before its name."""
+    """Call `_read_vector` with the channel name last, as `functools.partial` requires."""
     return _read_vector(path, channel_name, variables)
 
 
 _UNIT_FIELDS: Final = {"Time": "TimeInfo", "Data": "DataInfo"}
-"""Field of a timeseries struct that states the unit of another field."""
+"""Fields of a timeseries struct, each with the field that states its unit."""
 
 
 def _timeseries_unit(path: Path, channel_name: str, variables: Mapping[str, Any]) -> str:
-    """Return the unit stated in a struct with the fields of a timeseries, or an empty text."""
+    """Return the unit that a timeseries struct states for one of its fields, or an empty text."""
     parent_name, _, field_name = channel_name.rpartition(".")
     if field_name not in _UNIT_FIELDS:
         return ""
@@ -172,7 +172,7 @@ _ELEMENT_PATTERN: Final = re.compile(r"(.+)\((\d+)\)")
 
 
 def _split_element(text: str) -> tuple[str, int | None]:
-    """Split ``log(2)`` into name and element index (from 0); the index is None without one."""
+    """Split ``log(2)`` into name and element index (from 0), which is None for a plain name."""
     element_match = _ELEMENT_PATTERN.fullmatch(text)
     return (element_match[1], int(element_match[2]) - 1) if element_match else (text, None)
 
@@ -240,7 +240,7 @@ def _vector_or_column(
     array: Any,  # noqa: ANN401
     column_index: int | None,
 ) -> NDArray[Any]:
-    """Return an array as a vector of floats, or one column of it; raise if it is neither."""
+    """Return an array, or one column of it, as a vector of floats; raise if it is no vector."""
     array_shape = getattr(array, "shape", None)
     if type(array).__name__ in _OBJECT_TYPES:
         raise ExchangeError(
@@ -382,7 +382,7 @@ def _read_hdf5_vector(path: Path, hdf5_file: Any, channel_name: str, h5py: Any) 
 
 
 def _hdf5_link(hdf5_group: Any, member_name: str, h5py: Any) -> object:  # noqa: ANN401
-    """Return the link to a member of a group, not followed; None without such a member."""
+    """Return the link to a member of a group without following it; None if there is no member."""
     if not isinstance(hdf5_group, h5py.Group) or "/" in member_name or member_name in ("", "."):
         return None
     return hdf5_group.get(member_name, getlink=True)

@@ -24,7 +24,7 @@ _PERIOD_NAMES: Final = (
 
 
 def states_time(field_name: str) -> bool:
-    """Return whether a variable or field with this name has times, a rate or a period."""
+    """Return whether a variable or field of this name contains times, a rate or a sample period."""
     return is_title_of_times(field_name) or field_name.lower() in _RATE_NAMES + _PERIOD_NAMES
 
 
@@ -35,12 +35,12 @@ def stated_times(
     sibling_names: Callable[[str], Iterable[str]],
     read_vector: Callable[[str], NDArray[Any]],
 ) -> tuple[float | None, FileTimes | None]:
-    """Return sampling rate and times of a channel, from its struct or the structs that contain it.
+    """Return sampling rate and times of a channel, from the innermost struct that states either.
 
     `channel_names` are the requested channels, which are not searched. `sample_count` is the
     channel's number of samples. `sibling_names` returns the names of the fields of a struct, or of
-    the variables of the file for an empty name. `read_vector` returns the values of the variable
-    or field of a name. The rate in Hz or the times are None if the file does not state them.
+    the variables of the file for an empty name. `read_vector` returns the values of a variable or
+    field by its name. The rate in Hz or the times are None if not stated there.
     """
     parent_name = channel_name.rpartition("#")[0] or channel_name
     while parent_name:

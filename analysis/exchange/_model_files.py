@@ -90,7 +90,7 @@ MODEL_FORMATS: Final[Mapping[str, Callable[[Variables, BinaryIO], None]]] = {
 
 
 def _json_value(value: Any) -> Any:  # noqa: ANN401
-    """Return an array as nested lists, complex numbers as pairs; other values unchanged."""
+    """Return an array as nested lists, its complex numbers as pairs; other values unchanged."""
     if not isinstance(value, np.ndarray):
         return value
     if np.iscomplexobj(value):
@@ -99,5 +99,5 @@ def _json_value(value: Any) -> Any:  # noqa: ANN401
 
 
 def _string_array(value: Any, element_type: type) -> Any:  # noqa: ANN401
-    """Return a list of strings as an array of a type; other values unchanged."""
+    """Return a list of strings as an array with the given element type; other values unchanged."""
     return np.array(value, dtype=element_type) if isinstance(value, list) else value

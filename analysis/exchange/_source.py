@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 
 class ExchangeError(Exception):
-    """Error on a file that cannot be imported or exported; the message states the remedy."""
+    """Error if a file cannot be imported or exported; the message states the remedy."""
 
 
 class TargetError(ExchangeError):
-    """Error on the name of an output file, such as an unknown suffix."""
+    """Error if the name of an output file is not suitable, such as an unknown suffix."""
 
 
 # Reading
@@ -54,7 +54,7 @@ class FileTimes:
 
 @dataclass(frozen=True, slots=True)
 class SourceChannel:
-    """Values of one channel of a file, with the file's statements on them.
+    """Values of one channel of a file, with their unit, rate and times as the file states them.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class ImportFormat:
         Function of a path and names of channels that returns a `SourceChannel` for each name. It
         raises `ExchangeError` for a channel that the file lacks.
     max_bytes : int
-        Largest file that is read; its reader needs up to ten times as much memory.
+        Largest size of a file that is read; its reader needs up to ten times as much memory.
     """
 
     name: str
@@ -112,11 +112,11 @@ class ImportFormat:
 
 
 def _shipped(name: str, module: str, max_bytes: int) -> ImportFormat:
-    """Return a format whose module of this package is imported when a file is read."""
+    """Return a format of this package; its module is imported when the first file is read."""
 
     def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
-        read_format: ReadChannels = import_module(f"analysis.exchange.{module}").read
-        return read_format(path, channel_names)
+        read_channels: ReadChannels = import_module(f"analysis.exchange.{module}").read
+        return read_channels(path, channel_names)
 
     return ImportFormat(name, read, max_bytes)
 
@@ -219,7 +219,7 @@ def read_source(
 def _read_checked(
     file_format: ImportFormat, owner: Plugin | None, path: Path, channel_names: Sequence[str]
 ) -> Mapping[str, SourceChannel]:
-    """Return the channels of a file; those that a package has read are checked."""
+    """Return the channels of a file; check them if an installed package has read them."""
     if owner is None:
         return file_format.read(path, channel_names)
     try:
@@ -231,7 +231,7 @@ def _read_checked(
 
 
 def _checked_channel(path: Path, name: str, channel: SourceChannel) -> SourceChannel:
-    """Return a channel that a package has read, with real values; raise unless it is valid."""
+    """Return a channel read by an installed package, with real values; raise unless it is valid."""
     values = real_vector(path, name, np.asarray(channel.values))
     if values.ndim != 1:
         raise ExchangeError(f"{path}: the channel '{name}' has {values.ndim} dimensions, not one.")
@@ -247,7 +247,7 @@ def check_format_plugin(plugin: Plugin) -> str:
     Raises
     ------
     PluginError
-        If it cannot be used.
+        If the format cannot be used.
     """
     return f"{_FORMATS.load(plugin).name}, import of .{plugin.name}"
 
@@ -295,9 +295,8 @@ def bounded_memory(extra_bytes: int = MAX_MEMORY_BYTES) -> Iterator[None]:
 
     Larger requests raise a MemoryError. Formats such as MATLAB's are compressed and nested, and
     their readers trust the sizes stated in the file, so that a kilobyte can request all memory of
-    the machine. The kernel's limit applies to every library. On systems without it (Windows,
-    macOS), nothing is limited. Libraries must be imported before, because the address space that
-    they reserve counts, too.
+    the machine. The limit is the kernel's, so it applies to every library; Windows and macOS have
+    none. Libraries must be imported before, because the address space that they reserve counts.
     """
     try:
         import resource
@@ -372,10 +371,10 @@ def channel_index(
 ) -> int:
     """Return the index of a channel that is given by its title or by its number, as ``#3``.
 
-    `titles` are the titles of all channels in the file. `duplicates_text` is the start of the
-    message on several channels of one title, such as "columns are named". `numbered` states whether
-    a message lists the titles with their numbers. Raise ExchangeError without exactly one such
-    channel.
+    `titles` are the titles of all channels in the file. The message about several channels of one
+    title contains `duplicates_text`, such as "columns are named". `numbered` states whether
+    messages list the titles with their numbers. Raise ExchangeError unless there is exactly one
+    such channel.
     """
     title_count = titles.count(channel_name)
     if title_count == 1:
@@ -385,13 +384,13 @@ def channel_index(
             f"{path}: {title_count} {duplicates_text} '{channel_name}'; give the number, such as "
             f"#{titles.index(channel_name) + 1} for the first of them."
         )
-    channel_number = channel_name.removeprefix("#")
+    number_text = channel_name.removeprefix("#")
     if (
-        channel_name != channel_number
-        and channel_number.isdecimal()
-        and 0 < int(channel_number) <= len(titles)
+        channel_name != number_text
+        and number_text.isdecimal()
+        and 0 < int(number_text) <= len(titles)
     ):
-        return int(channel_number) - 1
+        return int(number_text) - 1
     listed_titles = (
         [f"#{channel_number} {title}" for channel_number, title in enumerate(titles, 1)]
         if numbered

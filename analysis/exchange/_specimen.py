@@ -41,8 +41,8 @@ class SpecimenFile:
     tip_mass_kg : float or None
         Point mass at the beam's tip; None if not stated.
     axis_tilt_deg : float or None
-        Inclination of the plane of motion along the beam at rest, positive if the tip is lower than
-        the motor's axis; None if not stated.
+        Angle between the plane in which the beam moves and the horizontal, measured along the beam
+        at rest, positive if the beam points downhill; None if not stated.
     """
 
     beam: Beam
@@ -56,10 +56,9 @@ class SpecimenFile:
 def read_specimen(path: Path) -> SpecimenFile:
     """Read beam, tool inertia, tilt and uncertainties of a specimen from a TOML file.
 
-    Only ``[beam]`` is required. A number is given alone or, as in a profile, with the statement
-    where it comes from: ``{ value = 0.98, source = "measured" }``. Other entries of a profile are
-    not used, because delays, rate and limits are those of the rig's own
-    recorder.
+    Only ``[beam]`` is required. A number is given alone or, as in a profile, with its origin:
+    ``{ value = 0.98, source = "measured" }``. Other entries of a profile are not used, because they
+    describe the rig's own recorder and not the one of the imported record.
 
     Raises
     ------
@@ -78,10 +77,10 @@ def read_specimen(path: Path) -> SpecimenFile:
     except DocumentError as error:
         raise ExchangeError(f"{path}: {error}.") from error
     rig_section, beam_section, sensor_section, uncertainty_section = (
-        _read_section(path, file_content, quantity)
-        for quantity in ("rig", "beam", "sensor", "uncertainty")
+        _read_section(path, file_content, section_name)
+        for section_name in ("rig", "beam", "sensor", "uncertainty")
     )
-    percent_number = partial(_number_in_range, path, "uncertainty", uncertainty_section, low=0.0)
+    read_percent = partial(_number_in_range, path, "uncertainty", uncertainty_section, low=0.0)
     tool_inertia_kg_m2 = 0.0
     if "tool_inertia_kg_m2" in sensor_section:
         tool_inertia_kg_m2 = _required_number(path, "sensor", sensor_section, "tool_inertia_kg_m2")
@@ -100,12 +99,10 @@ def read_specimen(path: Path) -> SpecimenFile:
         {
             quantity: percent_value
             for quantity in UNCERTAIN_QUANTITIES
-            if (
-                percent_value := percent_number(f"{quantity}_percent", high=MAX_UNCERTAINTY_PERCENT)
-            )
+            if (percent_value := read_percent(f"{quantity}_percent", high=MAX_UNCERTAINTY_PERCENT))
             is not None
         },
-        percent_number("uniformity_percent", high=MAX_UNIFORMITY_PERCENT),
+        read_percent("uniformity_percent", high=MAX_UNIFORMITY_PERCENT),
         _number_in_range(path, "beam", beam_section, "tip_mass_kg", low=0.0, high=MAX_TIP_MASS_KG),
         _number_in_range(
             path,
@@ -119,7 +116,7 @@ def read_specimen(path: Path) -> SpecimenFile:
 
 
 def _read_section(path: Path, content: Mapping[str, Any], section_name: str) -> Mapping[str, Any]:
-    """Return a section of the file, empty if absent; raise if the entry is no section."""
+    """Return a section of the file, empty if it is absent; raise if the entry is no section."""
     section = content.get(section_name, {})
     if not isinstance(section, dict):
         raise ExchangeError(
@@ -141,7 +138,7 @@ def _positive_number(path: Path, section: Mapping[str, Any], key: str) -> float:
 def _number_in_range(
     path: Path, section_name: str, section: Mapping[str, Any], key: str, *, low: float, high: float
 ) -> float | None:
-    """Return an optional number of a section within a range, or None if it is not stated."""
+    """Return an optional number of a section, or None if absent; raise if it is out of range."""
     if key not in section:
         return None
     number = _required_number(path, section_name, section, key)
@@ -154,7 +151,7 @@ def _number_in_range(
 
 
 def _required_number(path: Path, section_name: str, section: Mapping[str, Any], key: str) -> float:
-    """Return a required number of a section; raise ExchangeError without a finite number.
+    """Return a required number of a section; raise ExchangeError if it is missing or not finite.
 
     The entry is the number, or a table with the key ``value`` for it, as in a profile.
     """

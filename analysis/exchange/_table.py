@@ -1,4 +1,4 @@
-"""Tables for export, the same for every file format: named columns with units over one axis."""
+"""Tables for export, the same for every file format: named columns with units and a common axis."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ExportColumn:
     name : str
         Name with the unit as its suffix.
     title : str
-        Title in ASCII; the title of a ratio has " / " between two texts of at most 20 characters.
+        Title in ASCII; that of a ratio is two texts of at most 20 characters with " / " between.
     unit : str
         Unit in ASCII; empty for a number without a unit.
     values : ndarray, shape (n,)
@@ -49,7 +49,7 @@ class ExportColumn:
 
 @dataclass(frozen=True, slots=True)
 class ExportTable:
-    """Table to be exported: columns of values over a common axis of times or frequencies.
+    """Table to be exported: columns of values at common times or frequencies.
 
     Attributes
     ----------
@@ -149,8 +149,8 @@ def frf_table(
             "estimator": response.estimator,
             "segments": str(response.segments),
             **{
-                f"{column_name}_samples": str(column_values)
-                for column_name, column_values in welch_lengths.items()
+                f"{length_name}_samples": str(sample_count)
+                for length_name, sample_count in welch_lengths.items()
             },
             "rate_hz": repr(record.rate_hz),
             "angle_delay_removed_s": repr(record.angle_delay_s),

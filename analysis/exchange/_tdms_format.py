@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from typing import BinaryIO
 
 _MAX_LISTED_CHANNELS: Final = 5_000_000
-"""Largest number of channels, counted in each segment, because npTDMS processes all of them before
-it reads a value."""
+"""Largest number of channel entries in all segments together, because npTDMS processes all of them
+before it reads a value."""
 
 _EARLIEST_START: Final = np.datetime64("1980-01-01")
-"""Earliest start that counts as stated; LabVIEW's origin, in 1904, means that none was given."""
+"""Earliest valid start time; LabVIEW writes its origin, in 1904, if no start time was given."""
 _EARLIEST_START_NS: Final = int(_EARLIEST_START.astype("datetime64[ns]").astype(np.int64))
-"""Earliest start that counts as stated, in nanoseconds since 1970."""
+"""Earliest valid start time in nanoseconds since 1970."""
 
 _LEAD_IN_BYTES: Final = 28
 """Number of bytes of a segment's lead-in."""
@@ -42,12 +42,12 @@ _HAS_METADATA, _NEW_LIST, _BIG_ENDIAN = 1 << 1, 1 << 2, 1 << 6
 """Bits in the lead-in: the segment has metadata, a new list of channels, big-endian numbers."""
 
 
-def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read channels ``Group/Channel`` from a TDMS file (see `analysis.exchange.read_source`).
 
-    Scales in the file are applied. If npTDMS does not know a scale, the values are raw and the
-    channel states it. An index file in the same folder is not used, because it may belong to
-    another file.
+    Scales in the file are applied. If npTDMS does not know a scale, the values are raw and
+    `SourceChannel.unapplied_scale` names it. An index file in the same folder is not used, because
+    it may belong to another file.
     """
     try:
         from nptdms import TdmsFile
@@ -67,9 +67,9 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
                 is_cut_off = tdms_file.file_status.incomplete_final_segment
                 source_channels = {
                     channel_name: _read_channel(path, channel_name, channels_by_name, is_cut_off)
-                    for channel_name in names
+                    for channel_name in channel_names
                 }
-                for channel_name in names:
+                for channel_name in channel_names:
                     property_levels = (
                         channels_by_name[channel_name],
                         tdms_file[channels_by_name[channel_name].group_name],
@@ -78,7 +78,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
                     unapplied_scale = _unapplied_scale(
                         [property_level.properties for property_level in property_levels]
                     )
-                    group_times = _group_times(path, channel_name, names, channels_by_name)
+                    group_times = _group_times(path, channel_name, channel_names, channels_by_name)
                     source_channels[channel_name] = replace(
                         source_channels[channel_name],
                         unapplied_scale=unapplied_scale,
@@ -126,7 +126,7 @@ def _read_channel(
 ) -> SourceChannel:
     """Return one channel of a TDMS file.
 
-    `is_cut_off` states that the end of the file is missing, which is remarked in the channel.
+    If `is_cut_off`, the end of the file is missing, and the channel gets a remark on that.
     """
     channel = channels.get(name)
     if channel is None:
@@ -165,14 +165,14 @@ def _plain_lower_case(text: str) -> str:
 
 
 def _rate_hz(increment: object, unit_s: float) -> float | None:
-    """Return the sampling rate in Hz for an increment of time in `unit_s`; None if not valid."""
+    """Return the sampling rate in Hz for a time step in units of `unit_s`; None if not valid."""
     if not isinstance(increment, int | float) or not 0 < increment < math.inf:
         return None
     return 1 / (increment * unit_s)
 
 
 def _start_ns(properties: Mapping[str, Any], unit_s: float) -> int | None:
-    """Return the time of the first sample in ns, from start time and offset; None without them."""
+    """Return the time of the first sample in ns, from start time and offset; None if not stated."""
     start_time, offset_s = properties.get("wf_start_time"), properties.get("wf_start_offset")
     start_time_ns = 0
     if isinstance(start_time, np.datetime64) and start_time >= _EARLIEST_START:
@@ -198,7 +198,7 @@ def _drop_relative_starts(channels: dict[str, SourceChannel]) -> dict[str, Sourc
 
 
 def _unapplied_scale(property_levels: Sequence[Mapping[str, Any]]) -> str:
-    """Return the types of scales stated in the properties that npTDMS does not apply."""
+    """Return the types of stated scales that npTDMS does not apply, or an empty text."""
     from nptdms.scaling import get_scaling
 
     for properties in property_levels:
@@ -216,13 +216,13 @@ def _unapplied_scale(property_levels: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _group_times(
-    path: Path, channel_name: str, names: Sequence[str], channels: Mapping[str, Any]
+    path: Path, channel_name: str, channel_names: Sequence[str], channels: Mapping[str, Any]
 ) -> FileTimes | None:
-    """Return the times in another channel of the same group, unless it was requested, or None."""
+    """Return the times in a channel of the same group that was not requested, or None."""
     channel = channels[channel_name]
     for other_name, other_channel in channels.items():
         if (
-            other_name in names
+            other_name in channel_names
             or other_channel.group_name != channel.group_name
             or not is_title_of_times(other_channel.name)
             or len(other_channel) != len(channel)

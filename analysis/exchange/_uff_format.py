@@ -51,7 +51,7 @@ _STEP_TOLERANCE: Final = 1e-3
 """Largest difference between the time steps of two data sets, relative to the step."""
 
 
-def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read functions of time from a universal file (see `analysis.exchange.read_source`).
 
     A channel is named ``#2`` (the second data set of type 58) or by its first identification line,
@@ -63,7 +63,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
         raise missing_library_error(path, "pyuff") from error
     try:
         with bounded_memory():
-            return _read_channels(path, names, pyuff.UFF)
+            return _read_channels(path, channel_names, pyuff.UFF)
     except (ExchangeError, OSError, MemoryError):
         raise
     except Exception as error:  # pyuff raises many types
@@ -73,7 +73,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 
 
 def _read_channels(
-    path: Path, names: Sequence[str], open_file: Callable[[str], Any]
+    path: Path, channel_names: Sequence[str], open_file: Callable[[str], Any]
 ) -> dict[str, SourceChannel]:
     """Return the requested channels from their data sets."""
     _check_set_count(path)
@@ -88,7 +88,7 @@ def _read_channels(
         channel_name: channel_index(
             path, channel_name, set_titles, "data sets have the title", numbered=True
         )
-        for channel_name in names
+        for channel_name in channel_names
         if channel_name != ABSCISSA
     }
     if not number_by_name:
@@ -98,11 +98,11 @@ def _read_channels(
         data_set = uff_file.read_sets(set_numbers[set_number])
         set_abscissae = np.asarray(data_set["x"], dtype=np.float64)
         channels[channel_name] = _source_channel(
-            path, channel_name, data_set, set_abscissae, timed=ABSCISSA in names
+            path, channel_name, data_set, set_abscissae, timed=ABSCISSA in channel_names
         )
         abscissae.append(set_abscissae)
         abscissa_units.append(_abscissa_unit(data_set))
-    if ABSCISSA in names:
+    if ABSCISSA in channel_names:
         first_channel = next(iter(channels.values()))
         channels[ABSCISSA] = SourceChannel(
             _common_times(path, channels, abscissae),
@@ -130,9 +130,10 @@ def _source_channel(
     *,
     timed: bool,
 ) -> SourceChannel:
-    """Return one channel of a data set with the given abscissae `set_abscissae`.
+    """Return a data set as a channel; `set_abscissae` are its times.
 
-    `timed` states whether the user requests the abscissae as the channel of times.
+    If `timed`, the user requests the abscissae as a channel of times, so the channel states no
+    rate and no times of its own.
     """
     set_values = np.asarray(data_set["data"])
     if set_values.dtype.kind == "c":
@@ -162,7 +163,7 @@ def _source_channel(
 
 
 def _label_text(data_set: Mapping[str, Any], key: str) -> str:
-    """Return a label of a data set, or an empty text without a label."""
+    """Return a label of a data set, or an empty text if it has none."""
     label_text = str(data_set.get(key) or "").strip()
     return "" if label_text.upper() == "NONE" else label_text
 
@@ -175,7 +176,7 @@ def _abscissa_unit(data_set: Mapping[str, Any]) -> str:
 
 
 def _even_rate_hz(data_set: Mapping[str, Any], unit_s: float) -> float | None:
-    """Return the sampling rate of a data set with a constant increment, else None."""
+    """Return the sampling rate of a data set with equidistant abscissae, or else None."""
     increment_s = data_set["abscissa_inc"] * unit_s if data_set["abscissa_spacing"] == 1 else 0.0
     return 1 / increment_s if increment_s > 0 else None
 
@@ -205,9 +206,9 @@ def _check_time_response(path: Path, name: str, data_set: Mapping[str, Any], uni
         )
 
 
-def _code_name(code: int, names: Mapping[int, str]) -> str:
+def _code_name(code: int, code_names: Mapping[int, str]) -> str:
     """Return the name of a code in parentheses, or an empty text if it has no name."""
-    return f" ({names[code]})" if code in names else ""
+    return f" ({code_names[code]})" if code in code_names else ""
 
 
 _FUNCTION_TYPES: Final = {
@@ -232,7 +233,7 @@ _ABSCISSA_TYPES: Final = {18: "frequency", 19: "rpm", 20: "order"}
 def _common_times(
     path: Path, channels: Mapping[str, SourceChannel], abscissae_of_sets: Sequence[Any]
 ) -> Any:  # noqa: ANN401
-    """Return the abscissae of the first channel.
+    """Return the abscissae of the first channel if they are valid for all channels.
 
     Raise ExchangeError if the abscissae of another channel have other increments, or are shifted
     although both channels state the same start or none.
@@ -264,12 +265,12 @@ def _common_times(
 # Writing
 
 _TEXT_TOLERANCE, _BINARY_TOLERANCE = 1e-2, 1e-6
-"""Largest error of an abscissa, in increments, up to which first value and increment are written
-instead of all abscissae. Both have six digits; all abscissae of a binary file are exact."""
+"""Largest error of an abscissa, in increments, at which a text file or a binary file states first
+value and increment, with six digits each, instead of all abscissae."""
 
 _INCREMENT_TOLERANCE: Final = 1e-10
-"""Relative error of the increment, written with six digits, up to which a binary file states the
-increment instead of all abscissae."""
+"""Largest relative error of an increment of six digits at which a binary file states the increment
+instead of all abscissae."""
 
 _GENERAL_FUNCTION, _TIME_RESPONSE, _FREQUENCY_RESPONSE, _COHERENCE = 0, 1, 4, 6
 """Codes of the function type in the header of a data set."""
@@ -295,8 +296,8 @@ _SI_UNITS_SET: Final = (
 def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     """Write a table to a universal file: units (data set 164) and a function per column (58).
 
-    Times and frequencies are stated by first value and increment. In a record with gaps, or if six
-    digits are not enough for these, each abscissa is written.
+    Times and frequencies are stated by first value and increment, with six digits each. In a record
+    with gaps, or if six digits are not enough, each abscissa is written.
 
     Parameters
     ----------
@@ -311,7 +312,7 @@ def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     Raises
     ------
     ExchangeError
-        If each abscissa has to be written and the six digits of the text format are not enough.
+        If each abscissa has to be written as text and six digits do not distinguish neighbours.
     """
     abscissae = np.asarray(table.axis.values, dtype=np.float64)
     if binary:
@@ -334,7 +335,7 @@ def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
 
 
 def _is_reproducible(abscissae: NDArray[np.float64], tolerance: float) -> bool:
-    """Return whether first abscissa and increment, with six digits, reproduce each abscissa.
+    """Return whether first abscissa and increment, rounded to six digits, reproduce each abscissa.
 
     `tolerance` is the largest permitted error, as a fraction of the increment.
     """
@@ -348,7 +349,7 @@ def _is_reproducible(abscissae: NDArray[np.float64], tolerance: float) -> bool:
 
 
 def _is_increment_exact(abscissae: NDArray[np.float64]) -> bool:
-    """Return whether six digits are enough for the increment of a binary file."""
+    """Return whether six digits state the increment exactly enough for a binary file."""
     _, increment = _start_and_increment(abscissae)
     return abs(float(f"{increment:.5e}") - increment) <= _INCREMENT_TOLERANCE * increment
 
@@ -377,7 +378,7 @@ def _encode_body(
     is_even: bool,
     binary: bool,
 ) -> bytes:
-    """Return the encoded values of a function, with its abscissae unless these are even."""
+    """Return the encoded values of a function, with its abscissae unless these are equidistant."""
     real_columns: list[NDArray[np.generic]] = [] if is_even else [abscissae]
     real_columns += (
         [column_values.real, column_values.imag]
@@ -477,5 +478,5 @@ def _axis_line(
 
 
 def _ascii_text(text: str) -> str:
-    """Return a text with characters outside ASCII replaced."""
+    """Return a text with every character outside ASCII replaced by an ASCII one."""
     return printable(text).encode("ascii", "replace").decode()

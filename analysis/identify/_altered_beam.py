@@ -7,9 +7,9 @@ turns with the clamp. Relative to the stiffness of the beam, mode k then solves 
 
 The coefficients K (stiffness), C (clamp), M (mass), I (external damping) and T (tension by gravity)
 follow from the mode shape. The residue of the torque includes the arms of these forces about the
-motor axis. The plain beam has ``K = k⁴``, ``M = I = 1``, ``C = T = 0``. The effect of damping on a
-mode shape is of the order of the damping times the alteration. It changes poles by the square of
-that, and the arms to first order.
+motor axis. The uniform beam has ``K = k⁴``, ``M = I = 1``, ``C = T = 0``. Damping changes a mode
+shape by about the product of the damping and the deviation from a uniform beam. The arms change in
+proportion to this product, the poles in proportion to its square.
 
 A local compliance adds to the flexibility of the beam, not to its stiffness. The moment along a
 clamped-free beam follows from its loads alone, so few modes suffice.
@@ -55,11 +55,11 @@ _INVERSE_ITERATIONS: Final = 2
 _RELATIVE_SHIFT: Final = 1e-7
 """Shift of an inverse iteration relative to the eigenvalue: the matrix is not singular."""
 
-Terms = NDArray[np.inexact[Any]]
+CoefficientArray = NDArray[np.inexact[Any]]
 """Array of real or complex Galerkin coefficients."""
 
 Profile = Literal["taper", "outer half", "wave"]
-"""Course of a relative deviation along the beam.
+"""Shape of a relative deviation along the beam.
 
 "taper" rises from -1/2 to 1/2, "outer half" is 0 in the inner and 1 in the outer half, and "wave"
 is a cosine of one period."""
@@ -84,7 +84,7 @@ class Alteration:
     relaxation : tuple of (float, float)
         Strength and time constant (s) of a relaxation of the material: the stiffness gains
         ``strength s t / (1 + s t)``.
-    sensor : tuple of (float, float)
+    sensor_lag : tuple of (float, float)
         Second-order lag in the torque channel: reciprocal of its undamped frequency (s), and of its
         quality factor.
     lag_s : float
@@ -98,20 +98,20 @@ class Alteration:
     clamp_compliance: float = 0.0
     clamp_loss: float = 0.0
     relaxation: tuple[float, float] = (0.0, 1.0)
-    sensor: tuple[float, float] = (0.0, 0.0)
+    sensor_lag: tuple[float, float] = (0.0, 0.0)
     lag_s: float = 0.0
 
     @classmethod
-    def stated(cls, nominal: Plant, tilt_deg: float | None = None) -> Alteration:
-        """Return the alteration that the session file states: tip mass and gravity by inclination.
+    def from_nominal(cls, nominal: Plant, tilt_deg: float | None = None) -> Alteration:
+        """Return the alteration of the beam that the session file states: tip mass and tilt.
 
         Parameters
         ----------
         nominal : Plant
             Rig and specimen as the file states them.
         tilt_deg : float, optional
-            Inclination of the plane of motion along the beam at rest, positive where the tip is
-            lower than the motor's axis.
+            Angle between the beam at rest and the horizontal, positive if the tip is lower than
+            the root.
         """
         mass_kg = nominal.tip_mass_kg
         return cls(
@@ -120,18 +120,22 @@ class Alteration:
         )
 
     def has_same_shapes(self, other_alteration: Alteration) -> bool:
-        """Return whether two alterations differ at most in what leaves the mode shapes unchanged.
+        """Return whether two alterations of the beam result in the same mode shapes.
 
-        This is the relaxation of the material, and the lags of the torque channel.
+        They then differ at most in the relaxation of the material and in the lags of the torque
+        channel, which do not affect the mode shapes.
         """
         return self == replace(
-            other_alteration, relaxation=self.relaxation, sensor=self.sensor, lag_s=self.lag_s
+            other_alteration,
+            relaxation=self.relaxation,
+            sensor_lag=self.sensor_lag,
+            lag_s=self.lag_s,
         )
 
     @property
     def lags(self) -> tuple[tuple[float, float], ...]:
-        """Coefficients of s and s² in the denominators of the torque channel's lags."""
-        time_s, inverse_quality = self.sensor
+        """Return the coefficients of s and s² in the denominator of each low-pass of the torque."""
+        time_s, inverse_quality = self.sensor_lag
         lags = ((inverse_quality * time_s, time_s**2), (self.lag_s, 0.0))
         return tuple(lag for lag in lags if any(lag))
 
@@ -145,52 +149,52 @@ class ModeTerms:
     Attributes
     ----------
     stiffness, clamp, mass, lump, tension : ndarray, shape (n,)
-        Coefficients of D: K and C divided by the length to the fourth power, M without and of the
-        point masses, and g T divided by the length. The point masses' part is relative to the
-        density `density_kg_per_m`; if that is None, the point masses are proportional to the
-        density.
+        Coefficients of D: ``K / L⁴``, ``C / L⁴``, M without the point masses, M of the point
+        masses, and ``g T / L``, with the length L of the beam.
     mass_arm, lump_arm, medium_arm, tension_arm : ndarray, shape (n,)
-        Arms about the motor's axis, divided by the length; complex if the clamp has a loss.
-    turn_by_medium, turn_by_internal : ndarray, shape (n,)
-        Changes of the mass's arm by ``gamma s^lambda`` and ``zeta s^alpha``, which alter the mode
-        shape.
+        Arms of the forces of mass, point masses, external damping and tension about the motor's
+        axis, divided by the length; complex if the clamp has a loss.
+    arm_change_by_external, arm_change_by_internal : ndarray, shape (n,)
+        Change of the arm of the mass per ``gamma s^lambda`` and per ``zeta s^alpha``, since damping
+        changes the mode shape.
     density_kg_per_m : float or None
-        Mass per length for which `lump` is valid.
+        Mass per length for which `lump` is valid. None if the point masses are constant fractions
+        of the mass of the beam.
     alteration : Alteration
         Alteration of the beam.
     """
 
-    stiffness: Terms
-    clamp: Terms
-    mass: Terms
-    lump: Terms
-    tension: Terms
-    mass_arm: Terms
-    lump_arm: Terms
-    medium_arm: Terms
-    tension_arm: Terms
-    turn_by_medium: Terms
-    turn_by_internal: Terms
+    stiffness: CoefficientArray
+    clamp: CoefficientArray
+    mass: CoefficientArray
+    lump: CoefficientArray
+    tension: CoefficientArray
+    mass_arm: CoefficientArray
+    lump_arm: CoefficientArray
+    medium_arm: CoefficientArray
+    tension_arm: CoefficientArray
+    arm_change_by_external: CoefficientArray
+    arm_change_by_internal: CoefficientArray
     density_kg_per_m: float | None
     alteration: Alteration
 
-    def by_mode(self) -> Iterable[tuple[complex, ...]]:
-        """Return the coefficients of each mode, in the order of the attributes."""
-        return zip(*(terms.tolist() for terms in _coefficients(self)), strict=True)
+    def coefficients_by_mode(self) -> Iterable[tuple[complex, ...]]:
+        """Return one tuple of coefficients for each mode, in the order of the attributes."""
+        return zip(*(terms.tolist() for terms in _coefficient_arrays(self)), strict=True)
 
 
-_coefficients: Final = attrgetter(*(field.name for field in fields(ModeTerms)[:-2]))
-"""Function that returns the attributes of `ModeTerms` that are arrays."""
+_coefficient_arrays: Final = attrgetter(*(field.name for field in fields(ModeTerms)[:-2]))
+"""Function that returns the coefficients of `ModeTerms`: all attributes that are arrays."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Basis:
-    """First modes of the uniform beam at the points of a quadrature, and their integrals.
+    """First N modes of the uniform beam at quadrature points, and integrals over their shapes.
 
-    `z` are the eigenvalues k L, and `x` the relative positions with `weights`. `shapes`, `slopes`
-    and `curvatures` have the shape (N, points). `arms` and `arms_of_tension`, (N,), are integrals
-    of shape times position and of slope times 1 - x, and `tension`, (N, N), those of products of
-    slopes.
+    `z` are the eigenvalues k L, and `x` the quadrature points, as positions relative to the length,
+    with their `weights`. `shapes`, `slopes` and `curvatures` have the shape (N, points). `arms` are
+    the integrals of ``shape x`` and `arms_of_tension` those of ``slope (1 - x)``, both of shape
+    (N,). `tension` are the integrals of ``slope_i slope_j (1 - x)``, shape (N, N).
     """
 
     z: NDArray[np.float64]
@@ -206,19 +210,19 @@ class _Basis:
     def weighted_products(
         self, rows: NDArray[np.float64], profile: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the integrals over the beam of products of two functions, shape (N, N).
+        """Return the integrals over the beam of all pairwise products of N functions, shape (N, N).
 
-        The N functions are given as `rows` of values at the quadrature points. Each product is
-        weighted by a `profile`, the values of another function at these points.
+        `rows` are the values of the N functions at the quadrature points. Each product is weighted
+        by `profile`, the values of another function at these points.
         """
         integrals: NDArray[np.float64] = (rows * (self.weights * profile)) @ rows.T
         return integrals
 
     def deviation(self, deviations: Sequence[tuple[Profile, float]]) -> NDArray[np.float64]:
-        """Return the sum of relative deviations of density or stiffness, shape (points,).
+        """Return the total relative deviation of density or stiffness at the quadrature points.
 
-        Each deviation is a profile along the beam and its size. The sum is evaluated at the
-        quadrature points.
+        It is the sum of `deviations`, each given by its profile along the beam and its size. The
+        shape is (points,).
         """
         total_deviation = np.zeros(self.x.size)
         for profile, size in deviations:
@@ -235,7 +239,7 @@ _PROFILE_FUNCTIONS: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[
 
 
 def _basis_shapes(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the N shapes of the basis modes at positions relative to the length, (N, …)."""
+    """Return the shapes of the N basis modes at positions relative to the length, (N, …)."""
     return np.array([mode_shape(mode_number, x) for mode_number in range(1, _BASIS_MODE_COUNT + 1)])
 
 
@@ -278,8 +282,8 @@ def _basis() -> _Basis:
 def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> ModeTerms:
     """Return the Galerkin coefficients of the given modes of an altered beam.
 
-    `modes` are mode numbers, from 1. The basis is extended by one mode for each point mass, which
-    represents all modes beyond the basis.
+    `modes` are mode numbers, from 1. For each point mass one mode is added to the basis. It
+    represents all higher modes.
     """
     basis = _basis()
     length_m, mode_indices = beam.length_m, np.array(modes) - 1
@@ -330,8 +334,10 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
         basis.weighted_products(moments, relative_flexibility), _NEXT_EIGENVALUE**-4.0
     )
     root_moments = with_lump_modes(2 * (-1.0) ** np.arange(_BASIS_MODE_COUNT) / basis.z**2)
-    clamp_flexibility: Terms = alteration.clamp_compliance * np.outer(root_moments, root_moments)
-    elastic_stiffness: Terms = np.linalg.inv(beam_flexibility + clamp_flexibility)
+    clamp_flexibility: CoefficientArray = alteration.clamp_compliance * np.outer(
+        root_moments, root_moments
+    )
+    elastic_stiffness: CoefficientArray = np.linalg.inv(beam_flexibility + clamp_flexibility)
     gravity_factor = alteration.gravity_m_s2 * beam.density_over_stiffness * length_m**3
     # Eigenvalues are 1 / omega²: the largest ones, of the lowest modes, are the most exact.
     inverse_factor = np.linalg.inv(np.linalg.cholesky(elastic_stiffness + gravity_factor * tension))
@@ -340,7 +346,7 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
     )
     inverse_squares, eigenvectors = inverse_squares[::-1], eigenvectors[:, ::-1]
     all_shapes = inverse_factor.T @ eigenvectors / np.sqrt(inverse_squares)  # of modal mass 1
-    shapes: Terms = all_shapes[:, mode_indices]
+    shapes: CoefficientArray = all_shapes[:, mode_indices]
     if alteration.clamp_loss:
         clamp_flexibility = clamp_flexibility / (1 + 1j * alteration.clamp_loss)
         elastic_stiffness = np.linalg.inv(beam_flexibility + clamp_flexibility)
@@ -351,14 +357,16 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
     eigenvalue_differences = 1 / inverse_squares[mode_indices] - 1 / inverse_squares[:, None]
     eigenvalue_differences[mode_indices, np.arange(mode_indices.size)] = np.inf
     mass_arms = (mass_arm + lump_arm) @ all_shapes
-    turn_by_medium = mass_arms @ ((all_shapes.T @ shapes) / eigenvalue_differences)
-    turn_by_internal = mass_arms @ (
+    arm_change_by_external = mass_arms @ ((all_shapes.T @ shapes) / eigenvalue_differences)
+    arm_change_by_internal = mass_arms @ (
         ((elastic_stiffness @ all_shapes).T @ beam_flexibility @ modal_loads)
         / eigenvalue_differences
     )
 
-    def modal_coefficients(coefficient_matrix: NDArray[np.float64]) -> Terms:
-        coefficients: Terms = np.sum(shapes * (coefficient_matrix @ shapes), axis=0) / modal_masses
+    def modal_coefficients(coefficient_matrix: NDArray[np.float64]) -> CoefficientArray:
+        coefficients: CoefficientArray = (
+            np.sum(shapes * (coefficient_matrix @ shapes), axis=0) / modal_masses
+        )
         return coefficients
 
     root_modal_masses = np.sqrt(modal_masses)
@@ -377,30 +385,30 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
         lump_arm=lump_arm @ shapes / root_modal_masses,
         medium_arm=with_lump_modes(basis.arms) @ shapes / root_modal_masses,
         tension_arm=gravity_per_length * (tension_arm @ shapes) / root_modal_masses,
-        turn_by_medium=turn_by_medium / root_modal_masses * length_m**4,
-        turn_by_internal=turn_by_internal / root_modal_masses,
+        arm_change_by_external=arm_change_by_external / root_modal_masses * length_m**4,
+        arm_change_by_internal=arm_change_by_internal / root_modal_masses,
         density_kg_per_m=beam.density_kg_per_m,
         alteration=alteration,
     )
 
 
 def _complex_shapes(
-    stiffness_matrix: Terms, mass_matrix: NDArray[np.float64], lossless_shapes: Terms
+    stiffness_matrix: CoefficientArray,
+    mass_matrix: NDArray[np.float64],
+    lossless_shapes: CoefficientArray,
 ) -> NDArray[np.complex128]:
     """Return the mode shapes of a beam in a lossy clamp, as coefficients of the basis, (N, n).
 
-    The result is complex. It follows by inverse iteration from `lossless_shapes`, those of a
-    clamp without loss.
+    They are complex, and computed by inverse iteration from `lossless_shapes`, the mode shapes for
+    a clamp without loss.
     """
     complex_shapes = lossless_shapes.astype(np.complex128)
-    for mode_index in complex_shapes.T:
+    for shape in complex_shapes.T:
         for _ in range(_INVERSE_ITERATIONS):
-            eigenvalue = (mode_index @ stiffness_matrix @ mode_index) / (
-                mode_index @ mass_matrix @ mode_index
-            )
+            eigenvalue = (shape @ stiffness_matrix @ shape) / (shape @ mass_matrix @ shape)
             next_shape = np.linalg.solve(
                 stiffness_matrix - eigenvalue * (1 + _RELATIVE_SHIFT) * mass_matrix,
-                mass_matrix @ mode_index,
+                mass_matrix @ shape,
             )
-            mode_index[:] = next_shape / np.sqrt(next_shape @ mass_matrix @ next_shape)
+            shape[:] = next_shape / np.sqrt(next_shape @ mass_matrix @ next_shape)
     return complex_shapes

@@ -18,7 +18,7 @@ become the best one, however exactly its minimum is found."""
 
 
 def deviance(cost: float, value_count: int) -> float:
-    """Return ``-2 ln`` of the likelihood, up to a constant, for a noise of unknown level.
+    """Return the deviance, ``-2 ln`` of the likelihood plus a constant, for noise of unknown level.
 
     Parameters
     ----------
@@ -126,12 +126,13 @@ class DragEstimate:
     interval_95_m : tuple of float
         95 % interval of `value_m`, not below 0.
     speed_m_s : float
-        Speed at which C_D d has the smallest uncertainty; if only a mean is determined, the speed
-        with the largest weight in it.
+        Speed at which C_D d has the smallest uncertainty. If `law` is constant, the mean speed,
+        weighted with the power dissipated by drag.
     law : DragLaw
         C_D d at all speeds.
     covariance : tuple of tuple of float
-        Covariance of the estimated numbers of the law: of the first, or of both.
+        Covariance of the coefficients of `law`: 2 by 2, or 1 by 1 if only the constant was
+        estimated.
     """
 
     value_m: float

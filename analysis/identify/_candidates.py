@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from rigd.beam import Plant
 
 
-INTEGER_INTERNAL_ORDER: Final = (STRUCTURES["III"], STRUCTURES["VII"])
+INTERNAL_ORDER_ONE_STRUCTURES: Final = (STRUCTURES["III"], STRUCTURES["VII"])
 """Structures with internal and external damping whose internal damping has order 1."""
 
 _MIN_BIC_REDUCTION_FOR_NEW_NOISE: Final = 10.0
@@ -89,26 +89,26 @@ class CandidateSet:
         Record, reduced to the band.
     noise : NoiseSpectrum
         Noise under which all candidates were fitted.
-    free : tuple of str
+    free_settings : tuple of str
         Settings that are estimated.
     candidates : tuple of Candidate
         Candidates by rising BIC.
-    columns : ndarray of complex, shape (c, K)
+    effect_spectra : ndarray of complex, shape (c, K)
         Torque spectra, with free amplitudes, that all candidates include in addition to the linear
         beam.
     drag : DragEstimate, optional
         Air drag, if it is significant; all candidates then include it.
-    misread : tuple of Finding
+    misread_findings : tuple of Finding
         Findings of a wrong sign or unit, which invalidates every number; usually empty.
     """
 
     comparison: Comparison
     noise: NoiseSpectrum
-    free: tuple[Setting, ...]
+    free_settings: tuple[Setting, ...]
     candidates: tuple[Candidate, ...]
-    columns: NDArray[np.complex128]
+    effect_spectra: NDArray[np.complex128]
     drag: DragEstimate | None = None
-    misread: tuple[Finding, ...] = ()
+    misread_findings: tuple[Finding, ...] = ()
 
     @classmethod
     def from_measurement(
@@ -130,7 +130,9 @@ class CandidateSet:
             sign_and_unit_findings(Comparison.from_measurement(measurement, band_hz))
         ):
             # No beam explains such a record, so all structures leave much the same residual.
-            return replace(cls.fit_freest_structure(measurement, fixed, band_hz), misread=misread)
+            return replace(
+                cls.fit_freest_structure(measurement, fixed, band_hz), misread_findings=misread
+            )
         candidate_set = cls._from_uniform_beam(
             fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed
         )
@@ -139,19 +141,19 @@ class CandidateSet:
     @classmethod
     def refit_from_earlier(
         cls,
-        earlier: Sequence[Candidate],
+        earlier_candidates: Sequence[Candidate],
         measurement: Measurement,
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet | None:
-        """Refit the candidates for the beginning of a record to the record as it is now, longer.
+        """Refit candidates that were fitted to the beginning of a record to the longer record.
 
-        Each descent starts from the last estimate of the candidate. Return None if the residual of
-        the first candidate exceeds the noise: then a full search is needed.
+        Each descent starts from the earlier estimate of the candidate. Return None if the residual
+        of the first candidate exceeds the noise: then a full search is needed.
 
         Parameters
         ----------
-        earlier : sequence of Candidate
+        earlier_candidates : sequence of Candidate
             Earlier candidates by rising BIC.
         measurement : Measurement
             Longer record.
@@ -165,7 +167,7 @@ class CandidateSet:
         MeasurementError
             The record cannot be used.
         """
-        first_candidate, *other_candidates = earlier
+        first_candidate, *other_candidates = earlier_candidates
         unknowns = Unknowns.for_structure(
             first_candidate.structure, measurement.nominal, free_settings(fixed)
         )
@@ -175,7 +177,7 @@ class CandidateSet:
         candidate_set = cls._from_analysis(
             analysis, fixed, (replace(first_candidate, fit=analysis.fits[0]),)
         )
-        earlier_set = replace(candidate_set, candidates=tuple(earlier))
+        earlier_set = replace(candidate_set, candidates=tuple(earlier_candidates))
         refitted = (
             earlier_set._refit_in(candidate_set, c, DESCENT_EVALUATIONS) for c in other_candidates
         )
@@ -184,7 +186,7 @@ class CandidateSet:
             ._exclude_leakage()
             .cross_check()
         )
-        return candidate_set._update_reference_following()
+        return candidate_set._update_coherent_angle()
 
     @classmethod
     def fit_freest_structure(
@@ -192,9 +194,9 @@ class CandidateSet:
         measurement: Measurement,
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
-        additional: tuple[Structure, ...] = (),
+        additional_structures: tuple[Structure, ...] = (),
     ) -> CandidateSet:
-        """Fit the damping structure with free orders, and the `additional` structures, to a record.
+        """Fit the damping structure with free orders, and the `additional_structures`, to a record.
 
         The beam is uniform.
 
@@ -203,7 +205,7 @@ class CandidateSet:
         MeasurementError
             The record cannot be used.
         """
-        structures = (_FREEST_STRUCTURE, *additional)
+        structures = (_FREEST_STRUCTURE, *additional_structures)
         return cls._from_uniform_beam(
             fit_record(measurement, structures, fixed=fixed, band_hz=band_hz), fixed
         )
@@ -228,16 +230,16 @@ class CandidateSet:
         return cls(
             comparison=comparison,
             noise=analysis.noise,
-            free=free_settings(fixed),
+            free_settings=free_settings(fixed),
             candidates=_by_rising_bic(candidates),
-            columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
+            effect_spectra=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
         )
 
     @property
     def best(self) -> Candidate:
-        """Return the first candidate, which is reported.
+        """Return the first candidate, whose numbers are reported.
 
-        It is that of the lowest BIC unless `with_leading_candidate` moved another one to the front.
+        It has the lowest BIC unless `with_leading_candidate` moved another one to the front.
         """
         return self.candidates[0]
 
@@ -271,7 +273,7 @@ class CandidateSet:
         return replace(self, candidates=(candidate, *other_candidates))
 
     @property
-    def likeliest(self) -> RecordFit:
+    def likeliest_fit(self) -> RecordFit:
         """Return the candidates' fit with the lowest cost, a sum of squared whitened residuals."""
         return min((candidate.fit for candidate in self.candidates), key=lambda fit: fit.cost)
 
@@ -282,11 +284,13 @@ class CandidateSet:
         It includes the level of the noise, and so is comparable between candidate sets with
         different noise.
         """
-        return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
+        return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.is_compared])))
 
     def unknowns(self, structure: Structure) -> Unknowns:
         """Return the unknown parameters that a fit of a damping structure to this record varies."""
-        return Unknowns.for_structure(structure, self.comparison.measurement.nominal, self.free)
+        return Unknowns.for_structure(
+            structure, self.comparison.measurement.nominal, self.free_settings
+        )
 
     def refit(self, candidate: Candidate, max_evaluations: int = DESCENT_EVALUATIONS) -> Refit:
         """Return the minimum of the cost that a descent reaches from a candidate's estimate."""
@@ -311,14 +315,14 @@ class CandidateSet:
             unknowns,
             start_point,
             self.noise,
-            self.columns,
+            self.effect_spectra,
             max_evaluations=max_evaluations,
         )
 
-    def _update_reference_following(self) -> CandidateSet:
-        """Return the set refitted with a new estimate of the reference-following motor angle.
+    def _update_coherent_angle(self) -> CandidateSet:
+        """Re-estimate the part of the motor angle that follows the reference, and refit the set.
 
-        Return `self` if the reference-following part of the angle has converged.
+        Return `self` if this part has converged.
         """
         candidate_set = self
         for _ in range(MAX_ANGLE_REESTIMATES):
@@ -348,7 +352,7 @@ class CandidateSet:
 
     def _exclude_leakage(self) -> CandidateSet:
         """Refit all candidates without the bins into which a disturbance outside the band leaks."""
-        noise = without_leakage(self.noise, self.comparison, self.likeliest)
+        noise = without_leakage(self.noise, self.comparison, self.likeliest_fit)
         return self.refit_under_noise(noise) if noise is not self.noise else self
 
     def refit_under_noise(self, noise: NoiseSpectrum) -> CandidateSet:
@@ -376,9 +380,9 @@ class CandidateSet:
         ).candidate()
 
     def cross_check(self) -> CandidateSet:
-        """Restart each candidate from the plant of the best candidate, until the best one is final.
+        """Refit each candidate from the plant of the best one, until the best one stays the best.
 
-        An earlier search of a candidate may have missed a flat minimum.
+        The earlier search for a candidate may have missed a flat minimum.
         """
         candidate_set = self
         for _ in range(_MAX_CROSS_CHECK_ROUNDS):
@@ -409,10 +413,10 @@ class CandidateSet:
         cost_to_beat = candidate.fit.cost * (1 - MISSED_COST_FRACTION)
         if start_refit.predicted_cost > cost_to_beat:
             return candidate
-        first_descent = start_refit.further(REFIT_EVALUATIONS)
+        first_descent = start_refit.continue_descent(REFIT_EVALUATIONS)
         if first_descent.cost > candidate.fit.cost * (1 + _CONTINUATION_COST_TOLERANCE):
             return candidate
-        new_minimum = first_descent.further(DESCENT_EVALUATIONS)
+        new_minimum = first_descent.continue_descent(DESCENT_EVALUATIONS)
         return candidate if new_minimum.cost > cost_to_beat else new_minimum.candidate()
 
     def fit_special_cases(self) -> CandidateSet:
@@ -438,19 +442,20 @@ class CandidateSet:
         return candidate_set.with_leading_candidate(candidate_set.freest)
 
     def fit_with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
-        """Return a candidate's fit with the damping it lacks, and whether that damping was added.
+        """Return a candidate refitted with both internal and external damping.
 
-        An insignificant damping may still exist, and the damping ratio of a mode is the sum of both
-        dampings. If the mode was excited for less time than it rings, this dominates its
-        uncertainty. So the other damping is estimated as well, with order 1. A damping whose order
-        is at the limit of its range acts as an inertia or a stiffness, and also counts as absent.
+        A damping that is missing because it is insignificant may still exist, and adds to the
+        damping ratio of each mode. For a mode that was excited for less time than it rings, it is
+        the main uncertainty of the damping ratio. So the missing damping is estimated with order 1.
+        A damping whose order is at the limit of its range acts as an inertia or a stiffness. It
+        counts as missing, too.
 
         Returns
         -------
         fit : RecordFit
-            The candidate's own fit if it lacks no damping.
+            Fit with both dampings; the candidate's own fit if no damping or both are missing.
         bounded : bool
-            Whether the best coefficient of the other damping is negative. The coefficient is then
+            Whether the best coefficient of the added damping is negative. The coefficient is then
             set to one standard deviation, and the fit is not a minimum.
         """
         structure, own_fit = candidate.structure, candidate.fit
@@ -492,7 +497,7 @@ class CandidateSet:
         return self.descent(unknowns, x, 1).fit(), True
 
     def fit_with_free_orders(self) -> CandidateSet:
-        """Return the set with fits of the structures with free damping orders, if it lacks them."""
+        """Return the set with the structures of free damping orders fitted, if they are missing."""
         best_candidate = self.best
         by_structure = {c.structure.name: c.fit for c in self.candidates}
         refits: list[Refit] = []
@@ -519,19 +524,19 @@ class CandidateSet:
 
         The noise is estimated again from the residual of the best candidate with these spectra.
         """
-        all_columns = np.concatenate([self.columns, effect_spectra])
-        best_refit = replace(self, columns=all_columns).refit(self.best)
-        return self.refit_with_effect_spectra(all_columns, best_refit.residual_noise())
+        all_spectra = np.concatenate([self.effect_spectra, effect_spectra])
+        best_refit = replace(self, effect_spectra=all_spectra).refit(self.best)
+        return self.refit_with_effect_spectra(all_spectra, best_refit.residual_noise())
 
     def refit_with_effect_spectra(
         self, effect_spectra: NDArray[np.complex128], noise: NoiseSpectrum
     ) -> CandidateSet:
         """Refit all candidates with given torque spectra of free amplitude, under a given noise.
 
-        The spectra represent effects in addition to the linear beam. They replace the `columns` of
-        the set.
+        The spectra are those of effects in addition to the linear beam. They replace the
+        `effect_spectra` of the set.
         """
-        new_set = replace(self, columns=effect_spectra, noise=noise)
+        new_set = replace(self, effect_spectra=effect_spectra, noise=noise)
         return new_set.with_candidates(
             new_set.refit(c).candidate() for c in self.candidates
         ).cross_check()
@@ -542,14 +547,14 @@ class CandidateSet:
 
     def is_nearly_white(self, fit: RecordFit) -> bool:
         """Return whether the torque residual of a fit is white noise at the 1 % level."""
-        used_bins = self.noise.counts
+        used_bins = self.noise.is_compared
         return whiteness(
             fit.residual[used_bins], self.comparison.frequency_hz[used_bins]
         ).is_nearly_white
 
 
 def _one_damping_structures(fit: RecordFit) -> list[Structure]:
-    """Return the damping structures that leave out an insignificant damping of a fit."""
+    """Return the structures of one damping, if the other damping is insignificant in a fit."""
     structures_and_missing = zip(_ONE_DAMPING_STRUCTURES, (fit.external, fit.internal), strict=True)
     return [
         structure

@@ -1,4 +1,4 @@
-"""Simple causes of modes that no plain uniform beam has, each with one or two unknowns.
+"""Simple causes of modes that differ from those of a uniform beam, with one or two unknowns each.
 
 `analysis.identify._explanations` fits them to the modes of a record.
 """
@@ -37,14 +37,14 @@ class Cause:
     starts : sequence of tuple of float
         Unknowns from which searches begin.
     lower, upper : tuple of float
-        Plausible range; a result at an outer bound is discarded.
+        Plausible range of the unknowns; a fit that ends at a bound is discarded.
     alter : callable
-        Function of the stated alteration, the unknowns and the beam that returns the alteration
-        with this cause.
+        Function of the alteration that the file states, the unknowns and the beam. It returns the
+        alteration with this cause added.
     describe : callable
-        Function of the unknowns and the fitted beam that returns size, unit and a phrase.
+        Function of the unknowns and the fitted beam. It returns size, unit and a phrase.
     plant : callable, optional
-        Function of the unknowns and the fitted plant that returns the plant with this cause.
+        Function of the unknowns and the fitted plant. It returns the plant with this cause.
     special_cases : tuple of str
         Names of causes that this one includes as special cases.
     """
@@ -60,7 +60,7 @@ class Cause:
 
 
 def _set_tilt(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
-    """Return a beam alteration by gravity for a tilted axis; the unknown is the tilt in degrees."""
+    """Return an alteration with gravity for a tilted axis; the unknown is the tilt in degrees."""
     return replace(
         stated_alteration, gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(unknowns[0]))
     )
@@ -117,7 +117,7 @@ def _describe_lump(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, s
 
 
 def _compliance_rad_per_nm(unknowns: Sequence[float], beam: Beam) -> float:
-    """Return the clamp's compliance in rad/(N·m); the unknown is that compliance over L/EI."""
+    """Return the clamp's compliance in rad/(N·m); the unknown is its ratio to L/EI."""
     return unknowns[0] * beam.length_m / beam.bending_stiffness_n_m2
 
 
@@ -243,9 +243,7 @@ def _uneven_stiffness_cause(profile: Profile, phrase: str) -> Cause:
 
 
 def _describe_deviation(phrase: str) -> Callable[[Sequence[float], Beam], tuple[float, str, str]]:
-    """Return a function that describes a relative deviation of the beam's density or stiffness.
-
-    That function returns size, unit and phrase.
+    """Return a function that returns size, unit and phrase of a deviation of density or stiffness.
 
     `phrase` is the text, with ``{}`` for the size in per cent.
     """
@@ -324,7 +322,7 @@ CAUSES: Final = (
         (0.0,),
         (10.0,),
         lambda stated_alteration, unknowns, _: replace(
-            stated_alteration, sensor=(1e-3 * unknowns[0], _BUTTERWORTH_LOSS)
+            stated_alteration, sensor_lag=(1e-3 * unknowns[0], _BUTTERWORTH_LOSS)
         ),
         _describe_second_order_filter,
         _plant_with_second_order_filter,
@@ -335,7 +333,7 @@ CAUSES: Final = (
         (0.0, 0.0),
         (3.0, 2.0),
         lambda stated_alteration, unknowns, _: replace(
-            stated_alteration, sensor=(1e-3 * unknowns[0], unknowns[1])
+            stated_alteration, sensor_lag=(1e-3 * unknowns[0], unknowns[1])
         ),
         _describe_resonance,
         special_cases=("torque filter of second order",),

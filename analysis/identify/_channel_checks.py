@@ -1,8 +1,8 @@
 """Checks of the recorded channels: clipping, stopped motor, wrong sign or unit.
 
-Sign and unit are checked by the ratio of torque and angle to the response of the beam that the file
-states, as a median over the band. The median depends neither on the exact mode frequencies nor on
-the damping.
+Sign and unit are checked by the ratio of the measured response, torque over angle, to the response
+of the beam that the file states. The median of this ratio over the band depends neither on the
+exact mode frequencies nor on the damping.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ _MIN_DRIVEN_POWER: Final = 1e-3
 """Minimum power of the angle at a frequency that is used, relative to the largest power."""
 
 _MIN_PHASE_COSINE: Final = 0.7
-"""Minimum magnitude of the median cosine of the phase, relative to the response of the beam, at
-which the sign of torque over angle is certain."""
+"""Minimum magnitude of the median cosine of the phase between measured and expected response at
+which the sign of the ratio of torque to angle is certain."""
 
 _UNIT_FACTORS: Final = (
     (180 / math.pi, "degrees for radians"),
@@ -117,7 +117,7 @@ _UNIT_FACTORS: Final = (
     (1 / 1.3558179, "pound-force feet for N·m"),
     (2 * math.pi, "turns for radians"),
 )
-"""Factors by which a wrong unit changes torque over angle, each with its description."""
+"""Factors by which a wrong unit changes the ratio of torque to angle, with their descriptions."""
 
 _LOG_FACTOR_TOLERANCE: Final = math.log(1.1)
 """Largest difference between the logarithms of a measured factor and of a known unit factor that

@@ -37,8 +37,8 @@ _MIN_BINS: Final = 50
 """Minimum number of frequency bins in the compared band."""
 
 _MAX_REMOVED_TORQUE_CHANGE: Final = 0.1
-"""Change of the torque caused by the incoherent angle, as a sum of whitened squares, up to which
-this torque is not recomputed."""
+"""Change of the torque caused by the part of the angle that is incoherent with the reference, as a
+sum of whitened squares, up to which this torque is not recomputed."""
 
 _FEEDBACK_ITERATIONS: Final = 3
 """Number of iterations between the torque of the ringing beam and the part of the angle that
@@ -89,8 +89,8 @@ class Comparison:
     incoherent_rad : ndarray, shape (m,), or float
         Part of the angle that is incoherent with the reference; 0 if the whole angle is used.
     incoherent_nm, incoherent_in_gaps_nm : ndarray or float
-        Torque caused by that part of the angle, which was removed, at the retained samples and at
-        the ticks with unknown torque.
+        Torque caused by `incoherent_rad`, which was removed: at the retained samples, and at the
+        ticks with unknown torque.
     drag : DragExpansion, optional
         Removed torque by drag, and its derivatives with respect to the beam.
     impact_spectra : ndarray of complex, shape (k, K), or None
@@ -98,8 +98,8 @@ class Comparison:
     last_poles_rad_s : list of complex
         Poles of the last plant, from which the search for the poles of the next plant starts.
     shared_values : RecentValues
-        Cache of one result for all objectives of a long record, of which one for each would take
-        too much memory.
+        Cache of one result, common to all objectives of a long record: one result for each
+        objective would take too much memory.
     """
 
     measurement: Measurement
@@ -197,7 +197,7 @@ class Comparison:
             decays=DecaySpectra(samples, decimation.rate_hz, omega_rad_s),
         )
         gap_end_s = [
-            gap_end / measurement.rate_hz - comparison.first_s for _, gap_end in angle_gaps
+            gap_end / measurement.rate_hz - comparison.first_sample_s for _, gap_end in angle_gaps
         ]
         later_decays = tuple(
             LaterDecaySpectra(
@@ -224,7 +224,7 @@ class Comparison:
             for time_s in (sample_times_s, unknown_times_s)
         )
         impact_torques = np.concatenate(
-            [impact.columns(sample_times_s, rate_hz) for impact in impacts]
+            [impact.unit_torques(sample_times_s, rate_hz) for impact in impacts]
         )
         return replace(self, impact_spectra=self.spectrum(impact_torques))._remove_torque(
             impact_nm, impact_at_unknown_nm
@@ -249,10 +249,10 @@ class Comparison:
 
     def times_s(self) -> NDArray[np.float64]:
         """Return the times of the compared samples since the record's first tick, (samples,)."""
-        return self.first_s + np.arange(self.samples) / self.decimation.rate_hz
+        return self.first_sample_s + np.arange(self.samples) / self.decimation.rate_hz
 
     @property
-    def first_s(self) -> float:
+    def first_sample_s(self) -> float:
         """Return the time in seconds from the record's first tick to the first compared sample."""
         return float(self.retained.start - self.decimation.reach) / self.decimation.rate_hz
 
@@ -395,11 +395,11 @@ class Comparison:
         ).recompute_incoherent_torque(plant)
 
     def recompute_incoherent_torque(self, plant: Plant | ModalModel) -> Comparison:
-        """Return the comparison with the torque of the incoherent angle predicted again.
+        """Return the comparison with the torque of the incoherent angle predicted by `plant`.
 
-        That torque, predicted with `plant`, is subtracted from the measured torque. The incoherent
-        angle is the part that does not follow the reference of the motor's controller. Return
-        `self` if the whole angle is coherent with the reference.
+        This torque is subtracted from the measured torque, instead of an earlier prediction. The
+        incoherent angle is the part that does not follow the reference of the motor's controller.
+        Return `self` if the whole angle is coherent with the reference.
         """
         if not isinstance(self.incoherent_rad, np.ndarray):
             return self
@@ -462,8 +462,8 @@ class Comparison:
         """
         with_new_hum = replace(self, hum=hum)
         unknown_indices = self._decimated_indices(~self.measurement.torque_known)
-        first_s = self.retained.start / self.decimation.rate_hz
-        unknown_times_s = unknown_indices / self.measurement.rate_hz - first_s
+        first_sample_s = self.retained.start / self.decimation.rate_hz
+        unknown_times_s = unknown_indices / self.measurement.rate_hz - first_sample_s
         return with_new_hum._remove_torque(
             with_new_hum.hum_nm - self.hum_nm,
             with_new_hum._hum_torque_at(unknown_times_s) - self._hum_torque_at(unknown_times_s),
@@ -525,14 +525,14 @@ class Comparison:
                 law=law,
                 response=drag_response,
                 band=band,
-                by_pole={
+                pole_derivatives={
                     mode_number: band(derivative_rows)
-                    for mode_number, derivative_rows in drag_torque.by_pole.items()
+                    for mode_number, derivative_rows in drag_torque.pole_derivatives.items()
                 },
-                by_external=band(drag_torque.by_external),
-                by_ln_density=band(drag_torque.by_ln_density),
-                by_delay=band(drag_torque.by_delay),
-                by_law=band(drag_torque.by_law),
+                external_derivatives=band(drag_torque.external_derivatives),
+                ln_density_derivative=band(drag_torque.ln_density_derivative),
+                delay_derivative=band(drag_torque.delay_derivative),
+                law_derivatives=band(drag_torque.law_derivatives),
                 speed_m_s=drag_torque.speed_m_s,
                 top_speed_m_s=drag_torque.top_speed_m_s,
             ),
@@ -562,7 +562,7 @@ class Comparison:
         drift_spectrum = _drift_spectrum(self.samples)[None, self.bins]
         impact_spectra = drift_spectrum[:0] if self.impact_spectra is None else self.impact_spectra
         decay_columns = [
-            decay_spectra.columns(poles) for decay_spectra in (self.decays, *self.later_decays)
+            decay_spectra.spectra(poles) for decay_spectra in (self.decays, *self.later_decays)
         ]
         return np.concatenate(
             [*decay_columns, hum_spectra, impact_spectra, drift_spectrum, effect_spectra]
@@ -571,10 +571,10 @@ class Comparison:
     def decay_gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        """Return the derivatives of the free-decay spectra by the parameters that move the poles.
+        """Return the derivatives of the free decays' spectrum by the parameters of the poles.
 
-        These are the free decays in ``amplitudes @ nuisance_spectra(poles)``. The amplitudes are
-        held constant.
+        The spectrum is the part of ``amplitudes @ nuisance_spectra(poles)`` that belongs to free
+        decays. The amplitudes are held constant.
 
         Parameters
         ----------
@@ -598,10 +598,8 @@ class Comparison:
     def fill_unknown_torque(self, plant: Plant | ModalModel) -> Comparison:
         """Return the comparison with unmeasured torque filled by a plant's prediction.
 
-        The residual at these ticks then is 0.
-
-        After convergence of the fit, the cost has the same minimum as the cost of the known samples
-        alone.
+        The residual at the filled ticks then is 0. After convergence of the fit, the cost has the
+        same minimum as the cost of the known samples alone.
         """
         known_mask = self.measurement.torque_known
         if known_mask.all():

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 # Measurement
 
 _START_TOLERANCE_S: Final = 1e-7
-"""Tolerance in seconds for rounding: a sample by this much before an impact already belongs to its
-decay."""
+"""Rounding tolerance in seconds: a sample at most this long before an impact already belongs to the
+free decay after it."""
 
 MAX_LONG_GAPS: Final = 8
 """Maximum number of gaps of the angle that are too long to interpolate. Each adds an unknown
@@ -58,39 +58,37 @@ class RecordedImpact:
 
     Attributes
     ----------
-    first_s, last_s : float
+    start_s, end_s : float
         Beginning and end of the contact, since the record's first tick.
     start_uncertainty_s : float
         Uncertainty of the beginning.
     poles_rad_s : tuple of complex
         Poles of the ringing modes: the upper pole of a conjugate pair, or a real pole.
     sizes : tuple of float
-        Estimated amplitude of each row of `columns`; empty before they are estimated.
+        Estimated amplitude of each row of `unit_torques`; empty before they are estimated.
     largest_nm : float
         Largest torque within one second from the beginning.
     """
 
-    first_s: float
-    last_s: float
+    start_s: float
+    end_s: float
     start_uncertainty_s: float
     poles_rad_s: tuple[complex, ...]
     sizes: tuple[float, ...] = ()
     largest_nm: float = 0.0
 
     def decays(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the free decays of all modes that an impact starts, shape (d, n).
+        """Return the free decays of all modes after the impact, shape (d, n).
 
-        Each real decay of unit amplitude is followed by the same decay times the time since the
-        impact in seconds.
-
-        The decays times the time represent small errors of the poles.
+        The rows come in pairs: a real decay of unit amplitude, and this decay multiplied by the
+        time in seconds since the impact. The second row allows for a small error of the pole.
 
         Parameters
         ----------
         time_s : ndarray, shape (n,)
             Times since the record's first tick.
         """
-        since_s = time_s - self.first_s
+        since_s = time_s - self.start_s
         has_begun = since_s > -_START_TOLERANCE_S
         since_s = np.where(has_begun, since_s, 0.0)
         decay_rows = []
@@ -102,10 +100,11 @@ class RecordedImpact:
                 decay_rows += [real_decay, real_decay * since_s]
         return np.array(decay_rows).reshape(len(decay_rows), time_s.size)
 
-    def columns(self, time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
-        """Return time series of the impact's torque, one per unknown amplitude, of unit amplitude.
+    def unit_torques(self, time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
+        """Return the time series by which the unknown amplitudes of the impact are multiplied.
 
-        The rows are the free decays, then the single samples during the contact.
+        The sum of the products is the torque of the impact. The rows are the free decays, then a
+        single sample of 1 for each sample of the contact.
 
         Parameters
         ----------
@@ -119,9 +118,7 @@ class RecordedImpact:
         ndarray, shape (c, n)
         """
         half_period_s = 0.5 / rate_hz
-        in_contact = (time_s > self.first_s - half_period_s) & (
-            time_s < self.last_s - half_period_s
-        )
+        in_contact = (time_s > self.start_s - half_period_s) & (time_s < self.end_s - half_period_s)
         contact_indices = np.flatnonzero(in_contact)
         single_samples = np.zeros((contact_indices.size, time_s.size))
         single_samples[np.arange(contact_indices.size), contact_indices] = 1.0
@@ -137,7 +134,7 @@ class RecordedImpact:
         time_s : ndarray, shape (n,)
             Times since the record's first tick.
         grid_s : ndarray, shape (m,)
-            Times of the samples for which `amplitudes` was estimated.
+            Times of the samples for which `sizes` was estimated.
         rate_hz : float
             Sampling rate of these samples.
         """
@@ -145,7 +142,7 @@ class RecordedImpact:
             return np.zeros(time_s.size)
         decays = self.decays(time_s)
         amplitudes = np.array(self.sizes)
-        contact_nm = amplitudes[len(decays) :] @ self.columns(grid_s, rate_hz)[len(decays) :]
+        contact_nm = amplitudes[len(decays) :] @ self.unit_torques(grid_s, rate_hz)[len(decays) :]
         decay_nm: NDArray[np.float64] = amplitudes[: len(decays)] @ decays
         return decay_nm + np.interp(time_s, grid_s, contact_nm)
 
@@ -186,8 +183,8 @@ class Measurement:
     tip_mass_kg : float or None
         Point mass at the beam's tip as the file states it; None if it is not known.
     axis_tilt_deg : float or None
-        Inclination of the plane of motion along the beam at rest as the file states it, positive
-        where the tip is lower than the motor's axis; None if it was not measured.
+        Angle between the beam at rest and the horizontal as the file states it, positive if the
+        tip is lower than the root; None if it was not measured.
     is_single_sweep : bool
         Whether the motor passed each frequency once, in rising or falling order. An effect of time
         then cannot be distinguished from an effect of frequency.
@@ -311,7 +308,7 @@ class Measurement:
             )
 
     def long_gaps(self, highest_hz: float) -> tuple[tuple[int, int], ...]:
-        """Return the gaps of the motor angle that are too long to interpolate, as ticks.
+        """Return the gaps of the motor angle that are too long to interpolate, as ranges of ticks.
 
         The beam may ring after such a gap.
 
@@ -371,8 +368,8 @@ class Measurement:
     def angle_from_rest(self, highest_hz: float) -> NDArray[np.float64]:
         """Return the motor angle in rad relative to its rest position, gaps interpolated, (n,).
 
-        `highest_hz` is the highest frequency that the angle contains. Where the rest position is
-        unknown, it is the first angle.
+        `highest_hz` is the highest frequency that the angle contains. If the rest position is
+        unknown, the first angle is used.
         """
         filled_angle_rad = interpolate_gaps(
             self.angle_rad, self.angle_known, highest_hz / self.rate_hz

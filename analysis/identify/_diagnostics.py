@@ -50,11 +50,11 @@ def findings(
     """
     measurement = candidate_set.comparison.measurement
     model_independent = (
-        *candidate_set.misread,
+        *candidate_set.misread_findings,
         *clipping_findings(measurement),
         *standstill_findings(measurement),
     )
-    if candidate_set.misread:
+    if candidate_set.misread_findings:
         return model_independent
     all_findings = (
         *model_independent,
@@ -118,9 +118,9 @@ def setting_findings(candidate_set: CandidateSet, headline: Headline) -> Iterato
 def _significant_deviation(
     candidate_set: CandidateSet, headline: Headline, setting_name: Setting
 ) -> tuple[float, float, float] | None:
-    """Return the estimate of a setting minus the file's value, with its 95 % interval.
+    """Return the deviation of a setting from the file's value, and the ends of its 95 % interval.
 
-    Return None if the deviation is not significant, or if the value carries a flag.
+    Return None if the deviation is not significant, or if the estimate carries a flag.
     """
     reported_value, stated_value = (
         headline.parameters.get(setting_name),
@@ -297,9 +297,9 @@ excitation."""
 
 
 def mains_harmonic_text(frequency_hz: float) -> str:
-    """Return the words for the mains harmonic that a frequency is near, or an empty string.
+    """Return words that name the mains harmonic near a frequency as source of a disturbance.
 
-    The text describes the possible source of a disturbance with this frequency.
+    Return an empty string if there is no mains harmonic near it.
     """
     for mains_hz in (50, 60):
         for n in range(1, 9):
@@ -381,7 +381,7 @@ def unexplained_residual_finding(
     )
 
 
-_DRIFT_SEGMENTS: Final = 16
+_DRIFT_SEGMENT_COUNT: Final = 16
 """Number of segments of a record whose mean residual torques are compared."""
 
 _MIN_SCATTER_RATIO: Final = 10.0
@@ -397,10 +397,10 @@ def _torque_zero_drift_nm(candidate_set: CandidateSet) -> float:
     comparison = candidate_set.comparison
     predicted_nm, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
     residual_nm = comparison.torque_nm[comparison.retained] - predicted_nm
-    segment_length = residual_nm.size // _DRIFT_SEGMENTS
+    segment_length = residual_nm.size // _DRIFT_SEGMENT_COUNT
     segment_means_nm = (
-        residual_nm[: _DRIFT_SEGMENTS * segment_length]
-        .reshape(_DRIFT_SEGMENTS, segment_length)
+        residual_nm[: _DRIFT_SEGMENT_COUNT * segment_length]
+        .reshape(_DRIFT_SEGMENT_COUNT, segment_length)
         .mean(axis=1)
     )
     # Expected scatter for white noise with the power of the band's upper half.

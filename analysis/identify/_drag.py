@@ -1,8 +1,8 @@
-"""Air drag on the beam: whether it is significant, its size C_D d, and the damping by amplitude.
+"""Air drag on the beam: its significance, its size C_D d, and damping ratios at several amplitudes.
 
-Drag along the whole beam is described by one number, or by two where the coefficient falls with the
-speed. A fit without drag yields a fractional order, a delay, deviating mode frequencies and a wrong
-density instead, because drag damps each mode in proportion to its speed.
+The drag law of the whole beam has one coefficient, or two if C_D falls with the speed. A fit
+without drag yields a fractional order, a delay, deviating mode frequencies and a wrong density
+instead, because drag damps each mode in proportion to its speed.
 
 In free vibration of one mode, with the tip moving by ``A sin(omega t)``, a force per metre
 ``rho_air/2 C v^p`` dissipates in each cycle as much energy as linear damping of the ratio::
@@ -79,10 +79,10 @@ _ROUGH_COST_TOLERANCE: Final = 500.0
 """Predicted reduction of the cost below which the drag torque is not recomputed in the first, rough
 fit.
 
-The last step is still taken by all fits at this drag (`_fit_all_structures`). The two numbers of a
-law and external damping can compensate each other along a flat direction. There each recomputation
-predicted a step of half a standard deviation in the same direction, for ten rounds and more: away
-from the true value, at a second a round."""
+The fits of all structures still take the last step (`_fit_all_structures`). The two coefficients of
+a drag law and external damping can compensate each other along a flat direction. With a smaller
+tolerance, each recomputation then predicted another step of half a standard deviation, away from
+the true value, for ten rounds and more of a second each."""
 
 _STAGNATION_COST_REDUCTION: Final = 20.0
 """Predicted reduction of the cost below which a fit with drag may end if it stagnates: if the step
@@ -97,13 +97,13 @@ _FIRST_STRUCTURE: Final = "III"
 _FREEST_STRUCTURE: Final = "VI"
 """Structure with both dampings and free orders."""
 
-_ONE_NUMBER_LAW_STD: Final = 0.1
-"""Relative standard deviation of the drag coefficient above which the drag law has one number.
+_MIN_STD_OF_CONSTANT_LAW: Final = 0.1
+"""Relative standard deviation of C_D d above which the drag law is a constant.
 
-The drag coefficient of a cylinder falls with the speed. A constant coefficient is wrong by up to 7
-% on rods and wires between 0.2 and 2 mm, and external damping compensates for the rest. A more
-certain coefficient gets a second number, whether or not that differs from 0, since its interval
-would be too narrow otherwise."""
+The drag coefficient of a cylinder falls with the speed. A constant is wrong by up to 7 % on rods
+and wires between 0.2 and 2 mm, and external damping compensates for the error. If C_D d is more
+certain, the law gets its second coefficient, even if that is not significant: otherwise the
+interval would be too narrow."""
 
 _LOWEST_RELATIVE_SPEED: Final = 0.02
 """Lowest speed at which C_D d is reported, relative to the highest speed: below it the record
@@ -147,7 +147,10 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
     if rough_fit is None:
         return candidate_set
     # The freest structure starts from this fit: its fit without drag may be far off.
-    start_comparison, next_start = rough_fit.objective.comparison, _DragFitStart.of(rough_fit)
+    start_comparison, next_start = (
+        rough_fit.objective.comparison,
+        _DragFitStart.from_refit(rough_fit),
+    )
     for structure_name in (_FREEST_STRUCTURE, _FIRST_STRUCTURE):
         drag_fit = _converged_drag_fit(
             candidate_set, next_start, STRUCTURES[structure_name], start_comparison=start_comparison
@@ -169,9 +172,9 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
 
 
 def _bic_under_own_noise(refit: Refit) -> float:
-    """Return the BIC of a refit under the noise of its residual, comparable to that of a set."""
-    noise_power = refit.residual_noise().power[refit.noise.counts]
-    parameter_count = refit.x.size + len(refit.columns)
+    """Return the BIC of a refit under the noise of its residual, as in `CandidateSet.bic`."""
+    noise_power = refit.residual_noise().power[refit.noise.is_compared]
+    parameter_count = refit.x.size + len(refit.effect_spectra)
     return float(parameter_count * math.log(2 * noise_power.size) + 2 * np.sum(np.log(noise_power)))
 
 
@@ -179,21 +182,23 @@ def _bic_under_own_noise(refit: Refit) -> float:
 class _DragFitStart:
     """Start values of a fit with air drag: plant, damping structure, drag law and noise.
 
-    `has_two_numbers` states whether both numbers of the drag law are estimated.
+    `has_two_coefficients` states whether both coefficients of the drag law are estimated.
     """
 
     plant: Plant
     structure: Structure
     law: DragLaw
     noise: NoiseSpectrum
-    has_two_numbers: bool = False
+    has_two_coefficients: bool = False
 
     @classmethod
-    def of(cls, refit: Refit) -> _DragFitStart:
+    def from_refit(cls, refit: Refit) -> _DragFitStart:
         """Return the minimum of a refit as the start of the next fit with drag."""
         structure = refit.objective.unknowns.structure
-        has_two_numbers = len(refit.columns) > 1
-        return cls(refit.plant, structure, _law_at_minimum(refit), refit.noise, has_two_numbers)
+        has_two_coefficients = len(refit.effect_spectra) > 1
+        return cls(
+            refit.plant, structure, _law_at_minimum(refit), refit.noise, has_two_coefficients
+        )
 
 
 def _drag_may_improve_fit(candidate_set: CandidateSet) -> bool:
@@ -224,17 +229,15 @@ def small_drag_spectrum(
     `measured_modes` replace those of the plant, as for `DragResponse`.
     """
     drag_response = comparison.drag_response(plant, measured_modes)
-    return comparison.spectrum(drag_response.first_order()[None, comparison.retained])
+    return comparison.spectrum(drag_response.first_order_torque()[None, comparison.retained])
 
 
 def _first_order_drag(refit: Refit) -> tuple[float, float]:
-    """Return the air drag C_D d in metres that a fit lacks, and by how much it reduces the cost.
+    """Return C_D d in metres of the air drag missing from a fit, and by how much it cuts the cost.
 
-    Both are estimated to first order.
-
-    All other parameters of the fit stay free.
+    Both are first-order estimates, with all other parameters of the fit free.
     """
-    (drag_spectrum,), residual = refit.unexplained_columns(
+    (drag_spectrum,), residual = refit.unexplained_spectra(
         small_drag_spectrum(refit.objective.comparison, refit.plant)
     )
     squared_length = float(np.vdot(drag_spectrum, drag_spectrum).real)
@@ -250,7 +253,7 @@ def _first_order_start(candidate_set: CandidateSet, candidate: Candidate) -> _Dr
     Return None if the drag would be negative.
     """
     drag_spectrum = small_drag_spectrum(candidate_set.comparison, candidate.fit.plant)
-    refit = replace(candidate_set, columns=drag_spectrum).refit(
+    refit = replace(candidate_set, effect_spectra=drag_spectrum).refit(
         candidate, _SHORT_DESCENT_EVALUATIONS
     )
     drag_m = float(refit.amplitudes()[0][0])
@@ -271,15 +274,17 @@ def _converged_drag_fit(
 ) -> Refit | None:
     """Return a refit of one damping structure with air drag whose torque has converged.
 
-    The fit starts from `fit_start`.
-
-    `tolerance` is the largest cost reduction by a further step. `start_comparison` is the
-    comparison with the drag of the start, if it has been computed. Return None if the drag is
-    negative, is unstable or does not converge.
+    The fit starts from `fit_start`, and has converged if a further step would reduce the cost by
+    less than `tolerance`. `start_comparison` is the comparison with the drag of the start, if it
+    has been computed. Return None if the drag is negative, is unstable or does not converge.
     """
     unknowns = candidate_set.unknowns(structure)
     x = unknowns.vector(fit_start.plant)
-    law, noise, has_two_numbers = fit_start.law, fit_start.noise, fit_start.has_two_numbers
+    law, noise, has_two_coefficients = (
+        fit_start.law,
+        fit_start.noise,
+        fit_start.has_two_coefficients,
+    )
     comparison, is_rough_fit, cost_reduction = (
         start_comparison,
         tolerance > _COST_TOLERANCE,
@@ -299,10 +304,16 @@ def _converged_drag_fit(
         assert drag_expansion is not None
         descent = partial(Refit.descend, comparison, unknowns, noise=noise)
         start_refit = descent(
-            x, torque_spectra=drag_expansion.by_law[: 1 + has_two_numbers], max_evaluations=1
+            x,
+            torque_spectra=drag_expansion.law_derivatives[: 1 + has_two_coefficients],
+            max_evaluations=1,
         )
-        refit = start_refit.further(_SHORT_DESCENT_EVALUATIONS)
-        if has_two_numbers or is_rough_fit or _relative_drag_std(refit) > _ONE_NUMBER_LAW_STD:
+        refit = start_refit.continue_descent(_SHORT_DESCENT_EVALUATIONS)
+        if (
+            has_two_coefficients
+            or is_rough_fit
+            or _relative_drag_std(refit) > _MIN_STD_OF_CONSTANT_LAW
+        ):
             last_reduction, cost_reduction = (
                 cost_reduction,
                 start_refit.cost - max(start_refit.predicted_cost, refit.cost),
@@ -314,10 +325,10 @@ def _converged_drag_fit(
                 return start_refit
         else:
             # Not before: a second number would compensate for wrong damping of the beam.
-            has_two_numbers = True
+            has_two_coefficients = True
             refit = descent(
                 refit.x,
-                torque_spectra=drag_expansion.by_law,
+                torque_spectra=drag_expansion.law_derivatives,
                 max_evaluations=_SHORT_DESCENT_EVALUATIONS,
             )
         x, law, noise = refit.x, _law_at_minimum(refit), refit.residual_noise()
@@ -328,7 +339,7 @@ def _converged_drag_fit(
 
 
 def _relative_drag_std(refit: Refit) -> float:
-    """Return the relative standard deviation of C_D d in a refit whose drag law has one number."""
+    """Return the relative standard deviation of C_D d in a refit whose drag law is a constant."""
     law, (_, std) = _law_at_minimum(refit), refit.amplitudes()
     return float(std[0]) / max(float(law.constant_m), float(np.finfo(float).tiny))
 
@@ -341,8 +352,10 @@ def _law_at_minimum(refit: Refit) -> DragLaw:
     expansion = refit.objective.comparison.drag
     assert expansion is not None
     law_change = refit.amplitudes()[0].tolist()
-    slowing_m = expansion.law.slowing + (law_change[1] if len(law_change) > 1 else 0.0)
-    return DragLaw(expansion.law.constant_m + law_change[0], slowing_m)
+    decreasing_part = expansion.law.decreasing_part + (
+        law_change[1] if len(law_change) > 1 else 0.0
+    )
+    return DragLaw(expansion.law.constant_m + law_change[0], decreasing_part)
 
 
 def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> CandidateSet:
@@ -350,7 +363,7 @@ def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> Ca
     set_with_drag = replace(
         candidate_set,
         comparison=converged_fit.objective.comparison,
-        columns=converged_fit.columns,
+        effect_spectra=converged_fit.effect_spectra,
         noise=converged_fit.residual_noise(),
     )
     converged_cost = set_with_drag.descent(
@@ -365,14 +378,14 @@ def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> Ca
             unknowns,
             unknowns.vector(converged_fit.plant),
             set_with_drag.noise,
-            set_with_drag.columns,
+            set_with_drag.effect_spectra,
             max_evaluations=_SHORT_DESCENT_EVALUATIONS,
             relative_tolerance=MISSED_COST_FRACTION,
             hopeless=(_EARLY_EVALUATIONS, cost_limit),
         )
         short_descents.append((refit.candidate(), refit))
     candidates = [
-        refit.further(_LONG_DESCENT_EVALUATIONS).candidate()
+        refit.continue_descent(_LONG_DESCENT_EVALUATIONS).candidate()
         if refit.predicted_cost < cost_limit
         else candidate
         for candidate, refit in short_descents
@@ -422,7 +435,7 @@ _RELATIVE_TIP_AMPLITUDES: Final = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
 up to the limit of small slopes."""
 
 _SPEED_EXPONENTS: Final = (2.0, 4 / 3)
-"""Exponents of the speed in the drag force, for the two numbers of a `DragLaw`."""
+"""Exponents of the speed in the drag force, for the two coefficients of a `DragLaw`."""
 
 _QUADRATURE_POINTS: Final = 64
 """Number of points of the Gauss quadrature along the beam."""
@@ -458,30 +471,31 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAtAmplit
     if drag_estimate is None:
         return ()
     fit = candidate_set.best.fit
-    law_numbers = np.array([drag_estimate.law.constant_m, drag_estimate.law.slowing])[
+    law_coefficients = np.array([drag_estimate.law.constant_m, drag_estimate.law.decreasing_part])[
         : len(drag_estimate.covariance)
     ]
     covariance = np.array(drag_estimate.covariance)
     estimates = []
-    for mode_number in fit.modes:
-        if mode_number.number not in _REPORTED_MODE_NUMBERS or mode_number.frequency_hz <= 0:
+    for mode_estimate in fit.modes:
+        if mode_estimate.number not in _REPORTED_MODE_NUMBERS or mode_estimate.frequency_hz <= 0:
             continue
         for relative_amplitude in _RELATIVE_TIP_AMPLITUDES:
             tip_amplitude_m = relative_amplitude * fit.plant.beam.length_m
             ratio_by_law = damping_ratio_by_drag_law(
-                mode_number.number,
-                2 * math.pi * mode_number.frequency_hz,
+                mode_estimate.number,
+                2 * math.pi * mode_estimate.frequency_hz,
                 tip_amplitude_m,
                 fit.plant.beam.density_kg_per_m,
-            )[: law_numbers.size]
-            ratio_variance = mode_number.damping_ratio_std**2 + float(
+            )[: law_coefficients.size]
+            ratio_variance = mode_estimate.damping_ratio_std**2 + float(
                 ratio_by_law @ covariance @ ratio_by_law
             )
             estimates.append(
                 DampingAtAmplitude(
-                    mode=mode_number.number,
+                    mode=mode_estimate.number,
                     tip_amplitude_m=tip_amplitude_m,
-                    damping_ratio=mode_number.damping_ratio + float(ratio_by_law @ law_numbers),
+                    damping_ratio=mode_estimate.damping_ratio
+                    + float(ratio_by_law @ law_coefficients),
                     std=math.sqrt(ratio_variance),
                 )
             )
@@ -491,9 +505,9 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAtAmplit
 def damping_ratio_by_drag_law(
     mode: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
 ) -> NDArray[np.float64]:
-    """Return a mode's damping ratio by air drag, per unit of each number of a `DragLaw`, (2,).
+    """Return the damping ratio due to air drag per unit of each coefficient of a `DragLaw`, (2,).
 
-    The mode vibrates freely with a given amplitude of the tip in metres.
+    It is that of one mode in free vibration, with a given amplitude of the tip in metres.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     relative_shape = np.abs(mode_shape(mode, 0.5 * (nodes + 1)) / mode_shape(mode, 1.0))

@@ -1,8 +1,8 @@
-"""Change of the torque by air drag with beam and drag, to first order.
+"""First-order change of the torque by air drag if the beam or the drag law changes.
 
 The torque by drag is not linear in the motion, so no frequency response function describes it. In a
-fit it is computed at one beam and drag and removed from the measured torque. Its change with beam
-or drag is linear (`DragExpansion`) in
+fit it is computed for one beam and drag law and removed from the measured torque. If beam or drag
+law change, the torque changes linearly (`DragExpansion`) with
 
 * the poles of the modes, on which the motion near a resonance depends,
 * the external damping ``gamma s^lambda`` at these poles, since it also drives the modes,
@@ -10,12 +10,12 @@ or drag is linear (`DragExpansion`) in
 * the delay between the channels,
 * the drag itself.
 
-The first four follow from a fit's unknowns. The drag is free: its columns are projected out as
-those of a free decay are. A fit with drag repeats both steps until they agree.
+The first four follow from a fit's unknowns. The drag is free: its spectra are projected out like
+those of a free decay. Fits and computations of the drag torque alternate until they agree.
 
-Without drag a resonance peak grows without limit as the damping falls. With drag it hardly grows.
-Where the linear torque curves with a pole, the torque by drag curves against it. So only the first
-order in the poles of the linear torque counts, and its remainder is subtracted.
+Without drag a resonance peak grows without limit as the damping falls. With drag it hardly grows:
+to second order in a pole, the changes of the linear torque and of the torque by drag nearly cancel.
+So the linear torque counts to first order in the poles only. Its change beyond that is subtracted.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ class DragExpansion:
         Response of this beam to drag.
     band : callable
         Function from torque samples, at the times of the angle, to their spectrum in the band.
-    by_pole : dict of int to ndarray of complex, shape (2, K)
+    pole_derivatives : dict of int to ndarray of complex, shape (2, K)
         Derivatives by the real and the imaginary part of the upper pole of each mode.
-    by_external : ndarray of complex, shape (2, 2, K)
+    external_derivatives : ndarray of complex, shape (2, 2, K)
         Derivatives by the external damping that drives each of the two lowest modes, as in
         `DragTorque`.
-    by_ln_density, by_delay : ndarray of complex, shape (K,)
+    ln_density_derivative, delay_derivative : ndarray of complex, shape (K,)
         Derivatives by ln(mass per length) and by the delay of the torque.
-    by_law : ndarray of complex, shape (2, K)
-        Derivatives by `DragLaw.constant_m` and `DragLaw.slowing`.
+    law_derivatives : ndarray of complex, shape (2, K)
+        Derivatives by `DragLaw.constant_m` and `DragLaw.decreasing_part`.
     speed_m_s, top_speed_m_s : float
         Mean and highest speed of the beam, as in `DragTorque`.
     """
@@ -74,11 +74,11 @@ class DragExpansion:
     law: DragLaw
     response: DragResponse
     band: Callable[[Real], Complex]
-    by_pole: dict[int, Complex]
-    by_external: Complex
-    by_ln_density: Complex
-    by_delay: Complex
-    by_law: Complex
+    pole_derivatives: dict[int, Complex]
+    external_derivatives: Complex
+    ln_density_derivative: Complex
+    delay_derivative: Complex
+    law_derivatives: Complex
     speed_m_s: float
     top_speed_m_s: float
 
@@ -101,7 +101,7 @@ class DragExpansion:
             Poles of the other beam, differentiated by the unknowns.
         parameter_names : sequence of str
             Names of the parameters, as in `Unknowns`.
-        parameter_slopes : ndarray, shape (len(names), k)
+        parameter_slopes : ndarray, shape (len(parameter_names), k)
             Derivatives of the parameters by the unknowns, with density over stiffness and stiffness
             as logarithms.
 
@@ -112,23 +112,23 @@ class DragExpansion:
         torque_jacobian : ndarray of complex, shape (k, K)
             Derivatives of the change by the unknowns.
         """
-        derivative_spectra = [self.by_ln_density]
+        derivative_spectra = [self.ln_density_derivative]
         own_density, other_density = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
         parameter_steps = [np.log(other_density / own_density)]
         # ln(mass per length) is the sum of ln(rho/EI) and ln(EI).
         step_slopes = [
             _parameter_rows(parameter_slopes, parameter_names, BEAM_PARAMETERS).sum(axis=0)
         ]
-        for by_external, damping_change in zip(
-            self.by_external, self._external_damping_change(plant), strict=True
+        for external_derivative, damping_change in zip(
+            self.external_derivatives, self._external_damping_change(plant), strict=True
         ):
-            derivative_spectra += list(by_external)
+            derivative_spectra += list(external_derivative)
             parameter_steps += damping_change[:, 0].tolist()
             step_slopes += list(
                 damping_change[:, 1:]
                 @ _parameter_rows(parameter_slopes, parameter_names, _EXTERNAL_PARAMETERS)
             )
-        derivative_spectra.append(self.by_delay)
+        derivative_spectra.append(self.delay_derivative)
         parameter_steps.append(plant.delay_s - self.plant.delay_s)
         step_slopes += list(_parameter_rows(parameter_slopes, parameter_names, ("delay_s",)))
         # A real view suffices, since the spectra are multiplied by real numbers only.
@@ -139,9 +139,10 @@ class DragExpansion:
         return torque_change + change_by_poles, torque_jacobian + jacobian_by_poles
 
     def change_by_poles(self, poles: Sequence[Pole], unknown_count: int) -> tuple[Complex, Complex]:
-        """Return the change of the drag torque with the poles alone, and its derivatives.
+        """Return the change of the drag torque due to the poles of another beam.
 
-        The spectra have the shapes (K,) and (unknown_count, K).
+        The spectrum of the change, shape (K,), is returned with its derivatives by the unknowns,
+        shape (unknown_count, K).
 
         Parameters
         ----------
@@ -150,19 +151,21 @@ class DragExpansion:
         unknown_count : int
             Number of unknowns.
         """
-        change = np.zeros(self.by_delay.size, dtype=np.complex128)
+        change = np.zeros(self.delay_derivative.size, dtype=np.complex128)
         jacobian = np.zeros((unknown_count, change.size), dtype=np.complex128)
         for pole in poles:
-            if pole.mode not in self.by_pole or not pole.oscillates:
+            if pole.mode not in self.pole_derivatives or not pole.oscillates:
                 continue
             own_pole = complex(self.response.poles[pole.mode - 1])
             pole_step = pole.at_rad_s - own_pole
             remainder, remainder_slopes = self._torque_beyond_first_order(
                 pole.mode, own_pole, pole.at_rad_s
             )
-            by_real, by_imaginary = self.by_pole[pole.mode]
+            by_real, by_imaginary = self.pole_derivatives[pole.mode]
             change += pole_step.real * by_real + pole_step.imag * by_imaginary - remainder
-            by_real_at_pole, by_imaginary_at_pole = self.by_pole[pole.mode] - remainder_slopes
+            by_real_at_pole, by_imaginary_at_pole = (
+                self.pole_derivatives[pole.mode] - remainder_slopes
+            )
             jacobian += np.outer(pole.derivative.real, by_real_at_pole)
             jacobian += np.outer(pole.derivative.imag, by_imaginary_at_pole)
         return change, jacobian
@@ -170,15 +173,15 @@ class DragExpansion:
     def _external_damping_change(self, plant: Plant) -> list[Real]:
         """Return the external damping of another beam minus that of this beam, for two modes.
 
-        The difference is taken at the pole of each mode: with another order ``gamma s^lambda`` is
-        not linear in gamma and lambda, and a fit with insignificant external damping may reach any
-        order.
+        The difference is taken at the pole of each mode, without an expansion in the order:
+        ``gamma s^lambda`` is not linear in lambda, and a fit with insignificant external damping
+        may reach any order.
 
         Returns
         -------
         list of ndarray, shape (2, 3)
-            For each mode c_0 and c_1 of ``c_0 + c_1 s``, each with its derivatives by gamma and
-            lambda.
+            For each mode the difference as ``c_0 + c_1 s``. The rows are c_0 and c_1, each with its
+            derivatives by gamma and lambda.
         """
         own_damping, other_damping = self.plant.damping, plant.damping
         linear_terms = []
@@ -236,9 +239,10 @@ class DragExpansion:
 def _parameter_rows(
     derivatives: Real, derivative_names: Sequence[str], wanted_names: Sequence[str]
 ) -> Real:
-    """Return the derivatives of the wanted parameters by the unknowns, shape (n, k).
+    """Return the rows of `derivatives` for the wanted parameters, shape (n, k).
 
-    `derivative_names` are the parameters of the given rows. A missing parameter gets zeros.
+    `derivative_names` are the parameters of all rows. A parameter that is not among them gets
+    zeros.
     """
     zero_row = np.zeros(derivatives.shape[1])
     return np.array(

@@ -1,9 +1,9 @@
 """Encoder readings of a motor at rest.
 
-A motor that rests near the edge between two counts, while the beam rings, moves by much less than a
-count. But its encoder alternates between the two, in step with the mode. A fit takes this square
-wave for motion that drives the mode, and shifts the frequency: in one of 14 searches by seven
-standard deviations. Each change of the reading shows that the motor is at the edge.
+While the beam rings, a resting motor moves by much less than a count. But if it rests near the edge
+between two counts, its encoder alternates between them at the frequency of the mode. A fit takes
+this square wave for motion that drives the mode, and shifts the frequency of the mode: in one of 14
+searches by seven standard deviations. The alternating readings show that the motor is at the edge.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _MIN_CHANGES: Final = 4
-"""Minimum number of alternating changes between two counts that do not show a motion."""
+"""Minimum number of alternating changes between two counts that show a motor at rest."""
 
-_STEP_TOLERANCE: Final = 1.5
-"""Largest change over the smallest one of the record that is still a single count."""
+_MAX_COUNT_RATIO: Final = 1.5
+"""Largest change of the reading that is a single count, relative to the smallest change of the
+record."""
 
 
 def angle_without_alternating_counts(
@@ -48,7 +49,7 @@ def angle_without_alternating_counts(
     reference_moves = np.cumsum(np.diff(reference_rad) != 0)[change_indices]
     returns = (
         (changes_rad[1:] == -changes_rad[:-1])
-        & (np.abs(changes_rad[1:]) <= _STEP_TOLERANCE * np.abs(changes_rad).min())
+        & (np.abs(changes_rad[1:]) <= _MAX_COUNT_RATIO * np.abs(changes_rad).min())
         & (reference_moves[1:] == reference_moves[:-1])
     )
     settled_rad = angle_rad.copy()

@@ -22,7 +22,7 @@ class PivotLossFactor:
     value, std : float
         Loss factor (energy lost per radian over stored energy) and its standard deviation: ``zeta
         omega^alpha sin(alpha pi/2)`` of internal damping, ``gamma omega^lambda sin(lambda pi/2)``
-        over ``rho/EI omega²`` of external damping. Without pivot frequency zeta or gamma.
+        over ``rho/EI omega²`` of external damping. If `omega_rad_s` is None, zeta or gamma.
     """
 
     omega_rad_s: float | None
@@ -48,7 +48,7 @@ class ModeEstimate:
 
 @dataclass(frozen=True, slots=True)
 class Ringing:
-    """Free decay of the beam at the start of a record, besides the response to the motor.
+    """Free decay of the beam at the start of a record, in addition to the response to the motor.
 
     Attributes
     ----------

@@ -1,8 +1,8 @@
 """Simple causes of modes that deviate from a uniform beam; they are hypotheses, not facts.
 
-Each cause is fitted to the modal constants together with the seven parameters of the beam, at exact
-geometry. About twelve constants are compatible with several causes, so a cause that explains them
-is not established.
+Each cause is fitted to the modal constants together with the seven parameters of the beam, without
+a tolerance of the geometry. About twelve constants are compatible with several causes, so a cause
+that explains them is not established.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ Frequencies are known so precisely that a descent without tolerance would conver
 long and narrow curve."""
 
 _GIVE_UP_CHI_SQUARE: Final = 6.0
-"""Chi-square per degree of freedom, with a tolerance, above which a cause is given up."""
+"""Chi-square per degree of freedom above which a cause is given up after a descent with tolerance.
+"""
 
 _DERIVATIVE_STEP: Final = 1e-6
 """Step of an unknown for numerical derivatives. Steps of the unknowns of a cause are relative to
@@ -179,7 +180,7 @@ def _fit_cause(
     plausible range does not count as an explanation.
     """
     beam_unknowns = problem.lower.size
-    degrees_of_freedom = problem.compared - beam_unknowns - len(cause.lower)
+    degrees_of_freedom = problem.constant_count - beam_unknowns - len(cause.lower)
     if degrees_of_freedom <= 0:
         return None
     starts = [(*_CauseSearch(problem, cause, x).best_start(), x) for x in start_beams]
@@ -235,7 +236,7 @@ class _CauseSearch:
 
     Parameters
     ----------
-    problem : ConstantsProblem
+    problem : UniformBeamProblem
         Modal constants of the record and the beam to compare with them.
     cause : Cause
         Cause that is added to the beam.
@@ -258,13 +259,13 @@ class _CauseSearch:
         self._upper = np.concatenate([upper, cause.upper])
         cause_scale = np.max(np.abs([cause.lower, cause.upper]), axis=0)
         self._scale = np.concatenate([np.ones(x.size), cause_scale])
-        covariance = problem.covariance + tolerance**2 * np.eye(problem.compared)
+        covariance = problem.covariance + tolerance**2 * np.eye(problem.constant_count)
         self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def best_start(self) -> tuple[float, NDArray[np.float64]]:
-        """Return the best start of a cause, after one step of the beam's unknowns from each start.
+        """Return chi-square and unknowns of beam and cause at the best start of the cause.
 
-        The result is its chi-square, and its unknowns of beam and cause.
+        The unknowns of the beam have taken one step from each start before they are compared.
         """
         x, derivatives = self._beam_x, None
         lowest_step, highest_step = (limits[: x.size] - x for limits in (self._lower, self._upper))
@@ -272,13 +273,13 @@ class _CauseSearch:
         for cause_start in self._cause.starts:
             y = np.concatenate([x, cause_start])
             mode_terms = self._mode_terms(y)
-            deviations, slopes = self._deviations(x, mode_terms)
+            residual, slopes = self._residual_and_slopes(x, mode_terms)
             if derivatives is None:
                 derivatives = slopes()
-            beam_step, _ = _limited_step(deviations, derivatives, lowest_step, highest_step)
-            deviations, _ = self._deviations(x + beam_step, mode_terms)
+            beam_step, _ = _limited_step(residual, derivatives, lowest_step, highest_step)
+            residual, _ = self._residual_and_slopes(x + beam_step, mode_terms)
             stepped_starts.append(
-                (float(deviations @ deviations), np.concatenate([x + beam_step, cause_start]))
+                (float(residual @ residual), np.concatenate([x + beam_step, cause_start]))
             )
         return min(stepped_starts, key=lambda pair: pair[0])
 
@@ -289,14 +290,14 @@ class _CauseSearch:
         direction it rises first and then falls further.
         """
         unknown_scale, lowest_chi_square, best_y = self._scale, math.inf, y
-        deviations, beam_slopes = self._deviations_at(y)
+        residual, beam_slopes = self._residual_at(y)
         for _ in range(_MAX_DESCENT_STEPS):
-            chi_square = float(deviations @ deviations)
+            chi_square = float(residual @ residual)
             if chi_square < lowest_chi_square:
                 lowest_chi_square, best_y = chi_square, y
-            derivatives = np.concatenate([beam_slopes(), self._slopes_by_cause(y, deviations)])
+            derivatives = np.concatenate([beam_slopes(), self._cause_slopes(y, residual)])
             scaled_step, predicted_chi_square = _limited_step(
-                deviations,
+                residual,
                 derivatives * unknown_scale[:, None],
                 (self._lower - y) / unknown_scale,
                 (self._upper - y) / unknown_scale,
@@ -312,8 +313,8 @@ class _CauseSearch:
             )
             for halving in range(_MAX_STEP_HALVINGS + 1):
                 next_y = np.clip(y + scaled_step / 2**halving, self._lower, self._upper)
-                deviations, beam_slopes = self._deviations_at(next_y)
-                if deviations @ deviations < _MAX_CHI_SQUARE_RISE * chi_square:
+                residual, beam_slopes = self._residual_at(next_y)
+                if residual @ residual < _MAX_CHI_SQUARE_RISE * chi_square:
                     break
             y = next_y
         return lowest_chi_square, best_y
@@ -322,35 +323,39 @@ class _CauseSearch:
         """Return the Galerkin coefficients of the modes for the unknowns of beam and cause."""
         x, cause_unknowns = y[: self._beam_x.size], y[self._beam_x.size :].tolist()
         beam = self._problem.plant(x).beam
-        alteration = self._cause.alter(self._problem.stated, cause_unknowns, beam)
+        alteration = self._cause.alter(self._problem.stated_alteration, cause_unknowns, beam)
         if alteration.has_same_shapes(Alteration()):
             return replace(self._problem.plain_terms, alteration=alteration)
         terms = galerkin_mode_terms(alteration, beam, self._problem.modes)
         # The mass of a cause is a fraction of the beam's: the mode shapes do not change with that.
-        return terms if self._problem.stated.lumps else replace(terms, density_kg_per_m=None)
+        return (
+            terms
+            if self._problem.stated_alteration.lumps
+            else replace(terms, density_kg_per_m=None)
+        )
 
-    def _deviations(
+    def _residual_and_slopes(
         self, x: NDArray[np.float64], mode_terms: ModeTerms
     ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
-        """Return the whitened deviations of the modal constants, and a function for derivatives.
+        """Return predicted minus measured modal constants, whitened, and a function for slopes.
 
         `x` are the unknowns of the beam, shape (7,), and `mode_terms` describe the beam with the
-        cause. The derivatives are those by the unknowns of the beam at constant mode shapes.
+        cause. The slopes are the derivatives by `x` at constant mode shapes.
         """
-        return self._problem.deviations(x, self._whitener, mode_terms)
+        return self._problem.residual_and_slopes(x, self._whitener, mode_terms)
 
-    def _deviations_at(
+    def _residual_at(
         self, y: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
-        """Return `_deviations` for the unknowns of beam and cause."""
-        return self._deviations(y[: self._beam_x.size], self._mode_terms(y))
+        """Return `_residual_and_slopes` for the unknowns `y` of beam and cause."""
+        return self._residual_and_slopes(y[: self._beam_x.size], self._mode_terms(y))
 
-    def _slopes_by_cause(
-        self, y: NDArray[np.float64], deviations: NDArray[np.float64]
+    def _cause_slopes(
+        self, y: NDArray[np.float64], residual: NDArray[np.float64]
     ) -> list[NDArray[np.float64]]:
-        """Return the derivatives of the whitened deviations by the unknowns of the cause."""
+        """Return the derivatives of the `residual` at `y` by the unknowns of the cause."""
         return [
-            (self._deviations_at(y + cause_step)[0] - deviations) / cause_step.sum()
+            (self._residual_at(y + cause_step)[0] - residual) / cause_step.sum()
             for cause_step in _DERIVATIVE_STEP * np.diag(self._scale)[self._beam_x.size :]
         ]
 
@@ -363,8 +368,8 @@ def _limited_step(
 ) -> tuple[NDArray[np.float64], float]:
     """Return the Gauss-Newton step within limits, and the chi-square predicted after it.
 
-    The deviations themselves are solved by least squares. Frequencies are known a thousand times
-    more precisely than residues, and normal equations would square that ratio.
+    The least-squares problem is solved without normal equations. They would square the ratio of the
+    precisions of frequencies and residues, which is a thousand.
     """
     step, free_unknowns = np.zeros(len(derivative_rows)), np.arange(len(derivative_rows))
     while free_unknowns.size:
@@ -400,7 +405,7 @@ def finding(
         Test that refused the plain uniform beam.
     causes : sequence of CauseFit
         Causes from `explanations`.
-    stiffness_step : Step, optional
+    stiffness_step : StiffnessStep, optional
         Step of the stiffness during the record, from `best_stiffness_step`.
     """
     cause_phrases = [cause_fit.phrase for cause_fit in causes]

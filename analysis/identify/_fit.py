@@ -122,7 +122,7 @@ def fit_record(
     reference_descent = Descent(searches[closest_index].objective, reference_descent.x)
     remove_hum = reference_descent.remove_hum(_ROUGH_COST_TOLERANCE)
     if remove_hum is not reference_descent:
-        reference_descent = _update_reference_following(remove_hum, whole_angle)
+        reference_descent = _update_coherent_angle(remove_hum, whole_angle)
         comparison = reference_descent.objective.comparison
         coarse_response = CoarseResponse(comparison)
         searches = [
@@ -206,9 +206,9 @@ def _descend_with_noise(
     """Fit all structures under the noise estimated from the residual of the closest structure.
 
     `searches` holds one search for each structure; `closest_index` is the index of the closest
-    structure, and `reference_descent` its descent. `earlier_descents` are the descents before the
-    part that follows the reference was re-estimated; it is empty the first time. A structure that
-    was far behind in them is not searched for again.
+    structure, and `reference_descent` its descent. `earlier_descents` are the results of the last
+    call, with an earlier estimate of the input; empty at the first call. A structure whose cost was
+    far above that of the closest one is not searched for again.
     """
     # Lines are searched for once, in the residual of a fit to every bin.
     noise_spectrum = reference_descent.noise(with_lines=True)
@@ -222,7 +222,7 @@ def _descend_with_noise(
         .descend_to_minimum(noise_spectrum, _COST_TOLERANCE)
     )
     far_behind_ratio = math.exp(
-        FAR_BEHIND_BIC_DIFFERENCE / (2 * np.count_nonzero(noise_spectrum.counts))
+        FAR_BEHIND_BIC_DIFFERENCE / (2 * np.count_nonzero(noise_spectrum.is_compared))
     )
     cost_limit = far_behind_ratio * closest_descent.cost(noise_spectrum)
     structure_descents = []
@@ -242,7 +242,7 @@ def _descend_with_noise(
 
 def _residual_is_noise(descent: Descent, noise: NoiseSpectrum) -> bool:
     """Return whether the residual at the end of a descent is white at the 1 % level."""
-    objective, used_bins = descent.objective, noise.counts
+    objective, used_bins = descent.objective, noise.is_compared
     residual = objective.project(objective.linearise(descent.x), noise.weight).residual
     hz = objective.comparison.frequency_hz
     return whiteness(residual[used_bins], hz[used_bins]).is_nearly_white
@@ -260,8 +260,8 @@ def _descent_if_still_worse(
     return short_descent if short_descent.cost(noise) > cost_limit else None
 
 
-def _update_reference_following(descent: Descent, whole_angle: Comparison) -> Descent:
-    """Return a descent with the reference-following angle estimated again, without the hum.
+def _update_coherent_angle(descent: Descent, whole_angle: Comparison) -> Descent:
+    """Return a descent whose input, the angle that follows the reference, is estimated without hum.
 
     The first estimate was biased by the hum.
     """
@@ -291,14 +291,16 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
     """
     unknowns, comparison = objective.unknowns, objective.comparison
     linearisation = objective.linearise(x)
-    projected = objective.project(linearisation, noise.weight)
+    projected_residual = objective.project(linearisation, noise.weight)
     # Where the torque is unknown the residual is 0 and adds nothing to the cost.
-    compared_values = round(2 * np.sum(noise.counts) * comparison.measurement.known_torque_fraction)
-    degrees_of_freedom = compared_values - x.size - projected.amplitudes.size
-    residual_variance = projected.cost / degrees_of_freedom
+    compared_values = round(
+        2 * np.sum(noise.is_compared) * comparison.measurement.known_torque_fraction
+    )
+    degrees_of_freedom = compared_values - x.size - projected_residual.amplitudes.size
+    residual_variance = projected_residual.cost / degrees_of_freedom
     lower_bounds, upper_bounds = unknowns.bounds
     at_bound = (x <= lower_bounds) | (x >= upper_bounds)
-    jacobian = _compared_jacobian(objective, x, projected, noise)
+    jacobian = _compared_jacobian(objective, x, projected_residual, noise)
     covariance, determined_mask = covariance_of_unknowns(jacobian, residual_variance, at_bound)
     unknown_names, plant = unknowns.names, unknowns.plant(x)
     parameter_values = unknowns.parameters(x)
@@ -339,21 +341,21 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
         modes=mode_table(linearisation.poles, covariance),
         ringing=ringing(
             linearisation.poles,
-            projected,
+            projected_residual,
             residual_variance,
             objective.unknown_torques(linearisation) * noise.weight,
             hum_spectra,
         ),
-        cost=projected.cost,
+        cost=projected_residual.cost,
         degrees_of_freedom=degrees_of_freedom,
-        residual=projected.residual,
+        residual=projected_residual.residual,
     )
 
 
 def _compared_jacobian(
     objective: Objective,
     x: NDArray[np.float64],
-    projected: ProjectedResidual,
+    projected_residual: ProjectedResidual,
     noise: NoiseSpectrum,
 ) -> NDArray[np.complex128]:
     """Return the whitened derivatives of the measured torque's spectrum by the unknowns, (k, K).
@@ -362,8 +364,8 @@ def _compared_jacobian(
     """
     comparison, unknowns = objective.comparison, objective.unknowns
     if comparison.measurement.torque_known.all():
-        return projected.jacobian
+        return projected_residual.jacobian
     plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
     unknown_gradient = comparison.gradient_at_unknown_torque(plant, unknowns.gradient_names)
     unknown_jacobian = noise.weight * (parameters_by_unknowns.T @ unknown_gradient)
-    return projected.jacobian - unknown_jacobian
+    return projected_residual.jacobian - unknown_jacobian

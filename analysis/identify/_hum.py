@@ -69,9 +69,9 @@ _FREQUENCY_STEPS: Final = 4
 
 
 def resonance_half_width_hz(pole: Pole, spacing_hz: float) -> float:
-    """Return the half width in hertz of the range around a resonance in which hum is sought.
+    """Return the half width in hertz of the frequency range that belongs to a resonance.
 
-    It is at least a number of bins, which are `spacing_hz` apart.
+    It is at least `_MIN_RESONANCE_BINS` bins, which are `spacing_hz` apart.
     """
     return max(
         _RESONANCE_HALF_WIDTHS * abs(pole.at_rad_s.real) / (2 * np.pi),

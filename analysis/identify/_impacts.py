@@ -128,7 +128,10 @@ def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Itera
     also uses the residual of fits to either half. With `obvious` it is limited to obvious
     impacts.
     """
-    if candidate_set.misread or len(candidate_set.comparison.measurement.impacts) == MAX_IMPACTS:
+    if (
+        candidate_set.misread_findings
+        or len(candidate_set.comparison.measurement.impacts) == MAX_IMPACTS
+    ):
         return
     found_in_whole = find_impact(candidate_set)
     if found_in_whole is not None and found_in_whole.is_obvious:
@@ -204,14 +207,14 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
             analysis = fit_record(half_measurement, (_FREEST_STRUCTURE,), band_hz=band_hz)
         except MeasurementError:
             continue
-        fit, used_bins = analysis.fits[0], analysis.noise.counts
+        fit, used_bins = analysis.fits[0], analysis.noise.is_compared
         if not whiteness(
             fit.residual[used_bins], analysis.comparison.frequency_hz[used_bins]
         ).is_white:
             continue
         comparison_with_hum = comparison.remove_hum(()).recompute_incoherent_torque(fit.plant)
         unknowns = Unknowns.for_structure(
-            _FREEST_STRUCTURE, measurement.nominal, candidate_set.free
+            _FREEST_STRUCTURE, measurement.nominal, candidate_set.free_settings
         )
         refit_at_start = partial(
             Refit.descend,
@@ -222,7 +225,7 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         )
         first_refit = refit_at_start(noise=candidate_set.noise)
         noise_of_all_bins = replace(
-            first_refit.residual_noise(), counts=np.ones(hz.size, dtype=bool), lines=()
+            first_refit.residual_noise(), is_compared=np.ones(hz.size, dtype=bool), lines=()
         )
         yield refit_at_start(noise=noise_of_all_bins)
 
@@ -242,7 +245,7 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
         yield Finding(
             kind="knock",
             sentence=(
-                f"The beam was struck at {impact.first_s:.2f} s (to within "
+                f"The beam was struck at {impact.start_s:.2f} s (to within "
                 f"{start_uncertainty_s:.2g} s): {1e3 * impact.largest_nm:.3g} mN·m in the torque, "
                 "and from then on the free decay of its modes. "
                 + (
@@ -251,8 +254,8 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
                     else "It was fitted too, but is not all that is in the record."
                 )
             ),
-            value=impact.first_s,
-            interval=(impact.first_s - start_uncertainty_s, impact.first_s + start_uncertainty_s),
+            value=impact.start_s,
+            interval=(impact.start_s - start_uncertainty_s, impact.start_s + start_uncertainty_s),
             unit="s",
             remedy="Keep clear of the beam while it is recorded.",
         )
@@ -264,18 +267,16 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
 def _likeliest_start(refit: Refit) -> int | None:
     """Return the index of the sample at which an impact most likely begins.
 
-    Free decays of all modes from this sample on explain most of the residual.
-
-    Return None if chance may explain as much, or if the residual does not rise abruptly. The search
-    takes one correlation per decay: the sums for a decay from the first sample on, reversed in
-    time, give those for all samples at once.
+    Free decays of all modes from this sample on explain most of the residual. Return None if chance
+    may explain as much, or if the residual does not rise abruptly. One correlation per decay, by
+    fast Fourier transforms, gives the sums for all possible start samples.
     """
     comparison, weight = refit.objective.comparison, refit.noise.weight
     poles = comparison.poles(refit.plant)
     if not poles:
         return None
     residual = refit.objective.project(refit.objective.linearise(refit.x), weight).residual
-    decays = comparison.decays.columns(poles) * weight
+    decays = comparison.decays.spectra(poles) * weight
     projections = np.array([comparison.in_time(decay.conj() * residual) for decay in decays])
     projections *= comparison.samples / 2
     decay_lengths = np.sqrt(np.sum(np.abs(decays) ** 2, axis=1))
@@ -310,20 +311,18 @@ def _likeliest_start(refit: Refit) -> int | None:
 
 
 def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refit:
-    """Return a refit whose plant and noise were estimated with an impact in the model.
+    """Return a refit whose plant and noise were estimated with an impact between two samples.
 
-    The impact lies between two samples.
-
-    The refit itself is without the impact.
+    The model of the refit itself does not contain the impact.
     """
-    comparison, columns_before = refit.objective.comparison, refit.columns
+    comparison, spectra_before = refit.objective.comparison, refit.effect_spectra
     for _ in range(_IMPACT_FIT_ROUNDS):
         assumed_impact = _impact_between(refit, first_sample, end_sample)
-        all_columns = np.concatenate(
-            [columns_before, comparison.spectrum(_impact_torques(comparison, assumed_impact))]
+        all_spectra = np.concatenate(
+            [spectra_before, comparison.spectrum(_impact_torques(comparison, assumed_impact))]
         )
         refit = Refit.descend(
-            comparison, refit.objective.unknowns, refit.x, refit.noise, all_columns,
+            comparison, refit.objective.unknowns, refit.x, refit.noise, all_spectra,
             max_evaluations=REFIT_EVALUATIONS,
         )  # fmt: skip
         refit = replace(refit, noise=refit.residual_noise())
@@ -332,7 +331,7 @@ def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refi
         refit.objective.unknowns,
         refit.x,
         refit.noise,
-        columns_before,
+        spectra_before,
         max_evaluations=1,
     )
 
@@ -343,8 +342,8 @@ def _impact_between(refit: Refit, first_sample: int, end_sample: int) -> Recorde
     rate_hz = comparison.decimation.rate_hz
     poles = comparison.poles(refit.plant)
     return RecordedImpact(
-        first_s=comparison.first_s + first_sample / rate_hz,
-        last_s=comparison.first_s + end_sample / rate_hz,
+        start_s=comparison.first_sample_s + first_sample / rate_hz,
+        end_s=comparison.first_sample_s + end_sample / rate_hz,
         # The soft beginning of a touch is not visible before the torque has grown.
         start_uncertainty_s=max(2, end_sample - first_sample) / rate_hz,
         poles_rad_s=tuple(pole.at_rad_s for pole in poles),
@@ -353,18 +352,18 @@ def _impact_between(refit: Refit, first_sample: int, end_sample: int) -> Recorde
 
 def _impact_torques(comparison: Comparison, impact: RecordedImpact) -> NDArray[np.float64]:
     """Return the torques of an impact of unit amplitudes at the compared samples, (c, samples)."""
-    return impact.columns(comparison.times_s(), comparison.decimation.rate_hz)
+    return impact.unit_torques(comparison.times_s(), comparison.decimation.rate_hz)
 
 
 def _successive_cost_reductions(
     refit: Refit, unit_torques: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the cost reduction by each torque after the torques in the rows before it, (c,).
+    """Return the cost reduction by each torque in addition to the torques of earlier rows, (c,).
 
     `unit_torques` are torques of unit amplitude at the compared samples, shape (c, samples). All
     free parameters of the fit stay free, to first order.
     """
-    unexplained_spectra, residual = refit.unexplained_columns(
+    unexplained_spectra, residual = refit.unexplained_spectra(
         refit.objective.comparison.spectrum(unit_torques)
     )
     unexplained_spectra /= np.maximum(
@@ -381,17 +380,18 @@ def _successive_cost_reductions(
 
 
 _DEPENDENT_LENGTH: Final = 1e-6
-"""Length of a torque of length 1, after its projection on earlier torques is removed, below which
-it is a linear combination of these."""
+"""Length of the part of a torque of length 1 that is orthogonal to the earlier torques, below which
+the torque is a linear combination of them."""
 
 
 def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[int, int] | None:
     """Return first sample and end sample of an impact within a window of samples, or None.
 
-    Each sample of unknown torque has to reduce the cost by the BIC penalty of a parameter. If the
-    samples suffice without the decays there is no impact: the sensor was disturbed.
+    Each sample of unknown torque has to reduce the cost by the BIC penalty of a parameter. Return
+    None also if such samples explain the residual without free decays: then the sensor was
+    disturbed, and there was no impact.
     """
-    bic_penalty = math.log(2 * np.count_nonzero(refit.noise.counts))
+    bic_penalty = math.log(2 * np.count_nonzero(refit.noise.is_compared))
     comparison = refit.objective.comparison
     # Beginning: decays from the window's end on, then single samples backwards from there.
     impact = _impact_between(refit, window_end, window_end)
@@ -435,7 +435,7 @@ def _impact_with_amplitudes(refit: Refit, first_sample: int, end_sample: int) ->
     unit_torques = _impact_torques(comparison, impact)
     cost_before, expected_cost = refit.cost, refit.expected_cost
     is_beam_free = bool(cost_before < _OVERWHELMING_COST_RATIO * expected_cost)
-    unexplained_spectra, residual = refit.unexplained_columns(
+    unexplained_spectra, residual = refit.unexplained_spectra(
         comparison.spectrum(unit_torques), beam_free=is_beam_free
     )
     unexplained_parts = unexplained_spectra.view(np.float64)

@@ -41,8 +41,8 @@ those of a beam that rings for long. The torque, given as a second input, provid
 the beam."""
 
 _RETURN_TO_ZERO_S: Final = 4.0
-"""Duration in seconds after the record in which angle and reference are assumed to return to 0. A
-reference that fell to 0 at once would do so without the lag of the loop."""
+"""Duration in seconds after the record in which angle and reference are assumed to return to 0. If
+both fell to 0 at once, the angle would not lag the reference, as it does in the loop."""
 
 _RELATIVE_POWER_FLOOR: Final = 1e-12
 """Minimum assumed power of the reference at a frequency, relative to its largest power."""

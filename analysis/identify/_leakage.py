@@ -62,7 +62,7 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
         known_fraction,
         near_mode=near_mode,
     )
-    used_bins, noise_lines = noise.counts.copy(), list(noise.lines)
+    used_bins, noise_lines = noise.is_compared.copy(), list(noise.lines)
     for leaking_line in noise_near_end.lines:
         # A line leaks as peak / (pi distance in bins).
         spectrum_peak = leaking_line.amplitude_nm * samples / 2

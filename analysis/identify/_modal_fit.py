@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from analysis.identify.residual_tests import InputRelation, Whiteness
     from rigd.beam import Plant
 
-_RELATIVE_TOLERANCE: Final = 1e-8
+_COST_TOLERANCE: Final = 1e-8
 """Relative tolerance of the sum of squares at which a descent has converged."""
 
 _MIN_LOSS_FACTOR: Final = 1e-5
@@ -138,16 +138,16 @@ class ModalFit(ModalEstimate):
         torque_spectra = list(torque_spectra)
         span, residual = self.derivatives.rows(), self.residual.view(np.float64)
 
-        def whitened(columns: slice) -> NDArray[np.float64]:
+        def whitened_spectra(columns: slice) -> NDArray[np.float64]:
             bins = slice(columns.start // 2, columns.stop // 2)
             spectra = np.array([spectrum[bins] for spectrum in torque_spectra])
             return np.ascontiguousarray(spectra * self.noise.weight[bins]).view(np.float64)
 
         blocks = list(column_blocks(residual.size))
-        coefficients = sum(whitened(columns) @ span[:, columns].T for columns in blocks)
+        coefficients = sum(whitened_spectra(columns) @ span[:, columns].T for columns in blocks)
         projections, squares = np.zeros((2, len(torque_spectra)))
         for columns in blocks:
-            outside_span = whitened(columns) - coefficients @ span[:, columns]
+            outside_span = whitened_spectra(columns) - coefficients @ span[:, columns]
             projections += outside_span @ residual[columns]
             squares += np.einsum("ij,ij->i", outside_span, outside_span)
         cost_reductions: NDArray[np.float64] = projections**2 / np.maximum(
@@ -159,16 +159,16 @@ class ModalFit(ModalEstimate):
         """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
         return np.ascontiguousarray(torque_spectra * self.noise.weight).view(np.float64)
 
-    def outside_span(self, whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+    def outside_span(self, whitened_spectra: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the part of whitened spectra that no parameter of the fit can imitate.
 
         Parameters
         ----------
-        whitened : ndarray, shape (..., 2 K)
+        whitened_spectra : ndarray, shape (..., 2 K)
             Whitened spectra with real and imaginary parts interleaved.
         """
         span = self.derivatives.rows()
-        outside_span: NDArray[np.float64] = whitened - (whitened @ span.T) @ span
+        outside_span: NDArray[np.float64] = whitened_spectra - (whitened_spectra @ span.T) @ span
         return outside_span
 
     def effect_std(self, torque_spectrum: NDArray[np.complex128]) -> float:
@@ -187,7 +187,8 @@ class ModalFit(ModalEstimate):
     ) -> NDArray[np.float64]:
         """Return how much less certain damping ratios are with an additional effect, shape (n,).
 
-        Each is the standard deviation with a free size of the effect, over that without it.
+        Each value is the standard deviation with the effect, whose size is free, divided by that
+        without the effect.
 
         Parameters
         ----------
@@ -196,12 +197,12 @@ class ModalFit(ModalEstimate):
         prior_std : float
             Standard deviation of the size before the record.
         """
-        whitened = self._whiten(torque_spectrum)
+        whitened_spectrum = self._whiten(torque_spectrum)
         size_variance = 1 / (self.effect_std(torque_spectrum) ** -2 + prior_std**-2)
         damping_variance = np.diag(self.covariance)[
             MODE_CONSTANT_NAMES.index("ln_damping_ratio") :: len(MODE_CONSTANT_NAMES)
         ]
-        added_variance = (self.ln_damping_by_torque @ whitened) ** 2 * size_variance
+        added_variance = (self.ln_damping_by_torque @ whitened_spectrum) ** 2 * size_variance
         std_ratios: NDArray[np.float64] = np.sqrt(1 + added_variance / damping_variance)
         return std_ratios
 
@@ -225,9 +226,9 @@ class ModalFit(ModalEstimate):
     def plant_with_modal_frequencies(self, plant: Plant) -> Plant:
         """Return the plant with stiffnesses adjusted to the frequencies of the visible modes.
 
-        The given plant is returned unchanged if there is no such plant, if the visible modes are
-        not modes 1 to n without a gap, or if the plant has a tip mass, a compliant clamp or a
-        filter.
+        The given plant is returned unchanged if no stiffnesses give these frequencies, if the
+        visible modes are not modes 1 to n without a gap, or if the plant has a tip mass, a
+        compliant clamp or a filter.
 
         Parameters
         ----------
@@ -254,7 +255,7 @@ def fit_modes(
     comparison: Comparison,
     noise: NoiseSpectrum,
     starts: Sequence[tuple[int, float, float]],
-    columns: NDArray[np.complex128] | None = None,
+    torque_spectra: NDArray[np.complex128] | None = None,
 ) -> ModalFit | None:
     """Return the modal model fitted to a record; None if no mode is in the band or significant.
 
@@ -266,10 +267,10 @@ def fit_modes(
         First estimate; bins that it excludes stay excluded.
     starts : sequence of (int, float, float)
         Mode number, approximate frequency (Hz) and approximate damping ratio of each mode.
-    columns : ndarray of complex, shape (c, K), optional
+    torque_spectra : ndarray of complex, shape (c, K), optional
         Torque spectra of known form and unknown amplitude, as for `Objective`.
     """
-    search = _ModalSearch.starting_at(comparison, noise, starts, columns)
+    search = _ModalSearch.starting_at(comparison, noise, starts, torque_spectra)
     if search is None:
         return None
     return search.remove_unexcited_modes().converge_with_noise().add_resonances().fit()
@@ -312,7 +313,7 @@ class _ModalSearch:
         comparison: Comparison,
         noise: NoiseSpectrum,
         starts: Sequence[tuple[int, float, float]],
-        columns: NDArray[np.complex128] | None = None,
+        torque_spectra: NDArray[np.complex128] | None = None,
     ) -> _ModalSearch | None:
         """Return the search that starts at the modes in the band, or None if there is none."""
         starts_in_band = [
@@ -321,12 +322,12 @@ class _ModalSearch:
         if not starts_in_band:
             return None
         effect_spectra = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
-        effect_spectra = effect_spectra if columns is None else columns
+        effect_spectra = effect_spectra if torque_spectra is None else torque_spectra
         lowest_hz = _LOWEST_RELATIVE_FREQUENCY * min(hz for _, hz, _ in starts_in_band)
-        used_bins = noise.counts & (comparison.frequency_hz >= lowest_hz)
+        used_bins = noise.is_compared & (comparison.frequency_hz >= lowest_hz)
         return cls(
             comparison,
-            replace(noise, counts=used_bins),
+            replace(noise, is_compared=used_bins),
             effect_spectra,
             tuple(mode_number for mode_number, _, _ in starts_in_band),
             np.array(
@@ -357,13 +358,13 @@ class _ModalSearch:
             problem.normal_equations,
             self.x,
             ConstantBounds(lower_bounds.ravel(), upper_bounds.ravel()),
-            relative_tolerance=_RELATIVE_TOLERANCE,
+            relative_tolerance=_COST_TOLERANCE,
             max_evaluations=60,
         )
         return replace(self, x=minimum.x)
 
     def converge_with_noise(self) -> _ModalSearch:
-        """Return the search after descents, noise and unknown torque have converged together."""
+        """Alternate descents with estimates of noise and unknown torque until all converge."""
         search = self
         for _ in range(_MAX_NOISE_ESTIMATES):
             problem = search.problem()
@@ -384,7 +385,7 @@ class _ModalSearch:
                 ~search.is_near_mode(within_resonance=True),
             )
             noise_power /= comparison.measurement.known_torque_fraction
-            used_bins = search.noise.counts
+            used_bins = search.noise.is_compared
             mean_log_change = np.abs(np.log(noise_power / search.noise.power)[used_bins]).mean()
             search = replace(
                 search, comparison=comparison, noise=replace(search.noise, power=noise_power)
@@ -402,8 +403,9 @@ class _ModalSearch:
     def is_near_mode(self, *, within_resonance: bool = False) -> NDArray[np.bool_]:
         """Return a mask of the bins in which the residual may belong to a mode, shape (K,).
 
-        The bins `within_resonance` are those up to half of this distance from a mode. A peak of the
-        noise does not begin nearer to a mode than the whole distance, and ends there.
+        They are the bins within a distance that depends on the width of the resonance; with
+        `within_resonance`, within half of this distance. A peak of the noise begins outside of the
+        whole distance, and ends at half of it.
         """
         hz = self.comparison.frequency_hz[:, None]
         mode_hz, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
@@ -456,11 +458,10 @@ class _ModalSearch:
         return bool(np.any(np.abs(mode_rad_s[:-1] - mode_rad_s[-1]) < least_distances))
 
     def remove_unexcited_modes(self) -> _ModalSearch:
-        """Return the search without modes that the record does not excite.
+        """Return the search without modes that are not excited in the record.
 
-        They hardly reduce the cost at first, and lose their damping in a descent.
-
-        Such a mode would fit a narrow line of the noise.
+        Such modes hardly reduce the cost at the start, and lose their damping in a descent. They
+        would be fitted to a narrow line of the noise.
         """
         cost_increases = self.evidence()
         if cost_increases.min() >= _MIN_DEVIANCE_REDUCTION:
@@ -474,7 +475,7 @@ class _ModalSearch:
         return search
 
     def _remove_mode(self, mode_index: int) -> _ModalSearch:
-        """Return the search without the mode at `mode_index` in `remaining_numbers`."""
+        """Return the search without the mode at `mode_index` in `numbers`."""
         remaining_numbers = self.numbers[:mode_index] + self.numbers[mode_index + 1 :]
         return replace(
             self,
@@ -491,13 +492,13 @@ class _ModalSearch:
             [problem.for_modes(each.numbers).cost(each.x) - full_cost for each in without_mode]
         )
 
-    def residual_dependence_on_angle(self, whitened: NDArray[np.float64]) -> InputRelation:
+    def residual_dependence_on_angle(self, whitened_residual: NDArray[np.float64]) -> InputRelation:
         """Return the result of a test whether a residual depends linearly on the motor angle."""
-        residual = whitened.view(np.complex128)
+        residual = whitened_residual.view(np.complex128)
         angle_spectrum = self.comparison.spectrum(
             self.comparison.angle_rad[self.comparison.retained]
         )
-        used_bins = self.noise.counts
+        used_bins = self.noise.is_compared
         first_used_bin = int(np.argmax(used_bins))
         return input_relation(
             residual[first_used_bin:],
@@ -529,7 +530,7 @@ class _ModalSearch:
         joint_covariance = uncertainty.covariance
         constants, covariance = problem.constants(linear_parameters, x, joint_covariance)
         residual_spectrum = residual.view(np.complex128)
-        used_bins = search.noise.counts
+        used_bins = search.noise.is_compared
         effect_count = len(search.effect_spectra)
         effect_variances = np.diag(joint_covariance)[joint_covariance.shape[0] - effect_count :]
         return ModalFit(
@@ -555,7 +556,8 @@ class _ModalSearch:
 class _DerivativeSpan:
     """Orthonormal rows that span all derivatives of the whitened residual of a modal fit.
 
-    Those of a long record take too much memory to be stored with each fit.
+    The rows of a long record are computed again when needed: they take too much memory to be stored
+    with each fit.
     """
 
     def __init__(self, search: _ModalSearch, rows: NDArray[np.float64]) -> None:

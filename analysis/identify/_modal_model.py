@@ -251,7 +251,7 @@ class ModalEstimate:
     def uniform_plant(self, nominal: Plant) -> Plant:
         """Return a rig whose uniform beam has the inertias and frequencies of the modes on average.
 
-        The highest mode determines its damping. Without visible modes it is `nominal`.
+        The highest mode determines the damping. Return `nominal` if no mode is visible.
 
         Parameters
         ----------

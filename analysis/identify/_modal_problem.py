@@ -42,7 +42,7 @@ def column_blocks(column_count: int) -> Iterator[slice]:
 def _scaled_gram(
     *matrices: NDArray[np.float64], regularization: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the Gram matrix of all rows of matrices, scaled to length 1, and their lengths.
+    """Return the Gram matrix of the rows of all matrices, scaled to length 1, and the row lengths.
 
     `regularization` is added to the diagonal of the Gram matrix.
     """
@@ -64,9 +64,9 @@ def _scaled_gram(
 
 
 def _orthonormalise(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Replace rows by orthonormal rows with the same span.
+    """Replace rows, in place, by orthonormal rows with the same span.
 
-    Return the matrix whose product with them restores the given rows.
+    Return the matrix whose product with the orthonormal rows restores the given rows.
     """
     gram, row_lengths = _scaled_gram(rows, regularization=1e-13)
     triangular_factor = np.linalg.cholesky(gram)
@@ -79,7 +79,7 @@ def _orthonormalise(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _remove_span(rows: NDArray[np.float64], span: NDArray[np.float64]) -> None:
-    """Subtract from rows, in place, their part in the span of orthonormal rows."""
+    """Subtract from `rows`, in place, their projections on the orthonormal rows of `span`."""
     coefficients = rows @ span.T
     for columns in column_blocks(rows.shape[1]):
         rows[:, columns] -= coefficients @ span[:, columns]
@@ -103,8 +103,8 @@ class _LinearSolution:
 class _Uncertainty:
     """Uncertainty of the modal model at a minimum.
 
-    `covariance` is the joint one of frequencies, damping and linear parameters, `span` are
-    orthonormal rows that span all derivatives of the residual, and `ln_damping_by_torque`, shape
+    `covariance` is that of frequencies, damping and linear parameters together. `span` are
+    orthonormal rows that span all derivatives of the residual. `ln_damping_by_torque`, shape
     (n, 2 K), is the derivative of the logarithm of each eta by the whitened torque.
     """
 
@@ -128,7 +128,7 @@ def _ln_damping_by_torque(
 
 
 def _relative_pole(eta: float) -> complex:
-    """Return the pole of a mode over its undamped frequency in rad/s, for the loss factor eta.
+    """Return the pole of a mode with loss factor eta, divided by its undamped frequency in rad/s.
 
     It is the root of ``1 + eta q + q²`` with positive imaginary part.
     """
@@ -260,7 +260,7 @@ class ModalProblem:
         """Return the whitened spectra that the linear parameters multiply, shape (m, 2 K).
 
         They are those of the numerators of the modes, of the background and of the nuisances, in
-        this order. `further_rows` is the number of rows that are added without values.
+        this order. `further_rows` is the number of rows without values that are appended.
         """
         nuisance_spectra = self._nuisance_spectra(self._poles(x))
         nuisance_start = x.size + BACKGROUND_COEFFICIENTS
@@ -278,7 +278,7 @@ class ModalProblem:
     def _numerators(
         self, log_omega: float, eta: float
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128], tuple[NDArray[np.complex128], ...]]:
-        """Return q, one over the denominator, and both numerators over it, of a mode."""
+        """Return q, ``1/d``, and ``(q²/d, q³/d)`` of a mode, with ``d = 1 + eta q + q²``."""
         q = self._s / math.exp(log_omega)
         inverse_denominator = 1 / (1 + eta * q + q * q)
         return q, inverse_denominator, (q * q * inverse_denominator, q**3 * inverse_denominator)
@@ -286,7 +286,10 @@ class ModalProblem:
     def _solve(
         self, x: NDArray[np.float64], spectra: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the residual and linear parameters; make their spectra at `x` orthonormal."""
+        """Return residual and best linear parameters at the nonlinear parameters `x`.
+
+        The `spectra` of the linear parameters are made orthonormal in place.
+        """
         triangular_factor = _orthonormalise(spectra)
         measured_torque = self._measured_torque
         if (drag := self._comparison.drag) is not None:
@@ -347,7 +350,7 @@ class ModalProblem:
     def residual(
         self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64], model: ModalModel
     ) -> NDArray[np.complex128]:
-        """Return the residual spectrum of a model at a point in N·m, not whitened, shape (K,)."""
+        """Return the residual spectrum of a model in N·m, not whitened, shape (K,)."""
         nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
         poles = self._poles(x)
         comparison = self._comparison

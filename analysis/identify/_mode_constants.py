@@ -1,9 +1,10 @@
 """Modal constants of a uniform or altered beam, and their derivatives by its parameters.
 
 The pole of a mode is the root of its dynamic stiffness D(s) (`analysis.identify._altered_beam`).
-The residue of the torque is ``j L³ EI F² / D'(s)``, with the modal force F of a turn of the motor.
+The residue of the torque is ``j L³ EI F² / D'(s)``, with the modal force F per rotation of the
+motor.
 
-The numbers of each mode are Python's: arrays of so few numbers would take five times as long.
+Each mode is computed with Python numbers: arrays of so few numbers would take five times as long.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class BeamVibration:
         near_rad_s: Sequence[complex],
     ) -> None:
         self._modes: list[_Mode | None] = []
-        for coefficients, near in zip(terms.by_mode(), near_rad_s, strict=True):
+        for coefficients, near in zip(terms.coefficients_by_mode(), near_rad_s, strict=True):
             try:
                 mode = _Mode(parameters, terms, coefficients, length_m, lags, near)
             except (ArithmeticError, ValueError):  # the iterations end at no pole
@@ -76,7 +77,7 @@ class BeamVibration:
     def slopes(self) -> NDArray[np.float64]:
         """Return the derivatives of the constants by the parameters, shape (4 n, 7).
 
-        All modes have a pole.
+        Every mode must have a pole.
         """
         return np.array([row for mode in self._modes if mode for row in mode.slopes()])
 
@@ -100,7 +101,7 @@ class _Mode:
         self._ln_coefficients, self._orders = (ln_zeta, ln_gamma), (alpha, lambda_)
         (
             self._stiffness, clamp, mass, lump, tension, mass_arm, lump_arm,
-            self._medium_arm, tension_arm, turn_by_medium, turn_by_internal,
+            self._medium_arm, tension_arm, arm_change_by_external, arm_change_by_internal,
         ) = coefficients  # fmt: skip
         self._relaxation, self._lags = terms.alteration.relaxation, lags
         self._ratio = math.exp(ln_ratio)
@@ -116,8 +117,8 @@ class _Mode:
         _, self._slope, self._dampings, self._inertia = self._stiffness_at(s)
         # Damping turns the mode shape, and with it the arm of the mass.
         self._arms = (
-            self._inertia * turn_by_internal / self._stiffness,
-            self._inertia * turn_by_medium + self._medium_arm,
+            self._inertia * arm_change_by_internal / self._stiffness,
+            self._inertia * arm_change_by_external + self._medium_arm,
         )
         self._force = (
             self._inertia * (mass_arm + lump_arm)
@@ -125,10 +126,10 @@ class _Mode:
             + self._dampings[1] * self._arms[1]
             + self._tension_arm
         )
-        channel = cmath.exp(-self._delay_s * s)
+        channel_response = cmath.exp(-self._delay_s * s)
         for first, second in lags:
-            channel /= 1 + s * (first + s * second)
-        ln_residue = cmath.log(1j * length_m**3 * self._force**2 / self._slope * channel)
+            channel_response /= 1 + s * (first + s * second)
+        ln_residue = cmath.log(1j * length_m**3 * self._force**2 / self._slope * channel_response)
         self.constants = (
             math.log(s.imag / (2 * math.pi)),
             math.log(-s.real / abs(s)),
@@ -151,9 +152,9 @@ class _Mode:
     def _stiffness_at(
         self, s: complex
     ) -> tuple[complex, complex, tuple[complex, complex], complex]:
-        """Return the dynamic stiffness and its derivative by s, and the parts of the stiffness.
+        """Return the dynamic stiffness D, its derivative by s, and terms of D.
 
-        The parts are those of both dampings, and rho/EI s².
+        The terms are those of internal and external damping, as a pair, and ``rho/EI s²``.
         """
         log_s, (alpha, lambda_) = cmath.log(s), self._orders
         internal = cmath.exp(self._ln_coefficients[0] + alpha * log_s) * self._stiffness
@@ -164,13 +165,13 @@ class _Mode:
         slope = (alpha * internal + lambda_ * external + 2 * mass) / s
         strength, time_s = self._relaxation
         if strength:
-            relaxed = strength * time_s / (1 + time_s * s) * self._stiffness
-            stiffness += relaxed * s
-            slope += relaxed / (1 + time_s * s)
+            relaxation_term = strength * time_s / (1 + time_s * s) * self._stiffness
+            stiffness += relaxation_term * s
+            slope += relaxation_term / (1 + time_s * s)
         return stiffness, slope, (internal, external), inertia
 
     def slopes(self) -> Iterator[list[float]]:
-        """Return the derivatives of the four constants by the seven parameters."""
+        """Yield, for each of the four constants, its derivatives by the seven parameters."""
         s, dstiffness, force, inertia = self._pole, self._slope, self._force, self._inertia
         log_s, mass = cmath.log(s), inertia * self._mass
         # Derivatives of dynamic stiffness, its slope and the force by the parameters at constant s

@@ -1,4 +1,4 @@
-"""Check of a fitted model against its record: residual, findings, reasons against its numbers."""
+"""Check of a fitted model against its record: residual, findings, reasons to doubt its numbers."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ _CLIPPED_TORQUE_REASON: Final = "the torque is clipped"
 """Reason against all numbers if the torque is clipped."""
 
 _CONTRADICTING_KINDS: Final = frozenset({"sign", "unit", "implausible"})
-"""Findings that show that the record contradicts its file."""
+"""Kinds of findings which show that the record contradicts its file."""
 
 _CHANNEL_KINDS: Final = _CONTRADICTING_KINDS | {"clipping", "stop"}
-"""Findings that are reported even if the record contradicts its file."""
+"""Kinds of findings that are reported even if the record contradicts its file."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelCheck:
-    """What residual and findings say about a model of a record.
+    """Result of the check of a model against its record: residual tests, findings, doubts.
 
     Attributes
     ----------
@@ -71,24 +71,24 @@ class ModelCheck:
         nonlinear_forces: tuple[NonlinearForce, ...] = (),
         temporal_changes: tuple[TemporalChange, ...] = (),
     ) -> ModelCheck:
-        """Check a model with the nonlinear forces and the changes along the record that it has."""
+        """Check a model, including its nonlinear forces and changes along the record."""
         residual_tests = test_residual(candidate_set, modal_fit, band_hz)
         found = findings(candidate_set, nonlinear_forces, residual_tests.harmonics)
         return cls(candidate_set, modal_fit, residual_tests, found, temporal_changes)
 
     @property
     def finding_kinds(self) -> frozenset[str]:
-        """Kinds of the findings."""
+        """Return the kinds of all findings."""
         return frozenset(finding.kind for finding in self.findings)
 
     @property
     def contradicts_file(self) -> bool:
-        """Whether sign, unit or size of a channel contradict the file."""
+        """Return whether sign, unit or size of a channel contradict the file."""
         return not _CONTRADICTING_KINDS.isdisjoint(self.finding_kinds)
 
     @property
     def model_reason(self) -> str | None:
-        """Reason why the record refutes the model; None if it does not."""
+        """Return the reason why the record refutes the model; None if it does not."""
         if self.contradicts_file:
             return CONTRADICTED_FILE_REASON
         if "harmonics" in self.finding_kinds or not self.residual_tests.is_noise:
@@ -97,19 +97,20 @@ class ModelCheck:
 
     @property
     def clipped_reason(self) -> str | None:
-        """Reason against all numbers if the torque is clipped, else None."""
+        """Return the reason to doubt all numbers if the torque is clipped, else None."""
         return _CLIPPED_TORQUE_REASON if "clipping" in self.finding_kinds else None
 
     @property
     def doubt_reason(self) -> str | None:
-        """Reason against every number; None if there is none."""
+        """Return the reason to doubt every number; None if there is none."""
         return self.model_reason or self.clipped_reason or self._change_reason
 
     @property
     def mode_doubt_reason(self) -> str | None:
-        """Reason against every mode; None if there is none.
+        """Return the reason to doubt every mode; None if there is none.
 
-        With a fitted change along the record, the modes are those at the middle of the record.
+        A change along the record is such a reason only if it is part of the model: the modes then
+        are those at the middle of the record.
         """
         if self.temporal_changes and self.temporal_changes[0].is_certain:
             return self.doubt_reason
@@ -117,10 +118,9 @@ class ModelCheck:
 
     @property
     def _change_reason(self) -> str | None:
-        """Reason why changes along the record make every parameter doubtful, else None.
+        """Return the reason if a change along the record makes every parameter doubtful, else None.
 
-        With a change along the record, the parameters of a mode are those at the time when the
-        sweep passed it.
+        With such a change, the parameters of a mode are those at the time when the sweep passed it.
         """
         is_single_sweep = self.candidate_set.comparison.measurement.is_single_sweep
         if not self.temporal_changes or is_single_change_established(
@@ -151,7 +151,7 @@ class ModelCheck:
         """
         if self.contradicts_file:
             return tuple(finding for finding in self.findings if finding.kind in _CHANNEL_KINDS)
-        marked = mark_doubtful_findings(
+        marked_findings = mark_doubtful_findings(
             (*self.findings, *self._setting_findings(headline), *effect_findings),
             change_findings,
             self.model_reason,
@@ -164,19 +164,19 @@ class ModelCheck:
             explained=self.residual_tests.is_noise,
         )
         if self.residual_tests.is_noise:
-            return (*impacts, *marked)
+            return (*impacts, *marked_findings)
         residual_finding = unexplained_residual_finding(
             self.residual_tests.whiteness,
             self.residual_tests.input_relation,
             self.candidate_set.best.fit.modes,
             stiffness_step,
         )
-        return (*impacts, *marked, residual_finding)
+        return (*impacts, *marked_findings, residual_finding)
 
     def _setting_findings(self, headline: Headline) -> tuple[Finding, ...]:
         """Return findings on fitted settings, such as the delay, that differ from the file's.
 
-        Return none if the record cannot show such a difference.
+        The result is empty if the record cannot show such a difference.
         """
         if (
             "implausible" in self.finding_kinds

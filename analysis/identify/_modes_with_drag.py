@@ -40,11 +40,11 @@ _SMALLEST_DRAG_M: Final = 3e-4
 """Smallest C_D d of a beam in air: that of a wire of about 0.2 mm."""
 
 _LARGEST_DRAG_M: Final = 1e-2
-"""C_D d that a thick beam may have: the standard deviation of C_D d before the record."""
+"""C_D d of a thick beam, which is the standard deviation assumed for C_D d before the fit."""
 
 _MIN_DRAG_STDS: Final = 5.0
-"""Smallest drag over its standard deviation, above which a record without drag excludes any drag.
-"""
+"""Ratio of `_SMALLEST_DRAG_M` to the standard deviation of C_D d above which a record without drag
+excludes all drag."""
 
 _MIN_STD_RATIO: Final = 1.1
 """Ratio of the standard deviation of a damping ratio with drag of unknown size to that without
@@ -60,11 +60,11 @@ MAX_DRAG_COMPUTATIONS: Final = 8
 _LEAST_DRAG_M: Final = 1e-6
 """C_D d that hardly brakes a beam, for which the torque is computed if the estimate is less."""
 
-_CHANGED_STDS: Final = 3.0
-"""Change of a damping ratio by drag, in its standard deviations without drag, from which the value
-without drag is doubtful although drag does not explain the record as well."""
+_CHANGED_DAMPING_STDS: Final = 3.0
+"""Change of a damping ratio if drag is fitted, in its standard deviations without drag, from which
+the value without drag is doubtful even if the fit with drag explains the record less well."""
 
-_TOLERANCE_STDS: Final = 0.2
+_DRAG_TOLERANCE_STDS: Final = 0.2
 """Remaining change of the drag, in standard deviations, below which its computation has converged.
 """
 
@@ -175,7 +175,7 @@ def fit_modes_with_drag(
         law = DragLaw(current.law.constant_m + change_m)
         estimates_m.append(law.constant_m)
         is_first_order = len(estimates_m) == 2  # which misses that drag limits the amplitude
-        has_converged = _remaining_change_m(estimates_m) < _TOLERANCE_STDS * std_m
+        has_converged = _remaining_change_m(estimates_m) < _DRAG_TOLERANCE_STDS * std_m
         current = replace(
             current,
             modal_fit=fit_with_drag,
@@ -201,15 +201,15 @@ def fit_modes_with_drag(
             current,
             law=assumed_law,
             comparison=comparison,
-            drag_spectra=comparison.drag.by_law[:1],
+            drag_spectra=comparison.drag.law_derivatives[:1],
         )
     return current
 
 
 def _remaining_change_m(estimates_m: Sequence[float]) -> float:
-    """Return the change of the drag in m that another computation of its torque would cause.
+    """Return the change of C_D d in m that another computation of the drag torque would cause.
 
-    Each change is the same fraction of the one before.
+    It is extrapolated from the last changes: each is the same fraction of the one before.
     """
     changes_m = np.abs(np.diff(estimates_m))[-2:]
     largest_m = float(changes_m.max())
@@ -217,24 +217,24 @@ def _remaining_change_m(estimates_m: Sequence[float]) -> float:
 
 
 def modes_that_drag_changes(modal_fit: ModalFit, with_drag: ModalFit) -> tuple[int, ...]:
-    """Return the modes whose damping ratio drag changes by more than chance, by number.
+    """Return the numbers of the modes whose damping ratio drag changes by more than chance would.
 
     Parameters
     ----------
     modal_fit, with_drag : ModalFit
         Modes of the same record without and with drag.
     """
-    changed = []
+    changed_numbers = []
     for mode_number in set(modal_fit.visible) & set(with_drag.visible):
-        without = modal_fit.mode(mode_number)
-        change = without.damping_ratio - with_drag.mode(mode_number).damping_ratio
-        if abs(change) > _CHANGED_STDS * without.damping_ratio_std:
-            changed.append(mode_number)
-    return tuple(sorted(changed))
+        mode_without_drag = modal_fit.mode(mode_number)
+        change = mode_without_drag.damping_ratio - with_drag.mode(mode_number).damping_ratio
+        if abs(change) > _CHANGED_DAMPING_STDS * mode_without_drag.damping_ratio_std:
+            changed_numbers.append(mode_number)
+    return tuple(sorted(changed_numbers))
 
 
 def _mode_starts(modal_fit: ModalFit) -> list[tuple[int, float, float]]:
-    """Return number, frequency in hertz and damping ratio at which the search for modes starts."""
+    """Return number, frequency in hertz and damping ratio of each mode, as starts of a search."""
     return [
         (mode_number, pole.imag / (2 * math.pi), -pole.real / abs(pole))
         for mode_number, pole in modal_fit.poles_rad_s.items()

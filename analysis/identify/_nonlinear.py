@@ -1,4 +1,4 @@
-"""Nonlinear stiffness and damping (dependent on the deflection): torque, and a search for them.
+"""Nonlinear stiffness and damping: torque, and search for their forces in a record.
 
 The angle drives the motion r of mode i relative to its root. A further restoring force n acts on
 it::
@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify._candidates import INTEGER_INTERNAL_ORDER
+from analysis.identify._candidates import INTERNAL_ORDER_ONE_STRUCTURES
 from analysis.identify._refit import Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.statistics import BIC_DECISIVE
@@ -64,7 +64,8 @@ _PADDING_RATIO: Final = 1.5
 """Length of the transforms over that of the record."""
 
 _DECAY_EXPONENT: Final = 9.0
-"""Exponent of the transforms' damping: substitution repeats what wraps round."""
+"""Decay exponent of the `CausalTransform`. It is large because repeated substitution accumulates
+what wraps round from the end of a transform to its beginning."""
 
 _MAX_SUBSTITUTIONS: Final = 12
 """Maximum number of substitutions that compute the motion of a mode with its nonlinear force."""
@@ -90,7 +91,7 @@ class NonlinearTerm:
 
 
 class NonlinearForceSpectra:
-    """Computes the torque spectra of nonlinear restoring forces of unit size on single modes.
+    """Computation of the torque spectra of nonlinear restoring forces of unit size on single modes.
 
     Parameters
     ----------
@@ -114,7 +115,9 @@ class NonlinearForceSpectra:
             density_over_stiffness * self._s**2 + damping.gamma * self._s**damping.lambda_
         )
 
-    def column(self, term: NonlinearTerm, force_size: float = 0.0) -> NDArray[np.complex128]:
+    def torque_spectrum(
+        self, term: NonlinearTerm, force_size: float = 0.0
+    ) -> NDArray[np.complex128]:
         """Return the torque spectrum of a nonlinear force per unit of its size, in N·m, shape (K,).
 
         It is not finite if the repeated substitution diverges: the force is then too large.
@@ -183,9 +186,10 @@ class NonlinearForceSpectra:
     def _force_scale(
         self, force_kind: ForceKind, linear_motion_transform: NDArray[np.complex128]
     ) -> float:
-        """Return the factor of a power of deflection or speed in a nonlinear force of unit size.
+        """Return the constant factor of a nonlinear force of unit size, such as ``1 / R²``.
 
-        The linear motion determines the largest deflection R and the largest speed V of the mode.
+        It depends on the largest deflection R and the largest speed V of the mode, which are those
+        of its linear motion.
         """
         largest_deflection = np.abs(self._oversampled_values(linear_motion_transform)).max()
         if force_kind == "quadratic drag":
@@ -199,9 +203,9 @@ class NonlinearForceSpectra:
         motion_transform: NDArray[np.complex128],
         force_scale: float,
     ) -> NDArray[np.complex128]:
-        """Return the transform of the nonlinear force of a mode's motion, shape (length // 2 + 1,).
+        """Return the transform of a nonlinear force of unit size, shape (length // 2 + 1,).
 
-        The force is relative to its size.
+        `motion_transform` is the transform of the motion of the mode, which determines the force.
         """
         if force_kind == "quadratic drag":
             speed = self._oversampled_values(motion_transform * self._s)
@@ -212,7 +216,7 @@ class NonlinearForceSpectra:
         return force_scale * self._transform.forward(n, oversampling=_OVERSAMPLING)
 
     def _oversampled_values(self, motion_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the oversampled time series, over the record, of a mode's Laplace transform."""
+        """Return the inverse of a mode's Laplace transform as an oversampled time series."""
         return self._transform.inverse(
             motion_transform, _OVERSAMPLING * self._samples, oversampling=_OVERSAMPLING
         )
@@ -252,7 +256,7 @@ class NonlinearForce:
 
     Attributes
     ----------
-    term : Term
+    term : NonlinearTerm
         Kind and mode of the force.
     size : float
         Change of the stiffness at the largest deflection, as a fraction, or change of the damping
@@ -269,15 +273,15 @@ class NonlinearForce:
 def add_nonlinear_forces(
     candidate_set: CandidateSet, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
-    """Return the candidate set refitted with significant nonlinear forces, and these forces.
+    """Return the candidate set refitted with significant nonlinear forces, and the forces.
 
-    They are added one by one.
+    The forces are added one by one to the visible `modes`. Return the given candidates and no
+    forces if none is significant.
 
     A mode whose stiffness rises resembles a mode of another frequency, or a fractional order. If
     the best candidate has a fractional order, the search also starts from candidates without one.
-    Even then such a force leaves a trace in the residual of the best candidate, and without that
-    trace nothing is tested. `modes` are the visible modes. Return the candidates with the forces,
-    or the given candidates and no forces.
+    Even then such a force leaves a trace in the residual of the best candidate. Without that trace
+    nothing is tested.
     """
     best_candidate = candidate_set.best
     best_refit = candidate_set.refit(best_candidate)
@@ -304,13 +308,13 @@ def add_nonlinear_forces(
 def _start_candidates(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
     """Return the candidates from which the search for nonlinear forces starts.
 
-    This is the best one. If its internal order is free, it comes after those with the order 1.
+    The best candidate is the last. If its internal order is free, those with order 1 come first.
     """
     best_candidate = candidate_set.best
     if "alpha" not in best_candidate.structure.free:
         return (best_candidate,)
     return (
-        *(c for c in candidate_set.candidates if c.structure in INTEGER_INTERNAL_ORDER),
+        *(c for c in candidate_set.candidates if c.structure in INTERNAL_ORDER_ONE_STRUCTURES),
         best_candidate,
     )
 
@@ -318,7 +322,7 @@ def _start_candidates(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
 def _add_forces(
     candidate_set: CandidateSet, start_candidate: Candidate, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
-    """Return the candidate set refitted with the nonlinear forces of one candidate, and these.
+    """Return the candidate set refitted with the nonlinear forces of one candidate, and the forces.
 
     Significant forces are added to that candidate one by one.
     """
@@ -353,7 +357,9 @@ def _add_forces(
         refit, force_sizes, std = fit_with_term
     if not found_terms:
         return candidate_set, ()
-    with_forces = candidate_set.refit_with_effect_spectra(refit.columns, refit.residual_noise())
+    with_forces = candidate_set.refit_with_effect_spectra(
+        refit.effect_spectra, refit.residual_noise()
+    )
     forces = zip(found_terms, force_sizes.tolist(), std.tolist(), strict=True)
     return with_forces, tuple(
         NonlinearForce(best_term, force_size, s) for best_term, force_size, s in forces
@@ -373,9 +379,8 @@ def _best_first_order_force(
 ) -> tuple[NonlinearTerm | None, float]:
     """Return the nonlinear force that reduces the cost most, and the cost with it.
 
-    Both are predicted to first order. The force is None if there is none left.
-
-    Forces in `excluded_terms` are not considered.
+    Both are predicted to first order. Forces in `excluded_terms` are not considered. The force is
+    None if there is no other.
     """
     force_spectra = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
     # If drag on the whole beam is significant, drag on a single mode is not tested.
@@ -393,7 +398,7 @@ def _best_first_order_force(
     if not tested_terms:
         return None, refit.cost
     cost_reductions = refit.cost_reduction_by_spectrum(
-        np.array([force_spectra.column(force_term) for force_term in tested_terms])
+        np.array([force_spectra.torque_spectrum(force_term) for force_term in tested_terms])
     )
     best_index = int(np.argmax(cost_reductions))
     return tested_terms[best_index], max(
@@ -416,22 +421,22 @@ def _fit_with_forces(
     for _ in range(_MAX_SIZE_ITERATIONS):
         force_spectra = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
         spectra = [
-            force_spectra.column(force_term, e)
+            force_spectra.torque_spectrum(force_term, e)
             for force_term, e in zip(force_terms, force_sizes.tolist(), strict=True)
         ]
         if not np.isfinite(spectra).all():
             return None
-        columns = np.concatenate([candidate_set.columns, spectra])
+        torque_spectra = np.concatenate([candidate_set.effect_spectra, spectra])
         refit = Refit.descend(
             candidate_set.comparison,
             refit.objective.unknowns,
             refit.x,
             candidate_set.noise,
-            columns,
+            torque_spectra,
         )
         last_force_sizes = force_sizes
         force_sizes, std = (
-            force_values[len(candidate_set.columns) :] for force_values in refit.amplitudes()
+            force_values[len(candidate_set.effect_spectra) :] for force_values in refit.amplitudes()
         )
         if np.all(
             np.abs(force_sizes - last_force_sizes)

@@ -116,7 +116,8 @@ class TorquePredictor:
     ) -> Iterator[tuple[slice, NDArray[np.float64]]]:
         """Yield the predicted torque in N·m at the retained samples and its derivatives, in blocks.
 
-        Each block, shape (b, m), comes with its rows among the torque and its k derivatives.
+        Each block, shape (b, m), comes with the range of its rows. Row 0 is the torque, and rows 1
+        to k are its derivatives.
 
         Parameters
         ----------
@@ -156,7 +157,7 @@ class TorquePredictor:
         fine_indices: NDArray[np.intp],
         wrt: Sequence[str] = (),
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the torque in N·m predicted at fine samples of a higher rate, and derivatives.
+        """Return the torque in N·m at samples of a higher rate, and its derivatives.
 
         Parameters
         ----------

@@ -98,7 +98,7 @@ class Objective:
         those of the free decay.
     """
 
-    __slots__ = ("_recent", "columns", "comparison", "unknowns")
+    __slots__ = ("_recent", "comparison", "effect_spectra", "unknowns")
 
     def __init__(
         self,
@@ -106,10 +106,10 @@ class Objective:
         unknowns: Unknowns,
         effect_spectra: NDArray[np.complex128] | None = None,
     ) -> None:
-        no_columns = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
+        no_spectra = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
         self.comparison = comparison
         self.unknowns = unknowns
-        self.columns = no_columns if effect_spectra is None else effect_spectra
+        self.effect_spectra = no_spectra if effect_spectra is None else effect_spectra
         self._recent: RecentValues[Linearisation] = (
             comparison.shared_values if comparison.is_long else RecentValues()
         )
@@ -154,7 +154,7 @@ class Objective:
 
         They are free decays, other disturbances and effects.
         """
-        return self.comparison.nuisance_spectra(linearisation.poles, self.columns)
+        return self.comparison.nuisance_spectra(linearisation.poles, self.effect_spectra)
 
     def project(
         self, linearisation: Linearisation, weight: NDArray[np.float64] | float
@@ -219,7 +219,7 @@ class Objective:
     ) -> tuple[Objective, Minimum]:
         """Return the minimum of the cost reached by descents from `start_unknowns`.
 
-        The descent is repeated while filling unknown torques moves the minimum.
+        The descent is repeated until filling the unknown torques no longer moves the minimum.
 
         Parameters
         ----------
@@ -264,11 +264,11 @@ class Objective:
         comparison = self.comparison.fill_unknown_torque(self.unknowns.plant(x))
         if comparison is self.comparison:
             return self
-        return Objective(comparison, self.unknowns, self.columns)
+        return Objective(comparison, self.unknowns, self.effect_spectra)
 
 
 def _as_real_rows(complex_rows: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return a real view of complex rows, parts interleaved, with the shape (..., 2 K).
+    """Return complex rows as real ones, real and imaginary parts interleaved, shape (..., 2 K).
 
     Products of such rows are the real parts of complex products, at half the cost.
     """

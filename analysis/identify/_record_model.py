@@ -52,9 +52,9 @@ class ResidualTests:
     Attributes
     ----------
     whiteness : Whiteness
-        Whether the residual is white.
+        Test of whether the residual is white.
     input_relation : InputRelation
-        Whether the residual follows the angle.
+        Test of whether the residual follows the angle.
     harmonics : tuple of Harmonic
         Residual at multiples of the sweep's frequency.
     """
@@ -65,7 +65,7 @@ class ResidualTests:
 
     @property
     def is_noise(self) -> bool:
-        """Whether the residual is white and does not follow the angle."""
+        """Return whether the residual is white and does not follow the angle."""
         return self.whiteness.is_white and not self.input_relation.related
 
 
@@ -74,9 +74,9 @@ def test_residual(
 ) -> ResidualTests:
     """Test whether the residual is white, follows the angle, or has harmonics of the sweep.
 
-    This is the residual of the modal model, or that of the first candidate without such a model.
+    The residual is that of the modal model or, if that is None, of the first candidate.
     """
-    comparison, compared_bins = candidate_set.comparison, candidate_set.noise.counts
+    comparison, compared_bins = candidate_set.comparison, candidate_set.noise.is_compared
     modal_residual = candidate_set.best.fit.residual if modal_fit is None else modal_fit.residual
     angle_rad = comparison.angle_rad[comparison.retained]
     unit_variance_residual = comparison.in_time(modal_residual) * math.sqrt(comparison.samples / 2)
@@ -136,13 +136,13 @@ class RecordModel:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on the effects that are fitted with the modes."""
+        """Return the findings on the effects that are fitted with the modes."""
         effects = (self.small_effect, self.modes_with_drag)
         return tuple(effect.finding() for effect in effects if effect is not None)
 
 
 def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, float]) -> RecordModel:
-    """Fit the modal model of a record, with the small effects and the drag that it suggests.
+    """Fit the modal model of a record, with a small effect and drag if the record suggests them.
 
     The candidates remain those without effects.
     """
@@ -154,7 +154,7 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
     effect = small_effect(
         linear_candidates.comparison,
         linear_fit,
-        linear_fit.plant_with_modal_frequencies(linear_candidates.likeliest.plant),
+        linear_fit.plant_with_modal_frequencies(linear_candidates.likeliest_fit.plant),
         drag_spectrum,
     )
     modes_with_drag, changed_by_drag = None, tuple[int, ...]()
@@ -171,7 +171,7 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
     else:
         modal_fit, explains_record = modes_with_drag.modal_fit, True
         if effect is not None and (
-            effect.kind == "air drag" or not effect.significant_with(modal_fit)
+            effect.kind == "air drag" or not effect.is_significant_with(modal_fit)
         ):
             effect = None
     model = RecordModel(
@@ -183,7 +183,7 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
 
 
 def add_further_effects(model: RecordModel, band_hz: tuple[float, float]) -> RecordModel:
-    """Add the effects that the small ones leave unexplained, and fit the candidates with all.
+    """Add large effects if small ones do not explain the record, and fit the candidates with them.
 
     Parameters
     ----------
@@ -261,7 +261,10 @@ def _accepted_drag(
     modes_with_drag: ModesWithDrag | None,
     explains_record: Callable[[ModalFit], bool],
 ) -> tuple[ModesWithDrag | None, tuple[int, ...]]:
-    """Return modes with drag if they explain the record, else None and the modes in doubt."""
+    """Return the modes with drag if they explain the record, else None and the modes in doubt.
+
+    The modes in doubt are the numbers of those whose damping ratio depends on the drag.
+    """
     if modes_with_drag is None:
         return None, ()
     if modes_with_drag.converged and explains_record(modes_with_drag.modal_fit):
@@ -277,19 +280,19 @@ def fit_modal_model(
     `added_spectra`, shape (c, K), are torque spectra of unknown size in addition to those of the
     candidates.
     """
-    if candidate_set.misread:
+    if candidate_set.misread_findings:
         return None
-    mode_starts = _mode_starts(candidate_set.likeliest.modes)
-    torque_spectra, drag_expansion = candidate_set.columns, candidate_set.comparison.drag
+    mode_starts = _mode_starts(candidate_set.likeliest_fit.modes)
+    torque_spectra, drag_expansion = candidate_set.effect_spectra, candidate_set.comparison.drag
     if added_spectra is not None:
         torque_spectra = np.concatenate([torque_spectra, added_spectra])
     if drag_expansion is not None:  # the size of the drag is not known exactly
-        torque_spectra = np.concatenate([torque_spectra, drag_expansion.by_law])
+        torque_spectra = np.concatenate([torque_spectra, drag_expansion.law_derivatives])
     return fit_modes(candidate_set.comparison, candidate_set.noise, mode_starts, torque_spectra)
 
 
 def _mode_starts(modes: Iterable[ModeEstimate]) -> list[tuple[int, float, float]]:
-    """Return number, frequency in hertz and damping ratio at which the search for a mode starts.
+    """Return number, frequency in hertz and damping ratio of each mode, as starts of a search.
 
     A beam that fits badly may have an overdamped mode below one that oscillates. The search for the
     overdamped mode starts at the frequency ratio of a uniform beam.
@@ -331,7 +334,7 @@ def _explains_record(
 
 
 def _small_drag(candidate_set: CandidateSet, modal_fit: ModalFit) -> NDArray[np.complex128]:
-    """Return the torque spectrum of a small drag on a beam with these modes, shape (K,)."""
+    """Return the torque spectrum of a small drag on a beam with the fitted modes, shape (K,)."""
     plant = modal_fit.uniform_plant(candidate_set.comparison.measurement.nominal)
     drag_spectra = small_drag_spectrum(candidate_set.comparison, plant, modal_fit)
     return np.asarray(drag_spectra[0])
@@ -342,9 +345,9 @@ def _with_small_effect(
 ) -> RecordModel:
     """Fit a small effect together with the modes, and with the drag if there is any."""
     modal_fit = (
-        fit_modal_model(model.linear_candidates, effect.column[None])
+        fit_modal_model(model.linear_candidates, effect.torque_spectrum[None])
         if model.modes_with_drag is None
-        else model.modes_with_drag.fit_with_effect(model.linear_candidates, effect.column)
+        else model.modes_with_drag.fit_with_effect(model.linear_candidates, effect.torque_spectrum)
     )
     return replace(
         model,
@@ -356,7 +359,7 @@ def _with_small_effect(
 
 
 def _with_fitted_candidates(model: RecordModel) -> RecordModel:
-    """Fit the candidates with drag or a distinct small effect, which may change their numbers."""
+    """Refit the candidates with the drag of the model, or with its small effect if it is large."""
     linear_candidates, modes_with_drag = model.linear_candidates, model.modes_with_drag
     if modes_with_drag is not None:
         with_drag = replace(linear_candidates, comparison=modes_with_drag.comparison)
@@ -367,7 +370,7 @@ def _with_fitted_candidates(model: RecordModel) -> RecordModel:
     effect = model.small_effect
     if effect is None or effect.deviance_reduction <= LARGE_DEVIANCE_REDUCTION:
         return model
-    candidate_set = linear_candidates.refit_with_additional_effect(effect.column[None])
+    candidate_set = linear_candidates.refit_with_additional_effect(effect.torque_spectrum[None])
     return replace(model, candidate_set=candidate_set, modal_fit=fit_modal_model(candidate_set))
 
 
@@ -385,14 +388,16 @@ def _fit_further_effects(
         )
         return candidate_set, (), temporal_changes
     candidate_set = (
-        linear_candidates if linear_candidates.misread else refit_with_air_drag(linear_candidates)
+        linear_candidates
+        if linear_candidates.misread_findings
+        else refit_with_air_drag(linear_candidates)
     )
     visible_numbers = visible_modes(
         linear_candidates.comparison, linear_candidates.noise, linear_candidates.best.fit
     )
     candidate_set, nonlinear_forces = (
         (candidate_set, ())
-        if candidate_set.misread
+        if candidate_set.misread_findings
         else add_nonlinear_forces(candidate_set, visible_numbers)
     )
     if nonlinear_forces and candidate_set.drag is not None:

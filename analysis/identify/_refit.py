@@ -1,8 +1,7 @@
 """Refit from the end of a fit: another structure, other noise, a fixed order, or added torques.
 
 A nonlinear effect (for example a stiffness that depends on the deflection) adds to the torque a
-spectrum of known shape and unknown size, called a column. It is projected out like the free
-decay.
+spectrum of known shape and unknown size. It is projected out like the free decay.
 """
 
 from __future__ import annotations
@@ -78,21 +77,21 @@ class Refit:
         *,
         max_evaluations: int = 60,
         relative_tolerance: float = _COST_TOLERANCE,
-        hold: Sequence[str] = (),
+        held_unknowns: Sequence[str] = (),
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
         """Descend from a start vector, after unknown torques are filled with the prediction there.
 
         `torque_spectra`, shape (c, K), are torque spectra of unknown size that are projected out in
-        addition to the free decay. `hold` names unknowns that keep their start values.
+        addition to the free decay. `held_unknowns` names unknowns that keep their start values.
         `relative_tolerance` and `hopeless` are those of `analysis.optimizer.descend`. With
         `max_evaluations` of 1 the start is only evaluated.
         """
         descent_steps = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
         x = np.clip(start, descent_steps.lower, descent_steps.upper)
-        for fixed_name in hold:
-            fixed_index = unknowns.names.index(fixed_name)
-            descent_steps.lower[fixed_index] = descent_steps.upper[fixed_index] = x[fixed_index]
+        for held_name in held_unknowns:
+            held_index = unknowns.names.index(held_name)
+            descent_steps.lower[held_index] = descent_steps.upper[held_index] = x[held_index]
         objective, minimum = Objective(comparison, unknowns, torque_spectra).minimum(
             x,
             noise.weight,
@@ -103,7 +102,7 @@ class Refit:
         )
         return cls(objective, minimum.x, minimum.equations, noise)
 
-    def further(self, max_evaluations: int) -> Refit:
+    def continue_descent(self, max_evaluations: int) -> Refit:
         """Continue the descent with no unknown fixed, as `descend` from the same point would.
 
         The evaluation at this point counts, but is not repeated unless torques are unknown.
@@ -118,9 +117,9 @@ class Refit:
         return Refit(objective, minimum.x, minimum.equations, self.noise)
 
     @property
-    def columns(self) -> NDArray[np.complex128]:
-        """Return the torque spectra that are projected out besides the free decay, (c, K)."""
-        return self.objective.columns
+    def effect_spectra(self) -> NDArray[np.complex128]:
+        """Return the torque spectra of effects, projected out like those of free decays, (c, K)."""
+        return self.objective.effect_spectra
 
     @property
     def cost(self) -> float:
@@ -131,7 +130,7 @@ class Refit:
     def expected_cost(self) -> float:
         """Return the sum of squares that is expected if the residual is noise only."""
         known_fraction = self.objective.comparison.measurement.known_torque_fraction
-        return float(2 * np.count_nonzero(self.noise.counts) * known_fraction)
+        return float(2 * np.count_nonzero(self.noise.is_compared) * known_fraction)
 
     @property
     def predicted_cost(self) -> float:
@@ -168,11 +167,11 @@ class Refit:
         return torque_amplitudes, np.sqrt(np.diag(covariance))
 
     def amplitude_covariance(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the fitted factors of the added torque spectra, (c,), and their covariance."""
+        """Return the sizes of the added torque spectra, shape (c,), and the covariance, (c, c)."""
         linearisation = self.objective.linearise(self.x)
         projected_objective = self.objective.project(linearisation, self.noise.weight)
         whitened_spectra = self.objective.unknown_torques(linearisation) * self.noise.weight
-        # The Jacobian before the projection is needed: after it the columns are orthogonal to the
+        # The Jacobian before the projection is needed: after it the spectra are orthogonal to the
         # Jacobian, so their amplitudes would seem independent of the unknowns.
         derivatives = np.concatenate([linearisation.jacobian * self.noise.weight, whitened_spectra])
         derivative_norms = np.sqrt(np.sum(np.abs(derivatives) ** 2, axis=1))
@@ -181,23 +180,23 @@ class Refit:
         gram_matrix = (derivatives.conj() @ derivatives.T).real + 1e-12 * np.eye(
             derivative_norms.size
         )
-        first_column = derivative_norms.size - len(self.columns)
+        first_column = derivative_norms.size - len(self.effect_spectra)
         column_scale = derivative_norms[first_column:]
         covariance = np.linalg.inv(gram_matrix)[first_column:, first_column:] / np.outer(
             column_scale, column_scale
         )
         return projected_objective.amplitudes[
-            projected_objective.amplitudes.size - len(self.columns) :
+            projected_objective.amplitudes.size - len(self.effect_spectra) :
         ], covariance
 
-    def unexplained_columns(
+    def unexplained_spectra(
         self, torque_spectra: NDArray[np.complex128], *, beam_free: bool = True
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Whiten torque spectra and remove the part that other free terms explain, shape (c, K).
+        """Return the part of whitened torque spectra that other free terms do not explain, (c, K).
 
-        The whitened residual (prediction minus measurement), shape (K,), is returned as well. With
-        `beam_free` the unknowns may explain a part of the spectra, too. Otherwise only the terms
-        that are projected out may.
+        The free terms are the disturbances of unknown amplitude and, with `beam_free`, the unknowns
+        of the beam. The whitened residual (prediction minus measurement), shape (K,), is returned
+        as well.
         """
         noise_weight, linearisation = self.noise.weight, self.objective.linearise(self.x)
         projected_objective = self.objective.project(linearisation, noise_weight)
@@ -211,16 +210,14 @@ class Refit:
     def cost_reduction_by_spectrum(
         self, torque_spectra: NDArray[np.complex128]
     ) -> NDArray[np.float64]:
-        """Return the first-order reduction of the sum of squares by each torque spectrum alone.
-
-        Its shape is (c,).
+        """Return the first-order reduction of the cost by each torque spectrum alone, shape (c,).
 
         Parameters
         ----------
         torque_spectra : ndarray of complex, shape (c, K)
             Torque spectra of unknown size.
         """
-        unexplained_spectra, residual = self.unexplained_columns(torque_spectra)
+        unexplained_spectra, residual = self.unexplained_spectra(torque_spectra)
         correlation = (unexplained_spectra.conj() @ residual).real
         unexplained_squares = np.maximum(
             np.sum(np.abs(unexplained_spectra) ** 2, axis=1), np.finfo(float).tiny
@@ -231,9 +228,9 @@ class Refit:
     def fit(self) -> RecordFit:
         """Return the fit at this minimum with parameters, modes and uncertainties."""
         fit = summary(self.objective, self.x, self.noise)
-        if not len(self.columns):
+        if not len(self.effect_spectra):
             return fit
-        # `summary` does not know that the amplitudes of other columns are free as well.
+        # `summary` does not know that the amplitudes of the effects are free as well.
         projected_objective = self.objective.project(
             self.objective.linearise(self.x), self.noise.weight
         )
@@ -248,7 +245,7 @@ class Refit:
             gram_matrix[:decay_count, decay_count:],
             gram_matrix[decay_count:, decay_count:],
         )
-        # Inverse covariance of the decays alone, the other columns free (Schur complement).
+        # Inverse covariance of the decays alone, the other amplitudes free (Schur complement).
         decay_precision = decay_gram - cross_gram @ np.linalg.solve(column_gram, cross_gram.T)
         a = (projected_objective.amplitudes * gram_scale)[:decay_count]
         chi_square = float(a @ decay_precision @ a) * fit.degrees_of_freedom / fit.cost
@@ -257,9 +254,9 @@ class Refit:
         )
 
     def candidate(self) -> Candidate:
-        """Return this minimum as a candidate for the best fit of the record, with its structure."""
+        """Return the fit at this minimum, with its structure, as a candidate."""
         unknowns = self.objective.unknowns
-        return Candidate(unknowns.structure, self.fit(), len(self.columns))
+        return Candidate(unknowns.structure, self.fit(), len(self.effect_spectra))
 
     def residual_noise(self) -> NoiseSpectrum:
         """Return the noise of the residual at this minimum. Lines stay excluded."""
@@ -273,8 +270,8 @@ def unexplained_part(
 ) -> NDArray[np.complex128]:
     """Return the part of whitened spectra that other free terms do not explain, shape (c, K).
 
-    `explaining_spectra`, shape (k, K), are the whitened derivatives by all free parameters and
-    amplitudes.
+    `explaining_spectra`, shape (k, K), are those of the other free terms: whitened derivatives by
+    all free parameters and amplitudes.
     """
     spectrum_norms = np.sqrt(np.sum(np.abs(explaining_spectra) ** 2, axis=1))
     normalized_spectra = (

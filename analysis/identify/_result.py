@@ -27,7 +27,7 @@ class FitWithResidual(Protocol):
 
     @property
     def residual(self) -> NDArray[np.complex128]:
-        """Whitened spectrum of the residual, shape (K,)."""
+        """Return the whitened spectrum of the residual, shape (K,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +154,7 @@ class RecordAnalysis:
         return cls(
             fits=tuple(fits),
             frequency_hz=comparison.frequency_hz,
-            compared=noise.counts,
+            compared=noise.is_compared,
             noise_nm2_per_hz=2 * noise.power / (comparison.samples * comparison.decimation.rate_hz),
             lines=noise.lines,
             comparison=comparison,
@@ -181,6 +181,6 @@ class RecordAnalysis:
         torque_nm = (
             comparison.torque_nm[comparison.retained] + comparison.removed_nm - comparison.hum_nm
         )
-        measured_spectrum = comparison.spectrum(torque_nm)[noise.counts]
-        unwhitened_residual = (fit.residual * np.sqrt(noise.power / 2))[noise.counts]
+        measured_spectrum = comparison.spectrum(torque_nm)[noise.is_compared]
+        unwhitened_residual = (fit.residual * np.sqrt(noise.power / 2))[noise.is_compared]
         return nrmse_percent(unwhitened_residual, measured_spectrum)

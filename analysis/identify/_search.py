@@ -41,7 +41,7 @@ _LN_RATIO_SHIFTS: Final = np.linspace(-0.5, 0.5, 101)
 """Shifts of ln(rho/EI) at which the resonances are compared with the record."""
 
 _SCAN_DAMPING: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
-"""Damping for the scan of these shifts, as `Unknowns.start` accepts it."""
+"""Damping at which the shifts are compared, as `Unknowns.start` accepts it."""
 
 
 def resonance_shift(coarse_response: CoarseResponse, unknowns: Unknowns) -> NDArray[np.float64]:
@@ -72,7 +72,7 @@ def resonance_shift(coarse_response: CoarseResponse, unknowns: Unknowns) -> NDAr
 _COARSE_POINTS: Final = 400
 """Number of points of the coarse response."""
 
-_COARSE_TOLERANCE: Final = 1e-2
+_COARSE_COST_TOLERANCE: Final = 1e-2
 """Relative tolerance of the cost in a descent on the coarse response."""
 
 _SAME_MINIMUM_FRACTION: Final = 0.05
@@ -150,7 +150,7 @@ class CoarseResponse:
         return self._responses[plant]
 
     def best_ln_ratio_shift(self, plant: Plant) -> float:
-        """Return the shift of ln(rho/EI) of a plant, with constant losses, of the lowest cost."""
+        """Return the shift of ln(rho/EI), at constant losses, for which a plant fits best."""
         # Cached: structures that differ only in what is free begin at the same plant.
         if plant not in self._shifts:
             ratio, gamma = plant.beam.density_over_stiffness, plant.damping.gamma
@@ -171,14 +171,14 @@ class CoarseResponse:
         """Return the weighted mean square of the difference between two plants' responses."""
         return self._mean_square(self._predicted(first_plant) - self._predicted(second_plant))
 
-    def alike(self, first_plant: Plant, second_plant: Plant) -> bool:
-        """Return whether the responses of two plants are so similar that they are one minimum."""
+    def are_alike(self, first_plant: Plant, second_plant: Plant) -> bool:
+        """Return whether two plants respond so similarly that they count as the same minimum."""
         return self.distance(first_plant, second_plant) <= _SAME_MINIMUM_FRACTION * min(
             self.cost(first_plant), self.cost(second_plant)
         )
 
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
-        """Return `cost` with its gradient and Gauss-Newton matrix by the unknowns."""
+        """Return the cost at `x` with its gradient and Gauss-Newton matrix by the unknowns."""
         plant, unknown_slopes = unknowns.plant_and_gradient(x)
         spectra = self._response.evaluate(plant, unknowns.gradient_names)
         response_deviation = spectra[0] - self._measured
@@ -191,7 +191,7 @@ class CoarseResponse:
         )
 
     def _mean_square(self, response_deviation: NDArray[np.complex128]) -> float:
-        """Return the weighted mean square of differences of the response, in (N·m/rad)²."""
+        """Return the weighted mean square of a deviation of the response, in (N·m/rad)²."""
         return float(self._weights @ (response_deviation.real**2 + response_deviation.imag**2))
 
 
@@ -239,7 +239,7 @@ def coarse_minima(
             lambda x: coarse_response.normal_equations(unknowns, x),
             start_vector,
             descent_steps,
-            relative_tolerance=_COARSE_TOLERANCE,
+            relative_tolerance=_COARSE_COST_TOLERANCE,
             max_evaluations=_MAX_COARSE_EVALUATIONS,
         )
         for start_vector in start_vectors
@@ -248,7 +248,7 @@ def coarse_minima(
     for minimum in sorted(minima, key=lambda m: m.cost):
         plant = unknowns.plant(minimum.x)
         if not any(
-            coarse_response.alike(plant, unknowns.plant(known_minimum.x))
+            coarse_response.are_alike(plant, unknowns.plant(known_minimum.x))
             for known_minimum in distinct_minima
         ):
             distinct_minima.append(minimum)
@@ -257,7 +257,7 @@ def coarse_minima(
 
 # Descents on the whole record
 
-_RIVAL_TOLERANCE: Final = 1e-2
+_RIVAL_COST_TOLERANCE: Final = 1e-2
 """Relative tolerance of the descents that decide which of several minima is lower."""
 
 _MAX_RIVALS: Final = 2
@@ -325,9 +325,9 @@ class Descent:
         return self.objective.normal_equations(self.x, noise.weight).cost
 
     def with_reestimated_angle(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
-        """Re-estimate the motor angle from the reference angle, and descend until it converges.
+        """Re-estimate the part of the angle that follows the reference, and descend; repeat both.
 
-        Return `self` if it has converged already.
+        Return `self` if this part of the angle has converged already.
         """
         descent = self
         for _ in range(MAX_ANGLE_REESTIMATES):
@@ -340,17 +340,17 @@ class Descent:
         return descent
 
     def hum(self) -> tuple[Hum, ...]:
-        """Search for hum, a narrow-band disturbance, near the modes of the current beam."""
+        """Return the hum (narrow-band disturbance) that is found near modes of the current beam."""
         comparison = self.objective.comparison
-        at, noise = self.objective.linearise(self.x), self.noise()
-        torque_amplitudes = self.objective.project(at, noise.weight).amplitudes
-        decay_count = count_decay_spectra(at.poles) * (1 + len(comparison.later_decays))
-        decay_spectra = self.objective.unknown_torques(at)[:decay_count]
+        linearisation, noise = self.objective.linearise(self.x), self.noise()
+        torque_amplitudes = self.objective.project(linearisation, noise.weight).amplitudes
+        decay_count = count_decay_spectra(linearisation.poles) * (1 + len(comparison.later_decays))
+        decay_spectra = self.objective.unknown_torques(linearisation)[:decay_count]
         decaying_nm = comparison.in_time(torque_amplitudes[:decay_count] @ decay_spectra)
-        return find_hum_near_modes(comparison, self.plant, at.poles, noise, decaying_nm)
+        return find_hum_near_modes(comparison, self.plant, linearisation.poles, noise, decaying_nm)
 
     def remove_hum(self, tolerance: float) -> Descent:
-        """Remove the hum near modes from the data, and fit again. Return `self` without hum."""
+        """Remove the hum near modes from the data, and fit again; return `self` if none exists."""
         descent = self
         for _ in range(_MAX_HUM_SEARCHES):
             hum = descent.hum()
@@ -366,18 +366,18 @@ class Descent:
     def noise(self, *, with_lines: bool = False) -> NoiseSpectrum:
         """Return the noise spectrum of the current residual, without the free decay."""
         objective, comparison = self.objective, self.objective.comparison
-        at = objective.linearise(self.x)
+        linearisation = objective.linearise(self.x)
         is_near_mode = None
         if with_lines:
             hz = comparison.frequency_hz
             is_near_mode = np.zeros(hz.size, dtype=bool)
-            for mode_pole in at.poles:
+            for mode_pole in linearisation.poles:
                 mode_width_hz = resonance_half_width_hz(mode_pole, float(hz[1] - hz[0]))
                 is_near_mode |= (
                     np.abs(hz - abs(mode_pole.at_rad_s.imag) / (2 * np.pi)) < mode_width_hz
                 )
         return estimate_noise(
-            objective.project(at, 1.0).residual,
+            objective.project(linearisation, 1.0).residual,
             comparison.frequency_hz,
             comparison.samples,
             comparison.measurement.known_torque_fraction,
@@ -393,17 +393,17 @@ class StructureSearch:
     ----------
     objective : Objective
         Sum of squares of the whole record.
-    coarse : CoarseResponse
+    coarse_response : CoarseResponse
         Some points of the frequency response of the record.
-    first : ndarray, shape (k,)
+    order_one_start : ndarray, shape (k,)
         Unknowns of the best start with all orders 1.
     minima : list of Minimum
         Minima of the coarse response under white noise, the lowest first.
     """
 
     objective: Objective
-    coarse: CoarseResponse
-    first: NDArray[np.float64]
+    coarse_response: CoarseResponse
+    order_one_start: NDArray[np.float64]
     minima: list[Minimum]
 
     @classmethod
@@ -446,10 +446,12 @@ class StructureSearch:
         known_descent : Descent, optional
             Descent at a known minimum.
         """
-        whitened_response = self.coarse.whitened(noise, self.objective.comparison.frequency_hz)
+        whitened_response = self.coarse_response.whitened(
+            noise, self.objective.comparison.frequency_hz
+        )
         start_vectors = [minimum.x for minimum in self.minima[:_MAX_STORED_MINIMA]]
         minima_under_noise = coarse_minima(
-            whitened_response, self.unknowns, [*start_vectors, self.first]
+            whitened_response, self.unknowns, [*start_vectors, self.order_one_start]
         )
         rival_descents = [
             Descent(self.objective, minimum.x)
@@ -461,14 +463,16 @@ class StructureSearch:
             rival_descents = [known_descent] + [
                 rival_descent
                 for rival_descent in rival_descents
-                if not whitened_response.alike(known_plant, self.unknowns.plant(rival_descent.x))
+                if not whitened_response.are_alike(
+                    known_plant, self.unknowns.plant(rival_descent.x)
+                )
                 and whitened_response.cost(self.unknowns.plant(rival_descent.x))
                 < _BETTER_COST_RATIO * whitened_response.cost(known_plant)
             ]
         if len(rival_descents) == 1:
             return rival_descents[0]
         final_descents = [
-            rival_descent.descend_to_minimum(noise, _RIVAL_TOLERANCE)
+            rival_descent.descend_to_minimum(noise, _RIVAL_COST_TOLERANCE)
             for rival_descent in rival_descents
         ]
         return min(final_descents, key=lambda end: end.cost(noise))

@@ -83,7 +83,7 @@ session repeats."""
 _TILTED_AXIS_REASON: Final = (
     "the axis is tilted, and fits to the whole record are of one that is plumb"
 )
-"""Reason against the estimates on an exactly uniform beam if the axis is tilted."""
+"""Reason to doubt the estimates for an exactly uniform beam if the axis is tilted."""
 
 ORDER_ONE_STRUCTURE: Final = STRUCTURES["III"]
 """Structure with internal and external damping of order 1. It is fitted from every start: it has no
@@ -120,7 +120,7 @@ class Selection:
 
     @property
     def fit(self) -> RecordFit:
-        """Return the fit of a beam to the record whose parameter values are reported."""
+        """Return the whole-record fit whose parameter values are reported."""
         return self.headline.fit
 
     @property
@@ -373,7 +373,7 @@ def _select_with_known_impacts(
 def _uniform_beam_test(
     measurement: Measurement, modal_fit: ModalFit | None
 ) -> UniformBeamTest | None:
-    """Test whether a uniform beam predicts the measured modes. Return None without modal model."""
+    """Test whether a uniform beam predicts the measured modes; None if there is no modal model."""
     if modal_fit is None:
         return None
     return uniform_beam_test(modal_fit, measurement.nominal, measurement.axis_tilt_deg)
@@ -387,7 +387,7 @@ def _explain_deviations(
 ) -> tuple[tuple[CauseFit, ...], tuple[Finding, ...]]:
     """Return simple causes of the deviations from a uniform beam, and the finding that names them.
 
-    Return none with only two modes, which leave no degree of freedom for this test.
+    Both are empty with only two modes, which leave no degree of freedom for a test of causes.
     """
     if len(modal_fit.visible) <= MODES_WITHOUT_REDUNDANCY:
         return (), ()
@@ -406,7 +406,7 @@ def _add_modal_model(
     beam_test: UniformBeamTest | None,
     check: ModelCheck,
 ) -> Headline:
-    """Add the modal model and the estimates with tolerance to the headline of a uniform beam.
+    """Add the modal model and the estimates with tolerance to the headline for a uniform beam.
 
     Return `exact_headline` if there is no modal model.
     """
@@ -479,7 +479,7 @@ def _fit_freest_with_known_impacts(
     additional_structures = () if misread_findings else (ORDER_ONE_STRUCTURE,)
     candidate_set = replace(
         CandidateSet.fit_freest_structure(measurement, (), band_hz, additional_structures),
-        misread=misread_findings,
+        misread_findings=misread_findings,
     )
     if not misread_findings:
         candidate_set = candidate_set.fit_special_cases()
@@ -499,7 +499,9 @@ def _fit_freest_with_known_impacts(
         visible_numbers,
         {} if misread_findings else _unidentifiable_orders(candidate_set, visible_numbers),
         unexplained_reason=check.model_reason,
-        both=None if misread_findings else candidate_set.fit_with_both_dampings(candidate_set.best),
+        fit_with_both_dampings=None
+        if misread_findings
+        else candidate_set.fit_with_both_dampings(candidate_set.best),
     )
     beam_test = _uniform_beam_test(measurement, modal_fit)
     reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)
@@ -523,9 +525,9 @@ def _fit_freest_with_known_impacts(
 def _unidentifiable_orders(
     candidate_set: CandidateSet, visible_numbers: tuple[int, ...]
 ) -> dict[str, str]:
-    """Return why an order is not determined, for each order that the record does not determine.
+    """Return the reason why each undetermined damping order is not determined, by order name.
 
-    The fit is that of the structure with most free parameters.
+    The orders are those of the fit with most free parameters.
     """
     freest_candidate, *other_candidates = candidate_set.candidates
     common_reason = not_reported_reason(candidate_set, visible_numbers)

@@ -57,7 +57,7 @@ class SmallEffect:
         Kind of the `Finding` on the effect.
     phrase : str
         Description of the effect, as the beginning of a sentence.
-    column : ndarray of complex, shape (K,)
+    torque_spectrum : ndarray of complex, shape (K,)
         Spectrum of the torque by the effect, in N·m per unit of its size.
     deviance_reduction : float
         Reduction of deviance by the effect.
@@ -65,7 +65,7 @@ class SmallEffect:
 
     kind: Kind
     phrase: str
-    column: NDArray[np.complex128]
+    torque_spectrum: NDArray[np.complex128]
     deviance_reduction: float
 
     @property
@@ -78,9 +78,9 @@ class SmallEffect:
         """Return whether the nonlinear effect is so large that it needs a model of its own."""
         return self.deviance_reduction > LARGE_DEVIANCE_REDUCTION and not self.is_linear
 
-    def significant_with(self, modal_fit: ModalFit) -> bool:
+    def is_significant_with(self, modal_fit: ModalFit) -> bool:
         """Return whether the effect would improve a modal model that contains other effects."""
-        [cost_reduction] = modal_fit.cost_reduction_by_spectrum(self.column[None])
+        [cost_reduction] = modal_fit.cost_reduction_by_spectrum(self.torque_spectrum[None])
         return bool(cost_reduction >= MIN_DEVIANCE_REDUCTION)
 
     def finding(self) -> Finding:
@@ -98,7 +98,7 @@ class SmallEffect:
 
 def small_effect(
     comparison: Comparison,
-    modal: ModalFit,
+    modal_fit: ModalFit,
     plant: Plant,
     drag_spectrum: NDArray[np.complex128],
 ) -> SmallEffect | None:
@@ -108,10 +108,10 @@ def small_effect(
     `drag_spectrum`, shape (K,), is that of a small air drag per metre of C_D d.
     """
     possible_effects: list[tuple[Kind, str, NDArray[np.complex128]]] = [
-        *_possible_effects(comparison, modal, plant),
+        *_possible_effects(comparison, modal_fit, plant),
         ("air drag", "Air drag", drag_spectrum),
     ]
-    cost_reductions = modal.cost_reduction_by_spectrum(
+    cost_reductions = modal_fit.cost_reduction_by_spectrum(
         [torque_spectrum for _, _, torque_spectrum in possible_effects]
     )
     best_index = int(np.argmax(cost_reductions))
@@ -124,20 +124,20 @@ def small_effect(
 
 
 def _possible_effects(
-    comparison: Comparison, modal: ModalFit, plant: Plant
+    comparison: Comparison, modal_fit: ModalFit, plant: Plant
 ) -> Iterator[tuple[Kind, str, NDArray[np.complex128]]]:
     """Yield kind, description and torque spectrum, (K,), of small effects other than air drag."""
     force_spectra = NonlinearForceSpectra(comparison, plant)
-    for mode_number in modal.visible:
+    for mode_number in modal_fit.visible:
         yield (
             "nonlinear stiffness",
             f"A stiffness of mode {mode_number} that depends on the deflection",
-            force_spectra.column(NonlinearTerm("cubic stiffness", mode_number)),
+            force_spectra.torque_spectrum(NonlinearTerm("cubic stiffness", mode_number)),
         )
         yield (
             "nonlinear stiffness",
             f"A stiffness of mode {mode_number} that differs from side to side",
-            force_spectra.column(NonlinearTerm("quadratic stiffness", mode_number)),
+            force_spectra.torque_spectrum(NonlinearTerm("quadratic stiffness", mode_number)),
         )
     yield (
         "play",
@@ -145,7 +145,7 @@ def _possible_effects(
         backlash_spectrum(comparison, plant) / UNIT_BACKLASH_RAD,
     )
     yield "friction", "Dry friction between sensor and beam", _friction_spectrum(comparison)
-    model_torque_nm = comparison.prediction.torque(modal.model)[0]
+    model_torque_nm = comparison.prediction.torque(modal_fit.model)[0]
     largest_torque_nm = float(np.abs(model_torque_nm).max())
     if largest_torque_nm > 0 and math.isfinite(largest_torque_nm):
         for force_power, effect_words in ((3, "A gain of the torque that depends on its size"),

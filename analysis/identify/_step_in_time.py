@@ -1,7 +1,7 @@
 """Score of a step of the stiffness in time: a clamp that slips, a beam that cracks.
 
 If the stiffness of a ringing mode q of frequency omega rises by the fraction e at an instant, its
-response changes to first order by the response to a force ``-e omega² q`` from then on. Its motion
+response changes to first order by the response to a force ``-e omega² q`` from then on. The motion
 is continuous. In one sweep each mode is passed once, so such a step makes the modes inconsistent.
 The largest reduction of the modal model's residual over all instants shows whether a step is a
 likely cause.
@@ -98,7 +98,7 @@ def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
         if deviance_reductions[best_index] > best_step.score:
             best_step = StiffnessStep(
                 score=float(deviance_reductions[best_index]),
-                instant_s=comparison.first_s
+                instant_s=comparison.first_sample_s
                 + float(sample_indices[best_index]) / comparison.decimation.rate_hz,
                 relative_change=float(correlation[best_index] / spectrum_squares[best_index]),
             )

@@ -1,8 +1,8 @@
 """Fit of a damping structure of an installed package to a whole record.
 
-Data and noise spectrum are those of the structures of the analyser, so that the costs are
-comparable. The poles of the free decay at the start of the record are those of the closest of these
-structures: nearly all records begin at rest.
+Data and noise spectrum are those of the fits of types I to VII, so that the costs are comparable.
+The poles of the free decay at the start of the record are those of the type with the lowest BIC.
+They hardly matter: nearly all records begin at rest.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from analysis.models import Structure
     from analysis.structures import AddedStructure
 
-_ROUGH_TOLERANCE: Final = 1e-3
+_ROUGH_COST_TOLERANCE: Final = 1e-3
 """Relative tolerance of the cost in the descents from several starts."""
-_TOLERANCE: Final = 1e-8
+_COST_TOLERANCE: Final = 1e-8
 """Relative tolerance of the cost at the minimum."""
-_DESCENTS: Final = 3
-"""Number of starts, those of the lowest cost, from which descents begin."""
+_MAX_DESCENTS: Final = 3
+"""Maximum number of starts, those of the lowest cost, from which descents begin."""
 _MAX_EVALUATIONS: Final = 60
 """Largest number of evaluations of a descent."""
 
@@ -69,7 +69,7 @@ class StructureFit:
     degrees_of_freedom : int
         Cost that is expected if the residual is noise only.
     delta_bic : float
-        Bayesian information criterion (BIC) above the lowest of types I to VII.
+        Bayesian information criterion (BIC) minus the lowest one of types I to VII.
     compared_with : str
         Name of the type with the lowest BIC.
     residual : ndarray of complex, shape (K,)
@@ -90,7 +90,7 @@ class StructureFit:
 
     @property
     def sentence(self) -> str:
-        """Return the sentence of the verdict on this structure, which is none of its candidates."""
+        """Return the sentence that compares this structure with types I to VII by BIC."""
         above = self.delta_bic > 0
         difference = (
             f"its BIC is {abs(self.delta_bic):.3g} {'above' if above else 'below'} that of type "
@@ -107,7 +107,7 @@ class StructureFit:
 
 
 def fit_structure(
-    added: AddedStructure, selection: Selection, fixed: tuple[Setting, ...] = ()
+    added_structure: AddedStructure, selection: Selection, fixed: tuple[Setting, ...] = ()
 ) -> StructureFit | None:
     """Fit the damping structure of a package to the record of a selection.
 
@@ -116,7 +116,7 @@ def fit_structure(
 
     Parameters
     ----------
-    added : AddedStructure
+    added_structure : AddedStructure
         Structure and its package.
     selection : Selection
         Selection among types I to VII, with data and noise spectrum of the record.
@@ -128,20 +128,20 @@ def fit_structure(
     PluginError
         If the code of the package fails, or its damping is not finite somewhere in its range.
     """
-    structure, plugin = added.structure, added.plugin
+    structure, plugin = added_structure.structure, added_structure.plugin
     best = selection.candidates[0]
     if best.effect_count or selection.analysis.comparison.drag is not None:
         return None
     noise = selection.analysis.noise
     comparison = selection.analysis.comparison
-    settings = Unknowns.for_structure(
+    undamped_unknowns = Unknowns.for_structure(
         UNDAMPED, comparison.measurement.nominal, free_settings(fixed)
     )
     unknowns = StructureUnknowns(
         structure,
-        settings.nominal,
-        settings.free,
-        settings.omega_rad_s,
+        undamped_unknowns.nominal,
+        undamped_unknowns.free_settings,
+        undamped_unknowns.omega_rad_s,
         comparison.poles(best.fit.plant),
     )
     region = ConstantBounds(*unknowns.bounds)
@@ -149,24 +149,24 @@ def fit_structure(
         try:
             objective = Objective(comparison, unknowns)
             starts = [unknowns.vector_near(v, best.fit.plant) for v in structure.start_values()]
-            if len(starts) > _DESCENTS:
+            if len(starts) > _MAX_DESCENTS:
                 starts.sort(key=lambda x: objective.normal_equations(x, noise.weight).cost)
             descents = [
                 objective.minimum(
                     start,
                     noise.weight,
                     region,
-                    relative_tolerance=_ROUGH_TOLERANCE,
+                    relative_tolerance=_ROUGH_COST_TOLERANCE,
                     max_evaluations=_MAX_EVALUATIONS,
                 )
-                for start in starts[:_DESCENTS]
+                for start in starts[:_MAX_DESCENTS]
             ]
             objective, rough_minimum = min(descents, key=lambda each: each[1].cost)
             objective, minimum = objective.minimum(
-                rough_minimum.x, noise.weight, region, relative_tolerance=_TOLERANCE
+                rough_minimum.x, noise.weight, region, relative_tolerance=_COST_TOLERANCE
             )
             x = minimum.x
-            projected = objective.project(objective.linearise(x), noise.weight)
+            projected_residual = objective.project(objective.linearise(x), noise.weight)
             plant, slopes = unknowns.plant_and_gradient(x)
             loss_factors = tuple(
                 (pole.frequency_hz, plant.loss_factor(abs(pole.at_rad_s)))
@@ -178,7 +178,7 @@ def fit_structure(
     degrees_of_freedom = best.values - x.size - best.fit.ringing.degrees_of_freedom
     at_bound = (x <= region.lower) | (x >= region.upper)
     covariance, determined = covariance_of_unknowns(
-        projected.jacobian, projected.cost / degrees_of_freedom, at_bound
+        projected_residual.jacobian, projected_residual.cost / degrees_of_freedom, at_bound
     )
     stds = np.sqrt(np.diag(slopes @ covariance @ slopes.T))
     parameters = unknowns.parameters(x)
@@ -193,11 +193,13 @@ def fit_structure(
             else None
             for name, std, is_determined in zip(names, stds, determined, strict=True)
         },
-        at_bounds=tuple(name for name, held in zip(names, at_bound, strict=True) if held),
+        at_bounds=tuple(
+            name for name, is_at_bound in zip(names, at_bound, strict=True) if is_at_bound
+        ),
         loss_factors=loss_factors,
         cost=minimum.cost,
         degrees_of_freedom=degrees_of_freedom,
         delta_bic=bic(minimum.cost, best.values, x.size) - best.bic,
         compared_with=best.name,
-        residual=projected.residual,
+        residual=projected_residual.residual,
     )

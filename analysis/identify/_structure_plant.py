@@ -50,7 +50,7 @@ class StructurePlant(Plant):
     def torque_spectra(
         self, s: NDArray[np.complex128], wrt: Sequence[str], angle_spectrum: NDArray[np.complex128]
     ) -> NDArray[np.complex128]:
-        """Return the transforms of the torque and its derivatives, as `ResponseGrid.evaluate`.
+        """Return the transforms of the torque and its derivatives, like `ResponseGrid.evaluate`.
 
         Parameters
         ----------
@@ -84,7 +84,10 @@ class StructurePlant(Plant):
     def _factor_slopes(
         self, s: NDArray[np.complex128], parameter: Parameter
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return the derivatives of the factors c and e by a parameter, by central differences."""
+        """Return the derivatives of elastic factor and external damping by a parameter, (n,) each.
+
+        They are central differences.
+        """
         value = self.values[parameter.name]
         step = _PARAMETER_STEP * (
             value if parameter.logarithmic else parameter.upper - parameter.lower
@@ -103,8 +106,8 @@ class StructurePlant(Plant):
         near_rad_s: Sequence[complex] = (),  # noqa: ARG002 - nothing is searched
     ) -> tuple[Pole, ...]:
         """Return `decay_poles`, with derivatives of 0 by the parameters `wrt`."""
-        still = np.zeros(len(wrt), dtype=np.complex128)
-        return tuple(replace(pole, derivative=still) for pole in self.decay_poles)
+        zero_derivative = np.zeros(len(wrt), dtype=np.complex128)
+        return tuple(replace(pole, derivative=zero_derivative) for pole in self.decay_poles)
 
     def loss_factor(self, omega_rad_s: float) -> float:
         """Return the loss factor of the damping at an angular frequency."""
@@ -118,50 +121,57 @@ class StructurePlant(Plant):
 class StructureUnknowns(Unknowns):
     """Vector of unknowns of a package's structure: its free parameters, then the settings.
 
-    A logarithmic parameter is its logarithm, another one is relative to its range. Density over
-    stiffness and stiffness are the effective ones, with the real part of the damping at the first
-    two modes, so that a step of a parameter does not move the modes.
+    The unknown of a logarithmic parameter is its logarithm, that of another parameter is its value
+    relative to the range. Density over stiffness and stiffness are effective values, which include
+    the real part of the damping at the first two modes: a step of a parameter then does not move
+    the modes.
     """
 
     decay_poles: tuple[Pole, ...] = ()
     """Poles of the free decay at the start of the record."""
 
     @cached_property
-    def settings(self) -> Unknowns:
-        """Return the unknowns of beam and rig alone."""
-        return Unknowns(UNDAMPED, self.nominal, self.free, self.omega_rad_s)
+    def setting_unknowns(self) -> Unknowns:
+        """Return the unknowns of beam and rig alone, which come after those of the structure."""
+        return Unknowns(UNDAMPED, self.nominal, self.free_settings, self.omega_rad_s)
 
     @property
-    def _free(self) -> list[Parameter]:
+    def _free_parameters(self) -> list[Parameter]:
         """Return the free parameters of the structure."""
         return [each for each in self.structure.parameters if each.name in self.structure.free]
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lower and the upper bounds of the unknowns, each of shape (k,)."""
-        lower, upper = self.settings.bounds
+        lower, upper = self.setting_unknowns.bounds
         return (
-            np.array([*(_unknown(each, each.lower) for each in self._free), *lower]),
-            np.array([*(_unknown(each, each.upper) for each in self._free), *upper]),
+            np.array(
+                [*(_unknown_of_value(each, each.lower) for each in self._free_parameters), *lower]
+            ),
+            np.array(
+                [*(_unknown_of_value(each, each.upper) for each in self._free_parameters), *upper]
+            ),
         )
 
     def vector_near(self, values: Mapping[str, float], closest: Plant) -> NDArray[np.float64]:
-        """Return the unknowns for values of the structure's parameters on the closest plant."""
-        own_unknowns = [_unknown(each, values[each.name]) for each in self._free]
-        return np.array([*own_unknowns, *self.settings.vector(closest)])
+        """Return the unknowns for values of the structure's parameters, with `closest` as beam."""
+        own_unknowns = [
+            _unknown_of_value(each, values[each.name]) for each in self._free_parameters
+        ]
+        return np.array([*own_unknowns, *self.setting_unknowns.vector(closest)])
 
     def values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Return the values of the structure's parameters for a vector of unknowns."""
         own_values = {
-            each.name: _value(each, float(unknown))
-            for each, unknown in zip(self._free, x, strict=False)
+            each.name: _value_of_unknown(each, float(unknown))
+            for each, unknown in zip(self._free_parameters, x, strict=False)
         }
         return {**self.structure.fixed, **own_values}
 
     def plant(self, x: NDArray[np.float64]) -> StructurePlant:
         """Return the plant that a vector of unknowns describes."""
-        values, plant = self.values(x), self.settings.plant(x[len(self.structure.free) :])
-        first_rad_s, second_rad_s = self.settings.omega_rad_s
+        values, plant = self.values(x), self.setting_unknowns.plant(x[len(self.structure.free) :])
+        first_rad_s, second_rad_s = self.setting_unknowns.omega_rad_s
         s = np.array([1j * first_rad_s, 1j * second_rad_s])
         elastic, external = self.structure.finite_factors(s, values)
         density_over_stiffness = plant.beam.density_over_stiffness
@@ -172,7 +182,7 @@ class StructureUnknowns(Unknowns):
             "bending_stiffness_n_m2": plant.beam.bending_stiffness_n_m2 / stiffening,
         }
         changes: dict[str, float] = {
-            name: effective[name] for name in BEAM_PARAMETERS if name in self.free
+            name: effective[name] for name in BEAM_PARAMETERS if name in self.free_settings
         }
         plant = plant.with_parameters(changes)
         return StructurePlant(
@@ -201,7 +211,7 @@ class StructureUnknowns(Unknowns):
             ends = np.clip(
                 x[index] + np.array([-_UNKNOWN_STEP, _UNKNOWN_STEP]), lower[index], upper[index]
             )
-            below, above = (self._gradient_values(_with(x, index, end)) for end in ends)
+            below, above = (self._gradient_values(_with_value(x, index, end)) for end in ends)
             slopes[:, index] = (above - below) / (ends[1] - ends[0])
         return self.plant(x), slopes
 
@@ -216,14 +226,14 @@ class StructureUnknowns(Unknowns):
         )
 
 
-def _unknown(parameter: Parameter, value: float) -> float:
+def _unknown_of_value(parameter: Parameter, value: float) -> float:
     """Return the unknown for the value of a structure's parameter."""
     if parameter.logarithmic:
         return float(np.log(value))
     return (value - parameter.lower) / (parameter.upper - parameter.lower)
 
 
-def _value(parameter: Parameter, unknown: float) -> float:
+def _value_of_unknown(parameter: Parameter, unknown: float) -> float:
     """Return the value of a structure's parameter for its unknown."""
     value = (
         float(np.exp(unknown))
@@ -233,7 +243,7 @@ def _value(parameter: Parameter, unknown: float) -> float:
     return min(max(value, parameter.lower), parameter.upper)
 
 
-def _with(x: NDArray[np.float64], index: int, value: float) -> NDArray[np.float64]:
+def _with_value(x: NDArray[np.float64], index: int, value: float) -> NDArray[np.float64]:
     """Return a copy of a vector with another value at one index."""
     changed = x.copy()
     changed[index] = value

@@ -1,6 +1,6 @@
 """Changes along the record (damping, stiffness, gain), clocks of different rates, and backlash.
 
-Each effect adds to the torque a spectrum of known shape and unknown size, called a column as in
+Each effect adds to the torque a spectrum of known shape and unknown size, as in
 `analysis.identify._refit`: the change of the torque if damping, stiffness or gain rise in
 proportion to time, and the effect of a hub that follows the shaft with backlash. In one sweep time
 and frequency increase together, so a drifting damping competes with an order of the damping, and a
@@ -64,12 +64,13 @@ _MIN_DEVIANCE_REDUCTION: Final = SIGNIFICANT_STD**2 + 2 * math.log(20)
 candidates."""
 
 _RIVAL_BIC_FRACTION: Final = 0.75
-"""Fraction of the BIC advantage of another explanation that an effect must be predicted to reach.
-The first order predicts this advantage to a tenth."""
+"""Fraction of the BIC advantage of another explanation that an effect must reach as well, by
+first-order prediction. The prediction is accurate to a tenth."""
 
 _PREDICTED_BIC_FRACTION: Final = 0.5
-"""Fraction of the BIC advantage with which an effect would rival the best fitted one that it must
-be predicted to reach. The first order predicts at least this fraction of the advantage of a fit."""
+"""An effect is fitted if its predicted BIC advantage reaches this fraction of the advantage that it
+needs to rival the best fitted effect. The first order predicts at least this fraction of the
+advantage that a fit shows."""
 
 UNIT_BACKLASH_RAD: Final = 1e-4
 """Backlash that corresponds to 1 of the fitted size, in rad."""
@@ -86,7 +87,7 @@ _TAYLOR_TERMS: Final = 16
 _MAX_SIZE_FITS: Final = 8
 """Largest number of fits. After each, the torque spectrum is recomputed for the fitted size."""
 
-_SIZE_TOLERANCE: Final = 0.01
+_RELATIVE_SIZE_TOLERANCE: Final = 0.01
 """Relative change of the fitted size at which the repeated fits end."""
 
 
@@ -96,8 +97,8 @@ class TemporalChange:
 
     Attributes
     ----------
-    what : str
-        Changing property: "damping", "stiffness", "gain", "clock" or "play" (backlash).
+    effect : str
+        Property that changes: "damping", "stiffness", "gain" or "clock"; or "play" for backlash.
     size, std : float
         Estimate and standard deviation: the relative change from the first sample to the last, the
         relative difference of the clock rates, or the backlash in rad.
@@ -105,7 +106,7 @@ class TemporalChange:
         BIC with this effect minus the lowest BIC without it.
     """
 
-    what: Effect
+    effect: Effect
     size: float
     std: float
     bic_difference: float
@@ -113,7 +114,7 @@ class TemporalChange:
     @property
     def name(self) -> str:
         """Return the change in words, as the beginning of a sentence."""
-        return _EFFECT_NAMES[self.what]
+        return _EFFECT_NAMES[self.effect]
 
     @property
     def is_certain(self) -> bool:
@@ -130,7 +131,7 @@ def find_temporal_changes(
     (`CandidateSet.bic`), are fitted. Return the candidates, and the changes that explain the record
     best or equally well.
     """
-    if candidate_set.misread:
+    if candidate_set.misread_findings:
         return candidate_set, ()
     backlash_angle = _backlash_angle(candidate_set.comparison)
     highest_bic = candidate_set.best.bic + min(
@@ -174,7 +175,7 @@ def find_temporal_changes(
     if not best_change.is_certain or len(equivalent_changes) > 1:
         return candidate_set, equivalent_changes
     return candidate_set.refit_with_effect_spectra(
-        best_refit.columns, best_refit.residual_noise()
+        best_refit.effect_spectra, best_refit.residual_noise()
     ), equivalent_changes
 
 
@@ -196,7 +197,7 @@ def _has_possible_size(temporal_change: TemporalChange) -> bool:
     """
     return (
         temporal_change.size > 0
-        if temporal_change.what == "play"
+        if temporal_change.effect == "play"
         else abs(temporal_change.size) < 1
     )
 
@@ -218,9 +219,9 @@ def _promising_changes(
     backlash_angle: NDArray[np.float64],
     highest_bic: float,
 ) -> Iterator[tuple[Effect, float]]:
-    """Yield the changes that would make a candidate the best one, by rising predicted BIC.
+    """Yield the changes with which a candidate may become the best one, with their predicted BIC.
 
-    The BIC comes with each. A change must reduce the deviance significantly, and its BIC must be
+    The lowest BIC is first. A change must reduce the deviance significantly, and its BIC must be
     below `highest_bic`.
     """
     candidate_refit = candidate_set.refit(candidate, 1)
@@ -256,7 +257,7 @@ def _fit_with_change(
             changing_property,
             change_size,
         )
-        added_spectra = np.concatenate([candidate_set.columns, change_spectrum[None]])
+        added_spectra = np.concatenate([candidate_set.effect_spectra, change_spectrum[None]])
         cost_before = change_refit.cost
         change_refit = Refit.descend(
             candidate_set.comparison,
@@ -267,7 +268,9 @@ def _fit_with_change(
             max_evaluations=DESCENT_EVALUATIONS,
         )
         previous_size, change_size = change_size, float(change_refit.amplitudes()[0][-1])
-        is_converged = abs(change_size - previous_size) < _SIZE_TOLERANCE * abs(change_size)
+        is_converged = abs(change_size - previous_size) < _RELATIVE_SIZE_TOLERANCE * abs(
+            change_size
+        )
         if is_converged and abs(candidate.values * math.log(cost_before / change_refit.cost)) < 1:
             break
     refit_deviance = candidate.values * math.log(change_refit.cost / candidate.values)
@@ -330,11 +333,11 @@ def _torque_spectrum(
 
 
 def _clock_torque(comparison: Comparison, plant: Plant, change_size: float) -> NDArray[np.float64]:
-    """Return the torque change in N·m by clocks whose rates differ by `_CLOCK_UNIT`, (samples,).
+    """Return the torque change in N·m by different clock rates, per `_CLOCK_UNIT`, (samples,).
 
-    The torque with time stamp t is that at t plus the rate difference times the time since the
-    middle of the record. It is computed by its Taylor series. `change_size` is in units of
-    `_CLOCK_UNIT`.
+    The torque stamped t is that of the time t plus the rate difference times the time since the
+    middle of the record. It is computed by its Taylor series, for the rate difference
+    `change_size` in units of `_CLOCK_UNIT`.
     """
     prediction, time_s = comparison.prediction, comparison.times_s()
     offset_s = _CLOCK_UNIT * (time_s - time_s.mean())
@@ -368,8 +371,8 @@ def _hub_angle(
 ) -> NDArray[np.float64]:
     """Return the angle of a hub that starts at 0 and follows a shaft with backlash, shape (n,).
 
-    At each sample the shaft limits the last angle of the hub to a range about its own. The limits
-    of successive samples are combined until a single angle remains.
+    At each sample the last angle of the hub is limited to a range about the angle of the shaft. The
+    limits of successive samples are combined until a single angle remains.
     """
     lowest_rad, highest_rad = (
         shaft_angle_rad - half_backlash_rad,
@@ -394,7 +397,7 @@ _PADDING_RATIO: Final = 1.5
 """Length of the transforms over that of the record."""
 
 _DECAY_EXPONENT: Final = 9.0
-"""Exponent of the transforms' damping, as in `analysis.identify._nonlinear`."""
+"""Decay exponent of the `CausalTransform`, as in `analysis.identify._nonlinear`."""
 
 _MAX_SIZE_ORDER: Final = 12
 """Highest order in the size of the change to which the torque is computed."""
@@ -412,10 +415,9 @@ def memory_torque(
 ) -> NDArray[np.float64]:
     """Return the torque change by past values of a changing property, per unit size, (samples,).
 
-    This is the torque beyond the instantaneous derivative. `relative_change`, shape (samples,), is
-    w at the retained samples, constant before and after. For `changing_property` of "stiffness" the
-    mass is constant.
-    `change_size` is e.
+    It is the part of the torque change that the derivative by the present value does not contain.
+    `relative_change`, shape (samples,), is w of the module's equations at the retained samples,
+    constant before and after; `change_size` is e. If the stiffness changes, the mass is constant.
     """
     n = comparison.angle_rad.size
     transform = CausalTransform.for_record(
@@ -517,7 +519,7 @@ def is_single_change_established(
     """
     if len(equivalent_changes) != 1 or not equivalent_changes[0].is_certain:
         return False
-    return equivalent_changes[0].what == "play" or not is_single_sweep
+    return equivalent_changes[0].effect == "play" or not is_single_sweep
 
 
 def temporal_change_findings(
@@ -541,8 +543,9 @@ def temporal_change_findings(
             yield replace(
                 finding,
                 sentence=(
-                    f"{_EFFECT_NAMES[change.what]} ({_size_text(change)}) would explain the record "
-                    f"as well as {rival_names}: in one sweep, time and frequency vary together."
+                    f"{_EFFECT_NAMES[change.effect]} ({_size_text(change)}) would explain the "
+                    f"record as well as {rival_names}: in one sweep, time and frequency vary "
+                    "together."
                 ),
                 value=None,
                 interval=None,
@@ -551,9 +554,9 @@ def temporal_change_findings(
 
 def _size_text(temporal_change: TemporalChange) -> str:
     """Return the size of a change as text with its unit."""
-    if temporal_change.what == "play":
+    if temporal_change.effect == "play":
         return f"{1e3 * temporal_change.size:.2g} mrad"
-    if temporal_change.what == "clock":
+    if temporal_change.effect == "clock":
         return f"the torque's by {1e6 * temporal_change.size:+.3g} ppm"
     return f"{100 * temporal_change.size:+.2g} % from beginning to end"
 
@@ -571,18 +574,18 @@ _TWO_WAY_SWEEP_ADVICE: Final = (
 def _established_finding(temporal_change: TemporalChange) -> Finding:
     """Return the finding that a change along the record is established."""
     size_half_width = NORMAL_95 * temporal_change.std
-    is_backlash = temporal_change.what == "play"
+    is_backlash = temporal_change.effect == "play"
     remedy_text = f"S{_TWO_WAY_SWEEP_ADVICE}"
     if is_backlash:
         remedy_text = "Remove the backlash in gear and clamp."
-    elif temporal_change.what == "clock":
+    elif temporal_change.effect == "clock":
         remedy_text = f"Sample angle and torque by one clock, or s{_TWO_WAY_SWEEP_ADVICE}"
     return Finding(
-        kind=_FINDING_KINDS[temporal_change.what],
+        kind=_FINDING_KINDS[temporal_change.effect],
         sentence=(
-            f"{_EFFECT_NAMES[temporal_change.what]}: {_size_text(temporal_change)} "
-            f"(± {_DISPLAY_FACTORS.get(temporal_change.what, 100.0) * size_half_width:.1g}; 95 %). "
-            "It was fitted too"
+            f"{_EFFECT_NAMES[temporal_change.effect]}: {_size_text(temporal_change)} "
+            f"(± {_DISPLAY_FACTORS.get(temporal_change.effect, 100.0) * size_half_width:.1g}; "
+            "95 %). It was fitted too"
             + (
                 ", to first order in its size."
                 if is_backlash

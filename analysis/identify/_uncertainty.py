@@ -81,7 +81,7 @@ def covariance_of_unknowns(
 
 @dataclass(frozen=True, slots=True)
 class ParameterUncertainty:
-    """Uncertainty of the fitted plant parameters. The attributes are those of `RecordFit`."""
+    """Uncertainty of the fitted plant parameters, with attributes as in `RecordFit`."""
 
     std: dict[str, float | None]
     interval: dict[str, tuple[float, float] | None]
@@ -314,9 +314,9 @@ def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[
 
 
 def _propagated_std(derivatives: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
-    """Return the standard deviation of a quantity from its derivatives and their covariance.
+    """Return the standard deviation of a quantity from its derivatives by the unknowns.
 
-    The derivatives, shape (k,), and the covariance, shape (k, k), are those by the unknowns.
+    `derivatives` have the shape (k,), and `covariance`, that of the unknowns, has (k, k).
     """
     return math.sqrt(max(float(derivatives @ covariance @ derivatives), 0.0))
 
@@ -326,31 +326,34 @@ def _propagated_std(derivatives: NDArray[np.float64], covariance: NDArray[np.flo
 
 def ringing(
     poles: Sequence[Pole],
-    projected: ProjectedResidual,
+    projected_residual: ProjectedResidual,
     residual_variance: float,
-    projected_spectra: NDArray[np.complex128],
+    nuisance_spectra: NDArray[np.complex128],
     hum_spectra: NDArray[np.complex128],
 ) -> Ringing:
     """Return the amplitude of the free decay in each mode, with its chi-square.
 
-    A hum is excluded bin by bin. But it starts and ends with the record and so leaks into all other
-    bins, which the free decay would partly explain. So only the reduction of the sum of squares in
-    addition to the hum counts. `projected_spectra`, shape (m, K), are the whitened spectra of the
-    free decays and of the other projected terms. `hum_spectra`, shape (h, K), are the whitened
-    spectra of the lines. `residual_variance` is that of real and imaginary parts of the residual.
+    The bins of a hum are excluded. But a hum starts and ends with the record and so leaks into all
+    other bins, where free decays would explain a part of it. So chi-square is the reduction of the
+    sum of squares by free decays and hum together, minus that by the hum alone.
+    `nuisance_spectra`, shape (m, K), are the whitened spectra of the free decays and of the other
+    terms that are projected out. `hum_spectra`, shape (h, K), are those of the hum.
+    `residual_variance` is the variance of real and imaginary parts of the residual.
     """
     decay_count = count_decay_spectra(poles)
-    projected_spectra, decay_amplitudes = (
-        projected_spectra[:decay_count],
-        projected.amplitudes[:decay_count],
+    nuisance_spectra, decay_amplitudes = (
+        nuisance_spectra[:decay_count],
+        projected_residual.amplitudes[:decay_count],
     )
     explained_squares = float(
-        decay_amplitudes @ projected.amplitude_gram[:decay_count, :decay_count] @ decay_amplitudes
+        decay_amplitudes
+        @ projected_residual.amplitude_gram[:decay_count, :decay_count]
+        @ decay_amplitudes
     )
     if len(hum_spectra) and decay_amplitudes.size:
-        decay_free_residual = projected.residual - decay_amplitudes @ projected_spectra
+        decay_free_residual = projected_residual.residual - decay_amplitudes @ nuisance_spectra
         best_factors, remaining_squares = _best_combination(
-            decay_free_residual, np.concatenate([projected_spectra, hum_spectra])
+            decay_free_residual, np.concatenate([nuisance_spectra, hum_spectra])
         )
         explained_squares = (
             _best_combination(decay_free_residual, hum_spectra)[1] - remaining_squares
@@ -377,9 +380,9 @@ def ringing(
 def _best_combination(
     target_spectrum: NDArray[np.complex128], basis_spectra: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], float]:
-    """Fit a spectrum by a real linear combination of others.
+    """Fit a spectrum by a linear combination of m other spectra with real factors.
 
-    Return its factors, shape (m,), and the sum of squares that remains.
+    Return the factors, shape (m,), and the sum of squares that remains.
     """
     real_spectra = np.ascontiguousarray(basis_spectra).view(np.float64)
     spectrum_norms = np.sqrt(np.einsum("ij,ij->i", real_spectra, real_spectra))

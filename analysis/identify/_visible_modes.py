@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from analysis.identify._result import RecordFit
     from analysis.identify.noise import NoiseSpectrum
 
-_MIN_EVIDENCE: Final = 400.0
+_MIN_RESONANCE_DEVIANCE: Final = 400.0
 """Deviance by which a response with a resonance must be better than a smooth one. The resonance is
 then known to a twentieth of its height, and its damping to about a tenth."""
 
 _MIN_RESIDUAL_OVER_NOISE: Final = 1.4
-"""Residual of a smooth response over the noise, from which a mode is visible. The noise is known to
-10-20 % only."""
+"""Chi-square of a smooth response, relative to that of noise, from which a mode is visible. The
+noise is known to 10-20 % only."""
 
 _MIN_RELATIVE_REACH: Final = 0.05
 """Smallest half width of the window around a mode, relative to its frequency."""
@@ -45,12 +45,11 @@ excited. A sweep has 1 at all modes that it passes, a step 1/6 at mode 2 relativ
 def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) -> tuple[int, ...]:
     """Return the numbers of the modes whose resonance is needed to explain the record.
 
-    Near each mode the torque is compared with the best smooth response to the angle. If there is no
-    resonance, the residual is noise, with chi-square of known mean and scatter. The energy of a
-    resonance relative to the noise is the evidence. The position of the resonance in the window
-    does not matter, so the modes of a beam that is not uniform are found as well. A fit that is
-    better than the smooth response is evidence, too, for weaker resonances in a long record. `fit`
-    provides the frequencies and widths of the modes.
+    Near each mode of `fit` the best smooth response to the angle is fitted to the torque. If there
+    is no resonance, the residual is noise, whose chi-square has a known mean and scatter. A larger
+    chi-square is evidence of a resonance. Its position in the window does not matter, so the modes
+    of a beam that is not uniform are found as well. In a long record, weaker resonances are also
+    found if `fit` has a much lower chi-square than the smooth response.
     """
     torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained])
     angle_spectrum = comparison.spectrum(comparison.angle_rad[comparison.retained])
@@ -60,7 +59,7 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
         reach_hz = _window_half_width_hz(
             comparison, mode_estimate.frequency_hz, mode_estimate.damping_ratio
         )
-        in_window = (np.abs(offset_hz) < reach_hz) & noise.counts
+        in_window = (np.abs(offset_hz) < reach_hz) & noise.is_compared
         degrees_of_freedom = 2 * (int(np.count_nonzero(in_window)) - _SMOOTH_DEGREE - 1)
         if degrees_of_freedom < _MIN_BINS_PER_SIDE:
             continue
@@ -72,18 +71,18 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
         )
         # Chance does neither: together they are nearly eight standard deviations, or more.
         has_evidence = (
-            smooth_chi_square - degrees_of_freedom > _MIN_EVIDENCE
+            smooth_chi_square - degrees_of_freedom > _MIN_RESONANCE_DEVIANCE
             and smooth_chi_square > _MIN_RESIDUAL_OVER_NOISE * degrees_of_freedom
         )
         # With many bins a resonance may be below the noise of each and still be significant.
         fit_chi_square = float(np.vdot(fit.residual[in_window], fit.residual[in_window]).real)
-        if has_evidence or smooth_chi_square - fit_chi_square > _MIN_EVIDENCE:
+        if has_evidence or smooth_chi_square - fit_chi_square > _MIN_RESONANCE_DEVIANCE:
             visible_numbers.append(mode_estimate.number)
     return tuple(visible_numbers)
 
 
 def is_excited(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
-    """Return whether the excitation near a frequency is almost as large as near another one."""
+    """Return whether the excitation near a frequency is at least 0.2 of that near another one."""
     measurement = comparison.measurement
     reference_rad = measurement.reference_rad
     excitation_rad = (
@@ -120,11 +119,10 @@ def _smooth_response_chi_square(
     whitened_angle: NDArray[np.complex128],
     window_position: NDArray[np.float64],
 ) -> float:
-    """Return the sum of squares that remains after the best fit of a smooth response.
+    """Return the sum of squares that remains of the torque after the best fit of a smooth response.
 
-    Torque and angle are whitened spectra, shape (K,).
-
-    `window_position` is the position of each bin within the window, -1 to 1.
+    Torque and angle are whitened spectra, shape (K,). `window_position` is the position of each bin
+    within the window, -1 to 1.
     """
     orthonormal_spectra, _ = np.linalg.qr(
         np.array([window_position**k * whitened_angle for k in range(_SMOOTH_DEGREE + 1)]).T

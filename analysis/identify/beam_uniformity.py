@@ -105,8 +105,8 @@ def uniform_beam_test(
     nominal : Plant
         Rig and specimen as the file states them, with the tip mass if the file states one.
     tilt_deg : float, optional
-        Inclination of the plane of motion along the resting beam, as the file states it, in
-        degrees.
+        Angle in degrees between the beam at rest and the horizontal, as the file states it;
+        positive if the tip is lower than the root.
     """
     mode_numbers = fit.visible
     constant_rows = fit.rows(mode_numbers)

@@ -1,4 +1,4 @@
-"""Torque by air drag along the beam, and its derivatives by beam and drag.
+"""Torque by air drag along the beam, and its derivatives by the parameters of beam and drag law.
 
 A force f per metre on a beam that moves relative to its root acts on mode i with
 ``F_i = ∫ phi_i f dx / L``. With p, c and k of `analysis.identify._predictor`,
@@ -64,15 +64,15 @@ _OVERSAMPLING: Final = 3
 aliased into it."""
 
 _PAST_FORCES: Final = 3
-"""Number of earlier forces, besides the present one, that the interpolation polynomial passes
-through."""
+"""Number of earlier forces that the interpolation polynomial passes through, in addition to the
+present force."""
 
 HALF_AIR_DENSITY_KG_PER_M3: Final = 0.5 * AIR_DENSITY_KG_PER_M3
 """Half the density of air, in kg/m³."""
 
 LOWEST_MODE_INDICES: Final = [0, 1]
-"""Indices of the modes that external damping drives noticeably: it falls off against the
-inertia."""
+"""Indices of the modes on which external damping acts noticeably: relative to inertia, its force
+decreases with frequency."""
 
 _DIVERGED_SPEED_RATIO: Final = 10.0
 """Speed, relative to the highest one without drag, that no beam with drag can reach."""
@@ -87,7 +87,7 @@ record that is analysed at its full rate. Chunks would change the last digits.""
 _QUADRATURE_POINTS: Final = 12
 """Number of Gauss-Legendre points for the integral over one time step."""
 
-_SLOWING_EXPONENT: Final = 1 / 3
+_DECREASING_EXPONENT: Final = 1 / 3
 """Power of the speed in the drag force per speed if C_D falls as the power -2/3."""
 
 
@@ -95,7 +95,7 @@ _SLOWING_EXPONENT: Final = 1 / 3
 
 
 class DragError(ArithmeticError):
-    """The drag is too large, or the beam too light, for a stable simulation in time steps."""
+    """Error if drag is too large, or the beam too light, for a stable simulation in time steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,16 +106,18 @@ class DragLaw:
     ----------
     constant_m : float
         Part of C_D d that does not depend on the speed, in m.
-    slowing : float
+    decreasing_part : float
         Part of C_D d that falls with the speed: its value at 1 m/s, in m (m/s)^(2/3).
     """
 
     constant_m: float
-    slowing: float = 0.0
+    decreasing_part: float = 0.0
 
     def at(self, speed_m_s: float) -> float:
         """Return drag coefficient times diameter, C_D d, in m at a speed in m/s."""
-        return float(self.constant_m + self.slowing * speed_m_s ** (_SLOWING_EXPONENT - 1))
+        return float(
+            self.constant_m + self.decreasing_part * speed_m_s ** (_DECREASING_EXPONENT - 1)
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,14 +130,14 @@ class DragTorque:
         Drag law of the computation.
     torque_nm : ndarray, shape (m,)
         Torque by drag in N·m.
-    by_pole : dict of int to ndarray, shape (2, m)
+    pole_derivatives : dict of int to ndarray, shape (2, m)
         Derivatives by the real and the imaginary part of the upper pole of each mode.
-    by_external : ndarray, shape (2, 2, m)
+    external_derivatives : ndarray, shape (2, 2, m)
         Derivatives by c_0 and c_1 of an external damping ``c_0 + c_1 s`` that drives each of the
         two lowest modes, with constant poles.
-    by_law : ndarray, shape (2, m)
-        Derivatives by `DragLaw.constant_m` and `DragLaw.slowing`.
-    by_delay : ndarray, shape (m,)
+    law_derivatives : ndarray, shape (2, m)
+        Derivatives by `DragLaw.constant_m` and `DragLaw.decreasing_part`.
+    delay_derivative : ndarray, shape (m,)
         Derivative by the delay of the torque, in N·m/s.
     speed_m_s : float
         Mean speed over beam and record, weighted with the power dissipated by drag.
@@ -145,21 +147,21 @@ class DragTorque:
 
     law: DragLaw
     torque_nm: Real
-    by_pole: dict[int, Real]
-    by_external: Real
-    by_law: Real
-    by_delay: Real
+    pole_derivatives: dict[int, Real]
+    external_derivatives: Real
+    law_derivatives: Real
+    delay_derivative: Real
     speed_m_s: float
     top_speed_m_s: float
 
     @property
-    def by_ln_density(self) -> Real:
+    def ln_density_derivative(self) -> Real:
         """Return the derivative of the drag torque by ln(mass per length), in N·m, shape (m,).
 
-        Poles and drag law are constant.
+        Poles and drag law are held constant.
         """
-        law_coefficients = np.array([self.law.constant_m, self.law.slowing])
-        torque_derivative: Real = self.torque_nm - law_coefficients @ self.by_law
+        law_coefficients = np.array([self.law.constant_m, self.law.decreasing_part])
+        torque_derivative: Real = self.torque_nm - law_coefficients @ self.law_derivatives
         return torque_derivative
 
 
@@ -230,8 +232,8 @@ class DragResponse:
         )
         self._speed_transform = s * angle_transform
 
-    def first_order(self) -> Real:
-        """Return drag torque over C_D d in the limit of small drag, in N, shape (m,).
+    def first_order_torque(self) -> Real:
+        """Return the drag torque divided by C_D d in the limit of small drag, in N, shape (m,).
 
         C_D d is drag coefficient times diameter.
         """
@@ -291,20 +293,22 @@ class DragResponse:
                     )
                 )
                 direct_torques.append(self.in_time(modal_torques[mode_number - 1] * pole_factor))
-        for mode_number in LOWEST_MODE_INDICES:
-            inertia_term = self._inertia_terms[mode_number]
+        for mode_index in LOWEST_MODE_INDICES:
+            inertia_term = self._inertia_terms[mode_index]
             for pole_factor in (1 / inertia_term, self.s / inertia_term):
                 speed_sources.append(
                     (
-                        mode_number,
+                        mode_index,
                         self._oversampled_values(
-                            self._modal_speed_by_angle[mode_number] * pole_factor
+                            self._modal_speed_by_angle[mode_index] * pole_factor
                         ),
                     )
                 )
-                direct_torques.append(self.in_time(modal_torques[mode_number] * pole_factor))
+                direct_torques.append(self.in_time(modal_torques[mode_index] * pole_factor))
         force_changes = self._modal_force_changes(point_speed_m_s, law, speed_sources)
-        torque_derivatives = [self._torque_over_time(pole_factor) for pole_factor in force_changes]
+        torque_derivatives = [
+            self._torque_over_time(force_change) for force_change in force_changes
+        ]
         torque_derivatives[: len(direct_torques)] = [
             force_torque + direct_torque
             for force_torque, direct_torque in zip(torque_derivatives, direct_torques, strict=False)
@@ -317,15 +321,15 @@ class DragResponse:
         return DragTorque(
             law=law,
             torque_nm=self.in_time(torque_transform),
-            by_pole={
+            pole_derivatives={
                 mode_number: np.array(torque_derivatives[2 * i : 2 * i + 2])
                 for i, mode_number in enumerate(mode_numbers)
             },
-            by_external=np.reshape(
+            external_derivatives=np.reshape(
                 external_derivatives, (len(LOWEST_MODE_INDICES), 2, self._samples)
             ),
-            by_law=np.array(law_derivatives),
-            by_delay=self.in_time(-self.s * torque_transform),
+            law_derivatives=np.array(law_derivatives),
+            delay_derivative=self.in_time(-self.s * torque_transform),
             speed_m_s=self._mean_speed(point_speed_m_s),
             top_speed_m_s=top_speed_m_s,
         )
@@ -373,32 +377,32 @@ class DragResponse:
         return point_speed_m_s
 
     def _add_drag_to_speeds(self, speed_m_s: Real, law: DragLaw) -> None:
-        """Replace the speeds of the beam points without drag, in m/s, by those with drag.
+        """Add the effect of drag to the speeds of the beam points in m/s, shape (3 m, points).
 
-        The array is changed itself.
+        The array is changed in place.
         """
-        speed_by_state, by_state, by_force = self._time_step_matrices()
-        step_matrix = np.concatenate([self._grid.shapes.T @ speed_by_state, by_state])
-        state_by_force = by_force @ self._grid.to_modes
+        speed_per_state, state_transition, state_per_modal_force = self._time_step_matrices()
+        step_matrix = np.concatenate([self._grid.shapes.T @ speed_per_state, state_transition])
+        state_per_force = state_per_modal_force @ self._grid.to_modes
         modal_state, force_per_m, speed_magnitude = (
-            np.zeros(len(by_state)),
+            np.zeros(len(state_transition)),
             *np.zeros((2, DRAG_POINTS)),
         )
         step_output = np.zeros(len(step_matrix))
         drag_speed_change, free_state = step_output[:DRAG_POINTS], step_output[DRAG_POINTS:]
-        constant_factor, slowing_factor = (
+        constant_factor, decreasing_factor = (
             -HALF_AIR_DENSITY_KG_PER_M3 * law.constant_m,
-            -HALF_AIR_DENSITY_KG_PER_M3 * law.slowing,
+            -HALF_AIR_DENSITY_KG_PER_M3 * law.decreasing_part,
         )
-        multiply_step, multiply_force = step_matrix.dot, state_by_force.dot
+        multiply_step, multiply_force = step_matrix.dot, state_per_force.dot
         add, multiply, take_absolute, take_cube_root = np.add, np.multiply, np.absolute, np.cbrt
         for point_speed in speed_m_s:
             multiply_step(modal_state, step_output)
             add(point_speed, drag_speed_change, point_speed)
             take_absolute(point_speed, speed_magnitude)
-            if slowing_factor:
+            if decreasing_factor:
                 take_cube_root(speed_magnitude, force_per_m)
-                multiply(force_per_m, slowing_factor, force_per_m)
+                multiply(force_per_m, decreasing_factor, force_per_m)
                 multiply(speed_magnitude, constant_factor, speed_magnitude)
                 add(force_per_m, speed_magnitude, speed_magnitude)
             else:
@@ -410,24 +414,24 @@ class DragResponse:
     def _modal_force_changes(
         self, speed_m_s: Real, law: DragLaw, speed_sources: list[tuple[int, Real]]
     ) -> list[Real]:
-        """Return the first-order change of the modal forces by added speeds and by the drag law.
+        """Return the first-order changes of the modal forces, each of shape (modes + 1, 3 m).
 
-        To first order the force on a mode is a sum over the modal speeds, with one factor for each
-        pair of modes at each time step. `speed_m_s`, shape (3 m, points), includes the effect of
-        drag. Each element of `speed_sources` holds the index of a mode, and the speed, shape
-        (3 m,), that is added to this mode. The changes by the two coefficients of the drag law come
-        last.
+        First come the changes due to each of `speed_sources`: the index of a mode, and a speed,
+        shape (3 m,), that is added to this mode. The last two are those per unit of each
+        coefficient of the drag law. To first order the force on a mode is a sum over the modal
+        speeds, with one factor for each pair of modes at each time step. `speed_m_s`, shape
+        (3 m, points), includes the effect of drag.
         """
-        speed_by_state, by_state, by_force = self._time_step_matrices()
-        step_matrix = np.concatenate([speed_by_state, by_state])
-        state_by_force = np.hstack(
-            [by_force, np.zeros((len(by_force), 1))]
+        speed_per_state, state_transition, state_per_modal_force = self._time_step_matrices()
+        step_matrix = np.concatenate([speed_per_state, state_transition])
+        state_per_force = np.hstack(
+            [state_per_modal_force, np.zeros((len(state_per_modal_force), 1))]
         )  # the moment is no input
         run_count, force_weights = len(speed_sources) + 2, self._point_to_modal_forces
-        speed_to_force = (force_weights[:, None] * self._grid.shapes).reshape(-1, DRAG_POINTS).T
+        mode_pair_weights = (force_weights[:, None] * self._grid.shapes).reshape(-1, DRAG_POINTS).T
         force_changes = np.empty((len(speed_m_s), len(force_weights), run_count))
         modal_state, out = (
-            np.zeros((len(by_state), run_count)),
+            np.zeros((len(state_transition), run_count)),
             np.zeros((len(step_matrix), run_count)),
         )
         modal_speed, free_state = out[:DRAG_MODES], out[DRAG_MODES:]
@@ -437,11 +441,14 @@ class DragResponse:
             now, speed_magnitude = force_changes[step_range], np.abs(speed_m_s[step_range])
             cube_root = np.cbrt(speed_magnitude)
             force_slope = -2 * HALF_AIR_DENSITY_KG_PER_M3 * law.constant_m * speed_magnitude
-            if law.slowing:
+            if law.decreasing_part:
                 force_slope -= (
-                    (1 + _SLOWING_EXPONENT) * HALF_AIR_DENSITY_KG_PER_M3 * law.slowing * cube_root
+                    (1 + _DECREASING_EXPONENT)
+                    * HALF_AIR_DENSITY_KG_PER_M3
+                    * law.decreasing_part
+                    * cube_root
                 )
-            force_per_mode_speed = (force_slope @ speed_to_force).reshape(
+            force_per_mode_speed = (force_slope @ mode_pair_weights).reshape(
                 -1, len(force_weights), DRAG_MODES
             )
             for run, (mode_index, added_speed) in enumerate(speed_sources):
@@ -458,20 +465,23 @@ class DragResponse:
                 dot(step_matrix, modal_state, out)
                 dot(coupling_matrix, modal_speed, coupled_force)
                 add(at, coupled_force, at)
-                dot(state_by_force, at, modal_state)
+                dot(state_per_force, at, modal_state)
                 add(modal_state, free_state, modal_state)
         return list(np.ascontiguousarray(force_changes.transpose(2, 1, 0)))
 
     def _time_step_matrices(self) -> tuple[Real, Real, Real]:
         """Return the matrices of one time step of the modes under drag.
 
-        The first gives the modal speeds from the state, the second the next state from the state,
-        and the third the next state from the modal forces. The state holds two numbers for each
+        They multiply the state to give the modal speeds, the state to give its part of the next
+        state, and the modal forces to give the other part. The state holds two numbers for each
         mode, then the modal forces of the last three steps.
         """
         n, step_s = DRAG_MODES, 1 / (_OVERSAMPLING * self._rate_hz)
         state_count = 2 * n + _PAST_FORCES * n
-        by_state, by_force = np.zeros((state_count, state_count)), np.zeros((state_count, n))
+        state_transition, state_per_modal_force = (
+            np.zeros((state_count, state_count)),
+            np.zeros((state_count, n)),
+        )
         speed_output = np.zeros((n, state_count))
         for i, (pole_pair, impedance_slope_pair) in enumerate(
             zip(self._pole_pairs, self._impedance_slopes, strict=True)
@@ -484,26 +494,32 @@ class DragResponse:
             force_gain = pole_pair / impedance_slope_pair / self.plant.beam.bending_stiffness_n_m2
             if pole_pair[0].imag > 0:
                 a, b = step_decay[0].real, step_decay[0].imag
-                by_state[state_rows, state_rows] = [[a, -b], [b, a]]
+                state_transition[state_rows, state_rows] = [[a, -b], [b, a]]
                 real_weights = np.array([force_weights[0].real, force_weights[0].imag])
                 speed_output[i, state_rows] = 2 * force_gain[0].real, -2 * force_gain[0].imag
             elif np.isnan(pole_pair[0]):
                 continue
             else:
-                by_state[state_rows, state_rows] = np.diag(step_decay.real)
+                state_transition[state_rows, state_rows] = np.diag(step_decay.real)
                 real_weights = force_weights.real
                 speed_output[i, state_rows] = force_gain.real
-            by_force[state_rows, i] = real_weights[:, 0]
-            by_state[state_rows, 2 * n + i :: n] = real_weights[:, 1:]
+            state_per_modal_force[state_rows, i] = real_weights[:, 0]
+            state_transition[state_rows, 2 * n + i :: n] = real_weights[:, 1:]
         # Shift the stored forces by one step.
-        by_force[2 * n : 3 * n] = np.eye(n)
-        by_state[3 * n :, 2 * n : -n] = np.eye((_PAST_FORCES - 1) * n)
+        state_per_modal_force[2 * n : 3 * n] = np.eye(n)
+        state_transition[3 * n :, 2 * n : -n] = np.eye((_PAST_FORCES - 1) * n)
         # The new force is not known yet: it is extrapolated from the last three for the speed.
-        extrapolating_matrix = by_state[: 2 * n].copy()
+        extrapolating_matrix = state_transition[: 2 * n].copy()
         for steps_back, extrapolation_factor in enumerate((3.0, -3.0, 1.0)):
             force_columns = slice((2 + steps_back) * n, (3 + steps_back) * n)
-            extrapolating_matrix[:, force_columns] += extrapolation_factor * by_force[: 2 * n]
-        return speed_output[:, : 2 * n] @ extrapolating_matrix, by_state, by_force
+            extrapolating_matrix[:, force_columns] += (
+                extrapolation_factor * state_per_modal_force[: 2 * n]
+            )
+        return (
+            speed_output[:, : 2 * n] @ extrapolating_matrix,
+            state_transition,
+            state_per_modal_force,
+        )
 
     @property
     def _point_to_modal_forces(self) -> Real:
@@ -585,19 +601,19 @@ class DragResponse:
     def _phase_factor(self, pole: complex, residue: complex) -> Complex:
         """Return the factor that gives the torque of a mode its measured phase, shape (bins,).
 
-        Drag on a mode moves its pole to the left, whatever turns the phase of its residue: external
-        damping, delay or clamp. Torque of another phase would move the frequency.
+        Drag adds damping to a mode, whatever changes the phase of its residue: external damping,
+        delay or clamp. A drag torque without this phase would change the frequency instead.
         """
         # The residue of -s⁴ / Z, through the torque channel, is j times a multiple of this.
-        turn = residue / (1j * pole**4 * self.plant.channel_response(pole))
-        turn /= abs(turn)
-        factor: Complex = turn.real + turn.imag * (self.s - pole.real) / pole.imag
+        phasor = residue / (1j * pole**4 * self.plant.channel_response(pole))
+        phasor /= abs(phasor)
+        factor: Complex = phasor.real + phasor.imag * (self.s - pole.real) / pole.imag
         return factor
 
     def _oversampled_values(self, laplace_transform: Complex) -> Real:
-        """Convert a Laplace transform to values over time, at three times the sampling rate.
+        """Convert a Laplace transform to a time series at three times the sampling rate.
 
-        Their shape is (..., 3 m).
+        The shape is (..., 3 m).
         """
         return self._transform.inverse(
             laplace_transform, _OVERSAMPLING * self._samples, oversampling=_OVERSAMPLING
@@ -605,11 +621,11 @@ class DragResponse:
 
 
 def _drag_force(speed_m_s: Real, law: DragLaw) -> Real:
-    """Return the drag force per length of the beam in N/m, at speeds in m/s of the same shape."""
+    """Return the drag force per length of the beam in N/m, of the shape of the speeds in m/s."""
     speed_magnitude = np.abs(speed_m_s)
     force_per_speed = law.constant_m * speed_magnitude
-    if law.slowing:
-        force_per_speed += law.slowing * np.cbrt(speed_magnitude)
+    if law.decreasing_part:
+        force_per_speed += law.decreasing_part * np.cbrt(speed_magnitude)
     force_n_per_m: Real = -HALF_AIR_DENSITY_KG_PER_M3 * force_per_speed * speed_m_s
     return force_n_per_m
 
@@ -640,8 +656,8 @@ def _impedance_slopes(pole_pairs: Complex, plant: Plant) -> Complex:
 def _force_weights_of_step(poles_per_s: Complex, step_s: float) -> Complex:
     """Return the weights of the last forces F in one time step of the equation ``z' = p z + F``.
 
-    p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCES`), with the newest
-    force first. Between the instants the force is the polynomial through all of these forces.
+    p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCES`), with that of the
+    newest force first. Between the time steps F is the polynomial through the last forces.
     """
     quadrature_node, quadrature_weight = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     step_fraction = 0.5 * (quadrature_node + 1)

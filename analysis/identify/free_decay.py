@@ -1,4 +1,4 @@
-"""Free decay of the beam's modes: its poles, how they move, and its spectrum over a record.
+"""Spectra of the free decays of the beam's modes over a record, and derivatives by their poles.
 
 A beam that already rings when the record begins adds a sum of decays to the torque. Their
 amplitudes are unknown, and their poles are those of the model. The same holds after a gap of the
@@ -25,7 +25,7 @@ _HUM_DECAY_EXPONENT: Final = 1e-6
 
 
 def count_decay_spectra(poles: Sequence[Pole]) -> int:
-    """Return the number of decay spectra of some poles: two for each that oscillates."""
+    """Return the number of decay spectra: two for each oscillating pole, one for a real pole."""
     return sum(1 + pole.oscillates for pole in poles)
 
 
@@ -39,7 +39,7 @@ class DecaySpectra:
     rate_hz : float
         Rate of the samples.
     omega_rad_s : ndarray, shape (K,)
-        Frequencies of the bins, multiples of ``2 pi rate_hz / samples``.
+        Frequencies of the bins, multiples of ``2 pi rate_hz / sample_count``.
     """
 
     __slots__ = ("_duration_s", "_period_s", "_sample_rotation")
@@ -49,17 +49,17 @@ class DecaySpectra:
         self._duration_s = sample_count / rate_hz
         self._sample_rotation = np.exp(-1j * omega_rad_s * self._period_s)
 
-    def columns(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Return the spectra of ``exp(p t)`` of each pole, shape (m, K).
+    def spectra(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Return the spectra of the decay ``exp(p t)`` of each pole p, shape (m, K).
 
-        An oscillating decay has two rows: real and imaginary part.
+        An oscillating decay has two rows: the spectra of its real and of its imaginary part.
         """
         return self._real_spectra(poles, self._transform_of_decay)
 
     def gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        """Return the derivatives of ``amplitudes @ columns(poles)`` by the unknowns, shape (k, K).
+        """Return the derivatives of ``amplitudes @ spectra(poles)`` by the unknowns, shape (k, K).
 
         Parameters
         ----------
@@ -82,13 +82,13 @@ class DecaySpectra:
             else:
                 weighted_derivatives.append(amplitudes[amplitude_index] * pole.derivative.real)
                 amplitude_index += 1
-        real_parts: NDArray[np.float64] = np.array(weighted_derivatives).T @ self.growing(
+        real_parts: NDArray[np.float64] = np.array(weighted_derivatives).T @ self.growing_spectra(
             poles
         ).view(np.float64)
         spectrum_slopes: NDArray[np.complex128] = real_parts.view(np.complex128)
         return spectrum_slopes
 
-    def growing(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+    def growing_spectra(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
         """Return the spectra of ``t exp(p t)`` of each pole p, shape (m, K).
 
         The time t begins at the first sample.
@@ -98,9 +98,9 @@ class DecaySpectra:
     def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:
         """Return spectra of n oscillations over the whole record, shape (4 n, K).
 
-        Each oscillation has four spectra: sine and cosine, each constant or growing from zero.
-        Together they describe any amplitude and phase at the beginning and any other at the end,
-        which leaks into distant bins.
+        Each oscillation has four spectra: sine and cosine, each constant or growing from zero. Sums
+        of them have any amplitude and phase at the beginning and any other at the end of the
+        record. The difference leaks into distant bins.
         """
         no_derivatives = np.zeros(0, dtype=np.complex128)
         # A steady oscillation at the frequency of a bin would give 0 / 0, so it decays a little.
@@ -108,12 +108,12 @@ class DecaySpectra:
         poles = [
             Pole(0, complex(-decay_rate, 2 * np.pi * hz), no_derivatives) for hz in frequency_hz
         ]
-        return np.concatenate([self.columns(poles), self.growing(poles)])
+        return np.concatenate([self.spectra(poles), self.growing_spectra(poles)])
 
     def _real_spectra(
         self, poles: Sequence[Pole], spectrum_of_pole: Callable[[complex], NDArray[np.complex128]]
     ) -> NDArray[np.complex128]:
-        """Return one spectrum for each real pole, two for each oscillating one, shape (m, K)."""
+        """Return the decay spectra of poles: one for a real, two for an oscillating one, (m, K)."""
         real_spectra = np.empty((count_decay_spectra(poles), self._sample_rotation.size), complex)
         row_index = 0
         for pole in poles:
@@ -153,8 +153,8 @@ class DecaySpectra:
 class LaterDecaySpectra(DecaySpectra):
     """Spectra of decays that begin within the record and pass its low-pass filter.
 
-    They begin at a tick of the record, and end with the samples. Their contribution to the compared
-    samples is the sum over the ticks, since the filter has no effect in the band.
+    They begin at a tick of the record, and end with the last sample. The filter has no effect in
+    the band, so their spectrum is the sum over the ticks instead of the samples.
 
     Parameters
     ----------
@@ -164,9 +164,8 @@ class LaterDecaySpectra(DecaySpectra):
         Rate of the compared samples.
     omega_rad_s : ndarray, shape (K,)
         Frequencies of the bins.
-    first_s : float
-        Time of the first tick of the decays since the first sample. There they have their
-        amplitudes.
+    decay_start_s : float
+        Time from the first sample to the tick at which the decays begin, with full amplitude.
     tick_s : float
         Time between ticks.
     """
@@ -178,14 +177,16 @@ class LaterDecaySpectra(DecaySpectra):
         sample_count: int,
         rate_hz: float,
         omega_rad_s: NDArray[np.float64],
-        first_s: float,
+        decay_start_s: float,
         tick_s: float,
     ) -> None:
         super().__init__(sample_count, rate_hz, omega_rad_s)
-        self._duration_s -= first_s
+        self._duration_s -= decay_start_s
         self._tick_s = tick_s
         self._tick_rotation = np.exp(-1j * omega_rad_s * tick_s)
-        self._first_tick_factor = tick_s / self._period_s * np.exp(-1j * omega_rad_s * first_s)
+        self._first_tick_factor = (
+            tick_s / self._period_s * np.exp(-1j * omega_rad_s * decay_start_s)
+        )
 
     def _transform_of_decay(self, pole: complex) -> NDArray[np.complex128]:
         """Return the transform of ``exp(p t)`` from the first tick to the last sample, (K,)."""

@@ -232,7 +232,7 @@ class Headline(Estimates):
 
     @property
     def flags(self) -> dict[str, str]:
-        """Return the reason why a parameter is not valid, for each flagged parameter, by name."""
+        """Return the reasons why flagged parameters are not valid, by parameter name."""
         return {name: each.flag for name, each in self.parameters.items() if each.flag}
 
     @property
@@ -264,7 +264,11 @@ class Headline(Estimates):
         status : str
             "selected", "compatible" or "excluded".
         """
-        return tuple(structure_name for structure_name, its in self.structures if its == status)
+        return tuple(
+            structure_name
+            for structure_name, structure_status in self.structures
+            if structure_status == status
+        )
 
 
 def headline(
@@ -340,7 +344,7 @@ def headline_of_fit(
     order_reasons: Mapping[str, str] = _EMPTY_MAPPING,
     order_intervals: Mapping[str, tuple[float, float]] = _EMPTY_MAPPING,
     unexplained_reason: str | None = None,
-    both: tuple[RecordFit, bool] | None = None,
+    fit_with_both_dampings: tuple[RecordFit, bool] | None = None,
 ) -> Headline:
     """Return the headline of one fit, with flags on the numbers that are not valid.
 
@@ -358,10 +362,10 @@ def headline_of_fit(
         95 % intervals of orders, used instead of those of the fit.
     unexplained_reason : str, optional
         Reason against all numbers.
-    both : tuple of (RecordFit, bool), optional
+    fit_with_both_dampings : tuple of (RecordFit, bool), optional
         Result of `CandidateSet.fit_with_both_dampings`: the fit with both dampings, for the modes.
     """
-    with_both, uses_both = both or (fit, False)
+    with_both, uses_both = fit_with_both_dampings or (fit, False)
     damping_reason = ONE_MODE_REASON if len(visible_numbers) < _MODES_TO_SEPARATE_DAMPINGS else None
     if SECOND_DAMPING_REASON in order_reasons.values():
         damping_reason = SECOND_DAMPING_REASON
@@ -420,10 +424,10 @@ def structures(
 ) -> tuple[tuple[str, StructureStatus], ...]:
     """Return name and status of every structure: which ones the record excludes.
 
-    A special case of the freest structure is excluded by the likelihood ratio. Any other structure
-    is excluded if its likelihood is lower by as much and its BIC exceeds the lowest BIC by 10. A
-    structure that explains the record with unnecessary parameters is not excluded. A structure that
-    fixes an order at 1 is excluded if the order is in `fractional_orders`.
+    A special case of the freest structure is excluded if its deviance exceeds that of the freest
+    one by `EXCLUSION_DEVIANCES`, or if it fixes an order of `fractional_orders` at 1. Any other
+    structure is excluded if its deviance exceeds the first of these limits and its BIC exceeds the
+    lowest BIC by 10. So a structure with unnecessary parameters is not excluded.
 
     Parameters
     ----------

@@ -41,12 +41,12 @@ if TYPE_CHECKING:
     from analysis.identify.profile_likelihood import LikelihoodProfile, OrderName
     from analysis.identify.tolerant_estimate import TolerantEstimate
 
-NOT_UNIFORM: Final = (
+NOT_UNIFORM_REASON: Final = (
     "the modes are not those of a uniform beam, and what makes them differ may change this value"
 )
 """Reason for a flag on parameters that a deviation from a uniform beam may change."""
 
-NO_ORDER: Final = "no beam with one internal and one external order explains the losses"
+NO_ORDER_REASON: Final = "no beam with one internal and one external order explains the losses"
 """Reason for a flag on damping parameters: no beam with fractional orders explains the losses."""
 
 _EFFECTIVE_PARAMETERS: Final = (*BEAM_PARAMETERS, "delay_s", "gamma", "lambda")
@@ -61,12 +61,12 @@ def uniform_beam_refusal_reason(test: UniformBeamTest) -> str | None:
     return f"a uniform beam does not predict the modal constants ({test.summary.chance})"
 
 
-_CHANGED_BY_DRAG: Final = "air drag of unknown size would change it"
-"""Reason against a damping ratio that is not known apart from the drag."""
+_CHANGED_BY_DRAG_REASON: Final = "air drag of unknown size would change it"
+"""Reason to doubt a damping ratio that depends on a drag of unknown size."""
 
 _CONTRADICTION_STDS: Final = 3.0
-"""Distance of a number with a cause from the reported one, in standard deviations by the side of
-the 95 % interval that faces it, from which the cause makes the reported number doubtful."""
+"""Distance between the reported value and the value under a possible cause from which the reported
+value is doubtful, in standard deviations derived from the side of the 95 % interval towards it."""
 
 _EstimatesT = TypeVar("_EstimatesT", bound=Estimates)
 """Type variable for `Estimates` or a subclass, which `replace_by_modal_model` takes and returns."""
@@ -140,9 +140,9 @@ def replace_by_modal_model(
 
 
 def flag_contradicted_damping(headline: Headline, causes: Sequence[CauseFit]) -> Headline:
-    """Return the headline with flags on internal damping that differs with a cause of the modes.
+    """Return the headline with flags on values of internal damping that a cause contradicts.
 
-    The reported numbers are those of a nearly uniform beam. A cause that explains the modes as well
+    The reported numbers are those of a nearly uniform beam. A cause that also explains the modes
     may need another damping. External damping has a flag anyway if the beam is not uniform.
 
     Parameters
@@ -189,7 +189,7 @@ def flag_modes_changed_by_drag(headline: Headline, mode_numbers: Sequence[int]) 
         Modes whose damping ratio depends on air drag of unknown size.
     """
     modes = tuple(
-        replace(mode, damping_ratio=mode.damping_ratio.with_flag(_CHANGED_BY_DRAG))
+        replace(mode, damping_ratio=mode.damping_ratio.with_flag(_CHANGED_BY_DRAG_REASON))
         if mode.number in mode_numbers
         else mode
         for mode in headline.modes
@@ -198,7 +198,7 @@ def flag_modes_changed_by_drag(headline: Headline, mode_numbers: Sequence[int]) 
 
 
 def _flag_contradicted(estimate: Estimate, rivals: Sequence[tuple[float, str]]) -> Estimate:
-    """Return an estimate with a flag if a cause, given by value and phrase, has another value."""
+    """Return an estimate, with a flag if a value of `rivals` (value and phrase) contradicts it."""
     if estimate.interval_95 is None:
         return estimate
     low, high = estimate.interval_95
@@ -259,9 +259,10 @@ def _reported_parameters(
 ) -> dict[str, Estimate]:
     """Return the parameters of the beam with a tolerance of the geometry, flagged if undetermined.
 
-    `doubt` is the reason against every number. With `refused`, stiffness, density, delay and
+    `doubt` is the reason to doubt every number. With `refused`, stiffness, density, delay and
     external damping are effective values: a tip mass or a compliant clamp changes all modes alike,
-    by far more than the tolerance. So is internal damping if an order makes up for the frequencies.
+    by far more than the tolerance. Internal damping is an effective value if its order was fitted
+    to the frequencies.
     """
     return {
         parameter_name: Estimate(
@@ -279,7 +280,7 @@ def _reported_parameters(
 def _reason_undetermined(estimate: TolerantEstimate, parameter_name: str) -> str | None:
     """Return the reason why the modes do not determine a beam or damping parameter, or None."""
     if estimate.basis == "none":
-        return NO_ORDER
+        return NO_ORDER_REASON
     for order_name, coefficient_name in COEFFICIENT_OF.items():
         if parameter_name in (order_name, coefficient_name) and not is_order_identifiable(
             estimate, order_name
@@ -291,7 +292,7 @@ def _reason_undetermined(estimate: TolerantEstimate, parameter_name: str) -> str
 def is_order_identifiable(estimate: TolerantEstimate, order_name: str) -> bool:
     """Return whether the modes determine a damping order.
 
-    Its 95 % interval must be narrower than a quarter of its range, and its damping significant.
+    Its 95 % interval must be narrower than a quarter of its range, and the damping significant.
 
     Parameters
     ----------
@@ -360,7 +361,7 @@ def loss_factors_with_geometry_tolerance(
         )
         if loss_factor is None:
             continue
-        flag_reason = NO_ORDER if estimate.basis == "none" else None
+        flag_reason = NO_ORDER_REASON if estimate.basis == "none" else None
         flag_reason = flag_reason or effective_reason(
             estimate, coefficient_name, refused=test.status == "refused"
         )
@@ -383,7 +384,7 @@ def effective_reason(
         Whether the test refused a uniform beam.
     """
     is_effective = parameter_name in _EFFECTIVE_PARAMETERS or estimate.rests_on_frequencies
-    return NOT_UNIFORM if refused and is_effective else None
+    return NOT_UNIFORM_REASON if refused and is_effective else None
 
 
 def order_verdict_with_geometry_tolerance(
@@ -435,7 +436,7 @@ def order_status_with_geometry_tolerance(
         Whether the test refused a uniform beam.
     """
     if estimate.basis == "none":
-        return "not identifiable", NO_ORDER
+        return "not identifiable", NO_ORDER_REASON
     if not is_order_identifiable(estimate, order):
         return "not identifiable", ORDER_NOT_DETERMINED_REASON
     order_low, order_high = estimate.interval[order]

@@ -82,7 +82,7 @@ class Hum:
         return NoiseLine(self.frequency_hz, float(abs(self.phasor_nm)))
 
     def torque(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the torque of the hum in N·m at times since the first compared sample."""
+        """Return the torque of the hum in N·m at given times since the first compared sample."""
         phase_rotation = np.exp(2j * np.pi * self.frequency_hz * time_s)
         torque_nm: NDArray[np.float64] = (self.phasor_nm * phase_rotation).real
         return torque_nm
@@ -96,14 +96,14 @@ class NoiseSpectrum:
     ----------
     power : ndarray, shape (K,)
         Expected ``|residual|²`` of each bin.
-    counts : ndarray of bool, shape (K,)
+    is_compared : ndarray of bool, shape (K,)
         True for bins that are compared, False at the lines.
     lines : tuple of NoiseLine
         Narrow-band disturbances, which are not part of `power`.
     """
 
     power: NDArray[np.float64]
-    counts: NDArray[np.bool_]
+    is_compared: NDArray[np.bool_]
     lines: tuple[NoiseLine, ...]
 
     @property
@@ -112,7 +112,7 @@ class NoiseSpectrum:
 
         Real and imaginary parts of the whitened noise have variance 1.
         """
-        whitening_factor: NDArray[np.float64] = np.sqrt(2 / self.power) * self.counts
+        whitening_factor: NDArray[np.float64] = np.sqrt(2 / self.power) * self.is_compared
         return whitening_factor
 
 
@@ -223,7 +223,7 @@ def noise_power_with_peaks(
         np.convolve(local_ratio > _PEAK_POWER_RATIO, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
     )
     if may_continue is not None:
-        is_peak_allowed = is_peak_allowed | _continued(
+        is_peak_allowed = is_peak_allowed | _connected_bins(
             is_peak & is_peak_allowed, is_peak & may_continue
         )
     return np.where(
@@ -233,13 +233,15 @@ def noise_power_with_peaks(
     )
 
 
-def _continued(is_start: NDArray[np.bool_], may_continue: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the bins that are connected with a start by bins to which it may continue."""
+def _connected_bins(
+    is_start: NDArray[np.bool_], may_continue: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return a mask of the start bins and all bins connected to them by `may_continue`, (K,)."""
     is_connected = is_start | may_continue
     run_numbers = np.cumsum(np.diff(is_connected, prepend=False) & is_connected)
     has_start = np.bincount(run_numbers[is_start], minlength=run_numbers[-1] + 1) > 0
-    connected: NDArray[np.bool_] = is_connected & has_start[run_numbers]
-    return connected
+    connected_mask: NDArray[np.bool_] = is_connected & has_start[run_numbers]
+    return connected_mask
 
 
 def _block_borders(bin_count: int) -> NDArray[np.intp]:
@@ -291,11 +293,10 @@ def _find_line_groups(
 
 
 def _lasts_through_record(residual: NDArray[np.complex128], line_bins: slice) -> bool:
-    """Return whether a narrow-band disturbance lasts through the whole record.
+    """Return whether the disturbance in the bins `line_bins` lasts through the whole record.
 
-    `line_bins` is the range of its bins.
-
-    The residual of a wrong model at a mode begins when the sweep passes the mode, and decays.
+    The residual of a wrong model at a mode does not: it begins when the sweep passes the mode, and
+    decays.
     """
     bins_around = residual[
         max(line_bins.start - _DURATION_BINS, 0) : line_bins.stop + _DURATION_BINS

@@ -73,7 +73,7 @@ class Unknowns:
         Damping structure.
     nominal : Plant
         Source of the values that are not free. Its damping is not used.
-    free : tuple of str
+    free_settings : tuple of str
         Free settings, in the order of `SETTINGS`.
     omega_rad_s : tuple of float
         Undamped first and second natural frequency of the nominal beam.
@@ -81,7 +81,7 @@ class Unknowns:
 
     structure: Structure
     nominal: Plant
-    free: tuple[Setting, ...]
+    free_settings: tuple[Setting, ...]
     omega_rad_s: tuple[float, float]
 
     @classmethod
@@ -110,7 +110,7 @@ class Unknowns:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Return the names of the free parameters, in the order of the vector."""
-        return (*self.structure.free, *self.free)
+        return (*self.structure.free, *self.free_settings)
 
     @cached_property
     def gradient_names(self) -> tuple[str, ...]:
@@ -146,7 +146,7 @@ class Unknowns:
         Parameters
         ----------
         damping_sizes : ndarray, shape (len(structure.free),)
-            Those of ``ln z``, ``alpha``, ``ln g`` and ``lambda`` that are free.
+            Values of ``ln z``, ``alpha``, ``ln g`` and ``lambda``, as far as they are free.
         """
         unknown_values: dict[str, float] = {
             **dict(self.structure.fixed.items()),
@@ -253,7 +253,7 @@ class Unknowns:
 
     @cached_property
     def units(self) -> Mapping[str, float]:
-        """Return the value of delay and tool inertia for which the unknown is 1, by name.
+        """Return the delay and the tool inertia for which their unknowns are 1, by name.
 
         The tool inertia is that between torque sensor and beam.
         """
@@ -389,7 +389,7 @@ class Unknowns:
 
 
 def _ln_damping_size(ln_loss: float, order: float) -> tuple[float, float]:
-    """Return ``ln size`` of a damping with a given loss, and its derivative by the order."""
+    """Return ``ln z`` or ``ln g`` of a damping with a given loss, and its slope over the order."""
     order_phase_rad = _QUARTER_TURN_RAD * order
     return ln_loss - math.log(math.sin(order_phase_rad)), -_QUARTER_TURN_RAD / math.tan(
         order_phase_rad
@@ -410,39 +410,39 @@ _MAX_GROWTH_EXPONENT: Final = 50.0
 
 @dataclass(frozen=True, slots=True)
 class StepRule:
-    """Rule of the steps of a descent: their curve in the space of the unknowns, and limits.
+    """Rule of the steps of a descent: their limits, and curve in the space of the unknowns.
 
     Attributes
     ----------
     lower, upper : ndarray, shape (k,)
         Bounds of the unknowns.
-    dampings : tuple of (int, int, bool)
+    damping_indices : tuple of (int, int, bool)
         Index of the loss and index of the order of each damping with a free order, and whether the
         damping adds to the stiffness. If not, it reduces the inertia.
-    losses : tuple of int
+    loss_indices : tuple of int
         Indices of the losses of dampings with a fixed order.
-    linear_below : float
-        Loss below which a step changes the loss itself, to which the effect of the damping is
-        proportional. A step of its logarithm would lead from a negligible value to the upper bound,
-        and most of a descent would be spent on the way back.
+    linear_loss_limit : float
+        Loss below which a step changes the loss itself instead of its logarithm. The effect of the
+        damping is proportional to the loss: a step of the logarithm would lead from a negligible
+        value to the upper bound, and most of a descent would be spent on the way back.
     """
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
-    dampings: tuple[tuple[int, int, bool], ...]
-    losses: tuple[int, ...] = ()
-    linear_below: float = 0.0
+    damping_indices: tuple[tuple[int, int, bool], ...]
+    loss_indices: tuple[int, ...] = ()
+    linear_loss_limit: float = 0.0
 
     @classmethod
-    def for_unknowns(cls, unknowns: Unknowns, linear_below: float = 0.0) -> StepRule:
+    def for_unknowns(cls, unknowns: Unknowns, linear_loss_limit: float = 0.0) -> StepRule:
         """Return the rule of the steps for the unknowns of a structure.
 
         Parameters
         ----------
         unknowns : Unknowns
             Unknowns of the structure.
-        linear_below : float
-            Loss below which a step changes the loss itself.
+        linear_loss_limit : float
+            Loss below which a step changes the loss itself instead of its logarithm.
         """
         unknown_names = unknowns.names
         damping_indices = tuple(
@@ -459,7 +459,7 @@ class StepRule:
             for coefficient_name, order_name in (("zeta", "alpha"), ("gamma", "lambda"))
             if coefficient_name in unknown_names and order_name not in unknown_names
         )
-        return cls(*unknowns.bounds, damping_indices, loss_indices, linear_below)
+        return cls(*unknowns.bounds, damping_indices, loss_indices, linear_loss_limit)
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the smallest and largest admissible step of each unknown, each of shape (k,).
@@ -468,7 +468,7 @@ class StepRule:
         depends on the logarithm of that distance. The order of a vanished damping is constant.
         """
         smallest_steps, largest_steps = self.lower - x, self.upper - x
-        for loss_index, order_index, _ in self.dampings:
+        for loss_index, order_index, _ in self.damping_indices:
             step_fraction = (
                 _MAX_ORDER_STEP_FRACTION if x[loss_index] > self.lower[loss_index] else 0.0
             )
@@ -491,10 +491,10 @@ class StepRule:
             Step within the `limits`, tangent to the curve at `x`.
         """
         end = np.clip(x + unknown_step, self.lower, self.upper)
-        for i in self.losses:
-            if unknown_step[i] > 0 and math.exp(x[i]) < self.linear_below:
+        for i in self.loss_indices:
+            if unknown_step[i] > 0 and math.exp(x[i]) < self.linear_loss_limit:
                 end[i] = min(x[i] + math.log1p(unknown_step[i]), self.upper[i])
-        for i, j, adds_stiffness in self.dampings:
+        for i, j, adds_stiffness in self.damping_indices:
             if unknown_step[i] != 0:
                 phase_before, phase_after = (
                     _phase_of_order(x[j], adds_stiffness),
@@ -502,7 +502,7 @@ class StepRule:
                 )
                 largest_loss = math.exp(self.upper[i])
                 loss_factor = math.exp(x[i])
-                is_linear = loss_factor < self.linear_below
+                is_linear = loss_factor < self.linear_loss_limit
                 loss_factor, phase_rad = _loss_and_phase_after_step(
                     loss_factor,
                     float(unknown_step[i]),

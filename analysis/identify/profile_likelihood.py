@@ -90,7 +90,7 @@ class LikelihoodProfile:
 
     @classmethod
     def undetermined(cls, candidate: Candidate, order: OrderName) -> LikelihoodProfile:
-        """Return the profile of an order that was not profiled: one value, the whole range 0 to 2.
+        """Return the profile of an order that was not varied: one value, and interval 0 to 2.
 
         Parameters
         ----------
@@ -283,7 +283,7 @@ def _may_improve(candidate_set: CandidateSet, profile_fit: ProfileWithPlants) ->
 
 # Profile of one order
 
-_LAST_DEVIANCE: Final = 25.0
+_MAX_PROFILE_DEVIANCE: Final = 25.0
 """Deviance up to which the order is varied. The 95 % limit is 3.84."""
 
 _OVERSHOOT_FACTOR: Final = 1.04
@@ -375,7 +375,7 @@ class OrderProfiler:
         self._store_lower(self._minimum_order, free_order_fit)
 
     def plant(self, order_value: float) -> Plant:
-        """Return the plant that was fitted with the order fixed at a value, already computed."""
+        """Return the fitted plant at a value of the order that has been computed."""
         return self._refits[order_value].plant
 
     def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -390,9 +390,10 @@ class OrderProfiler:
             self._extend(direction)
 
     def extend_from_candidates(self) -> None:
-        """Extend the profile from candidates that fit as well, outside of the 95 % interval.
+        """Extend the profile from candidates that fit about as well with a very different order.
 
-        Most of them fix the order at 1. A barrier may separate them from the minimum.
+        The order is outside of the 95 % interval; most of these candidates fix it at 1. A barrier
+        may separate it from the minimum.
         """
         damping_coefficient, free_parameters = COEFFICIENT_OF[self.order], set(self.structure.free)
         for candidate in self._candidate_set.candidates:
@@ -410,7 +411,9 @@ class OrderProfiler:
                 and not lower_end <= candidate.fit.parameters[self.order] <= upper_end
             ):
                 start_unknowns = self._unknowns.vector(candidate.fit.plant)
-                self._start_at(self._descend(start_unknowns, _MAX_EVALUATIONS, hold=(self.order,)))
+                self._start_at(
+                    self._descend(start_unknowns, _MAX_EVALUATIONS, held_unknowns=(self.order,))
+                )
                 self.extend_both_ways()
 
     def extend_from_other_minima(self) -> None:
@@ -431,7 +434,7 @@ class OrderProfiler:
             start_unknowns = self._minimum.x.copy()
             start_unknowns[self._order_index] = trial_order
             trial_fits[trial_order] = self._descend(
-                start_unknowns, _TRIAL_EVALUATIONS, hold=(self.order,)
+                start_unknowns, _TRIAL_EVALUATIONS, held_unknowns=(self.order,)
             )
         highest_cost = min(self.costs.values()) * math.exp(
             FAR_BEHIND_BIC_DIFFERENCE / self._value_count
@@ -467,7 +470,10 @@ class OrderProfiler:
         smallest_order, largest_order = ORDER_RANGE
         order_value, order_distance, deviance_root = self._minimum_order, self._order_std(), 0.0
         inside_order, outside_order = order_value, None
-        while smallest_order < order_value < largest_order and deviance_root**2 < _LAST_DEVIANCE:
+        while (
+            smallest_order < order_value < largest_order
+            and deviance_root**2 < _MAX_PROFILE_DEVIANCE
+        ):
             nearest_refit = self._refits[order_value]
             order_value = min(
                 max(self._minimum_order + direction * order_distance, smallest_order), largest_order
@@ -478,7 +484,7 @@ class OrderProfiler:
             else:
                 outside_order, target_deviance = (
                     outside_order if outside_order is not None else order_value,
-                    _LAST_DEVIANCE,
+                    _MAX_PROFILE_DEVIANCE,
                 )
             distance_growth = (
                 _OVERSHOOT_FACTOR * math.sqrt(target_deviance) / max(deviance_root, 1e-3)
@@ -537,7 +543,7 @@ class OrderProfiler:
         refit = self._descend(
             self._tangent(order_value, nearest_refit),
             _MAX_EVALUATIONS,
-            hold=fixed_names,
+            held_unknowns=fixed_names,
             hopeless=(_TRIAL_EVALUATIONS, highest_cost),
         )
         if refit.cost > highest_cost:
@@ -566,19 +572,19 @@ class OrderProfiler:
         start_unknowns = start_refit.x.copy()
         start_unknowns[self._order_index] = order_value
         second_refit = self._descend(
-            start_unknowns, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless
+            start_unknowns, _MAX_EVALUATIONS, held_unknowns=(self.order,), hopeless=hopeless
         )
         return min(first_refit, second_refit, key=lambda refit: refit.cost)
 
     @cached_property
     def _without_damping(self) -> Refit:
-        """Return the fit with the smallest damping. Its cost does not depend on the order."""
+        """Return the fit with the smallest damping, for which the cost is the same at any order."""
         damping_coefficient = COEFFICIENT_OF[self.order]
         start_unknowns = self._minimum.x.copy()
         coefficient_index = self._unknowns.names.index(damping_coefficient)
         start_unknowns[coefficient_index] = self._unknowns.bounds[0][coefficient_index]
         return self._descend(
-            start_unknowns, _MAX_EVALUATIONS, hold=(self.order, damping_coefficient)
+            start_unknowns, _MAX_EVALUATIONS, held_unknowns=(self.order, damping_coefficient)
         )
 
     def _descend(
@@ -586,7 +592,7 @@ class OrderProfiler:
         start_unknowns: NDArray[np.float64],
         max_evaluations: int,
         *,
-        hold: tuple[str, ...] = (),
+        held_unknowns: tuple[str, ...] = (),
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
         """Minimize the sum of squares from a vector of unknowns, with some unknowns fixed."""
@@ -596,10 +602,10 @@ class OrderProfiler:
             self._unknowns,
             start_unknowns,
             candidate_set.noise,
-            candidate_set.columns,
+            candidate_set.effect_spectra,
             max_evaluations=max_evaluations,
             relative_tolerance=_COST_TOLERANCE,
-            hold=hold,
+            held_unknowns=held_unknowns,
             hopeless=hopeless,
         )
 

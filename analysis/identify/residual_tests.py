@@ -279,7 +279,7 @@ def input_relation(
 TESTED_MULTIPLES: Final = (2, 3)
 """Multiples of the drive frequency that are tested."""
 
-_BLOCK_S: Final = 1.0
+_BLOCK_DURATION_S: Final = 1.0
 """Duration of the blocks in which a harmonic is measured, in seconds."""
 
 _MIN_DRIVE_HZ: Final = 2.0
@@ -321,7 +321,7 @@ def harmonics(
     rate_hz: float,
     band_hz: tuple[float, float],
 ) -> tuple[Harmonic, ...]:
-    """Test a residual for harmonics of a sweep. Return no test if the angle is no sweep.
+    """Test a residual for harmonics of a sweep; return an empty tuple if the angle is no sweep.
 
     Parameters
     ----------
@@ -332,7 +332,7 @@ def harmonics(
     band_hz : tuple of float
         First and last frequency at which the residual is known.
     """
-    block_length = round(_BLOCK_S * rate_hz)
+    block_length = round(_BLOCK_DURATION_S * rate_hz)
     block_count = angle_rad.size // block_length
     analytic_blocks = _analytic_signal(angle_rad)[: block_count * block_length].reshape(
         block_count, block_length

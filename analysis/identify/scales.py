@@ -106,7 +106,7 @@ def with_scale_uncertainty(
 def _relative_scale_uncertainty(
     scale_exponents: Mapping[str, int], scale_uncertainty: Mapping[str, float]
 ) -> float:
-    """Return the relative standard uncertainty of a parameter by those of the scales.
+    """Return the relative standard uncertainty of a parameter due to uncertain scales.
 
     `scale_exponents` are the powers of the scales, such as length, to which the parameter is
     proportional.
@@ -122,9 +122,9 @@ def _relative_scale_uncertainty(
 def _with_scale_uncertainty(
     reported_value: Estimate, relative_std: float, *, is_logarithmic: bool
 ) -> Estimate:
-    """Return a reported value whose uncertainty includes that of torque scale and length.
+    """Return a reported value whose uncertainty includes that due to torque scale and length.
 
-    `relative_std` is the relative uncertainty by these scales. Both are added in quadrature.
+    `relative_std` is the relative uncertainty due to these scales. It is added in quadrature.
     """
     assert reported_value.interval_95 is not None
     estimated_value, (lower_end, upper_end) = reported_value.value, reported_value.interval_95

@@ -323,7 +323,8 @@ def _unidentifiable_reason(order_verdict: OrderVerdict) -> str:
 # Advice on experiments
 
 _MIN_MODES_FOR_AN_ORDER: Final = 2
-"""Number of visible modes from which a further mode, or a longer sweep, is advised."""
+"""Number of visible modes from which one more mode, or slower sweeps around the modes, are advised.
+With fewer modes, the advice is how to make these visible."""
 
 _SECOND_OVER_FIRST_FREQUENCY: Final = 6.267
 """Frequency of the second mode of a uniform beam over that of the first."""
@@ -339,7 +340,7 @@ def experiments(
     findings: tuple[Finding, ...],
     close_rivals: tuple[Candidate, ...],
 ) -> list[str]:
-    """Return experiments that would clarify the verdict, besides the findings' remedies.
+    """Return experiments that would clarify the verdict, in addition to the findings' remedies.
 
     Parameters
     ----------

@@ -36,20 +36,20 @@ EstimateBasis = Literal["geometry", "losses", "none"]
 """Data that an estimate with tolerance uses."""
 
 _PLAUSIBLE_P_VALUE: Final = 0.3
-"""p-value from which the stated tolerance suffices. A beam that is more uneven reaches a lower
-p-value, since orders compensate a part of the excess."""
+"""p-value from which the stated tolerance suffices. The limit is high, since the damping orders of
+the fit compensate a part of the deviations of a beam that exceeds the tolerance."""
 
 _PLAUSIBLE_P_VALUE_WIDER: Final = 0.1
 """p-value from which the wider tolerance suffices."""
 
-_WIDER_TOLERANCE: Final = 3e-3
+_WIDER_FREQUENCY_TOLERANCE: Final = 3e-3
 """Relative frequency tolerance that is tried if the stated one does not suffice."""
 
-_LOOSE_TOLERANCE: Final = 0.05
+_LOOSE_FREQUENCY_TOLERANCE: Final = 0.05
 """Relative frequency tolerance at which frequencies and residues have almost no weight."""
 
 _LOSS_TOLERANCE: Final = 0.01
-"""Relative tolerance of the damping ratios of a beam so uneven that only its losses are data."""
+"""Relative tolerance of the damping ratios of a beam so uneven that only its losses are fitted."""
 
 _MIN_VISIBLE_MODES: Final = 2
 """Smallest number of visible modes for an estimate with tolerance."""
@@ -81,9 +81,9 @@ class TolerantEstimate:
     Attributes
     ----------
     basis : str
-        "geometry": frequencies and residues of all modes within the tolerance; "losses": damping
-        ratios and residue phases alone; "none": no beam with two dampings of one order each
-        explains even these.
+        "geometry": all modal constants, with frequencies and residues within the tolerance.
+        "losses": damping ratios and residue phases alone. "none": no beam with two dampings of one
+        order each explains the losses.
     uniformity : float
         Assumed relative standard deviation of each frequency.
     p_value : float or None
@@ -166,8 +166,8 @@ def tolerant_estimate(
     uniformity : float
         Stated relative standard deviation of each frequency.
     tilt_deg : float, optional
-        Inclination of the plane of motion along the resting beam, as the file states it, in
-        degrees.
+        Angle in degrees between the beam at rest and the horizontal, as the file states it;
+        positive if the tip is lower than the root.
     is_uniform : bool
         Whether a uniform beam predicts the modes (`uniform_beam_test`).
 
@@ -179,11 +179,11 @@ def tolerant_estimate(
     mode_numbers = fit.visible
     if len(mode_numbers) < _MIN_VISIBLE_MODES:
         return None
-    wider_tolerance = max(_WIDER_TOLERANCE, uniformity)
+    wider_frequency_tolerance = max(_WIDER_FREQUENCY_TOLERANCE, uniformity)
     tolerance_attempts: tuple[tuple[EstimateBasis, float, float], ...] = (
         ("geometry", uniformity, _PLAUSIBLE_P_VALUE),
-        ("geometry", wider_tolerance, _PLAUSIBLE_P_VALUE_WIDER),
-        ("losses", _LOOSE_TOLERANCE, MIN_P_VALUE_OF_UNIFORM_BEAM),
+        ("geometry", wider_frequency_tolerance, _PLAUSIBLE_P_VALUE_WIDER),
+        ("losses", _LOOSE_FREQUENCY_TOLERANCE, MIN_P_VALUE_OF_UNIFORM_BEAM),
     )
     for estimate_basis, frequency_tolerance, min_p_value in tolerance_attempts:
         loss_tolerance = (
@@ -198,7 +198,7 @@ def tolerant_estimate(
         )
         minima = problem.minima()
         # With the loose tolerance frequencies and residues do not count as data.
-        constant_count = problem.compared // (2 if estimate_basis == "losses" else 1)
+        constant_count = problem.constant_count // (2 if estimate_basis == "losses" else 1)
         degrees_of_freedom = constant_count - (
             len(PARAMETERS) if estimate_basis == "geometry" else len(PARAMETERS) - 2
         )
@@ -221,7 +221,7 @@ def tolerant_estimate(
         return beam_estimate
     if estimate_basis == "geometry":
         problem = UniformBeamProblem(
-            fit, mode_numbers, nominal, _LOOSE_TOLERANCE, tilt_deg, loss_tolerance
+            fit, mode_numbers, nominal, _LOOSE_FREQUENCY_TOLERANCE, tilt_deg, loss_tolerance
         )
         minima = problem.minima()
     best_minimum = minima[0]

@@ -62,8 +62,8 @@ _SHAPE_UPDATES: Final = 4
 """Number of times that the mode shapes of a loaded or tilted beam are recomputed for the fitted
 beam."""
 
-_DEVIATION_WITHOUT_POLE: Final = 1e6
-"""Whitened deviation of every constant if a mode has no pole."""
+_RESIDUAL_WITHOUT_POLE: Final = 1e6
+"""Whitened residual of every constant if a mode has no pole."""
 
 _COST_TOLERANCE: Final = 1e-4
 """Relative tolerance of chi-square at which a descent ends."""
@@ -76,14 +76,14 @@ INTEGRAL_TOLERANCE_RATIO: Final = 3
 the frequencies. They are integrals over a mode's shape, which vary more than its frequency."""
 
 _IDLE_CURVATURE: Final = 1e-4
-"""Second derivative of chi-square below which an unknown counts as without effect."""
+"""Second derivative of chi-square by an unknown below which the unknown has no effect."""
 
 
 class UniformBeamProblem:
     """Least-squares fit of a uniform beam's parameters to the measured modal constants.
 
     Unknowns are the contribution of internal damping to the stiffness at the highest visible mode
-    (``ln zeta omega^alpha``) and external damping to the inertia at the lowest
+    (``ln zeta omega^alpha``) and that of external damping to the inertia at the lowest
     (``ln gamma omega^lambda / (rho/EI omega²)``), which depend little on the orders; alpha and
     lambda; the logarithms of rho/EI and EI; and the delay.
 
@@ -98,8 +98,8 @@ class UniformBeamProblem:
     uniformity : float
         Relative standard deviation of each frequency, in addition to the noise.
     tilt_deg : float, optional
-        Inclination of the plane of motion along the resting beam, as the file states it, in
-        degrees.
+        Angle in degrees between the beam at rest and the horizontal, as the file states it;
+        positive if the tip is lower than the root.
     loss_tolerance : float
         Relative standard deviation of each damping ratio, in addition to the noise.
     """
@@ -128,12 +128,12 @@ class UniformBeamProblem:
         self.covariance = fit.covariance[np.ix_(constant_rows, constant_rows)] + np.diag(
             tolerance_std.ravel() ** 2
         )
-        self.compared = mode_count * len(MODE_CONSTANT_NAMES)
+        self.constant_count = mode_count * len(MODE_CONSTANT_NAMES)
         self._whitener = np.linalg.inv(np.linalg.cholesky(self.covariance))
         length_m = nominal.beam.length_m
         z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
-        self.stated = Alteration.stated(nominal, tilt_deg)
-        self.terms = galerkin_mode_terms(self.stated, nominal.beam, self.modes)
+        self.stated_alteration = Alteration.from_nominal(nominal, tilt_deg)
+        self.terms = galerkin_mode_terms(self.stated_alteration, nominal.beam, self.modes)
         constants_by_mode = self.measured.reshape(-1, len(MODE_CONSTANT_NAMES))
         self._omega_rad_s = 2 * np.pi * np.exp(constants_by_mode[:, 0])
         self._damping_ratios = np.exp(constants_by_mode[:, 1])
@@ -235,16 +235,16 @@ class UniformBeamProblem:
             self._measured_poles,
         )
 
-    def deviations(
+    def residual_and_slopes(
         self,
         x: NDArray[np.float64],
         whitener: NDArray[np.float64],
         terms: ModeTerms | None = None,
     ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
-        """Return predicted minus measured modal constants, whitened, and their derivatives.
+        """Return predicted minus measured modal constants, whitened, and a function for slopes.
 
-        Differences of phases are between -pi and pi. If a mode has no pole, all deviations are
-        large and constant.
+        Differences of phases are between -pi and pi. If a mode has no pole, the residual is large
+        and constant.
 
         Parameters
         ----------
@@ -257,17 +257,17 @@ class UniformBeamProblem:
 
         Returns
         -------
-        deviations : ndarray of float, shape (4 n,)
+        residual : ndarray of float, shape (4 n,)
             Whitened differences.
         slopes : callable
-            Function that computes their derivatives by the unknowns, shape (7, 4 n).
+            Function that returns the derivatives of the residual by the unknowns, shape (7, 4 n).
         """
         vibration = self._vibration(x, self.terms if terms is None else terms)
         differences = vibration.constants() - self.measured
         if np.isnan(differences).any():
             return (
-                np.full(self.compared, _DEVIATION_WITHOUT_POLE),
-                lambda: np.zeros((x.size, self.compared)),
+                np.full(self.constant_count, _RESIDUAL_WITHOUT_POLE),
+                lambda: np.zeros((x.size, self.constant_count)),
             )
         phase_differences = differences[
             MODE_CONSTANT_NAMES.index("residue_phase_rad") :: len(MODE_CONSTANT_NAMES)
@@ -277,10 +277,10 @@ class UniformBeamProblem:
 
     def equations(self, x: NDArray[np.float64]) -> NormalEquations:
         """Return chi-square at one vector of unknowns with its gradient and Gauss-Newton matrix."""
-        deviations, slopes = self.deviations(x, self._whitener)
+        residual, slopes = self.residual_and_slopes(x, self._whitener)
         jacobian = slopes()
         return NormalEquations(
-            float(deviations @ deviations), jacobian @ deviations, jacobian @ jacobian.T
+            float(residual @ residual), jacobian @ residual, jacobian @ jacobian.T
         )
 
     def starts(self) -> list[NDArray[np.float64]]:
@@ -335,8 +335,10 @@ class UniformBeamProblem:
     def minima(self) -> list[Minimum]:
         """Minimize chi-square from all start vectors. Return the minima, the lowest first."""
         minima = self._minimize_from(self.starts())
-        for _ in range(_SHAPE_UPDATES if self.stated != Alteration() else 0):
-            self.terms = galerkin_mode_terms(self.stated, self.plant(minima[0].x).beam, self.modes)
+        for _ in range(_SHAPE_UPDATES if self.stated_alteration != Alteration() else 0):
+            self.terms = galerkin_mode_terms(
+                self.stated_alteration, self.plant(minima[0].x).beam, self.modes
+            )
             minima = self._minimize_from([minimum.x for minimum in minima])
         return minima
 

@@ -24,9 +24,9 @@ Status = Literal["compatible", "fractional", "open", "not identifiable", "absent
 """Status of a damping order."""
 
 EXCLUSION_DEVIANCES: Final = (10.828, 13.816, 16.266, 18.467)
-"""Deviance above that of the freest structure from which a simpler one is excluded, by the number
-of missing parameters (1 to 4): the 0.1 % limit of chi-square. A true structure is excluded once in
-a thousand records."""
+"""Deviance above that of the freest structure from which a structure is excluded if it has 1 to 4
+fewer parameters: the 0.1 % limit of chi-square. A true structure is excluded once in a thousand
+records."""
 
 ORDER_NOT_DETERMINED_REASON: Final = "the record does not determine the order"
 """Reason against an order whose profile is too wide or has several minima."""
@@ -151,7 +151,7 @@ def too_few_modes(structure: Structure, mode_count: int) -> str | None:
 
 
 def deviance_of_order_one(order_profile: LikelihoodProfile) -> float:
-    """Return the deviance of order 1 above the lowest, or infinity outside of the profile.
+    """Return the deviance at order 1 minus the lowest one; infinity if the profile ends before 1.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def _order_status(
     *,
     doubt_reason: str | None,
 ) -> tuple[Status, str | None]:
-    """Return the status of a damping order, and why it is doubtful or None."""
+    """Return the status of a damping order, and the reason if it is doubtful, else None."""
     freest_candidate, order_name = candidate_set.freest, order_profile.order
     reason_against = not_reported_reason(candidate_set, visible_numbers)
     if reason_against is not None:
@@ -250,7 +250,7 @@ class Verdict:
         Sentences of the verdict, the most important first.
     experiments : tuple of str
         Experiments that would clarify the verdict.
-    damping_with_amplitude : tuple of DampingAt
+    damping_with_amplitude : tuple of DampingAtAmplitude
         Damping in free vibration by amplitude, if the record shows air drag. Empty otherwise.
     """
 

@@ -1,7 +1,7 @@
 """Transfer functions from motor angle to coupling torque that are to be realised.
 
-A beam of the exact model and a modal model have the same description: the response, the poles of
-the modes, and the channel of the torque.
+A beam of the exact model and a modal model are described alike: by the response, the poles of the
+modes, and the delay and filters of the torque channel.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MAX_BEAM_MODES: Final = 40
 """Largest number of modes of an exported beam."""
 
 _MAX_OSCILLATING_DAMPING_RATIO: Final = 0.8
-"""Damping ratio from which a mode beyond the band is represented by real poles."""
+"""Smallest damping ratio at which a mode beyond the band is represented by real poles."""
 _RESIDUAL_FREQUENCY_RATIOS: Final = (1.5, 2.2, 3.3, 5.0)
 """Frequencies of the pole pairs that represent the background of a modal model, relative to the end
 of the band."""
@@ -48,20 +48,20 @@ _BUTTERWORTH_COEFFICIENT: Final = 2**0.5
 
 
 class LinearModelError(UserError, ValueError):
-    """The model cannot be exported. The message names the cause and the remedy."""
+    """Error if a model cannot be exported. The message names the cause and the remedy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dynamics:
-    """Response from motor angle to coupling torque, with the poles for its state space.
+    """Response from motor angle to coupling torque, with the poles that a state space of it has.
 
     Attributes
     ----------
     response : callable
         Function from s (rad/s, not 0) to N·m/rad, without filters and delay of the torque channel.
     pairs : ndarray of complex
-        Upper poles of the conjugate pairs that a realisation may have, in the order in which they
-        are added, in rad/s.
+        Poles with positive imaginary part, in rad/s, of the conjugate pairs that a realisation may
+        have. A realisation with n pairs has the first n.
     names : tuple of str
         Name of each pair.
     in_band : int
@@ -73,8 +73,7 @@ class Dynamics:
     tool_inertia_kg_m2 : float
         Inertia between sensor and beam, part of the response.
     motor_inertia_kg_m2 : float or None
-        Inertia of a motor that the realisation must not make unstable. None if this is not
-        required.
+        Inertia of a motor that the realisation must not make unstable; None if it may.
     filters : tuple of (float, int)
         Time constant (s) and order of each low-pass filter in the torque channel.
     delay_s : float
@@ -165,9 +164,9 @@ def beam_dynamics(plant: Plant) -> Dynamics:
     LinearModelError
         If the beam has too many modes in the band, or their poles are not found.
     """
-    pole_pairs_rad_s, mode_indices, real_poles = _beam_poles(plant)
-    hz = np.abs(pole_pairs_rad_s) / (2 * np.pi)
-    in_channel = replace(
+    pole_pairs_rad_s, mode_numbers, real_poles = _beam_poles(plant)
+    pole_hz = np.abs(pole_pairs_rad_s) / (2 * np.pi)
+    plant_without_channel = replace(
         plant, delay_s=0.0, filter_time_constant_s=0.0, second_order_filter_time_constant_s=0.0
     )
     torque_filters = (
@@ -175,10 +174,10 @@ def beam_dynamics(plant: Plant) -> Dynamics:
         (plant.second_order_filter_time_constant_s, 2),
     )
     return Dynamics(
-        response=lambda s: ResponseGrid(s).evaluate(in_channel)[0],
+        response=lambda s: ResponseGrid(s).evaluate(plant_without_channel)[0],
         pairs=pole_pairs_rad_s,
-        names=tuple(f"mode_{mode_index}" for mode_index in mode_indices),
-        in_band=int((hz < BEAM_BAND_HZ[1]).sum()),
+        names=tuple(f"mode_{mode_number}" for mode_number in mode_numbers),
+        in_band=int((pole_hz < BEAM_BAND_HZ[1]).sum()),
         band_hz=BEAM_BAND_HZ,
         real_poles=real_poles,
         tool_inertia_kg_m2=plant.tool_inertia_kg_m2,
@@ -234,8 +233,8 @@ def modal_dynamics(
 ) -> Dynamics:
     """Return the motor-to-torque dynamics of a modal model within the band of its record.
 
-    The background is a polynomial in s, which no state space realises: the two powers beyond the
-    acceleration are approximated by well-damped pairs of poles above the band.
+    The background is a polynomial in s, which no state space realises: its two powers above s² are
+    approximated by well-damped pairs of poles above the band.
 
     Parameters
     ----------
@@ -256,10 +255,10 @@ def modal_dynamics(
         pairs=np.concatenate([modal_poles, background_poles]),
         names=(
             *(
-                f"mode_{mode_number}" if mode_number else f"resonance_{background_index}"
-                for background_index, mode_number in enumerate(mode_numbers, start=1)
+                f"mode_{mode_number}" if mode_number else f"resonance_{pole_number}"
+                for pole_number, mode_number in enumerate(mode_numbers, start=1)
             ),
-            *(f"residual_{mode_number}" for mode_number in range(1, background_poles.size + 1)),
+            *(f"residual_{pole_number}" for pole_number in range(1, background_poles.size + 1)),
         ),
         in_band=modal_poles.size,
         band_hz=band_hz,

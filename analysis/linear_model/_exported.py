@@ -32,7 +32,7 @@ _MAX_DRAWS_PER_SAMPLE: Final = 10
 """Largest number of random draws for each accepted sample."""
 
 _TABLE_POINTS: Final = 400
-"""Number of frequencies of the exported response, besides those of poles and zeros."""
+"""Number of frequencies of the exported response, in addition to those of poles and zeros."""
 
 _STEP_STD: Final = 1e-3
 """Step of the numerical derivatives, in standard deviations of the parameters."""
@@ -49,7 +49,7 @@ class ModelOptions:
     given : str
         Input: "acceleration", or "angle" for angle, velocity and acceleration.
     order : int or None
-        Number of states. None for as few as the accuracy needs.
+        Number of states. None for the fewest that reach `MAX_RELATIVE_ERROR`.
     rate_hz : float or None
         Sampling rate of the model, whose input is held between samples. None for continuous time.
     samples : int
@@ -110,7 +110,7 @@ class Accuracy:
 
     @property
     def error_median(self) -> float:
-        """Return the median over the frequencies of the relative error of the state space."""
+        """Return the relative error of the state space as a median over the frequencies."""
         return float(np.median(self.error))
 
     @property
@@ -126,7 +126,7 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearModel:
-    """Exported state space of the beam, with the analysis it is from, its error and uncertainty.
+    """State space of an identified beam, with the analysis behind it, its error and uncertainty.
 
     Attributes
     ----------
@@ -255,7 +255,7 @@ def linear_model(
 ) -> LinearModel:
     """Convert an identified model to a state space.
 
-    This is the uniform beam if it predicts the measured modes, otherwise the modal model.
+    The model is the uniform beam if it predicts the measured modes, otherwise the modal model.
 
     Parameters
     ----------
@@ -310,7 +310,7 @@ def linear_model(
 def _accuracy(
     uncertain_dynamics: UncertainDynamics, fit: PoleFit, state_space: StateSpace
 ) -> Accuracy:
-    """Return the relative error of a state space over its band, and that of the response."""
+    """Return the relative error of a state space and the relative uncertainty of the response."""
     low_hz, high_hz = fit.dynamics.band_hz
     pole_and_zero_hz = np.concatenate([fit.dynamics.pairs, fit.zeros]).imag / (2 * np.pi)
     hz_in_band = pole_and_zero_hz[(pole_and_zero_hz > low_hz) & (pole_and_zero_hz < high_hz)]
@@ -334,7 +334,7 @@ def _relative_std(
 ) -> NDArray[np.float64]:
     """Return the relative standard deviation of the torque response with delay, shape (len(s),).
 
-    It follows from the covariance of the parameters to first order. NaN without a covariance.
+    It follows from the covariance of the parameters to first order; it is NaN if there is none.
     """
     if not uncertain_dynamics.names:
         return np.full(s.size, np.nan)
@@ -370,14 +370,15 @@ def _draw_posterior(
 ) -> PosteriorSamples:
     """Draw parameters from their normal distribution, and convert each sample to a state space.
 
-    All state spaces have the same states. Raise `LinearModelError` if too few samples allow this.
+    Samples whose model needs other states than the nominal one are rejected. Raise
+    `LinearModelError` if too few remain.
     """
-    drawn_count = options.samples
+    requested_count = options.samples
     accepted_values: list[NDArray[np.float64]] = []
     sample_systems: list[StateSpace] = []
     random_generator = np.random.default_rng(_RANDOM_SEED)
-    for _ in range(drawn_count * _MAX_DRAWS_PER_SAMPLE):
-        if len(accepted_values) == drawn_count:
+    for _ in range(requested_count * _MAX_DRAWS_PER_SAMPLE):
+        if len(accepted_values) == requested_count:
             break
         drawn_values = random_generator.multivariate_normal(
             uncertain_dynamics.values,
@@ -397,14 +398,14 @@ def _draw_posterior(
             sample_systems.append(
                 sampled_fit.system(pole_structure, fit_coefficients, options.given)
             )
-    if len(accepted_values) < drawn_count:
+    if len(accepted_values) < requested_count:
         raise LinearModelError(
-            f"Only {len(accepted_values)} of {drawn_count} samples of the posterior have the "
+            f"Only {len(accepted_values)} of {requested_count} samples of the posterior have the "
             "states of the model: its parameters are too uncertain; record more, or add "
             "--samples 0."
         )
     return PosteriorSamples(
-        np.array(accepted_values).reshape(drawn_count, uncertain_dynamics.values.size),
+        np.array(accepted_values).reshape(requested_count, uncertain_dynamics.values.size),
         tuple(sample_systems),
     )
 

@@ -1,4 +1,4 @@
-"""Identified model to be exported as a linear model: read from a document, or of a session."""
+"""Identified model to be exported as a linear model: from a document, or from a session file."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ _ANALYZE_AGAIN_ADVICE: Final = "analyze the session again"
 """Advice at the end of error messages on documents."""
 
 _LOGARITHM_PREFIX: Final = "ln_"
-"""Prefix of the name of a parameter whose logarithm has the covariance."""
+"""Prefix of a parameter's name in a covariance if this is the covariance of its logarithm."""
 
 _MAX_OFFSET_MODE: Final = 50
-"""Largest mode number that a stiffness offset may have."""
+"""Largest number of a mode for which a document may state a stiffness offset."""
 
 _MAX_MODES: Final = 40
 """Largest number of modes in a modal model."""
@@ -50,11 +50,11 @@ _REASONS_TO_LEAVE_OUT: Final = {
     "drag": "the drag of the air grows with the amplitude",
     "clock_rate_difference": "it is a property of the instruments",
 }
-"""Parameters that a linear model from motion to torque leaves out, and why. A clock rate difference
-is a parameter in documents of older versions only, as offsets of modes and the compliance of the
-clamp are."""
+"""Parameters that a linear model from motion to torque leaves out, and why. Only documents of older
+versions have the clock rate difference as a parameter, as well as offsets of modes and the
+compliance of the clamp."""
 _DEFAULT_BAND_HZ: Final = (0.05, 50.0)
-"""Band of a document that does not state its band."""
+"""Band in hertz of an analysis whose document does not state the band."""
 
 _MIN_FIRST_HZ: Final = 0.05
 """Lowest first frequency of a band, in hertz."""
@@ -162,8 +162,8 @@ class IdentifiedModel:
     def _beam_part(self) -> Mapping[str, Any]:
         """Return the section of the reported numbers with the parameters of the exported beam.
 
-        This is the exactly uniform beam, if its covariance is stated: parameters with a tolerance
-        of the geometry reproduce the resonances less exactly than they were measured.
+        It is the section of the exactly uniform beam, if that states a covariance: parameters of an
+        uneven beam reproduce the resonances less exactly than these were measured.
         """
         exact_geometry = self.headline.get("exact_geometry")
         if isinstance(exact_geometry, dict) and isinstance(exact_geometry.get("parameters"), dict):
@@ -198,7 +198,7 @@ class IdentifiedModel:
                 raise self._error("covariance.names", f"{key_name!r} has no such parameter")
 
         def all_values(determined_values: Mapping[str, float]) -> Mapping[str, float]:
-            """Return all beam parameters by name. Given values replace fitted ones.
+            """Return all beam parameters by name, some of them replaced by `determined_values`.
 
             A value whose name begins with "ln_" is a logarithm, and is converted.
             """
@@ -229,7 +229,7 @@ class IdentifiedModel:
     def modes(self) -> UncertainDynamics:
         """Return the dynamics of the modal model, and the covariance of its constants.
 
-        Both hold in the band of the analysis.
+        They are valid in the band of the analysis only.
 
         Raises
         ------
@@ -346,7 +346,7 @@ def read_identified_model(path: Path) -> IdentifiedModel:
         )
 
     def entries(list_key: str) -> list[dict[str, Any]]:
-        """Return the entries of a list in the document that belong to the analysed file."""
+        """Return the entries of a list in the document that belong to the file of the headline."""
         stated_list = document.get(list_key)
         entry_dicts = (
             [document_entry for document_entry in stated_list if isinstance(document_entry, dict)]
@@ -435,7 +435,7 @@ def _is_possible_beam(sampled_values: Mapping[str, float]) -> bool:
 
 
 def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> Plant:
-    """Return the rig with a beam of given parameters, by name, and length in metres."""
+    """Return the plant whose beam has the given parameters, by name, and length in metres."""
     last_offset_mode = max(
         (
             int(key_name.removeprefix(OFFSET_PREFIX))

@@ -1,4 +1,4 @@
-"""Uncertain constants of a modal model, by the names that the covariance of a fit has for them."""
+"""Constants of a modal model by their names in the covariance of a fit: values and changes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ _PoleAndResidue = tuple[complex, complex]
 class _ModalConstant:
     """Kind of constant of a mode, such as its damping ratio.
 
-    `value` computes it from pole and residue. `change` returns both after an added change.
+    ``value(pole, residue)`` is the constant. ``change(pole, residue, amount)`` returns the pole and
+    the residue for which the constant is larger by the amount.
     """
 
     value: Callable[[complex, complex], float]
@@ -55,11 +56,10 @@ _MODAL_CONSTANTS: Final[Mapping[str, _ModalConstant]] = {
         lambda _, residue: cmath.phase(residue / 1j), lambda p, r, by: (p, r * cmath.rect(1.0, by))
     ),
 }
-"""Constants of a mode by the beginning of their names, which end in the number of the mode, from
-1."""
+"""Constants of a mode by their names without the number of the mode (from 1) at the end."""
 
 _BACKGROUND_NAME: Final = "background"
-"""Beginning of the names of background coefficients, which end in the power of s."""
+"""Name of a background coefficient without the power of s at its end."""
 
 
 def constant_value(modal: ModalModel, constant_name: str) -> float | None:
@@ -89,7 +89,7 @@ def with_changed_constants(modal: ModalModel, constant_changes: Mapping[str, flo
     modal : ModalModel
         Fitted modal model.
     constant_changes : mapping of str to float
-        Change of each constant, by name.
+        Amount to be added to each constant, by name.
     """
     poles_and_residues = list(zip(modal.poles_rad_s, modal.residues, strict=True))
     background_terms = list(modal.background)
@@ -109,6 +109,6 @@ def with_changed_constants(modal: ModalModel, constant_changes: Mapping[str, flo
 
 
 def _split_name(constant_name: str) -> tuple[str, int]:
-    """Split a name such as "ln_frequency_2" into "ln_frequency" and 2, or -1 without number."""
+    """Split a name such as "ln_frequency_2" into "ln_frequency" and 2; -1 if there is no number."""
     name_prefix, _, number_text = constant_name.rpartition("_")
     return name_prefix, int(number_text) if number_text.isdecimal() else -1

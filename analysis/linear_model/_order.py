@@ -1,4 +1,4 @@
-"""Choice of the states of a realisation: the fewest for an accuracy, or a given number."""
+"""Choice of the states of a realisation: the fewest that reach an accuracy, or a given number."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from analysis.linear_model._state_space import StateSpace
 
 MAX_RELATIVE_ERROR: Final = 1e-3
-"""Relative error over the band at which the number of states suffices (`--order auto`)."""
+"""Largest relative error in the band that ``--order auto`` accepts."""
 
 _REAL_POLE_RANGES_RAD_S: Final = ((0.1, 1e3), (0.3, 3e3), (0.03, 1e4), (0.03, 3e2), (30.0, 1e4))
-"""First and last of the real poles, which are logarithmically spaced, in rad/s."""
+"""Ranges to be tried for the logarithmically spaced real poles, in rad/s."""
 _MAX_REAL_POLES: Final = 12
 """Largest number of added real poles."""
 
@@ -34,7 +34,7 @@ _MAX_INTEGRATORS: Final = 2
 def realise_response(
     fit: PoleFit, order: int | None, input_kind: InputKind
 ) -> tuple[PoleStructure, StateSpace]:
-    """Approximate a response by a state space with a given number of states, or the fewest.
+    """Approximate a response by a state space with a given number of states, or as few as suffice.
 
     Parameters
     ----------
@@ -53,7 +53,9 @@ def realise_response(
     """
     dynamics = fit.dynamics
     if order is not None:
-        min_states = len(dynamics.real_poles) + sum(each for _, each in dynamics.filters)
+        min_states = len(dynamics.real_poles) + sum(
+            filter_order for _, filter_order in dynamics.filters
+        )
         max_states = min_states + 2 * len(dynamics.pairs) + _MAX_REAL_POLES
         zero_real_poles = dict.fromkeys(range(len(dynamics.pairs) + 1), 0)
         realisation = _best_realisation(
@@ -103,9 +105,9 @@ def realise_response(
 
 
 def _real_poles_suffice(fit: PoleFit, pair_count: int, real_pole_count: int) -> bool:
-    """Return whether a number of real poles suffices for `MAX_RELATIVE_ERROR` of the response.
+    """Return whether a fit with this many real poles has an error within `MAX_RELATIVE_ERROR`.
 
-    The fits have given numbers of conjugate pole pairs, and both integrators.
+    Besides the real poles, it has `pair_count` conjugate pole pairs and two poles at s = 0.
     """
     pole_structures = _structures_with_real_poles(pair_count, real_pole_count, _MAX_INTEGRATORS)
     return any(
@@ -118,7 +120,7 @@ def _structures_with_states(
 ) -> Iterator[PoleStructure]:
     """Yield the pole structures with a number of conjugate pairs and a total number of states.
 
-    `state_count` does not count the states that all structures have.
+    `state_count` leaves out the states of over-damped modes and filters, which all structures have.
     """
     if input_kind == "angle":  # which has the velocity and the acceleration as inputs
         yield from _structures_with_real_poles(
@@ -156,17 +158,17 @@ def _best_realisation(
     min_real_poles: Mapping[int, int],
     error_tolerance: float,
 ) -> tuple[PoleStructure, StateSpace] | None:
-    """Return the most accurate stable state space within a tolerance, or None if there is none.
+    """Return the most accurate stable state space with an error within a tolerance, or None.
 
     `min_real_poles` gives the admissible numbers of pairs and, for each, the smallest number of
     real poles.
     """
     accurate_fits: list[tuple[float, int, PoleStructure, NDArray[np.float64]]] = []
     for pole_structure in (
-        accurate_fit
+        candidate_structure
         for pair_count, min_real_pole_count in min_real_poles.items()
-        for accurate_fit in _structures_with_states(pair_count, state_count, input_kind)
-        if len(accurate_fit.added_real_poles_rad_s) >= min_real_pole_count
+        for candidate_structure in _structures_with_states(pair_count, state_count, input_kind)
+        if len(candidate_structure.added_real_poles_rad_s) >= min_real_pole_count
     ):
         fit_coefficients, fit_error = fit.solve(pole_structure)
         if fit_error <= error_tolerance:

@@ -5,10 +5,9 @@ The coupling torque per angular acceleration is approximated by a sum over poles
     H(s) / s² ≈ sum_k c_k(s) + D + V / s + K / s²
 
 with a pair of poles for each mode, some real poles for the branch cut of fractional orders, the
-inertia D, and the integrals of the acceleration (velocity and angle) with V and K. The residual of
-the least squares is relative. Poles are at the exact positions, or negative and real, so every fit
-is stable. D, V and K of a beam are not negative, and a motor with the realised beam is not
-unstable.
+inertia D, and the integrals of the acceleration (velocity and angle) with V and K. The residual is
+relative to the response. Poles are at the exact positions, or negative and real, so every fit is
+stable. D, V and K of a beam are not negative, and a motor with the realised beam is not unstable.
 """
 
 from __future__ import annotations
@@ -43,25 +42,26 @@ _OUTPUT_SIGNAL: Final = SignalNames(("coupling_torque",), ("N.m",))
 """Name and unit of the output."""
 
 _FIT_POINTS: Final = (200, 10)
-"""Number of frequencies over the band, and at each pole and zero, to which the response is
-fitted."""
+"""Numbers of frequencies to which a state space is fitted: over the band, and around each pole and
+zero."""
 
 _CHECK_POINTS: Final = (1200, 34)
-"""Number of frequencies over the band, and at each pole and zero, at which the error of a fit is
-checked."""
+"""Numbers of frequencies at which the error of a fit is checked: over the band, and around each
+pole and zero."""
 _BAND_MARGIN_FACTOR: Final = 1.1
-"""Factor by which the fitted frequencies exceed the band on either side."""
+"""Factor by which the range of frequencies with full weight exceeds the band at each end."""
 
 _TAIL_FACTORS: Final = (500.0, 10.0)
-"""Factors by which the frequencies with little weight extend below and above the band."""
+"""Factors by which the range of frequencies with little weight exceeds the band, below and above.
+"""
 _TAIL_POINTS: Final = 25
-"""Number of frequencies with little weight on either side of the band."""
+"""Number of frequencies with little weight on each side of the band."""
 
 _TAIL_WEIGHT: Final = 1e-5
 """Weight of the relative error at frequencies outside of the band."""
 
 _MIN_RELATIVE_DISTANCE: Final = 3e-7
-"""Relative distance from a pole or zero below which a relative error has no meaning."""
+"""Smallest distance from a pole or zero, relative to the frequency, for a meaningful error."""
 _SCAN_POINTS: Final = 4000
 """Number of frequencies at which minima of the response are searched for."""
 
@@ -69,24 +69,24 @@ _MAX_NEWTON_ITERATIONS: Final = 30
 """Largest number of Newton iterations for the zeros."""
 
 _SINGULAR_VALUE_LIMIT: Final = 1e-10
-"""Relative limit of the singular values in the least squares."""
+"""Singular values below this fraction of the largest one count as zero in the least squares."""
 
 _MAX_RELATIVE_ZERO_CHANGE: Final = 0.3
-"""Largest relative change of a zero by Newton's method."""
+"""Largest relative distance of a zero from the start point of Newton's method."""
 _MAX_GROWTH_PER_S: Final = 1e-2
-"""Largest growth rate of the motor with the realised beam that counts as stable, in 1/s."""
+"""Largest growth rate, in 1/s, at which a motor with the realised beam counts as stable."""
 
 
 @dataclass(frozen=True, slots=True)
 class PoleStructure:
-    """Numbers and real poles that define the states of a state space, without coefficients.
+    """States of a realisation: pole pairs, real poles and integrators, without coefficients.
 
     Attributes
     ----------
     pairs : int
         Number of conjugate pairs of poles.
     added_real_poles_rad_s : tuple of float
-        Negative real poles, besides those of over-damped modes.
+        Negative real poles in addition to those of over-damped modes.
     integrators : int
         Number of integrals of the acceleration: 0, 1 (velocity) or 2 (velocity and angle).
     """
@@ -127,9 +127,9 @@ class PoleFit:
         self._s = imaginary_axis(frequency_hz[is_usable])
         self._in_band = (np.arange(frequency_hz.size) < frequencies_in_band_hz.size)[is_usable]
         point_weight = np.where(self._in_band, 1.0, _TAIL_WEIGHT)
-        per_acceleration = dynamics.response(self._s) / self._s**2
-        self._scale = point_weight / np.abs(per_acceleration)
-        self._target = (per_acceleration - dynamics.tool_inertia_kg_m2) * self._scale
+        torque_per_acceleration = dynamics.response(self._s) / self._s**2
+        self._scale = point_weight / np.abs(torque_per_acceleration)
+        self._target = (torque_per_acceleration - dynamics.tool_inertia_kg_m2) * self._scale
         self._pair_basis = [self._pair_basis_functions(upper_pole) for upper_pole in dynamics.pairs]
 
     @cached_property
@@ -146,7 +146,7 @@ class PoleFit:
         return self.dynamics.filtered(self.check_points_s)
 
     def real_poles(self, pole_structure: PoleStructure) -> tuple[float, ...]:
-        """Return all real poles of a state space with a given structure, in rad/s.
+        """Return all real poles of a pole structure in rad/s, those of over-damped modes first.
 
         Parameters
         ----------
@@ -221,7 +221,7 @@ class PoleFit:
     def is_stable_on_motor(
         self, pole_structure: PoleStructure, fit_coefficients: NDArray[np.float64]
     ) -> bool:
-        """Return whether a frictionless motor with the beam's inertia is stable with the model.
+        """Return whether a frictionless motor of the beam's inertia is stable with the fitted beam.
 
         Parameters
         ----------
@@ -326,9 +326,9 @@ class PoleFit:
     def _dense_frequencies(
         self, band_hz: tuple[float, float], point_counts: tuple[int, int]
     ) -> Real:
-        """Return frequencies of a band in hertz.
+        """Return frequencies in a band, in hertz, that are dense near the poles and zeros.
 
-        They are dense within three half widths of poles and zeros.
+        `point_counts` are their numbers over the band and within 3 half widths of a pole or zero.
         """
         poles_and_zeros_rad_s = self._poles_and_zeros()
         half_width_rad_s = np.maximum(
@@ -344,9 +344,9 @@ class PoleFit:
         )
 
     def _is_apart_from_poles_and_zeros(self, frequency_hz: Real) -> NDArray[np.bool_]:
-        """Return which frequencies are far enough from poles and zeros to compare the response.
+        """Return a mask of the frequencies that are far enough from every pole and zero.
 
-        At a zero the relative error has no meaning.
+        Nearer ones are not used, because a relative error means nothing at a zero.
         """
         omega_rad_s = 2 * np.pi * frequency_hz
         distance_rad_s = np.abs(1j * omega_rad_s[:, None] - self._poles_and_zeros()).min(
@@ -356,7 +356,7 @@ class PoleFit:
         return is_apart
 
     def _response_minima(self) -> NDArray[np.complex128]:
-        """Return the points s = j omega of local minima of the response per acceleration."""
+        """Return the points s = j omega of the local minima of the torque per acceleration."""
         low_hz, high_hz = self.dynamics.band_hz
         s = imaginary_axis(np.geomspace(low_hz / 2, high_hz * 2, _SCAN_POINTS))
         response_magnitude = np.abs(self.dynamics.response(s) / s**2)
@@ -375,25 +375,25 @@ class PoleFit:
         if not s.size:
             return s
         for _ in range(_MAX_NEWTON_ITERATIONS):
-            newton_step = 1e-6 * np.abs(s)
+            difference_step = 1e-6 * np.abs(s)
             response_above, response_below = response_of(
-                np.concatenate([s + newton_step, s - newton_step])
+                np.concatenate([s + difference_step, s - difference_step])
             ).reshape(2, -1)
-            relative_change = (
-                newton_step
+            newton_step = (
+                difference_step
                 * (response_above + response_below)
                 / np.where(response_above == response_below, 1.0, response_above - response_below)
             )
-            s = s - relative_change
+            s = s - newton_step
             has_left = np.abs(s / start_points - 1) > _MAX_RELATIVE_ZERO_CHANGE
             s[has_left] = start_points[has_left]
-            if (np.abs(relative_change)[~has_left] < 1e-9 * np.abs(s)[~has_left]).all():
+            if (np.abs(newton_step)[~has_left] < 1e-9 * np.abs(s)[~has_left]).all():
                 break
         return s
 
 
 def imaginary_axis(frequency_hz: Real) -> NDArray[np.complex128]:
-    """Return s = j omega in rad/s for given frequencies, of the same shape.
+    """Return s = j omega in rad/s for each frequency.
 
     Parameters
     ----------
@@ -426,7 +426,7 @@ def _least_squares(
     target_response: NDArray[np.complex128],
     bounded_count: int,
 ) -> NDArray[np.float64]:
-    """Return the real coefficients of a least-squares fit. The last ones are not negative."""
+    """Return real least-squares coefficients, the last `bounded_count` of them not negative."""
     real_matrix = np.concatenate([basis_functions.real, basis_functions.imag], axis=1).T
     real_target = np.concatenate([target_response.real, target_response.imag])
     column_norms = np.linalg.norm(real_matrix, axis=0)

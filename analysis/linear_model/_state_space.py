@@ -39,8 +39,8 @@ class StateSpace:
     inputs, outputs, states : SignalNames
         Names and units of the vectors u, y and x.
     delay_s : float
-        Delay of the outputs in addition to the matrices. Negative if the inputs are older than the
-        outputs.
+        Delay of the outputs in s that the matrices do not include: ``y(t) = C x(t - delay_s) +
+        D u(t - delay_s)``. Negative if the outputs lead.
     period_s : float
         Time between the samples, 0 in continuous time.
     """
@@ -80,7 +80,7 @@ class StateSpace:
         return frequency_response
 
     def sampled(self, rate_hz: float) -> StateSpace:
-        """Convert the system to a sampling rate, exactly for inputs held between the samples.
+        """Return the discrete-time system, which is exact for inputs held between the samples.
 
         Parameters
         ----------
@@ -137,7 +137,7 @@ def with_filter(state_space: StateSpace, time_constant_s: float, order: int) -> 
 
 
 def concatenate_names(signal_vectors: Sequence[SignalNames]) -> SignalNames:
-    """Return the names and units of several vectors one after the other."""
+    """Concatenate the names and units of several signal vectors."""
     return SignalNames(
         tuple(
             signal_name for signal_vector in signal_vectors for signal_name in signal_vector.names

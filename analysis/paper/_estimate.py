@@ -41,7 +41,7 @@ class SettingsError(FrequencyResponseError):
 def estimate(
     record: Record, settings: WelchSettings
 ) -> tuple[FrequencyResponse, FrequencyResponse]:
-    """Estimate the frequency response for the fits, and a whole-record one for comparison.
+    """Estimate the frequency response for the fits, and one without segments for comparison.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def _check_segmentation(record: Record, segmentation: Segmentation) -> None:
 
 
 def _segment_remedy(sweep_samples: int) -> str:
-    """Return the end of a sentence with options that suit a sweep of a number of samples."""
+    """Return the end of a sentence with options that suit a sweep of this many samples."""
     try:
         segment_length, overlap_samples = segment_lengths(
             sweep_samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION
@@ -215,7 +215,7 @@ def estimate_warnings(
 
 
 def _excited_band_hz(metadata: Mapping[str, str]) -> tuple[float, float] | None:
-    """Return the lowest and highest frequency of the excitation; None if not stated."""
+    """Return the lowest and highest frequency of the excitation in Hz; None if not stated."""
     try:
         start_hz, stop_hz = float(metadata["start_hz"]), float(metadata["stop_hz"])
     except (KeyError, ValueError):

@@ -14,16 +14,17 @@ The standard deviations follow from the covariance of a weighted least-squares f
 each deviation of the model from the measurement as random. Their accuracy on simulated sessions
 with type VI is as follows:
 
-* With errors that are independent between bins, they are within 20 % of the scatter of repeated
-  fits.
-* With errors common to the nine neighbouring bins that zero padding makes similar, they are half of
-  that scatter, because a resonance is then narrower than one error and the fit absorbs most of it.
-* With Welch's estimate of a chirp, leakage dominates over noise, and they are 3 to 50 times the
-  scatter between sessions. The bias is 1 to 7 times as large as they are, and 4 to 20 times if the
-  structure is wrong.
+* If the errors of the response are independent between bins, the standard deviations are within
+  20 % of the scatter of repeated fits.
+* If groups of nine neighbouring bins have a common error, as with zero padding, the standard
+  deviations are half of the scatter: a resonance is narrower than such a group, so that the fit
+  absorbs most of the group's error.
+* With Welch's estimate of a chirp, leakage dominates over noise, and the standard deviations are
+  3 to 50 times the scatter between sessions. The bias of a parameter is 1 to 7 times its standard
+  deviation, and 4 to 20 times if the structure is wrong.
 
-They therefore rank the parameters by how well the response determines them, but they are no
-confidence intervals.
+The standard deviations therefore rank the parameters by how well the response determines them, but
+they do not yield confidence intervals.
 """
 
 import itertools
@@ -53,11 +54,11 @@ _FEW_POINTS: Final = 800
 _REFINED_MINIMA: Final = 3
 """Number of minima that are refined with all points."""
 _ROUGH_TOLERANCE: Final = 1e-5
-"""Relative tolerance of the first descents."""
+"""Relative cost reduction in a step below which the first descents end."""
 _REFINED_TOLERANCE: Final = 1e-12
-"""Relative tolerance of the refined minima."""
+"""Relative cost reduction in a step below which the refinement of a minimum ends."""
 _SAME_MINIMUM_DISTANCE: Final = 0.02
-"""Largest difference in any unknown between two descents that found the same minimum."""
+"""Difference in an unknown above which two descents count as ended at different minima."""
 
 
 class FitError(ValueError):
@@ -98,11 +99,11 @@ class FrfFit:
 
     @property
     def std_of_free_parameters(self) -> dict[str, float | None] | None:
-        """Return the standard deviations of all parameters, with None for fixed ones, or None."""
+        """Return the standard deviations, with None for fixed parameters; None if `std` is None."""
         if self.std is None:
             return None
-        free = self.structure.free
-        return {name: std if name in free else None for name, std in self.std.items()}
+        free_parameters = self.structure.free
+        return {name: std if name in free_parameters else None for name, std in self.std.items()}
 
 
 def fit_frf(
@@ -176,9 +177,9 @@ def fit_many(
     *,
     tool_inertia_kg_m2: float = 0.0,
 ) -> tuple[FrfFit, ...]:
-    """Fit several damping structures and weightings to a frequency response (see `fit_frf`).
+    """Fit each of several structures with each of several weightings to a frequency response.
 
-    Each fit has the result of `fit_frf`; only the preparation of the frequency grids is common.
+    The fits are those of `fit_frf`, but the frequency grids are prepared only once.
 
     Parameters
     ----------
@@ -211,19 +212,19 @@ def fit_many(
             )
         )
     return tuple(
-        _fit(structure, weighting_name(weighting), few, whole)
+        _fit(structure, weighting_name(weighting), thinned_grid, full_grid)
         for structure in structures
-        for weighting, (few, whole) in zip(weightings, grids_by_weighting, strict=True)
+        for weighting, (thinned_grid, full_grid) in zip(weightings, grids_by_weighting, strict=True)
     )
 
 
 _Linearization = tuple[NDArray[np.complex128], NDArray[np.complex128]]
-"""Types of a deviation and of its derivatives with respect to the unknowns."""
+"""Model minus measurement, shape (n,), and its derivatives by the unknowns, shape (k, n)."""
 
 
 @dataclass(frozen=True, slots=True)
 class _FrequencyGrid:
-    """Frequency points, with weights, at which model and measurement are compared."""
+    """Frequencies with weights and measured response, at which a model is compared with it."""
 
     response_grid: ResponseGrid
     undamped_plant: Plant
@@ -231,7 +232,7 @@ class _FrequencyGrid:
     weights: NDArray[np.float64]
 
     def evaluate(self, damping: Damping, wrt: Sequence[str] = ()) -> NDArray[np.complex128]:
-        """Return the response of the damped plant, then its derivatives, shape (1 + k, n)."""
+        """Return response (first row) and derivatives of the damped plant, shape (1 + k, n)."""
         return self.response_grid.evaluate(replace(self.undamped_plant, damping=damping), wrt)
 
 
@@ -253,7 +254,7 @@ class _FrfProblem:
         return self._recent_linearizations.at(x, self._linearize)
 
     def _linearize(self, x: NDArray[np.float64]) -> _Linearization:
-        """Return model minus measurement and its derivatives with respect to x."""
+        """Compute model minus measurement and its derivatives with respect to x."""
         response_and_derivatives = self.grid.evaluate(
             self.unknowns.damping(x), self.unknowns.structure.free
         )
@@ -320,7 +321,7 @@ def _fit(
 
 
 def _refine(frf_problem: _FrfProblem, rough_minimum: Minimum, bounds: ConstantBounds) -> Minimum:
-    """Continue a less accurate descent to the minimum."""
+    """Continue a descent that ended with a rough tolerance, with the refined tolerance."""
     return descend(
         frf_problem.normal_equations,
         rough_minimum.x,
@@ -345,7 +346,7 @@ def _distinct_minima(minima: list[Minimum]) -> list[Minimum]:
 def _standard_deviations(
     frf_problem: _FrfProblem, x: NDArray[np.float64]
 ) -> dict[str, float] | None:
-    """Return the standard deviations of all parameters, or None if not determined."""
+    """Return the standard deviations of all parameters; None if the data do not determine them."""
     deviation, jacobian = frf_problem.deviation_and_jacobian(x)
     covariance = sandwich_covariance(deviation, jacobian, frf_problem.grid.weights)
     if covariance is None:
@@ -400,8 +401,8 @@ def representative_points(
     point_indices : ndarray of int, shape (m,), m <= count
         Indices of the chosen points, increasing.
     weights : ndarray, shape (m,)
-        Weight of each chosen point, including the weights of omitted points around it. The sum
-        is 1.
+        Weight of each chosen point, to which the weights of omitted points around it are added.
+        Their sum is 1.
     """
     n = measured_response.size
     if n <= point_count:
@@ -432,8 +433,8 @@ _START_GRID: Final[dict[str, tuple[float, ...]]] = {
     "gamma": tuple(math.log(size) for size in (1e-3, 1e-2, 1e-1, 1.0)),
     "lambda": (0.3, 0.8, 1.3, 1.8),
 }
-"""Values of the unknowns in the coarse grid. A coefficient is the logarithm of the damping relative
-to stiffness or inertia at a mode, about twice a damping ratio."""
+"""Values of the unknowns in the coarse grid. The unknown for a coefficient is the logarithm of the
+damping relative to stiffness or inertia at a mode, which is about twice a damping ratio."""
 _MAX_STARTS: Final = 8
 """Largest number of descents for each structure."""
 
@@ -504,7 +505,7 @@ def sandwich_covariance(
 
 
 def _correlated_bins(deviation: NDArray[np.complex128]) -> int:
-    """Return the number of correlated neighbouring bins: twice the lag of half the correlation."""
+    """Return the number of correlated neighbouring bins, from the lag of a correlation of 0.5."""
     half_correlation = 0.5 * np.vdot(deviation, deviation).real
     # Only a few lags are needed. FFTs would cost as much as the model at every point.
     for lag in range(1, deviation.size):

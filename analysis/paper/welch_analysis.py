@@ -102,7 +102,7 @@ class Peak:
 
 @dataclass(frozen=True, slots=True)
 class PeakDeviation:
-    """Deviation of one session's resonant peak from a model's: a term of Eqs. (31) and (32)."""
+    """Deviation between measured and modelled resonant peak: a term of Eqs. (31) and (32)."""
 
     frequency_rad_s: float
     """Magnitude of the difference in frequency, in rad/s."""
@@ -115,7 +115,7 @@ def resonant_peaks(
     response: NDArray[np.complex128],
     mode_hz: NDArray[np.float64],
 ) -> tuple[Peak | None, ...]:
-    """Return the resonant peaks of a response near given modes, without interpolation of bins.
+    """Return the resonant peak of a response near each given mode, without interpolation of bins.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ reduced by exp(-2 sigma T), rounding errors grow by exp(sigma T)."""
 
 
 def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
-    """Return the torque that the exact model predicts from the measured angle of a whole record.
+    """Return the torque that the exact beam model predicts from a record's measured angle.
 
     The beam is assumed at rest before the first sample, at the angle of the segment ``rest`` or
     else at the first angle. The angle is convolved with ``G(s) + J_tool s²`` and the difference of
@@ -237,7 +237,7 @@ def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
 def band_limited(
     signal_values: NDArray[np.float64], rate_hz: float, band_hz: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Return a signal limited to a frequency band, by a mask on its Fourier transform (no delay).
+    """Return a signal limited to a frequency band, without delay: its spectrum is 0 elsewhere.
 
     Parameters
     ----------
@@ -309,8 +309,8 @@ MODES: Final = 3
 """Number of modes whose peaks and poles are evaluated."""
 
 LARGEST_FREQUENCY_SHIFT: Final = 0.1
-"""Largest relative difference between the frequency of a fitted mode and the undamped beam's. A
-damping ratio of 0.4 causes such a difference."""
+"""Largest relative difference between the frequencies of a fitted mode and of the undamped beam's
+mode. A damping ratio of 0.4 causes such a difference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,7 +320,7 @@ class FittedModel:
     Attributes
     ----------
     fit : FrfFit
-        The fit.
+        Fit of the structure with the weighting.
     response : ndarray of complex, shape (n,)
         Response of the model, with the tool inertia, at the fitted bins, in N·m/rad.
     indices : FitIndices
@@ -329,8 +329,8 @@ class FittedModel:
         Modes of the beam without tool inertia, from its poles; empty if strong damping leaves a
         mode without a pole.
     followed : tuple of bool
-        Whether each mode vibrates at a frequency within `LARGEST_FREQUENCY_SHIFT` of the undamped
-        beam's. If not, the fit does not describe that resonance of the antenna.
+        Whether each mode's frequency is within `LARGEST_FREQUENCY_SHIFT` of the undamped beam's. If
+        not, the fit does not describe that resonance of the antenna.
     peaks : tuple of Peak or None
         Resonant peaks of `response`, one for each mode.
     deviations : tuple of PeakDeviation or None
@@ -361,8 +361,8 @@ class WelchAnalysis:
     response : FrequencyResponse
         Estimated response in the band, without the channels' delays.
     whole_record : FrequencyResponse
-        Ratio of the Fourier transforms of the whole record, for comparison, in the same band and
-        without the delays.
+        Response estimated as the ratio of torque's to angle's Fourier transform over the whole
+        record, for comparison; in the same band and without the delays.
     peaks : tuple of Peak or None
         Measured resonant peaks, one for each mode.
     models : tuple of FittedModel
@@ -476,7 +476,7 @@ def _evaluate_fit(
 
 
 def _vibrate_near_undamped(fitted_modes: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
-    """Return whether each mode vibrates near the frequency of the undamped beam's mode."""
+    """Return for each fitted mode whether its frequency is near the undamped beam's."""
     undamped_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
     return tuple(
         fitted_mode.damping_ratio < 1

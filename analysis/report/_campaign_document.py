@@ -26,7 +26,7 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
     campaign : Campaign
         Results of all sessions.
     with_paper : bool
-        Whether the paper's own numbers are included in the tables.
+        Whether the tables include the numbers that the reference paper publishes.
 
     Returns
     -------
@@ -34,10 +34,10 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
         ``headlines`` of each session and, with ``file`` null, of all sessions together;
         ``validity`` of the linear model for the least valid session; ``verdict`` on all sessions
         (null without whole-record estimates); ``files`` with the verdict on each; ``errors`` (files
-        that are left out, and why); ``is_one_specimen``, and the ``groups`` of sessions if they are
-        not of one specimen; ``trials`` of the validation: how many were requested, completed and
-        lost; ``fits`` and ``modes`` of single sessions; and the tables by the names of their CSV
-        files. All numbers are finite.
+        that are left out, with reasons); ``is_one_specimen``, and the ``groups`` of sessions if
+        they are not of one specimen; ``trials`` of the validation: how many were requested,
+        completed and lost; ``fits`` and ``modes`` of single sessions; and the tables by the names
+        of their CSV files. All numbers are finite.
     """
     leading_quantity = campaign.homogeneity.leading
     document_content: dict[str, Any] = finite(
@@ -105,7 +105,7 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
 
 
 def _fit_identity(session: SessionAnalysis, estimator: str, structure_name: str) -> dict[str, Any]:
-    """Return the keys that identify a session's fit: file, estimator, type and weighting."""
+    """Return the entries that identify a session's fit: file, estimator, type and weighting."""
     return {
         "file": str(session.path), "estimator": estimator, "type": structure_name,
         "weighting": None,
@@ -132,7 +132,7 @@ def _record_fit_json(session: SessionAnalysis, estimate: RecordEstimate) -> dict
 
 
 def _fit_values(fit: FrfFit | RecordFit, indices: FitIndices) -> dict[str, Any]:
-    """Return the keys with the results of a fit."""
+    """Return the entries of a fit's JSON object with parameters, accuracy and indices."""
     return {
         "parameters": fit.parameters,
         "std": fit.std_of_free_parameters,

@@ -15,6 +15,7 @@ from analysis.report._frf_figure import line_styles
 from analysis.report._paper_tables import welch_method_text
 from analysis.report._pooled_tables import exact_condition_text, session_count_text
 from analysis.report.table import NOT_REPORTED_MARK, unreported_parameters
+from analysis.statistics import NORMAL_95
 from rigd.spectral import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
@@ -34,8 +35,8 @@ _INDEX_PANELS: Final = (
     ("md", "(c) Maximum deviation", "MD (N·m/rad)"),
 )
 """Index, heading and axis label of each panel of the figure of indices."""
-_MARK_SIZE_PT: Final = 3.0
-"""Size of the marks of means and outliers, in points."""
+_MARKER_SIZE_PT: Final = 3.0
+"""Size of the markers for means and outliers, in points."""
 
 
 def index_figure(campaign: CampaignResult) -> Figure:
@@ -77,10 +78,10 @@ def index_figure(campaign: CampaignResult) -> Figure:
                 medianprops={"color": "#C00000", "linewidth": 1.2},
                 meanprops={
                     "marker": "o", "markerfacecolor": style.GREEN, "markeredgecolor": style.GREEN,
-                    "markersize": _MARK_SIZE_PT,
+                    "markersize": _MARKER_SIZE_PT,
                 },
                 flierprops={
-                    "marker": "x", "markeredgecolor": box_color, "markersize": _MARK_SIZE_PT,
+                    "marker": "x", "markeredgecolor": box_color, "markersize": _MARKER_SIZE_PT,
                 },
             )  # fmt: skip
         axes.set_yscale("log")
@@ -108,13 +109,13 @@ def index_figure(campaign: CampaignResult) -> Figure:
 _PANELS_PER_ROW: Final = 4
 """Number of panels in a row of the pooled figure."""
 INTERVAL_COLOR: Final = "#C3DCED"
-"""Colour of an interval: the blue of pooled lines, but light and opaque."""
+"""Colour of a pooled value's interval: opaque light blue, like the line of the value."""
 
 
 def pooled_figure(campaign: CampaignResult) -> Figure:
-    """Draw each session's estimate of every parameter over the pooled estimate, with intervals.
+    """Draw the sessions' estimates of each parameter, with the pooled value in the background.
 
-    The parameters are those of the reported pooled estimate.
+    All have 95 % intervals. The parameters are those of the reported pooled estimate.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -154,7 +155,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
             estimate.name,
             parameter,
             panel_axes,
-            reported=parameter.name not in not_reported,
+            is_reported=parameter.name not in not_reported,
         )
         if panel_number + _PANELS_PER_ROW >= len(estimate.parameters):
             panel_axes.set_xlabel("Session", labelpad=1)
@@ -175,12 +176,12 @@ def _draw_parameter_panel(
     parameter: PooledParameter,
     panel_axes: Axes,
     *,
-    reported: bool,
+    is_reported: bool,
 ) -> None:
-    """Draw the sessions' estimates of one parameter.
+    """Draw the sessions' estimates of one parameter, and the pooled value.
 
-    Behind them are the interval of the pooled value and the interval in which the next session's
-    estimate is expected.
+    In the background are the interval of the pooled value and the interval in which the next
+    session's estimate is expected. `is_reported`: whether the parameter is a reported result.
     """
     parameter_symbol, display_factor, _ = label(parameter.name)
     session_positions, session_values, half_widths = [], [], []
@@ -190,7 +191,7 @@ def _draw_parameter_panel(
             if estimate.name == structure_name and std is not None:
                 session_positions.append(session_number)
                 session_values.append(display_factor * estimate.fit.parameters[parameter.name])
-                half_widths.append(1.96 * display_factor * std)
+                half_widths.append(NORMAL_95 * display_factor * std)
     panel_axes.axhspan(
         *(display_factor * end for end in parameter.next_interval),
         color=style.SHADE_COLOR,
@@ -198,10 +199,12 @@ def _draw_parameter_panel(
     )
     panel_axes.axhspan(
         *(display_factor * end for end in parameter.interval),
-        color=INTERVAL_COLOR if reported else style.FAINT,
+        color=INTERVAL_COLOR if is_reported else style.LIGHT_GREY,
         zorder=0.6,
     )
-    session_color, pooled_color = (style.INK, style.BLUE) if reported else (style.GREY, style.GREY)
+    session_color, pooled_color = (
+        (style.INK, style.BLUE) if is_reported else (style.GREY, style.GREY)
+    )
     panel_axes.axhline(display_factor * parameter.value, color=pooled_color)
     panel_axes.errorbar(
         session_positions,
@@ -212,7 +215,7 @@ def _draw_parameter_panel(
         color=session_color,
         linewidth=0.8,
     )
-    mark_text = "" if reported else NOT_REPORTED_MARK
+    mark_text = "" if is_reported else NOT_REPORTED_MARK
     mark_text += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
     p_value_text = f"p = {probability(parameter.chance)}".replace("= <", "<")
     panel_axes.set_title(f"{parameter_symbol}{mark_text}   {p_value_text}")
@@ -238,7 +241,7 @@ _BEST_MODEL_STYLES: Final[tuple[dict[str, Any], ...]] = (
 
 
 def nominal_figure(campaign: CampaignResult) -> Figure:
-    """Draw the nominal models of every type over all measured responses (Figure 6)."""
+    """Draw the nominal models of each type on top of all measured responses (as in Figure 6)."""
     type_names = list(dict.fromkeys(model.structure for model in campaign.nominal))
     panel_columns = min(len(type_names), 4 if len(type_names) > 6 else 3)
     panel_rows = -(-len(type_names) // panel_columns)
@@ -271,7 +274,7 @@ def nominal_figure(campaign: CampaignResult) -> Figure:
 
 
 def best_figure(campaign: CampaignResult) -> Figure:
-    """Draw the two best nominal models over all measured responses (Figure 8)."""
+    """Draw the two best nominal models on top of all measured responses (as in Figure 8)."""
     drawn_models = best_models(campaign.nominal)
     width_in, height_in = 10.0, 6.6
     model_names = " and ".join(f"type {m.structure} ({m.weighting})" for m in drawn_models)
@@ -320,7 +323,7 @@ def _draw_responses(
     model_styles: Sequence[tuple[str, dict[str, Any]]],
     decimation_columns: int,
 ) -> dict[str, Line2D]:
-    """Draw all sessions' responses and the models over them; return the lines by label."""
+    """Draw the sessions' responses with models on top; return the lines by legend label."""
     line_by_label: dict[str, Line2D] = {}
     frequency_hz = campaign.sessions[0].frequency_hz
     for session in shown_sessions(campaign):
@@ -348,7 +351,7 @@ def _draw_responses(
 
 
 def shown_sessions(campaign: CampaignResult) -> list[SessionAnalysis]:
-    """Return the sessions to draw together, evenly spread over the campaign."""
+    """Return the sessions whose responses are drawn: if there are many, evenly spread ones."""
     last_index = len(campaign.sessions) - 1
     session_indices = np.unique(np.linspace(0, last_index, _MAX_DRAWN_SESSIONS).round().astype(int))
     return [campaign.sessions[session_index] for session_index in session_indices]
@@ -381,7 +384,7 @@ def draw_session(
 def _decimated_line(
     frequency_hz: NDArray[np.float64], curve_values: NDArray[np.float64], decimation_columns: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the points of a curve, decimated for a number of columns of a logarithmic axis."""
+    """Return a curve decimated to a number of pixel columns of a logarithmic axis."""
     return style.envelope(frequency_hz, curve_values, decimation_columns, logarithmic=True)
 
 
@@ -394,7 +397,7 @@ def _add_legend(figure: Figure, line_by_label: dict[str, Line2D]) -> None:
 
 
 def _db_limits(campaign: CampaignResult, models: Sequence[NominalModel]) -> tuple[float, float]:
-    """Return magnitude limits in dB that contain all sessions' responses and the models' peaks."""
+    """Return axis limits in dB that contain all sessions' responses and the models' peaks."""
     measured_frf = [session.response for session in campaign.sessions]
     return style.db_limits(measured_frf, [model.response for model in models], headroom_db=3.0)
 
@@ -404,7 +407,7 @@ _ROW_HEIGHT_IN: Final = 0.27
 
 
 def validation_figure(campaign: CampaignResult) -> Figure:
-    """Draw the prediction error of every left-out session by model, the best model at the top."""
+    """Draw each model's errors in predicting left-out sessions, the best model at the top."""
     from matplotlib.lines import Line2D
 
     ranked_models = group_errors_by_model(campaign.validation)

@@ -1,4 +1,4 @@
-"""Tables of a campaign for terminal, page, CSV and JSON: which are shown, and lists of sessions."""
+"""Tables of a campaign: the tables of each output, and those with a row for each session."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
-    """Return the tables of the whole records for terminal and page, the most important first."""
+    """Return the tables of the whole-record fits for terminal and page, in their order there."""
     homogeneity = campaign.homogeneity
     estimates = likely_estimates(campaign)
     scatter_tables = [homogeneity_table(campaign)] if homogeneity.quantities else []
@@ -63,7 +63,7 @@ def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 
 def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Table]:
-    """Return the tables that are written to files, by name, except empty ones."""
+    """Return the tables that are written to files, except empty ones, by table name."""
     candidate_tables = (
         *paper_tables(campaign, with_paper=with_paper),
         session_list_table(campaign),
@@ -84,7 +84,7 @@ def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[st
 
 
 def session_list_table(campaign: CampaignResult) -> Table:
-    """Return the table of all files with the metadata that they state, excluded files last."""
+    """Return the table of all files with the metadata that each states, excluded files last."""
 
     def text_cell(text: str) -> Cell:
         return Cell(text, text or ABSENT_TEXT)
@@ -133,7 +133,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
 
 
 def _added_column(metadata_name: str) -> Column:
-    """Return the column of metadata that users added, with the unit from its name."""
+    """Return the table column of a metadata key that users added, with the unit in its name."""
     unit_symbol = unit_of(metadata_name)
     column_heading = metadata_name.removesuffix(suffix_of(metadata_name)).replace("_", " ")
     return Column(
@@ -144,7 +144,7 @@ def _added_column(metadata_name: str) -> Column:
 
 
 def _added_cell(metadata_value: float | str | None) -> Cell:
-    """Return the cell of a metadata value that users added; a dash if there is none."""
+    """Return the table cell of a metadata value that users added; a dash if there is none."""
     if metadata_value is None:
         return Cell(None, ABSENT_TEXT)
     return Cell(
@@ -164,11 +164,11 @@ def sessions_welch_table(campaign: CampaignResult) -> Table:
             "at_bounds": " ".join(model.fit.at_bounds),
             **{
                 f"nominal_{index_name}": index_value
-                for index_name, index_value in asdict(nominal.indices[session_index]).items()
+                for index_name, index_value in asdict(nominal_model.indices[session_index]).items()
             },
         }
         for session_index, session in enumerate(campaign.sessions)
-        for model, nominal in zip(session.welch_models, campaign.nominal, strict=True)
+        for model, nominal_model in zip(session.welch_models, campaign.nominal, strict=True)
     ]
     return _file_only_table("sessions_welch", table_rows)
 
@@ -204,9 +204,9 @@ def _file_only_table(table_name: str, table_rows: list[dict[str, Any]]) -> Table
 
 
 def validation_table(campaign: CampaignResult) -> Table:
-    """Return the table of errors when each session is predicted from the others.
+    """Return the table of errors with which each session is predicted from the other sessions.
 
-    The trials that failed follow.
+    Sessions that could not be predicted are the last rows.
     """
     table_rows: list[dict[str, Any]] = [
         {

@@ -41,16 +41,16 @@ if TYPE_CHECKING:
     IndexValues = dict[str, float | None]
 
 NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
-"""Indices of a fit for which there is no measured response to compare with."""
+"""Indices MSE, WMSE and MD of a fit if there is no measured response to compare it with."""
 
 
 def indices_of_record_fit(
     fit: RecordFit, welch_analysis: WelchAnalysis
 ) -> tuple[IndexValues, IndexValues]:
-    """Return the errors MSE, WMSE and MD of a whole-record fit in the band of the Welch fits.
+    """Return MSE, WMSE and MD of a whole-record fit against two measured responses.
 
-    The first errors are against Welch's response, the second against the ratio of the whole
-    record's transforms.
+    These are Welch's estimate and the ratio of the whole record's Fourier transforms, in the band
+    of the Welch fits.
 
     Parameters
     ----------
@@ -62,9 +62,8 @@ def indices_of_record_fit(
     Returns
     -------
     welch, whole_record : dict
-        ``mse`` and ``wmse`` in (N·m/rad)², ``md`` in N·m/rad. The first are the distance to Welch's
-        estimate, on the bins of the paper's fits; the second are the distance to the empirical
-        transfer function estimate.
+        Distances of the fit from Welch's estimate, and from the ratio of transforms: ``mse`` and
+        ``wmse`` in (N·m/rad)², ``md`` in N·m/rad.
     """
     record = welch_analysis.record
     # The delay stated in the file has been removed from the responses.
@@ -132,15 +131,14 @@ def record_entries(
     Returns
     -------
     dict
-        ``headline``: what the record says, with flags; ``fits`` and ``modes``: lists of objects as
-        the document has them of the Welch fits,
-        with ``estimator`` "record"; ``records``: one object with verdict, noise, hum, and response
-        and loss factors with their 95 % bands. Numbers may be numpy's or
-        not finite, as `finite` takes them. What is not reported is flagged, not
-        left out: ``withheld`` of a fit names its parameters that the data do not support,
-        ``visible`` of a mode says whether the record shows it. ``indices`` are against Welch's
-        response, as those of the paper's fits, ``indices_whole_record`` against the ratio of the
-        whole record's transforms.
+        ``headline``: reported estimates with flags. ``fits`` and ``modes``: lists of objects like
+        those of the Welch fits, with ``estimator`` "record". ``records``: one object with verdict,
+        noise, hum, and response and loss factors with their 95 % bands. Numbers may have NumPy's
+        types or be infinite or NaN (see `finite`). Values that are not reported are flagged instead
+        of omitted: ``withheld`` of a fit names the parameters that the data do not support,
+        ``visible`` of a mode states whether the record shows it. ``indices`` are distances from
+        Welch's response, as for the paper's fits, and ``indices_whole_record`` are distances from
+        the ratio of the whole record's transforms.
     """
     fit_keys = [
         (
@@ -263,7 +261,7 @@ def _added_structure_json(structure_fit: StructureFit, whole_record: WholeRecord
 
 
 def _pivot_loss_factor_json(pivot_loss_factor: PivotLossFactor | None) -> dict[str, Any] | None:
-    """Return the size of a damping (loss factor or coefficient) for JSON; None if unknown."""
+    """Return the loss factor (or coefficient) of a damping for JSON; None if unknown."""
     return None if pivot_loss_factor is None else asdict(pivot_loss_factor)
 
 
@@ -301,7 +299,7 @@ def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
 
 
 def _loss_factor_json(loss_factor: LossFactor | None) -> dict[str, list[float]] | None:
-    """Return a loss factor over frequency and its 95 % band as lists; None without one."""
+    """Return a loss factor over frequency with its 95 % band as lists; None for no loss factor."""
     if loss_factor is None:
         return None
     lower_limit, upper_limit = loss_factor.limits()
@@ -320,7 +318,7 @@ def document(
     Parameters
     ----------
     record_results : sequence of RecordResult
-        Results of each file. The entries of whole-record fits follow those of the Welch fits.
+        Results of each file.
     error_messages : mapping of str to str, optional
         Message for each file that could not be analysed.
 
@@ -329,8 +327,9 @@ def document(
     dict
         Lists of objects that name their file: ``headlines`` (result of each whole record, with
         flags), ``files`` (properties of the record, validity of the linear model, and settings of
-        the Welch method), ``fits``, ``modes``, ``peaks``, ``records`` and ``errors``; and
-        ``versions``. All numbers are finite.
+        the Welch method), ``fits`` and ``modes`` (first those of the Welch method, then those of
+        the whole records), ``peaks``, ``records`` and ``errors``; and ``versions``. All numbers are
+        finite.
     """
     record_entries_by_file = [
         record_entries(result.whole, result.welch) for result in record_results if result.whole
@@ -410,7 +409,7 @@ def document_text(document_content: Mapping[str, Any], *, ascii_only: bool = Fal
     document_content : mapping
         Document, without NaN and infinite numbers.
     ascii_only : bool
-        Whether other characters are escaped, for a stream of unknown encoding.
+        Whether characters outside ASCII are escaped, for a stream of unknown encoding.
     """
     return json.dumps(document_content, indent=2, ensure_ascii=ascii_only, allow_nan=False) + "\n"
 
@@ -520,7 +519,7 @@ def _welch_modes_json(analysis: WelchAnalysis, model: FittedModel) -> list[dict[
 
 
 def _fit_identity(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
-    """Return the keys that identify a Welch fit: file, estimator, type and weighting."""
+    """Return the entries that identify a Welch fit: file, estimator, type and weighting."""
     return {
         "file": str(analysis.record.path),
         "estimator": "welch",

@@ -105,21 +105,18 @@ _TORQUE_OVER_ANGLE: Final = _fraction(
     + _ARGUMENT_S,
     _subscript(_variable("Θ", r"\Theta"), _variable("m")) + _ARGUMENT_S,
 )
-"""Formula of the coupling torque over the motor angle, both as Laplace transforms."""
+"""Formula of the coupling torque divided by the motor angle, both as Laplace transforms."""
 
 
 def _damping_term(
     coefficient_symbol: Formula, order_symbol: Formula, *, is_first_order: bool
 ) -> Formula:
-    """Return a damping term: coefficient times s, or times s to a fractional power."""
+    """Return the formula of a damping term: coefficient times s or a fractional power of s."""
     return coefficient_symbol + (_S_SYMBOL if is_first_order else _power(_S_SYMBOL, order_symbol))
 
 
 def _elastic_factor(structure: Structure) -> Formula | None:
-    """Return ``1 + zeta s^alpha`` of a damping structure as a formula.
-
-    It is None without internal damping.
-    """
+    """Return the formula ``1 + zeta s^alpha``, or None for a structure without internal damping."""
     if not structure.internal:
         return None
     return _join(
@@ -130,7 +127,7 @@ def _elastic_factor(structure: Structure) -> Formula | None:
 
 
 def _inertial_terms(structure: Structure) -> Formula:
-    """Return ``rho/EI s^2 + gamma s^lambda`` with the terms of the structure."""
+    """Return the formula ``rho/EI s^2 + gamma s^lambda`` with the structure's external damping."""
     density_ratio = _fraction(_variable("ρ", r"\rho"), _EI_SYMBOLS)
     # In display style, although the ratio is inside a fraction.
     ratio_mathml = f'<mstyle displaystyle="true">{density_ratio.mathml}</mstyle>'
@@ -147,9 +144,9 @@ def _inertial_terms(structure: Structure) -> Formula:
 
 
 def _beam_equations(structure: Structure) -> tuple[Formula, Formula]:
-    """Return the equation of the beam's response and that of the wave number beta in it.
+    """Return the equations of the beam's response and of the wave number beta in the response.
 
-    The first is Eq. 25 of the reference paper.
+    The first equation is Eq. 25 of the reference paper.
     """
     elastic_factor, z = _elastic_factor(structure), _BETA_SYMBOL + _L_SYMBOL
     sin, cos, sinh, cosh = (
@@ -183,7 +180,7 @@ def _beam_equations(structure: Structure) -> tuple[Formula, Formula]:
 
 
 def _measured_equation(fit: RecordFit) -> Formula:
-    """Return the equation of the measured torque over angle: beam, tool inertia and channels."""
+    """Return the equation of measured torque divided by angle: beam, tool inertia and channels."""
     beam_response = _G_SYMBOL + _ARGUMENT_S
     parameter_names = fit.parameters
     beam_and_tool = _join(beam_response, _PLUS_SIGN, _variable("J"), _power(_S_SYMBOL, _NUMBER_TWO))
@@ -242,13 +239,13 @@ def _conjugate_variable(variable_letter: str) -> Formula:
 
 
 def equations(whole_record: WholeRecord) -> tuple[Formula, ...]:
-    """Return the equations of a record's models: of the modal model, if there is one, and the beam.
+    """Return the equations of a record's models: modal model, if there is one, and beam.
 
     Returns
     -------
     tuple of Formula
-        Modal model, if there is one; measured response of a beam; Eq. 25 of the reference paper,
-        and its beta. They contain the terms of the structure.
+        Modal model, if there is one; measured response of a beam; Eq. 25 of the reference paper;
+        beta in Eq. 25. They contain only the damping terms of the reported structure.
     """
     modal_equations = () if whole_record.headline.modal is None else (_modal_equation(),)
     return (
@@ -280,7 +277,7 @@ _EFFECT_DEFINITIONS: Final = {
 
 
 def definitions(whole_record: WholeRecord) -> str:
-    """Return a text that defines the symbols of the equations that no table explains."""
+    """Return a text that defines the symbols of the equations that are not in any table."""
     definition_sentences = [
         "On the left coupling torque over motor angle, as Laplace transforms",
         f"L = {whole_record.record.beam.length_m:g} m is the length from the axis to the tip",
@@ -301,7 +298,7 @@ def definitions(whole_record: WholeRecord) -> str:
 
 
 def types_table(whole_record: WholeRecord) -> Table:
-    """Return the table of the damping types with their internal and external terms."""
+    """Return the table of damping types I to VII with their internal and external terms."""
     order_adjectives = {False: "fractional", True: "integer"}
 
     def rows() -> Iterator[tuple[str, str, str, str]]:

@@ -40,7 +40,7 @@ _AT_LIMIT_NOTE: Final = "* at the limit of the search range: not determined by t
 def structures_table(whole_record: WholeRecord) -> Table:
     """Return the table of all whole-record fits, with one row for each damping structure.
 
-    Fractional orders that the data do not determine are marked.
+    Fractional orders that the data do not determine have a mark (†).
     """
     lowest_cost = min(fit.cost for fit in whole_record.fits.values())
     unsupported_orders = whole_record.unsupported_orders
@@ -102,7 +102,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
 
 
 def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
-    """Return the table of the fits of packages' structures; nothing without such fits."""
+    """Return the table of the fits of structures from installed packages; empty without any."""
     if not whole_record.added:
         return ()
     rows: list[tuple[Entry, ...]] = [
@@ -150,7 +150,7 @@ def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
 
 
 def _marked_row(whole_record: WholeRecord) -> str:
-    """Return what the highlighted row of the table of fits contains, as part of a note."""
+    """Return the part of a note that states which fit the highlighted row of the table shows."""
     return (
         "the one reported"
         if whole_record.headline.exact is None
@@ -159,12 +159,12 @@ def _marked_row(whole_record: WholeRecord) -> str:
 
 
 def _hidden_cell(cell: Cell) -> Cell:
-    """Return a cell that is displayed as a dash, and has its number in the CSV file."""
+    """Return a cell that is displayed as a dash, but whose number is written to the CSV file."""
     return cell if cell.value is None else replace(cell, text=ABSENT_TEXT, doubtful=True)
 
 
 def _damping_columns() -> list[Column]:
-    """Return the columns of value and standard deviation of each damping parameter."""
+    """Return two columns for each damping parameter: its value and its standard deviation."""
     return [
         value_column
         for parameter_name in DAMPING_PARAMETERS
@@ -185,7 +185,7 @@ def _damping_cells(
 ) -> list[Cell]:
     """Return the cells of the damping parameters' values and standard deviations.
 
-    Fixed values have no standard deviation. Parameters that the structure does not have are dashes.
+    Fixed values have no standard deviation. Parameters that the structure lacks are dashes.
     """
     not_reported = unreported_parameters(structure, unsupported_orders)
     parameter_cells: list[Cell] = []
@@ -234,14 +234,14 @@ _INDEX_UNITS: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
 
 
 def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str] = ()) -> Table:
-    """Return the table of every Welch fit's parameters and indices.
+    """Return the table of the parameters and indices of all Welch fits of a record.
 
     Parameters
     ----------
     analysis : WelchAnalysis
         Welch fits of a record.
     unsupported_orders : collection of str
-        Orders that the whole record does not support. They are marked.
+        Orders of damping that the whole record does not support. They have a mark in the table.
     """
     fits = [model.fit for model in analysis.models]
     return Table.from_rows(
@@ -278,7 +278,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
 
 
 def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
-    """Return the table of each Welch fit's mean and standard deviation over several files."""
+    """Return the table of the Welch fits' means and standard deviations over several files."""
     table_rows: list[tuple[Entry, ...]] = []
     for same_models in zip(*(welch_analysis.models for welch_analysis in analyses), strict=True):
         model_fits = [model.fit for model in same_models]
@@ -376,13 +376,13 @@ def peaks_table(analysis: WelchAnalysis) -> Table:
 
 
 _FAR_MODE_MARK: Final = "‡"
-"""Mark of modes that are far from the undamped beam's."""
+"""Symbol after a mode whose frequency is far from the undamped beam's."""
 
 
 def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     """Return the table of modes from each Welch fit's poles; None if no fit has modes.
 
-    A mode far from that of the undamped beam is marked. An overdamped mode is a dash.
+    A mode far from the undamped beam's has a mark (‡). An overdamped mode is shown as a dash.
     """
     fitted_models = analysis.models
     max_modes = max((len(fitted_model.modes) for fitted_model in fitted_models), default=0)

@@ -33,11 +33,11 @@ _FURTHER_LINES: Final[tuple[dict[str, Any], ...]] = (
     {"color": style.PURPLE, "linestyle": (0, (5, 1.5, 1, 1.5))},
     {"color": style.ORANGE, "linestyle": "-"},
 )
-"""Colours and dashes of the models with further weightings."""
+"""Colours and dashes of models with weightings other than the paper's two."""
 
 
 def frf_figure(analysis: WelchAnalysis) -> Figure:
-    """Draw the measured frequency response, those of all fitted models, and the coherence."""
+    """Draw the measured frequency response, the responses of all models, and the coherence."""
     settings = analysis.settings
     type_names = settings.types
     panel_columns = min(len(type_names), 4 if len(type_names) > 6 else 3)
@@ -116,7 +116,7 @@ def _draw_type_panel(
         type_curves.append(
             (
                 f"measured, {ESTIMATOR_NAMES['fft']}", whole_record.frequency_hz,
-                whole_record.response, {"color": style.FAINT, "linewidth": 0.6},
+                whole_record.response, {"color": style.LIGHT_GREY, "linewidth": 0.6},
             )
         )  # fmt: skip
     measured_frf = analysis.response
@@ -171,7 +171,7 @@ def _draw_type_panel(
 def _write_scores(
     panel_axes: Axes, models: list[FittedModel], style_by_weighting: dict[str, dict[str, Any]]
 ) -> None:
-    """Write each model's mean square errors (MSE, WMSE) into the panel, in its line's colour."""
+    """Write each model's errors (MSE, WMSE) into the panel, in the colour of the model's line."""
     for line_number, model in enumerate(models):
         panel_axes.annotate(
             f"MSE {model.indices.mse:.3g}  WMSE {model.indices.wmse:.3g}",

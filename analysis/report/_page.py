@@ -18,9 +18,9 @@ Facts = tuple[str, list[tuple[str, str]]]
 
 
 def page(template_name: str, **template_content: Any) -> str:  # noqa: ANN401 - what the template asks for
-    """Return a template of this package as HTML, filled with content.
+    """Return the HTML that a template of this package and its content give.
 
-    It raises an error if the template uses a name that is not in the content.
+    Raise an error if the template uses a name that is not in the content.
     """
     return _environment().get_template(template_name).render(template_content)
 
@@ -39,7 +39,7 @@ def _environment() -> jinja2.Environment:
 
 
 def versions(made_at: datetime) -> Facts:
-    """Return a table of (name, text): date of the report and versions of the programs."""
+    """Return the date of the report and the versions of the programs, as a group of facts."""
     return (
         "Versions",
         [

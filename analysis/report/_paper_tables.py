@@ -46,8 +46,8 @@ FIT_NAME_COLUMNS: Final = (
 def paper_tables(campaign: CampaignResult, *, with_paper: bool = False) -> tuple[Table, ...]:
     """Return the reference paper's tables with the numbers of the campaign's Welch fits.
 
-    There are none without Welch fits. With `with_paper` the tables also contain the paper's own
-    numbers in parentheses.
+    The tuple is empty if the campaign has no Welch fits. With `with_paper` the tables also contain
+    the numbers that the paper publishes, in parentheses.
     """
     if not campaign.nominal:
         return ()
@@ -59,7 +59,7 @@ def paper_tables(campaign: CampaignResult, *, with_paper: bool = False) -> tuple
 
 
 def welch_method_text(campaign: CampaignResult) -> str:
-    """Return how the sessions' frequency responses were estimated, as text."""
+    """Return a text that states how the sessions' frequency responses were estimated."""
     settings = campaign.settings
     segment_counts = [session.segments for session in campaign.sessions]
     min_segments, max_segments = min(segment_counts), max(segment_counts)
@@ -74,7 +74,7 @@ _STATISTICS: Final = ("mean", "median", "std", "min", "max")
 """Statistics of a parameter over the sessions, as in Table 3."""
 _TABLE_3_HEADINGS: Final = {"zeta": ("ζ (10⁻⁴ s^α)", 1e4), "alpha": ("α", 1.0),
                    "gamma": ("γ (10⁻¹ s^λ/m⁴)", 10.0), "lambda": ("λ", 1.0)}  # fmt: skip
-"""Heading and factor of each parameter in Table 3, with the paper's powers of ten."""
+"""Heading and display factor (a power of ten, as in the paper) of each parameter in Table 3."""
 _AT_LIMIT_NOTE: Final = "*n: at the limit of the search range in n sessions."
 """Note on estimates at the limit of the search range."""
 _PARENTHESES_NOTE: Final = "In parentheses: the paper's."
@@ -146,7 +146,7 @@ def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
 
 
 _PEAK_HEADINGS: Final = {"frequency_rad_s": "ω{} (rad/s)", "magnitude_db": "M{} (dB)"}
-"""Headings of the deviations of a resonance peak, with the number of the mode."""
+"""Headings of a resonance peak's deviations, with a placeholder for the mode's number."""
 
 
 def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
@@ -210,7 +210,7 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
 
 
 _TABLE_5_FACTORS: Final = {"alpha": 1.0, "zeta": 1e5, "lambda": 1.0, "gamma": 1e2}
-"""Factor of each parameter in Table 5, with the paper's powers of ten."""
+"""Display factor of each parameter in Table 5: a power of ten, as in the paper."""
 
 
 def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
@@ -273,7 +273,7 @@ _INDEX_HEADINGS: Final = {
 
 
 def indices_table(campaign: CampaignResult) -> Table:
-    """Return the table of the nominal models' distances from the sessions, as in Figure 7."""
+    """Return the table of the distances between nominal models and sessions, as in Figure 7."""
     table_rows: list[Row] = []
     for model in campaign.nominal:
         row: dict[str, Entry] = {"type": model.structure, "weighting": model.weighting}
@@ -388,7 +388,7 @@ def _cells_with_paper_values(
 
 
 def _paper_entries(paper_values: Mapping[str, float | None]) -> dict[str, Entry]:
-    """Return the paper's numbers as table entries for files; their keys begin with ``paper_``."""
+    """Return the paper's numbers as entries of a row for files, with keys ``paper_…``."""
     return {f"paper_{value_name}": paper_value for value_name, paper_value in paper_values.items()}
 
 
@@ -409,7 +409,7 @@ class PaperStatistics:
 
 @cache
 def published_table3() -> Mapping[tuple[str, str, str], PaperStatistics]:
-    """Return the paper's Table 3, by type, weighting and parameter."""
+    """Return the statistics in the paper's Table 3 by type, weighting and parameter."""
     return {
         (row["type"], row["weighting"], row["parameter"]): PaperStatistics(
             **{
@@ -423,7 +423,9 @@ def published_table3() -> Mapping[tuple[str, str, str], PaperStatistics]:
 
 @cache
 def published_table4() -> Mapping[tuple[str, str, str, int], float]:
-    """Return the paper's Table 4, by type, weighting, quantity and mode.
+    """Return the mean deviations of the peaks in the paper's Table 4.
+
+    The key is (name of the model type, weighting, quantity, number of the mode).
 
     The names of the quantities are those of `MeanPeakDeviation`.
     """
@@ -449,6 +451,6 @@ def published_wmse() -> Mapping[tuple[str, str], float]:
 
 
 def _read_data_rows(file_name: str) -> list[dict[str, str]]:
-    """Return the rows of a data file of this package, by column name."""
+    """Return the rows of a CSV file of this package, each as a dict by column name."""
     file_text = files("analysis.report").joinpath("data", file_name).read_text(encoding="utf-8")
     return list(csv.DictReader(file_text.splitlines()))

@@ -47,7 +47,7 @@ _AXIS_END_RATIO: Final = 1.6
 
 @dataclass(frozen=True, slots=True)
 class _PooledFit:
-    """Pooled estimate of a campaign in the form of an `Estimate` of `analysis.report.bands`."""
+    """Pooled estimate of a campaign in the form of a `FittedPlant`, from which bands are drawn."""
 
     structure: Structure
     plant: Plant
@@ -57,7 +57,7 @@ class _PooledFit:
 
     @classmethod
     def from_campaign(cls, campaign: CampaignResult) -> _PooledFit | None:
-        """Return the pooled estimate whose parameters a campaign reports; None without one."""
+        """Return the pooled estimate whose parameters a campaign reports; None if there is none."""
         modal_result, pooled_estimate = campaign.modal, campaign.headline
         tolerant_estimate = modal_result.tolerant if modal_result else None
         if tolerant_estimate is None:
@@ -74,10 +74,9 @@ class _PooledFit:
 
     @classmethod
     def from_estimate(cls, pooled_estimate: PooledEstimate) -> _PooledFit:
-        """Return a pooled estimate with an enlarged covariance.
+        """Return a pooled estimate whose covariance is enlarged for the number of sessions.
 
-        With it, intervals of 1.96 standard deviations are as wide as those of Student's t for the
-        number of sessions.
+        Intervals of 1.96 standard deviations are then as wide as those of Student's t distribution.
         """
         # Bands are 1.96 standard deviations wide, but Student's t of a few sessions is larger.
         interval_ratio = student_t_quantile(0.95, pooled_estimate.sessions - 1) / NORMAL_95
@@ -197,7 +196,7 @@ def _session_estimates_of_mode(
 def _draw_loss_factor(
     axes: Axes, pooled_modes: Sequence[PooledMode], fit: _PooledFit | None
 ) -> None:
-    """Draw half the pooled loss factor, which is the damping ratio, between first and last mode."""
+    """Draw the damping ratio (half the pooled loss factor) between the first and the last mode."""
     if len(pooled_modes) < 2 or fit is None:
         return
     frequency_hz = np.geomspace(
@@ -223,7 +222,7 @@ def _draw_pooled_mode(axes: Axes, mode: PooledMode, session_count: int) -> None:
 def _draw_enlarged_mode(
     axes: Axes, mode: PooledMode, session_modes: Sequence[ModeEstimate], session_count: int
 ) -> None:
-    """Draw one mode of every session with its intervals, over the pooled 95 % intervals."""
+    """Draw a mode's estimates from all sessions on top of the pooled 95 % intervals."""
     from matplotlib.patches import Rectangle
 
     t = student_t_quantile(0.95, session_count - 1)
@@ -257,7 +256,7 @@ def _draw_enlarged_mode(
 
 
 def response_figure(campaign: CampaignResult) -> Figure:
-    """Draw the pooled estimate's frequency response with its 95 % band over the sessions'.
+    """Draw the pooled frequency response and its 95 % band on top of the sessions' responses.
 
     The sessions' responses are the measured ones if Welch's method is applicable to the sessions,
     otherwise those of the sessions' own whole-record fits.
@@ -348,7 +347,7 @@ def _draw_sessions(
     phase_axes: Axes,
     grid_hz: NDArray[np.float64],
 ) -> float:
-    """Draw the response of each session; return the lower limit of their magnitudes in dB."""
+    """Draw the sessions' responses; return the axis limit in dB below all their magnitudes."""
     from rigd.beam import ResponseGrid
 
     lowest_db = np.inf

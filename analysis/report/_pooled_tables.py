@@ -42,13 +42,13 @@ _INERTIA_COLUMNS: Final = (
 NOT_POOLED_NOTE: Final = (
     "In grey: not pooled, as fewer than two sessions determine its damping or not all were fitted."
 )
-"""Note on the structures that are not pooled, for the table of structures."""
+"""Note below the table of structures on those that are not pooled."""
 
 
 def structures_table(campaign: CampaignResult) -> Table:
-    """Return the table of all structures' joint fits to all sessions.
+    """Return the table of all structures' joint fits to all sessions, by increasing BIC.
 
-    Pooled structures come first. The lowest BIC is first in either group.
+    Structures that are not pooled follow the pooled ones.
     """
 
     def row(ranked_structure: RankedStructure) -> Row:
@@ -91,9 +91,9 @@ def structures_table(campaign: CampaignResult) -> Table:
 
 
 def likely_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
-    """Return the reported pooled estimate, and that of the structure with the lowest BIC.
+    """Return the reported pooled estimate, then the one of the structure with the lowest BIC.
 
-    BIC is the Bayesian information criterion. There is one estimate if both are the same.
+    The list has one element if both are the same, and none without a pooled estimate.
     """
     estimates_by_name = {
         estimate.name: estimate
@@ -104,7 +104,7 @@ def likely_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
 
 
 def session_count_text(estimate: PooledEstimate, campaign: CampaignResult) -> str:
-    """Return the number of sessions in an estimate as text, such as "7 of 10 sessions"."""
+    """Return how many sessions an estimate is pooled from, such as "7 of 10 sessions"."""
     session_total = len(campaign.sessions)
     return (
         f"{estimate.sessions}{f' of {session_total}' if estimate.sessions < session_total else ''}"
@@ -113,9 +113,9 @@ def session_count_text(estimate: PooledEstimate, campaign: CampaignResult) -> st
 
 
 def exact_condition_text(campaign: CampaignResult) -> str:
-    """Return the words for the condition that the beam is exactly uniform.
+    """Return a text for captions that the beam is assumed exactly uniform.
 
-    They are empty if the pooled estimate does not depend on it.
+    It is empty if the pooled estimate does not depend on this assumption.
     """
     return f", {EXACTLY_UNIFORM_CONDITION}" if campaign.modal and campaign.modal.leads else ""
 
@@ -223,7 +223,8 @@ def _pooled_row(
         "bic": pooled_estimate.bic,
         "misfit": pooled_estimate.misfit,
         "parameter": Cell(
-            parameter.name, with_mark(symbol_with_unit(parameter.name), parameter.name, homogeneity)
+            parameter.name,
+            with_mixture_mark(symbol_with_unit(parameter.name), parameter.name, homogeneity),
         ),
         "value": value_cell,
         "std": std_cell,
@@ -240,10 +241,10 @@ def _pooled_row(
 
 
 def tolerance_table(campaign: CampaignResult) -> Table:
-    """Return the table of a campaign's parameters if the beam is uniform within a tolerance.
+    """Return the table of a campaign's parameters for a beam that is uniform within a tolerance.
 
-    It also contains the parameters that an exactly uniform beam would have. It has no rows if no
-    tolerance of the beam's geometry is stated.
+    It also contains the parameters of an exactly uniform beam. It has no rows if no tolerance of
+    the beam's geometry is stated.
     """
     modal_result, reported_numbers = campaign.modal, campaign_estimates(campaign)
     tolerant_estimate = modal_result.tolerant if modal_result else None
@@ -276,7 +277,7 @@ def tolerance_table(campaign: CampaignResult) -> Table:
             {
                 "parameter": Cell(
                     parameter_name,
-                    with_mark(
+                    with_mixture_mark(
                         symbol_with_unit(parameter_name), parameter_name, campaign.homogeneity
                     ),
                 ),
@@ -362,7 +363,7 @@ def modes_table(campaign: CampaignResult) -> Table:
             mean_value, mode_cells[std] = estimate_cells(
                 (getattr(pooled_mode, quantity_key), std_value), std_value, display_factor
             )
-            value_text = with_mark(
+            value_text = with_mixture_mark(
                 mean_value.text, f"{quantity_key}_{pooled_mode.number}", homogeneity
             )
             mode_cells[quantity_key] = replace(mean_value, text=value_text)
@@ -409,7 +410,7 @@ def modes_table(campaign: CampaignResult) -> Table:
 
 
 def specimens_table(campaign: CampaignResult) -> Table:
-    """Return the table of specimens as the files state them, the campaign's first."""
+    """Return the table of the specimens that the files state, the campaign's own as first row."""
     stated_specimens = campaign.homogeneity.specimens
     return Table(
         "specimens",
@@ -437,7 +438,7 @@ def specimens_table(campaign: CampaignResult) -> Table:
 
 
 def homogeneity_table(campaign: CampaignResult) -> Table:
-    """Return the table of each quantity's scatter between sessions: of modes and parameters."""
+    """Return the table of the scatter between sessions of modal quantities and parameters."""
     homogeneity = campaign.homogeneity
 
     def row(scatter: Heterogeneity) -> Row:
@@ -445,7 +446,9 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
         return {
             "quantity": Cell(
                 scatter.quantity,
-                with_mark(symbol_with_unit(scatter.quantity), scatter.quantity, homogeneity),
+                with_mixture_mark(
+                    symbol_with_unit(scatter.quantity), scatter.quantity, homogeneity
+                ),
             ),
             "sessions": len(scatter.values),
             "mean": number_cell(scatter.mean, f".{_decimals_of_scatter(scatter)}f", display_factor),
@@ -479,10 +482,10 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
 
 
 def _decimals_of_scatter(scatter: Heterogeneity) -> int:
-    """Return the number of decimals for the mean of a quantity over the sessions.
+    """Return the number of decimals with which a quantity's mean over the sessions is shown.
 
-    It follows from the larger one of the scatter between the sessions and their smallest standard
-    deviation.
+    It follows from the scatter between the sessions, or from the smallest standard deviation of a
+    session if that is larger.
     """
     _, display_factor, _ = label(scatter.quantity)
     shown_std = display_factor * max(scatter.between_std, min(std for _, _, std in scatter.values))
@@ -494,9 +497,9 @@ def p_value_cell(p_value: float) -> Cell:
     return replace(number_cell(p_value), text=probability(p_value))
 
 
-def with_mark(cell_text: str, quantity_name: str, homogeneity: Homogeneity) -> str:
-    """Return a text, with a symbol if the sessions form groups with different values.
+def with_mixture_mark(cell_text: str, quantity_name: str, homogeneity: Homogeneity) -> str:
+    """Return a quantity's text, with a mark if the sessions form groups with different values.
 
-    `quantity_name` is the name of the quantity in which the groups differ.
+    `quantity_name` is the name of the quantity.
     """
     return f"{cell_text} {MIXTURE_MARK}" if homogeneity.is_mixed(quantity_name) else cell_text

@@ -23,7 +23,7 @@ from analysis.decimation import fast_length
 from analysis.report import _style as style
 from analysis.report._shown_model import ShownModel
 from analysis.report._style import Illustration
-from analysis.report._uniformity import UNIFORMITY, uniformity_description, uniformity_figure
+from analysis.report._uniformity import UNIFORMITY_FIGURE, uniformity_description, uniformity_figure
 from analysis.report.bands import dense_grid, loss_estimate, loss_factors, supported_band_hz
 from analysis.statistics import KOLMOGOROV_95, NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 _LABEL_HEIGHT_IN: Final = 0.15
 """Height of a tick label with the space around it, in inches."""
 _MIN_LABELS_PER_DECADE: Final = 1 / math.log10(2.0)
-"""Number of labels per decade for which there must be room, so that 1, 2 and 5 are labelled."""
+"""Number of labels that must fit into a decade of an axis so that 1, 2 and 5 are labelled."""
 
 
 def plain_logarithmic(axes: Axes, lower_limit: float, upper_limit: float) -> None:
@@ -73,18 +73,18 @@ _BAND_COLOR: Final = "#8CC4E8"
 _MEASURED_COLOR: Final = "#BDBDBD"
 """Colour of the measured response behind the model."""
 _RESPONSE_POINTS: Final = 900
-"""Number of columns or points of the measured response in the panel of the whole band."""
+"""Number of points of the measured response that the panel of the whole band shows."""
 _DETAIL_POINTS: Final = 161
 """Number of points of the model's response in the enlarged panel of a mode."""
-_DETAIL_TO_HALF_WIDTH: Final = 6.0
-"""Frequency range of a mode's enlarged panel to either side, in half-widths of the resonance."""
+_DETAIL_HALF_WIDTHS: Final = 6.0
+"""Frequency range on either side of a mode in its enlarged panel, in half-widths of the peak."""
 
 _MIN_RELATIVE_DETAIL: Final = 0.006
-"""Least frequency range of a mode's enlarged panel to either side, relative to the frequency."""
+"""Least frequency range on either side of a mode in its enlarged panel, relative to the mode."""
 
 
 def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
-    """Draw magnitude, phase and width of the 95 % band, and an enlarged panel of every mode.
+    """Draw a record's response: magnitude, phase, 95 % band, and an enlarged panel of each mode.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def _draw_magnitude(
     model_band: ResponseBand,
     curve_color: str,
 ) -> None:
-    """Draw the measured magnitude, the model's magnitude over it, and the model's 95 % band."""
+    """Draw the measured magnitude, and on top the model's magnitude with its 95 % band."""
     axes.plot(
         *style.envelope(
             frequency_hz, magnitude_db(measured_frf), _RESPONSE_POINTS, logarithmic=True
@@ -213,7 +213,7 @@ def _draw_magnitude(
 def _detail_range_hz(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
     """Return the frequency range of a mode's enlarged panel, with at least one bin."""
     bin_spacing_hz = float(np.diff(frequency_hz).max())
-    relative_width = max(_DETAIL_TO_HALF_WIDTH * mode.damping_ratio, _MIN_RELATIVE_DETAIL)
+    relative_width = max(_DETAIL_HALF_WIDTHS * mode.damping_ratio, _MIN_RELATIVE_DETAIL)
     half_width_hz = max(relative_width * mode.frequency_hz, bin_spacing_hz)
     lowest_hz = float(frequency_hz[0]) / 2
     return max(mode.frequency_hz - half_width_hz, lowest_hz), mode.frequency_hz + half_width_hz
@@ -249,12 +249,12 @@ def loss_figure(
     mode_estimates : sequence of ModeEstimate
         Modes to draw as points.
     loss_model : FittedPlant or None
-        Beam whose loss factors are drawn; None: no beam explains the losses, and no curve is drawn.
+        Beam whose loss factors are drawn; None if no beam explains the losses, then without curves.
     axis_hz : tuple of float
         Lowest and highest frequency of the axis, positive.
     supported_hz : tuple of float or None
-        Frequency band in which the data support the curves. No curve is drawn outside it. None: the
-        data nowhere support the curves.
+        Frequency band in which the data support the curves, which are drawn only there. None if the
+        data do not support the curves at any frequency.
     unsupported_orders : collection of str
         Orders that the data do not support. If there is one, the total is not split into its parts.
     flagged_modes : collection of int
@@ -320,7 +320,7 @@ def _draw_loss_factors(
 ) -> list[NDArray[np.float64]]:
     """Draw the loss factors in the band in which the data determine them.
 
-    Returns the values of each curve.
+    Return the drawn values of each curve, for the limits of the axis.
     """
     if supported_hz is None or loss_model is None:
         return []
@@ -375,7 +375,7 @@ def _unsupported_ranges_hz(
     supported_hz: tuple[float, float] | None,
     modes_hz: list[float],
 ) -> list[tuple[float, float]]:
-    """Return the frequency ranges to shade: outside the modes and outside the supported band."""
+    """Return the frequency ranges to be shaded: beyond the modes, and outside `supported_hz`."""
     if not modes_hz:
         return [axis_hz]
     first_hz, last_hz = modes_hz[0], modes_hz[-1]
@@ -385,7 +385,7 @@ def _unsupported_ranges_hz(
 
 
 _BINS_PER_POINT: Final = 24
-"""Number of bins whose mean is one point of the residual's spectrum."""
+"""Number of frequency bins that are averaged to one point of the residual's spectrum."""
 _NOISE_MODEL_POINTS: Final = 600
 """Number of points of the noise model's curve."""
 _MAX_INTERVALS: Final = 120
@@ -452,7 +452,7 @@ def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> N
 
 
 def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
-    """Draw the residual's cumulative periodogram less that of white noise, with its 95 % range."""
+    """Draw the residual's cumulative periodogram minus white noise's, with the 95 % range."""
     is_compared = analysis.compared
     bin_power = np.abs(model.residual[is_compared]) ** 2
     cumulative_power = np.cumsum(bin_power) / bin_power.sum()
@@ -503,8 +503,8 @@ def residual_power(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the whitened residual's power in intervals of the record; it is 1 for pure noise.
 
-    The inverse transform of the residual's spectrum in the band is the complex envelope of the
-    whitened residual. K bins give K independent values over the record.
+    The envelope of the whitened residual is the inverse transform of its spectrum in the band.
+    K frequency bins give K independent values over the record.
 
     Returns
     -------
@@ -529,7 +529,7 @@ def residual_power(
     return times_s, interval_power
 
 
-FIGURES: Final = ("record_frf", UNIFORMITY, "loss_factor", "residual", "record_signals")
+FIGURES: Final = ("record_frf", UNIFORMITY_FIGURE, "loss_factor", "residual", "record_signals")
 """File names of a whole record's figures.
 
 The second figure is omitted if too few modes are visible for the test."""
@@ -541,7 +541,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
 
     highest_hz, headline = whole_record.band_hz[1], whole_record.headline
     model = ShownModel.from_headline(headline, whole_record.record)
-    analysis = model.compared(whole_record.analysis)
+    analysis = model.analysis_of_residual(whole_record.analysis)
     modes_text = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
     frf, _, loss_name, residual_name, signals_name = FIGURES
     measured_frf = measured_response(whole_record)
@@ -558,7 +558,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     uniformity_test = headline.uniform_beam
     if uniformity_test is not None and uniformity_test.p_value is not None:
         yield Illustration(
-            UNIFORMITY,
+            UNIFORMITY_FIGURE,
             partial(uniformity_figure, uniformity_test),
             uniformity_description(uniformity_test),
         )
@@ -624,7 +624,7 @@ def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
 
 
 def _describe_curve_model(whole_record: WholeRecord) -> str:
-    """Return of which beam model the curves of the loss factors are, for the figure's caption."""
+    """Return a text that states to which beam model the loss factor's curves belong."""
     tolerant_estimate = whole_record.headline.tolerant
     if tolerant_estimate is None:
         return f"type {whole_record.headline.name}"
@@ -635,7 +635,7 @@ def _describe_curve_model(whole_record: WholeRecord) -> str:
 
 
 def _reasons_of_hollow_points(headline: Headline) -> str:
-    """Return why damping ratios are drawn as hollow points, for a caption; empty if none are."""
+    """Return a sentence that states why some points are hollow; empty if there are none."""
     flag_texts = dict.fromkeys(
         mode.damping_ratio.flag for mode in headline.modes if mode.shown and mode.damping_ratio.flag
     )
@@ -645,7 +645,7 @@ def _reasons_of_hollow_points(headline: Headline) -> str:
 def measured_response(whole_record: WholeRecord) -> FrequencyResponse:
     """Return the empirical transfer function estimate from below the first mode to the band's end.
 
-    It still includes the delay between the channels.
+    The delay between the channels is not removed from it.
     """
     record = whole_record.record
     angle = record.angle_rad - (record.rest_angle_rad or 0.0)

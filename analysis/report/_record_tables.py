@@ -42,13 +42,13 @@ _MARK_NOTE: Final = (
     f"{NOT_REPORTED_MARK} not a property of the antenna, for the reason in the remark: do not "
     "interpret. The number only describes the fitted curve."
 )
-"""Note that explains the mark of flagged parameters."""
+"""Note that explains the symbol of flagged parameters."""
 
 
 def modes_table(whole_record: WholeRecord) -> Table:
     """Return the table of modes: frequencies, damping ratios and effective inertias.
 
-    Modes with a doubtful damping ratio are marked.
+    Doubtful damping ratios have a mark (†).
     """
     headline = whole_record.headline
     has_inertias = any(mode.participation is not None for mode in headline.modes)
@@ -139,7 +139,7 @@ def _inertia_cells(participation: Estimate | None) -> tuple[Cell, Cell]:
 
 
 def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
-    """Yield notes on how well the modal model fits, and on resonances that are not the beam's."""
+    """Yield notes on the fit of the modal model, and on resonances that are not the beam's."""
     modal_fit = whole_record.headline.modal
     if modal_fit is None:
         return
@@ -168,9 +168,9 @@ def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
 def parameters_table(whole_record: WholeRecord) -> Table:
     """Return the table of all reported parameters with uncertainties.
 
-    If the file states the uncertainties of the scales, the table also contains intervals that
-    include them. Parameters that are not properties of the antenna are marked, and the last column
-    states why.
+    If the file states the uncertainties of the scales, additional intervals include these
+    uncertainties. Parameters that are not properties of the antenna have a mark, and the last
+    column states why.
     """
     headline = whole_record.headline
     parameters_with_scales = whole_record.parameters_with_scales
@@ -214,7 +214,7 @@ _PARAMETER_COLUMNS: Final = (
 )
 """Columns of a parameter: symbol, meaning, unit, value and uncertainty."""
 _REMARK_COLUMN: Final = Column("Remark", "remark", TEXT_FORMAT)
-"""Column with the reason for a parameter's mark."""
+"""Column with the reason why a parameter has a mark."""
 _UNCERTAINTY_NOTE: Final = (
     "std is one standard deviation; intervals of ρ/EI and EI, and on an exactly uniform beam those "
     "of ζ and γ, are symmetric in the logarithm. The CSV file has SI units."
@@ -223,7 +223,7 @@ _UNCERTAINTY_NOTE: Final = (
 
 
 def parameter_names(headline: Headline) -> tuple[str, ...]:
-    """Return the names of the reported parameters in the order damping, beam, rig."""
+    """Return the names of the reported parameters: first damping, then beam, then rig."""
     exact_parameters = () if headline.exact is None else headline.exact.parameters
     return tuple(dict.fromkeys((*(key for key in exact_parameters if key in headline.parameters),
                                 *headline.parameters)))  # fmt: skip
@@ -244,7 +244,7 @@ def _condition_text(headline: Headline) -> str:
 
 
 def _scale_notes(whole_record: WholeRecord) -> Iterator[str]:
-    """Yield notes on the scales: which uncertainties the intervals include, and which not."""
+    """Yield notes that state which uncertainties of scales the intervals include or omit."""
     if not parameters_compensate_scales(whole_record.fit):
         held_parameters = ", ".join(
             parameter_named(scale_key).symbol for scale_key in whole_record.fixed
@@ -303,7 +303,7 @@ def _scale_notes(whole_record: WholeRecord) -> Iterator[str]:
 
 
 def _scale_dependence(whole_record: WholeRecord) -> str:
-    """Return as text how each parameter depends on the scales, as products of their powers."""
+    """Return a text that states each parameter's dependence on the scales as powers of scales."""
     return ", ".join(
         f"{parameter_named(name).symbol} ∝ {_product_text(SCALE_EXPONENTS[name])}"
         for name in whole_record.headline.parameters
@@ -312,7 +312,7 @@ def _scale_dependence(whole_record: WholeRecord) -> str:
 
 
 def _product_text(exponents: Mapping[str, int]) -> str:
-    """Return a product of powers of scales as text."""
+    """Return the text of a product of powers of scales, from their exponents."""
     return " · ".join(
         _SCALE_NAMES[scale_name]
         + ("" if scale_power == 1 else str(scale_power).translate(_SUPERSCRIPTS))
@@ -323,7 +323,7 @@ def _product_text(exponents: Mapping[str, int]) -> str:
 def exact_geometry_table(whole_record: WholeRecord) -> Table | None:
     """Return the table of an exactly uniform beam's parameters.
 
-    It is None if the main table shows these parameters.
+    Return None if these are the parameters of the main table.
     """
     exact_estimates = whole_record.headline.exact
     if exact_estimates is None:
@@ -362,7 +362,7 @@ def _is_fixed(headline: Headline, parameter_name: str, *, exact: bool = False) -
 def loss_factors_table(whole_record: WholeRecord) -> Table:
     """Return the table of internal and external loss factors at their pivot frequencies.
 
-    There, the loss factor is not correlated with the order of the damping.
+    At its pivot frequency, a loss factor is not correlated with the order of the damping.
     """
     headline = whole_record.headline
     return Table.from_rows(
@@ -388,9 +388,9 @@ def loss_factors_table(whole_record: WholeRecord) -> Table:
 
 
 def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
-    """Return the table of the parameters of a simpler damping structure next to the reported ones.
+    """Return the table that compares the parameters of a simpler structure with the reported ones.
 
-    It is None if no structure with fewer free parameters is sufficient for the record.
+    Return None if no structure with fewer free parameters is sufficient for the record.
     """
     headline: Estimates = whole_record.headline.exact or whole_record.headline
     simpler_estimates = headline.simpler
@@ -517,11 +517,11 @@ def _parameter_row(
 
 
 _SI_UNITS: Final = {"µs": "s", "ms": "s", "g": "kg", "mm": "m", "ppm": "1", "%": "1"}
-"""SI units of the units that tables show."""
+"""SI unit for each displayed unit that is not an SI unit."""
 
 
 def _unit_cell(unit_text: str) -> Cell:
-    """Return the cell of a unit, with the SI unit for programs, whose numbers are in SI units."""
+    """Return the cell that displays a unit; for programs its value is the SI unit."""
     power_text, _, unit_symbol = unit_text.rpartition(" ")
     return Cell(
         _SI_UNITS.get(unit_text, unit_symbol if power_text.startswith("1e") else unit_text),
@@ -558,12 +558,12 @@ def _quantity_cells(reported_value: Estimate, display_factor: float = 1.0) -> tu
 
 
 def _interval_ends(reported_value: Estimate) -> tuple[float | None, float | None]:
-    """Return the ends of a quantity's 95 % interval; None twice without an interval."""
+    """Return the ends of a quantity's 95 % interval; (None, None) without an interval."""
     return reported_value.interval_95 or (None, None)
 
 
 def _reason_notes(reported_values: Iterable[Estimate]) -> tuple[str, ...]:
-    """Return one note for each different reason for which values are marked as not reported."""
+    """Return the reasons why values are not reported as notes, each different reason once."""
     flag_texts = dict.fromkeys(
         reported_value.flag for reported_value in reported_values if reported_value.flag is not None
     )
@@ -571,7 +571,7 @@ def _reason_notes(reported_values: Iterable[Estimate]) -> tuple[str, ...]:
 
 
 def _correlation_cell(is_diagonal: bool, correlation_value: float) -> Cell:
-    """Return the cell of a correlation, in bold if it is strong and of two different parameters."""
+    """Return the cell of a correlation, in bold if it is strong and not on the diagonal."""
     correlation_cell = number_cell(correlation_value, ".3f")
     if is_diagonal or abs(correlation_value) < _STRONG_CORRELATION:
         return correlation_cell
@@ -579,17 +579,23 @@ def _correlation_cell(is_diagonal: bool, correlation_value: float) -> Cell:
 
 
 def amplitude_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
-    """Return a table of the damping ratio in free vibration by amplitude; nothing without data."""
+    """Return the table of damping ratios in free vibration by amplitude; empty without data."""
     damping_by_amplitude = whole_record.verdict.damping_with_amplitude
     if not damping_by_amplitude:
         return ()
     table_rows: list[tuple[Entry, ...]] = []
-    for at in damping_by_amplitude:
-        damping_ratio, std, half_width = at.damping_ratio, at.std, NORMAL_95 * at.std
+    for amplitude_estimate in damping_by_amplitude:
+        damping_ratio, std, half_width = (
+            amplitude_estimate.damping_ratio,
+            amplitude_estimate.std,
+            NORMAL_95 * amplitude_estimate.std,
+        )
         ratio_cells = estimate_cells(
             (damping_ratio, std, damping_ratio - half_width, damping_ratio + half_width), std, 100.0
         )
-        table_rows.append((at.mode, at.tip_amplitude_m, *ratio_cells))
+        table_rows.append(
+            (amplitude_estimate.mode, amplitude_estimate.tip_amplitude_m, *ratio_cells)
+        )
     return (
         Table.from_rows(
             "damping_with_amplitude",

@@ -76,7 +76,7 @@ TABLES_TITLE: Final = "Tables"
 """Title of the tab with the tables of the Welch fits."""
 
 _MEASURED_MAGNITUDE_ENTRY: Final = LegendEntry("|measured|", GREY)
-"""Legend entry of the measured magnitude, with which residuals are compared."""
+"""Legend entry of the measured magnitude in the charts of residuals."""
 _WIDE_CHART_SIZE: Final = (1280.0, 350.0)
 """Width and height of a page's wide chart, in points, for a window of 1280 × 800."""
 _NARROW_CHART_SIZE: Final = (640.0, 262.0)
@@ -126,7 +126,7 @@ class ChartCurve:
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """Chart of a page with its title and its curves, from the lowest to the topmost."""
+    """Chart of a page with its title and its curves, in the order in which they are drawn."""
 
     title: str
     chart: Chart
@@ -159,20 +159,20 @@ class ChartPage:
 
 
 def welch_pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
-    """Return the charts of the Welch fits, with one tab for the measured response and each type."""
+    """Return the charts of the Welch fits: a page for the measured response, and one per type."""
     level_axis = _magnitude_axis(analysis)
-    keys_by_weighting = line_keys(analysis.settings.weightings)
+    entry_by_weighting = model_legend_entries(analysis.settings.weightings)
     return (
         _measured_page(analysis, level_axis),
         *(
-            _type_page(analysis, type_name, level_axis, keys_by_weighting)
+            _type_page(analysis, type_name, level_axis, entry_by_weighting)
             for type_name in analysis.settings.types
         ),
     )
 
 
-def line_keys(weightings: tuple[str, ...]) -> dict[str, LegendEntry]:
-    """Return label and line style of the fitted models, by the weighting of the fit."""
+def model_legend_entries(weightings: tuple[str, ...]) -> dict[str, LegendEntry]:
+    """Return the legend entry (label and line style) of fitted models, by their weighting."""
     further_lines = cycle(_FURTHER_LINES)
     entry_by_weighting = {
         weighting_name: _LINES_BY_WEIGHTING.get(weighting_name) or next(further_lines)
@@ -185,7 +185,7 @@ def line_keys(weightings: tuple[str, ...]) -> dict[str, LegendEntry]:
 
 
 def draw_welch_fits(analysis: WelchAnalysis, tables_markdown: str, stream: RecordingStream) -> None:
-    """Send the charts and tables of the Welch fits to Rerun, independent of the session's time.
+    """Send the charts and tables of the Welch fits to Rerun, visible at any time of the session.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def draw_welch_fits(analysis: WelchAnalysis, tables_markdown: str, stream: Recor
 
 
 def welch_fits_tab(analysis: WelchAnalysis) -> rrb.Container:
-    """Return the tab of the Welch fits, which contains tabs for each page and for the tables."""
+    """Return the tab of the Welch fits, with one inner tab for each page and one for the tables."""
     import rerun.blueprint as rrb
 
     tables_view = rrb.TextDocumentView(name=TABLES_TITLE, origin=TABLES_ENTITY)
@@ -210,7 +210,7 @@ def welch_fits_tab(analysis: WelchAnalysis) -> rrb.Container:
 
 
 def _draw_page(fit_page: ChartPage, stream: RecordingStream) -> None:
-    """Draw the three charts of a tab with their curves, which are decimated for the screen."""
+    """Send the three charts of a page to Rerun, with curves decimated for the screen."""
     decimation = CurveDecimation.logarithmic(
         fit_page.frequency_hz, *fit_page.band_hz, _FREQUENCY_GROUPS
     )
@@ -230,7 +230,7 @@ def _draw_page(fit_page: ChartPage, stream: RecordingStream) -> None:
 
 
 def _draw_text(entity_path: str, markdown_text: str, stream: RecordingStream) -> None:
-    """Send a Markdown text that is the same at any time of the session."""
+    """Send a Markdown text to Rerun, visible at any time of the session."""
     import rerun as rr
 
     text_document = rr.TextDocument(markdown_text, media_type=rr.MediaType.MARKDOWN)
@@ -381,8 +381,8 @@ def _type_page(
 def _magnitude_axis(analysis: WelchAnalysis) -> Axis:
     """Return the common magnitude axis of all pages of the Welch fits.
 
-    It contains the peaks of all responses and the residuals of the better models. Being common, it
-    makes the types comparable.
+    Its range contains the peaks of all responses and the residuals of the better models. All types
+    have the same axis, so that they can be compared.
     """
     return _axis_of_responses(
         analysis.response.response, [model.response for model in analysis.models]
@@ -403,19 +403,19 @@ def _axis_of_responses(measured_frf: Complex, modelled_frf: Sequence[Complex]) -
 
 
 def _entity_name(weighting: str) -> str:
-    """Return the name of a fit's weighting in a form that an entity path of Rerun can contain."""
+    """Return a weighting's name in a form that is valid in Rerun's entity paths."""
     return "model_" + "".join(c if c.isalnum() else "_" for c in weighting)
 
 
 # Whole record
 
 _MAX_LABELS_PER_SIDE: Final = 5
-"""Largest number of labels on either side of 0, in half the height of a window."""
+"""Largest number of axis labels on either side of 0 that half the height of a window can hold."""
 
 
 @dataclass(frozen=True, slots=True)
-class Lines:
-    """Curves over the session's time in one plot: names, styles and values.
+class PlotOverTime:
+    """Plot of several curves over the session's time: title, and names and styles of the curves.
 
     Attributes
     ----------
@@ -425,8 +425,8 @@ class Lines:
         Title of the plot, with the unit.
     names, colors, widths
         Name, colour and width of each line, from the lowest to the topmost.
-    values
-        Function from the torque in the band to the lines' values (n, lines).
+    compute_values
+        Function that returns the lines' values, shape (n, lines), for the torque of a record.
     """
 
     entity: str
@@ -434,11 +434,11 @@ class Lines:
     names: tuple[str, ...]
     colors: tuple[Color, ...]
     widths: tuple[float, ...]
-    values: Callable[[TorqueInBand], Real]
+    compute_values: Callable[[TorqueInBand], Real]
 
 
 _PLOTS_OVER_TIME: Final = (
-    Lines(
+    PlotOverTime(
         f"{RECORD_ENTITY}/torque",
         "Coupling torque in the band of the fit (N·m)",
         ("measured (N·m)", "model (N·m)"),
@@ -446,7 +446,7 @@ _PLOTS_OVER_TIME: Final = (
         (2.5, 1.0),
         lambda torque: np.column_stack((torque.measured, torque.modelled)),
     ),
-    Lines(
+    PlotOverTime(
         f"{RECORD_ENTITY}/residual",
         "Residual, measured − model (mN·m)",
         ("residual (mN·m)",),
@@ -459,7 +459,7 @@ _PLOTS_OVER_TIME: Final = (
 
 
 def record_page(whole_record: WholeRecord) -> ChartPage:
-    """Return the charts of response and residual of the whole record's displayed model.
+    """Return the charts that compare the displayed model's response with the measured one.
 
     The measured response is the ratio of the whole record's transforms, without the model's delay.
     """
@@ -538,7 +538,7 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
 def draw_record(
     whole_record: WholeRecord, torque: TorqueInBand, tables_markdown: str, stream: RecordingStream
 ) -> None:
-    """Draw the results of the whole record: verdict, response, and torque over time.
+    """Send the results of the whole record to Rerun: verdict, response, and torque over time.
 
     Parameters
     ----------
@@ -561,9 +561,9 @@ def draw_record(
     )
     _draw_page(record_page(whole_record), stream)
     t_ns = np.round(1e9 * whole_record.record.time_s).astype(np.int64)
-    for plot_lines in _PLOTS_OVER_TIME:
+    for time_plot in _PLOTS_OVER_TIME:
         send_columns(
-            stream, plot_lines.entity, t_ns, {_SCALARS_COMPONENT: plot_lines.values(torque)}
+            stream, time_plot.entity, t_ns, {_SCALARS_COMPONENT: time_plot.compute_values(torque)}
         )
 
 
@@ -577,8 +577,10 @@ def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container
         _page_view(record_page(whole_record)),
         rrb.Vertical(
             *(
-                _lines_view(plot_lines, end_s, float(np.abs(plot_lines.values(torque)).max()))
-                for plot_lines in _PLOTS_OVER_TIME
+                _time_plot_view(
+                    time_plot, end_s, float(np.abs(time_plot.compute_values(torque)).max())
+                )
+                for time_plot in _PLOTS_OVER_TIME
             ),
             name=TORQUE_TITLE,
         ),
@@ -586,25 +588,27 @@ def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container
     )
 
 
-def _lines_view(plot_lines: Lines, end_s: float, largest_value: float) -> rrb.TimeSeriesView:
-    """Return a plot over the whole session, independent of the current time."""
+def _time_plot_view(
+    time_plot: PlotOverTime, end_s: float, largest_value: float
+) -> rrb.TimeSeriesView:
+    """Return the view of a plot that always shows the whole session, at any current time."""
     import rerun as rr
     import rerun.blueprint as rrb
 
     start_boundary = rrb.TimeRangeBoundary.absolute(seconds=0.0)
     end_boundary = rrb.TimeRangeBoundary.absolute(seconds=end_s)
     series_style = rr.SeriesLines(
-        names=plot_lines.names,
-        colors=plot_lines.colors,
-        widths=plot_lines.widths,
+        names=time_plot.names,
+        colors=time_plot.colors,
+        widths=time_plot.widths,
         # The default averages the values of a pixel, which understates peaks.
         aggregation_policy="MinMax",
     )
     return rrb.TimeSeriesView(
-        name=plot_lines.title,
-        origin=plot_lines.entity,
-        overrides={plot_lines.entity: series_style},
-        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(plot_lines.names) > 1),
+        name=time_plot.title,
+        origin=time_plot.entity,
+        overrides={time_plot.entity: series_style},
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(time_plot.names) > 1),
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start_boundary, end=end_boundary)),
         axis_y=rrb.ScalarAxis(range=_labelled_axis_range(largest_value)),
         time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start_boundary, end=end_boundary),
@@ -612,9 +616,9 @@ def _lines_view(plot_lines: Lines, end_s: float, largest_value: float) -> rrb.Ti
 
 
 def _labelled_axis_range(largest_value: float) -> tuple[float, float]:
-    """Return the ends of an axis about 0 on which Rerun shows labels other than 0.
+    """Return the ends of an axis, symmetric about 0, on which Rerun shows labels other than 0.
 
-    Rerun labels multiples of a power of ten if there is room for all of them.
+    Rerun only labels the multiples of a power of ten if all of them have room.
     """
     label_step = 10.0 ** np.floor(np.log10(max(largest_value, 1e-12)))
     axis_end = (
@@ -651,7 +655,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     OutputError
         If the file cannot be written, or was created meanwhile.
     rigd.session.SessionError
-        If the session file cannot be read any more.
+        If the session file can no longer be read.
     """
     from rigd.view import draw_session
 

@@ -1,4 +1,4 @@
-"""Warnings of several files: one of several files is reported once, with their names."""
+"""Warnings of several files: a common one is reported once, with the names of the files."""
 
 from __future__ import annotations
 
@@ -57,11 +57,14 @@ def shared_warnings(files: Sequence[FileWarnings]) -> list[str]:
 
 
 def _files_text(names: Sequence[str], file_count: int) -> str:
-    """Return a text on the files with a warning: their number and a few names."""
+    """Return a text on the files that have a warning: their number and a few of their names."""
     if len(names) == 1:
         return names[0]
     if len(names) == file_count:
         return f"all {file_count} files"
-    shown = ", ".join(names[:_MOST_NAMES])
-    more = len(names) - _MOST_NAMES
-    return f"{len(names)} of {file_count} files ({shown}{f' and {more} more' if more > 0 else ''})"
+    named_files = ", ".join(names[:_MOST_NAMES])
+    unnamed_count = len(names) - _MOST_NAMES
+    return (
+        f"{len(names)} of {file_count} files ({named_files}"
+        f"{f' and {unnamed_count} more' if unnamed_count > 0 else ''})"
+    )

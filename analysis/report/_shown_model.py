@@ -37,7 +37,7 @@ class ShownModel:
     modes : tuple of ModeEstimate
         Modes that are visible in the record.
     stated_delay_s : float
-        Delay of the torque against the angle, as the file states it.
+        Delay of the torque channel minus that of the angle channel, as the file states them.
     """
 
     name: str
@@ -48,12 +48,12 @@ class ShownModel:
 
     @classmethod
     def from_headline(cls, headline: Headline, record: Record) -> ShownModel:
-        """Return the model that a record's report shows, from the reported results (headline).
+        """Return the model that the report of a record shows.
 
         Parameters
         ----------
         headline : Headline
-            Headline of the record.
+            Reported estimates of the record.
         record : Record
             Record with the delays that its file states.
         """
@@ -81,7 +81,7 @@ class ShownModel:
     def delay_s(self) -> float:
         """Delay of the torque channel in s, which is removed from the displayed response.
 
-        It is fitted for a beam model. For a modal model it is the delay that the file states.
+        For a beam model it was fitted, for a modal model it is the one that the file states.
         """
         return self.beam.parameters["delay_s"] if self.modal is None else self.stated_delay_s
 
@@ -97,8 +97,8 @@ class ShownModel:
             return response_band(self.beam, frequency_hz)
         return modal_response_band(self.modal, frequency_hz, self.delay_s)
 
-    def compared(self, analysis: RecordAnalysis) -> RecordAnalysis:
-        """Return a record's analysis with the noise density and the bins of this model's residual.
+    def analysis_of_residual(self, analysis: RecordAnalysis) -> RecordAnalysis:
+        """Return a record's analysis in which noise and bins are those of this model's residual.
 
         Parameters
         ----------
@@ -110,7 +110,7 @@ class ShownModel:
         return RecordAnalysis.from_fits(analysis.fits, self.modal.noise, analysis.comparison)
 
     def fit_percent(self, analysis: RecordAnalysis) -> float:
-        """Return how well the model reproduces the measured torque in the band, in percent.
+        """Return how well the model reproduces the measured torque in the band (100 % = exact).
 
         Parameters
         ----------
@@ -118,7 +118,7 @@ class ShownModel:
             Analysis of the record.
         """
         fit = self.beam if self.modal is None else self.modal
-        return self.compared(analysis).fit_percent(fit)
+        return self.analysis_of_residual(analysis).fit_percent(fit)
 
 
 def shown_modes(headline: Headline) -> tuple[ModeEstimate, ...]:

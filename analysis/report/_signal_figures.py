@@ -61,7 +61,7 @@ class RecordInterval:
 
 
 def resonance_intervals(record: Record, mode_count: int) -> tuple[RecordInterval, ...]:
-    """Return the interval in which each mode below the Nyquist frequency vibrates most."""
+    """Return for each mode below the Nyquist frequency the interval of its largest oscillation."""
     duration_s = len(record.time_s) / record.rate_hz
     intervals = []
     modes_hz = undamped_frequencies_rad_s(record.beam, mode_count) / (2 * math.pi)
@@ -90,7 +90,7 @@ def resonance_intervals(record: Record, mode_count: int) -> tuple[RecordInterval
 
 
 def shade_intervals(axes: Axes, intervals: tuple[RecordInterval, ...]) -> None:
-    """Shade time intervals in the panel of the whole record and number them from 1."""
+    """Shade intervals in the panel of the whole record, and label them with numbers from 1."""
     for interval_number, interval in enumerate(intervals, start=1):
         axes.axvspan(
             interval.first_s, interval.last_s, color=style.SHADE_COLOR, linewidth=0, zorder=0
@@ -103,7 +103,7 @@ def shade_intervals(axes: Axes, intervals: tuple[RecordInterval, ...]) -> None:
 
 
 def set_up_detail(axes: Axes, interval_number: int, interval: RecordInterval) -> None:
-    """Set title and time axis of an enlarged panel, with the number of its interval."""
+    """Set the title (with the interval's number) and the time axis of an enlarged panel."""
     axes.set_title(f"{interval_number}  {interval.name}", fontsize=8.5, fontweight="normal")
     axes.set_xlim(interval.first_s, interval.last_s)
     axes.set_facecolor("#FCFAF4")
@@ -118,15 +118,15 @@ class TorqueInBand:
 
     @property
     def residual(self) -> NDArray[np.float64]:
-        """Difference of measured and modelled torque in N·m, shape (n,)."""
+        """Measured minus modelled torque in N·m, shape (n,)."""
         return self.measured - self.modelled
 
 
 def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float) -> TorqueInBand:
-    """Return the measured torque and the model's, limited to frequencies up to `highest_hz`.
+    """Return measured and modelled torque, both limited to frequencies up to `highest_hz`.
 
-    The model's torque is computed from the measured angle. Above the limit the measured torque is
-    noise, and the model's torque is the encoder's quantisation.
+    The modelled torque is computed from the measured angle. At higher frequencies the measured
+    torque is noise, and the modelled torque is due to the encoder's quantisation.
     """
     angle = Measurement.from_record(record).angle_from_rest(highest_hz)
     band_hz = (0.0, highest_hz)
@@ -144,16 +144,16 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
 
 
 def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figure:
-    """Draw the angle, the measured and modelled torque and their difference.
+    """Draw the angle, the measured and modelled torque, and the difference of the torques.
 
-    Below, the torques and their difference are enlarged at each mode.
+    Panels below enlarge the torques and their difference at each mode.
 
     Parameters
     ----------
     record : Record
         Record of angle and torque.
     model : ShownModel
-        Model of the torque, with the modes that get an enlarged panel.
+        Model of the torque; each of its modes has an enlarged panel.
     highest_hz : float
         Highest frequency of the fit's band.
     """
@@ -255,7 +255,7 @@ def _draw_whole_record(
     axis_label: str,
     title_pad: float | None = None,
 ) -> None:
-    """Draw signals over the whole record."""
+    """Draw signals over the whole record, each in its line style."""
     signal_list = tuple(styled_signals)
     for signal_values, line_style in signal_list:
         axes.plot(*style.envelope(record.time_s, signal_values), **line_style)
@@ -282,7 +282,7 @@ def _draw_detail(
 
 
 def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
-    """Draw angles (a) and torque (b) over the whole record and enlarged at each mode."""
+    """Draw angles (a) and torque (b): over the whole record, and enlarged at each mode."""
     record = analysis.record
     intervals = resonance_intervals(record, len(analysis.peaks))
     sweep_s = record.sweep_samples / record.rate_hz
@@ -349,8 +349,8 @@ def best_model(analysis: WelchAnalysis) -> FittedModel:
 def torque_figure(analysis: WelchAnalysis) -> Figure:
     """Draw measured and modelled torque and their difference, also enlarged at each mode.
 
-    All three are limited to frequencies up to the band's end. Above it the measured torque is
-    noise, and the modelled torque is the encoder's quantisation.
+    All three are limited to frequencies up to the end of the band. At higher frequencies the
+    measured torque is noise, and the modelled torque is due to the encoder's quantisation.
     """
     record = analysis.record
     fitted_model = best_model(analysis)

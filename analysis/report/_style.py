@@ -1,9 +1,9 @@
-"""Figures of a report: their style, and the pictures that are made of them.
+"""Style of a report's figures, and drawing of the figures into image files.
 
 The colours are Okabe and Ito's, distinguishable with any common colour blindness. Lines that lie on
-each other differ in dash as well as in colour, and are decimated to the resolution of a screen.
-Half of the pictures are drawn by a copy of this process, because drawing takes half the time of a
-report.
+top of each other differ in dash and colour. Lines are decimated to the resolution of a screen. A
+copy of this process draws half of the figures at the same time, because drawing takes half the time
+of a report.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ INK: Final = "#222222"
 """Colour of titles, labels and points."""
 GREY: Final = "#808080"
 """Colour of measured curves."""
-FAINT: Final = "#D2D2D2"
+LIGHT_GREY: Final = "#D2D2D2"
 """Colour of secondary lines, such as the ratio of transforms behind Welch's estimate."""
 SHADE_COLOR: Final = "#F0E9D8"
 """Colour of shaded areas, such as the range of white noise."""
@@ -70,7 +70,7 @@ DPI: Final = 150
 _PNG_COMPRESSION_LEVEL: Final = 1
 """Compression level of PNG figures: fast, with a tenth more bytes for a quarter of the time."""
 _MAX_SVG_BYTES: Final = 1_000_000
-"""Size of an SVG figure beyond which a page shows the figure as a PNG image."""
+"""Largest size of an SVG image in a page; instead of a larger one, the page shows a PNG image."""
 _VECTOR_FORMAT_SETTINGS: Final[dict[Any, Any]] = {
     "svg.fonttype": "none", "svg.hashsalt": "rigd", "pdf.fonttype": 42,
 }  # fmt: skip
@@ -130,9 +130,9 @@ def figure_style() -> Iterator[None]:
 
 
 def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str = "") -> Figure:
-    """Return an empty figure with a bold title and a grey subtitle, which are shrunk to fit.
+    """Return an empty figure with a bold title and a grey subtitle, in a font that fits the width.
 
-    A figure for a paper has no title and no subtitle, because its caption says what is seen.
+    A figure for a paper has no title and no subtitle, because it has a caption.
     """
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
@@ -238,10 +238,10 @@ def save(figure: Figure, path: Path) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Illustration:
-    """Figure of a report that is yet to be drawn."""
+    """Figure of a report before it is drawn: name, drawing function and caption."""
 
     name: str
-    """Name of its files without their suffixes."""
+    """Name of the figure's files without suffix."""
     draw: Callable[[], Figure]
     """Function that draws the figure; it is called within `figure_style`."""
     description: str
@@ -298,65 +298,71 @@ def save_pictures(
     Returns
     -------
     list of Picture
-        Each figure in one of the formats: SVG, which can be searched and is sharp on paper, else
-        PNG. It is a PNG image, too, if the SVG image is large, as with the responses of many
-        sessions.
+        Each figure as an SVG image, which can be searched and is sharp on paper. It is a PNG image
+        if SVG was not among the formats, or if the SVG image is large.
 
     Raises
     ------
     OutputError
         If a file exists or cannot be written.
     """
-    images = _draw_by_two(illustrations, formats, on_step)
+    images = _draw_in_two_processes(illustrations, formats, on_step)
     pictures = []
     for illustration in illustrations:
-        rendered = images[illustration.name]
+        rendered_images = images[illustration.name]
         for file_format in formats:
             # The suffix is appended, because a name may contain dots.
-            write_new(folder / f"{illustration.name}.{file_format}", rendered[file_format])
-        has_small_svg = "svg" in rendered and len(rendered["svg"]) <= _MAX_SVG_BYTES
+            write_new(folder / f"{illustration.name}.{file_format}", rendered_images[file_format])
+        has_small_svg = "svg" in rendered_images and len(rendered_images["svg"]) <= _MAX_SVG_BYTES
         page_format: FigureFormat = "svg" if has_small_svg else "png"
         pictures.append(
-            Picture(illustration.name, illustration.description, rendered[page_format], page_format)
+            Picture(
+                illustration.name,
+                illustration.description,
+                rendered_images[page_format],
+                page_format,
+            )
         )
     return pictures
 
 
-def _draw_by_two(
+def _draw_in_two_processes(
     illustrations: Sequence[Illustration],
     formats: Collection[FigureFormat],
     on_step: Callable[[str], None],
 ) -> dict[str, Images]:
-    """Return the image files of figures by their names, half of them drawn by a copy."""
-    own, others = illustrations[::2], illustrations[1::2]
+    """Return the image files of each figure by its name; a copy of the process draws half."""
+    own_illustrations, copied_illustrations = illustrations[::2], illustrations[1::2]
     images: dict[str, Images] = {}
     computation = (
-        computed_meanwhile(lambda: {each.name: _images(each, formats) for each in others})
-        if others
+        computed_meanwhile(
+            lambda: {each.name: _images(each, formats) for each in copied_illustrations}
+        )
+        if copied_illustrations
         else nullcontext(dict)
     )
     with computation as other_images:
-        for illustration in own:
+        for illustration in own_illustrations:
             images[illustration.name] = _images(illustration, formats)
             on_step(f"figure {illustration.name}")
         images |= other_images()
-    for illustration in others:
+    for illustration in copied_illustrations:
         on_step(f"figure {illustration.name}")
     return images
 
 
 def _images(illustration: Illustration, formats: Collection[FigureFormat]) -> Images:
-    """Return a figure's image files in some formats, and in that of the page."""
+    """Return a figure's images by file format: the requested ones, and one for the page."""
     with figure_style():
         figure = illustration.draw()
-        rendered: Images = {
+        rendered_images: Images = {
             file_format: render_figure(figure, file_format) for file_format in formats
         }
-        if not {"svg", "png"} & rendered.keys():
-            rendered["svg"] = render_figure(figure, "svg")
-        if len(rendered.get("svg", b"")) > _MAX_SVG_BYTES and "png" not in rendered:
-            rendered["png"] = render_figure(figure, "png")
-    return rendered
+        if not {"svg", "png"} & rendered_images.keys():
+            rendered_images["svg"] = render_figure(figure, "svg")
+        if len(rendered_images.get("svg", b"")) > _MAX_SVG_BYTES and "png" not in rendered_images:
+            rendered_images["png"] = render_figure(figure, "png")
+    return rendered_images
 
 
 # Lines
@@ -369,7 +375,7 @@ def envelope(
     *,
     logarithmic: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a line decimated to the least and greatest y in each of equal intervals of x.
+    """Decimate a line to the smallest and the largest y in each of equal intervals of x.
 
     Parameters
     ----------
@@ -385,7 +391,7 @@ def envelope(
     Returns
     -------
     x, y : ndarray, shape (m,)
-        Decimated line; the line itself if it has at most two points per column.
+        Decimated line; the line itself if it has at most two points per interval.
     """
     if len(x) <= 2 * interval_count:
         return x, y
@@ -401,9 +407,9 @@ def envelope(
 
 
 def log_spaced_indices(x: NDArray[np.float64], max_indices: int) -> NDArray[np.intp]:
-    """Return the indices of at most `max_indices` values of x that are evenly spaced in log x.
+    """Return the indices of about evenly spaced values on the logarithmic axis of x.
 
-    x is positive and increasing.
+    x is positive and increasing. At most `max_indices` indices are returned.
     """
     spaced_values = np.geomspace(x[0], x[-1], max_indices)
     return np.unique(np.clip(np.searchsorted(x, spaced_values), 0, len(x) - 1))
@@ -447,9 +453,9 @@ def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, with_labels: boo
 
 
 def response_axes(magnitude_axes: Axes, phase_axes: Axes, *, with_labels: bool = True) -> None:
-    """Label the axes of a frequency response, and set the range of the phase.
+    """Label the axes of a frequency response, and set the range of the phase axis.
 
-    The phase of torque over angle is from 0 to 180°, well inside the range.
+    The phase of the response from angle to torque is from 0 to 180°, well inside this range.
     """
     phase_axes.set_ylim(-60, 240)
     phase_axes.set_yticks((0, 90, 180))
@@ -465,7 +471,7 @@ def type_panels(
     band_hz: tuple[float, float],
     db_limits: tuple[float, float],
 ) -> Iterator[tuple[str, Axes, Axes]]:
-    """Yield each model type with new axes for magnitude and phase, in the first cells of a grid."""
+    """Yield each type's name and its new axes for magnitude and phase, in the cells of a grid."""
     for panel_number, type_name in enumerate(type_names):
         row, panel_column = divmod(panel_number, grid_cells.ncols)
         subgrid = grid_cells[row, panel_column].subgridspec(
@@ -492,9 +498,9 @@ def db_limits(
     modelled_frf: Sequence[NDArray[np.complex128]],
     headroom_db: float,
 ) -> tuple[float, float]:
-    """Return magnitude limits in dB that contain the measured responses and the models' peaks.
+    """Return axis limits in dB that contain the measured responses and the models' peaks.
 
-    The depth of narrow zeros is not included.
+    Narrow zeros of the models may lie below the limits.
     """
     measured_db = magnitude_db(np.concatenate(measured_frf) + 1e-300)
     top_db = float(measured_db.max())
@@ -520,7 +526,10 @@ def legend(
 
 
 def limits(*signal_arrays: NDArray[np.float64]) -> tuple[float, float]:
-    """Return axis limits with a margin around all values. The limits always differ."""
+    """Return axis limits with a margin around the values of all signals.
+
+    The limits differ even if all values are equal.
+    """
     lowest_value = min(float(v.min()) for v in signal_arrays)
     highest_value = max(float(v.max()) for v in signal_arrays)
     limit_margin = 0.06 * (highest_value - lowest_value) or max(abs(highest_value), 1e-12)

@@ -50,7 +50,7 @@ def result_text(
         Results of one record.
     verbose : bool
         Whether all tables are included. Otherwise the text contains the verdict, the modes and the
-        parameters of damping and beam, or without a whole-record fit the Welch fits.
+        parameters of damping and beam, or the Welch fits if there are no whole-record fits.
     with_warnings : bool
         Whether the text ends with the warnings (`shown_warnings`).
     """
@@ -121,7 +121,7 @@ def _main_results(whole_record: WholeRecord) -> RenderableType:
 
 
 def _with_mark_notes_only(table: Table, caption: str = "") -> Table:
-    """Return a table with only those notes that explain numbers marked as not reported."""
+    """Return a table without notes, except those on numbers marked as not reported."""
     mark_notes = tuple(
         table_note for table_note in table.notes if table_note.startswith(NOT_REPORTED_MARK)
     )
@@ -140,16 +140,16 @@ def warning_lines(sentences: Iterable[str]) -> list[Text]:
 
 
 def tables_text(result: RecordResult) -> str:
-    """Return the tables of the Welch fits as plain text; without these, of the whole record."""
+    """Return the tables of the Welch fits as plain text, or those of the whole-record fits."""
     if result.welch is not None:
         return as_text(analysis_tables(result))
     return "" if result.whole is None else as_text(record_text(result.whole))
 
 
 def analysis_tables(result: RecordResult) -> RenderableType:
-    """Return the tables of a record's Welch fits, resonance peaks and modes, with its warnings.
+    """Return the tables of a record's Welch fits, resonance peaks and modes, and its warnings.
 
-    Orders that the whole record does not support are marked.
+    Orders of damping that the whole record does not support have a mark.
     """
     welch_analysis = result.welch
     assert welch_analysis is not None
@@ -170,7 +170,7 @@ def analysis_tables(result: RecordResult) -> RenderableType:
 
 
 def summary_table(results: Sequence[RecordResult]) -> RenderableType:
-    """Return the mean and standard deviation of the Welch fits of several files as a table."""
+    """Return the table of the Welch fits' means and standard deviations over several files."""
     welch_analyses = [result.welch for result in results if result.welch is not None]
     fit_summary = fit_tables.summary_table(welch_analyses)
     validity_notes = [
@@ -230,7 +230,7 @@ def with_empty_lines(tables_to_show: Iterable[Table]) -> Iterator[RenderableType
 # Damping in sentences
 
 _MIN_PLAIN_VALUE: Final = 1e-3
-"""Value below which a damping is written with the power of ten that zeta has in the paper."""
+"""Value below which a damping coefficient is written with the paper's power of ten for zeta."""
 
 _DAMPING_SYMBOLS: Final = {
     "internal": ("ζ", "", "zeta", "alpha", "α"),
@@ -242,9 +242,9 @@ _DAMPING_SYMBOLS: Final = {
 def damping_sentences(headline: Headline) -> tuple[str, ...]:
     """Return sentences on the damping ratios, and on the internal and external damping.
 
-    Modes that are not visible are omitted. There is no sentence if no number is a property of the
-    antenna. If part of the record is unexplained, the damping ratios are stated conditionally and
-    without intervals.
+    Modes that are not visible are omitted. The tuple is empty if no number is a property of the
+    antenna. If the model does not explain the whole record, the damping ratios are stated with this
+    reservation and without intervals.
 
     Returns
     -------
@@ -269,7 +269,7 @@ def damping_sentences(headline: Headline) -> tuple[str, ...]:
         )
     damping_texts.extend(
         f"The {loss_factor.damping} damping "
-        f"{_size_text(loss_factor)}{_order_text(headline, loss_factor)}."
+        f"{_loss_text(loss_factor)}{_order_text(headline, loss_factor)}."
         for loss_factor in headline.sizes
         # A coefficient for an assumed order is no property of the antenna.
         if loss_factor.size.flag is None
@@ -299,8 +299,8 @@ def _percent_text(damping_ratio: Estimate) -> str:
     return f"{value_cell.text} % ({lower_cell.text} to {upper_cell.text} %)"
 
 
-def _size_text(loss_factor: ReportedLossFactor) -> str:
-    """Return the loss factor, or else the coefficient, of a damping as part of a sentence."""
+def _loss_text(loss_factor: ReportedLossFactor) -> str:
+    """Return the part of a sentence with a damping's loss factor, or its coefficient if unknown."""
     coefficient_symbol, unit_text, *_names = _DAMPING_SYMBOLS[loss_factor.damping]
     pivot_loss_factor = loss_factor.size
     display_factor, power_of_ten = (
@@ -320,14 +320,14 @@ def _size_text(loss_factor: ReportedLossFactor) -> str:
 
 
 def _coefficient_is_flagged(headline: Headline, loss_factor: ReportedLossFactor) -> bool:
-    """Return whether the coefficient of a damping is flagged as not a property of the antenna."""
+    """Return whether a damping's coefficient is flagged as not a property of the antenna."""
     return headline.parameters[_DAMPING_SYMBOLS[loss_factor.damping][2]].flag is not None
 
 
 def _order_text(headline: Headline, loss_factor: ReportedLossFactor) -> str:
-    """Return the fractional order of a damping as the end of a sentence.
+    """Return the end of a sentence with the fractional order of a damping.
 
-    It is empty for parameters with a tolerance of the geometry.
+    It is empty if the parameters are estimated with a tolerance of the beam's geometry.
     """
     *_others, order_name, order_symbol = _DAMPING_SYMBOLS[loss_factor.damping]
     order_value = headline.parameters[order_name]

@@ -1,4 +1,4 @@
-"""Figures of touches: the evidence of each touch, and a map of all contact points from above."""
+"""Figures of touches: a map of all contact points from above, and the evidence of each touch."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _SHOWN_AFTER_MS: Final = 100.0
 _MIN_LOG_LIKELIHOOD_RANGE: Final = 40.0
 """Least range of the log-likelihood's axis."""
 _LINEAR_RANGE_STD: Final = 5.0
-"""Number of standard deviations up to which the axis of innovations is linear."""
+"""Number of standard deviations up to which the axis of innovations is linear, not logarithmic."""
 _MAX_DETAIL_FRACTION: Final = 0.25
-"""Largest extent of the contact points, relative to the antenna, for an enlarged map of them."""
+"""Largest extent of all contact points, relative to the antenna, for which a detail is drawn."""
 _SESSION_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE)
 """Colours of the sessions in the map."""
 
@@ -173,10 +173,10 @@ def map_figure(session_touches: Sequence[SessionTouches]) -> Figure:
         _draw_map(detail_axes, session_touches, with_numbers=True)
         interval_ends_m = np.concatenate(
             [
-                t.ends_m
+                t.interval_ends_m
                 for session in session_touches
                 for t in session.touches
-                if t.ends_m is not None
+                if t.interval_ends_m is not None
             ]
         )
         map_centre_m = (interval_ends_m.min(axis=0) + interval_ends_m.max(axis=0)) / 2
@@ -201,10 +201,12 @@ def _draw_map(axes: Axes, sessions: Sequence[SessionTouches], *, with_numbers: b
         session_label: str | None = session.path.stem
         for touch in session.touches:
             if touch.antenna_m is not None:
-                axes.plot(*touch.antenna_m.T, color=style.FAINT, linewidth=1.0, zorder=1)
-            if touch.point_m is None or touch.ends_m is None:
+                axes.plot(*touch.antenna_m.T, color=style.LIGHT_GREY, linewidth=1.0, zorder=1)
+            if touch.point_m is None or touch.interval_ends_m is None:
                 continue
-            axes.plot(*touch.ends_m.T, color=session_color, linewidth=2.4, alpha=0.5, zorder=2)
+            axes.plot(
+                *touch.interval_ends_m.T, color=session_color, linewidth=2.4, alpha=0.5, zorder=2
+            )
             kind_is_known = touch.estimate is not None and touch.estimate.kind != "unknown"
             axes.plot(
                 *touch.point_m, "o", color=session_color, markersize=4, zorder=3,

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from analysis.identify.beam_uniformity import UniformBeamTest
     from analysis.report.table import Entry
 
-UNIFORMITY: Final = "uniform_beam"
-"""File name of the figure of the test, without suffix."""
+UNIFORMITY_FIGURE: Final = "uniform_beam"
+"""Name of the file with the figure of the test, without suffix."""
 
-_CONSTANT_TITLES: Final = {
+_MODAL_CONSTANT_TITLES: Final = {
     "ln_frequency": "Frequency",
     "ln_damping_ratio": "Damping ratio",
     "ln_residue": "Residue, magnitude",
@@ -38,7 +38,7 @@ _PERCENT: Final = 100.0
 
 
 def _deviations(uniformity_test: UniformBeamTest) -> NDArray[np.float64]:
-    """Return measured minus predicted constants, shape (modes, 4); phases within half a turn."""
+    """Return measured minus predicted constants, (modes, 4), phases between -pi and pi."""
     deviations = (uniformity_test.measured - uniformity_test.predicted).reshape(
         -1, len(MODE_CONSTANT_NAMES)
     )
@@ -66,7 +66,7 @@ def uniformity_figure(uniformity_test: UniformBeamTest) -> Figure:
     )  # fmt: skip
     for panel_number, constant_name in enumerate(MODE_CONSTANT_NAMES):
         std_axes, percent_axes = (figure.add_subplot(grid[row, panel_number]) for row in range(2))
-        std_axes.set_title(_CONSTANT_TITLES[constant_name], fontsize=8.5)
+        std_axes.set_title(_MODAL_CONSTANT_TITLES[constant_name], fontsize=8.5)
         std_axes.axhspan(
             -NORMAL_95, NORMAL_95, color=style.SHADE_COLOR, linewidth=0, zorder=0,
             label="95 % of uniform beams",
@@ -116,7 +116,7 @@ def uniformity_figure(uniformity_test: UniformBeamTest) -> Figure:
 def _set_axes(
     axes: Axes, mode_numbers: tuple[int, ...], largest_value: float, *, min_limit: float = 0.0
 ) -> None:
-    """Set symmetric limits about zero, and a tick at each mode."""
+    """Set symmetric limits of the vertical axis, and a tick of the horizontal axis at each mode."""
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7, zorder=1)
     axis_limit = max(1.2 * largest_value, min_limit)
     axes.set_ylim(-axis_limit, axis_limit)
@@ -126,7 +126,7 @@ def _set_axes(
 
 
 def uniformity_description(uniformity_test: UniformBeamTest) -> str:
-    """Return the description of the test's figure, with the result of the test."""
+    """Return the caption of the test's figure, which states the result of the test."""
     return (
         "Modal constants measured, less those of the uniform beam that fits them best, by mode: "
         "above in standard deviations of the measured value (shaded: where 95 of 100 values of a "

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     Real = NDArray[np.float64]
 
 _BLOCK_BINS: Final = 24
-"""Number of frequency bins over which the power is averaged to find the excited band."""
+"""Number of frequency bins in a block, whose mean power decides whether the block was excited."""
 _EXCITED_TO_NOISE_POWER: Final = 4.0
 """Ratio of a block's mean power to the noise's power, above which the block counts as excited.
 
@@ -41,9 +41,9 @@ By chance the ratio exceeds 2 in one of 10 000 blocks."""
 def supported_band_hz(whole_record: WholeRecord) -> Band | None:
     """Return the frequency band in which the data support the selected fit's loss factors.
 
-    The modes determine the damping. A model whose orders the data support is also right between and
-    beyond the modes, in the band in which the beam was excited. A model with an order that the data
-    do not support only interpolates between the visible modes.
+    The modes determine the damping. A model whose orders the data support is valid in the whole
+    band in which the beam was excited, also between and beyond the modes. A model with an order
+    that the data do not support is valid only between the visible modes.
 
     Returns
     -------
@@ -61,19 +61,19 @@ def supported_band_hz(whole_record: WholeRecord) -> Band | None:
 
 
 def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
-    """Return the lowest and highest frequency at which the torque's power exceeds the noise's.
+    """Return the lowest and highest frequency at which the torque is stronger than the noise.
 
     Parameters
     ----------
     record : Record
         Record with the measured torque.
     analysis : RecordAnalysis
-        Analysis of the record, with its noise and with the band to which the result is limited.
+        Analysis of the record with its noise spectrum. The result is limited to its band.
 
     Returns
     -------
     tuple of float or None
-        Lowest and highest frequency in Hz; None if the torque nowhere exceeds the noise.
+        Lowest and highest frequency in Hz; None if the torque is below the noise at all of them.
     """
     torque_nm = record.torque_nm - record.torque_nm.mean()
     frequency_hz = np.fft.rfftfreq(torque_nm.size, 1 / record.rate_hz)
@@ -119,16 +119,16 @@ class FittedPlant(Protocol):
 
     @property
     def determined(self) -> tuple[str, ...]:
-        """Names of the parameters with a covariance, in the covariance's order."""
+        """Names of the parameters that the data determine, in the order of `covariance`."""
 
     @property
     def covariance(self) -> Real:
-        """Covariance of the determined parameters; positive ones by their logarithms."""
+        """Covariance of the determined parameters, or of the logarithms of positive ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class NearlyUniformBeam:
-    """Beam estimated with a tolerance of its geometry, in the form of an `FittedPlant`.
+    """Beam estimated with a tolerance of its geometry, in the form of a `FittedPlant`.
 
     Attributes
     ----------
@@ -139,9 +139,9 @@ class NearlyUniformBeam:
     parameters : mapping of str to float
         Values of the parameters by name.
     determined : tuple of str
-        Names of the parameters in the covariance's order.
+        Names of the parameters in the order of `covariance`.
     covariance : ndarray, shape (7, 7)
-        Covariance of the parameters; of positive ones by their logarithms.
+        Covariance of the parameters, or of the logarithms of positive ones.
     """
 
     structure: Structure
@@ -152,7 +152,7 @@ class NearlyUniformBeam:
 
     @classmethod
     def from_estimate(cls, tolerant_estimate: TolerantEstimate) -> NearlyUniformBeam:
-        """Return the beam of an estimate with a tolerance of the geometry and both orders free."""
+        """Return the beam that was estimated with a tolerance of the geometry and free orders."""
         return cls(
             STRUCTURES["VI"],
             tolerant_estimate.plant,
@@ -176,11 +176,11 @@ def loss_estimate(whole_record: WholeRecord) -> FittedPlant | None:
 
 
 _GRID_POINTS: Final = 900
-"""Number of frequencies that are spread over a band, without those at the peaks."""
+"""Number of frequencies of a grid over a band, in addition to those near the peaks."""
 
 
 def dense_grid(first_hz: float, last_hz: float, peaks_hz: Sequence[float]) -> Real:
-    """Return frequencies that are dense over a band, and denser at the narrow peaks.
+    """Return frequencies on which curves over a band are drawn, denser near narrow peaks.
 
     Parameters
     ----------
@@ -192,6 +192,7 @@ def dense_grid(first_hz: float, last_hz: float, peaks_hz: Sequence[float]) -> Re
     Returns
     -------
     ndarray, shape (n,)
+        Frequencies in Hz, increasing.
     """
     band_grid = np.geomspace(first_hz, last_hz, _GRID_POINTS)
     relative_offsets = np.geomspace(1e-4, 0.1, 40)
@@ -217,7 +218,7 @@ class ResponseBand:
     response : ndarray of complex, shape (n,)
         Torque per angle in N·m/rad, without a delay between the channels.
     log_magnitude_std : ndarray, shape (n,)
-        Standard deviation of ``ln |response|``, which is the relative one of the magnitude.
+        Standard deviation of ``ln |response|``, the relative standard deviation of the magnitude.
     phase_std_rad : ndarray, shape (n,)
         Standard deviation of the phase.
     """
@@ -228,7 +229,7 @@ class ResponseBand:
     phase_std_rad: Real
 
     def magnitude_limits(self) -> tuple[Real, Real]:
-        """Return the lower and upper limit of the magnitude's 95 % band, in N·m/rad, (n,) each."""
+        """Return lower and upper limits of the magnitude's 95 % band in N·m/rad, (n,) each."""
         return _logarithmic_limits(np.abs(self.response), self.log_magnitude_std)
 
 
@@ -244,9 +245,9 @@ def response_band(fit: FittedPlant, frequency_hz: Real) -> ResponseBand:
 
     Notes
     -----
-    With g the derivatives of ln H by the determined parameters and C their covariance, the
-    variance of ``ln |H|`` is ``Re g C Re g'`` and that of the phase ``Im g C Im g'``. Parameters
-    that are fixed, or that the data do not determine, count as known.
+    Let g be the derivatives of ln H by the determined parameters, and C the parameters' covariance.
+    The variance of ``ln |H|`` is ``Re g C Re g'``, the variance of the phase ``Im g C Im g'``.
+    Parameters that are fixed, or that the data do not determine, count as known.
     """
     delay_free_plant: Plant = replace(fit.plant, delay_s=0.0)
     # The delay changes the measured phase, but not that of beam and clamp.
@@ -290,8 +291,8 @@ def modal_response_band(fit: ModalFit, frequency_hz: Real, delay_s: float = 0.0)
     frequency_hz : ndarray, shape (n,)
         Positive.
     delay_s : float
-        Delay of the torque against the angle, as the file states it. It is removed from the
-        response.
+        Delay of the torque channel minus that of the angle channel, as the file states them. It is
+        removed from the response.
     """
     s = 2j * np.pi * frequency_hz
     response = fit.model.response(s)
@@ -332,8 +333,8 @@ class LossFactor:
     Attributes
     ----------
     value : ndarray, shape (n,)
-        Loss factor; NaN where it has no meaning, because damping of a low order outweighs the
-        inertia.
+        Loss factor; NaN at frequencies where the damping acts as a stiffness larger than the
+        inertia, so that no loss factor is defined.
     log_std : ndarray, shape (n,)
         Standard deviation of the loss factor's logarithm.
     """
@@ -355,10 +356,10 @@ class LossFactors:
     frequency_hz : ndarray, shape (n,)
         Frequencies of the loss factors.
     internal, external : LossFactor or None
-        Loss in the material and loss to the surroundings; None if the structure does not include
-        it.
+        Loss factors of the material and of the surroundings; None if the structure has no such
+        damping.
     total : LossFactor
-        Sum of both. At a mode it is twice the damping ratio, without terms of second order.
+        Sum of both. At a mode it is twice the damping ratio, to first order of the damping.
     """
 
     frequency_hz: Real
@@ -380,13 +381,13 @@ def loss_factors(fit: FittedPlant, frequency_hz: Real) -> LossFactors:
     Notes
     -----
     A mode with the stiffness k⁴ obeys ``(1 + zeta s^alpha) k⁴ + rho/EI s² + gamma s^lambda = 0``.
-    On s = j omega, with ``z = zeta omega^alpha`` and ``g = gamma omega^lambda / (rho/EI omega²)``,
-    the imaginary part of elastic and of inertial term over the real one is::
+    At s = j omega, with ``z = zeta omega^alpha`` and ``g = gamma omega^lambda / (rho/EI omega²)``,
+    the imaginary part divided by the real part is, for the elastic and for the inertial term::
 
         z sin(alpha pi/2) / (1 + z cos(alpha pi/2))
         g sin(lambda pi/2) / (1 - g cos(lambda pi/2))
 
-    and at a resonance, where the real parts cancel, their sum is the loss factor of the mode.
+    At a resonance the real parts cancel, and the sum of both ratios is the loss factor of the mode.
     """
     omega_rad_s = 2 * np.pi * frequency_hz
     parameter_values = fit.parameters
@@ -438,9 +439,9 @@ def loss_factors(fit: FittedPlant, frequency_hz: Real) -> LossFactors:
 def _loss_with_slopes(
     omega_rad_s: Real, damping_coefficient: Real | float, damping_order: float, term_sign: float
 ) -> tuple[Real, tuple[Real, Real]]:
-    """Return a damping term's loss factor, and the slopes of its logarithm.
+    """Return a damping term's loss factor, and the derivatives of the loss factor's logarithm.
 
-    The slopes are those by the coefficient's logarithm and by the order.
+    The derivatives are with respect to the logarithm of the coefficient, and to the order.
     """
     log_omega, quarter_turn_angle = np.log(omega_rad_s), _QUARTER_TURN * damping_order
     term_magnitude = damping_coefficient * omega_rad_s**damping_order
@@ -459,9 +460,9 @@ def _loss_with_slopes(
 
 
 def _rows_by_parameter(fit: FittedPlant, slopes_by_name: dict[str, Real], point_count: int) -> Real:
-    """Return slopes as rows (k, n) in the order of the parameters in the fit's covariance.
+    """Return derivatives by parameters as rows (k, n), in the order of the fit's covariance.
 
-    A parameter without slopes has a row of zeros.
+    A parameter that is not in `slopes_by_name` has a row of zeros.
     """
     return np.array(
         [
@@ -474,14 +475,14 @@ def _rows_by_parameter(fit: FittedPlant, slopes_by_name: dict[str, Real], point_
 def _standard_deviations(gradient: Real, covariance: Real) -> Real:
     """Return the standard deviations (n,) of a function of the parameters.
 
-    `gradient` contains its slopes (k, n), and `covariance` is that of the parameters, (k, k).
+    `gradient` contains the function's derivatives, (k, n); `covariance` is the parameters', (k, k).
     """
     log_variance = np.einsum("in,ij,jn->n", gradient, covariance, gradient, optimize=True)
     return np.asarray(np.sqrt(np.maximum(log_variance, 0.0)))
 
 
 def _logarithmic_limits(central_value: Real, log_std: Real) -> tuple[Real, Real]:
-    """Return the lower and upper limit of a 95 % interval that is symmetric in the logarithm."""
+    """Return lower and upper limits of 95 % intervals that are symmetric in the logarithm."""
     # An undetermined value may overflow. Its band then includes everything.
     limit_factor = np.exp(np.minimum(NORMAL_95 * log_std, 300.0))
     return central_value / limit_factor, central_value * limit_factor

@@ -44,17 +44,17 @@ _NO_VERDICT_SENTENCE: Final = (
 
 
 def campaign_sentences(campaign: CampaignResult) -> tuple[str, ...]:
-    """Return the verdict on a campaign and the validity of the linear model.
+    """Return the verdict on a campaign, and the validity of the linear model, as sentences.
 
-    Without a verdict the sentences state whether the sessions are of one specimen, and why there is
-    no verdict. The second sentence, or the only one, states the validity.
+    Without a verdict they state whether the sessions are of one specimen, and why there is no
+    verdict. The second sentence (or the only one) states the validity.
     """
     verdict_sentences = _verdict_sentences(campaign)
     return (*verdict_sentences[:1], campaign.validity.sentence, *verdict_sentences[1:])
 
 
 def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
-    """Return the verdict, or without one the statements on specimens and on the missing verdict."""
+    """Return the verdict's sentences, or those on specimens and on why there is no verdict."""
     if campaign.verdict is not None:
         return campaign.verdict.sentences
     has_estimates = any(session.record_estimates for session in campaign.sessions)
@@ -107,7 +107,7 @@ def _session_warnings(campaign: CampaignResult) -> list[str]:
 
 
 def campaign_text(campaign: CampaignResult, *, with_paper: bool = False) -> str:
-    """Return a campaign's tables as plain text, with the files that were left out.
+    """Return a campaign's tables as plain text, with a list of the files that were excluded.
 
     Parameters
     ----------
@@ -123,8 +123,8 @@ def campaign_text(campaign: CampaignResult, *, with_paper: bool = False) -> str:
 # Page
 
 _WHOLE_RECORD_FIGURES: Final = ("damping", "pooled_response", "pooled", "validation")
-"""Figures of the whole-record fits, which follow the verdict. All other figures are those of the
-paper."""
+"""Names of the whole-record fits' figures, which follow the verdict on the page. The other figures
+correspond to the reference paper's."""
 
 
 def campaign_page(
@@ -172,7 +172,7 @@ def campaign_page(
 
 
 def _warning_texts(campaign: CampaignResult) -> list[str]:
-    """Return all warnings: files left out, lost trials, and the sessions' own warnings."""
+    """Return all warnings: excluded files, failed predictions, and the sessions' own warnings."""
     return [
         *(f"Left out: {failure.message}" for failure in campaign.failures),
         *(
@@ -184,7 +184,7 @@ def _warning_texts(campaign: CampaignResult) -> list[str]:
 
 
 def _collect_facts(campaign: CampaignResult) -> list[Facts]:
-    """Return tables of (name, text) on specimen and estimators, for the HTML page."""
+    """Return groups of facts on specimen and estimators, for the HTML page."""
     settings, (first_hz, last_hz) = campaign.settings, campaign.record_band_hz
     stated_beam = campaign.sessions[0].beam
     fact_groups = [
@@ -236,7 +236,7 @@ def _collect_facts(campaign: CampaignResult) -> list[Facts]:
 
 
 def _geometry_facts(campaign: CampaignResult) -> list[tuple[str, str]]:
-    """Return (name, text) on the tolerance of the beam's geometry; nothing if none is stated."""
+    """Return facts (name, text) on the tolerance of the beam's geometry, if one is stated."""
     if campaign.modal is None or not campaign.modal.leads:
         return []
     return [
@@ -298,7 +298,7 @@ def write_campaign(
 
 
 def _illustrations(campaign: CampaignResult) -> Iterator[Illustration]:
-    """Yield the figures for which the campaign has data."""
+    """Yield the figures of a campaign's report, except those for which there are no data."""
     from analysis.report._campaign_figures import (
         best_figure,
         index_figure,

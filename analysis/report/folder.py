@@ -1,8 +1,8 @@
 """Folders of reports: each is complete or absent, and no other files are overwritten.
 
-Each folder contains a list of its files with their SHA-256 (``SHA256SUMS``, as ``sha256sum -c``
-checks it). A file that is in the list and unchanged was written by an analysis. No other file is
-ever replaced or removed.
+Each folder contains a list of its files with their SHA-256 checksums (``SHA256SUMS``, which
+``sha256sum -c`` can check). A file that is in the list and unchanged was written by an analysis. No
+other file is ever replaced or removed.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _RESULT_KEYS: Final = frozenset(("versions", "headlines", "fits"))
 
 
 class OutputExistsError(ValueError):
-    """Error: a file or folder that is to be written exists already."""
+    """Error if a file or folder that is to be written exists already."""
 
 
 class OutputError(Exception):
-    """Error: an output file or folder cannot be written."""
+    """Error if an output file or folder cannot be written."""
 
 
 # Names
@@ -42,7 +42,7 @@ class OutputError(Exception):
 def report_folders(
     session_files: Sequence[Path], report_path: Path | None, *, overwrite: bool = False
 ) -> list[Path]:
-    """Return the folder for each file's report, and raise if it must not be written.
+    """Return the folder for each file's report; raise if a report must not be written there.
 
     Parameters
     ----------
@@ -122,12 +122,12 @@ def check_new_file(path: Path, message_subject: str, *, overwrite: bool = False)
 
 
 def _is_free(folder: Path) -> bool:
-    """Return True if a path does not exist or is an empty folder, so that a report fits there."""
+    """Return whether a report can be written to a path: it does not exist or is an empty folder."""
     return not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir()))
 
 
 def _unused_folder(folder: Path, reserved_folders: set[Path], *, overwrite: bool = False) -> Path:
-    """Return the folder, or the first numbered folder name like it that is not in use."""
+    """Return a folder's path, or the first unused one with a number appended if it is in use."""
     folder_number, candidate_folder = 1, folder
     while candidate_folder in reserved_folders or (
         os.path.lexists(candidate_folder) and not overwrite
@@ -161,14 +161,14 @@ def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
     folder : Path
         Final path of the folder.
     overwrite : bool
-        Whether an earlier report in this folder is replaced: its own files are removed, all others
-        stay.
+        Whether an earlier report in this folder is replaced: the files of the report are removed,
+        all other files remain.
 
     Raises
     ------
     OutputExistsError
-        If the folder was created meanwhile and is not empty, or if a file of the earlier report was
-        changed.
+        If another program has created the folder in the meantime and it is not empty, or if a file
+        of the earlier report was changed.
     OutputError
         If the folder cannot be created.
     """
@@ -206,7 +206,7 @@ def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 def write_new(path: Path, file_content: str | bytes, *, overwrite: bool = False) -> None:
-    """Write a new file, and create its folders. Text is encoded as UTF-8.
+    """Write a new file, and create the folders of its path. Text is encoded as UTF-8.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ def _replace_file(path: Path, file_bytes: bytes) -> None:
 
 
 def _require_free_or_report(folder: Path) -> None:
-    """Raise OutputExistsError if a folder is neither free nor an earlier report."""
+    """Raise OutputExistsError unless a folder is absent, empty or contains an earlier report."""
     if not _is_free(folder) and not (folder.is_dir() and (folder / CHECKSUM_LIST_NAME).is_file()):
         raise OutputExistsError(
             f"--overwrite replaces reports of an analysis, and {folder} is not one: it has no list "
@@ -300,7 +300,7 @@ def _replace_report(
 def _is_unchanged_report_file(
     folder: Path, file_name: str, listed_checksums: Mapping[str, set[str]]
 ) -> bool:
-    """Return whether a file of a report's folder is in the folder's list and unchanged."""
+    """Return whether a file in a report's folder is listed there and has a listed checksum."""
     file_path = folder / file_name
     is_inside = file_path.resolve().is_relative_to(folder.resolve()) and not file_path.is_symlink()
     return (
@@ -311,9 +311,9 @@ def _is_unchanged_report_file(
 
 
 def _read_list(folder: Path) -> dict[str, set[str]]:
-    """Return the SHA-256 checksums that the list in a report's folder states, by file name.
+    """Return the SHA-256 checksums in the list of a report's folder, by file name.
 
-    A file that was being replaced at an interruption has two checksums.
+    A file has two checksums if the analysis was interrupted while it replaced the file.
     """
     checksums: dict[str, set[str]] = {}
     try:

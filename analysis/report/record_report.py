@@ -13,7 +13,7 @@ from analysis.report import _record_tables as tables
 from analysis.report._document import document, document_text
 from analysis.report._equation import definitions, equations, latex, mathml, types_table
 from analysis.report._text import damping_sentences, tables_text
-from analysis.report._uniformity import UNIFORMITY, uniformity_table
+from analysis.report._uniformity import UNIFORMITY_FIGURE, uniformity_table
 from analysis.report.folder import write_new
 from analysis.report.table import Table, csv_text, latex_table, with_validity
 from analysis.results import DEFAULT_FORMATS
@@ -69,7 +69,7 @@ def record_page(
 
     whole_record = result.whole
     assert whole_record is not None
-    other_pictures = [picture for picture in pictures if picture.name != UNIFORMITY]
+    other_pictures = [picture for picture in pictures if picture.name != UNIFORMITY_FIGURE]
     uniformity_test = whole_record.headline.uniform_beam
     return page(
         "record.html",
@@ -85,7 +85,7 @@ def record_page(
         if uniformity_test is None
         else {
             "sentence": uniformity_test.summary.sentence,
-            "pictures": [picture for picture in pictures if picture.name == UNIFORMITY],
+            "pictures": [picture for picture in pictures if picture.name == UNIFORMITY_FIGURE],
             "tables": uniformity_tables(whole_record),
         },
         equations=[mathml(picture_or_formula) for picture_or_formula in equations(whole_record)],
@@ -100,7 +100,7 @@ def record_page(
 
 
 def _session_lines(record: Record) -> list[str]:
-    """Return start, outcome, specimen and operator of the session, as the file states them."""
+    """Return lines that state start, outcome, specimen and operator of the session."""
     record_metadata = record.metadata
     fact_lines = [
         f"{key}: {record_metadata[key]}"
@@ -114,7 +114,7 @@ def _session_lines(record: Record) -> list[str]:
 
 
 def _start_lines(metadata: Mapping[str, str]) -> list[str]:
-    """Return the start time of the session as a list of one text; empty if the file states none."""
+    """Return a list of one line with the session's start time; empty if the file states none."""
     try:
         start_utc_s = int(metadata["start_utc_ns"]) / 1e9
         start_time = datetime.fromtimestamp(start_utc_s, UTC)
@@ -133,7 +133,7 @@ _METADATA_SHOWN_ELSEWHERE = frozenset(
 
 
 def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[Facts]:
-    """Return tables of (name, text) on file, record, session and settings, for the HTML page."""
+    """Return groups of facts on file, record, session and settings, for the HTML page."""
     record, welch_analysis = result.record, result.welch
     return [
         ("File", _file_facts(record.path)),
@@ -165,7 +165,7 @@ def sha256(path: Path) -> str | None:
 
 
 def _file_facts(path: Path) -> list[tuple[str, str]]:
-    """Return (name, text) of a file's path, size and checksum."""
+    """Return facts (name, text) on a file: path, size and checksum."""
     checksum = sha256(path)
     file_facts = [("path", str(path))]
     if checksum is not None:
@@ -174,7 +174,7 @@ def _file_facts(path: Path) -> list[tuple[str, str]]:
 
 
 def _record_facts(record: Record) -> list[tuple[str, str]]:
-    """Return (name, text) of a record's outcome, samples, beam, latencies and gaps."""
+    """Return facts (name, text) on a record: outcome, samples, beam, latencies and gaps."""
     stated_beam, sample_gaps = record.beam, record.gaps
     full_rate = record.full_rate
     decimation_text = (
@@ -212,7 +212,7 @@ def _record_facts(record: Record) -> list[tuple[str, str]]:
 
 
 def _record_fit_facts(whole_record: WholeRecord) -> list[tuple[str, str]]:
-    """Return (name, text) of the whole-record fits' estimator, band, types and fixed values."""
+    """Return facts (name, text) on the whole-record fits: estimator, band, types, fixed values."""
     first_hz, last_hz = whole_record.band_hz
     hum_texts = [
         f"{hum_line.frequency_hz:.5g} Hz, {1e3 * hum_line.amplitude_nm:.3g} mN·m"
@@ -237,7 +237,7 @@ def _record_fit_facts(whole_record: WholeRecord) -> list[tuple[str, str]]:
 
 
 def _welch_facts(analysis: WelchAnalysis) -> list[tuple[str, str]]:
-    """Return (name, text) of the Welch fits' estimator, band, types and segments."""
+    """Return facts (name, text) on the Welch fits: estimator, band, types and segments."""
     settings, segmentation, response = analysis.settings, analysis.segmentation, analysis.response
     first_hz, last_hz = settings.band_hz
     welch_facts = [
@@ -300,7 +300,7 @@ def _write_page(
 
 
 def uniformity_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
-    """Return the tables of the test of the beam's uniformity; nothing without the test."""
+    """Return the tables of the test of the beam's uniformity; empty if there was no test."""
     uniformity_test = whole_record.headline.uniform_beam
     if uniformity_test is None or uniformity_test.p_value is None:
         return ()
@@ -309,7 +309,7 @@ def uniformity_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
 
 
 def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
-    """Return the table of modes, those of whole-record fits, and those of the Welch method."""
+    """Return the table of modes, the tables of whole-record fits, and the tables of Welch fits."""
     whole_record, welch_analysis = result.whole, result.welch
     assert whole_record is not None
     condition_tables = (

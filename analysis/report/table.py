@@ -1,6 +1,6 @@
-"""Table that is defined once and rendered for the terminal, LaTeX, CSV, JSON and pages.
+"""Table that is defined once and rendered for terminal, LaTeX, CSV, JSON and HTML pages.
 
-The HTML of a page is made by the template's macro `table`, from the same cells.
+The template's macro `table` makes the HTML of a page from the same cells as all other outputs.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ TEXT_FORMAT: Final = ""
 """Number format of a column that contains texts instead of numbers."""
 
 Value = str | float | bool | None
-"""Value of a cell as programs read it."""
+"""Value of a cell in CSV and JSON files: in SI units, without formatting."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Cell of a table with a displayed text of its own, instead of the column's number format.
+    """Cell of a table whose displayed text does not follow from its column's number format.
 
     Attributes
     ----------
@@ -46,8 +46,7 @@ class Cell:
     strong : bool
         Whether the text is emphasised.
     doubtful : bool
-        Whether the value is not a reported result: it is shown in grey, because the data do not
-        support it.
+        Whether the value is shown in grey, because the data do not support it as a result.
     """
 
     value: Value
@@ -97,8 +96,8 @@ class Column:
         """Whether the column contains numbers."""
         return self.number_format != TEXT_FORMAT
 
-    def shown(self, entry: Entry) -> Cell:
-        """Return the cell with the text that is displayed for an entry of this column."""
+    def displayed_cell(self, entry: Entry) -> Cell:
+        """Return an entry of this column as a cell with the displayed text."""
         if isinstance(entry, Cell):
             return entry
         if isinstance(entry, bool):
@@ -123,16 +122,16 @@ class Table:
     caption : str
         Title of the table.
     columns : tuple of Column
-        Columns for people, in their order. The first one identifies the row.
+        Displayed columns in their order. The first column identifies the row.
     rows : tuple of mapping of str to Entry
-        Entries by the keys of their columns. Further entries are for programs only. A row may lack
-        entries.
+        Entries of each row by column key. Entries without a column are written to files only. A row
+        may lack entries.
     notes : tuple of str
         Sentences below the table.
     selected : int or None
         Index of the row that is shown in bold.
     grouped : bool
-        Whether a line is drawn on the terminal between rows whose first cells differ.
+        Whether the terminal shows a line between rows whose first cells differ.
     """
 
     name: str
@@ -155,7 +154,7 @@ class Table:
         selected: int | None = None,
         grouped: bool = False,
     ) -> Table:
-        """Return a table whose rows contain their entries in the order of the columns.
+        """Return a table from rows that are sequences of entries in the order of the columns.
 
         Parameters
         ----------
@@ -180,7 +179,7 @@ class Table:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Keys of all entries of a table, in their order: the header of its CSV file."""
+        """Keys of all entries in the order of the rows: the header of the table's CSV file."""
         return tuple(
             dict.fromkeys(key for row in self.rows for key in row)
             or (column.key for column in self.columns)
@@ -201,14 +200,15 @@ class Table:
         """Cells of a table's displayed columns, row by row."""
         columns = self.shown_columns
         return tuple(
-            tuple(column.shown(row.get(column.key, "")) for column in columns) for row in self.rows
+            tuple(column.displayed_cell(row.get(column.key, "")) for column in columns)
+            for row in self.rows
         )
 
 
 def with_validity(table: Table, validity: Validity) -> Table:
-    """Return a table with the validity of the linear model, as a note and in each row.
+    """Add the validity of the linear model to a table: as a note, and as values in each row.
 
-    People read the note below the table. Programs read the values in each row.
+    The note is for people, and the values are for programs that read the files.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def with_validity(table: Table, validity: Validity) -> Table:
 
 
 def csv_text(table: Table) -> str:
-    """Return a table as CSV, with keys as header and numbers in SI units with all digits.
+    """Return the text of a CSV file: keys as header, numbers in SI units with all digits.
 
     Unknown values are empty fields.
     """
@@ -238,12 +238,12 @@ def csv_text(table: Table) -> str:
 
 
 def json_rows(table: Table) -> list[dict[str, Value]]:
-    """Return a table's rows as plain values by their keys; None if unknown or not finite."""
+    """Return a table's rows as dicts of JSON values; None for a value unknown or not finite."""
     return [{key: _program_value(entry) for key, entry in row.items()} for row in table.rows]
 
 
 def _program_value(entry: Entry) -> Value:
-    """Return an entry's value as programs read it; None if it is not finite."""
+    """Return an entry's value for CSV and JSON; None if it is a number that is not finite."""
     entry_value = entry.value if isinstance(entry, Cell) else entry
     return (
         None if isinstance(entry_value, float) and not math.isfinite(entry_value) else entry_value
@@ -308,7 +308,7 @@ _LATEX_TOKENS: Final = re.compile(
     r"|(?P<minus>−)|(?P<stiffness>\bEI\b)|(?P<other>.)",
     re.DOTALL,
 )
-"""Pattern of a text's parts with their own LaTeX: powers, superscripts, Greek letters, others."""
+"""Pattern of those parts of a text that need LaTeX commands: powers, Greek letters and others."""
 
 
 def latex_text(text: str) -> str:
@@ -349,7 +349,7 @@ def _latex_token(token: re.Match[str]) -> str:
 
 
 def latex_table(table: Table) -> str:
-    r"""Return a table as LaTeX's ``table``, with the rules of the package booktabs.
+    r"""Return a table as a LaTeX ``table`` environment with the rules of the package booktabs.
 
     The notes follow below the table.
     """
@@ -426,7 +426,7 @@ def estimate_cells(
 
 
 NOT_REPORTED_MARK: Final = "†"
-"""Mark after a number that is not a reported result."""
+"""Symbol after a number that is not a reported result."""
 
 _ORDER_SYMBOLS: Final = {"alpha": "α", "lambda": "λ"}
 """Symbols of the fractional orders by parameter name."""
@@ -447,8 +447,8 @@ def unreported_parameters(
     Returns
     -------
     frozenset of str
-        Each of these orders that the structure has, and the coefficient that belongs to it. A
-        coefficient is valid for one order only, as its unit shows.
+        The unsupported orders that the structure has, and the coefficients that belong to them. A
+        coefficient is valid only together with its order, on which its unit depends.
     """
     return frozenset(
         parameter_name
@@ -459,19 +459,19 @@ def unreported_parameters(
 
 
 def mark_cell(cell: Cell) -> Cell:
-    """Return a cell in grey with the symbol † for "not reported"; a dash gets no symbol."""
+    """Return a cell in grey with the symbol † for "not reported", which a dash does not get."""
     return grey_cell(
         cell if cell.value is None else replace(cell, text=cell.text + NOT_REPORTED_MARK)
     )
 
 
 def grey_cell(cell: Cell) -> Cell:
-    """Return a cell in grey, such as the standard deviation of a number that is not reported."""
+    """Return a cell in grey, for example the standard deviation of a number with the symbol †."""
     return replace(cell, doubtful=cell.value is not None)
 
 
 def footnotes(unsupported_orders: Collection[str]) -> tuple[str, ...]:
-    """Return the note on the symbol † if fractional orders are not reported, else nothing."""
+    """Return the note on the symbol † as a tuple; empty if all orders are supported."""
     if not unsupported_orders:
         return ()
     order_symbols = " or ".join(

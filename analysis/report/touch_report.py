@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _MAX_INTERVAL_ASYMMETRY = 0.25
 """Asymmetry of an interval above which its ends are shown instead of value and half-width.
 
-It is the distance of the value from the middle, relative to the interval's length."""
+The asymmetry is the distance of the value from the interval's middle, relative to its length."""
 _KIND_DESCRIPTIONS = {
     "rigid": "obstacle at rest",
     "yielding": "obstacle that gives way",
@@ -117,7 +117,7 @@ def _estimate_cell(estimated_quantity: TouchQuantity | None, display_offset: flo
 
 
 def session_lines(session: SessionTouches) -> list[str]:
-    """Return text lines on a session: number of touches, source of the model, and warnings.
+    """Return text lines on a session: number of touches, source of the beam model, and warnings.
 
     Parameters
     ----------
@@ -132,7 +132,9 @@ def session_lines(session: SessionTouches) -> list[str]:
         if touch_count == 1
         else f"{touch_count} touches"
     )
-    detection_phrase = "during the session" if session.found == "loop" else "in the record"
+    detection_phrase = (
+        "during the session" if session.detection_source == "loop" else "in the record"
+    )
     detection_text = f", detected {detection_phrase}" if touch_count else ""
     validity_text = f" {session.validity.sentence}" if touch_count else ""
     return [
@@ -143,7 +145,7 @@ def session_lines(session: SessionTouches) -> list[str]:
 
 
 def model_words(session: SessionTouches) -> str:
-    """Return as text from where the parameters of a session's beam model are."""
+    """Return a text that states the source of the parameters of a session's beam model."""
     model_source = session.model.source
     return "the nominal beam of the attached profile" if model_source == "profile" else model_source
 
@@ -171,7 +173,7 @@ def touches_document(
             "touches": [
                 {
                     "file": str(session.path),
-                    "detected": session.found,
+                    "detected": session.detection_source,
                     "validity": session.validity.as_json(),
                     **touch.as_dict(),
                 }
@@ -250,7 +252,7 @@ def write_touch_report(
 
 
 def _collect_facts(session_touches: Sequence[SessionTouches]) -> list[Facts]:
-    """Return tables of (name, text) on sessions, model and estimator, for the HTML page."""
+    """Return groups of facts on sessions, model and estimator, for the HTML page."""
     return [
         (
             "Sessions",

@@ -1,4 +1,4 @@
-"""Reference measurement with cyclictest of rt-tests, the lowest latency on this computer."""
+"""Reference measurement with cyclictest of rt-tests, of the lowest latency on this computer."""
 
 import os
 import re
@@ -17,7 +17,7 @@ NAME = "cyclictest"
 _HISTOGRAM_US = 50_000
 """Largest delay of the histogram in µs."""
 _TIMEOUT_MARGIN_S = 20.0
-"""Seconds after the end of the measurement in which the program must end."""
+"""Longest time in seconds from the end of the measurement to the end of the program."""
 _BIN_LINE = re.compile(r"^(\d+)\s+(\d+)\s*$", re.MULTILINE)
 """Pattern of a bin in the program's output: delay in µs and count."""
 _OVERFLOW_LINE = re.compile(r"^# Histogram Overflows:\s*(\d+)", re.MULTILINE)
@@ -27,7 +27,7 @@ _LARGEST_DELAY_LINE = re.compile(r"^# Max Latencies:\s*(\d+)", re.MULTILINE)
 
 
 class CyclictestError(FailureError):
-    """cyclictest could not be run, or its output is unexpected; the message states the reason."""
+    """Error if cyclictest cannot be run or its output is unexpected; the message says why."""
 
 
 def is_installed() -> bool:

@@ -37,18 +37,18 @@ _BLOCK_RECORDS = 10_000
 _SHORT_TARE_S = 0.2
 """Duration in seconds of the tare, and of the return, in a measured session."""
 _NO_LIMIT = 1_000_000_000
-"""Limit of a number of ticks that no session reaches."""
+"""Number of ticks that no session reaches, for limits that shall have no effect."""
 
 OnPoll = Callable[[], None]
 """Type of a function that is called about ten times a second during a measurement."""
 
 
 class LoopError(FailureError):
-    """A session in which the loop was to be measured failed; the message states the reason."""
+    """Raised with the reason if a session that measures the timing of the loop fails."""
 
 
 def simulated_profile(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
-    """Return a profile of a simulated rig with the rate and the spin time to be measured.
+    """Return a profile of a simulated rig with the given loop rate and spin time.
 
     Everything is simulated in the control process. Late ticks are measured and do not end the
     session. Only the real-time settings of the given profile are used.
@@ -191,7 +191,7 @@ def busy_program(cores: set[int]) -> Iterator[int]:
 
 
 def _hold_excitation(profile: Profile, seconds: float) -> Excitation:
-    """Return a reference that holds the angle for some seconds."""
+    """Return an excitation whose reference angle is constant for some seconds."""
     return hold(rate_hz=profile.rig.rate_hz, duration_s=seconds, rest_s=0.0)
 
 

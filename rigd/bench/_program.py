@@ -45,7 +45,7 @@ class Results:
     seconds: float
     """Duration of each measurement."""
     spin_us: float
-    """Time at the end of each wait in which the loop polls the clock instead of sleeping."""
+    """Time in µs at the end of each wait in which the loop polls the clock instead of sleeping."""
     granted: dict[str, str]
     """Value that the system granted for each real-time setting."""
     load_average: tuple[float, float, float]
@@ -55,7 +55,7 @@ class Results:
     sessions: list[LoopMeasurement] = field(default_factory=list)
     """Measurements of sessions with the recorder and increasing load."""
     search: list[LoopMeasurement] = field(default_factory=list)
-    """Measurements at other rates, preceded by the best one at the requested rate."""
+    """Best measurement at the requested rate, followed by measurements at other rates."""
     no_peer: str = ""
     """Reason why there is no measurement with cyclictest, or an empty string."""
 
@@ -67,8 +67,12 @@ class Results:
     @property
     def peer(self) -> LoopMeasurement | None:
         """Measurements with cyclictest, pooled over the rounds, or None if there are none."""
-        peers = [peer for _, peer in self.rounds if peer is not None]
-        return pool_measurements(cyclictest.NAME, peers) if peers else None
+        cyclictest_measurements = [peer for _, peer in self.rounds if peer is not None]
+        return (
+            pool_measurements(cyclictest.NAME, cyclictest_measurements)
+            if cyclictest_measurements
+            else None
+        )
 
     @property
     def highest_rate_hz(self) -> float | None:
@@ -82,7 +86,7 @@ class Results:
 
     @property
     def highest_rate_between_stalls_hz(self) -> float | None:
-        """Highest rate in Hz at which 99.9 % of the ticks were in time, without stalls; or None."""
+        """Highest rate in Hz at which 99.9 % of ticks outside of stalls ran in time, or None."""
         held_rates = [
             search_measurement.rate_hz
             for search_measurement in self.search
@@ -93,7 +97,7 @@ class Results:
     def ratios(self) -> tuple[float, float] | None:
         """Return the ratios of the loop's to cyclictest's wake-up latency, p50 and p99.
 
-        They are medians over the rounds, or None without cyclictest.
+        They are medians over the rounds. Return None if cyclictest did not run.
         """
         pairs = [
             (percentiles(loop_alone.lateness_us), percentiles(peer.lateness_us))
@@ -109,7 +113,7 @@ class Results:
 
 
 class Bench:
-    """Runs the series of latency measurements with the real-time settings of a profile.
+    """Series of latency measurements with the real-time settings of a profile.
 
     Parameters
     ----------
@@ -178,7 +182,7 @@ class Bench:
             results.sessions.append(self.session(WITH_LOAD, live=True))
 
     def search(self, results: Results) -> None:
-        """Search for the highest rate that the loop holds, in factors of 2, and add the results.
+        """Search in steps of a factor 2 for the highest rate that the loop holds, and add results.
 
         Stalls are ignored, because they affect every rate. The best of several attempts counts,
         because other programs only degrade the result.
@@ -190,13 +194,13 @@ class Bench:
             rate_hz = rate_hz * 2.0 if upwards else rate_hz / 2.0
             if not LOWEST_HZ <= rate_hz <= HIGHEST_HZ:
                 return
-            attempt_number = self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz)
-            if attempt_number.held < HELD_FRACTION:
-                attempt_number = max(
-                    attempt_number, self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz), key=_sort_key
+            measurement = self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz)
+            if measurement.held < HELD_FRACTION:
+                measurement = max(
+                    measurement, self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz), key=_sort_key
                 )
-            results.search.append(attempt_number)
-            if _holds(attempt_number) is not upwards:
+            results.search.append(measurement)
+            if _holds(measurement) is not upwards:
                 return
 
     def session(
@@ -227,19 +231,19 @@ class Bench:
         return loops.run_alone(LOOP_ALONE, simulated_profile, self._seconds, self._show_progress)
 
     def _measure_cyclictest(self, results: Results) -> LoopMeasurement | None:
-        """Measure with cyclictest, or return None and state the reason in the results."""
+        """Measure with cyclictest; return None and add the reason to `results` if it fails."""
         self._register_start(cyclictest.NAME)
         self._show_progress()
         if not cyclictest.is_installed():
             results.no_peer = "not installed (package rt-tests)"
             return None
-        scheduled = not results.granted.get("scheduling", REFUSED).startswith(REFUSED)
+        is_realtime_granted = not results.granted.get("scheduling", REFUSED).startswith(REFUSED)
         try:
             return cyclictest.run(
                 self._rate_hz,
                 self._seconds,
                 cpu=loop_core(results.granted),
-                priority=self._profile.realtime.priority if scheduled else 0,
+                priority=self._profile.realtime.priority if is_realtime_granted else 0,
             )
         except cyclictest.CyclictestError as error:
             results.no_peer = str(error)
@@ -253,7 +257,7 @@ class Bench:
             raise loops.LoopError(f"The real-time settings cannot be tried ({error}).") from error
 
     def _register_start(self, measurement_name: str) -> None:
-        """Register the name and the start of a measurement, which the progress shows."""
+        """Register name and start of a measurement, from which the progress follows."""
         self._present_name = measurement_name
         duration_s = self._seconds + loops.OVERHEAD_S
         self._remaining_s = max(0.0, self._remaining_s - duration_s)
@@ -288,14 +292,14 @@ def cores_without_loop(granted_settings: dict[str, str]) -> set[int]:
     return allowed_cores - {loop_core(granted_settings)} or allowed_cores
 
 
-def _sort_key(measured: LoopMeasurement) -> tuple[bool, float]:
+def _sort_key(measurement: LoopMeasurement) -> tuple[bool, float]:
     """Return the key by which the best measurement of the loop at a rate sorts last."""
-    return measured.held >= HELD_FRACTION, measured.held_between_stalls
+    return measurement.held >= HELD_FRACTION, measurement.held_between_stalls
 
 
-def _holds(measured: LoopMeasurement) -> bool:
+def _holds(measurement: LoopMeasurement) -> bool:
     """Return whether 99.9 % or more of the ticks outside of stalls ran within their periods."""
-    return measured.held_between_stalls >= HELD_FRACTION
+    return measurement.held_between_stalls >= HELD_FRACTION
 
 
 def _median(numbers: list[float]) -> float:

@@ -72,7 +72,7 @@ def verdict(results: Results) -> str:
     if highest_hz is not None:
         verdict_text = f"This computer holds {highest_hz:g} Hz: {criterion_text}."
     else:
-        best_measurement = max(results.search, key=lambda each: each.held)
+        best_measurement = max(results.search, key=lambda measurement: measurement.held)
         verdict_text = (
             f"This computer holds none of these rates: {best_measurement.rate_hz:g} Hz came "
             f"nearest, with {100 * best_measurement.held:.2f} % of the ticks."
@@ -84,18 +84,18 @@ def verdict(results: Results) -> str:
         )
     refused_names = [
         setting_name
-        for setting_name, verdict_text in results.granted.items()
-        if verdict_text.startswith(REFUSED)
+        for setting_name, setting_text in results.granted.items()
+        if setting_text.startswith(REFUSED)
     ]
     if refused_names:
         verdict_text += (
             f" Not granted: {', '.join(refused_names).replace('_', ' ')}; rigd check says how."
         )
-    peer = results.peer
-    if peer is not None and peer.held < HELD_FRACTION:
+    cyclictest_result = results.peer
+    if cyclictest_result is not None and cyclictest_result.held < HELD_FRACTION:
         verdict_text += (
-            f" cyclictest alone would have missed {100 * (1 - peer.held):.2f} % at "
-            f"{peer.rate_hz:g} Hz: this is due to the computer itself."
+            f" cyclictest alone would have missed {100 * (1 - cyclictest_result.held):.2f} % at "
+            f"{cyclictest_result.rate_hz:g} Hz: this is due to the computer itself."
         )
     return verdict_text
 
@@ -126,8 +126,12 @@ def as_json(results: Results) -> dict[str, object]:
 
 def _measurements(results: Results) -> list[LoopMeasurement]:
     """Return the measurements in the order of the report's table."""
-    peer = results.peer
-    return [results.alone, *([] if peer is None else [peer]), *results.sessions]
+    cyclictest_result = results.peer
+    return [
+        results.alone,
+        *([] if cyclictest_result is None else [cyclictest_result]),
+        *results.sessions,
+    ]
 
 
 def _latency_table(measurements: list[LoopMeasurement]) -> Iterator[str]:
@@ -164,18 +168,18 @@ def _latency_table(measurements: list[LoopMeasurement]) -> Iterator[str]:
 
 
 def _search_table(search: list[LoopMeasurement]) -> Iterator[str]:
-    """Yield the lines of the table of rates."""
+    """Yield the lines of the table of all rates at which the loop was measured."""
     yield (
         f"{'':>10}{'held, %':>9}{'but stalls':>12}{'stalls':>8}{'late p99, µs':>14}"
         f"{'exec p99, µs':>14}{'CPU, %':>8}"
     )
-    for measured in sorted(search, key=lambda measured: measured.rate_hz):
-        cpu = "" if measured.cpu_percent is None else f"{measured.cpu_percent:8.1f}"
+    for measurement in sorted(search, key=lambda measurement: measurement.rate_hz):
+        cpu = "" if measurement.cpu_percent is None else f"{measurement.cpu_percent:8.1f}"
         yield (
-            f"{measured.rate_hz:7.0f} "
-            f"Hz{100 * measured.held:9.3f}{100 * measured.held_between_stalls:12.3f}"
-            f"{measured.stalls:8d}{percentiles(measured.lateness_us).p99:14.0f}"
-            f"{percentiles(measured.work_us).p99:14.0f}{cpu}"
+            f"{measurement.rate_hz:7.0f} "
+            f"Hz{100 * measurement.held:9.3f}{100 * measurement.held_between_stalls:12.3f}"
+            f"{measurement.stalls:8d}{percentiles(measurement.lateness_us).p99:14.0f}"
+            f"{percentiles(measurement.work_us).p99:14.0f}{cpu}"
         )
 
 
@@ -222,7 +226,7 @@ def _percentiles_object(delays_us: npt.NDArray[np.float64]) -> dict[str, float]:
 
 # Histogram
 
-_FIRST_US, _LAST_US = 1.0, 100_000.0
+_FIRST_EDGE_US, _LAST_EDGE_US = 1.0, 100_000.0
 """Lowest edge above 0 and highest edge of the histogram's bins, in µs."""
 _DECADE_STEPS = (1.0, 2.0, 5.0)
 """Edges of the histogram's bins within a decade, relative to the beginning of the decade."""
@@ -239,8 +243,8 @@ def edges_us() -> list[float]:
 
     They are 0, 1, 2, 5, 10, …, 100 000; the last bin has no upper edge.
     """
-    decades = round(log10(_LAST_US / _FIRST_US))
-    return [0.0, *(s * 10.0**d for d in range(decades) for s in _DECADE_STEPS), _LAST_US]
+    decades = round(log10(_LAST_EDGE_US / _FIRST_EDGE_US))
+    return [0.0, *(s * 10.0**d for d in range(decades) for s in _DECADE_STEPS), _LAST_EDGE_US]
 
 
 def counts_of(delays_us: npt.NDArray[np.float64]) -> list[int]:
@@ -268,22 +272,20 @@ def histogram_lines(histogram_columns: Sequence[tuple[str, npt.NDArray[np.float6
     header_line = " " * (_LABEL_WIDTH + 3) + "".join(
         f"{column_title:<{_BAR_WIDTH + 9}}" for column_title, _ in histogram_columns
     )
-    histogram_text = [header_line.rstrip()]
+    text_lines = [header_line.rstrip()]
     for bin_no in range(used_bins[0], used_bins[-1] + 1):
         bars_text = (
             f"{_histogram_bar(bin_totals[bin_no], longest_count)}{bin_totals[bin_no]:>7}  "
             for bin_totals in bin_counts
         )
-        histogram_text.append(
-            f"{_bin_label(bin_no):>{_LABEL_WIDTH}}   {''.join(bars_text)}".rstrip()
-        )
-    return histogram_text
+        text_lines.append(f"{_bin_label(bin_no):>{_LABEL_WIDTH}}   {''.join(bars_text)}".rstrip())
+    return text_lines
 
 
-def _histogram_bar(bin_count: int, longest: int) -> str:
-    """Return the bar of a bin; `longest` is the count of the longest bar."""
-    bar_length = round((_BAR_WIDTH - 1) * log10(1 + bin_count) / log10(1 + longest))
-    return f"{_BAR_CHARACTER * max(bar_length, int(bin_count > 0)):<{_BAR_WIDTH}}"
+def _histogram_bar(bin_count: int, longest_count: int) -> str:
+    """Return the bar of a bin; `longest_count` is the count of the longest bar."""
+    bar_length = round((_BAR_WIDTH - 1) * log10(1 + bin_count) / log10(1 + longest_count))
+    return f"{_BAR_CHARACTER * bar_length:<{_BAR_WIDTH}}"
 
 
 def _bin_label(bin_index: int) -> str:

@@ -12,7 +12,7 @@ from rigd.engine.shared_state import Phase
 HELD_FRACTION = 0.999
 """Smallest fraction of ticks that must run within their periods so that the loop holds a rate."""
 STALL_US = 2000.0
-"""Wake-up latency in µs from which a delay counts as a stall.
+"""Smallest wake-up latency in µs that counts as a stall.
 
 Firmware or the host of a virtual machine causes such delays, not the loop or its rate."""
 
@@ -30,8 +30,8 @@ class Usage:
 def process_usage(pid: int, proc: Path = Path("/proc")) -> Usage:
     """Return the processor time and page faults of a process with one thread since its start.
 
-    The statistics of the scheduler count nanoseconds. The usual ones sample the running process at
-    each scheduler tick, and can miss a loop that is synchronous with these ticks.
+    The time is taken from the scheduler's statistics, in nanoseconds. The usual statistics sample
+    the running process at each scheduler tick, and can miss a loop in step with these ticks.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def process_usage(pid: int, proc: Path = Path("/proc")) -> Usage:
 
 
 class UsageMeter:
-    """Measures the processor time and page faults of the control process during a record.
+    """Meter of the processor time and page faults of the control process during a record.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class UsageMeter:
 
     @property
     def cpu_percent(self) -> float | None:
-        """Load of a processor core by the process in percent, or None before two readings."""
+        """Load of a processor core by the process in percent; None before the second reading."""
         if len(self._readings) < 2:
             return None
         (begin_s, first_usage), (end_s, last_usage) = self._readings
@@ -83,7 +83,7 @@ class UsageMeter:
 
     @property
     def page_faults(self) -> int | None:
-        """Number of page faults from first to last reading, or None before two readings."""
+        """Number of page faults from first to last reading; None before the second reading."""
         if len(self._readings) < 2:
             return None
         return self._readings[1][1].page_faults - self._readings[0][1].page_faults
@@ -145,7 +145,7 @@ class LoopMeasurement:
 
 
 def percentiles(values_us: npt.NDArray[np.float64]) -> LatencyPercentiles:
-    """Return the percentiles of one or more delays in µs.
+    """Return the percentiles of delays in µs, of which there must be at least one.
 
     Examples
     --------

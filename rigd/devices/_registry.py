@@ -1,4 +1,4 @@
-"""Opening of the devices that a profile names, and what then moves; only these are imported."""
+"""Open the devices that a profile names, and state what will move; import no other drivers."""
 
 import importlib
 from enum import Enum
@@ -9,7 +9,7 @@ from rigd.devices._unknown import describe_unknown_values
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.kinds import DEVICES, fits, known_selections
 from rigd.devices.parameters import DeviceSelection, RigParameters
-from rigd.devices.running_simulator import differences, find_simulator
+from rigd.devices.running_simulator import find_simulator, profile_differences
 from rigd.errors import UserError
 from rigd.plugins import PluginError, plugin_errors
 
@@ -34,7 +34,7 @@ class ActuationTarget(Enum):
     def allows_virtual_clock(self) -> bool:
         """Whether a session on this target can run under the virtual clock instead of real time.
 
-        It can on a rig simulated in this process, and on ``rigd simulate`` in lock-step.
+        True for a rig simulated in this process, and for ``rigd simulate`` in lock-step.
         """
         return self in (ActuationTarget.SIMULATED, ActuationTarget.LOCK_STEP)
 
@@ -47,7 +47,7 @@ def check_selection(selection: DeviceSelection, source: Path | None = None) -> N
     selection
         Drive and sensor that a profile names.
     source
-        The profile's file, for the message.
+        Path of the profile's file, for the message; None: not stated.
 
     Raises
     ------
@@ -94,13 +94,13 @@ def describe_actuation_target(rig: RigParameters, target: ActuationTarget) -> st
         Result of `actuation_target`.
     """
     if target is not ActuationTarget.HARDWARE:
-        how = "in this process" if target is ActuationTarget.SIMULATED else target.value
-        return f"No hardware: {rig.name} is simulated ({how})."
+        simulation_text = "in this process" if target is ActuationTarget.SIMULATED else target.value
+        return f"No hardware: {rig.name} is simulated ({simulation_text})."
     return f"HARDWARE: {rig.name} moves the drive on {drive_address(rig)}."
 
 
 def drive_address(rig: RigParameters) -> str:
-    """Return where the drive of a rig is connected, as a phrase."""
+    """Return where the drive of a rig is connected, as a phrase such as "can0, node 3"."""
     kind = DEVICES.get(rig.devices.drive)
     if kind is None or kind.address is None:
         return rig.devices.drive
@@ -114,11 +114,11 @@ def simulated_differently(rig: RigParameters) -> list[str]:
     The list is empty if no simulator runs.
     """
     running_simulator = None if is_simulated_here(rig) else find_simulator(rig.name)
-    return [] if running_simulator is None else differences(rig, running_simulator)
+    return [] if running_simulator is None else profile_differences(rig, running_simulator)
 
 
 def simulator() -> ModuleType:
-    """Import and return the package `rigd.sim.wire`, which simulates a rig's bus and line."""
+    """Import and return the package `rigd.sim.wire`, the simulator on CAN bus and serial line."""
     return importlib.import_module("rigd.sim.wire")
 
 
@@ -130,7 +130,7 @@ def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> D
     rig
         Parameters of a profile.
     target
-        What the operator has confirmed to move, or None if nothing was confirmed.
+        What the operator has confirmed will move, or None if nothing was confirmed.
 
     Raises
     ------

@@ -9,10 +9,10 @@ from rigd.devices.contracts import Devices, WrenchSensor
 from rigd.devices.declaration import DeviceKind, OpenedDrive
 from rigd.devices.parameters import AtiCan, AtiSerial, RigParameters, ServoDrive
 
-_PER_MILLE_LIMIT = 32.767
+_MAX_TORQUE_RATIO = 32.767
 """Largest ratio of torque to rated torque that the 16 bits of object 6071 can hold."""
-_ROUNDING_S = 1e-9
-"""Largest rounding error in seconds of a stated delay."""
+_DELAY_ROUNDING_S = 1e-9
+"""Largest rounding error in seconds of a delay in a profile."""
 
 
 # Simulation in this process
@@ -55,7 +55,7 @@ def _open_can_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
 
 
 def _open_serial_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
-    """Create the ATI sensor on a serial line, of the rig or of the simulator of the drive."""
+    """Create the ATI sensor on the rig's serial line, or on that of the drive's simulator."""
     from rigd.devices.ati import AtiSerialSensor
 
     return AtiSerialSensor(rig, opened.line.simulator)
@@ -75,13 +75,13 @@ def _serial_address(rig: RigParameters) -> str:
 
 
 def _serial_stream_hz(rig: RigParameters) -> float:
-    """Return the records per second on the serial line."""
+    """Return the number of records per second that the sensor sends on the serial line."""
     assert rig.ati_serial is not None
     return rig.ati_serial.stream_hz
 
 
 def _serial_metadata(rig: RigParameters) -> dict[str, str]:
-    """Return the filter of the sensor's records for the session file."""
+    """Return session metadata: the filter by which the sensor's records are decimated."""
     assert rig.ati_serial is not None
     return {
         "sensor_filter": rig.ati_serial.filter,
@@ -113,11 +113,11 @@ def _drive_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
             "more than the limit, or 0 to leave what the drive has."
         )
     peak_ratio = profile_values["motor.peak_torque_nm"] / profile_values["motor.rated_torque_nm"]
-    if peak_ratio > _PER_MILLE_LIMIT:
+    if peak_ratio > _MAX_TORQUE_RATIO:
         yield (
             f"motor.peak_torque_nm is {peak_ratio:g} times motor.rated_torque_nm; the "
             "drive's target "
-            f"torque reaches {_PER_MILLE_LIMIT:g} times."
+            f"torque reaches {_MAX_TORQUE_RATIO:g} times."
         )
     for key_prefix in ("", "drive_"):
         period_text, timeout_text = (
@@ -176,11 +176,11 @@ def _serial_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
         **{each.name: profile_values[f"ati_serial.{each.name}"] for each in fields(AtiSerial)}
     )
     delay_s = profile_values["sensor.delay_s"]
-    least_s = settings.filter_delay_s(profile_values["rig.rate_hz"])
-    if delay_s < least_s - _ROUNDING_S:
+    min_delay_s = settings.filter_delay_s(profile_values["rig.rate_hz"])
+    if delay_s < min_delay_s - _DELAY_ROUNDING_S:
         yield (
             f"sensor.delay_s = {delay_s:g} s is less than the filter of the sensor's records "
-            f"alone: at least {least_s:.6g} s."
+            f"alone: at least {min_delay_s:.6g} s."
         )
 
 

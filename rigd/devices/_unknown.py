@@ -1,4 +1,4 @@
-"""Values of a rig that its profile states as unknown, and how the operator can find them.
+"""Values that a profile declares as unknown, and how the operator can find them.
 
 A profile writes such a value as ``{ source = "is_unknown" }``; the parameter is then NaN. Nothing
 may be computed from it, and no device is opened with it.

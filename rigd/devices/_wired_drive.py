@@ -1,4 +1,4 @@
-"""Opening of a CiA 402 drive on its bus, or on the simulator of it."""
+"""Open a CiA 402 drive on its CAN bus, or on the simulator that replaces the bus."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,8 +22,8 @@ _NETWORK_INTERFACES_FOLDER = Path("/sys/class/net")
 
 
 @dataclass(frozen=True, slots=True)
-class WiredLine:
-    """Bus of a CiA 402 drive, and the simulator that replaces it."""
+class WiredConnection:
+    """CAN bus of a CiA 402 drive, and the simulator that replaces the hardware, if one runs."""
 
     can_link: CanLink
     """Bus of the drive."""
@@ -60,7 +60,7 @@ def open_wired_drive(rig: RigParameters) -> OpenedDrive:
         renew_noise=None
         if running_simulator is None
         else partial(_restart_simulator_noise, running_simulator),
-        line=WiredLine(can_link, running_simulator),
+        line=WiredConnection(can_link, running_simulator),
     )
 
 

@@ -33,7 +33,7 @@ def wired_stop_dropped(device: str, explanation: str = "") -> DeviceError:
     device
         Name of the drive.
     explanation
-        How the drive reports it, as the rest of a sentence.
+        How the drive reports the dropped stop, as the rest of a sentence.
     """
     return DeviceError(
         f"{device}: the wired stop (STO) was dropped{explanation}. Find out who pressed it and "
@@ -56,10 +56,10 @@ class LineHealth:
     status
         Status word of the device; 0 means no error.
     doubt
-        Reason why readings may be older than reported, for the operator; the same text while the
-        reason is the same. Empty if there is no such doubt.
+        Reason why readings may be older than reported, for the operator. The text changes only if
+        the reason changes; it is empty if there is no such doubt.
     doubt_count
-        Sentence that states the number of readings concerned so far; empty if `doubt` is empty.
+        Sentence with the number of readings so far that may be older; empty if `doubt` is empty.
     cause
         Probable cause of missing readings, with its remedy; empty if unknown.
     """
@@ -85,7 +85,7 @@ class Drive(Protocol):
     """Reason why the drive may still exert torque after `disable`, for the operator; else empty."""
 
     def connect(self) -> None:
-        """Open the line and verify identity and configuration of the drive; no torque is exerted.
+        """Connect to the drive, verify its identity and configuration; exert no torque.
 
         Raises
         ------
@@ -133,7 +133,7 @@ class Drive(Protocol):
         """Zero the torque and disable the drive; works in every state and never raises."""
 
     def close(self) -> None:
-        """Disable the drive and release its line."""
+        """Disable the drive, and close the connection to it."""
 
 
 @runtime_checkable
@@ -157,7 +157,7 @@ class WrenchSensor(Protocol):
     """Whether an axis or gauge of the last wrench read was at the end of its range."""
 
     def connect(self) -> None:
-        """Open the line and read identity and calibration of the sensor.
+        """Connect to the sensor, and read its identity and calibration.
 
         Raises
         ------
@@ -181,7 +181,7 @@ class WrenchSensor(Protocol):
         """
 
     def close(self) -> None:
-        """Release the sensor's line."""
+        """Close the connection to the sensor."""
 
 
 @runtime_checkable
@@ -211,5 +211,5 @@ class Devices:
 
     @property
     def uses_line(self) -> bool:
-        """Whether the drive is connected by a bus or line, real or simulated."""
+        """Whether the drive is connected by a bus or serial line, real or simulated."""
         return self.drive.health().bits is not None

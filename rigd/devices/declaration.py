@@ -20,7 +20,7 @@ class OpenedDrive:
     rig: RigParameters
     """Parameters of the rig with which the drive was created."""
     drive: Drive
-    """The drive."""
+    """Drive of the rig, not yet connected."""
     simulated: bool
     """Whether the drive is simulated, so that no motor moves."""
     renew_noise: Callable[[int | None], int] | None = None
@@ -55,7 +55,7 @@ class DeviceKind:
     sections: tuple[str, ...] = ()
     """Sections of rigd's own that a profile with this device must have."""
     drives: tuple[str, ...] = ()
-    """Names of the drives with which the sensor works; none: with any."""
+    """Names of the drives with which the sensor works; empty: with any drive."""
     in_process: bool = False
     """Whether the drive is a simulation in the process that opens it; it can then use the virtual
     clock."""
@@ -64,15 +64,15 @@ class DeviceKind:
     stream_hz: Callable[[RigParameters], float] | None = None
     """Function that returns the records per second that the sensor streams; None: it is polled."""
     contradictions: Callable[[Mapping[str, Any]], Iterable[str]] | None = None
-    """Function that yields messages on values of a profile that do not go together.
+    """Function that yields messages on values of a profile that contradict each other.
 
     Its argument maps the dotted keys of the profile (``"rig.rate_hz"``) to validated values."""
     check_rows: Callable[[RigParameters], Iterable[CheckRow]] | None = None
-    """Function that yields rows of ``rigd check`` that need no device.
+    """Function that yields rows of ``rigd check`` for which no device is opened.
 
-    A failed row refuses every session."""
+    No session is run while one of these rows has failed."""
     metadata: Callable[[RigParameters], Mapping[str, str]] | None = None
-    """Function that returns metadata for the session file; they replace none of rigd's own."""
+    """Function that returns metadata for the session file; rigd's own keys are not replaced."""
 
     @property
     def required_sections(self) -> tuple[str, ...]:

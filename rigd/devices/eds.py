@@ -28,7 +28,7 @@ _MAX_SHOWN_CHARACTERS: Final = 80
 _BIT_RATES_KBIT_S: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
 """Bit rates of CANopen in kbit/s, for which an EDS file states whether the drive supports them."""
 _ARRAY_OBJECT, _RECORD_OBJECT = 0x8, 0x9
-"""Object type (CiA 301) of an array."""
+"""Object types (CiA 301) of an array and of a record."""
 _TYPE_LENGTHS_BIT: Final = {
     0x01: 1, 0x02: 8, 0x03: 16, 0x04: 32, 0x05: 8, 0x06: 16, 0x07: 32, 0x08: 32,
     0x10: 24, 0x11: 64, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64,
@@ -40,9 +40,9 @@ _SIGNED_TYPES: Final = frozenset((0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15
 _TEXT_TYPES: Final = (0x09, 0x0B)
 """Data types (CiA 301) of texts."""
 _OCTET_STRING_TYPE, _DOMAIN_TYPE = 0x0A, 0x0F
-"""Data type (CiA 301) of a string of bytes."""
+"""Data types (CiA 301) of a string of bytes and of a block of data."""
 _FLOAT_LAYOUTS: Final = {0x08: "<f", 0x11: "<d"}
-"""Layout in bytes of the data types (CiA 301) of floating-point numbers."""
+"""Layouts for :mod:`struct` of floating-point numbers, by data type (CiA 301)."""
 _LAST_BASIC_TYPE: Final = 0x1B
 """Largest number of a basic data type (CiA 301); larger numbers are types defined in the file."""
 _ACCESS_RIGHTS: Final = ("ro", "rw", "wo", "const", "rwr", "rww")
@@ -240,7 +240,7 @@ def _read_text(path: Path) -> str:
 
 
 def _parse_sections(text: str, path: Path) -> Sections:
-    """Parse the text of a file into sections; other lines than section titles and keys are ignored.
+    """Parse the text of a file into sections; ignore lines that are neither title nor key.
 
     If a section or key occurs twice, the first occurrence is used.
     """
@@ -276,10 +276,10 @@ def _too_many_entries_error(path: Path) -> EdsError:
 
 
 def _correct_sections(sections: Sections, path: Path) -> dict[tuple[int, int], Mapping[str, str]]:
-    """Return corrected keys for each object or sub-index that has a value, sorted by index.
+    """Return the corrected keys of each object or sub-index that has a value, sorted by index.
 
     Sub-indices that an array declares together (``CompactSubObj``) are included. A sub-index
-    without name, type or access right gets those of the whole object.
+    without name, type or access right gets that of the whole object.
     """
     objects_by_index: dict[int, dict[int, dict[str, str]]] = {}
     for section_title, section_keys in sections.items():
@@ -428,7 +428,7 @@ def _to_signed(integer_value: int | None, data_type: int) -> int | None:
 def _identity_number(
     entries: Mapping[tuple[int, int], EdsEntry], sub: int, header_text: str
 ) -> int:
-    """Return a number of the drive's identity, from object 1018 or else from the file's header."""
+    """Return a number of the drive's identity: from object 1018, or else from `header_text`."""
     identity_entry = entries.get((0x1018, sub))
     identity_value = (identity_entry.default if identity_entry else None) or _parse_integer_or_zero(
         header_text

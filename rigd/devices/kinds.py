@@ -26,7 +26,7 @@ DEVICES: Final = Registry("rigd.devices", SHIPPED, _load_device)
 
 
 def failure_of_device(error: Exception, selection: DeviceSelection) -> str:
-    """Return why a device failed, for the operator, if an exception is that of a device.
+    """Return the message for the operator of an exception that a device has raised.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def failure_of_device(error: Exception, selection: DeviceSelection) -> str:
     Raises
     ------
     Exception
-        The given one, if it is neither an error of a device nor raised by a package's device.
+        The given exception, if it is neither a device's error nor raised in a package's device.
     """
     if isinstance(error, DeviceError | OSError):
         return str(error)
@@ -50,19 +50,24 @@ def failure_of_device(error: Exception, selection: DeviceSelection) -> str:
 
 
 def selected_kinds(selection: DeviceSelection) -> tuple[DeviceKind, ...]:
-    """Return the kinds that a profile names, the drive's first and none twice; unknown ones not.
+    """Return the kinds of the drive and of the sensor that a profile names, as far as they exist.
+
+    A device that is both drive and sensor is returned once.
 
     Raises
     ------
     PluginError
-        If a package that adds one of them cannot be used.
+        If a package that adds one of these devices cannot be used.
     """
     names = dict.fromkeys((selection.drive, selection.sensor))
     return tuple(kind for name in names if (kind := DEVICES.get(name)) is not None)
 
 
 def known_selections() -> list[str]:
-    """Return the drives and sensors that can be combined, each as a phrase of a message."""
+    """Return the combinations of drive and sensor that fit, as phrases for messages.
+
+    The last phrase names the devices that installed packages add.
+    """
     phrases = [
         f'drive = "{drive.name}" with sensor = "{sensor.name}"'
         for drive in SHIPPED.values()

@@ -84,7 +84,7 @@ _LATEST_TIME_S = 1e6
 
 
 def _is_time_allowed(time_s: float) -> bool:
-    """Return whether a value in seconds is allowed as a time."""
+    """Return whether the start or end time of an obstacle is finite and within its limits."""
     return 0 <= time_s <= _LATEST_TIME_S
 
 
@@ -286,7 +286,7 @@ def describe_obstacle(disturbance: Disturbance) -> str:
 
 
 def _default_side(angle_rad: float) -> int:
-    """Return the default side of an obstacle: that from which a beam at angle zero approaches."""
+    """Return the default side of an obstacle, reached by a beam that moves away from angle zero."""
     return -1 if angle_rad < 0 else 1
 
 
@@ -299,5 +299,5 @@ def _parse_finite(text: str) -> float:
 
 
 def _obstacle_error(text: str, reason: str) -> ObstacleError:
-    """Return the error for a wrong text of an obstacle or impact; it states text and reason."""
+    """Return the error for a text that describes no valid obstacle or impact, with the reason."""
     return ObstacleError(f"Obstacle '{text}': {reason}.")

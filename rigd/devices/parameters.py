@@ -119,10 +119,10 @@ class Simulation:
     clock_rate_difference: Annotated[float, Ge(-1e-3), Le(0)] = field(
         default=0.0, metadata=OPTIONAL
     )
-    """Relative difference of the sensor's sampling period from that of the angle, 0 or negative.
+    """Sampling period of the sensor divided by that of the angle, minus 1; 0 or negative.
 
-    With a negative value the torque gets older all the time. A positive value is not possible,
-    since a reading cannot be younger than it is."""
+    With a negative value the age of the torque grows all the time. A positive value is impossible:
+    the age would fall below zero."""
     hum_nm: NonNegative = field(default=0.0, metadata=OPTIONAL)
     """Amplitude in N·m of a sinusoidal interference in the sensor's torque; 0: none."""
     hum_hz: Positive = field(default=50.0, metadata=OPTIONAL)
@@ -183,10 +183,10 @@ class Acquisition:
     """Settings of the acquisition: which replies of the devices a tick uses."""
 
     mode: Literal["same_tick", "previous_tick"]
-    """Whether a tick waits for the replies to its own requests or uses those to the previous
-    tick's."""
+    """Whether a tick waits for the replies to its own requests, or uses the replies to the requests
+    of the previous tick."""
     deadline_us: Annotated[float, Gt(0)]
-    """Time in microseconds after its start until which a tick waits for its own replies.
+    """Time in microseconds from the start of a tick until which the tick waits for its own replies.
 
     After that the last values are used."""
 

@@ -19,7 +19,7 @@ from rigd.runtime.processes import listening_sockets
 if TYPE_CHECKING:  # it imports numpy, which takes longer than a stop may take
     from rigd.devices.parameters import RigParameters
 
-_LONGEST_REPLY = 65_536
+_MAX_REPLY_BYTES = 65_536
 """Largest length in bytes of a simulator's reply."""
 _REPLY_TIMEOUT_S = 2.0
 """Time in seconds to wait for a simulator's reply."""
@@ -34,8 +34,8 @@ class SimulatorAddress:
     control_socket: str
     """Unix socket that accepts faults to inject; while it answers, the simulator runs."""
     can_socket: str = ""
-    """Unix socket that carries CAN frames; empty if the simulator is on a real (virtual) CAN
-    bus."""
+    """Unix socket that carries CAN frames; empty if the simulator uses a CAN interface of the
+    kernel."""
     serial_port: str = ""
     """Pseudo-terminal of the simulated serial sensor; empty if there is none."""
     lock_step: bool = False
@@ -49,7 +49,7 @@ def described(rig: "RigParameters") -> dict[str, object]:
     return json.loads(json.dumps(dict(_flatten(asdict(rig), ""))))  # type: ignore[no-any-return]
 
 
-def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
+def profile_differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
     """Return the differences between a profile and the simulated rig, one phrase per key.
 
     A different seed of the noise does not count, since each session has its own.
@@ -87,7 +87,7 @@ def announce(rig_name: str, address: SimulatorAddress) -> Path:
     return address_path
 
 
-def forget(rig_name: str) -> None:
+def remove_address_file(rig_name: str) -> None:
     """Remove the address file of a simulator, also the file of a simulator that was killed."""
     _address_file(rig_name).unlink(missing_ok=True)
 
@@ -125,7 +125,7 @@ def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[st
             control_link.connect(address.control_socket)
             control_link.sendall(json.dumps(request).encode() + b"\n")
             with control_link.makefile("rb") as reply_lines:
-                reply = json.loads(reply_lines.readline(_LONGEST_REPLY))
+                reply = json.loads(reply_lines.readline(_MAX_REPLY_BYTES))
     except (OSError, ValueError) as error:
         raise DeviceError(
             f"The simulated rig (process {address.pid}) does not answer ({error}); start it again."

@@ -1,4 +1,4 @@
-"""Names of a control process in the process table, by its activity; quick to import."""
+"""Names of a control process in the process table, one for each activity; quick to import."""
 
 from collections.abc import Sequence
 from typing import Final

@@ -1,7 +1,7 @@
 """Sequence of a probing move: tare, enable, move to and fro, disable.
 
-It uses the cycle of a session, with its interlocks, stops and watchdogs, but another controller,
-and records nothing.
+It uses the same cycle as a session, with the interlocks, stops and watchdogs, but with another
+controller, and records nothing.
 """
 
 from typing import Any
@@ -22,7 +22,7 @@ from rigd.safety.probing_move import ProbingMove, plan_probe
 
 
 class ProbeSequence(SessionSequence):
-    """Run of one probing move, which measures the motor and the encoder, on connected devices.
+    """Sequence of one probing move on connected devices, which measures motor and encoder.
 
     The parameters are those of a `SessionSequence`.
     """
@@ -48,12 +48,12 @@ class ProbeSequence(SessionSequence):
         self._last_tick = 0
 
     def move(self) -> dict[str, Any]:
-        """Run the probing move with the enabled drive, switch the torque off, return the estimate.
+        """Run the probing move on the enabled drive, switch the torque off, and return the result.
 
         Returns
         -------
         dict
-            The reason for the end (key ``end``), and the fields of a
+            Name of the reason why the move ended (key ``end``), and the fields of a
             `rigd.safety.probe_estimate.ProbeEstimate`.
 
         Raises
@@ -69,7 +69,7 @@ class ProbeSequence(SessionSequence):
         cycle.encoder_monitor = None  # the move itself compares angle and torques
         cycle.controller = probing_move
         cycle.start(self._rest_spread_nm)
-        self._run_tick(start_rad, excused=True)  # enabling takes its time
+        self._run_tick(start_rad, may_miss_ticks=True)  # enabling takes its time
         self._move, self._last_tick = probing_move, self._scheduler.tick
         while probing_move.end is None:
             self._run_tick(cycle.angle_rad)
@@ -77,7 +77,7 @@ class ProbeSequence(SessionSequence):
         return {"end": probing_move.end.name} | estimate_probe(self._rig, probing_move).as_dict()
 
     def _control_tick(self, reference_rad: float) -> SessionEnd | None:
-        """Run one tick of the probing move, and pass it the number of ticks missed before."""
+        """Run one tick of the probing move, and report the ticks missed before it to the move."""
         if self._move is not None:
             self._move.missed = max(0, self._scheduler.tick - self._last_tick - 1)
             self._last_tick = self._scheduler.tick

@@ -1,4 +1,4 @@
-"""Data of a profile for its probing move; quick to import, because the supervisor uses it too."""
+"""Data of a profile that a probing move needs; quick to import for the supervisor's sake."""
 
 from rigd.profile import Profile
 from rigd.safety.probing_move import ProbedRig

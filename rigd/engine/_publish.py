@@ -1,4 +1,4 @@
-"""Publication of a tick's results to the shared state, the recorder and the live view."""
+"""Output of a tick's results to shared memory, for supervisor, recorder and live view."""
 
 import time
 from dataclasses import dataclass
@@ -15,20 +15,20 @@ from rigd.session.layout import Status, pack_control_into, pack_sample_into, pac
 
 
 class ReadingPublisher:
-    """Writer of the control process's last readings to the shared state, several times a second.
+    """Writer of the latest readings to the shared state, called several times a second.
 
     Parameters
     ----------
     shared_state
         State to write to.
     devices
-        Devices whose line health it reports.
+        Devices whose bus and serial line are monitored.
 
     Attributes
     ----------
     doubts
-        Sentences for the operator that explain why the age of a reading is doubtful, as of the last
-        call of `publish`.
+        Sentences for the operator that state why the age of a reading is doubtful. Each call of
+        `publish` replaces them.
     doubt_counts
         Sentences with the number of doubtful readings since the devices were connected.
     """
@@ -48,7 +48,8 @@ class ReadingPublisher:
         cycle
             Cycle with the last readings.
         now_ns
-            Present time of the loop's clock. The load of a line is averaged since the last call.
+            Present time of the loop's clock. The load of a line is averaged over the time since the
+            last call.
         """
         shared_state = self._shared_state
         shared_state.beat(StateField.CONTROL_BEAT)
@@ -80,7 +81,10 @@ class ReadingPublisher:
         self._publish_load((drive_health, sensor_health), now_ns)
 
     def _publish_load(self, line_healths: tuple[LineHealth, ...], now_ns: int) -> None:
-        """Publish the load of the busiest bus or serial line since the last call, in ppm."""
+        """Write the load in ppm of the busiest bus or serial line to the shared state.
+
+        The load is averaged over the time since the last call.
+        """
         line_bits = tuple(line_health.bits or 0 for line_health in line_healths)
         if self._last_bits is None:
             self._shared_state[StateField.BUS_LOAD_PPM] = UNKNOWN
@@ -90,8 +94,8 @@ class ReadingPublisher:
                 return  # virtual time has not advanced
             ppm_seconds = 1e-15 * (now_ns - previous_ns)  # 1e-9 s, 1e-6
             loads_ppm = [
-                (now - last_bits) / (line_health.bit_rate_bit_s * ppm_seconds)
-                for line_health, now, last_bits in zip(
+                (present_bits - last_bits) / (line_health.bit_rate_bit_s * ppm_seconds)
+                for line_health, present_bits, last_bits in zip(
                     line_healths, line_bits, previous_bits, strict=True
                 )
                 if line_health.bit_rate_bit_s
@@ -121,10 +125,10 @@ _FREE_SLOT_POLL_S = 0.0002
 
 @dataclass(slots=True)
 class TickCounts:
-    """Numbers of a record's ticks, where scheduled = recorded + missed + lost.
+    """Counts of a record's ticks, where scheduled = recorded + missed + lost.
 
-    Among the recorded ticks, `late` counts those with a late wake-up. `stale_angles` and
-    `stale_wrenches` count those with a reading that is older than the tick.
+    `late` is the number of recorded ticks with a late wake-up. `stale_angles` and `stale_wrenches`
+    are the numbers of recorded ticks whose angle or wrench reading is older than the tick.
     """
 
     scheduled: int = 0
@@ -153,7 +157,7 @@ class SampleLog:
     Attributes
     ----------
     counts
-        Numbers of late ticks, stale readings and lost samples.
+        Counts of late ticks, stale readings and lost samples.
     """
 
     def __init__(
@@ -179,7 +183,7 @@ class SampleLog:
     def write(
         self, tick: int, reference_rad: float, missed_ticks: int, *, wait_for_slot: bool
     ) -> None:
-        """Write the sample of the tick that was just run to the ring for the recorder.
+        """Write the sample of the last tick to the ring that the recorder reads.
 
         Parameters
         ----------
@@ -190,8 +194,8 @@ class SampleLog:
         missed_ticks
             Number of ticks that were missed directly before this tick.
         wait_for_slot
-            Whether to wait for free space in a full ring, because nothing moves or time is
-            virtual. Otherwise the sample is lost.
+            Whether to wait for free space if the ring is full, which is harmless if nothing moves
+            or time is virtual. Otherwise the sample is lost.
         """
         cycle, scheduler, ring = self._cycle, self._scheduler, self._ring
         lateness_ns = scheduler.lateness_ns

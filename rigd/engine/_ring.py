@@ -27,7 +27,7 @@ _WRITTEN_COUNTER, _READ_COUNTER = 0, 1
 
 @dataclass(frozen=True, slots=True)
 class RingSpec:
-    """File descriptor and layout of a ring buffer, with which a child process attaches to it."""
+    """File descriptor and layout of a ring buffer, which a child process needs to open it."""
 
     fd: int
     """File descriptor of the shared memory, which the child inherits."""
@@ -43,7 +43,7 @@ class Ring:
     Parameters
     ----------
     spec
-        Descriptor of the memory and its layout; :meth:`create` makes a new ring.
+        Descriptor and layout of the memory of an existing ring; :meth:`create` makes a new ring.
     """
 
     def __init__(self, spec: RingSpec) -> None:
@@ -107,7 +107,7 @@ class Ring:
         return HEADER_SIZE + self._next_record % self.capacity * self.record_size
 
     def publish(self) -> None:
-        """Make the record just written at :meth:`next_slot` visible to the readers of the ring."""
+        """Make the record that was written at :meth:`next_slot` visible to the ring's readers."""
         self._next_record += 1
         self._counters[_WRITTEN_COUNTER] = self._next_record
 
@@ -143,15 +143,15 @@ class Ring:
 
 
 class Observer:
-    """Reader of a ring that never delays the producer, and counts records overwritten unread.
+    """Reader of a ring that never delays the producer, and may therefore miss records.
 
     Parameters
     ----------
     ring
         Ring to read.
-    first
-        Index of the first record to read, counted since the ring was created; None: the next
-        record that is written.
+    first_index
+        Index of the first record to read, counted since the ring was created. None: start with the
+        next record that is written.
 
     Attributes
     ----------
@@ -159,9 +159,9 @@ class Observer:
         Number of records that were overwritten before they were read.
     """
 
-    def __init__(self, ring: Ring, first: int | None = None) -> None:
+    def __init__(self, ring: Ring, first_index: int | None = None) -> None:
         self._ring = ring
-        self._next_index = ring.written_count if first is None else first
+        self._next_index = ring.written_count if first_index is None else first_index
         self.dropped = 0
 
     @property

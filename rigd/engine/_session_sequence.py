@@ -1,4 +1,4 @@
-"""Sequence of a session: tare, enable, hold, record, damp, return, disable, check the tare.
+"""Steps of a session: tare, enable, hold, record, damp, return, disable, check the tare.
 
 The record extends from tick 0 to the last tick of the excitation. The other steps use the same
 cycle (`rigd.engine.cycle.Cycle`) and write their results to the metadata of the session file.
@@ -41,14 +41,14 @@ if TYPE_CHECKING:
     from rigd.engine._touch_monitor import TouchMonitor
 
 _SETTLING_S = 0.5
-"""Time in s for which the motor is held before tick 0, and the beam rests before the last tare."""
+"""Time in s to hold the motor before tick 0, and to wait before the tare after the record."""
 _VIRTUAL_POLL_S = 0.0002
 """Pause in s between two polls of the shared state while virtual time does not advance."""
 _START_TIMEOUT_S = 10.0
 """Longest time in s that the control process waits for the supervisor to start the record."""
 _SUPERVISOR_TIMEOUT_S = 2.0
 """Longest time in s without a heartbeat of the supervisor. Only time in which this process ran
-counts, because a stalled computer is not the supervisor's fault."""
+counts, because the supervisor cannot run either while the computer is stalled."""
 _WRONG_SIGN_CHANNELS = tuple(
     INTERLOCKS_BY_NAME[name].channel for name in ("angle", "velocity", "tracking error")
 )
@@ -68,8 +68,8 @@ _ENCODER_TESTED_MESSAGE = (
     "The beam pulled at a shaft that stood still, so the encoder was tested: it works."
 )
 _VIBRATING_SPREAD_RATIO = 2.0
-"""Ratio of the coupling torque's standard deviation after a session to the one before it. Above
-this ratio the beam counts as vibrating."""
+"""Ratio of the coupling torque's standard deviation after a session to its value before the
+session, above which the beam counts as vibrating."""
 _LONGEST_DAMPING_S = 5.0
 """Longest duration of active damping in s, which is twice the time needed to damp a vibration with
 the sensor's full range."""
@@ -95,7 +95,7 @@ class SessionEnd(Exception):
     Attributes
     ----------
     outcome, reason
-        Outcome and reason, for the file and the operator.
+        How and why the session ended, for the file and the operator.
     device_failed
         Whether a device failed, so that it must be reconnected.
     """
@@ -108,7 +108,7 @@ class SessionEnd(Exception):
 
 
 class SessionSequence:
-    """Steps of one session on connected devices, from the tare to the final check of the zero.
+    """Steps of one session on connected devices, from the tare to the check for drift of the tare.
 
     Parameters
     ----------
@@ -117,19 +117,19 @@ class SessionSequence:
     reference_rad
         Angle per tick, relative to the start angle.
     cycle, clock, scheduler
-        Cycle that runs each tick, clock, and schedule of the ticks.
+        Cycle that runs each tick, the clock, and the schedule of the ticks.
     standstill
-        Check of the angles that are read without torque.
+        Monitor of the angles that are read while the torque is off.
     channels
         Rings for samples, the controller's terms and events.
     reading_publisher
-        Publisher of the readings.
+        Writer of the latest readings to the shared state.
     parent
         Connection to the supervisor process.
     stop_request
-        Stop signals that this process received itself.
+        Stop requests that reached this process as signals.
     ending
-        Steps after the record.
+        Plan of the steps after the record.
     touch
         Detector of touches, or None if the session does not search for an obstacle.
     reference_reader
@@ -154,7 +154,7 @@ class SessionSequence:
     ) -> None:
         self._touch = touch
         self._reader = reference_reader
-        self._display = reading_publisher
+        self._reading_publisher = reading_publisher
         self._profile = profile
         self._cycle = cycle
         self._clock = clock
@@ -188,7 +188,7 @@ class SessionSequence:
         """Results for the metadata ``outcome`` of the file, in addition to the counts."""
 
     def tare(self) -> dict[str, str]:
-        """Measure the wrench at rest before the drive is enabled, and return it as file metadata.
+        """Tare the sensor at rest before the drive is enabled; return the tare as metadata.
 
         Returns
         -------
@@ -198,8 +198,8 @@ class SessionSequence:
         Raises
         ------
         SessionEnd
-            If the rig does not come to rest in time, or the record would leave the angle limits
-            from its present angle.
+            If the rig does not come to rest in time, or the reference, started at the present
+            angle, would exceed the angle limit.
         """
         self._cycle.limit_monitor.reset(0.0)  # the counts of the last session no longer apply
         rest_readings = self._wait_for_rest()
@@ -228,12 +228,15 @@ class SessionSequence:
         if sensor_violation is not None:
             raise SessionEnd("fault", str(sensor_violation))
         self._rest_spread_nm = rest_readings.torque_spread_nm
-        self._compare_with_tare_before(float(rest_readings.torques_nm.mean()))
+        self._compare_with_previous_tare(float(rest_readings.torques_nm.mean()))
         self._cycle.tare = rest_readings.mean
         return rest_readings.as_metadata() | {"start_angle_rad": repr(self._start_angle_rad)}
 
-    def _compare_with_tare_before(self, zero_nm: float) -> None:
-        """Raise `SessionEnd` if the torque at rest, in N·m, differs too much from the last tare."""
+    def _compare_with_previous_tare(self, zero_nm: float) -> None:
+        """Raise `SessionEnd` if the torque at rest differs too much from the previous tare.
+
+        `zero_nm` is the coupling torque at rest in N·m, which is stored for the next comparison.
+        """
         limit_monitor = self._cycle.limit_monitor
         if limit_monitor.tared_nm is not None:
             violation = limit_monitor.check_tare(zero_nm - limit_monitor.tared_nm)
@@ -245,7 +248,7 @@ class SessionSequence:
         limit_monitor.tared_nm = zero_nm
 
     def _wait_for_rest(self) -> RestReadings:
-        """Return the readings of the first interval in which neither the motor nor the beam moves.
+        """Wait until motor and beam are at rest, and return the readings of the interval at rest.
 
         Raise `SessionEnd` if the rig does not come to rest within ``session.rest_timeout_s``.
         """
@@ -295,7 +298,7 @@ class SessionSequence:
         self._cycle.start(self._rest_spread_nm)
         for tick_number in range(round(_SETTLING_S * self._rate_hz)):
             # Enabling the drive before the first tick takes longer than a tick.
-            self._run_tick(self._start_angle_rad, excused=tick_number == 0)
+            self._run_tick(self._start_angle_rad, may_miss_ticks=tick_number == 0)
 
     def wait_for_go(self) -> None:
         """Hold the motor until the supervisor requests the start of the record.
@@ -305,7 +308,7 @@ class SessionSequence:
         Raises
         ------
         SessionEnd
-            If the supervisor does not report this within 10 s, although its process may exist.
+            If the supervisor does not start the record within 10 s.
         """
         self._shared_state[StateField.PHASE] = Phase.READY
         deadline_s = time.monotonic() + _START_TIMEOUT_S
@@ -317,7 +320,7 @@ class SessionSequence:
                     "Check CPU load.",
                 )
             if self._clock.virtual:
-                self._display.publish(self._cycle, self._scheduler.due_ns)
+                self._reading_publisher.publish(self._cycle, self._scheduler.due_ns)
                 self._switch_off_if_stopped()
                 time.sleep(_VIRTUAL_POLL_S)
             else:
@@ -331,8 +334,8 @@ class SessionSequence:
         Raises
         ------
         SessionEnd
-            If the record ends early. The torque is off in the last sample, unless the record ends
-            in missed or lost ticks.
+            If the record ends early. The last sample then has the torque off, unless the last ticks
+            of the record were missed or lost.
         """
         relative_reference_rad, start_rad = self._relative_reference, self._start_angle_rad
         total_ticks = len(relative_reference_rad)
@@ -414,41 +417,41 @@ class SessionSequence:
         if end is not None:
             cycle.torque_off()
         self._publish_readings()
-        for record_tick_count in self._display.doubt_counts:
-            self._log_event("warning", record_tick_count)
+        for doubt_count_text in self._reading_publisher.doubt_counts:
+            self._log_event("warning", doubt_count_text)
         self._record_clock_results(start_utc_ns, start_monotonic_ns, last_ns - first_ns)
         if end is not None:
             raise end
 
     def _await_segment(self, reference_reader: ReferenceReader, tick: int) -> None:
-        """Stop virtual time until the fit process has planned the reference of a tick.
+        """Wait, without advancing virtual time, until the fit process has planned a tick.
 
-        With devices on a bus or serial line, return after 1 s: the tick then holds the last angle,
-        and shows the devices that their host still runs.
+        With devices on a bus or serial line, return after at most 1 s: the tick then holds the last
+        angle, so that the devices do not treat the silent host as failed.
         """
         uses_line = self._cycle.devices.uses_line
         wait_start_s = time.monotonic()
         while reference_reader.must_wait(tick) and self._stop_reason() is None:
             if uses_line and time.monotonic() - wait_start_s > MAX_VIRTUAL_PAUSE_S:
                 return
-            self._display.publish(self._cycle, self._scheduler.due_ns)
+            self._reading_publisher.publish(self._cycle, self._scheduler.due_ns)
             time.sleep(_VIRTUAL_POLL_S)
 
     def _monitor_touch(
         self, touch_monitor: "TouchMonitor", tick: int, missed_ticks: int
     ) -> SessionEnd | None:
-        """Check the last tick for a touch of an obstacle, and let the touch watch react to it.
+        """Check the last tick for a touch of an obstacle, to which the touch monitor reacts.
 
-        Return an error that ends the session if the touch requires that, otherwise None.
+        Return the error with which the session ends, or None if the session continues.
         """
         contact = touch_monitor.step(tick, missed_ticks)
         if contact is None:
             return None
-        if contact.detected:
+        if contact.is_touch:
             self._shared_state[StateField.TOUCHES] += 1
-        if contact.ends:
+        if contact.session_outcome:
             self._cycle.torque_off()  # before this tick's sample is written
-            return SessionEnd(contact.ends, contact.message)
+            return SessionEnd(contact.session_outcome, contact.message)
         self._log_event("info", contact.message)
         return None
 
@@ -514,14 +517,15 @@ class SessionSequence:
         if violation is not None:
             raise SessionEnd("fault", str(violation))
 
-    def _run_tick(self, reference_rad: float, *, excused: bool = False) -> None:
+    def _run_tick(self, reference_rad: float, *, may_miss_ticks: bool = False) -> None:
         """Run one tick outside the record, where missed ticks are limited but not counted.
 
-        Set `excused` for a tick that other work, such as enabling the drive, may delay.
+        Set `may_miss_ticks` to permit any number of missed ticks before this tick, which other
+        work, such as enabling the drive, delays.
         """
         missed_ticks = self._scheduler.wait()
         self._cycle.skip(missed_ticks)
-        if missed_ticks > self._profile.limits.missed_ticks_in_a_row and not excused:
+        if missed_ticks > self._profile.limits.missed_ticks_in_a_row and not may_miss_ticks:
             raise SessionEnd(
                 "fault",
                 f"The loop stalled for {missed_ticks} ticks with the torque held, more than "
@@ -534,9 +538,9 @@ class SessionSequence:
             raise end
 
     def _control_tick(self, reference_rad: float) -> SessionEnd | None:
-        """Run one tick of control; return an error that ends the session, or None.
+        """Run one tick of control; return the error that ends the session, or None.
 
-        If the session ends, the torque is off.
+        The torque is off if an error is returned.
         """
         try:
             violation = self._cycle.step(self._scheduler.due_ns, reference_rad)
@@ -596,33 +600,33 @@ class SessionSequence:
             raise SessionEnd("fault", str(self._cycle.with_reported_cause(reading_violation)))
 
     def _check_missed_ticks(self, new_missed_ticks: int, tick: int) -> SessionEnd | None:
-        """Return an error that ends the session if more ticks were missed than allowed."""
+        """Return the error that ends the session if too many ticks were missed, otherwise None."""
         if not new_missed_ticks:
             return None
         self._cycle.skip_encoder(new_missed_ticks)
-        violation_text = self._cycle.limit_monitor.check_missed(
+        violation = self._cycle.limit_monitor.check_missed(
             new_missed_ticks, self.counts.missed, tick + 1
         )
-        return None if violation_text is None else SessionEnd("fault", str(violation_text))
+        return None if violation is None else SessionEnd("fault", str(violation))
 
     def stop_requested(self) -> bool:
-        """Return whether the session must end; steps longer than a tick call this as they run."""
+        """Return whether the session must end; steps that last longer than a tick check this."""
         return self._stop_reason() is not None
 
     def _check_stale_readings(self, scheduled_ticks: int) -> SessionEnd | None:
-        """Return an error that ends the session if more readings were stale than allowed."""
+        """Return the error that ends the session if too many readings were stale, else None."""
         tick_counts = self.counts
-        violation_text = self._cycle.limit_monitor.check_stale_fraction(
+        violation = self._cycle.limit_monitor.check_stale_fraction(
             tick_counts.stale_angles, tick_counts.stale_wrenches, scheduled_ticks
         )
         return (
             None
-            if violation_text is None
-            else SessionEnd("fault", str(self._cycle.with_reported_cause(violation_text)))
+            if violation is None
+            else SessionEnd("fault", str(self._cycle.with_reported_cause(violation)))
         )
 
     def _stop_reason(self) -> SessionEnd | None:
-        """Return an error that ends the session if a stop is requested or a process died."""
+        """Return the error that ends the session if a stop is requested or a process died."""
         stop_reason = self._shared_state[StateField.STOP]
         if self._stop.requested or stop_reason == StopReason.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")
@@ -636,10 +640,10 @@ class SessionSequence:
         return None
 
     def _poll(self) -> SessionEnd | None:
-        """Publish heartbeat and readings, and check slow limits, suspend, supervisor and stop.
+        """Publish heartbeat and readings; return the error that ends the session, or None.
 
-        Return an error that ends the session, or None. The supervisor requests a stop when the
-        recorder has died (`rigd.runner`).
+        This checks the slow limits, a suspended computer, the supervisor's heartbeat, and stop
+        requests. The supervisor also requests a stop when the recorder has died (`rigd.runner`).
         """
         self._publish_readings()
         violation = self._cycle.check_slow_limits(
@@ -684,11 +688,11 @@ class SessionSequence:
             raise end
 
     def _record_clock_results(
-        self, start_utc_ns: int, start_monotonic_ns: int, executed_ns: int
+        self, start_utc_ns: int, start_monotonic_ns: int, execution_span_ns: int
     ) -> None:
-        """Store wall clock drift, page faults and true tick rate of the record in `results`.
+        """Store end time, wall clock drift, page faults and true tick rate of the record.
 
-        The results go into the file's metadata.
+        `results` contains them for the file's metadata.
         """
         end_utc_ns = time.time_ns()
         self.results["end_utc_ns"] = str(end_utc_ns)
@@ -700,13 +704,13 @@ class SessionSequence:
             ((end_utc_ns - start_utc_ns) / elapsed_ns - 1) * 1e6
         )
         interval_count = self.counts.scheduled - self.counts.missed - 1
-        if executed_ns > 0:
-            self.results["true_rate_hz"] = repr(interval_count / (executed_ns * 1e-9))
+        if execution_span_ns > 0:
+            self.results["true_rate_hz"] = repr(interval_count / (execution_span_ns * 1e-9))
 
     def _publish_readings(self) -> None:
         """Write the readings to the shared state, and log each doubt about their age once."""
-        self._display.publish(self._cycle, self._scheduler.due_ns)
-        for doubt in self._display.doubts:
+        self._reading_publisher.publish(self._cycle, self._scheduler.due_ns)
+        for doubt in self._reading_publisher.doubts:
             if doubt not in self._doubts_reported:
                 self._doubts_reported.add(doubt)
                 self._log_event("warning", doubt)
@@ -733,9 +737,9 @@ class SessionSequence:
 
 
 def _return_path(profile: Profile, ending: PostRecordPlan) -> list[float]:
-    """Return the path of the motor's return as a fraction from 0 to 1 for each tick.
+    """Return the path of the motor's return: for each tick the fraction of the way, from 0 to 1.
 
-    It is computed before the drive is enabled, so that the loop does not pause for it.
+    The path is computed before the drive is enabled, because the loop has no time for it.
     """
     duration_s, rate_hz = profile.session.return_s, profile.rig.rate_hz
     if ending.poles_rad_s and duration_s <= _LONGEST_SHAPED_RETURN_S:

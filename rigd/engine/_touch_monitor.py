@@ -18,31 +18,32 @@ disturbed reading."""
 
 @dataclass(frozen=True, slots=True)
 class DetectedContact:
-    """Contact of the beam with an obstacle that the control loop has detected: message, outcome."""
+    """Contact with an obstacle that the control loop has detected, and what follows from it."""
 
     message: str
     """Sentence for the operator."""
-    ends: str = ""
-    """Outcome with which the session ends at once; empty: the session continues."""
-    detected: bool = True
+    session_outcome: str = ""
+    """Outcome with which the contact ends the session; empty if the session continues."""
+    is_touch: bool = True
     """Whether the detector found a touch, which is then marked in the tick's sample."""
 
 
 class TouchMonitor:
-    """Monitor that detects a touch during a search, and makes the motor react to it.
+    """Monitor that detects touches during a search, and makes the motor react to a touch.
 
-    After a touch on the way out, or in the pause after it, the motor brakes, waits, and returns to
+    After a touch on the way out, or in the following pause, the motor brakes, waits, and returns to
     the start of the pass. After a touch on the way back the motor cannot avoid the obstacle, so the
     session is stopped.
 
     Parameters
     ----------
     order
-        Description of the search.
+        Passes of the search, and settings of the touch detector.
     cycle
         Cycle with the readings of the last tick.
     reference_rad
-        Reference of the session, relative to its start. The reaction to a touch is written to it.
+        Reference of the session, relative to the start angle. After a touch this array is
+        overwritten with the motor's reaction.
     rate_hz
         Ticks a second.
     """
@@ -104,7 +105,7 @@ class TouchMonitor:
         return DetectedContact(f"Touch detected at {tick / self._rate_hz:.3f} s.")
 
     def _return_after_touch(self, tick: int) -> None:
-        """Replace the remaining reference of the pass by braking, waiting and the way back."""
+        """Overwrite the remaining reference of the pass with braking, waiting and the way back."""
         reference_rad, current_pass = self._reference_rad, self._pass
         self._detector.disarm()
         last_angles_rad = (
@@ -119,7 +120,7 @@ class TouchMonitor:
         reference_rad[tick + 1 : current_pass.ends] = memoryview(path_rad)  # type: ignore[arg-type] # numpy's stubs
 
     def _check_force_limit(self, shear_n: float) -> DetectedContact | None:
-        """Return the contact if its force exceeds the limit in two ticks in a row, else None."""
+        """Return a contact if its force exceeded the limit in two consecutive ticks, else None."""
         if self._projection is None:
             return None
         force_n = abs(self._detector.contact_force_n(shear_n))
@@ -131,5 +132,5 @@ class TouchMonitor:
             f"Contact force {force_n:.3g} N exceeds force_limit_n = {limit_n:g} N. Choose a lower "
             "speed, or a higher limit.",
             "fault",
-            detected=False,
+            is_touch=False,
         )

@@ -16,12 +16,12 @@ from rigd.session.layout import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 # Topics
 
 VIRTUAL_BUFFERED_S = 160.0
-"""Time in s whose records the rings hold under the virtual clock.
+"""Time span in s of the records that the rings hold under the virtual clock.
 
-It is longer than `RECORDER_BUFFER_S`, because there a session takes about a second
-and observers lag behind."""
-_EVENTS = 256
-"""Number of log events that their ring holds."""
+It is longer than `RECORDER_BUFFER_S`, because under the virtual clock a session takes about a
+second, and observers lag behind."""
+_EVENT_CAPACITY = 256
+"""Number of records that the ring of log events holds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,19 +37,23 @@ class Topic:
     is_recorded: bool
     """Whether the recorder writes each record to the file."""
     is_shown_live: bool
-    """Whether the live publisher reads the records, and drops those it cannot show in time."""
+    """Whether the live publisher reads the records; it drops those that it cannot show in time."""
 
     def capacity(self, rate_hz: float, buffered_s: float = RECORDER_BUFFER_S) -> int:
-        """Return the number of records for which the ring buffer of a topic needs space.
+        """Return the number of records that the topic's ring buffer must hold.
 
         Parameters
         ----------
         rate_hz
             Ticks a second.
         buffered_s
-            Time in s whose records the ring holds.
+            Time span in s of the records that the ring holds.
         """
-        return ceil(rate_hz * buffered_s / self.tick_interval) if self.tick_interval else _EVENTS
+        return (
+            ceil(rate_hz * buffered_s / self.tick_interval)
+            if self.tick_interval
+            else _EVENT_CAPACITY
+        )
 
     def expected_hz(self, rate_hz: float) -> float | None:
         """Return the topic's records per second while a session is recorded, or None if irregular.
@@ -77,13 +81,13 @@ explain a sample precede it in the file."""
 
 # Memory of a rig
 
-DESCRIPTORS = len(TOPICS) + 2
+DESCRIPTOR_COUNT = len(TOPICS) + 2
 """Number of file descriptors of shared memory that :func:`create_channels` needs."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelSpecs:
-    """Descriptors and layout with which a child process attaches to the shared memory."""
+    """File descriptors and layouts that a child process needs to open the shared memory."""
 
     rings: tuple[RingSpec, ...]
     """Descriptors and layouts of all rings, in the order of :data:`TOPICS`."""
@@ -115,7 +119,7 @@ class Channels:
 
     @property
     def specs(self) -> ChannelSpecs:
-        """Descriptors and layout with which a child process attaches to the shared memory."""
+        """File descriptors and layouts that a child process needs to open the shared memory."""
         return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.shared_state.fd)
 
     def request_stop(self) -> None:
@@ -124,7 +128,7 @@ class Channels:
             self.shared_state[StateField.STOP] = StopReason.OPERATOR
 
     def clear(self) -> None:
-        """Discard the records of the last session in all rings, while no recorder runs."""
+        """Discard all records in the rings before the next session, while no recorder runs."""
         for ring in self.rings:
             ring.discard()
 
@@ -145,9 +149,9 @@ def create_channels(
     rate_hz
         Ticks a second.
     descriptors
-        Descriptors, as many as `DESCRIPTORS`: for the rings, the shared state and the reference.
+        `DESCRIPTOR_COUNT` file descriptors: one for each ring, the shared state and the reference.
     buffered_s
-        Time in s whose records the rings hold.
+        Time span in s of the records that the rings hold.
     """
     *ring_fds, shared_state_fd, reference_fd = descriptors
     rings = [
@@ -158,7 +162,7 @@ def create_channels(
 
 
 def attach_channels(specs: ChannelSpecs) -> Channels:
-    """Attach a child process to the channels that the supervisor created, and return them."""
+    """Return the channels that the supervisor created, opened in this child process."""
     return _make_channels(
         [Ring(ring_spec) for ring_spec in specs.rings], SharedState(specs.shared_state_fd)
     )

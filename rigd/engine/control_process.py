@@ -1,8 +1,8 @@
-"""The control process: it alone talks to the devices, and it never leaves the torque on.
+"""The control process, which alone talks to the devices, and never leaves the torque on.
 
 It connects the devices, observes them at the rig's rate with the torque off, and runs the sessions
-that the supervisor requests, one after the other. It ends when a device fails: the operator decides
-when to reconnect.
+that the supervisor requests, one after the other. It ends when a device fails, because the operator
+decides when to reconnect.
 """
 
 import gc
@@ -58,7 +58,7 @@ from rigd.session.layout import WRENCH_FIELDS
 _MAX_SILENCE_S = 1.0
 """Longest time in s for which a device may send no reading between sessions."""
 _STANDSTILL_POLL_S = 0.05
-"""Longest time in s to wait for an order of the supervisor while virtual time does not advance."""
+"""Longest single wait in s for an order of the supervisor while virtual time is stopped."""
 _ZERO_READING_S = 0.2
 """Duration in s of the readings whose last angle becomes the rig's zero."""
 _STANDSTILL_TICKS = 2
@@ -80,7 +80,7 @@ def main() -> None:
             priority=realtime_settings.priority, cpu=realtime_settings.cpu
         )
     try:
-        devices = open_devices(job.profile.rig, job.moving)
+        devices = open_devices(job.profile.rig, job.announced_target)
         # Imports a package and designs its controller before a connected drive expects SYNCs.
         make_controller(job.profile.controlled_rig())
     except RigdError as error:  # of a device, a controller, or a beam that cannot be simulated
@@ -147,7 +147,7 @@ def run_control(
 
 
 class _ControlServer:
-    """Executor of the supervisor's orders, such as to run a session, on connected devices."""
+    """Server that executes the supervisor's orders, such as a session, on connected devices."""
 
     def __init__(
         self,
@@ -167,17 +167,17 @@ class _ControlServer:
         self._shared_state = channels.shared_state
         self._parent = parent
         self._stop = stop_request
-        self._granted = realtime_results
+        self._realtime_results = realtime_results
         self._zero_rad = 0.0
         self._silent_ticks = 0
-        self._on_lines = devices.uses_line
+        self._uses_line = devices.uses_line
         # A simulated motor starts cold.
-        real_motor = not devices.simulated
+        is_real_motor = not devices.simulated
         self._limit_monitor = make_limit_monitor(
-            profile, stored_motor_heat_nm2(profile) if real_motor else 0.0
+            profile, stored_motor_heat_nm2(profile) if is_real_motor else 0.0
         )
         self._standstill = StandstillMonitor(profile)
-        self._display = ReadingPublisher(channels.shared_state, devices)
+        self._reading_publisher = ReadingPublisher(channels.shared_state, devices)
         self._cycle = self._make_cycle(profile)
 
     def store_heat(self) -> None:
@@ -202,7 +202,7 @@ class _ControlServer:
         self._publish_readings()
 
     def serve(self) -> None:
-        """Execute the supervisor's orders until it has ended or a stop is requested.
+        """Execute the supervisor's orders until the supervisor has ended or a stop is requested.
 
         Raises
         ------
@@ -227,7 +227,7 @@ class _ControlServer:
                     self.observe_standstill()
 
     def _await_order(self) -> object | None:
-        """Read the devices with the torque off until the supervisor sends an order; return it.
+        """Return the supervisor's next order; until then read the devices with the torque off.
 
         Return None if the supervisor has ended or a stop is requested. Virtual time does not
         advance meanwhile, except for occasional ticks with devices on a bus or serial line.
@@ -245,7 +245,7 @@ class _ControlServer:
                 return supervisor_message
             if not self._clock.virtual:
                 self._read_idle_devices()
-            elif self._on_lines and time.monotonic() - last_tick_s > MAX_VIRTUAL_PAUSE_S:
+            elif self._uses_line and time.monotonic() - last_tick_s > MAX_VIRTUAL_PAUSE_S:
                 last_tick_s = time.monotonic()
                 self._scheduler.wait()
                 self._read_at_rest()
@@ -293,7 +293,7 @@ class _ControlServer:
         ):
             shared_state[state_field] = 0
         self._warn_of_refusals(session_job)
-        self._log_accepted(session_job)
+        self._log_accepted_checks(session_job)
         cycle = self._cycle = self._make_cycle(session_job.profile)
         reference_rad = map_reference(session_job.reference)
         touch_monitor = None
@@ -304,9 +304,9 @@ class _ControlServer:
                 session_job.touch, cycle, reference_rad, session_job.profile.rig.rate_hz
             )
         reference_reader = None
-        if session_job.reference.planned is not None:
+        if session_job.reference.planned_ticks is not None:
             reference_reader = ReferenceReader(
-                reference_rad, session_job.reference.planned, shared_state
+                reference_rad, session_job.reference.planned_ticks, shared_state
             )
         session_sequence = SessionSequence(
             session_job.profile,
@@ -316,7 +316,7 @@ class _ControlServer:
             self._scheduler,
             self._standstill,
             self._channels,
-            self._display,
+            self._reading_publisher,
             self._parent,
             self._stop,
             session_job.ending,
@@ -378,7 +378,9 @@ class _ControlServer:
             raise DeviceError(failure_text)
 
     def _restart_noise(self, session_job: SessionJob) -> dict[str, str]:
-        """Restart the noise of a simulated rig and return its seed as metadata; {} for a real rig.
+        """Restart the noise of a simulated rig, and return the seed as metadata.
+
+        The metadata are empty for a real rig.
 
         Raises
         ------
@@ -391,7 +393,7 @@ class _ControlServer:
         )
 
     def _run_probe(self, profile: Profile) -> None:
-        """Run the probing move of a profile, disable the drive, send the result to the supervisor.
+        """Run the probing move, disable the drive, and send the result to the supervisor.
 
         Raises
         ------
@@ -408,7 +410,7 @@ class _ControlServer:
             self._scheduler,
             self._standstill,
             self._channels,
-            self._display,
+            self._reading_publisher,
             self._parent,
             self._stop,
         )
@@ -441,9 +443,9 @@ class _ControlServer:
             self._parent.send(MeasurementRefused(end.reason))
 
     def _measure_tare(self) -> dict[str, object]:
-        """Measure the sensor's zero at rest, and return mean and standard deviation by axis.
+        """Tare the sensor at rest; return mean and standard deviation of each axis.
 
-        The values are for display, because each session measures the zero itself.
+        The returned values are for display, because each session repeats the tare.
         """
         self._cycle.sensor_monitor.learn()
         rest_readings = self._read_rest(self._profile.session.tare_s)
@@ -459,9 +461,9 @@ class _ControlServer:
         }
 
     def _set_zero(self) -> dict[str, object]:
-        """Set the rig's zero, from which its limits are measured, to the present angle.
+        """Set the rig's zero, from which the angle limits are measured, to the present angle.
 
-        Return the change of the zero in rad.
+        Return ``moved_rad``, the new zero relative to the previous one.
 
         Raises
         ------
@@ -485,7 +487,7 @@ class _ControlServer:
 
     def _publish_readings(self) -> None:
         """Write the last readings of angle and torque to the shared state."""
-        self._display.publish(self._cycle, self._scheduler.due_ns)
+        self._reading_publisher.publish(self._cycle, self._scheduler.due_ns)
 
     def _read_rest(self, duration_s: float) -> RestReadings:
         """Return the sensor and encoder readings of `duration_s` seconds without torque."""
@@ -524,16 +526,16 @@ class _ControlServer:
         return cycle
 
     def _warn_of_refusals(self, session_job: SessionJob) -> None:
-        """Log the real-time settings that the system did not grant, as warnings."""
+        """Log a warning for the real-time settings that the system did not grant."""
         own_refusals = {
             setting_name: refusal_text
-            for setting_name, refusal_text in self._granted.items()
+            for setting_name, refusal_text in self._realtime_results.items()
             if refusal_text.startswith(REFUSED)
         }
         for refused_settings, consequence_text in (
             (own_refusals, "more ticks will be late"),
             (
-                session_job.refused,
+                session_job.refused_settings,
                 "a computer that is busy with other programs may end the session",
             ),
         ):
@@ -545,10 +547,10 @@ class _ControlServer:
                 warning_message = f"The system did not grant {setting_names}: {consequence_text}."
                 write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
-    def _log_accepted(self, session_job: SessionJob) -> None:
-        """Log the failed checks of ``rigd check`` that the operator accepted, as warnings."""
-        for check_row in session_job.accepted:
-            warning_message = f"Accepted by the operator, though rigd check fails: {check_row}"
+    def _log_accepted_checks(self, session_job: SessionJob) -> None:
+        """Log a warning for each failed check of ``rigd check`` that the operator accepted."""
+        for check_text in session_job.accepted_check_texts:
+            warning_message = f"Accepted by the operator, though rigd check fails: {check_text}"
             write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
 

@@ -1,9 +1,9 @@
-"""One tick: read the devices, check the limits, control, command; and the checks at rest.
+"""One tick of the control loop (read, check, control, command), and the checks at rest.
 
-`Cycle` runs a tick. The tare is the mean of readings without torque (`observe_rest`). The zero of
-the angle, and with it the limits, depend on the encoder's count. `LimitMonitor` checks every
-reading during a session, and `StandstillMonitor` before, between and after sessions. While the
-torque is off, a person may turn the motor by hand, but its angle cannot jump.
+`Cycle` runs a tick. The tare is the mean of readings without torque (`observe_rest`). A jump of the
+encoder's count would shift the zero of the angle, and with it the limits. `LimitMonitor` therefore
+checks every reading during a session, and `StandstillMonitor` before, between and after sessions.
+While the torque is off, a person may turn the motor by hand, but its angle cannot jump.
 """
 
 import json
@@ -49,17 +49,17 @@ _STALE_WRENCH_CHANNELS = tuple(
 )
 
 _RECENT_TICKS = 32
-"""Number of ticks whose angles and torques are compared to detect a wrong sign."""
+"""Number of latest ticks whose angles and torques show whether a sign is wrong."""
 _SPEED_TICKS = 4
-"""Number of ticks over which the speed is computed, at either end of the last `_RECENT_TICKS`."""
+"""Number of ticks from which the speed is computed, at either end of the last `_RECENT_TICKS`."""
 _MIN_SPEED_STEPS = 10
-"""Encoder steps within `_SPEED_TICKS` above which the speed exceeds the encoder's noise."""
+"""Minimum number of encoder steps in `_SPEED_TICKS` with which the speed exceeds the noise."""
 _MIN_SPEED_CHANGE = 0.2
-"""Least change of speed over the last `_RECENT_TICKS`, as a fraction of the speed. With a smaller
-change the torque explains little of the motion."""
+"""Minimum change of the speed in `_RECENT_TICKS`, as a fraction of the speed. A smaller change does
+not show the sign of the torque."""
 _OPPOSITE_ACCELERATION_RATIOS = 1 / 3, 3.0
-"""Smallest and largest ratio of the measured acceleration to the one expected with the opposite
-sign. The range allows for friction and for an inertia that is only assumed."""
+"""Smallest and largest ratio of the measured acceleration to minus the expected acceleration that
+show a wrong sign. The range allows for friction and for an inertia that is only assumed."""
 
 
 # The encoder without torque
@@ -69,8 +69,8 @@ class StandstillMonitor:
     """Monitor that checks that the motor's angle does not jump while the torque is off.
 
     Each angle is compared with the angles before it. From one tick to the next the speed may change
-    as much as ``limits.acceleration_rad_s2`` allows, as in the loop. Over ticks that were missed
-    the motor may move as fast as ``limits.velocity_rad_s``.
+    as much as ``limits.acceleration_rad_s2`` allows, as in the loop. After missed ticks the angle
+    may have changed as much as ``limits.velocity_rad_s`` allows.
 
     Parameters
     ----------
@@ -82,13 +82,13 @@ class StandstillMonitor:
         rate_hz, limits = profile.rig.rate_hz, profile.limits
         self._period_ns = 1e9 / rate_hz
         # A difference of two movements has four readings in it, each half a step wrong.
-        self._resolution_rad = 2.0 * profile.rig.encoder.resolution_rad
-        self._per_tick2_rad = limits.acceleration_rad_s2 / rate_hz**2
-        self._per_tick_rad = limits.velocity_rad_s / rate_hz
+        self._angle_tolerance_rad = 2.0 * profile.rig.encoder.resolution_rad
+        self._max_movement_change_rad = limits.acceleration_rad_s2 / rate_hz**2
+        self._max_movement_rad = limits.velocity_rad_s / rate_hz
         self.reset()
 
     def reset(self) -> None:
-        """Forget the angles checked so far, because the drive has moved the motor meanwhile."""
+        """Discard the previous angles; call this after the drive has moved the motor."""
         self._angle_rad: float | None = None
         self._due_ns = 0
         self._last_movements_rad: tuple[float, float] | None = None
@@ -99,19 +99,19 @@ class StandstillMonitor:
         return self._last_movements_rad is not None
 
     def check(self, angle_rad: float, due_ns: int) -> None:
-        """Raise `DeviceError` if the motor cannot have turned to an angle since the last tick.
+        """Raise `DeviceError` if the angle has jumped since the last tick.
 
         Parameters
         ----------
         angle_rad
-            Angle from any zero that does not change. It must not be stale.
+            Angle relative to a zero that does not change. The reading must not be stale.
         due_ns
-            Time at which its tick was due.
+            Time at which the tick of this angle was due.
 
         Raises
         ------
         DeviceError
-            If the angle has jumped further than the motor can turn in that time.
+            If the angle has changed more than the motor can turn since the last tick.
         """
         last_angle_rad, elapsed_ticks = (
             self._angle_rad,
@@ -123,28 +123,29 @@ class StandstillMonitor:
         movement_rad = angle_rad - last_angle_rad
         last_movements_rad, self._last_movements_rad = self._last_movements_rad, None
         if elapsed_ticks > 1:
-            possible_rad = self._per_tick_rad * elapsed_ticks + self._resolution_rad
-            jump_rad, key = movement_rad, "limits.velocity_rad_s"
+            max_jump_rad = self._max_movement_rad * elapsed_ticks + self._angle_tolerance_rad
+            jump_rad, limit_key = movement_rad, "limits.velocity_rad_s"
         else:
             # The movement before the first is unknown.
             last_movement_rad, earlier_movement_rad = last_movements_rad or (
                 0.0,
-                self._per_tick_rad,
+                self._max_movement_rad,
             )
             # One latch may be late by most of a period, and the next one punctual.
-            possible_rad = (
-                self._per_tick2_rad
-                + self._resolution_rad
+            max_jump_rad = (
+                self._max_movement_change_rad
+                + self._angle_tolerance_rad
                 + abs(last_movement_rad)
                 + abs(earlier_movement_rad)
             )
-            jump_rad, key = movement_rad - last_movement_rad, "limits.acceleration_rad_s2"
+            jump_rad, limit_key = movement_rad - last_movement_rad, "limits.acceleration_rad_s2"
             self._last_movements_rad = movement_rad, last_movement_rad
-        if not abs(jump_rad) <= possible_rad:
+        if not abs(jump_rad) <= max_jump_rad:
             elapsed_text = f"{elapsed_ticks} ticks" if elapsed_ticks > 1 else "one tick"
             raise DeviceError(
                 f"The encoder jumped by {jump_rad:.4g} rad within {elapsed_text} while the torque "
-                f"was off; at most {possible_rad:.2g} rad is possible ({key}). {ENCODER_REMEDY}"
+                f"was off; at most {max_jump_rad:.2g} rad is possible ({limit_key}). "
+                f"{ENCODER_REMEDY}"
             )
 
 
@@ -164,14 +165,14 @@ class Cycle:
         Controller and limit monitor. The monitor checks every reading before the controller
         uses it.
     reading_monitors
-        Checks of the readings against physics and noise.
+        Monitors that check encoder and sensor readings for plausibility.
 
     Attributes
     ----------
     devices
-        Devices, as given.
+        The argument of the same name.
     zero_rad
-        The drive's own angle at the rig's zero.
+        Angle that the drive reports at the rig's zero.
     angle_rad, raw_wrench, wrench, coupling_torque_nm
         The last readings. The angle is measured from the rig's zero. Wrench and torque are tared,
         the raw wrench is not.
@@ -180,7 +181,8 @@ class Cycle:
     flags
         Status bits of the last tick.
     encoder_monitor
-        Check of the encoder against the torques, or None in a probing move, which has its own.
+        Check of the encoder against the torques, or None in a probing move, which checks the
+        encoder itself.
     """
 
     def __init__(
@@ -237,7 +239,7 @@ class Cycle:
         self.flags = status_flags
 
     def step(self, due_ns: int, reference_rad: float) -> Violation | None:
-        """Run one tick of the loop, and return the violated limit or None.
+        """Run one tick of the loop; return the violation if a limit is violated, otherwise None.
 
         After a violation the torque is off.
 
@@ -251,7 +253,7 @@ class Cycle:
         Raises
         ------
         ControllerError
-            If the controller of an installed package fails; the torque is then as before.
+            If the controller of an installed package fails. The torque command is then unchanged.
         """
         self.observe(due_ns)
         status_flags = self.flags & ~_TORQUE_OFF
@@ -298,7 +300,7 @@ class Cycle:
         return None
 
     def start(self, noise_nm: float) -> None:
-        """Reset controller and monitors to rest at the angle last read.
+        """Reset controller and monitors to a motor at rest at the last angle.
 
         Parameters
         ----------
@@ -312,7 +314,7 @@ class Cycle:
         self._recent_ticks.clear()
 
     def skip(self, missed_ticks: int) -> None:
-        """Report ticks missed while the torque was held to the limit and encoder monitors."""
+        """Report missed ticks, in which the torque was unchanged, to limit and encoder monitors."""
         if missed_ticks:
             self.limit_monitor.skip(missed_ticks)
             self.skip_encoder(missed_ticks)
@@ -328,9 +330,9 @@ class Cycle:
         """Return whether the shaft has just accelerated against the torque on it.
 
         The torque on the motor is the commanded torque less the measured coupling torque, which
-        includes every load on the beam. If the motor accelerates about as much as its inertia
-        allows, but in the opposite direction, the sign of its angle or torque is wrong, or somebody
-        turns the shaft. Call it after a tick that violated a limit.
+        includes every load on the beam. If the measured acceleration is about
+        −torque / inertia, the sign of angle or torque is wrong, or somebody turns the shaft.
+        Call this after a tick that violated a limit.
 
         Parameters
         ----------
@@ -355,11 +357,11 @@ class Cycle:
         half_window = _SPEED_TICKS // 2
         torques_nm = [sent_nm - coupling_nm for _, coupling_nm, sent_nm in recent_ticks]
         impulse_nm_s = sum(torques_nm[half_window : -1 - half_window]) / rate_hz
-        expected_rad = impulse_nm_s / inertia_kg_m2 * _SPEED_TICKS / rate_hz
+        expected_change_rad = impulse_nm_s / inertia_kg_m2 * _SPEED_TICKS / rate_hz
         min_ratio, max_ratio = _OPPOSITE_ACCELERATION_RATIOS
-        opposition = -speed_change_rad * expected_rad
+        opposition = -speed_change_rad * expected_change_rad
         return (
-            min_ratio * expected_rad**2 <= opposition <= max_ratio * expected_rad**2
+            min_ratio * expected_change_rad**2 <= opposition <= max_ratio * expected_change_rad**2
             and opposition > 0.0
         )
 
@@ -377,7 +379,7 @@ class Cycle:
         ).capitalize()
 
     def check_encoder(self, standstill: StandstillMonitor, due_ns: int) -> None:
-        """Raise `DeviceError` if the angle just read has jumped, while the torque is off.
+        """Raise `DeviceError` if the last angle has jumped while the torque was off.
 
         Parameters
         ----------
@@ -397,7 +399,7 @@ class Cycle:
     def check_sensor(self) -> Violation | None:
         """Return a violation if the sensor repeats its readings, otherwise None.
 
-        Call it after each reading.
+        Call this after each reading.
         """
         if self.flags & _UNUSABLE_FLAGS & ~_ANGLE_STALE:
             return None
@@ -419,9 +421,9 @@ class Cycle:
         )
 
     def with_reported_cause(self, violation: Violation) -> Violation:
-        """Return a violation with the cause that the device reports as its remedy.
+        """Return a violation whose remedy is the cause that the device reports.
 
-        Return the violation unchanged if the device reports no cause.
+        The violation is unchanged if the device reports no cause.
 
         Parameters
         ----------
@@ -439,30 +441,32 @@ class Cycle:
     def check_slow_limits(
         self, due_ns: int, recorder_lag_s: float = 0.0, disk_free_mb: float = inf
     ) -> Violation | None:
-        """Check motor heat, recorder lag and free disk space; return the violated limit or None.
+        """Check motor heat, recorder lag and free disk space; return the violation or None.
 
         Parameters
         ----------
         due_ns
             Time at which the present tick was due.
         recorder_lag_s
-            Time in s by which the recorder is behind the loop.
+            Time in s by which the recorder lags behind the loop.
         disk_free_mb
             Free space in MB on the disk that holds the session file.
 
         Returns
         -------
         Violation or None
-            The violated limit, if any; the torque is then off.
+            Violation of a limit, if there is one. The torque is then off.
         """
-        squares_nm2, self._torque_squares_nm2 = self._torque_squares_nm2, 0.0
-        violation = self.limit_monitor.check_slow(due_ns, squares_nm2, recorder_lag_s, disk_free_mb)
+        torque_squares_nm2, self._torque_squares_nm2 = self._torque_squares_nm2, 0.0
+        violation = self.limit_monitor.check_slow(
+            due_ns, torque_squares_nm2, recorder_lag_s, disk_free_mb
+        )
         if violation is not None:
             self.torque_off()
         return violation
 
     def torque_off(self) -> None:
-        """Set the torque to zero, and disable the drive unless that has been done already."""
+        """Set the torque to zero, and disable the drive if it is enabled."""
         if self._commanding:
             self._commanding = False
             self._drive.disable()
@@ -489,9 +493,9 @@ class RestReadings:
     wrenches
         Raw wrenches (not tared) in N and N·m, shape (n, 6).
     angles_rad
-        Angles from the rig's zero; shape (n,).
+        Angles relative to the rig's zero, shape (n,).
     torques_nm
-        Coupling torque of the raw wrenches; shape (n,).
+        Coupling torques of the raw wrenches, shape (n,).
     """
 
     duration_s: float
@@ -539,7 +543,7 @@ def observe_rest(
     projection: Wrench,
     check: Callable[[], None],
 ) -> RestReadings:
-    """Read angle and wrench for `duration_s` without changing the torque, return the readings.
+    """Read angle and wrench for a time without changing the torque; return the readings.
 
     Parameters
     ----------
@@ -550,7 +554,7 @@ def observe_rest(
     projection
         Coupling torque = projection · wrench.
     check
-        Function that is called after each reading and ends the readings by raising.
+        Function that is called after each reading. An exception of it ends the readings.
     """
     wrenches: list[Wrench] = []
     angles_rad: list[float] = []
@@ -570,14 +574,14 @@ def observe_rest(
 
 
 def make_limit_monitor(profile: Profile, heat_nm2: float = 0.0) -> LimitMonitor:
-    """Return the limit monitor of a rig, which is used as long as the rig is connected.
+    """Return a limit monitor for a rig; one monitor is used as long as the rig is connected.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     heat_nm2
-        Heat of the motor: mean square of its torque over its thermal time constant, (N·m)².
+        Heat of the motor in (N·m)²: mean square of the torque in the last thermal time constant.
     """
     rig = profile.rig
     limit_monitor = LimitMonitor(
@@ -661,9 +665,9 @@ def store_motor_heat(profile: Profile, heat_nm2: float) -> None:
 
 
 def stored_motor_heat_nm2(profile: Profile) -> float:
-    """Return the motor's remaining heat from the last connection, in (N·m)²; 0 if unknown.
+    """Return the heat in (N·m)² that the motor has left from the last connection; 0 if unknown.
 
-    The motor cools with its thermal time constant.
+    The motor has cooled since then with its thermal time constant.
     """
     try:
         heat_document = json.loads(_heat_file(profile).read_text("utf-8"))

@@ -12,13 +12,13 @@ live          LiveJob, LiveSession, LiveSessionEnded of `rigd.live`
 touch         TouchJob
 fit           FitJob, FileHeader, RecordEnded
 page          the data that it shows, as a JSON document
-prediction    a job of `rigd.daemon.background`; so does plan
+prediction    a job of `rigd.daemon.background` (also: plan)
 ============  =============================================
 
-A message is its length followed by one of these objects, pickled. In a session each is short enough
-for a pipe's buffer, so that no child ever waits for its supervisor. `multiprocessing.connection` is
-not used, because it would wait for the remainder of a message of which a hung child has written
-half.
+A message is one of these objects, pickled, after its length in bytes. In a session each message is
+short enough for a pipe's buffer, so that no child ever waits for its supervisor.
+`multiprocessing.connection` is not used: after a hung child has written half a message, it would
+wait for the rest.
 """
 
 import os
@@ -55,8 +55,9 @@ class ControlJob:
 
     profile: "Profile"
     """Profile whose devices are connected."""
-    moving: "ActuationTarget | None"
-    """The only motor that may move, as stated to the operator; None: no motor was stated."""
+    announced_target: "ActuationTarget | None"
+    """Target of the motion that was announced to the operator; any other is refused. None: not
+    announced."""
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
     fast: bool
@@ -68,7 +69,7 @@ class PostRecordPlan:
     """Plan of the steps after a session's record: how to damp the beam and return the motor."""
 
     stays: bool = False
-    """Whether the motor stays at the end of the reference instead of returning to the start."""
+    """Whether the motor stays at the end of the reference instead of returning to its start."""
     poles_rad_s: tuple[complex, ...] = ()
     """Poles in rad/s of the modes that the return must not excite; empty if they are unknown."""
     damper: "DamperSettings | None" = None
@@ -86,7 +87,7 @@ class TouchOrder:
     approach: "Approach"
     """Passes of the search, and the reaction to a touch."""
     shear_projection: tuple[float, ...] | None
-    """Coefficients of the base shear force, shear = projection · wrench; None: not measured."""
+    """Projection in shear force = projection · wrench; None: the shear force is not measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,16 +98,16 @@ class SessionJob:
     """Profile of the rig, possibly with another controller and other limits."""
     reference: "ReferenceSpec"
     """Reference angles in shared memory, relative to the angle at the start."""
-    refused: Mapping[str, str] = field(default_factory=dict)
-    """Reasons why the system refused real-time settings to supervisor and recorder, by setting."""
+    refused_settings: Mapping[str, str] = field(default_factory=dict)
+    """Real-time setting of supervisor or recorder → reason why the system refused it."""
     ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Steps after the record."""
     touch: TouchOrder | None = None
     """Search for an obstacle; None: no search."""
     seed: int | None = None
     """Seed of a simulated rig's noise; None: the rig chooses a seed."""
-    accepted: tuple[str, ...] = ()
-    """Failed rows of `rigd check` that the operator accepted, each as a text for the log."""
+    accepted_check_texts: tuple[str, ...] = ()
+    """Texts for the log, one for each failed row of `rigd check` that the operator accepted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +159,7 @@ class SessionFinished:
     reason: str
     """Reason for an early end, or failure after the record; empty if neither."""
     fault: bool
-    """Whether anything failed during the record or after it."""
+    """Whether anything failed during or after the record."""
     counts: Mapping[str, int]
     """Numbers of scheduled, missed, late and lost ticks, and of ticks with stale readings."""
     results: Mapping[str, str] = field(default_factory=dict)
@@ -172,7 +173,7 @@ class MeasurementResult:
     """Message with the result of a tare, a new zero or a probing move between sessions."""
 
     values: dict[str, Any]
-    """Results by name, as the methods `tare`, `zero` and `probe` of `rigd.runner.Rig` return."""
+    """Results by name: the dictionary that `Rig.tare`, `Rig.zero` or `Rig.probe` returns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,11 +212,11 @@ class FileHeader:
     """Contents of the session file that precede its first sample."""
 
     metadata: Mapping[str, str]
-    """Metadata ``session`` of docs/session_format.md."""
+    """Record ``session`` of docs/session_format.md."""
     segments: Mapping[str, tuple[int, int]]
-    """First tick of each segment, and the tick after its last, by the segment's name."""
+    """Segment name → first tick and end tick (exclusive)."""
     attachments: Mapping[str, str]
-    """Texts of the attached files, by file name."""
+    """Name of an attached file → its text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,11 +224,11 @@ class CloseFile:
     """Order to the recorder to write the outcome and close the session file."""
 
     outcome: Mapping[str, str]
-    """Metadata ``outcome`` of docs/session_format.md; the recorder recounts the samples."""
+    """Record ``outcome`` of docs/session_format.md. The recorder replaces the counts of samples."""
     touches: bytes = b""
     """Estimated touches in the binary format of the session file."""
     segments: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    """First tick and end of the segments that were not known before the record, by name."""
+    """Name of a segment unknown before the record → first tick and end tick (exclusive)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,7 +251,7 @@ class FileClosed:
     path: Path | None = None
     """Path of the file; None: no record had begun, and there is no file."""
     counts: Mapping[str, int] = field(default_factory=dict)
-    """Numbers of ticks in the file."""
+    """Counts of scheduled, recorded and lost ticks."""
     outcome: str = ""
     """``complete``, ``stopped`` or ``fault``, as in the file; empty without a file."""
     reason: str = ""
@@ -263,10 +264,10 @@ class ProcessFailed:
 
     reason: str
     """Description of the failure, for the operator."""
-    taken: bool = False
-    """Whether a file with the session's name exists already, which is the reason of the failure."""
+    is_name_taken: bool = False
+    """Whether the process failed because a file with the session's name exists already."""
     saved_path: Path | None = None
-    """Path of the record, if it was saved under another name."""
+    """Path of the saved record, if it is not in the expected file."""
 
 
 # Touch
@@ -278,17 +279,17 @@ class TouchJob:
 
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
-    first: int
-    """Number of samples written to the ring before the session."""
+    first_index: int
+    """Index in the ring of the first sample of the session."""
     rate_hz: float
     """Ticks a second."""
     model: "TouchModel"
     """Model of the beam."""
     shear_projection: tuple[float, ...] | None
-    """Coefficients of the base shear force, shear = projection · wrench; None: not measured."""
+    """Projection in shear force = projection · wrench; None: the shear force is not measured."""
     realtime: "RealtimeSettings | None" = None
-    """Real-time settings, which name the loop's core that this process must avoid; None: the
-    session is not in real time."""
+    """Real-time settings, with the loop's core that the touch process must avoid; None: the session
+    is not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,8 +320,8 @@ class FitJob:
 
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
-    first: int
-    """Number of samples written to the ring before the session."""
+    first_index: int
+    """Index in the ring of the first sample of the session."""
     profile: "Profile"
     """Profile of the rig."""
     reference: "ReferenceSpec"
@@ -328,8 +329,8 @@ class FitJob:
     search: "PrecisionSearch | None" = None
     """Target precision, for which segments are planned; None: the reference is fixed."""
     realtime: "RealtimeSettings | None" = None
-    """Real-time settings, which name the loop's core that this process must avoid; None: the
-    session is not in real time."""
+    """Real-time settings, with the loop's core that the fit process must avoid; None: the session
+    is not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -362,19 +363,19 @@ class PlannedSegment:
     name: str
     """Name of the segment for the operator."""
     document: Mapping[str, Any]
-    """Improvement of the estimate that the segment is expected to bring, as in JSON documents."""
+    """Present standard deviations, and those expected after the segment, as in JSON documents."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchEnded:
-    """Message that no further segment follows, so the record ends with the planned segments."""
+    """Message that no further segment is planned, so that the record ends with the last one."""
 
     reached: bool
     """Whether the target precision is reached."""
     reason: str
     """Reason for the end, a sentence for the operator."""
     segments: Mapping[str, tuple[int, int]]
-    """First tick and end of the scan and of each segment, by name."""
+    """Name of the scan or of a segment → first tick and end tick (exclusive)."""
 
 
 # Daemon
@@ -406,7 +407,7 @@ def encode(message: object) -> bytes:
 
 
 class MessageReader:
-    """Reader of messages from a pipe, which never waits longer than a given timeout.
+    """Reader of messages from a pipe, which waits no longer than a given timeout.
 
     Parameters
     ----------
@@ -443,7 +444,7 @@ class MessageReader:
         return message
 
     def _take_complete_message(self) -> object | None:
-        """Remove and return the first complete message of the data read so far, or None."""
+        """Remove the first complete message from the received data and return it, or None."""
         if len(self._pending) < _LENGTH_HEADER.size:
             return None
         (message_bytes,) = _LENGTH_HEADER.unpack_from(self._pending)
@@ -458,7 +459,7 @@ class MessageReader:
 
 
 def is_ready(fd: int, poll_event: int, timeout_s: float | None) -> bool:
-    """Wait until a descriptor can be read or written; return False after the timeout.
+    """Wait until a descriptor can be read or written without blocking; return False on a timeout.
 
     Parameters
     ----------

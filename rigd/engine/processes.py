@@ -1,11 +1,11 @@
 """Both ends of a child process: its client, and its connection to the process that started it.
 
-`ChildProcess` starts the process that a row of `rigd.engine.workers` describes, and is the client
-of its messages; it suspends, resumes and ends it. A worker that sends messages is ``python -m
+`ChildProcess` starts the process that a row of `rigd.engine.workers` describes, exchanges messages
+with it, and suspends, resumes and ends it. A worker that sends messages is run as ``python -m
 MODULE PID`` with the process id of its supervisor. It receives its job and then messages on
 standard input, whose end means that the supervisor is gone, and sends its answers on standard
-output (`messages`); its end of the pipes is a `SupervisorConnection`. Any other worker is a program
-with arguments, which the system kills when its supervisor ends.
+output (`messages`). In the worker, `SupervisorConnection` handles these pipes. Any other worker is
+a program with arguments, which the system kills when its supervisor ends.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ from rigd.runtime.background import (
 _WRITE_PATIENCE_S = 5.0
 """Longest time in s that a child may take to read a message."""
 _EXIT_GRACE_S = 1.0
-"""Longest time in s from the end of a child's output to the end of its process."""
+"""Longest time in s to wait for a child to exit after it has closed its output."""
 _KILLED_GRACE_S = 2.0
 """Longest time in s to wait for a killed child to end."""
 _MAX_ERROR_BYTES = 65_536
@@ -44,27 +44,27 @@ _MAX_ERROR_BYTES = 65_536
 
 
 class ChildError(FailureError):
-    """Error of a child process: it cannot be started, has ended or sent no valid message."""
+    """Raised if a child process cannot be started, has ended, or sent an invalid message."""
 
     system_reason = ""
-    """Reason of the system why the process cannot be started."""
+    """Text of the system that states why the process cannot be started; else empty."""
 
 
 class ChildProcess:
-    """Child process of a supervisor: its start, its messages, and its end.
+    """Child process that a supervisor starts, exchanges messages with, and ends.
 
     Parameters
     ----------
     worker
         Description of the process.
     arguments
-        Arguments of a program.
+        Command-line arguments, for a worker that is a program.
     descriptors
-        Descriptors that the child inherits.
+        File descriptors that the child inherits.
     cores
-        Cores that the child may use; empty: those of this process.
+        Cores that the child may use; empty: the same cores as this process.
     folder
-        Working folder of the child; None: that of this process.
+        Working folder of the child; None: the same folder as this process.
 
     Raises
     ------
@@ -109,13 +109,13 @@ class ChildProcess:
             )
             child_error.system_reason = str(error.strerror)
             raise child_error from None
-        self._restrict(cores)
+        self._apply_limits(cores)
         if not is_program:
             os.set_blocking(self._stdin_fd, False)
             self._messages = MessageReader(self._stdout_fd)
 
-    def _restrict(self, cores: Collection[int]) -> None:
-        """Give the new process its cores, its priority, and its limit of memory."""
+    def _apply_limits(self, cores: Collection[int]) -> None:
+        """Set the cores, the priority and the memory limit of the new process."""
         worker, pid = self._worker, self.pid
         with contextlib.suppress(OSError):  # it has ended already, which poll() reports
             if cores:
@@ -138,7 +138,7 @@ class ChildProcess:
     def send(self, message: object) -> None:
         """Send one message to the child.
 
-        If the child has ended, nothing is raised here, but by the next `poll`.
+        If the child has ended, the next `poll` raises the error instead.
 
         Raises
         ------
@@ -159,7 +159,7 @@ class ChildProcess:
 
     @property
     def exit_code(self) -> int | None:
-        """Exit code of the child, or minus the signal that ended it; None while it runs."""
+        """Exit code of the child; −N if signal N ended the child; None while it runs."""
         return self._process.poll()
 
     def poll(self, timeout_s: float | None) -> object | None:
@@ -170,7 +170,7 @@ class ChildProcess:
         Raises
         ------
         ChildError
-            If the child has ended, or sent something that is no message of it.
+            If the child has ended, or sent anything but a message of its kind of worker.
         """
         process_text = f"The {self._worker.name} process"
         try:
@@ -207,7 +207,7 @@ class ChildProcess:
         Raises
         ------
         ChildError
-            If the child has ended, or sent something that is no message of it.
+            If the child has ended, or sent anything but a message of its kind of worker.
         """
         import asyncio  # late: the processes of a rig do not need it
 
@@ -222,7 +222,7 @@ class ChildProcess:
         return message
 
     def error_text(self) -> str:
-        """Return the end of the child's standard error, which is not shown to the operator."""
+        """Return the last text that the child wrote to standard error, for `captures_stderr`."""
         assert self._errors_fd is not None
         start = max(0, os.fstat(self._errors_fd).st_size - _MAX_ERROR_BYTES)
         return os.pread(self._errors_fd, _MAX_ERROR_BYTES, start).decode(errors="replace").strip()
@@ -240,7 +240,7 @@ class ChildProcess:
         self._signal(signal.SIGKILL)
 
     def _signal(self, signal_number: signal.Signals) -> None:
-        """Send a signal to the child, and to the processes that a program has started."""
+        """Send a signal to the child; if it is a program, also to the processes it has started."""
         if self._worker.sends:
             self._process.send_signal(signal_number)
         elif self.running:
@@ -248,13 +248,13 @@ class ChildProcess:
                 os.killpg(self.pid, signal_number)
 
     def close_input(self) -> None:
-        """Request the child to end, by the end of its input."""
+        """Ask the child process to exit by closing its standard input."""
         if self._process.stdin is not None and not self._process.stdin.closed:
             with contextlib.suppress(BrokenPipeError):  # it had ended already
                 self._process.stdin.close()
 
     def stop(self) -> None:
-        """End the child: close its input, terminate it after its time to end, then kill it.
+        """End the child: close its input, terminate it if it does not exit in time, then kill it.
 
         A program is killed at once. Calling this again has no effect.
         """
@@ -286,7 +286,7 @@ class ChildProcess:
             self._errors_fd = None
 
     def _wait_for_output_end(self, patience_s: float) -> bool:
-        """Wait until the child's output ends, and return whether it ends within `patience_s`."""
+        """Wait until the child closes its output; return False if it does not in `patience_s`."""
         deadline_s = time.monotonic() + patience_s
         while (remaining_s := deadline_s - time.monotonic()) > 0:
             if is_ready(self._stdout_fd, select.POLLIN, remaining_s) and not os.read(
@@ -322,9 +322,10 @@ class ChildProcess:
 
 
 class SupervisorConnection:
-    """A child process's connection to the supervisor, whose process id is its only argument.
+    """Connection of this child process to its supervisor.
 
-    (The parent's id at the start of the child would be wrong if the supervisor has died already.)
+    The supervisor's process id is the child's only command-line argument. ``os.getppid`` would
+    return another id if the supervisor died before the child called it.
     """
 
     def __init__(self) -> None:
@@ -366,23 +367,23 @@ class SupervisorConnection:
                 unsent_bytes = unsent_bytes[os.write(self._messages_fd, unsent_bytes) :]
 
     def alive(self) -> bool:
-        """Return whether the supervisor still runs, fast enough for use in the control loop."""
+        """Return whether the supervisor is running; fast enough for the control loop."""
         return os.getppid() == self._pid
 
 
 class Heartbeat:
-    """Detector of a hung process by its heartbeat, polled by another process.
+    """Detector of a hung process, whose heartbeat count another process polls.
 
-    Only time in which the polling process itself ran counts: a computer that stalls for a second
-    does not make a process count as hung.
+    Only time in which the polling process itself runs is counted. A computer that stalls for a
+    second therefore does not make the polled process appear hung.
     """
 
     _MAX_STEP_S = 0.2
-    """Longest time in s that counts between two polls."""
+    """Maximum time in s that is counted from one poll to the next."""
 
     def __init__(self) -> None:
         self._beat = -1
-        self._polled_s = 0.0
+        self._last_poll_s = 0.0
         self.still_s = 0.0
 
     def stalled_for(self, beat_count: int, now_s: float) -> float:
@@ -395,7 +396,7 @@ class Heartbeat:
         now_s
             Time of a monotonic clock.
         """
-        passed_s = min(now_s - self._polled_s, self._MAX_STEP_S)
+        passed_s = min(now_s - self._last_poll_s, self._MAX_STEP_S)
         self.still_s = self.still_s + passed_s if beat_count == self._beat else 0.0
-        self._beat, self._polled_s = beat_count, now_s
+        self._beat, self._last_poll_s = beat_count, now_s
         return self.still_s

@@ -1,4 +1,4 @@
-"""Real-time settings of a rig's processes: each is requested, and the result is recorded.
+"""Real-time settings of a rig's processes, with text on whether the system granted each setting.
 
 The control process gets all settings for a 1 kHz loop (:func:`apply_realtime`). Supervisor and
 recorder get a priority below the loop's and above that of every ordinary program
@@ -17,10 +17,10 @@ from pathlib import Path
 REFUSED = "refused: "
 """Prefix of the text for a real-time setting that the system did not grant; the reason follows."""
 MEMORY_LOCKED = "locked"
-"""Text for a process whose memory is locked, so that it causes no page faults."""
+"""Text for a granted lock of the process's memory, which prevents page faults."""
 MAX_WAKE_UP_US = 2
-"""Longest exit latency in µs of the processor's idle states; deeper states are disabled. Halting is
-faster than that. With 0 an idle core would poll and consume power."""
+"""Longest exit latency in µs of the idle states that a core may use; slower states are disabled.
+The halt state is faster than 2 µs. With 0 an idle core would poll and consume power."""
 
 SUPERVISION_NICENESS = -10
 """Niceness of supervisor and recorder if the system grants no real-time priority."""
@@ -40,7 +40,7 @@ _IDLE_LATENCY_DEVICE = "dev/cpu_dma_latency"
 
 
 def disable_garbage_collection() -> str:
-    """Turn off Python's cyclic garbage collector, whose run can take ten periods; return "off"."""
+    """Turn off Python's cyclic garbage collector, which can take ten periods; return "off"."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -53,12 +53,12 @@ def apply_realtime(*, priority: int, cpu: int, root_folder: Path = Path("/")) ->
     Parameters
     ----------
     priority
-        Priority under SCHED_FIFO, 1 to 99; 0 leaves the scheduling policy as it is.
+        Priority under SCHED_FIFO, 1 to 99; 0 leaves the scheduling policy unchanged.
     cpu
         Core to run on; -1: the last isolated core or, if none is isolated, the last core that this
         process may use.
     root_folder
-        Root of the file system.
+        Root of the file system, which tests replace.
 
     Returns
     -------
@@ -82,10 +82,10 @@ def apply_realtime(*, priority: int, cpu: int, root_folder: Path = Path("/")) ->
 
 
 def pin_off_loop_core(loop_cpu: int) -> None:
-    """Restrict this process to cores other than the control loop's, if it may use others.
+    """Restrict this process to cores other than the control loop's, if there are others.
 
-    The loop has the higher priority in any case, but not over the kernel when it clears or compacts
-    memory for this process.
+    The loop has a higher priority than this process, but not than the kernel while it clears or
+    compacts memory for this process.
 
     Parameters
     ----------
@@ -101,18 +101,18 @@ def pin_off_loop_core(loop_cpu: int) -> None:
 class RaisedPriority:
     """Raised priority of this process: above ordinary programs and below the control loop.
 
-    It lasts from :meth:`request` to :meth:`restore`. If the real-time priority is granted, the
-    process also avoids the loop's core where it may use another core. Its children are ordinary
-    processes, but inherit the restriction to these cores: start them with :attr:`cores_before`.
+    The raised priority lasts from :meth:`request` to :meth:`restore`. If it is granted as real-time
+    priority, the process also leaves the loop's core if it may use another one. Child processes
+    have ordinary priority but inherit the cores: start them with :attr:`cores_before`.
 
     Parameters
     ----------
     realtime_priority
-        Priority under SCHED_RR; 0 leaves the scheduling policy as it is.
+        Priority under SCHED_RR; 0 leaves the scheduling policy unchanged.
     loop_cpu
         Core of the loop, as in ``realtime.cpu``.
     root_folder
-        Root of the file system.
+        Root of the file system, which tests replace.
 
     Attributes
     ----------
@@ -127,10 +127,10 @@ class RaisedPriority:
         self.cores_before = frozenset(os.sched_getaffinity(0))
         core, _ = _core_of_loop(loop_cpu, root_folder)
         self._other_cores = self.cores_before - {core}
-        self._apply: Callable[[int], None] | None = None
+        self._apply_priority: Callable[[int], None] | None = None
 
     def request(self) -> dict[str, str]:
-        """Request the raised priority, and return the results by setting: scheduling and cores.
+        """Request the raised priority; return which settings the system granted.
 
         Returns
         -------
@@ -152,37 +152,40 @@ class RaisedPriority:
         return {"scheduling": scheduling_result}
 
     def raise_new_threads(self) -> None:
-        """Raise the priority of the threads started since, too; one interpreter lock serves all."""
-        if self._apply is None:
+        """Give the threads that were started since `request` the priority of the process.
+
+        All threads need it, because they compete for one interpreter lock.
+        """
+        if self._apply_priority is None:
             return
         for thread in Path("/proc/self/task").iterdir():
             with contextlib.suppress(OSError):  # one that has just ended
-                self._apply(int(thread.name))
+                self._apply_priority(int(thread.name))
 
     def restore(self) -> None:
         """Return to ordinary priority; calling this again has no effect."""
-        if self._apply is None:
+        if self._apply_priority is None:
             return
-        self._apply = self._restore
+        self._apply_priority = self._restore
         self.raise_new_threads()
-        self._apply = None
+        self._apply_priority = None
 
     def _raise_to_realtime(self) -> str:
         """Set the real-time priority SCHED_RR for all threads, and return its description."""
         self._set_realtime(0)
-        self._apply = self._set_realtime
+        self._apply_priority = self._set_realtime
         self.raise_new_threads()
         return f"SCHED_RR {self._priority}"
 
     def _raise_by_niceness(self) -> str:
         """Set the niceness `SUPERVISION_NICENESS` for all threads, and return its description."""
         self._set_nice(0)
-        self._apply = self._set_nice
+        self._apply_priority = self._set_nice
         self.raise_new_threads()
         return f"nice {SUPERVISION_NICENESS}"
 
     def _set_realtime(self, thread_id: int) -> None:
-        """Set the real-time priority of a thread, and keep it off the loop's core."""
+        """Set the real-time priority of a thread, and restrict it to cores without the loop."""
         # Forked processes and new threads start with the ordinary policy.
         policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(thread_id, policy, os.sched_param(self._priority))
@@ -224,7 +227,7 @@ def isolated_cores(root_folder: Path = Path("/")) -> frozenset[int]:
 
 
 def parse_core_list(text: str) -> frozenset[int]:
-    """Return the numbers of the cores that a text in the kernel's format, as ``0-2,5``, lists.
+    """Return the core numbers in a list in the kernel's format, such as ``0-2,5``.
 
     Raises
     ------
@@ -253,9 +256,9 @@ def _try_setting(apply_setting: Callable[[], str]) -> str:
 
 
 def lock_memory(libc: ctypes.CDLL) -> str:
-    """Lock the memory of this process against paging, and return a text that says how much.
+    """Lock the memory of this process against paging; return a text that states how much.
 
-    `libc` is the C library, whose ``mlockall`` is called.
+    `libc` is the C library with the function ``mlockall``.
     """
     limit_bytes, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if limit_bytes == resource.RLIM_INFINITY or os.geteuid() == 0:
@@ -276,14 +279,14 @@ def _core_of_loop(loop_cpu: int, root_folder: Path) -> tuple[int, bool]:
     """Return the core on which the control process runs, and whether the kernel isolates it."""
     if loop_cpu >= 0:  # chosen whether it may be used or not
         return loop_cpu, False
-    isolated_numbers = isolated_cores(root_folder)
-    if isolated_numbers:
+    isolated_core_numbers = isolated_cores(root_folder)
+    if isolated_core_numbers:
         # Isolated cores are not in a process's affinity until it requests one: try it.
         allowed_cores = os.sched_getaffinity(0)
         with contextlib.suppress(OSError):
-            os.sched_setaffinity(0, {max(isolated_numbers)})
+            os.sched_setaffinity(0, {max(isolated_core_numbers)})
             os.sched_setaffinity(0, allowed_cores)
-            return max(isolated_numbers), True
+            return max(isolated_core_numbers), True
     return max(os.sched_getaffinity(0)), False
 
 
@@ -293,14 +296,14 @@ def _format_cores(cores: frozenset[int]) -> str:
 
 
 def _pin_to_loop_core(loop_cpu: int, root_folder: Path) -> str:
-    """Restrict this process to the core of the loop, and return its number as text."""
+    """Restrict this process to the core of the loop; return the number of the core as text."""
     core, isolated = _core_of_loop(loop_cpu, root_folder)
     os.sched_setaffinity(0, {core})
     return f"{core}, isolated" if isolated else str(core)
 
 
 def _limit_idle_states(root_folder: Path) -> str:
-    """Disable idle states that a core leaves slowly, until this process ends; return a text."""
+    """Disable slow idle states of the cores until this process ends; return text on the result."""
     latency_files = (root_folder / _IDLE_STATES_FOLDER).glob(
         "cpu[0-9]*/cpuidle/state[0-9]*/latency"
     )
@@ -319,7 +322,7 @@ def _set_fifo_priority(realtime_priority: int) -> str:
 
 
 def _check_return_code(return_code: int) -> None:
-    """Raise the C library's last error if `return_code`, the return value of a call, is not 0."""
+    """Raise the C library's last error if the return code of a call is not 0."""
     if return_code != 0:
         error_number = ctypes.get_errno()
         raise OSError(error_number, os.strerror(error_number))

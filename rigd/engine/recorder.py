@@ -1,4 +1,4 @@
-"""The recorder process: it writes the records of the rings to the session file.
+"""The recorder process, which writes the records of the rings to the session file.
 
 The recorder opens the file before the motor moves, writes the records of the loop as fast as the
 disk allows, and closes the file with the outcome. If the supervisor dies, it waits until the loop
@@ -65,7 +65,7 @@ def main() -> None:
     try:
         writer = SessionWriter(job.path)
     except SessionError as error:
-        parent.send(ProcessFailed(str(error), taken=isinstance(error, SessionExistsError)))
+        parent.send(ProcessFailed(str(error), is_name_taken=isinstance(error, SessionExistsError)))
         raise SystemExit(1) from None
     _publish_free_space(channels.shared_state, job.path.parent)
     parent.send(FileOpened(realtime_results))
@@ -78,9 +78,9 @@ def main() -> None:
 
 
 def _abandon_recording(writer: SessionWriter) -> tuple[str, Path | None]:
-    """Abandon a recording; return a sentence about its data, and their path or None.
+    """Abandon a recording; return a sentence on where its data are, and the path of the data.
 
-    The sentence is empty and the path None if the data stay in the recording's own file.
+    The sentence is empty and the path None if the data are in the ``.part`` file as usual.
     """
     try:
         saved_path = writer.abandon()
@@ -100,7 +100,7 @@ def _abandon_recording(writer: SessionWriter) -> tuple[str, Path | None]:
 def _record_until_closed(
     parent: SupervisorConnection, channels: Channels, writer: SessionWriter, disk_folder: Path
 ) -> None:
-    """Write the records of the rings until the supervisor orders to close the file, or ends."""
+    """Write the records of the rings until the supervisor requests the end, or has ended."""
     recorder = Recorder(channels, writer)
     polled_s = time.monotonic()
     while True:
@@ -129,7 +129,7 @@ def _record_until_closed(
 
 
 def _publish_free_space(shared_state: SharedState, disk_folder: Path) -> None:
-    """Publish the free space on the disk of a folder, in MB, in the shared state."""
+    """Write the free space in MB on the disk of a folder to the shared state."""
     with contextlib.suppress(OSError):
         shared_state[StateField.DISK_FREE_MB] = max(
             1, ceil(shutil.disk_usage(disk_folder).free / 1e6)
@@ -149,7 +149,7 @@ class Recorder:
     Attributes
     ----------
     begun
-        Whether the record has begun, and with it the contents of the file.
+        Whether the first sample has arrived, so that the file has contents.
     """
 
     def __init__(self, channels: Channels, writer: SessionWriter) -> None:
@@ -166,7 +166,7 @@ class Recorder:
             for topic, ring in zip(TOPICS, channels.rings, strict=True)
             if topic.is_recorded
         ]
-        self._recorded = 0
+        self._recorded_samples = 0
         self.header: FileHeader | None = None
         """Header of the session; None until the supervisor has sent it."""
         self.begun = False
@@ -204,7 +204,7 @@ class Recorder:
     def _write_samples(self, record_bytes: bytes) -> None:
         """Write a block of samples to the file and count them."""
         self._writer.write_samples(record_bytes)
-        self._recorded += len(record_bytes) // SAMPLE_SIZE
+        self._recorded_samples += len(record_bytes) // SAMPLE_SIZE
 
     def close(
         self,
@@ -216,18 +216,18 @@ class Recorder:
         Parameters
         ----------
         outcome
-            Outcome as reported by the loop.
+            Record ``outcome`` with the counts of the control loop.
         segments
-            Segments that were not known before the record; they may extend beyond its end.
+            Segments that were not known before the record. They may extend beyond its last tick.
         """
         while self.transfer():
             pass
-        accounted_ticks = self._recorded + int(outcome["missed"])
+        accounted_ticks = self._recorded_samples + int(outcome["missed"])
         # A killed control process may not have counted its last sample.
         scheduled_ticks = max(int(outcome["scheduled"]), accounted_ticks)
         tick_counts = {
             "scheduled": scheduled_ticks,
-            "recorded": self._recorded,
+            "recorded": self._recorded_samples,
             "lost": scheduled_ticks - accounted_ticks,
         }
         if tick_counts["lost"] and outcome["outcome"] == "complete":

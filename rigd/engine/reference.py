@@ -1,11 +1,11 @@
-"""Reference of a session in shared memory: complete, or appended in segments during the session.
+"""Reference of a session in shared memory, either complete or appended in segments as it runs.
 
-It is in shared memory so that the control process does not pause to receive it. However long the
+The control process does not pause to receive a reference in shared memory. However long the
 session is, a drive that monitors the loop's heartbeat sees no gap.
 
-One process appends segments, and another follows them. As in a ring, the angles are written
-before the field that announces them (`StateField.PLANNED`). The follower never waits for a
-segment: it holds the last angle until the next segment arrives.
+The fit process appends segments, which the control process follows. As in a ring, the angles are
+written before the field that announces them (`StateField.PLANNED`). The control process never
+waits for a segment: it holds the last angle until the next segment arrives.
 """
 
 import mmap
@@ -21,36 +21,36 @@ if TYPE_CHECKING:
 
 _DOUBLE_BYTES = 8  # bytes of a double
 _REST_TOLERANCE_RAD = 1e-4
-"""Largest distance in rad of a segment's ends from the start angle: one or two encoder steps."""
+"""Largest deviation in rad of a segment's first and last angle from the start angle."""
 _MAX_ANGLE_RAD = 6.3
-"""Angle in rad that no reference reaches; a larger number in the memory is an error."""
+"""Upper limit in rad of the angles of a segment; larger values are refused as errors."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSpec:
-    """Descriptor and length of the reference angles in shared memory, to attach to them."""
+    """File descriptor and length with which a process opens the reference in shared memory."""
 
     fd: int
     """File descriptor of the shared memory, which child processes inherit."""
     ticks: int
     """Capacity of the reference in ticks."""
-    planned: int | None = None
+    planned_ticks: int | None = None
     """Number of ticks that are planned at the start, before segments are appended; None: all."""
 
 
 def write_reference(
     fd: int, reference_rad: "NDArray[np.float64]", planned_ticks: int | None = None
 ) -> ReferenceSpec:
-    """Write reference angles to shared memory; return what other processes need to attach.
+    """Write reference angles to shared memory; return the data with which processes open it.
 
     Parameters
     ----------
     fd
         Descriptor of the memory.
     reference_rad
-        Angles from the rig's zero, one per tick; shape (n,).
+        Angle at each tick relative to the start angle, shape (n,).
     planned_ticks
-        Number of ticks that are planned; None: all.
+        Number of ticks that are planned so far, if segments will be appended; None: all.
 
     Raises
     ------
@@ -68,24 +68,24 @@ def write_reference(
 def map_reference(spec: ReferenceSpec) -> "memoryview[float]":
     """Return a view of a reference in shared memory: the angle in rad for each tick.
 
-    Changes of a complete reference are visible in this process only.
+    If this process writes to a complete reference, no other process sees the change.
     """
-    access_mode = mmap.ACCESS_COPY if spec.planned is None else mmap.ACCESS_READ
+    access_mode = mmap.ACCESS_COPY if spec.planned_ticks is None else mmap.ACCESS_READ
     shared_memory = mmap.mmap(spec.fd, _DOUBLE_BYTES * spec.ticks, access=access_mode)
     return memoryview(shared_memory).cast("d")
 
 
 def covers_reference(shared_state: SharedState, scheduled_ticks: int, reference_ticks: int) -> bool:
-    """Return whether the ticks of a record extend to the end of its reference angles.
+    """Return whether a record is complete, i.e. extends to the end of its reference.
 
     Parameters
     ----------
     shared_state
-        State of the session.
+        Shared state of the rig's processes.
     scheduled_ticks
         Number of ticks of the record.
     reference_ticks
-        Number of ticks of the reference; for a growing reference, its capacity.
+        Number of ticks of the reference, or the capacity of a growing reference.
     """
     if scheduled_ticks == reference_ticks:
         return True
@@ -103,18 +103,18 @@ class ReferenceWriter:
     Parameters
     ----------
     spec
-        Reference whose first segment is written.
+        Reference that already contains the first segment.
     shared_state
         State that announces the planned ticks (`StateField.PLANNED`).
     """
 
     def __init__(self, spec: ReferenceSpec, shared_state: SharedState) -> None:
-        assert spec.planned is not None
+        assert spec.planned_ticks is not None
         self._memory = mmap.mmap(spec.fd, _DOUBLE_BYTES * spec.ticks)
         self._shared_state = shared_state
-        self.ticks = spec.planned
+        self.ticks = spec.planned_ticks
         """Number of ticks of the reference that are planned so far."""
-        self.room = spec.ticks - spec.planned
+        self.room = spec.ticks - spec.planned_ticks
         """Number of ticks that can still be appended to the reference."""
 
     def append(self, reference_rad: "NDArray[np.float64]") -> None:
@@ -123,8 +123,8 @@ class ReferenceWriter:
         Parameters
         ----------
         reference_rad
-            Angles of the segment relative to the start angle, shape (n,). It begins and ends at
-            rest at the start angle.
+            Angles of the segment relative to the start angle, shape (n,). The segment begins and
+            ends at rest at the start angle.
 
         Raises
         ------
@@ -132,9 +132,11 @@ class ReferenceWriter:
             If the capacity is exceeded, or the segment does not begin and end at the start angle.
         """
         segment_ticks = int(reference_rad.size)
-        ends_rad = abs(reference_rad[0]), abs(reference_rad[-1])
+        end_angles_rad = abs(reference_rad[0]), abs(reference_rad[-1])
         # Also refuse NaN: the loop follows every angle in this memory.
-        if not (max(ends_rad) <= _REST_TOLERANCE_RAD and abs(reference_rad).max() < _MAX_ANGLE_RAD):
+        if not (
+            max(end_angles_rad) <= _REST_TOLERANCE_RAD and abs(reference_rad).max() < _MAX_ANGLE_RAD
+        ):
             raise ValueError(f"a segment from {reference_rad[0]} rad to {reference_rad[-1]} rad")
         if segment_ticks > self.room:
             raise ValueError(f"a segment of {segment_ticks} ticks; there is room for {self.room}")
@@ -150,56 +152,60 @@ class ReferenceWriter:
 class ReferenceReader:
     """Reader of a growing reference, which holds the last angle until the next segment arrives.
 
-    A segment that would extend beyond the record does not begin, because the motor would have to
-    stop at full speed.
+    A segment that would extend beyond the longest record is not begun, because the record would end
+    while the motor moves.
 
     Parameters
     ----------
     reference_rad
-        Memory of the reference.
+        View of the reference in shared memory.
     planned_ticks
         Number of ticks that are planned at the start.
     shared_state
-        `StateField.PLANNED` announces the planned ticks, and `StateField.LAST_SEGMENT` the last
-        segment. The reader writes the number of held ticks to `StateField.HELD_TICKS`, the number
-        before the segment that began last to `StateField.HELD_TICKS_BEFORE_SEGMENT`, and the end of
-        that segment to `StateField.BEGUN_REFERENCE_TICKS`.
+        State in which the writer announces the planned ticks (`StateField.PLANNED`) and the last
+        segment (`StateField.LAST_SEGMENT`). The reader writes to it the number of held ticks
+        (`StateField.HELD_TICKS`), and for the segment that began last the number of held ticks
+        before it (`HELD_TICKS_BEFORE_SEGMENT`) and its end (`BEGUN_REFERENCE_TICKS`).
     """
 
     def __init__(
         self, reference_rad: "memoryview[float]", planned_ticks: int, shared_state: SharedState
     ) -> None:
         self._reference_rad = reference_rad
-        self._planned = planned_ticks
-        self._announced = shared_state.view(StateField.PLANNED)
+        self._planned_ticks = planned_ticks
+        self._announced_ticks = shared_state.view(StateField.PLANNED)
         self._last_segment = shared_state.view(StateField.LAST_SEGMENT)
         self._held_ticks = shared_state.view(StateField.HELD_TICKS)
-        self._held_before = shared_state.view(StateField.HELD_TICKS_BEFORE_SEGMENT)
+        self._held_ticks_before = shared_state.view(StateField.HELD_TICKS_BEFORE_SEGMENT)
         self._begun_ticks = shared_state.view(StateField.BEGUN_REFERENCE_TICKS)
-        self._held = 0
+        self._held_tick_count = 0
 
     def reference_at(self, tick: int) -> float:
-        """Return the reference angle of a tick in rad; ticks must increase from call to call."""
-        reference_tick = tick - self._held
-        if reference_tick >= self._planned:
-            announced_ticks = self._announced[0]
-            if self._planned < announced_ticks <= len(self._reference_rad) - self._held:
-                self._planned = announced_ticks
-                self._held_before[0] = self._held
+        """Return the reference angle in rad of a tick; call this with increasing ticks."""
+        reference_tick = tick - self._held_tick_count
+        if reference_tick >= self._planned_ticks:
+            announced_ticks = self._announced_ticks[0]
+            if (
+                self._planned_ticks
+                < announced_ticks
+                <= len(self._reference_rad) - self._held_tick_count
+            ):
+                self._planned_ticks = announced_ticks
+                self._held_ticks_before[0] = self._held_tick_count
                 self._begun_ticks[0] = announced_ticks
-            if reference_tick >= self._planned:
+            if reference_tick >= self._planned_ticks:
                 # The next segment starts at its first angle, however long the wait.
-                self._held += reference_tick + 1 - self._planned
-                self._held_ticks[0] = self._held
-                return self._reference_rad[self._planned - 1]
+                self._held_tick_count += reference_tick + 1 - self._planned_ticks
+                self._held_ticks[0] = self._held_tick_count
+                return self._reference_rad[self._planned_ticks - 1]
         return self._reference_rad[reference_tick]
 
     def must_wait(self, tick: int) -> bool:
-        """Return whether the reference of a tick is not planned yet but may still be appended."""
-        reference_tick = tick - self._held
+        """Return whether the reference of a tick is not planned yet but may be planned later."""
+        reference_tick = tick - self._held_tick_count
         return (
-            reference_tick >= self._planned
-            and reference_tick >= self._announced[0]
+            reference_tick >= self._planned_ticks
+            and reference_tick >= self._announced_ticks[0]
             and not self._last_segment[0]
         )
 
@@ -207,4 +213,4 @@ class ReferenceReader:
         """Return whether a tick is after the last segment, so that the record ends."""
         if not self._last_segment[0]:
             return False
-        return tick - self._held >= max(self._planned, self._announced[0])
+        return tick - self._held_tick_count >= max(self._planned_ticks, self._announced_ticks[0])

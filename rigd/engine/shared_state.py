@@ -1,16 +1,17 @@
-"""Shared state of a rig's processes: fields that each process reads and writes, and log events.
+"""Shared state of a rig's processes: fields, each written by one process, and log events.
 
 Fields
     `SharedState` holds a few integers, such as the phase of the session and the heartbeat of each
-    process. Each field has one writer. Access takes a fraction of a microsecond and never blocks,
-    so the control loop can use it.
+    process. All processes can read them. Access takes a fraction of a microsecond and never
+    blocks, so the control loop can use it.
 Events
     Log lines of the control process, as fixed-size records in a separate ring. The loop must not
     wait for a reader, so it writes to shared memory instead of a pipe. The recorder writes each
     event to the file, and the supervisor shows it to the operator.
 
-The module `channels` lists what is published and lays out the memory. This module imports nothing
-heavy, because the processes of a rig start before anything else.
+The module `channels` lists the published topics and allocates the memory. This module imports
+nothing heavy, because the supervisor imports it before it starts the processes of a rig, which must
+start early.
 """
 
 import contextlib
@@ -26,7 +27,7 @@ from rigd.engine._ring import Ring, reserve
 
 
 class Phase(IntEnum):
-    """Phase of the control process, such as taring or recording, as a number."""
+    """Phase of the control process, such as taring or recording."""
 
     PREPARING = 0
     """Connecting the devices."""
@@ -41,7 +42,7 @@ class Phase(IntEnum):
     RETURNING = 5
     """Damping the beam and returning to the start angle after the record."""
     OFF = 6
-    """Torque is zero and the drive is disabled: between sessions, and at the end."""
+    """Idle with the drive disabled, between sessions and at the end."""
     WAITING = 7
     """Waiting until the beam is at rest, before the tare."""
     PROBING = 8
@@ -59,11 +60,11 @@ _OPERATOR_NAMES = {
     Phase.WAITING: "waiting for the beam to rest",
     Phase.PROBING: "probing move",
 }
-"""Names of phases for the operator, where they differ from the names in the code."""
+"""Phase → name for the operator, where it differs from the name in the code."""
 
 
 class Activity(StrEnum):
-    """Stage of a session for the operator, the same in terminal, page and socket documents."""
+    """Stage of a session, as terminal, page and socket documents show it to the operator."""
 
     PREPARING = "preparing"
     """The record has not begun."""
@@ -78,7 +79,7 @@ class Activity(StrEnum):
 
 
 class StopReason(IntEnum):
-    """Reason why the supervisor requests a stop: the values of :attr:`StateField.STOP`."""
+    """Reason why the supervisor requests a stop, a value of :attr:`StateField.STOP`."""
 
     NONE = 0
     """No stop is requested."""
@@ -89,29 +90,29 @@ class StopReason(IntEnum):
 
 
 class StateField(IntEnum):
-    """Index of each field of the :class:`SharedState`."""
+    """Fields of the :class:`SharedState`, by their indices in the memory."""
 
     # Written by the supervisor
     STOP = 0
     """Reason for a requested stop, a value of :class:`StopReason`."""
     GO = 1
-    """1 once the record may begin, because the recorder is ready."""
+    """Whether the record may begin, because the recorder is ready: 1, otherwise 0."""
     SUPERVISOR_BEAT = 2
-    """Heartbeat count of the supervisor. All heartbeats count up several times a second, so a
-    process whose count does not increase hangs."""
+    """Heartbeat count of the supervisor. Each process increments its count several times a second;
+    a process whose count does not increase hangs."""
     # Written by the control process
     PHASE = 3
     """Phase of the control process, a value of :class:`Phase`."""
     START_UTC_NS = 4
     """UTC time of tick 0 in ns since 1970; 0: the record has not begun."""
     SCHEDULED = 5
-    """Number of ticks of the record so far, missed and lost ticks included."""
+    """Number of ticks of the record so far, including missed and lost ticks."""
     MISSED = 6
     """Number of ticks of the record that were missed."""
     LATE = 7
     """Number of ticks of the record with a late wake-up."""
     LOST = 8
-    """Number of samples of the record for which the ring was full."""
+    """Number of samples of the record that were lost because the ring was full."""
     ANGLE_NRAD = 9
     """Last angle of the motor in 1e-9 rad."""
     COUPLING_TORQUE_NNM = 10
@@ -121,9 +122,9 @@ class StateField(IntEnum):
     CONTROL_BEAT = 12
     """Heartbeat count of the control process."""
     BUS_LOAD_PPM = 17
-    """Measured load of the busiest bus or serial line in 1e-6, or UNKNOWN."""
+    """Measured load of the busiest bus or serial line in ppm, or UNKNOWN."""
     BUS_ERRORS = 18
-    """Errors on all lines since the devices were connected, or UNKNOWN."""
+    """Number of errors on all bus and serial lines since the connection, or UNKNOWN."""
     SENSOR_STATUS = 19
     """Status word of the sensor, with 0 for no fault, or UNKNOWN."""
     # Written by the recorder
@@ -137,7 +138,7 @@ class StateField(IntEnum):
     LIVE_BEAT = 16
     """Heartbeat count of the live publisher."""
     LIVE_SAMPLES_SEEN = 20
-    """Number of samples of the ring that have been shown, or counted as dropped."""
+    """Number of samples that the live publisher has shown or dropped."""
     # Written by the control process
     STALE_ANGLES = 21
     """Number of recorded ticks with a stale angle."""
@@ -146,11 +147,11 @@ class StateField(IntEnum):
     TOUCHES = 23
     """Number of touches detected in the record."""
     HELD_TICKS = 25
-    """Number of recorded ticks in which the angle was held because no next segment was planned."""
+    """Number of ticks in which the angle was held because the next segment was not planned yet."""
     HELD_TICKS_BEFORE_SEGMENT = 29
-    """Number of ticks in which the angle was held before the segment that began last."""
+    """Value of `HELD_TICKS` at the start of the segment that began last."""
     BEGUN_REFERENCE_TICKS = 30
-    """Number of ticks of the reference up to the end of the segment that began last; 0: none."""
+    """Tick of the reference at which the segment that began last ends; 0: none has begun."""
     # Written by the touch process
     TOUCH_BEAT = 24
     """Heartbeat count of the touch process."""
@@ -158,10 +159,10 @@ class StateField(IntEnum):
     FIT_BEAT = 26
     """Heartbeat count of the fit process."""
     PLANNED = 27
-    """Number of planned ticks of a reference that grows during the session."""
+    """Number of ticks planned so far of a reference that grows during the session."""
     # Written by the supervisor
     LAST_SEGMENT = 28
-    """Whether the record ends with the segments that are planned: 1, otherwise 0."""
+    """Whether no further segments follow the planned ones: 1, otherwise 0."""
 
 
 UNKNOWN = -1
@@ -174,7 +175,7 @@ class SharedState:
     Parameters
     ----------
     fd
-        Descriptor of the memory, laid out by `create`; each field has 64 bits with sign.
+        Descriptor of memory that `create` has reserved, with a signed 64-bit integer per field.
     """
 
     def __init__(self, fd: int) -> None:
@@ -199,7 +200,7 @@ class SharedState:
         return None if (field_value := self._fields[field]) == UNKNOWN else field_value
 
     def view(self, field: StateField) -> "memoryview[int]":
-        """Return a memory view of one field, whose value ``view[0]`` reads and writes quickly."""
+        """Return a view of one field, for quick access: ``view[0]`` is the value."""
         return self._fields[field : field + 1]
 
     def beat(self, field: StateField) -> None:
@@ -230,7 +231,7 @@ _TEXT_SIZE = EVENT_SIZE - _HEADER.size
 
 @dataclass(frozen=True, slots=True)
 class LogEvent:
-    """Event in the session's log, which is one line of text."""
+    """Event of the session's log, with one line of text."""
 
     t_ns: int
     """Time in ns since the session's start."""
@@ -239,7 +240,7 @@ class LogEvent:
     message: str
     """Text for the operator."""
     notable: bool = False
-    """Whether the operator sees the line at once, whatever its level; not stored in the file."""
+    """Whether the event is shown to the operator whatever its level; not stored in the file."""
 
 
 def write_event(ring: Ring, log_event: LogEvent) -> None:
@@ -276,7 +277,7 @@ def read_events(event_bytes: bytes) -> list[LogEvent]:
 
 
 def activity(shared_state: SharedState) -> Activity:
-    """Return the stage of the present session, derived from the shared state of the processes.
+    """Return the stage of the present session for the operator, from the shared state.
 
     Parameters
     ----------

@@ -11,11 +11,11 @@ from functools import partial
 from typing import Protocol
 
 SUSPENDED_S = 0.01
-"""Time in s from :meth:`SuspendMonitor.suspended_s` above which the computer counts as suspended;
-every real suspend is longer."""
+"""Result of :meth:`SuspendMonitor.suspended_s` in s above which the computer was suspended; any
+real suspend takes longer."""
 MAX_VIRTUAL_PAUSE_S = 1.0
-"""Longest pause in s between two ticks of virtual time with devices on a bus or serial line, which
-would otherwise treat the silent host as failed."""
+"""Longest pause in s between two ticks of virtual time if devices are on a bus or serial line.
+After a longer pause the devices would treat the host as failed."""
 
 
 class Clock(Protocol):
@@ -34,17 +34,17 @@ class Clock(Protocol):
 class RealClock:
     """The system's monotonic clock.
 
-    Deadlines are absolute: the remainder is recomputed for each sleep, so that neither the
-    work of a tick nor a late wake-up adds up (a loop that sleeps "period minus work" drifts).
-    ``time.sleep`` itself waits for an absolute time; calling the kernel's ``clock_nanosleep`` for
-    the deadline wakes up no earlier (measured in alternation: medians of 24–31 µs either way).
+    Deadlines are absolute: the remaining time is recomputed for each sleep, so that neither the
+    work of a tick nor a late wake-up shifts later ticks (a loop that sleeps "period minus work"
+    drifts). Calling the kernel's ``clock_nanosleep`` instead of ``time.sleep`` does not reduce the
+    wake-up latency (median 24–31 µs with either).
 
     Parameters
     ----------
     spin_ns
-        The last part of each wait that is spent polling instead of sleeping. It trades processor
-        time for punctuality; the kernel's real-time throttling allows no more than a part of each
-        period.
+        Time at the end of each wait that is spent polling instead of sleeping. Polling costs
+        processor time and makes the wake-up more punctual. The kernel's real-time throttling
+        allows polling in a part of each period only.
     """
 
     virtual = False
@@ -88,13 +88,13 @@ class VirtualClock:
 class SuspendMonitor:
     """Detector of a suspended computer.
 
-    The monotonic clock stops during a suspend, so no tick seems missed although the rig ran without
-    a loop. The clock since boot continues.
+    The monotonic clock stops during a suspend, so that no tick appears missed although the loop did
+    not run. The clock since boot does not stop; the difference of the clocks shows the suspend.
 
     Parameters
     ----------
     monotonic_ns, boot_ns
-        Clocks, which tests replace.
+        Monotonic clock and clock since boot, which tests replace.
     """
 
     def __init__(
@@ -118,19 +118,19 @@ class SuspendMonitor:
 
 
 def _clock_since_boot() -> Callable[[], int]:
-    """Return a clock in ns that also runs during a suspend, or the monotonic clock if none does."""
+    """Return a clock in ns that runs during a suspend; without one the monotonic clock."""
     if not hasattr(time, "CLOCK_BOOTTIME"):
         return time.monotonic_ns
     return partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
 
 
 class TickScheduler:
-    """Schedule of the loop's ticks with an absolute deadline for each; missed ticks are skipped.
+    """Schedule of the loop's ticks, each with an absolute deadline; missed ticks are skipped.
 
     Parameters
     ----------
     clock
-        Real or virtual time.
+        Real or virtual clock.
     rate_hz
         Ticks per second.
 
@@ -139,9 +139,9 @@ class TickScheduler:
     tick
         Index of the current tick, counted from the last :meth:`restart`.
     t_ns
-        Scheduled time of the current tick, since tick 0.
+        Scheduled time of the current tick in ns since tick 0.
     due_ns
-        Scheduled time of the current tick on the clock; a restart does not change it.
+        Scheduled time of the current tick in ns on the clock; a restart does not change it.
     lateness_ns
         Wake-up latency: time in ns from the deadline to the wake-up, less than a period.
 
@@ -169,7 +169,7 @@ class TickScheduler:
         return self._start_ns
 
     def restart(self) -> None:
-        """Restart the count of ticks: the next tick becomes tick 0, at its unchanged deadline."""
+        """Restart the count of ticks: the next tick becomes tick 0, with an unchanged deadline."""
         self._start_ns += round((self.tick + 1) * self._period_ns)
         self.tick = -1
 

@@ -1,9 +1,9 @@
-"""The touch process: it estimates the position and force of each detected touch.
+"""The touch process, which estimates the position and force of each detected touch.
 
 It observes the ring of samples as the live publisher does, so it can neither delay the loop nor
-take a sample from the recorder. The loop marks a detection by a status bit of the sample. The
-estimation starts with the samples of 25 ms after the detection; the first estimate uses 50 ms, and
-the final one 200 ms.
+take a sample from the recorder. The loop marks a detection by a status bit of the sample. A preview
+uses the samples up to 25 ms after the detection, the first estimate 50 ms, and the final estimate
+200 ms.
 """
 
 import time
@@ -35,8 +35,8 @@ from rigd.touch.samples import (
 _MAX_BLOCK_SAMPLES = 250
 """Largest number of samples that are read from the ring at once."""
 _IDLE_PAUSE_S, _PENDING_PAUSE_S = 0.005, 0.001
-"""Pauses in s when there are no new samples: without a touch, and while a touch waits for its
-estimate."""
+"""Pauses in s if there are no new samples: without a pending touch, and with a touch that waits for
+its estimate."""
 
 
 def main() -> None:
@@ -47,18 +47,18 @@ def main() -> None:
     if job.realtime is not None:
         pin_off_loop_core(job.realtime.cpu)
     channels = attach_channels(job.channels)
-    sample_reader = Observer(channels.samples, job.first)
+    sample_reader = Observer(channels.samples, job.first_index)
     estimator = TouchEstimator(job.model, job.rate_hz)
     parent.send(TouchReady())
-    touch_follower = RunningTouchEstimator(estimator, job)
+    running_estimator = RunningTouchEstimator(estimator, job)
     while True:
         channels.shared_state.beat(StateField.TOUCH_BEAT)
         sample_bytes = sample_reader.take(_MAX_BLOCK_SAMPLES)
         if sample_bytes:
-            touch_follower.take(decode_samples(sample_bytes))
+            running_estimator.take(decode_samples(sample_bytes))
         else:
-            time.sleep(_IDLE_PAUSE_S if touch_follower.idle else _PENDING_PAUSE_S)
-        for touch_report in touch_follower.reports():
+            time.sleep(_IDLE_PAUSE_S if running_estimator.idle else _PENDING_PAUSE_S)
+        for touch_report in running_estimator.reports():
             parent.send(touch_report)
         try:
             if parent.poll(0.0) is not None:
@@ -75,23 +75,23 @@ class _PendingTouch:
     """Number of the touch in its session, from 1 on."""
     tick: int
     """Tick at which the touch was detected."""
-    free_from: int
+    free_from_tick: int
     """First tick at which the beam is free again after the previous touch."""
     estimate: GrowingEstimate
     """Estimate of the touch, which improves as samples arrive."""
     previewed: bool = False
-    """Whether the estimate has used the first samples already, to save time later."""
+    """Whether the preview has been computed, so that the first estimate takes less time."""
     reported: bool = False
     """Whether the first estimate has been sent."""
 
 
 class RunningTouchEstimator:
-    """Estimator of all detected touches of a record, each as soon as it has enough samples.
+    """Estimator of the detected touches of a running record, as soon as samples suffice.
 
     Parameters
     ----------
     estimator
-        Estimator for the model and the rate of the job.
+        Estimator for the model and the sample rate of the job.
     job
         Job of the touch process.
     """
@@ -111,7 +111,7 @@ class RunningTouchEstimator:
         )
         self._samples: NDArray[np.void] | None = None
         self._pending_touches: deque[_PendingTouch] = deque()
-        self._free_from = 0
+        self._free_from_tick = 0
         self._count = 0
         self._record_ended = False
 
@@ -132,15 +132,15 @@ class RunningTouchEstimator:
             self._count += 1
             estimate = self._estimator.follow()
             self._pending_touches.append(
-                _PendingTouch(self._count, tick, self._free_from, estimate)
+                _PendingTouch(self._count, tick, self._free_from_tick, estimate)
             )
-            self._free_from = tick + self._contact_ticks
+            self._free_from_tick = tick + self._contact_ticks
         self._record_ended |= bool(new_samples["status"][-1] & Status.TORQUE_OFF)
         if not self._pending_touches:
             self._samples = self._samples[-self._history_ticks :]
 
     def reports(self) -> list[TouchReport]:
-        """Return the estimate of the oldest pending touch in a list, if it has enough samples.
+        """Return a list with the next estimate of the oldest pending touch, if samples suffice.
 
         The list is empty if no estimate is due.
         """
@@ -166,22 +166,22 @@ class RunningTouchEstimator:
     def _estimate(
         self, pending_touch: _PendingTouch, after_ticks: int, *, is_final: bool
     ) -> TouchReport:
-        """Return the estimate of a touch from the record until `after_ticks` past its detection."""
+        """Return the estimate of a touch from samples up to `after_ticks` after its detection."""
         record, start_s = self._record(pending_touch, after_ticks)
         touch_estimate = pending_touch.estimate.update(record, scan=False, first=not is_final)
         document = touch_estimate.as_dict(start_s)
         return TouchReport(pending_touch.number, pending_touch.tick, is_final, document)
 
     def _record(self, pending_touch: _PendingTouch, after_ticks: int) -> tuple[TouchRecord, float]:
-        """Return the record around a touch until `after_ticks` past its detection, and its start.
+        """Return the samples around a touch, up to `after_ticks` after its detection.
 
-        The start is the time in s since the start of the session's record.
+        Also returns their start time in s since the start of the session's record.
         """
         assert self._samples is not None
         job = self._job
         # Soon after another touch the beam may not have been free: the estimate is then unknown.
-        free_from = min(pending_touch.free_from, pending_touch.tick)
-        samples = around_touch(self._samples, pending_touch.tick, job.rate_hz, free_from)
+        free_from_tick = min(pending_touch.free_from_tick, pending_touch.tick)
+        samples = around_touch(self._samples, pending_touch.tick, job.rate_hz, free_from_tick)
         record = touch_record(samples, pending_touch.tick, job.rate_hz, job.shear_projection)
         return record.until(record.detected + after_ticks), int(samples["tick"][0]) / job.rate_hz
 

@@ -1,8 +1,7 @@
-"""The table of workers: every child process of rigd, how it is started, and what follows its loss.
+"""The table of workers: each child process of rigd, how it is started, and what its loss entails.
 
-Each row is a `Worker`; `rigd.engine.processes.ChildProcess` starts it, and is the client of its
-messages. The programs of the analyser are named here and nowhere else, since rigd does not import
-them.
+Each row is a `Worker`, which `rigd.engine.processes.ChildProcess` starts. The programs of the
+analyser are named only here, because rigd does not import them.
 """
 
 from dataclasses import dataclass
@@ -39,39 +38,39 @@ class MemoryLimit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Worker:
-    """Description of one child process: how it is started, what it sends, and how it ends."""
+    """Description of a kind of child process: how it is started, what it sends, how it ends."""
 
     name: str
     """Name of the process in messages to the operator."""
     module: str
     """Module that is run as ``python -m module``; empty for the supervisor."""
     sends: tuple[str, ...] = ()
-    """Classes of its messages, by name; the first one that a `WorkerClient` sends means that it is
-    ready. Empty for a program, whose results are files and an exit code."""
+    """Class names of the messages that the process sends; the first one means that it is ready.
+    Empty for a program, whose results are files and an exit code."""
     loss: Literal["fault", "warning", "nothing"]
-    """What the operator gets if the process dies or hangs: a fault, a warning, or no message."""
+    """How a dead or hung process is reported to the operator: fault, warning, or not at all."""
     consequence: str
-    """Sentence for the operator that states what follows the loss of the process."""
+    """Sentence for the operator that states what happens after the loss of the process."""
     restarts: int = 0
-    """Number of times that the process is started again in a session, or in a row for the page."""
+    """Maximum number of restarts in a session; for the page, of consecutive restarts."""
     beat: StateField | None = None
-    """Field of its heartbeat in the shared state; None: the process has no access to it."""
+    """Field of the shared state with its heartbeat; None: it has no access to the shared state."""
     start_timeout_s: float = 20.0
     """Longest time in s for the process to become ready on a busy computer."""
     max_silence_s: float | None = None
-    """Longest time in s without a heartbeat; None: the process's results are checked instead."""
+    """Longest time in s without a heartbeat; None: not limited."""
     end_timeout_s: float
-    """Time in s in which the process must end on request, before it is terminated, then killed."""
+    """Time in s that the process has to exit on request, and after SIGTERM before it is killed."""
     is_per_session: bool = False
     """Whether each session starts a new process of this kind."""
     niceness: int | None = 0
-    """Increment of the niceness; None: it runs only while no other process needs the processor."""
+    """Increment of the niceness; None: the process runs only on an otherwise idle processor."""
     memory: MemoryLimit | None = None
-    """Limit of its memory; None: no limit."""
+    """Limit of the process's memory; None: no limit."""
     prefers_oom_kill: bool = False
     """Whether the system ends this process first if memory runs out."""
     captures_stderr: bool = False
-    """Whether its standard error is read by its client instead of being shown to the operator."""
+    """Whether `ChildProcess` reads its standard error instead of showing it to the operator."""
 
 
 # Processes of a rig, which share its memory
@@ -125,6 +124,7 @@ TOUCH: Final = Worker(
     loss="warning",
     consequence="Touches are detected but not estimated; the session continues.",
     beat=StateField.TOUCH_BEAT,
+    start_timeout_s=60.0,  # it computes the responses of the beam first
     # An estimate may take long; a missing estimate is reported as such.
     max_silence_s=None,
     end_timeout_s=1.0,
@@ -139,7 +139,7 @@ FIT: Final = Worker(
     consequence="The session continues without fits.",
     beat=StateField.FIT_BEAT,
     # A decision may take long on a busy computer; the loop holds the angle meanwhile.
-    max_silence_s=15.0,
+    max_silence_s=30.0,
     end_timeout_s=1.0,
     is_per_session=True,
     niceness=5,  # a third of a processor in competition with another program

@@ -97,7 +97,7 @@ def make_excitation(
 
 
 def find_excitation(name: str) -> tuple[ExcitationKind, Plugin] | None:
-    """Return the excitation of a name that a package adds, with the package; else None.
+    """Return the excitation that an installed package adds under a name, and the package, or None.
 
     Parameters
     ----------

@@ -619,7 +619,7 @@ def _raise_to_least(band_fractions: Real) -> Real:
 def _unit_sweep(band: Band, tick_count: int, fade_ticks: int, rate_hz: float) -> Real:
     """Return a sweep of amplitude 1 through a band, shape (tick_count,).
 
-    Both ends have a raised-cosine fade of ``fades / 2`` ticks.
+    A raised-cosine fade at either end takes half of `fade_ticks`.
     """
     duration_s = tick_count / rate_hz
     t = np.arange(tick_count) / rate_hz

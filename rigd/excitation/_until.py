@@ -143,8 +143,8 @@ def until(
     tip_slope_rad: Annotated[
         float,
         doc(
-            "Largest slope of the beam's free end, of which the scan uses 80 % and segments 90 "
-            "%. Beyond the default, the linear model is not exact."
+            "Largest slope of the beam's free end. The scan is predicted to use up to 80 % of it, "
+            "a segment up to 77 %. Beyond the default, the linear model is not exact."
         ),
     ] = SMALL_SLOPE_RAD,
     amplitude_rad: Annotated[

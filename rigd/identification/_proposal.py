@@ -1,4 +1,4 @@
-"""Proposed profile values from a motor's estimate, and controllers for the identification."""
+"""Profile values proposed from a motor's estimate, and controllers for its identification."""
 
 from dataclasses import dataclass, replace
 from math import floor, inf, log10
@@ -23,7 +23,7 @@ lightest motors."""
 def with_cautious_controller(rig_profile: Profile) -> Profile:
     """Return a profile with the slowest stable PID, which tolerates wrong motor data.
 
-    The check of the scales (``limits.torque_ratio``) is off, since the sessions measure them.
+    The check of the torque scale (``limits.torque_ratio``) is off: the sessions measure that scale.
     """
     rig_profile = replace(
         _with_pid(rig_profile), limits=replace(rig_profile.limits, torque_ratio=inf)
@@ -41,9 +41,9 @@ def with_cautious_controller(rig_profile: Profile) -> Profile:
 def with_tuned_controller(profile: Profile, estimate: MotorEstimate) -> Profile:
     """Return a profile whose PID is designed for the estimated motor.
 
-    The scale of the commands is unchanged: inertia, friction and feed-forward are divided by the
-    torque scale instead. If the loop is not stable with the profile's pole, the controller is that
-    of `with_cautious_controller`.
+    Inertia, friction and feed-forward are divided by the estimated torque scale, so that commands
+    need not be scaled. If the loop is not stable with the profile's pole, the controller is that of
+    `with_cautious_controller`.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def with_tuned_controller(profile: Profile, estimate: MotorEstimate) -> Profile:
 
 
 def _with_pid(profile: Profile) -> Profile:
-    """Return a profile with rigd's PID, in place of a package's controller for a known motor."""
+    """Return a profile with rigd's PID, as a package's controller may require a known motor."""
     control_settings = replace(profile.control, controller=SHIPPED_CONTROLLER)
     return replace(profile, control=control_settings, controller_settings=None)
 
@@ -89,9 +89,9 @@ def _is_stable(profile: Profile) -> bool:
 # Proposal
 
 _SIGNIFICANT_STDS = 3.0
-"""Standard deviations by which an estimate must deviate from a profile's value to differ."""
+"""Smallest significant deviation of an estimate from a value, in standard deviations."""
 _MAX_UNREMARKED_MISFIT = 1.5
-"""Misfit of an estimate above which there is a note for the operator."""
+"""Largest misfit of an estimate that is not mentioned to the operator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ class ProposalRow:
     profile_value: float
     """Value of the number in the profile."""
     source: str
-    """Source of the profile's value."""
+    """Origin of the profile's value, as the profile states it."""
     least: float = 0.0
     """Smallest value that the profile's other settings allow."""
 
@@ -131,9 +131,9 @@ class ProposalRow:
         return abs(self.measured.value - self.profile_value) > _SIGNIFICANT_STDS * self.measured.std
 
     def toml(self) -> str:
-        """Return the line with the estimate for the profile.
+        """Return a line of TOML that enters the estimate in the profile.
 
-        An estimate insignificantly below the smallest allowed value is replaced by that value.
+        The smallest allowed value replaces an estimate that is insignificantly below it.
         """
         std = self.measured.std or 0.0
         value_text, std_text = _format_with_std(self.measured.value, std)
@@ -148,7 +148,7 @@ class ProposalRow:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """Proposed values for a profile from an estimate of its motor."""
+    """Values for a profile that follow from an estimate of its motor."""
 
     estimate: MotorEstimate
     """Estimate of the motor."""
@@ -188,7 +188,7 @@ class Proposal:
         return [cell_row.rstrip() for cell_row in table_lines]
 
     def toml(self) -> list[str]:
-        """Return the lines with the estimates for the profile, under their sections."""
+        """Return lines of TOML that enter the estimates in the profile, section by section."""
         toml_lines: list[str] = []
         present_section = ""
         for row in self.rows:
@@ -236,7 +236,7 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
     profile
         Profile for which values are proposed.
     unusable_count
-        Number of passes that were omitted before the estimate.
+        Number of passes with missing, old or clipped readings, which were not used.
     """
     rig = profile.rig
     rig_motor = rig.motor
@@ -268,8 +268,12 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
     torque_at_sync = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
     smallest_values = {"actuation.delay_s": 1 / rig.rate_hz} if torque_at_sync else {}
     proposal_rows = tuple(
-        ProposalRow(*row, profile.sources.get(row[0], "assumed"), smallest_values.get(row[0], 0.0))
-        for row in compared_numbers
+        ProposalRow(
+            *compared_number,
+            profile.sources.get(compared_number[0], "assumed"),
+            smallest_values.get(compared_number[0], 0.0),
+        )
+        for compared_number in compared_numbers
     )
     operator_notes = _notes(estimate, profile, unusable_count)
     if any(row.is_below_least for row in proposal_rows if row.key in smallest_values):
@@ -281,13 +285,13 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
 
 
 def _scaled(factor: float, quantity: MotorQuantity) -> MotorQuantity:
-    """Return a quantity and its standard deviation, multiplied by a factor."""
+    """Return a quantity whose value and standard deviation are multiplied by a factor."""
     std = None if quantity.std is None else factor * quantity.std
     return MotorQuantity(factor * quantity.value, std)
 
 
 def _notes(estimate: MotorEstimate, profile: Profile, unusable_count: int) -> list[str]:
-    """Return the sentences for the operator on what the estimate does not determine."""
+    """Return the sentences for the operator on assumptions and defects of the estimate."""
     torque_scale = estimate.torque_scale
     if torque_scale.std is None:
         operator_notes = [
@@ -329,7 +333,7 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable_count: int) -> li
 
 
 def _format_with_std(estimate_value: float, std: float) -> tuple[str, str]:
-    """Format a value and its standard deviation, to two significant digits of the latter."""
+    """Format a value and its standard deviation, which is rounded to two significant digits."""
     if std <= 0.0:
         return f"{estimate_value:.6g}", "0"
     exponent = floor(log10(max(abs(estimate_value), std)))

@@ -1,4 +1,4 @@
-"""Reader of recorded sessions whose windows of motion are the input of the motor's estimate."""
+"""Reader of the recorded windows of motion from which a motor is estimated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ _UNUSABLE_STATUS = int(
 )
 """Status bits of samples that cannot be used.
 
-Their readings are old or clipped, or the torque was off, so that they do not belong to the torque
-that was commanded."""
+Such a sample has old or clipped readings, or the torque was off, so that its readings are not the
+response to the commanded torque."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Recording:
     tool_inertia_kg_m2: float
     """Inertia between sensor and beam."""
     unusable: int
-    """Number of passes with missing samples, or with old or clipped readings."""
+    """Number of passes that were left out for missing, old or clipped readings."""
 
 
 def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording:
@@ -48,7 +48,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     paths
         Session files of one rig, in any order.
     actuation_delay_s
-        Start value of the search for the command's delay.
+        Start value in s of the search for the delay from a command to its torque.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         unusable_count += pass_count - len(usable_passes)
     if first_data is None:
         raise MotorEstimateError("No session file is given.")
-    if all(pass_window.top_hz == HIGHEST_FREQUENCY_HZ[SPEEDS] for pass_window in pass_readings):
+    if {pass_window.top_hz for pass_window in pass_readings} == {HIGHEST_FREQUENCY_HZ[SPEEDS]}:
         raise MotorEstimateError(
             "Constant speeds alone do not determine inertia, delay and torque scale; give the "
             f"session {MULTISINE} of the same rig, too."
@@ -114,7 +114,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
 def _read_passes(
     session: Session, session_number: int, rate_hz: float
 ) -> tuple[list[PassReadings], int]:
-    """Return the usable windows of a session, and the number of its passes."""
+    """Return the usable windows of a session, and the number of all its passes."""
     schedule = read_schedule(session.metadata)
     if schedule is None:
         raise MotorEstimateError(
@@ -128,15 +128,15 @@ def _read_passes(
     speed_passes = passes_of_schedule(schedule, rate_hz)
     pass_readings = []
     for speed_pass in speed_passes:
-        first_index, end = np.searchsorted(
+        first_index, end_index = np.searchsorted(
             tick_numbers, (speed_pass.first, speed_pass.end)
         ).tolist()
         if (
-            end - first_index < speed_pass.end - speed_pass.first
-            or is_unusable[first_index:end].any()
+            end_index - first_index < speed_pass.end - speed_pass.first
+            or is_unusable[first_index:end_index].any()
         ):
             continue
-        window_samples = sample_records[first_index:end]
+        window_samples = sample_records[first_index:end_index]
         pass_readings.append(
             PassReadings(
                 angle_rad=window_samples["angle_rad"],

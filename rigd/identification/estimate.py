@@ -8,12 +8,12 @@ is constant between commands,
 is multiplied by smooth test functions ``w(t) exp(-iωt)`` and integrated by parts, so that no
 reading is differentiated. Each frequency gives a linear equation between moments of the readings
 (`_equations`). All integrals are exact for a command that changes at any moment of a period. The
-measured coupling torque τ_c is alone on its side because it carries the noise.
+measured coupling torque τ_c is the left side of the equations, because it carries the noise.
 
 The equations are solved by weighted least squares (`_fit_equation`). The mean of the repeats is
 fitted, because the loop feeds the noise of a reading back into the command, which would bias a fit
-of single repeats. The scatter of the repeats gives the weights, the remainder of this bias, and
-the standard deviations.
+of single repeats. The scatter of the repeats gives the weights, the bias that remains in the mean,
+and the standard deviations.
 """
 
 from collections.abc import Hashable, Sequence
@@ -34,22 +34,22 @@ Complex = NDArray[np.complex128]
 SCALE_INDEX, INERTIA_INDEX, VISCOUS_INDEX, COULOMB_INDEX, DELAY_INDEX, ZERO_INDEX = range(6)
 """Indices of the unknowns in the solution vector.
 
-From the last one on, there is a zero of the torque for each session."""
+From `ZERO_INDEX` on, there is one torque offset (zero of the sensor) for each session."""
 
 _RISE_FRACTION = 0.15
-"""Fraction of a window over which the test functions rise, and over which they fall."""
+"""Duration of the rise, and of the fall, of the test functions as a fraction of the window."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Rate and delays of the readings, and start value of the search for the command's delay."""
+    """Rate and delays of the readings, and a first guess of the command's delay."""
 
     rate_hz: float
     """Rate of the samples."""
     angle_delay_s: float
-    """Age of an angle when it is read."""
+    """Age in s of an angle when it is read."""
     torque_delay_s: float
-    """Age of a coupling torque when it is read."""
+    """Age in s of a coupling torque when it is read."""
     actuation_delay_s: float
     """Start value of the search for the delay from a command to its torque."""
 
@@ -69,7 +69,7 @@ class _MotionRepeats:
     top_hz: float
     """Highest frequency of the motion."""
     session: int
-    """Index of the session with this motion."""
+    """Index of the session in which the motion was recorded."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +89,7 @@ def _equations(
     torque_scale: float,
     unknown_count: int,
 ) -> _MotionEquations:
-    """Return the motor's linear equations for repeats of a motion, integrated with test functions.
+    """Return the motor's equation for repeats of a motion, integrated with the test functions.
 
     `delay_s` and `torque_scale` are the present estimates of the command's delay and torque scale.
     Times count from the window's first angle.
@@ -141,7 +141,7 @@ def _equations(
 
 
 def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
-    """Return the test functions' window at times `t`, and its first and second derivative.
+    """Return the window of the test functions at times `t`, and its first two derivatives.
 
     The window is smooth to its third derivative and zero outside of 0 to `length_s`.
     """
@@ -160,8 +160,8 @@ def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
 _STD_MARGIN = 1.25
 """Factor by which all standard deviations are widened.
 
-They are themselves known to some 15 %, and the model does not contain the filter of the readings
-and the beam's part in a jump of torque."""
+They are known to some 15 % only, and the model neglects the filter of the readings and the beam's
+part in a jump of torque."""
 _MAX_ITERATIONS = 30
 """Largest number of iterations for delay and weights."""
 _DELAY_TOLERANCE_S = 1e-9
@@ -182,7 +182,7 @@ class _MotorFit:
     stds: Real
     """Standard deviations of `values`; 0 for a scale that is not estimated."""
     misfit: float
-    """Mean square of the residual over that expected from the scatter of the repeats."""
+    """Ratio of the residual's mean square to that expected from the scatter of the repeats."""
     friction_departure_nm: float
     """Largest departure of a pass's mean torque from viscous and Coulomb friction."""
 
@@ -192,8 +192,8 @@ def _fit_equation(
 ) -> _MotorFit | None:
     """Return the weighted fit of the motor's equation to all motions, or None if it diverges.
 
-    The fit is iterated for the delay and the weights. Each stack has at least two repeats. With
-    `hold_scale` the commanded torque counts as the true one.
+    The fit is iterated for the delay and the weights. Each of `stacks` has at least two repeats.
+    With `hold_scale`, the torque scale is fixed at 1.
     """
     unknown_count = ZERO_INDEX + 1 + max(motion_repeats.session for motion_repeats in stacks)
     is_free = (
@@ -208,18 +208,20 @@ def _fit_equation(
             _equations(motion_repeats, timing, delay_s, torque_scale, unknown_count)
             for motion_repeats in stacks
         ]
-        bin_weights = bin_weights or [np.ones(row.y.shape[1]) for row in stack_equations]
+        bin_weights = bin_weights or [
+            np.ones(equations.y.shape[1]) for equations in stack_equations
+        ]
         solution = _solve_mean_equations(stack_equations, bin_weights, is_free)
-        fit_residuals = [row.y - row.x @ solution for row in stack_equations]
-        change_s = float(solution[DELAY_INDEX])
-        if abs(change_s) < _DELAY_TOLERANCE_S:
+        fit_residuals = [equations.y - equations.x @ solution for equations in stack_equations]
+        delay_change_s = float(solution[DELAY_INDEX])
+        if abs(delay_change_s) < _DELAY_TOLERANCE_S:
             try:
                 return _finish_fit(
                     stack_equations, bin_weights, fit_residuals, is_free, solution, delay_s
                 )
             except np.linalg.LinAlgError:  # an unknown has no effect in the record
                 return None
-        delay_s, torque_scale = delay_s + change_s, float(solution[SCALE_INDEX])
+        delay_s, torque_scale = delay_s + delay_change_s, float(solution[SCALE_INDEX])
         if not (abs(delay_s) < _LONGEST_DELAY_S and torque_scale > 0.0):
             return None
         bin_weights = _inverse_variances(fit_residuals, stacks)
@@ -229,16 +231,16 @@ def _fit_equation(
 def _solve_mean_equations(
     stack_equations: Sequence[_MotionEquations], weights: Sequence[Real], is_free: NDArray[np.bool_]
 ) -> Real:
-    """Return the least-squares solution of the repeats' mean equations.
+    """Return the least-squares solution of the equations, averaged over the repeats of each motion.
 
-    The torque scale is 1 if it is not `is_free`.
+    `is_free` is a mask of the unknowns to solve for; the torque scale is 1 if not among them.
     """
     solution = np.zeros(is_free.size)
     solution[SCALE_INDEX] = 1.0
     weighted_blocks, weighted_targets = [], []
-    for row, bin_weights in zip(stack_equations, weights, strict=True):
+    for equations, bin_weights in zip(stack_equations, weights, strict=True):
         weight_root = np.sqrt(bin_weights)
-        x, y = row.x.mean(axis=0), row.y.mean(axis=0)
+        x, y = equations.x.mean(axis=0), equations.y.mean(axis=0)
         if not is_free[SCALE_INDEX]:
             y = y - x[:, SCALE_INDEX]
         weighted_blocks += [
@@ -260,7 +262,7 @@ def _solve_mean_equations(
 def _inverse_variances(
     residuals: Sequence[Complex], stacks: Sequence[_MotionRepeats]
 ) -> list[Real]:
-    """Return the weights of the mean equations of each motion's repeats, by frequency.
+    """Return the weight of each motion's mean equation at each frequency.
 
     A weight is the inverse variance of the mean of the repeats. The variance of single repeats is
     pooled over the stacks of a session, which have the same noise, and over neighbouring
@@ -268,13 +270,13 @@ def _inverse_variances(
     """
     variances: dict[int, Real] = {}
     for session_number in {motion_repeats.session for motion_repeats in stacks}:
-        free_indices = [
+        session_residuals = [
             r for r, s in zip(residuals, stacks, strict=True) if s.session == session_number
         ]
         repeat_deviations = sum(
-            np.sum(np.abs(r - r.mean(axis=0)) ** 2, axis=0) for r in free_indices
+            np.sum(np.abs(r - r.mean(axis=0)) ** 2, axis=0) for r in session_residuals
         )
-        bin_variances = np.asarray(repeat_deviations) / sum(len(r) - 1 for r in free_indices)
+        bin_variances = np.asarray(repeat_deviations) / sum(len(r) - 1 for r in session_residuals)
         kernel_width = min(_SMOOTHED_BINS, bin_variances.size)
         smoothing_kernel = np.ones(kernel_width)
         edge_counts = np.convolve(np.ones(bin_variances.size), smoothing_kernel, "same")
@@ -295,13 +297,15 @@ def _finish_fit(
     solution: Real,
     delay_s: float,
 ) -> _MotorFit:
-    """Remove the bias by noise from the solution, and estimate its uncertainty."""
+    """Remove the bias that the noise causes from the solution, and estimate its uncertainty."""
     free_indices = np.flatnonzero(is_free)
     normal_matrix = np.zeros((free_indices.size, free_indices.size))
     noise_bias = np.zeros(free_indices.size)
-    for row, bin_weight, bin_residuals in zip(stack_equations, weights, residuals, strict=True):
-        repeat_count = len(row.y)
-        x = row.x[..., free_indices]
+    for equations, bin_weight, bin_residuals in zip(
+        stack_equations, weights, residuals, strict=True
+    ):
+        repeat_count = len(equations.y)
+        x = equations.x[..., free_indices]
         mean_equation = x.mean(axis=0)
         normal_matrix += np.einsum(
             "mp,m,mq->pq", mean_equation.conj(), bin_weight, mean_equation
@@ -314,27 +318,31 @@ def _finish_fit(
     inverse_matrix = np.linalg.inv(normal_matrix)
 
     # Each stack's part in the variance, from the scatter of its repeats' effects on the solution.
-    variance_parts, freedom_degrees = [], []
+    variance_parts, stack_degrees_of_freedom = [], []
     weighted_squares, term_count = 0.0, 0
-    departure_nm = 0.0
-    for row, bin_weight, bin_residuals in zip(stack_equations, weights, residuals, strict=True):
-        repeat_count = len(row.y)
-        mean_equation = row.x[..., free_indices].mean(axis=0)
+    friction_departure_nm = 0.0
+    for equations, bin_weight, bin_residuals in zip(
+        stack_equations, weights, residuals, strict=True
+    ):
+        repeat_count = len(equations.y)
+        mean_equation = equations.x[..., free_indices].mean(axis=0)
         noise_effects = (
             np.einsum("mp,m,rm->rp", mean_equation.conj(), bin_weight, bin_residuals).real
             @ inverse_matrix
         )
         variance_parts.append(noise_effects.var(axis=0, ddof=1) / repeat_count)
-        freedom_degrees.append(repeat_count - 1)
+        stack_degrees_of_freedom.append(repeat_count - 1)
         mean_residual = bin_residuals.mean(axis=0)
         weighted_squares += float(np.sum(bin_weight * np.abs(mean_residual) ** 2))
         term_count += mean_residual.size
-        constant_column = abs(row.x[0, 0, COULOMB_INDEX])
-        departure_nm = max(departure_nm, abs(float(mean_residual[0].real)) / float(constant_column))
-    parts_of_variance = np.array(variance_parts)
-    unknown_variances = parts_of_variance.sum(axis=0)
+        constant_column = abs(equations.x[0, 0, COULOMB_INDEX])
+        friction_departure_nm = max(
+            friction_departure_nm, abs(float(mean_residual[0].real)) / float(constant_column)
+        )
+    stack_variances = np.array(variance_parts)
+    unknown_variances = stack_variances.sum(axis=0)
     degrees_of_freedom = unknown_variances**2 / np.sum(
-        parts_of_variance**2 / np.array(freedom_degrees)[:, None], axis=0
+        stack_variances**2 / np.array(stack_degrees_of_freedom)[:, None], axis=0
     )
     misfit = weighted_squares / max(1.0, term_count - 0.5 * free_indices.size)
     widening = _STD_MARGIN * _student_factor(degrees_of_freedom) * sqrt(max(1.0, misfit))
@@ -343,11 +351,11 @@ def _finish_fit(
     unbiased_values[free_indices] -= inverse_matrix @ noise_bias
     unbiased_values[DELAY_INDEX] += delay_s
     stds[free_indices] = widening * np.sqrt(unknown_variances)
-    return _MotorFit(unbiased_values, stds, misfit, departure_nm)
+    return _MotorFit(unbiased_values, stds, misfit, friction_departure_nm)
 
 
 def _student_factor(degrees_of_freedom: Real) -> Real:
-    """Return the ratio of Student's t to the normal quantile at three standard deviations.
+    """Return the ratio of Student's t to 3 at the probability of three standard deviations.
 
     It is exact to second order in the inverse degrees of freedom.
     """
@@ -364,20 +372,20 @@ _MIN_SPEED_FRACTION = 0.1
 _HALF_SPEED_WINDOW_S = 0.01
 """Half the time in seconds over which the shaft's speed is measured to detect a standstill."""
 _MAX_SCALE_STD = 0.05
-"""Largest standard deviation of an estimated torque scale: the accuracy of a datasheet's value."""
+"""Largest standard deviation of an accepted torque scale: the accuracy of a datasheet's value."""
 _PLAUSIBLE_SCALES = (0.5, 2.0)
 """Smallest and largest plausible torque scale.
 
-Without a beam the equation also has the solution of no torque and no inertia."""
+Without a beam, a scale of 0 with no inertia and no friction solves the equation, too."""
 
 
 class MotorEstimateError(FailureError, ValueError):
-    """The recorded windows do not determine the motor's data; the message states the reason."""
+    """Error if the windows do not determine the motor's data; the message states the reason."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassReadings:
-    """Readings in the evaluated window of one pass at constant nominal speed, shape (n,) each."""
+    """Readings in the evaluated window of a pass at constant nominal speed, n samples of each."""
 
     angle_rad: Real
     """Measured angle of the shaft."""
@@ -400,7 +408,7 @@ class MotorQuantity:
     """Estimated quantity of a motor with its standard deviation."""
 
     value: float
-    """Estimate of the quantity, or its assumed value."""
+    """Estimate of the quantity; its assumed value if it was not estimated."""
     std: float | None
     """Standard deviation of the estimate, or None if the quantity was not estimated."""
 
@@ -418,8 +426,8 @@ class MotorEstimate:
     torque_scale: MotorQuantity
     """Ratio of true to commanded torque.
 
-    If it could not be estimated, it is 1 without a standard deviation, and the other quantities
-    refer to the torque as the drive states it."""
+    If it could not be estimated, it is 1 without a standard deviation, and the other quantities are
+    relative to the torque as the drive states it."""
     actuation_delay_s: MotorQuantity
     """Delay from the command to the torque."""
     windows: int
@@ -427,7 +435,8 @@ class MotorEstimate:
     dropped: int
     """Number of windows that were dropped because the shaft may have stood still."""
     misfit: float
-    """Mean square of the residual over that expected from scatter: 1 if the equation holds."""
+    """Ratio of the residual's mean square to that expected from scatter; 1 if the equation holds.
+    """
     friction_departure_nm: float
     """Largest departure of a pass's mean torque from viscous and Coulomb friction."""
 
@@ -442,8 +451,8 @@ def estimate_motor(
     windows
         Windows of equal length; at least `MIN_REPEATS` of each key, and both directions.
     timing
-        Timing of the readings. The windows show only the delay from command to angle, from which
-        the angle's own delay is subtracted.
+        Timing of the readings. The windows determine only the delay from command to measured angle,
+        from which the angle's own delay is subtracted.
     tool_inertia_kg_m2
         Inertia between sensor and beam. It makes the coupling torque jump with each command. The
         moment within a period at which the sensor measures the jump is unknown, which widens the
@@ -452,9 +461,9 @@ def estimate_motor(
     Returns
     -------
     MotorEstimate
-        Estimates with standard deviations. These contain the scatter between repeats, are widened
-        for the finite number of repeats so that three of them cover 99.7 %, for the part of the
-        readings that the equation does not explain, and by a margin.
+        Estimates with standard deviations. These follow from the scatter between repeats, and are
+        widened for the number of repeats (so that an interval of three of them has a probability of
+        99.7 %), for the part of the readings that the equation does not explain, and by a margin.
 
     Raises
     ------
@@ -541,7 +550,7 @@ def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_
     session_indices = {
         session_number: session_index
         for session_index, session_number in enumerate(
-            sorted({g[0].session for g in complete_groups})
+            sorted({repeat_group[0].session for repeat_group in complete_groups})
         )
     }
     return [

@@ -22,7 +22,7 @@ from rigd.profile import Profile
 Real = NDArray[np.float64]
 
 TRIAL = "motor-trial"
-"""Name of the excitation of the short session before the others."""
+"""Name of the excitation of the short session that precedes the other sessions."""
 MULTISINE = "motor-multisine"
 """Name of the excitation with a multisine on fast passes."""
 SPEEDS = "motor-speeds"
@@ -36,32 +36,32 @@ _MAX_SPEED_RAD_S = 1.0
 _SPEED_LIMIT_FRACTION = 0.5
 """Largest speed of a pass as a fraction of the profile's speed limit.
 
-The remainder is for the multisine and errors of the motor's data."""
+The remainder is reserved for the multisine and for errors of the motor's data."""
 _STROKE_FRACTION = 0.93
 """Fraction of the stroke that the passes use.
 
-The remainder is for multisine, offsets and overshoot."""
+The remainder is reserved for multisine, offsets and overshoot."""
 _RELATIVE_SPEEDS = (0.1, 0.3, 0.6, 1.0)
-"""Speeds of the passes of `SPEEDS`, relative to the fastest."""
+"""Speeds of the passes of the excitation `SPEEDS`, relative to the fastest pass."""
 _SPEED_MODULATION = {TRIAL: 0.2, MULTISINE: 0.5}
-"""Largest change of a pass's speed by the multisine, as a fraction, by excitation.
+"""Largest change of a pass's speed by the multisine, as a fraction, for each excitation.
 
-It is small in the trial, in which the motor's data are uncertain: a quarter of the inertia that the
-profile states must not yet reverse the speed."""
+It is small in the trial, in which the motor's data are uncertain: the speed must not reverse even
+if the inertia is a quarter of that stated in the profile."""
 _CYCLE_COUNTS = {TRIAL: 6, MULTISINE: 16, SPEEDS: 5}
-"""Number of cycles of passes, by excitation."""
+"""Number of cycles of passes for each excitation."""
 _MULTISINE_BAND_HZ = (1.6, 32.0)
 """Lowest and highest frequency of the multisine in Hz.
 
-In this band the beam's clamped-free modes make its torque differ from that of an inertia, so that
-the scale of the motor's own torque is identifiable. Below 32 Hz the encoder's steps do not yet hide
-the acceleration."""
+In this band, the beam's clamped-free modes make the beam's torque differ from that of an inertia,
+so that the scale of the motor's torque is identifiable. Above 32 Hz, the encoder's steps hide the
+acceleration."""
 _MIN_MULTISINE_FRACTION = 0.1
-"""Smallest accepted fraction to which the torque limit may reduce the multisine."""
+"""Smallest accepted factor by which the multisine is reduced to respect the torque limit."""
 _OFFSET_STEPS = 40.0
-"""Range of the cycles' offsets in encoder steps.
+"""Range of the offsets of the cycles, in encoder steps.
 
-It is large enough that the encoder's rounding errors do not repeat from cycle to cycle."""
+It is so large that the encoder's rounding errors do not repeat from cycle to cycle."""
 _GOLDEN_FRACTION = 0.618033988749895
 """Golden ratio minus 1, whose multiples modulo 1 are evenly distributed."""
 
@@ -70,7 +70,7 @@ _GOLDEN_FRACTION = 0.618033988749895
 class PassSchedule:
     """Speeds and durations of the passes of a session, which define its motion.
 
-    Each pass consists of a turn, a time to settle, and the window that is evaluated.
+    Each pass consists of a turn, a settling time, and the window that is evaluated.
     """
 
     speeds_rad_s: tuple[float, ...]
@@ -80,11 +80,11 @@ class PassSchedule:
     rest_s: float = 0.5
     """Duration of the rest at the beginning."""
     approach_s: float = 2.0
-    """Duration of the motion to the end of the stroke where the passes begin."""
+    """Duration of the motion to the angle at which the passes begin."""
     turn_s: float = 0.4
     """Duration of the turn before each pass."""
     settle_s: float = 0.15
-    """Time to settle after a turn."""
+    """Duration of the settling time after each turn."""
     window_s: float = 1.2
     """Duration of the evaluated window of a pass."""
     end_s: float = 0.5
@@ -106,7 +106,7 @@ class SpeedPass:
 
 
 def passes_of_schedule(schedule: PassSchedule, rate_hz: float) -> list[SpeedPass]:
-    """Return the evaluated windows of a session's passes in their order.
+    """Return the evaluated window of each pass of a session, in order of time.
 
     Parameters
     ----------
@@ -122,21 +122,23 @@ def passes_of_schedule(schedule: PassSchedule, rate_hz: float) -> list[SpeedPass
     start_tick = round(schedule.rest_s * rate_hz) + round(schedule.approach_s * rate_hz)
     speed_passes = []
     for cycle_number in range(schedule.cycles):
-        for relative_speed in schedule.speeds_rad_s:
-            for signed_speed in (relative_speed, -relative_speed):
+        for speed_rad_s in schedule.speeds_rad_s:
+            for signed_speed_rad_s in (speed_rad_s, -speed_rad_s):
                 start_tick += turn_ticks + settle_ticks
                 speed_passes.append(
-                    SpeedPass(start_tick, start_tick + window_ticks, signed_speed, cycle_number)
+                    SpeedPass(
+                        start_tick, start_tick + window_ticks, signed_speed_rad_s, cycle_number
+                    )
                 )
                 start_tick += window_ticks
     return speed_passes
 
 
 def trial_session(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
-    """Return a short multisine excitation with little motion, run before the other sessions.
+    """Return the excitation of the trial, a short session with little speed modulation.
 
-    The controller of the other sessions is designed from its estimate. The excitation is as that of
-    :func:`multisine_session`.
+    The controller of the other sessions is designed from the estimate of the trial. The excitation
+    and its errors are otherwise those of `multisine_session`.
 
     Parameters
     ----------
@@ -151,17 +153,17 @@ def trial_session(profile: Profile, *, torque_percent: float, stroke_rad: float)
 def multisine_session(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
     """Return passes to and fro with a multisine that is scaled to the allowed torque.
 
-    With the response of the profile's closed loop, the speed has equal amplitudes at all harmonics
-    of the window, with the phases of M. R. Schroeder (IEEE Trans. Inf. Theory 16 (1970) 85).
+    The predicted speed has equal amplitudes at all harmonics of the window, with the phases of
+    M. R. Schroeder (IEEE Trans. Inf. Theory 16 (1970) 85).
 
     Parameters
     ----------
     profile
         Profile of the rig; its loop shapes the reference and predicts the peaks.
     torque_percent
-        Largest predicted torque, in percent of the motor's rated torque.
+        Largest allowed torque, as predicted, in percent of the motor's rated torque.
     stroke_rad
-        Largest predicted angle to either side of the start.
+        Largest allowed angle, as predicted, to each side of the start.
 
     Raises
     ------
@@ -177,25 +179,25 @@ def _multisine_excitation(
     excitation_name: str, profile: Profile, torque_percent: float, stroke_rad: float
 ) -> Excitation:
     """Return the excitation `TRIAL` or `MULTISINE`: passes with a multisine."""
-    limit_nm = _torque_limit(profile, torque_percent)
+    allowed_nm = _torque_limit(profile, torque_percent)
     closed_loop = close_loop(profile.loop_model())
     pass_schedule = _fit_schedule(excitation_name, (1.0,), profile, stroke_rad)
     passes_rad = _passes_reference(pass_schedule, profile)
     multisine_rad = _multisine_reference(
         pass_schedule, closed_loop, _SPEED_MODULATION[excitation_name]
     )
-    passes_nm = _peak_torque(closed_loop, passes_rad)
+    passes_peak_nm = _peak_torque(closed_loop, passes_rad)
     peak_nm = _peak_torque(closed_loop, passes_rad + multisine_rad)
     multisine_fraction = 1.0
-    if peak_nm > limit_nm:
+    if peak_nm > allowed_nm:
         # The peak is a convex function of the fraction, below the straight line between the two.
-        multisine_fraction = (limit_nm - passes_nm) / (peak_nm - passes_nm)
+        multisine_fraction = (allowed_nm - passes_peak_nm) / (peak_nm - passes_peak_nm)
     if multisine_fraction < _MIN_MULTISINE_FRACTION:
-        needed_nm = passes_nm + _MIN_MULTISINE_FRACTION * (peak_nm - passes_nm)
+        sufficient_torque_nm = passes_peak_nm + _MIN_MULTISINE_FRACTION * (peak_nm - passes_peak_nm)
         raise ExcitationError(
-            f"--torque-percent {torque_percent:g}: of {limit_nm:.3g} N·m the passes alone take "
-            f"{passes_nm:.3g} N·m, and too little is left for the multisine; allow at least "
-            f"{_rounded_percent(profile, needed_nm)} % or a shorter --stroke-rad."
+            f"--torque-percent {torque_percent:g}: of {allowed_nm:.3g} N·m the passes alone take "
+            f"{passes_peak_nm:.3g} N·m, and too little is left for the multisine; allow at least "
+            f"{_rounded_percent(profile, sufficient_torque_nm)} % or a shorter --stroke-rad."
         )
     return _checked_excitation(
         excitation_name,
@@ -268,7 +270,7 @@ def _torque_limit(profile: Profile, torque_percent: float) -> float:
 
 
 def _rounded_percent(profile: Profile, torque_nm: float) -> int:
-    """Return a torque in percent of the rated torque, rounded up with a margin of 1 %."""
+    """Return a torque plus a margin of 1 %, in percent of the rated torque, rounded up."""
     return ceil(101 * torque_nm / profile.rig.motor.rated_torque_nm)
 
 
@@ -286,11 +288,13 @@ def _fit_schedule(
             f"{limits.angle_rad:g} rad."
         )
     cycle_count = _CYCLE_COUNTS[excitation_name]
-    travel_s = float(np.ptp(_passes_path(PassSchedule(relative_speeds, 1), profile.rig.rate_hz)))
+    travel_per_speed_s = float(
+        np.ptp(_passes_path(PassSchedule(relative_speeds, 1), profile.rig.rate_hz))
+    )
     fastest_rad_s = min(
         _MAX_SPEED_RAD_S,
         _SPEED_LIMIT_FRACTION * limits.velocity_rad_s,
-        2 * _STROKE_FRACTION * stroke_rad / travel_s,
+        2 * _STROKE_FRACTION * stroke_rad / travel_per_speed_s,
     )
     return PassSchedule(
         tuple(relative_speed * fastest_rad_s for relative_speed in relative_speeds), cycle_count
@@ -298,7 +302,7 @@ def _fit_schedule(
 
 
 def _passes_path(schedule: PassSchedule, rate_hz: float) -> Real:
-    """Return the angle in rad during all passes; it begins at 0 at the end of the approach."""
+    """Return the angle in rad at each tick of all passes, relative to the end of the approach."""
     turn_ticks, settle_ticks, window_ticks = (
         round(time_s * rate_hz)
         for time_s in (schedule.turn_s, schedule.settle_s, schedule.window_s)
@@ -335,7 +339,7 @@ def _passes_reference(schedule: PassSchedule, profile: Profile) -> Real:
 
 
 def _add_offsets(reference_rad: Real, schedule: PassSchedule, profile: Profile) -> None:
-    """Add to each cycle of a reference angle its own offset of some encoder steps, in place.
+    """Add a different offset of some encoder steps to each cycle of a reference angle, in place.
 
     The offset changes in the turn before the cycle.
     """
@@ -368,7 +372,8 @@ def _multisine_reference(
 ) -> Real:
     """Return the reference angle in rad of the multisine alone.
 
-    The response of the loop to it changes the speed of the passes by the fraction `modulation`.
+    In response to it, the loop changes the speed of the passes by at most the fraction
+    `modulation`.
     """
     rate_hz = closed_loop.model.rate_hz
     window_ticks = round(schedule.window_s * rate_hz)
@@ -415,7 +420,7 @@ def _multisine_reference(
 
 
 def _smooth_rise(x: Real) -> Real:
-    """Return a smooth rise from 0 to 1 for x from 0 to 1.
+    """Return a polynomial that rises from 0 to 1 for x from 0 to 1.
 
     Its slope and curvature are zero at both ends.
     """
@@ -436,7 +441,7 @@ def _checked_excitation(
     torque_percent: float,
     stroke_rad: float,
 ) -> Excitation:
-    """Return the excitation with a reference; raise ExcitationError if its angle is too large."""
+    """Return an excitation; raise ExcitationError if the angle predicted for it is too large."""
     peak_rad = float(np.max(np.abs(closed_loop.simulate(reference_rad).angle_rad)))
     if peak_rad > stroke_rad:
         raise ExcitationError(
@@ -446,7 +451,7 @@ def _checked_excitation(
     rate_hz = profile.rig.rate_hz
     reference_rad.flags.writeable = False
     rest_ticks = round(schedule.rest_s * rate_hz)
-    end = reference_rad.size - round(schedule.end_s * rate_hz)
+    end_tick = reference_rad.size - round(schedule.end_s * rate_hz)
     stored_parameters = {
         **asdict(schedule),
         "speeds_rad_s": " ".join(repr(speed_rad_s) for speed_rad_s in schedule.speeds_rad_s),
@@ -460,7 +465,7 @@ def _checked_excitation(
     }
     segment_ticks = {
         "rest": (0, rest_ticks),
-        "sweep": (rest_ticks, end),
-        "ring_down": (end, reference_rad.size),
+        "sweep": (rest_ticks, end_tick),
+        "ring_down": (end_tick, reference_rad.size),
     }
     return Excitation(excitation_name, stored_parameters, rate_hz, reference_rad, segment_ticks)

@@ -1,9 +1,9 @@
 """Index of a folder of sessions: an SQLite file in the folder with one row per session.
 
-The index is a cache. Each row contains the size and time of its source files as a stamp, and is
-rebuilt when the stamp differs. An index that cannot be read or written is ignored. Several programs
-may use it at the same time: each writes in one transaction, and the stamps reveal rows that another
-program overwrote or removed.
+The index is a cache. Each row contains the sizes and times of its source files as a stamp, and is
+rebuilt if the files no longer match the stamp. An index that cannot be read or written is ignored.
+Several programs may use it at the same time: each writes in one transaction, and the stamps reveal
+rows that another program overwrote or removed.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ INDEX_NAME: Final = "library.sqlite"
 _APPLICATION_ID: Final = 0x72696764  # "rigd"
 """SQLite's application ID, by which the index is recognised: "rigd" in ASCII."""
 _INDEX_VERSION: Final = 3
-"""Version of the table and of the rows' content. Indexes of older versions are rebuilt."""
+"""Version of the table's columns and content. Indexes of other versions are rebuilt."""
 _SQLITE_FIRST_BYTES: Final = b"SQLite format 3\0"
 """First bytes of every SQLite file."""
 _APPLICATION_ID_POSITION: Final = slice(68, 72)
@@ -61,17 +61,17 @@ _SQL_TYPES: Final = {
     "meta": "TEXT",
     "problem": "TEXT",
 }
-"""SQL types of the columns, without ``file`` and ``stamp``.
+"""SQL type of each column except ``file`` and ``stamp``.
 
-Modes, validity and meta are JSON. Times are UTC in ISO 8601."""
+Modes, validity and meta are JSON; ``start_utc`` is in ISO 8601."""
 _PYTHON_TYPES: Final = {"TEXT": str, "INTEGER": int | None, "REAL": float | None}
-"""Python types of the values that are read from a column of each SQL type."""
+"""Python type that a value read from a column must have, by the SQL type of the column."""
 _COLUMNS_TO_READ: Final = tuple(name for name in _SQL_TYPES if name != "start_utc")
 """Columns that are read from the index: all but the start time as text, which is for other
 programs."""
 
 StampedRow = tuple[str, SessionRow]
-"""Size and time of a row's source files as a stamp, and the row."""
+"""Stamp of a row (sizes and times of its source files), and the row."""
 
 
 class Index:
@@ -80,7 +80,7 @@ class Index:
     Parameters
     ----------
     folder
-        Folder of the sessions. It may be without an index, or not writable.
+        Folder of the sessions, which need not have an index or be writable.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -88,9 +88,9 @@ class Index:
         self._path = folder / INDEX_NAME
 
     def read(self) -> dict[str, StampedRow]:
-        """Return the index's rows by file name, each with the size and time (stamp) of its files.
+        """Return the rows of the index by file name, each with its stamp.
 
-        The dictionary is empty without a valid index.
+        The dictionary is empty if there is no valid index.
         """
         if not self._is_own_index():
             return {}
@@ -183,7 +183,7 @@ class Index:
             database.close()
 
     def _is_own_index(self) -> bool:
-        """Return True if the index file was written by this program or is empty."""
+        """Return whether the index file was written by this program or is empty."""
         try:
             with self._path.open("rb") as index_file:
                 first_bytes = index_file.read(_APPLICATION_ID_POSITION.stop)

@@ -19,7 +19,7 @@ SESSION_SUFFIX: Final = ".mcap"
 INCOMPLETE_SUFFIX: Final = ".mcap.part"
 """File name suffix of a session file that is being recorded or is incomplete."""
 REPORT_FOLDER: Final = re.compile(r"(.+)\.report(?:-(\d+))?")
-"""Pattern of the name of a report folder: session, and number of the report."""
+"""Pattern of the name of a report folder; its groups are session name and report number."""
 REPORT_PAGE: Final = "report.html"
 """Name of the HTML page in a report folder."""
 RESULTS_FILE: Final = "analysis.json"
@@ -28,11 +28,11 @@ RESULTS_FILE: Final = "analysis.json"
 _MAX_JSON_BYTES: Final = 8 << 20
 """Largest size of a JSON file that is read."""
 _MAX_TEXT_CHARACTERS: Final = 1000
-"""Number of characters to which texts are cut."""
+"""Largest number of characters of a text; longer ones are cut."""
 _MAX_META_ENTRIES: Final = 100
-"""Largest number of metadata entries of users in a row."""
+"""Largest number of users' metadata entries that a row contains."""
 _MAX_COUNT_DIGITS: Final = 18
-"""Number of digits that every count of up to 64 bits may have."""
+"""Largest number of digits with which every number is below 2**63."""
 
 """Mode of a session as in JSON documents."""
 Document = dict[str, Any]
@@ -66,8 +66,8 @@ class SessionRow:
     note: str = ""
     """Note of the operator."""
     outcome: str = "unknown"
-    """``complete``, ``stopped`` or ``fault``; ``unknown`` if the file does not state it;
-    ``recording`` or ``incomplete`` for a file without an end; ``unreadable``."""
+    """``complete``, ``stopped`` or ``fault``, or ``unknown`` if the file does not state which;
+    ``recording`` or ``incomplete`` if the file has no end; ``unreadable`` if it cannot be read."""
     reason: str = ""
     """Reason why the session ended early or failed."""
     duration_s: float | None = None
@@ -83,12 +83,12 @@ class SessionRow:
     lost: int | None = None
     """Number of samples that were measured but not recorded."""
     modes: tuple[EstimatedMode, ...] = ()
-    """Modes of the last report or, without a report, of the quick look."""
+    """Modes of the last report or, if there is no report, of the quick look."""
     validity: Document | None = None
-    """Validity of the linear model for the modes, as `rigd.session.Validity.as_json`; None without
-    modes."""
+    """Validity of the linear model for the modes, as `rigd.session.Validity.as_json`; None if there
+    are no modes."""
     report: Path | None = None
-    """Path of the HTML page of the last report; None without a report."""
+    """Path of the HTML page of the last report; None if there is no report."""
     meta: dict[str, float | str] = field(default_factory=dict)
     """Metadata that users added, by name."""
     problem: str = ""
@@ -134,7 +134,7 @@ def read_row(
     SessionRow
         Row of the session.
     bool
-        Whether the row is valid until a file changes; False after a system error.
+        Whether the index may store the row; not after a system error, which may be temporary.
 
     Raises
     ------
@@ -215,7 +215,7 @@ def _text_of_key(key_texts: Mapping[str, str], key: str) -> str:
 
 
 def _count_of_key(key_texts: Mapping[str, str], key: str) -> int | None:
-    """Return the non-negative integer that a key states; None if there is none below 2**63."""
+    """Return the count that a key states; None if it states no integer from 0 to 2**63 - 1."""
     count_text = key_texts.get(key, "")
     # More digits are not a count and exceed 64 bits.
     is_count = (
@@ -237,9 +237,9 @@ def _number_of_key(key_texts: Mapping[str, str], key: str) -> float | None:
 
 
 def _modes_of_results(quick_look: Path | None, report_folder: Path | None) -> Document:
-    """Return the modes and the validity of the linear model from a session's results.
+    """Return the fields `modes` and `validity` of a row from a session's results.
 
-    The report has priority over the quick look. Without results the dictionary is empty.
+    The report has priority over the quick look. If there are no results, the dictionary is empty.
     """
     if report_folder is not None:
         for headline_document in _list_in_document(
@@ -256,7 +256,10 @@ def _modes_of_results(quick_look: Path | None, report_folder: Path | None) -> Do
 
 
 def _with_validity(modes: tuple[EstimatedMode, ...], document: object) -> Document:
-    """Return modes with the validity that a document states; empty without modes."""
+    """Return the fields `modes` and `validity` of a row from modes and a document of results.
+
+    The dictionary is empty if there are no modes.
+    """
     if not modes:
         return {}
     validity_document = document.get("validity") if isinstance(document, dict) else None
@@ -272,13 +275,13 @@ def _read_json(path: Path) -> object:
 
 
 def _list_in_document(document: object, key: str) -> list[object]:
-    """Return the list that a key of a document has; empty if there is none."""
+    """Return the list at a key of a JSON document; an empty list if there is none."""
     listed_value = document.get(key) if isinstance(document, dict) else None
     return listed_value if isinstance(listed_value, list) else []
 
 
 def usable_modes(mode_list: object) -> tuple[EstimatedMode, ...]:
-    """Return the modes of a list that are visible in the record and have finite numbers."""
+    """Return the modes of a JSON list that the record shows; invalid entries are left out."""
     return tuple(mode for mode in modes_from_json(mode_list) if mode.shown)
 
 

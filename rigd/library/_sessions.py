@@ -1,4 +1,4 @@
-"""List of the sessions in a folder: search, comparison with the index, reading and filters."""
+"""List of the sessions in a folder: its files are found, read if new or changed, and filtered."""
 
 import os
 from collections.abc import Callable
@@ -26,7 +26,7 @@ _DATE_CHARACTERS: Final = len("2026-11-20")
 
 
 class LibraryError(UserError, ValueError):
-    """Error: sessions cannot be listed. The message names the folder or filter, and the remedy."""
+    """Error if sessions cannot be listed; the message names folder or filter, and the remedy."""
 
 
 def list_sessions(
@@ -52,13 +52,13 @@ def list_sessions(
     folder
         Folder with the session files.
     specimen, operator, excitation, outcome
-        Required values, compared without case; None permits any value.
+        Required values, which are compared regardless of case; None permits any value.
     since, until
         First and last permitted start time in ISO 8601, local unless an offset is given. A date
         without a time as `until` includes the whole day.
     text
-        Text that must occur in specimen, operator, excitation, note, reason, metadata or name,
-        compared without case.
+        Text that must occur, in any case, in specimen, operator, excitation, note, reason, metadata
+        or name.
     on_progress
         Function that is called from time to time with the fraction of new files that have been
         read.
@@ -110,14 +110,14 @@ def list_sessions(
 
 
 def _searchable_text(row: SessionRow) -> str:
-    """Return all texts of a row in which `list_sessions` searches, in case-folded form."""
+    """Return the texts of a row in which `list_sessions` searches, joined and case-folded."""
     row_texts = (row.id, row.specimen, row.operator, row.excitation, row.note, row.reason)
     user_metadata = (f"{entry_name}={entry_value}" for entry_name, entry_value in row.meta.items())
     return "\n".join((*row_texts, *user_metadata)).casefold()
 
 
 def _time_ns(given_time: str | datetime | None, argument_name: str) -> int | None:
-    """Return a time in ns since 1970; for a date without time, the start or end of its day."""
+    """Return a time in ns since 1970; for a date, the start of the day or, if `until`, its end."""
     if given_time is None or given_time == "":
         return None
     try:
@@ -159,10 +159,7 @@ class _SessionFiles:
         self.report: Path | None = None
 
     def add_results(self, quick_look: Path | None, report_folder: Path | None) -> None:
-        """Add the paths of quick look and report.
-
-        Their sizes and times are appended to those of the session file.
-        """
+        """Add the paths of quick look and report, and append their sizes and times to the stamp."""
         self.quick_look, self.report = quick_look, report_folder
         if quick_look is not None:
             self.stamp += f" look {_stamp_of(quick_look)}"
@@ -174,7 +171,7 @@ class _SessionFiles:
 
 
 def _read_rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[SessionRow]:
-    """Return the data of a folder's sessions, from its index or from new or changed files.
+    """Return the rows of a folder's sessions from its index, or from files that are new or changed.
 
     The index is updated.
     """

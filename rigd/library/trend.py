@@ -9,9 +9,9 @@ from rigd.estimates import Change, Estimate, change_between
 from rigd.library._row import SessionRow
 
 _MAX_LOG_FREQUENCY_RATIO: Final = log(1.25)
-"""Largest logarithm of the frequency ratio of the same mode in two sessions.
+"""Largest logarithm of the ratio of a mode's frequencies in two sessions.
 
-Modes of a beam are further apart."""
+Different modes of a beam are further apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,24 +67,24 @@ def mode_trends(session_rows: Iterable[SessionRow]) -> list[ModeTrend]:
     Returns
     -------
     list of ModeTrend
-        Trends in the order of frequency. Modes of two sessions are the same if their frequencies
-        are nearest to each other, within a factor of 1.25. Changes are relative to the mode's first
-        session.
+        Trends in the order of frequency. Modes of two sessions count as the same mode if their
+        frequencies are nearest to each other, within a factor of 1.25. Changes are relative to the
+        first session that has the mode.
     """
     trends: list[list[TrendPoint]] = []
     for row in sorted(session_rows, key=lambda row: (row.start_utc_ns or 0, row.id)):
-        assigned: set[int] = set()
+        assigned_trends: set[int] = set()
         for mode in row.modes:
             distances = {
                 trend_index: abs(log(mode.frequency_hz.value / points[-1].frequency_hz.value))
                 for trend_index, points in enumerate(trends)
-                if trend_index not in assigned
+                if trend_index not in assigned_trends
             }
             nearest_trend = min(distances, key=distances.__getitem__, default=None)
             if nearest_trend is None or distances[nearest_trend] > _MAX_LOG_FREQUENCY_RATIO:
                 nearest_trend = len(trends)
                 trends.append([])
-            assigned.add(nearest_trend)
+            assigned_trends.add(nearest_trend)
             points = trends[nearest_trend]
             changes: tuple[Change | None, Change | None] = (None, None)
             if points:

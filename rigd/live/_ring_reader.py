@@ -94,11 +94,6 @@ class SessionRecordReader:
         """Number of the next sample to read, counted as `LiveSession.begins`."""
         return self._readers[SAMPLE].next_index
 
-    @property
-    def exhausted(self) -> bool:
-        """Whether the session has ended and all its records were read."""
-        return all(reader.exhausted for reader in self._readers.values())
-
     def end(self, record_counts: Sequence[int]) -> None:
         """Set the number of records that each ring buffer has at the end of the session."""
         for topic, end in zip(TOPICS, record_counts, strict=True):
@@ -147,11 +142,6 @@ class _RingReader:
     def next_index(self) -> int:
         """Number of the next record to read."""
         return self._observer.next_index
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether the session has ended and all its records were read."""
-        return self.end is not None and self._observer.next_index >= self.end
 
     def records(self, decode: Callable[[bytes], Records]) -> Iterator[Records]:
         """Yield the unread records in decoded blocks."""

@@ -15,7 +15,7 @@ from rigd.printable import counts_text, progress_bar
 from rigd.session.touches import touch_line
 
 _MIN_REDRAW_INTERVAL_S: Final = 0.05
-"""Minimum time in seconds between two updates of the line, which take 2 ms of processor time."""
+"""Minimum time in seconds between two redraws of the progress line, each of which takes 2 ms."""
 _CLOSE_TIMEOUT_S: Final = 2.0
 """Maximum time in seconds to wait for a suspended terminal at the end of a session."""
 
@@ -26,8 +26,8 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
     Parameters
     ----------
     plan
-        Plan as in the daemon's reply to ``start``. An older daemon omits some keys. They must not
-        raise an error here, because then Ctrl-C would no longer stop the session.
+        Plan as in the daemon's reply to ``start``. Keys that an older daemon omits must not raise
+        an error here, because then Ctrl-C would no longer stop the session.
     """
     limits = plan.get("limits", {})
 
@@ -140,7 +140,7 @@ class ProgressLine:
         self._thread.join(_CLOSE_TIMEOUT_S)
 
     def _write_until_closed(self) -> None:
-        """Write the line and the messages until the line is closed; run in a thread."""
+        """Write the progress line and the messages until `close` is called; runs in a thread."""
         is_closed = False
         while not is_closed:
             self._has_changed.wait()

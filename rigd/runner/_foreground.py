@@ -27,10 +27,10 @@ from rigd.runtime import StopRequest
 from rigd.runtime.locks import RigLock
 
 _QUICK_LOOK_MAX_RUN_TIME_S: Final = 10.0
-"""Maximum run time in seconds of the last quick look after the sessions. Time in which it waits for
-the processor does not count."""
+"""Maximum run time in seconds of the last quick look after the sessions, without the time in which
+it waits for the processor."""
 _QUICK_LOOK_MAX_WAIT_S: Final = 120.0
-"""Maximum time in seconds to wait for the last quick look, with waits for the processor."""
+"""Maximum time in seconds to wait for the last quick look, whatever time it has run."""
 _POLL_S: Final = 0.05
 
 _PrintLine = Callable[[str], None]
@@ -50,7 +50,7 @@ class SeriesFailedError(FailureError):
     Attributes
     ----------
     results
-        List of these results.
+        The argument as a list.
     """
 
     def __init__(self, message: str, results: Sequence[SessionResult] = ()) -> None:
@@ -82,7 +82,9 @@ def run_in_foreground(
     identifies_motor: bool = False,
     tip_slope_rad: float | None = None,
 ) -> list[SessionResult]:
-    """Run a series of sessions until a stop or the first incomplete session; return the results.
+    """Run a series of sessions for `rigd run`, and return the results.
+
+    The series ends early after a stop or an incomplete session.
 
     Parameters
     ----------
@@ -97,15 +99,15 @@ def run_in_foreground(
     folder
         Folder of the session files; created if it does not exist.
     repeat, seed, notes, fast, live, force, accept, hardware
-        Options of the command line. The sessions of a series use one connection. Each session waits
+        Options of the command line. The rig is connected once for all sessions. Each session waits
         until the beam is at rest.
     quiet_stdout
         Print all text to standard error, because standard output is reserved for a JSON document.
     quick_look
         Make a quick look at each session, and wait some seconds for the last one.
     from_angle
-        Whether the excitation depends on the motor angle. The rig is then connected first, and
-        `build_excitation` receives the angle as ``start_rad``.
+        Whether the excitation depends on the present motor angle. The rig is then connected before
+        planning, and `build_excitation` receives the angle as ``start_rad``.
     prepare
         Function that returns a modified profile before the sessions are planned.
     obstacles
@@ -194,14 +196,14 @@ def run_in_foreground(
 
 
 class _TerminalProgress:
-    """Prints the progress and the results of a series of sessions to the terminal."""
+    """Listener of a series of sessions that prints progress and results to the terminal."""
 
     def __init__(self, record_ticks: int, session_count: int, print_line: _PrintLine) -> None:
-        self._ticks = record_ticks
-        self._repeat = session_count
+        self._record_ticks = record_ticks
+        self._session_count = session_count
         self._print = print_line
         self._progress_line: ProgressLine | None = None
-        self._number = ""
+        self._session_number_text = ""
         self._last_view_text = ""
 
     def __enter__(self) -> Self:
@@ -211,7 +213,9 @@ class _TerminalProgress:
         self._close()
 
     def on_start(self, number: int, path: Path) -> None:  # noqa: ARG002 - printed when it exists
-        self._number = f"{number}/{self._repeat}" if self._repeat > 1 else ""
+        self._session_number_text = (
+            f"{number}/{self._session_count}" if self._session_count > 1 else ""
+        )
         self._progress_line = ProgressLine()
 
     def on_message(self, level: str, text: str) -> None:
@@ -232,10 +236,10 @@ class _TerminalProgress:
         self._progress_line.update(
             progress.phase,
             progress.tick,
-            self._ticks,
+            self._record_ticks,
             missed=progress.missed,
             late=progress.late,
-            session_number_text=self._number,
+            session_number_text=self._session_number_text,
         )
 
     def on_result(self, result: SessionResult, *, look_follows: bool) -> None:  # noqa: ARG002

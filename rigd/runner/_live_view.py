@@ -1,4 +1,4 @@
-"""Live view of a rig: the publisher process, and what it shows of a session."""
+"""Client of a rig's live view, and the data of a session that the view shows."""
 
 import math
 import uuid
@@ -28,9 +28,9 @@ from rigd.view import SessionDescription, linear_sweep_band_hz
 from rigd.view.plots import BUS_PLOT_COMPONENTS, REAL_TIME_PLOT_COMPONENTS
 
 _ADDRESS_TIMEOUT_S = 10.0
-"""Maximum time in seconds for which a session waits for the start of the live view."""
+"""Maximum time in seconds that a session waits for the address of the live view."""
 _SHOW_TIMEOUT_S = 1.0
-"""Maximum time in seconds for which a session waits until the live view shows it."""
+"""Maximum time in seconds that a session waits until the live view shows the session."""
 _DEFAULT_FIT_BAND_HZ = 50.0
 """Upper frequency in Hz that is assumed for an excitation without start and stop frequencies."""
 _MAX_FIT_MODES = 4
@@ -38,21 +38,21 @@ _MAX_FIT_MODES = 4
 
 
 class LiveViewClient(WorkerClient):
-    """Client of the publisher process."""
+    """Client of the publisher process, which serves the live view."""
 
     worker = LIVE
 
-    def __init__(self, group: ProcessGroup, rig: str, *, fast: bool = False) -> None:
+    def __init__(self, group: ProcessGroup, rig_name: str, *, fast: bool = False) -> None:
         super().__init__(group)
         self._fast = fast
         self.address: LiveAddress | None = None
-        self._job = LiveJob(rig, group.channels.specs)
+        self._job = LiveJob(rig_name, group.channels.specs)
         self._session: LiveSession | None = None
         self._is_session_shown = False
         self._restart()
 
     def show(self, order: SessionOrder, stop: StopRequest) -> str:
-        """Prepare the view for the next session; return text with its address, or why none."""
+        """Prepare the view for the next session; return its address, or text on why it has none."""
 
         def is_not_stopped() -> bool:
             return not stop.requested
@@ -89,7 +89,7 @@ class LiveViewClient(WorkerClient):
             self._send(LiveFit(fits[-1]))
 
     def finish(self, outcome: str, reason: str) -> None:
-        """Show the end of the current session; an unknown outcome and reason are empty."""
+        """Show how the current session ended; pass empty texts if that is unknown."""
         if self._session is not None:
             self._session = None
             end_positions = tuple(ring.written_count for ring in self._group.channels.rings)
@@ -100,7 +100,7 @@ class LiveViewClient(WorkerClient):
         self._start(self._job, *([] if self._session is None else [self._session]))
 
     def _process_message(self, message: object) -> None:
-        """Process a message of the publisher: its address, or that it shows the session."""
+        """Process a message of the publisher: its address, or that the session is shown."""
         match message:
             case LiveSessionShown():
                 self._is_session_shown = True
@@ -113,13 +113,13 @@ class LiveViewClient(WorkerClient):
                     self._add_event("info", f"Live view: {message.viewer_url}")
 
     def _process_failure(self, reason: str) -> None:
-        """Continue without the view; the next session is a new chance."""
+        """Continue this session without the view, which the next session tries to start again."""
         self.failure, self.address = reason, None
         if self._session is not None:
             self._add_event("warning", f"No live view: {reason} The session continues.")
 
     def _give_up(self, reason: str) -> None:
-        """Continue without a view after the last restart, and add an event that states why."""
+        """Continue without the view when no restart is left, and add an event with the reason."""
         super()._give_up(reason)
         self.address = None
 
@@ -154,7 +154,7 @@ def describe_planned_session(order: SessionOrder, *, fast: bool = False) -> Sess
 
 
 def _fit_modes(order: SessionOrder) -> int | None:
-    """Return the number of modes whose fits are plotted: those expected in the excited band.
+    """Return the number of modes expected in the excited band, whose fits are plotted.
 
     Returns None if the session makes no fits.
     """
@@ -190,6 +190,6 @@ def gauge_limits(profile: Profile) -> dict[str, float]:
         "i2t": motor_parameters.continuous_torque_nm,
         "missed": limits.missed_percent,
     } | {
-        wrench_axis: limits.sensor_range_percent / 100.0 * end
-        for wrench_axis, end in zip(wrench_axes, sensor_parameters.range, strict=True)
+        wrench_axis: limits.sensor_range_percent / 100.0 * axis_range
+        for wrench_axis, axis_range in zip(wrench_axes, sensor_parameters.range, strict=True)
     }

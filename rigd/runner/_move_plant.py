@@ -1,4 +1,4 @@
-"""Model of motor, beam and closed loop with which moves are planned."""
+"""Model of motor, beam and closed loop that is used to plan moves."""
 
 import math
 from dataclasses import replace
@@ -23,7 +23,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _MAX_MODES = 6
-"""Maximum number of modes whose vibration a move suppresses; higher modes are too weak to show."""
+"""Maximum number of modes whose vibration a move suppresses; higher modes are negligible."""
 _DEFAULT_FREQUENCY_UNCERTAINTY = 0.01
 """Assumed relative uncertainty of the mode frequencies of the profile's beam."""
 _MAX_REFERENCE_ACCELERATION_RATIO = 1.2
@@ -36,9 +36,9 @@ _NOISE_REALISATIONS = 4
 
 
 def loop_model_with(profile: Profile, identified_beam: IdentifiedBeam | None) -> LoopModel:
-    """Return the loop model of a rig with an identified beam and its torque channel.
+    """Return the model of a rig's control loop, with the identified beam and delay if given.
 
-    If `identified_beam` is None, the model has the values of the profile.
+    If `identified_beam` is None, all values are those of the profile.
     """
     loop_model = profile.loop_model()
     if identified_beam is None:
@@ -60,9 +60,10 @@ def move_plant_of(
     coupling_limit_nm: float,
     identified_beam: IdentifiedBeam | None = None,
 ) -> MovePlant:
-    """Return the model of motor, beam and closed loop with which a move is planned.
+    """Return the model of motor, beam and closed loop that is used to plan a move.
 
-    `identified_beam` is the identified beam, or None for the beam of the profile.
+    `coupling_limit_nm` is the largest coupling torque that the sensor can measure. `model` contains
+    the beam; `identified_beam` states its uncertainty, or is None for the beam of the profile.
     """
     # The friction compensation (tanh of the speed) is not linear, and its maximum is subtracted
     # from the available torque.

@@ -1,4 +1,4 @@
-"""Fits during a session: client of the fit process, and use of its estimates."""
+"""Client of the fit process, which fits the record during a session."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from rigd.runner._process_group import ProcessGroup
 
 _FINAL_FIT_TIMEOUT_S: Final = 60.0
-"""Maximum time in seconds for the fit of the whole record, while the torque is off."""
+"""Maximum time in seconds to wait for the fit of the whole record after the session."""
 _STOPPED_FIT_TIMEOUT_S: Final = 5.0
-"""Maximum time in seconds for the fit of the whole record after the operator has stopped."""
+"""Maximum time in seconds to wait for the fit of the whole record if a stop is requested."""
 _STORED_KEYS: Final = (
     "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "validity",
     "modes", "parameters",
@@ -40,12 +40,12 @@ _STORED_KEYS: Final = (
 
 
 class FitClient(WorkerClient):
-    """Client of the fit process of one session, which collects the estimates.
+    """Client that collects the estimates of one session's fit process.
 
-    If the session lasts until a precision is reached, it ends with its last planned segment after
-    the process has reported the end of the search or has failed. `segments` contains the planned
-    segments after that. `unmet_reason` states why the whole record does not have the requested
-    precision, or why this is unknown. It is empty if the record has the precision.
+    A session that lasts until a precision is reached ends with its last planned segment, after the
+    fit process has ended the search or has failed. When the search has ended, `segments` contains
+    the planned segments. `unmet_reason` states why the whole record does not have the requested
+    precision, or why this is unknown; it is empty if the record has the precision.
     """
 
     worker = FIT
@@ -90,13 +90,13 @@ class FitClient(WorkerClient):
         `ticks` is the length of the record. `call_while_waiting` is called repeatedly meanwhile.
         """
         self._send(RecordEnded(ticks))
-        stopped_by_s = time.monotonic() + _STOPPED_FIT_TIMEOUT_S
+        stop_deadline_s = time.monotonic() + _STOPPED_FIT_TIMEOUT_S
 
         def is_worth_waiting() -> bool:
             call_while_waiting()
             if (
                 self._shared_state[StateField.STOP] == StopReason.NONE
-                or time.monotonic() <= stopped_by_s
+                or time.monotonic() <= stop_deadline_s
             ):
                 return True
             self._skip_reason = "A stop skipped the fit of the whole record."
@@ -194,14 +194,14 @@ class FitClient(WorkerClient):
                 self._events.append(LogEvent(0, "info", reason, notable=True))
 
     def _give_up(self, reason: str) -> None:
-        """Continue the session without the fit process, or end it with the last planned segment."""
+        """Give up the fit process; a session that it plans ends with the last planned segment."""
         super()._give_up(reason)
         if self._is_searching:
             self._shared_state[StateField.LAST_SEGMENT] = 1
 
     @property
     def _consequence(self) -> str:
-        """Sentence that states what follows the loss of the fit process."""
+        """Sentence that states how the session goes on without the fit process."""
         if self._is_searching:
             return "The session ends with what is planned."
         return super()._consequence

@@ -29,11 +29,14 @@ from rigd.units import with_half_width, with_percentage
 Real = NDArray[np.float64]
 
 _SUFFICIENT_RATIO: Final = 0.98
-"""Ratio of expected to requested standard deviation up to which a pause is appended."""
+"""Maximum ratio of expected to requested standard deviation at which a pause is appended."""
 _MIN_FORECAST_ESTIMATES: Final = 4
 """Minimum number of estimates from which the remaining time is forecast."""
 _UNREACHABLE_TIME_RATIO: Final = 2.0
 """Ratio of forecast to available time above which the requested precision is unreachable."""
+_MAX_FORECAST_S: Final = 86_400.0
+"""Longest time in s that is forecast: the information grows too little for a number if it takes
+more than a day."""
 _MAX_UNREACHABLE_FORECASTS: Final = 3
 """Number of consecutive forecasts of an unreachable precision that end the session."""
 _NOT_VISIBLE: Final = "not visible yet"
@@ -45,7 +48,8 @@ _COLUMN_WIDTH: Final = 22
 _MAX_REPEATED_SCANS: Final = 2
 """Maximum number of times that the scan is repeated after failed fits."""
 _TIGHTENING_FACTOR: Final = 0.7
-"""Factor on the requested deviations after a flagged estimate, for twice the information."""
+"""Factor by which requested standard deviations are reduced after a flagged estimate: half the
+variance requires twice the information."""
 _TIP_SLOPE_MARGIN: Final = 0.85
 """Fraction of the largest tip slope for which segments are designed. While the damping is not known
 precisely, the predicted slope is up to 24 % smaller than the slope of the segment."""
@@ -55,10 +59,11 @@ beam. The effect of the damping on the torque is proportional to the amplitude, 
 square: this amplitude together with the largest one distinguishes them best (G. Elfving, Optimum
 allocation in linear regression theory, Ann. Math. Stat. 23, 1952)."""
 _FULL_AMPLITUDE_PERIOD: Final = 4
-"""Number of segments of which one has the largest amplitude, while air drag is unknown: the optimum
-is 29 % of the time."""
+"""While air drag is unknown, one of this number of segments has the largest amplitude; the optimum
+would be 29 % of the time."""
 _CORRECTION_FACTOR_RANGE: Final = (0.5, 16.0)
-"""Range of the ratio of reported to expected standard deviation that corrects the design."""
+"""Range to which the factor that corrects the design is limited: the ratio of the reported standard
+deviation to the predicted one."""
 _MODAL_QUANTITY_KEYS: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
 """Requested modal quantity → its key in the estimates of a mode."""
 
@@ -140,12 +145,12 @@ def _target_estimate(target: Target, estimate: Estimate | None) -> TargetEstimat
             *quantity_and_mode, None, inf, target.std, "it is not part of what was found"
         )
     # An estimate that is less than its uncertainty does not show how small the value is.
-    least_value = max(abs(estimate.value), estimate.std or 0.0)
+    relative_scale = max(abs(estimate.value), estimate.std or 0.0)
     return TargetEstimate(
         *quantity_and_mode,
         estimate.value,
         inf if estimate.flag or estimate.std is None else estimate.std,
-        target.std * (least_value if target.relative else 1.0),
+        target.std * (relative_scale if target.relative else 1.0),
         estimate.flag or "",
     )
 
@@ -177,7 +182,7 @@ def beam_estimate(
 class _PlannedInterval:
     """Planned segment of the reference, and its position in the record.
 
-    The record has more ticks than the reference if the angle had to be held for lack of a segment.
+    The record has more ticks than the reference if the angle was held until a segment was planned.
     """
 
     name: str
@@ -194,11 +199,11 @@ class _PlannedInterval:
 
 
 class ExcitationPlanner:
-    """Chooses the segments of the reference until the requested precision is reached.
+    """Planner that chooses the segments of the reference until the precision is reached.
 
-    `due_tick` is the tick of the reference up to which the next decision needs samples, or None
-    after the last decision. If `may_be_last` is True, the next estimate may end the session, and
-    must be a fit of all damping structures.
+    `due_tick` is the tick of the reference up to which samples are needed for the next decision, or
+    None after the last decision. If `may_be_last` is True, the next estimate may end the session,
+    and must be a fit of all damping structures.
     """
 
     def __init__(
@@ -235,9 +240,9 @@ class ExcitationPlanner:
     ) -> Iterator[object]:
         """Plan the next segment from a fit of the samples before `due_tick`.
 
-        Yields the messages for the supervisor. The angle was held for `held_ticks` ticks because no
-        segment was available in time. `held_ticks_before` of these precede the segment that began
-        last.
+        Yields the messages for the supervisor. `held_ticks` is the number of ticks in which the
+        angle was held because no segment was planned in time; `held_ticks_before` is its value at
+        the start of the segment that began last.
         """
         last_interval = self._intervals[-1]
         last_interval.record_tick = last_interval.reference_tick + held_ticks_before
@@ -252,7 +257,7 @@ class ExcitationPlanner:
             return
         estimates = target_estimates(document, self._targets)
         time_s = document["tick"] / self._rate_hz
-        self._forecast.add(time_s, max(flagged_estimate.ratio for flagged_estimate in estimates))
+        self._forecast.add(time_s, max(target_estimate.ratio for target_estimate in estimates))
         doubt_text = document["doubt"] or ""
         # A doubt from the structure with most parameters is first checked with all structures.
         is_shown = document["tick"] == self._shown_tick
@@ -260,16 +265,14 @@ class ExcitationPlanner:
         yield self._report_message(document, estimates, time_s, without_table_row=hides_row)
         if not hides_row:
             self._shown_tick = document["tick"]
-        if self.may_be_last and all(
-            flagged_estimate.ratio <= 1.0 for flagged_estimate in estimates
-        ):
+        if self.may_be_last and all(target_estimate.ratio <= 1.0 for target_estimate in estimates):
             yield self._end_message(f"Reached: {estimates_text(estimates)}.", reached=True)
             return
         if self.may_be_last:
             flagged_estimates = [
-                flagged_estimate
-                for flagged_estimate in estimates
-                if flagged_estimate.doubt not in ("", _NOT_VISIBLE)
+                target_estimate
+                for target_estimate in estimates
+                if target_estimate.doubt not in ("", _NOT_VISIBLE)
             ]
             if flagged_estimates and last_interval.name == "pause" and not doubt_text:
                 # The plan is fulfilled, but the estimate is flagged as no property of the antenna.
@@ -278,8 +281,11 @@ class ExcitationPlanner:
             self._doubtful_count = self._doubtful_count + 1 if doubt_text else 0
         if self._doubtful_count >= _MAX_DOUBTFUL_FITS:
             findings_text = " ".join(document["findings"])
-            rescan_reason = f"The record is doubtful: {doubt_text}. {findings_text} Take a chirp."
-            yield self._end_message(rescan_reason.replace("  ", " "), reached=False)
+            end_reason = (
+                f"The record is doubtful: {doubt_text}. {findings_text} Record a chirp instead: "
+                "rigd run chirp."
+            )
+            yield self._end_message(end_reason.replace("  ", " "), reached=False)
             return
         try:
             estimate = beam_estimate(document, self._targets, self._uniformity)
@@ -297,9 +303,9 @@ class ExcitationPlanner:
 
     @property
     def needs_early_fit(self) -> bool:
-        """Whether all damping structures are to be fitted already during the last segment.
+        """Whether all damping structures are to be fitted once before the end of the pause.
 
-        This provides start values for the fit of all structures after the pause.
+        The early fit provides start values for the fit of all structures after the pause.
         """
         return (
             self._intervals[-1].name == "pause"
@@ -307,19 +313,19 @@ class ExcitationPlanner:
             and self.due_tick is not None
         )
 
-    def has_last_segment_begun(self, begun_until_tick: int) -> bool:
+    def has_last_segment_begun(self, begun_segment_end: int) -> bool:
         """Return whether the last planned segment has begun, so that its record tick is known.
 
-        `begun_until_tick` is the tick of the reference at which the segment that began last
+        `begun_segment_end` is the tick of the reference at which the segment that began last
         ends, or 0 if none has begun.
         """
-        return len(self._intervals) == 1 or begun_until_tick > self._intervals[-1].reference_tick
+        return len(self._intervals) == 1 or begun_segment_end > self._intervals[-1].reference_tick
 
     def end_of_record(
-        self, ticks: int, held_ticks_before: int, begun_until_tick: int
+        self, ticks: int, held_ticks_before: int, begun_segment_end: int
     ) -> SearchEnded:
-        """Return the message that ends the search after a record of `ticks` ticks has ended."""
-        if self.has_last_segment_begun(begun_until_tick):
+        """Return the message that ends the search because the record ended after `ticks` ticks."""
+        if self.has_last_segment_begun(begun_segment_end):
             last_interval = self._intervals[-1]
             last_interval.record_tick = last_interval.reference_tick + held_ticks_before
         else:
@@ -400,46 +406,46 @@ class ExcitationPlanner:
 
     def _next_amplitude(self, *, with_air_drag: bool) -> float:
         """Return the amplitude of the next segment, relative to the largest one."""
-        is_full = not with_air_drag or self._segment_count % _FULL_AMPLITUDE_PERIOD == 0
-        return 1.0 if is_full else _REDUCED_AMPLITUDE
+        has_full_amplitude = not with_air_drag or self._segment_count % _FULL_AMPLITUDE_PERIOD == 0
+        return 1.0 if has_full_amplitude else _REDUCED_AMPLITUDE
 
     def _corrected_targets(
         self, estimate: BeamEstimate, angle_rad: Real, estimates: Sequence[TargetEstimate]
     ) -> list[Target]:
-        """Return the requested standard deviations with which the next segment is designed.
+        """Return the corrected standard deviations that the next segment is designed to reach.
 
-        The design predicts standard deviations of the beam model, but a fit reports those of the
-        modal model. Each requested deviation is therefore divided by the ratio of reported to
-        predicted deviation for the record so far.
+        The design predicts the standard deviations of the beam model, but a fit reports those of
+        the modal model. Each requested standard deviation is therefore divided by the ratio of the
+        reported to the predicted one for the record so far.
         """
         std_by_name = {target_estimate.name: target_estimate.std for target_estimate in estimates}
         corrected_targets = []
-        for target_estimate in expected_precisions(
+        for expected_precision in expected_precisions(
             angle_rad, estimate, self._targets, self._rate_hz
         ):
-            correction_factor = std_by_name.get(target_estimate.target.name, inf) / max(
-                target_estimate.std, 1e-300
+            correction_factor = std_by_name.get(expected_precision.target.name, inf) / max(
+                expected_precision.std, 1e-300
             )
             correction_factor = (
                 float(np.clip(correction_factor, *_CORRECTION_FACTOR_RANGE))
                 if isfinite(correction_factor)
                 else 1.0
             )
-            self._correction_factors[target_estimate.target.name] = correction_factor
+            self._correction_factors[expected_precision.target.name] = correction_factor
             corrected_targets.append(
                 replace(
-                    target_estimate.target,
-                    std=self._tightening * target_estimate.target.std / correction_factor,
+                    expected_precision.target,
+                    std=self._tightening * expected_precision.target.std / correction_factor,
                 )
             )
         return corrected_targets
 
     def _modes_to_excite(self, estimates: Sequence[TargetEstimate]) -> list[int]:
-        """Return the numbers of modes that the next segment must excite, since none shows so far.
+        """Return the numbers of the modes that the next segment must excite to make them visible.
 
-        The design expects that the model determines such a mode from the others, but the check of
-        the record requires that the mode itself is visible. Only every second segment is bound to
-        excite such modes.
+        The design assumes that the beam model determines such a mode from the others, but the check
+        of the record requires that the mode itself is visible. Only every second segment must
+        excite such modes; for the other segments the list is empty.
         """
         unseen_modes = [
             target_estimate.mode
@@ -452,7 +458,7 @@ class ExcitationPlanner:
         return unseen_modes if self._excites_unseen_modes else []
 
     def _repeat_scan(self, reason: str, held_ticks: int) -> Iterator[object]:
-        """Append the first chirp, the scan, again after an unusable estimate, or end the search.
+        """Append the scan (the first chirp) again after an unusable estimate, or end the search.
 
         Yields the message for the supervisor. `reason` states why the estimate is unusable.
         """
@@ -466,7 +472,10 @@ class ExcitationPlanner:
         yield PlannedSegment("the scan once more", {"why": reason})
 
     def _append_scan(self, name: str, held_ticks: int) -> bool:
-        """Append the first chirp again as segment `name`; return whether enough time was left."""
+        """Append the first chirp again as segment `name`; return False if too little time remains.
+
+        The motor has been held for `held_ticks` so far, which the record contains in addition.
+        """
         scan_rad = self._intervals[0].reference_rad
         if self._max_ticks - self._writer.ticks - held_ticks < scan_rad.size:
             return False
@@ -486,7 +495,7 @@ class ExcitationPlanner:
         self._writer.append(reference_rad)
 
     def _reference_rad(self, held_ticks: int) -> Real:
-        """Return the reference angle (n,) in the record up to the end of the last segment."""
+        """Return the reference angle (n,) at each tick of the record up to the last segment."""
         reference_rad = np.zeros(self._writer.ticks + held_ticks)
         for interval in self._intervals:
             reference_rad[interval.record_tick : interval.record_tick + interval.size] = (
@@ -544,9 +553,9 @@ class ExcitationPlanner:
         return {
             "duration_s": segment.reference_rad.size / self._rate_hz,
             "stated": {
-                target_forecast.name: target_forecast.std
-                for target_forecast in estimates
-                if isfinite(target_forecast.std)
+                target_estimate.name: target_estimate.std
+                for target_estimate in estimates
+                if isfinite(target_estimate.std)
             },
             "expected": [
                 {
@@ -565,7 +574,7 @@ class ExcitationPlanner:
         }
 
     def _end_message(self, reason: str, *, reached: bool) -> SearchEnded:
-        """Return the message that ends the search with the planned segments."""
+        """Return the message that ends the search, with the ticks of all segments."""
         self.due_tick = None
         segment_ticks = {
             interval.name: (interval.record_tick, interval.record_tick + interval.size)
@@ -579,9 +588,9 @@ class ExcitationPlanner:
 class _TimeForecast:
     """Forecast of the time until the requested precision is reached.
 
-    It extrapolates the largest ratio of reported to requested standard deviation. The inverse
-    square of this ratio is proportional to the information, which grows linearly with time under
-    the most informative excitation.
+    The ratio of reported to requested standard deviation is extrapolated for the least precise
+    quantity. Its inverse square is proportional to the information, which grows linearly with time
+    under the most informative excitation.
     """
 
     def __init__(self) -> None:
@@ -594,10 +603,15 @@ class _TimeForecast:
 
     @property
     def remaining_s(self) -> float | None:
-        """Forecast time in seconds until the ratio is 1, from the last half of the estimates.
+        """Forecast of the time in s until the ratio is 1, from the last half of the estimates.
 
-        It is None if there are too few estimates, or if the information does not grow.
+        It is None if there are too few estimates, or if the information hardly grows.
         """
+        required_s = self._required_s()
+        return None if required_s is None or required_s > _MAX_FORECAST_S else required_s
+
+    def _required_s(self) -> float | None:
+        """Return the time in s until the ratio is 1, however long; None if there is no forecast."""
         if len(self._information_at_times) < _MIN_FORECAST_ESTIMATES:
             return None
         (now_s, present_information), (earlier_s, earlier_information) = (
@@ -617,19 +631,24 @@ class _TimeForecast:
     def unreachable_reason(self, available_s: float) -> str:
         """Return text that states why the available time is too short, with the remedy.
 
-        It is empty if the time may suffice.
+        The text is empty if the time may suffice.
         """
-        required_s = self.remaining_s
+        required_s = self._required_s()
         if required_s is None or required_s <= _UNREACHABLE_TIME_RATIO * available_s:
             return ""
         now_s, present_information = self._information_at_times[-1]
         reachable_ratio = (
             present_information + (1.0 - present_information) * available_s / required_s
         ) ** -0.5
+        if required_s > _MAX_FORECAST_S:
+            time_text, longer_text = "more than a day", ""
+        else:
+            time_text = f"about {required_s:.0f} s more"
+            longer_text = f", or give --at-most {1.2 * (now_s + required_s):.0f}"
         return (
-            f"it would take about {required_s:.0f} s more, and the {available_s:.0f} s that are "
-            f"left will do for {reachable_ratio:.2g} times the deviation asked for. Ask for "
-            f"that, or give --at-most {1.2 * (now_s + required_s):.0f}."
+            f"it would take {time_text}, and the remaining {available_s:.0f} s suffice for "
+            f"{reachable_ratio:.2g} times the requested standard deviation. Request that"
+            f"{longer_text}."
         )
 
 

@@ -1,7 +1,7 @@
 """Probing move before the first session, which verifies the scales of motor and sensors.
 
 The result is stored in the user's runtime folder. It is valid until the computer is restarted, as
-long as the verified values, the drive, the sensor and a simulated rig do not change.
+long as verified values, drive, sensor and, if the rig is simulated, the simulation do not change.
 """
 
 import contextlib
@@ -46,12 +46,12 @@ class ProbeResult:
     estimate: ProbeEstimate
     """Estimated friction, and ratios of measured to expected values."""
 
-    def contradiction(self, profile: Profile, *, motor: bool = True) -> str:
+    def contradiction(self, profile: Profile, *, checks_motor: bool = True) -> str:
         """Return text that states how the result contradicts the profile, or "" if it does not.
 
-        If `motor` is False, torque and inertia of the motor are not compared.
+        If `checks_motor` is False, torque and inertia of the motor are not compared.
         """
-        return contradiction(probed_rig(profile), self.end, self.estimate, motor=motor)
+        return contradiction(probed_rig(profile), self.end, self.estimate, motor=checks_motor)
 
     def as_metadata(self) -> dict[str, str]:
         """Return the probing move's result as metadata of a session file."""
@@ -94,21 +94,21 @@ def verify_by_probing(
     stop: StopRequest,
     report: Callable[[Literal["info", "warning"], str], None],
     *,
-    motor: bool = True,
+    checks_motor: bool = True,
 ) -> ProbeResult | None:
-    """Make a probing move if motor and encoder were not measured, and return its result.
+    """Make a probing move if it is needed, and return its result, or None if it is not.
 
-    A valid stored result is used instead of a new move. Returns None if no probing is needed, and
-    raises ProbeFailedError if the result contradicts the profile. If `motor` is False, torque and
-    inertia of the motor are not compared.
+    It is needed unless the profile states that motor and encoder were measured. A valid stored
+    result is used instead of a new move. Raises ProbeFailedError if the result contradicts the
+    profile. If `checks_motor` is False, torque and inertia of the motor are not compared.
     """
-    if _is_identified(profile) or _is_simulated_with_profile(profile):
+    if _is_measured(profile) or _is_simulated_with_profile(profile):
         return None
     probe_result = read_stored_result(profile, rig)
-    if probe_result is None or probe_result.contradiction(profile, motor=motor):
+    if probe_result is None or probe_result.contradiction(profile, checks_motor=checks_motor):
         report("info", probing_announcement(profile))
         probe_result = run_probing_move(profile, rig, stop)
-        contradiction_text = probe_result.contradiction(profile, motor=motor)
+        contradiction_text = probe_result.contradiction(profile, checks_motor=checks_motor)
         if contradiction_text:
             raise ProbeFailedError(contradiction_text)
         report("info", f"Probing move passed: {'; '.join(probe_result.lines(profile))}.")
@@ -117,13 +117,13 @@ def verify_by_probing(
     return probe_result
 
 
-def _is_identified(profile: Profile) -> bool:
+def _is_measured(profile: Profile) -> bool:
     """Return whether a profile states that motor and encoder were measured."""
     return all(profile.sources.get(key) == "measured" for key in PROBED_KEYS)
 
 
 def _is_simulated_with_profile(profile: Profile) -> bool:
-    """Return whether the rig is simulated with its profile's values, so that probing is useless."""
+    """Return whether the rig is simulated with the values that probing would verify."""
     if is_simulated_here(profile.rig):
         return True
     simulator = find_simulator(profile.rig.name)
@@ -173,7 +173,7 @@ def probe_in_foreground(
     hardware: bool,
     report_line: Callable[[str], None],
 ) -> tuple[Profile, ProbeResult]:
-    """Make a probing move for `rigd probe`, even if motor and encoder were measured.
+    """Make a probing move for `rigd probe`, even if the profile needs no verification.
 
     Parameters
     ----------
@@ -229,13 +229,13 @@ def read_stored_result(profile: Profile, rig: Rig) -> ProbeResult | None:
 
 
 def _result_of_document(document: Mapping[str, Any]) -> ProbeResult:
-    """Return the result of a probing move from its document."""
+    """Return the result of a probing move from the document that states it."""
     estimate_fields = {key: field_value for key, field_value in document.items() if key != "end"}
     return ProbeResult(ProbeEnd[document["end"]], ProbeEstimate(**estimate_fields))
 
 
 def _verified_values(profile_values: Mapping[str, object]) -> dict[str, object]:
-    """Return those values of a profile that a probing move verifies."""
+    """Return the values of a profile that a probing move verifies."""
     return {
         key: profile_value
         for key, profile_value in profile_values.items()
@@ -244,9 +244,10 @@ def _verified_values(profile_values: Mapping[str, object]) -> dict[str, object]:
 
 
 def _validity_key(profile: Profile, rig: Rig) -> str:
-    """Return a hash of everything that a stored result depends on.
+    """Return a hash that changes when the stored result of a probing move becomes invalid.
 
-    This is the verified values, the drive, the sensor, and the process of a simulated rig.
+    It depends on the verified values, the limits of angle and speed, the drive, the sensor, and the
+    process of a simulated rig.
     """
     simulator = find_simulator(profile.rig.name)
     limits = profile.limits

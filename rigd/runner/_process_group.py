@@ -1,7 +1,7 @@
 """Processes of a rig (control process, recorder and others), and their shared memory.
 
-This module is quick to import, so that the processes are started early. They import their modules
-while the supervisor reads the profile and plans the session.
+This module is quick to import, so that the processes are started early. The processes then import
+their modules while the supervisor reads the profile and plans the session.
 """
 
 import contextlib
@@ -30,9 +30,9 @@ class ProcessGroup:
     Parameters
     ----------
     live
-        Start the publisher of the live view too.
+        Also start the publisher of the live view.
     extra_processes
-        Further processes to start at once. Others are started when they are needed.
+        Further processes to start at once. All other processes are started when they are needed.
 
     Raises
     ------
@@ -46,12 +46,12 @@ class ProcessGroup:
     live
         Whether the publisher of the live view is started too.
     cores
-        Processor cores for processes that are started later, or empty for those of this process.
+        Processor cores for processes that are started later; empty for the cores of this process.
     """
 
     def __init__(self, *, live: bool, extra_processes: Collection[Worker] = ()) -> None:
         self.live = live
-        self._also = frozenset(extra_processes)
+        self._extra_processes = frozenset(extra_processes)
         self.cores: frozenset[int] = frozenset()
         self._fds: list[int] = []
         self._channels: Channels | None = None
@@ -61,7 +61,9 @@ class ProcessGroup:
         try:
             while len(self._fds) < _SHARED_MEMORY_FILES:
                 self._fds.append(shared_memory_fd())
-            wanted_processes = {CONTROL, RECORDER, *self._also} | ({LIVE} if live else set())
+            wanted_processes = {CONTROL, RECORDER, *self._extra_processes} | (
+                {LIVE} if live else set()
+            )
             for process in (process for process in PROCESSES if process in wanted_processes):
                 self._start(process)
         except (OSError, ChildError):
@@ -85,7 +87,7 @@ class ProcessGroup:
         return self._children[RECORDER]
 
     def idle_process(self, process: Worker) -> ChildProcess:
-        """Return a started process without a job; replace it if it already received one.
+        """Return a started process that has received no job; start a new one if necessary.
 
         Raises
         ------
@@ -101,7 +103,10 @@ class ProcessGroup:
         return self._children[process]
 
     def stalled_s(self, process: Worker) -> float:
-        """Return the time in s since the last heartbeat of a process; call this repeatedly."""
+        """Return the time in s since the last heartbeat of a process.
+
+        Call this repeatedly, because a heartbeat is noticed as a change between two calls.
+        """
         assert process.beat is not None
         beat_count = self.channels.shared_state[process.beat]
         return self._heartbeats[process].stalled_for(beat_count, time.monotonic())
@@ -144,7 +149,7 @@ class ProcessGroup:
         from rigd.safety.limits import RECORDER_BUFFER_S
 
         # Readers of samples, such as a live view or a fit, are slower than the virtual clock.
-        is_faster_than_observers = fast and (self.live or self._also or may_be_observed)
+        is_faster_than_observers = fast and (self.live or self._extra_processes or may_be_observed)
         buffered_s = VIRTUAL_BUFFERED_S if is_faster_than_observers else RECORDER_BUFFER_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
 

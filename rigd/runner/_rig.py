@@ -45,13 +45,13 @@ _POLL_S = 0.05
 _CONNECT_TIMEOUT_S = 30.0
 """Maximum time in seconds for connecting the devices."""
 _VIRTUAL_CLOCK_HEARTBEAT_TIMEOUT_S = 30.0
-"""Maximum time between heartbeats under the virtual clock, whose ticks may wait for replies."""
+"""Maximum time in seconds between heartbeats under the virtual clock, whose ticks may wait."""
 _ENABLE_TIMEOUT_S = 5.0
 """Maximum time in seconds for enabling a drive, during which there is no heartbeat."""
 _PROBE_TIMEOUT_S = 60.0
 """Maximum time in seconds for a probing move, in addition to the wait for rest before it."""
 _MEASUREMENT_TIMEOUT_S = 10.0
-"""Maximum time in seconds for a reply to a tare or zero, in addition to the measuring time."""
+"""Maximum time in seconds to wait for a tare or a new zero, in addition to the measuring time."""
 
 
 class RigError(FailureError):
@@ -129,7 +129,7 @@ class Rig:
 
     @property
     def drive_statement(self) -> Mapping[str, str]:
-        """Metadata on its settings that the connected drive reports, empty while not connected."""
+        """Settings that the connected drive reports, as metadata; empty while not connected."""
         return {} if self._connection is None or not self.connected else self._connection.drive
 
     def connect(self, target: ActuationTarget | None = None, *, reset_fault: bool = False) -> None:
@@ -277,7 +277,7 @@ class Rig:
         Returns
         -------
         dict
-            ``moved_rad``: the angle relative to the previous zero.
+            ``moved_rad``: the new zero relative to the previous zero.
 
         Raises
         ------
@@ -328,7 +328,7 @@ class Rig:
             self.disconnect()
             raise RigError(str(error)) from None
         finally:
-            stop.on_request = _ignore_stop_request
+            stop.on_request = _do_nothing_on_stop
             _reset_session_fields(shared_state)
         if isinstance(probe_reply, MeasurementRefused):
             raise RigError(probe_reply.reason)
@@ -336,7 +336,7 @@ class Rig:
         return probe_reply.values
 
     def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
-        """Monitor the control process until it sends the result of a probing move, return that.
+        """Monitor the control process during a probing move, and return its reply.
 
         A hung control process is killed.
         """
@@ -364,7 +364,7 @@ class Rig:
                 )
 
     def watch(self) -> None:
-        """Check that the control process is running; call this several times a second when idle.
+        """Check that the control process is running; call this often while no session runs.
 
         Raises
         ------
@@ -407,8 +407,7 @@ class Rig:
     def signals(self) -> list[SignalBlock]:
         """Return the signals that were recorded since the last call; any thread may call this.
 
-        The first call starts the reading and returns no earlier signals. So does a call more than
-        1 s after the previous one.
+        The first call, and a call more than 1 s after the previous one, return no earlier signals.
         """
         with self._status_lock:
             group = self._group
@@ -494,14 +493,14 @@ class Rig:
         return control_message
 
     def _await_closed_devices(self) -> None:
-        """Wait until the control process has closed all devices after one failed; disconnect."""
+        """Wait until the control process has closed all devices after a failure; disconnect."""
         assert self._group is not None
         with contextlib.suppress(ChildError):
             self._group.control.poll(_MEASUREMENT_TIMEOUT_S)
         self.disconnect()
 
 
-def _ignore_stop_request() -> None:
+def _do_nothing_on_stop() -> None:
     """Do nothing when a stop is requested, because its flag is read later."""
 
 

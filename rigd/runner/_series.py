@@ -22,8 +22,8 @@ from rigd.runner.session import SessionProgress, SessionResult, can_always_recei
 from rigd.runtime import StopRequest
 
 _QUICK_LOOK_MAX_PAUSE_S: Final = 8.0
-"""Maximum pause in seconds before the next session for the quick look at the last one, which mostly
-takes two or three seconds. An unfinished quick look is then suspended."""
+"""Maximum time in seconds that the next session waits for the quick look at the previous one, which
+mostly takes two or three. An unfinished quick look is then suspended."""
 _POLL_S: Final = 0.05
 
 
@@ -40,10 +40,10 @@ class SeriesListener(Protocol):
         """Process a message for the operator before the first session."""
 
     def on_live_view(self, view_text: str) -> None:
-        """Process the text with the address of the live view, or with the reason for none."""
+        """Process the text with the address of the live view, or on why there is no view."""
 
     def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
-        """Process progress and new events of a session, about fifty times a second."""
+        """Process the progress and new events of a session; called about fifty times a second."""
 
     def on_result(self, result: SessionResult, *, look_follows: bool) -> None:
         """Process the result of a session; `look_follows` states whether a quick look follows."""
@@ -64,7 +64,7 @@ class Series:
         Number of sessions.
     notes
         Metadata of the user: operator, specimen, note and others. Empty texts are omitted. If the
-        specimen has a file, the profile must already contain its beam.
+        specimen has a file, the profile must already contain the beam of that file.
     force
         See :func:`rigd.runner.planning.plan_session`.
     accept
@@ -72,7 +72,7 @@ class Series:
     watch_fit
         Fit each record repeatedly during the session.
     identifies_motor
-        Whether the sessions measure the motor. A probing move then verifies only the values on
+        Whether the sessions identify the motor. A probing move then verifies only the values on
         which the limits of travel and speed depend.
 
     Attributes
@@ -132,11 +132,11 @@ class Series:
         return int(self._excitation.reference_rad.size)
 
     def frequency_hz(self, tick: int) -> float | None:
-        """Return the present frequency of the excitation at a tick, or None if it has none."""
+        """Return the frequency of the excitation in Hz at a tick, or None if it has none there."""
         return present_frequency_hz(self._excitation, tick)
 
     def plan_document(self) -> dict[str, Any]:
-        """Return the plan of each session as a dictionary for JSON."""
+        """Return the plan, which is the same for each session, as a dictionary for JSON."""
         return plan_document(self._profile, self._excitation, self.plan)
 
     def run(
@@ -166,8 +166,8 @@ class Series:
         can_receive_stop
             See :class:`rigd.runner.session.SessionSupervisor`.
         quick_looks
-            Program that makes a quick look at each session. The next session waits some seconds for
-            it.
+            Queue to which each session is added for a quick look. The next session waits some
+            seconds for the quick look.
 
         Raises
         ------
@@ -231,7 +231,7 @@ class Series:
                 return
 
     def _session_seed(self, number: int) -> int | None:
-        """Return the seed of a simulated rig's noise in a session, or None for a random seed."""
+        """Return the seed of the simulated rig's noise in a session, or None for a random seed."""
         simulation = self._profile.rig.simulation
         if simulation is None or simulation.seed is None:
             return None
@@ -240,7 +240,7 @@ class Series:
     def _probe_if_needed(
         self, rig: Rig, stop: StopRequest, listener: SeriesListener
     ) -> dict[str, str]:
-        """Make a probing move if motor and encoder were not measured; return its metadata.
+        """Make a probing move if it is needed, and return its result as metadata.
 
         The metadata are empty if no move is needed.
         """
@@ -249,7 +249,7 @@ class Series:
         from rigd.runner import _probing  # late: a simulation in this process needs none
 
         probe_result = _probing.verify_by_probing(
-            self._profile, rig, stop, listener.on_message, motor=not self._identifies_motor
+            self._profile, rig, stop, listener.on_message, checks_motor=not self._identifies_motor
         )
         return {} if probe_result is None else probe_result.as_metadata()
 
@@ -259,7 +259,7 @@ class Series:
 
 
 def _await_quick_look(quick_looks: QuickLookQueue, rig: Rig, stop: StopRequest) -> None:
-    """Wait some seconds for the quick look at the last session before the next session begins."""
+    """Wait some seconds for the quick look at the previous session before the next session."""
     deadline_s = time.monotonic() + _QUICK_LOOK_MAX_PAUSE_S
     while quick_looks.busy and not stop.requested and time.monotonic() < deadline_s:
         rig.watch()

@@ -1,4 +1,4 @@
-"""Slope of the antenna's tip: its limit in identifications, and text on it in plans.
+"""Slope of the antenna's tip: its limit in sessions that identify the antenna, and text in plans.
 
 The exact beam model (`rigd.beam`) is valid for small slopes only. The profile limits the slope by
 `limits.tip_slope_rad`, and a session by `--tip-slope`.
@@ -15,7 +15,7 @@ from rigd.excitation import KINDS, Excitation
 from rigd.profile import Profile
 
 PAPER_AMPLITUDE_RAD: Final = 0.025
-"""Amplitude of the reference paper's chirp, up to which chirps are exempt from the limit."""
+"""Amplitude in rad of the reference paper's chirp, up to which chirps are exempt from the limit."""
 
 KINDS_WITH_TARGET_ANGLE: Final = ("move", "touch")
 """Kinds of excitation with a target angle, which do not identify the antenna and have no amplitude.
@@ -28,7 +28,7 @@ _STEEP_SLOPE_EFFECTS: Final = {
 
 
 class TipSlopeError(UserError):
-    """Raised if the limit of the tip slope that the operator states is invalid."""
+    """Raised if the operator states an invalid limit of the tip slope."""
 
 
 def with_tip_slope(profile: Profile, tip_slope_rad: float | None) -> Profile:
@@ -58,7 +58,7 @@ def with_tip_slope(profile: Profile, tip_slope_rad: float | None) -> Profile:
 def has_slope_limit(excitation: Excitation) -> bool:
     """Return whether the limit of the tip slope applies to an excitation.
 
-    It applies to excitations that identify the antenna, except for chirps of small amplitude.
+    The limit applies to excitations that identify the antenna, except chirps of small amplitude.
     """
     if excitation.kind == "chirp":
         return not is_exempt_chirp(excitation)
@@ -77,8 +77,8 @@ def is_exempt_chirp(excitation: Excitation) -> bool:
 def is_physical(tip: TipMotion, beam: Beam) -> bool:
     """Return whether a predicted tip motion is physically possible.
 
-    It is possible if the deflection is at most the beam's length, and the linear model's error is
-    below 100 %.
+    The motion is possible if the deflection is at most the beam's length, and the error of the
+    linear model is below 100 %.
     """
     return tip.deflection_m <= beam.length_m and linear_model_error(tip.slope_rad) < 1.0
 
@@ -95,7 +95,7 @@ def tip_document(tip: TipMotion | None, beam: Beam) -> dict[str, Any] | None:
 
 
 def slope_remedy(excitation: Excitation, slope_rad: float, limit_rad: float) -> str:
-    """Return advice on how to change or allow a session beyond the limit of the tip slope."""
+    """Return text on how to change or allow a session that exceeds the limit of the tip slope."""
     factor_text = ""
     if excitation.kind == "file":
         amplitude_factor = _rounded_down(limit_rad / slope_rad)
@@ -110,7 +110,7 @@ def slope_remedy(excitation: Excitation, slope_rad: float, limit_rad: float) -> 
 
 
 def tip_in_words(tip: TipMotion | None, beam: Beam, excitation: Excitation) -> str:
-    """Return text on the predicted tip motion and the linear model's error; "" without beam."""
+    """Return text on the predicted tip motion and the linear model's error; "" if unknown."""
     if tip is None:
         return ""
     linear_error = linear_model_error(tip.slope_rad)

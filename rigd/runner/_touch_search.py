@@ -1,7 +1,7 @@
 """Search for an obstacle: settings of the touch detector, and client of the touch process.
 
 The control loop detects a touch and reacts to it. Meanwhile the touch process estimates position
-and force. A session continues without the touch process if that fails.
+and force. If the touch process fails, the session continues without estimates.
 """
 
 from collections.abc import Callable
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 _ROUNDING_STD_PER_STEP: Final = 1 / sqrt(12)
 """Standard deviation of the rounding error, as a fraction of the quantisation step."""
 _FINAL_ESTIMATES_TIMEOUT_S: Final = 120.0
-"""Maximum time in seconds for the last estimates after the end of a record. They take seconds, but
-more than half a minute if each processor has five busy programs."""
+"""Maximum time in seconds to wait for the final estimates after the end of a record. They take
+seconds, but more than half a minute if five programs compete for each processor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ def _sensor_filter(rig: RigParameters) -> "SensorFilter":
 def _reading_noise(profile: Profile) -> "ChannelNoise":
     """Return the standard deviations of torque, shear force and angle readings.
 
-    Only the ratios are used, since the size of the noise is measured at rest.
+    Only the ratios are used, because the touch detector measures the level of the noise at rest.
     """
     from rigd.touch import ChannelNoise
 
@@ -94,17 +94,17 @@ def _reading_noise(profile: Profile) -> "ChannelNoise":
     axis_noise = np.array(rig.sensor.resolution)
     if rig.simulation is not None:
         axis_noise = np.repeat([rig.simulation.force_noise_n, rig.simulation.torque_noise_nm], 3)
-    torque_nm, shear_n = (
+    torque_std_nm, shear_std_n = (
         float(np.linalg.norm(np.array(projection) * axis_noise))
         for projection in (rig.sensor.projection, rig.sensor.shear_projection)
     )
     return ChannelNoise(
-        torque_nm, shear_n or None, _ROUNDING_STD_PER_STEP * rig.encoder.resolution_rad
+        torque_std_nm, shear_std_n or None, _ROUNDING_STD_PER_STEP * rig.encoder.resolution_rad
     )
 
 
 class TouchClient(WorkerClient):
-    """Client of the touch process of one session, which collects the estimates."""
+    """Client that collects the estimates of one session's touch process."""
 
     worker = TOUCH
 
@@ -135,8 +135,9 @@ class TouchClient(WorkerClient):
     ) -> list[dict[str, Any]]:
         """Wait for the final estimates of all detected touches; return a JSON dictionary for each.
 
-        `touch_count` is the number of detected touches. A touch without an estimate has its number
-        only. ``final_reports`` is false if there is only the first, less accurate estimate.
+        `touch_count` is the number of detected touches. The dictionary of a touch without an
+        estimate contains its number only. If only the less accurate first estimate is known,
+        ``final`` is False.
         """
 
         def are_final() -> bool:
@@ -163,7 +164,7 @@ class TouchClient(WorkerClient):
         return estimates
 
     def _process_message(self, message: object) -> None:
-        """Process one message of the touch process: add an estimate, for the view and as event."""
+        """Store the estimate that a message of the touch process reports, and add an event."""
         if isinstance(message, TouchReport):
             self._reports[message.number] = message
             touch_document = _touch_document(message.number, message)
@@ -172,7 +173,7 @@ class TouchClient(WorkerClient):
 
 
 def _touch_document(number: int, report: TouchReport | None) -> dict[str, Any]:
-    """Return a touch as a dictionary for JSON, given its estimate if there is one."""
+    """Return a touch as a dictionary for JSON: its number, and its estimate if there is one."""
     if report is None:
         return {"number": number}
     # A first estimate may be the only one.

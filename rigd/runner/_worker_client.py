@@ -1,4 +1,4 @@
-"""Client of a process that accompanies sessions: its start, readiness, messages, and loss."""
+"""Client of a worker process that a session uses but does not depend on."""
 
 import time
 from abc import ABC, abstractmethod
@@ -14,20 +14,20 @@ if TYPE_CHECKING:
     from rigd.runner._process_group import ProcessGroup
 
 _POLL_S: Final = 0.05
-"""Time in seconds to wait for a message at once."""
+"""Maximum time in seconds of a single wait for a message."""
 
 
 class WorkerClient(ABC):
-    """Client of a worker without which a session continues.
+    """Client of a worker process; if the process is lost, the session continues without it.
 
-    A subclass names the worker, sends its job by `_start`, and processes its messages.
+    A subclass names the worker, sends its job with `_start`, and processes its messages.
 
     Attributes
     ----------
     worker
         Description of the process.
     failure
-        Sentence that states why the process was lost; empty while it is used.
+        Sentence that states why the process was lost; empty while the process is in use.
     """
 
     worker: ClassVar["Worker"]
@@ -62,7 +62,7 @@ class WorkerClient(ABC):
         return events
 
     def check(self) -> None:
-        """Process the received messages, and give the worker up or restart it if it hangs."""
+        """Process the received messages; restart a hung worker, or give it up."""
         if self.process_messages(0.0) and self.worker.max_silence_s is not None:
             limit_s = self.worker.max_silence_s if self._is_ready else self.worker.start_timeout_s
             if self._group.stalled_s(self.worker) > limit_s:
@@ -72,7 +72,7 @@ class WorkerClient(ABC):
                 )
 
     def process_messages(self, timeout_s: float) -> bool:
-        """Process messages, waiting up to `timeout_s` seconds; return whether it is still used."""
+        """Process messages, waiting up to `timeout_s`; return whether the worker is in use."""
         if not (self.failure or self._is_done):
             try:
                 for message in self._group[self.worker].messages(timeout_s):
@@ -88,7 +88,7 @@ class WorkerClient(ABC):
         return not (self.failure or self._is_done)
 
     def _start(self, *messages: object) -> None:
-        """Start a process, or take one that waits for its job, and send it the first messages."""
+        """Send messages, such as the job, to a new process or to one that has no job yet."""
         self.failure, self._is_ready = "", False
         try:
             self._group.idle_process(self.worker)
@@ -111,7 +111,7 @@ class WorkerClient(ABC):
         timeout_s: float,
         call_while_waiting: Callable[[], bool | None],
     ) -> bool:
-        """Process messages until a condition is met or the worker is lost; return False if late.
+        """Process messages until a condition is met or the worker is lost; False on a timeout.
 
         The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
         """
@@ -125,7 +125,7 @@ class WorkerClient(ABC):
         return True
 
     def _restart_or_give_up(self, reason: str) -> None:
-        """Restart the lost process, or give it up after its number of restarts."""
+        """Restart the lost process, or give it up if its number of restarts is used up."""
         self._restart_count += 1
         if self._restart_count > self.worker.restarts:
             self._give_up(reason)
@@ -139,17 +139,17 @@ class WorkerClient(ABC):
         raise NotImplementedError  # unless the table permits restarts
 
     def _process_failure(self, reason: str) -> None:
-        """Continue without a worker that cannot be started, or reports why it cannot go on."""
+        """Continue without a worker that cannot be started or that reports its own failure."""
         self._give_up(reason)
 
     def _give_up(self, reason: str) -> None:
-        """Continue without the worker, and add an event that states why and what follows."""
+        """Continue without the worker, and add an event that states why, and the consequence."""
         self.failure = reason
         self._add_event("warning", f"{reason} {self._consequence}")
 
     @property
     def _consequence(self) -> str:
-        """Sentence that states what follows the loss of the worker."""
+        """Sentence that states how the session goes on without the worker."""
         return self.worker.consequence
 
     def _add_event(self, level: Level, message: str) -> None:

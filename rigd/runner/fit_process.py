@@ -2,9 +2,9 @@
 
 The process reads the ring buffer of samples like the live publisher, so that it neither delays the
 control loop nor takes samples from the recorder. The analyser's `OnlineEstimator` makes the
-estimates in a thread, so that samples are read meanwhile, and the supervisor receives them. If the
-session lasts until a precision is reached, each estimate is also used to plan the next segment of
-the reference (`ExcitationPlanner`).
+estimates in a thread, so that samples are read meanwhile. The estimates are sent to the supervisor.
+If the session lasts until a precision is reached, each estimate is also used to plan the next
+segment of the reference (`ExcitationPlanner`).
 """
 
 import json
@@ -40,12 +40,12 @@ _IDLE_WAIT_S: Final = 0.005
 _FIT_INTERVAL_S: Final = 1.0
 """Time in seconds between two fits of a session whose excitation is planned before its start."""
 _PERIODIC_NICENESS: Final = 19
-"""Niceness of estimates that nobody waits for. In the class SCHED_IDLE, a computer that is busy
-with other programs would stop the whole process for want of the interpreter's lock."""
+"""Niceness of the thread that makes estimates at intervals, for which nobody waits. With SCHED_IDLE
+instead, the thread could hold the interpreter lock while a busy computer does not run it."""
 _TICK_BEYOND_ALL: Final = 1 << 32
-"""Tick beyond all ticks of a session, for an estimate from all samples."""
+"""Tick after the last tick of any session, to request an estimate from all samples."""
 _FIRST_REQUEST_ID: Final = 1_000_000_000
-"""First identification number of requested estimates; those of periodic estimates start at 0."""
+"""First identification number of requested estimates; periodic estimates are numbered from 0."""
 
 
 class EstimationError(Exception):
@@ -68,7 +68,7 @@ class EstimateRequest:
 
 
 class _OnlineEstimate(Protocol):
-    """Estimate of the analyser from the samples of a running session."""
+    """Estimate that the analyser has made from the samples of a running session."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the estimate as a JSON document (docs/online_fit.md)."""
@@ -104,7 +104,7 @@ def main() -> None:
 class EstimatorThread:
     """Thread that fits the samples of a session, on request or at intervals.
 
-    Samples may be passed before the session is known.
+    Samples may be passed with `feed` before `begin` states the session.
     """
 
     def __init__(self) -> None:
@@ -162,7 +162,7 @@ class EstimatorThread:
         segments: Mapping[str, tuple[int, int]],
         interval_s: float | None,
     ) -> None:
-        """Make estimates until the process ends; an error is passed on in place of an estimate."""
+        """Make estimates until the process ends; an error is returned instead of an estimate."""
         try:
             if interval_s is not None:
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _PERIODIC_NICENESS)
@@ -189,7 +189,7 @@ class EstimatorThread:
 
 
 def _estimate_document(estimator: _OnlineEstimator, request: EstimateRequest) -> dict[str, Any]:
-    """Return the requested estimate as a JSON document that needs no library of the analyser."""
+    """Return the requested estimate as a JSON document of plain Python objects."""
     online_estimate = estimator.estimate(
         request.tick, whole=request.whole, from_last=request.from_last
     )
@@ -199,13 +199,13 @@ def _estimate_document(estimator: _OnlineEstimator, request: EstimateRequest) ->
 
 
 class _SessionFit:
-    """Passes the samples of one session to the estimator, and its estimates to the supervisor."""
+    """Fit of one session: passes samples to the estimator, and estimates to the supervisor."""
 
     def __init__(self, job: FitJob, parent: SupervisorConnection, channels: Channels) -> None:
         self._parent = parent
         self._estimator = EstimatorThread()
         self._shared_state = channels.shared_state
-        self._reader = Observer(channels.samples, job.first)
+        self._reader = Observer(channels.samples, job.first_index)
         self._job = job
         self._search: ExcitationPlanner | None = None
         self._pending: EstimateRequest | None = None  # request without an estimate so far
@@ -234,16 +234,16 @@ class _SessionFit:
                 case RecordEnded(ticks):
                     self._record_ticks = ticks
                     if self._search is not None and self._search.due_tick is not None:
-                        held_ticks_before, begun_until_tick = (
+                        held_ticks_before, begun_segment_end = (
                             self._shared_state[StateField.HELD_TICKS_BEFORE_SEGMENT],
                             self._shared_state[StateField.BEGUN_REFERENCE_TICKS],
                         )
                         self._parent.send(
-                            self._search.end_of_record(ticks, held_ticks_before, begun_until_tick)
+                            self._search.end_of_record(ticks, held_ticks_before, begun_segment_end)
                         )
 
     def _start_fits(self, header: FileHeader) -> None:
-        """Start the estimates of a session with this header of its file, and the planning."""
+        """Start the estimates, and the planning of segments, for the session of a file header."""
         job = self._job
         if job.search is not None:
             reference_writer = ReferenceWriter(job.reference, self._shared_state)
@@ -299,9 +299,9 @@ class _SessionFit:
         self._estimator.request(self._pending)
 
     def _process_estimate(self, estimate: dict[str, Any]) -> bool:
-        """Report an estimate or plan the next segment with it.
+        """Report an estimate to the supervisor, or plan the next segment with the estimate.
 
-        Returns whether the estimate is the final one, of the whole record.
+        Returns whether this was the final estimate, from the whole record.
         """
         pending_request, excitation_planner = self._pending, self._search
         if pending_request is not None and pending_request.id != estimate["id"]:

@@ -51,15 +51,15 @@ _UNKNOWN_FORCE_WARNING = (
 
 
 class RefusedError(UserError):
-    """Raised if a session is refused, such as for exceeding limits; it states the remedy."""
+    """Raised if a session is refused, for example because it would exceed limits."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionPrediction:
     """Predicted peak magnitudes of angle, speed and torques in a session.
 
-    They are predicted with the linear closed loop without torque limit. A torque command that the
-    drive would limit therefore appears as a peak above the motor's peak torque.
+    The prediction uses the linear closed loop without torque limit. A torque command that the drive
+    would limit therefore appears as a peak above the motor's peak torque.
     """
 
     peak_angle_rad: float
@@ -78,7 +78,7 @@ class SessionPrediction:
 
 @dataclass(frozen=True, slots=True)
 class SessionPlan:
-    """Prediction of a session before any motion, and whether the limits allow the session."""
+    """Prediction of a session before any motion, and whether the session is allowed."""
 
     prediction: SessionPrediction
     """Predicted peak magnitudes."""
@@ -87,7 +87,7 @@ class SessionPlan:
     tip_in_words: str
     """Sentence on the predicted motion of the beam's free end and the linear model's validity."""
     refused: str = ""
-    """Reasons to refuse the session, one line for each exceeded limit, or empty if allowed."""
+    """Reasons to refuse the session, one line for each; empty if the session is allowed."""
     ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Motion that the control process makes after the record, such as the return to the start."""
     clearance: OfflineCheckResult = field(default_factory=OfflineCheckResult)
@@ -117,12 +117,12 @@ class RigPreview:
 
     @property
     def uniformity(self) -> float:
-        """Relative standard deviation of mode frequencies from those of a uniform beam."""
+        """Relative standard deviation of the mode frequencies from those of a uniform beam."""
         return self._profile.uncertainty.uniformity_percent / 100.0
 
     @property
     def stated_estimate(self) -> BeamEstimate:
-        """Beam estimate with the profile's values and the sensor's noise, and free parameters."""
+        """Beam estimate with the profile's values and sensor noise, to design excitations."""
         rig = self._profile.rig
         density_nm2_per_hz = 2.0 * torque_noise_nm(self._profile) ** 2 / rig.rate_hz
         return BeamEstimate.stated(self._profile.plant, density_nm2_per_hz)
@@ -140,7 +140,7 @@ class RigPreview:
         return self._closed_loop.response(frequency_hz)
 
     def fraction_of_limits(self, reference_rad: Real) -> float:
-        """Return the largest ratio of a predicted peak to its limit for a reference angle (n,).
+        """Return the largest ratio of a peak to its limit that a reference angle (n,) would cause.
 
         Raises
         ------
@@ -148,11 +148,11 @@ class RigPreview:
             If the loop is unstable and the predicted response overflows.
         """
         predicted_peaks, _ = _peaks_and_angle(self._closed_loop, reference_rad)
-        fixed_peaks, clippable_peaks = _limited_peaks(self._profile, predicted_peaks)
-        return _largest_fraction(fixed_peaks + clippable_peaks)
+        unclippable_peaks, clippable_peaks = _limited_peaks(self._profile, predicted_peaks)
+        return _largest_fraction(unclippable_peaks + clippable_peaks)
 
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
-        """Return the model of motor, beam and closed loop with which a move is planned.
+        """Return the model of motor, beam and closed loop that is used to plan a move.
 
         Parameters
         ----------
@@ -160,14 +160,14 @@ class RigPreview:
             Path of a document of ``analyze --json`` with an identified beam; empty for the beam of
             the profile.
         use
-            Purpose of the model, which limits the effects that the identified beam may have.
+            Purpose of the model, which determines the effects that the identified beam may have.
 
         Raises
         ------
         IdentifiedBeamError
             If the document is invalid, or has an effect that this use does not model.
         ControlDesignError
-            If the loop is unstable with that beam.
+            If the loop is unstable with the identified beam.
         RealisationError
             If the beam's damping cannot be realised by a model with poles.
         """
@@ -186,37 +186,38 @@ class RigPreview:
         """Return the model of motor, estimated beam and closed loop for the design of excitation.
 
         If the loop cannot be computed with the estimated damping, the damping of the profile is
-        used. The effect on the motor is small, because the coupling torque is fed forward. The last
+        used. This affects the motor little, because the coupling torque is fed forward. The last
         model is cached.
 
         Parameters
         ----------
         plant
-            Estimated beam and ends. Delay and tool inertia are those of the profile.
+            Estimated beam with its clamp and tip. Its delay and tool inertia are replaced by those
+            of the profile.
 
         Raises
         ------
         ControlDesignError
-            If the loop is unstable with that beam.
+            If the loop is unstable with the estimated beam.
         RealisationError
             If neither damping can be realised by a model with poles.
         """
         if self._last_estimated_plant is not None and self._last_estimated_plant[0] == plant:
             return self._last_estimated_plant[1]
-        profile, stated = self._profile, self._profile.plant
+        profile, stated_plant = self._profile, self._profile.plant
         loop_model, coupling_limit_nm = profile.loop_model(), _sensor_limit_nm(profile)
         # An early estimate of the torque channel is less accurate than the profile.
-        estimated = replace(
-            plant, delay_s=stated.delay_s, tool_inertia_kg_m2=stated.tool_inertia_kg_m2
+        estimated_plant = replace(
+            plant, delay_s=stated_plant.delay_s, tool_inertia_kg_m2=stated_plant.tool_inertia_kg_m2
         )
         try:
             move_plant = move_plant_of(
-                profile, replace(loop_model, plant=estimated), coupling_limit_nm
+                profile, replace(loop_model, plant=estimated_plant), coupling_limit_nm
             )
         except (ControlDesignError, RealisationError):
-            with_stated_damping = replace(estimated, damping=stated.damping)
+            plant_with_stated_damping = replace(estimated_plant, damping=stated_plant.damping)
             move_plant = move_plant_of(
-                profile, replace(loop_model, plant=with_stated_damping), coupling_limit_nm
+                profile, replace(loop_model, plant=plant_with_stated_damping), coupling_limit_nm
             )
         self._last_estimated_plant = plant, move_plant
         return move_plant
@@ -225,7 +226,7 @@ class RigPreview:
 def excitation_for(
     profile: Profile, kind: str, parameters: Mapping[str, Value], start_rad: float = 0.0
 ) -> Excitation:
-    """Return the excitation of a given kind and parameters for the rig of a profile.
+    """Return the excitation with the given kind and parameters for the rig of a profile.
 
     Parameters
     ----------
@@ -234,7 +235,7 @@ def excitation_for(
     kind, parameters
         Name and parameters of the excitation, as for `rigd.excitation.make_excitation`.
     start_rad
-        Motor angle at the start of the session, relative to the rig's zero. Only moves use it.
+        Motor angle at the start of the session, relative to the rig's zero. Only moves need it.
     """
     if "tip_slope_rad" in inspect.signature(KINDS[kind]).parameters:
         parameters = {"tip_slope_rad": profile.limits.tip_slope_rad} | dict(parameters)
@@ -271,7 +272,7 @@ def plan_session(
 def predict_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
 ) -> SessionPlan:
-    """Return the plan of a session; its field `refused` states why it is not allowed, if so.
+    """Return the plan of a session, whose field `refused` states why it is refused, if it is.
 
     Parameters
     ----------
@@ -344,7 +345,7 @@ def predict_session(
 
 
 def _amplitude_advice(profile: Profile, excitation: Excitation, *, force: bool) -> str:
-    """Return the advice, for an error message, on an excitation that would exceed limits."""
+    """Return advice, as part of an error message, on how to change an excitation within limits."""
     if excitation.kind in KINDS_WITH_TARGET_ANGLE:
         return "go less far or slower"
     largest_rad = largest_amplitude(profile, excitation, force=force)
@@ -352,9 +353,10 @@ def _amplitude_advice(profile: Profile, excitation: Excitation, *, force: bool) 
 
 
 def _motion_after_record(loop: ClosedLoop, *, stays: bool, damped: bool) -> PostRecordPlan:
-    """Return the motion after the record: a vibration-free return to the start, with damping.
+    """Return the plan for the motion after the record: active damping, then the return.
 
-    Active damping is designed for the loop, and left out where its controller is not known.
+    `stays` states that the motor does not return to its start. `damped` must be False if the
+    controller is not known, for which active damping cannot be designed.
     """
     if loop.model.plant is None:
         return PostRecordPlan(stays=stays)
@@ -365,14 +367,14 @@ def _motion_after_record(loop: ClosedLoop, *, stays: bool, damped: bool) -> Post
 def largest_amplitude(
     profile: Profile, excitation: Excitation, *, force: bool = False
 ) -> float | None:
-    """Return the largest amplitude of an excitation for which a session stays within all limits.
+    """Return the largest amplitude with which an excitation stays within all limits.
 
     All other parameters of the excitation stay the same.
 
     Parameters
     ----------
     profile, excitation
-        Profile of the rig, and excitation, whose own amplitude is ignored.
+        Profile of the rig, and excitation; the amplitude of the excitation is ignored.
     force
         Whether torques may be clipped, so that the torque limits are ignored.
 
@@ -401,10 +403,12 @@ def largest_amplitude(
         amplitude_scale = amplitude_rad / stated_amplitude_rad
         reference_rad = excitation.reference_rad * amplitude_scale
         predicted_peaks, _ = _peaks_and_angle(closed_loop, reference_rad)
-        fixed_peaks, clippable_peaks = _limited_peaks(profile, predicted_peaks)
+        unclippable_peaks, clippable_peaks = _limited_peaks(profile, predicted_peaks)
         if tip_slope is not None:
-            fixed_peaks += (replace(tip_slope, value=tip_slope.value * amplitude_scale),)
-        return _largest_fraction(fixed_peaks if force else fixed_peaks + clippable_peaks)
+            unclippable_peaks += (replace(tip_slope, value=tip_slope.value * amplitude_scale),)
+        return _largest_fraction(
+            unclippable_peaks if force else unclippable_peaks + clippable_peaks
+        )
 
     # All peaks are proportional to the amplitude, except for the friction compensation.
     amplitude_rad = min(stated_amplitude_rad, _MAX_AMPLITUDE_RAD)
@@ -437,7 +441,9 @@ def plan_document(profile: Profile, excitation: Excitation, plan: SessionPlan) -
         "sweep": excitation.motion,
         "profile": profile.name,
         "parameters": dict(excitation.parameters),
-        "segments": {name: list(end_text) for name, end_text in excitation.segments.items()},
+        "segments": {
+            name: list(segment_ticks) for name, segment_ticks in excitation.segments.items()
+        },
         "record_s": excitation.reference_rad.size / profile.rig.rate_hz,
         "ends_itself": excitation.ends_itself,
         **asdict(plan.prediction),
@@ -494,10 +500,9 @@ def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPredictio
 def _peaks_and_angle(
     closed_loop: ClosedLoop, reference_rad: Real
 ) -> tuple[SessionPrediction, Real]:
-    """Return the peak magnitudes of the simulated response to a reference, and its angle in rad.
+    """Return the peak magnitudes in the response to a reference (n,), and the angle (n,) in rad.
 
-    Both arrays have the shape (n,). The response is computed in chunks: that of an hour would take
-    150 MB.
+    The response is computed in chunks, because the response of an hour would take 150 MB.
     """
     angle_rad = np.empty(reference_rad.size)
     peaks = np.zeros(5)
@@ -514,12 +519,12 @@ def _peaks_and_angle(
         )
         peaks = np.maximum(peaks, [_peak(signal) for signal in signals])
     angle, velocity, torque, tracking_error, coupling_torque = map(float, peaks)
-    predicted = SessionPrediction(angle, velocity, torque, tracking_error, coupling_torque)
-    return predicted, angle_rad
+    prediction = SessionPrediction(angle, velocity, torque, tracking_error, coupling_torque)
+    return prediction, angle_rad
 
 
 def predicted_metadata(
-    profile: Profile, predicted: SessionPrediction, excitation: Excitation
+    profile: Profile, prediction: SessionPrediction, excitation: Excitation
 ) -> dict[str, str]:
     """Return the predicted peaks and their limits as metadata of a session file.
 
@@ -527,25 +532,25 @@ def predicted_metadata(
     ----------
     profile
         Profile of the rig, with its limits.
-    predicted
+    prediction
         Predicted peaks of the session.
     excitation
-        Excitation of the session. Segments that are planned during the session may reach a tip
-        slope of their own, which is included.
+        Excitation of the session. The stated peak of the tip slope includes segments that are
+        planned during the session.
 
     Returns
     -------
     dict of str to str
         Keys ``predicted_peak_…`` and ``limit_…`` with their units → numbers as texts.
     """
-    fixed_peaks, clippable_peaks = _limited_peaks(profile, predicted)
+    unclippable_peaks, clippable_peaks = _limited_peaks(profile, prediction)
     metadata = {}
-    tip_slope = _limited_tip_slope(profile, predicted)
+    tip_slope = _limited_tip_slope(profile, prediction)
     if tip_slope is not None:
         largest_rad = max(tip_slope.value, excitation.later_tip_slope_rad)
         tip_slope = replace(tip_slope, value=largest_rad)
     for limited_peak in (
-        *fixed_peaks,
+        *unclippable_peaks,
         *clippable_peaks,
         *(() if tip_slope is None else (tip_slope,)),
     ):
@@ -562,7 +567,7 @@ _METADATA_KEYS = {
     "torque": "torque_nm",
     "tip slope": "tip_slope_rad",
 }
-"""Name of a limited peak → the part of its metadata keys after ``predicted_peak_``."""
+"""Name of a limited peak → its metadata key without ``predicted_peak_`` or ``limit_``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -573,7 +578,7 @@ class _LimitedPeak:
     value: float
     limit: float
     unit: str
-    key: str
+    limit_key: str
 
     def violation_text(self) -> str | None:
         """Return text that states how the peak exceeds the limit, or None if it does not."""
@@ -581,29 +586,29 @@ class _LimitedPeak:
             return None
         return (
             f"The predicted peak {self.name} of {self.value:.4g} {self.unit} exceeds "
-            f"{self.limit:.4g} {self.unit} ({self.key})"
+            f"{self.limit:.4g} {self.unit} ({self.limit_key})"
         )
 
 
 def _limited_peaks(
-    profile: Profile, predicted: SessionPrediction
+    profile: Profile, prediction: SessionPrediction
 ) -> tuple[tuple[_LimitedPeak, ...], tuple[_LimitedPeak, ...]]:
-    """Return the peaks whose limits always apply, and the torque peaks that may be clipped."""
+    """Return the peaks whose limits always apply, then the torque peaks that may be clipped."""
     limits, motor_parameters = profile.limits, profile.rig.motor
-    fixed_peaks = (
+    unclippable_peaks = (
         _LimitedPeak(
-            "angle", predicted.peak_angle_rad, limits.angle_rad, "rad", "limits.angle_rad"
+            "angle", prediction.peak_angle_rad, limits.angle_rad, "rad", "limits.angle_rad"
         ),
         _LimitedPeak(
             "speed",
-            predicted.peak_velocity_rad_s,
+            prediction.peak_velocity_rad_s,
             limits.velocity_rad_s,
             "rad/s",
             "limits.velocity_rad_s",
         ),
         _LimitedPeak(
             "tracking error",
-            predicted.peak_tracking_error_rad,
+            prediction.peak_tracking_error_rad,
             limits.tracking_error_rad,
             "rad",
             "limits.tracking_error_rad",
@@ -612,28 +617,28 @@ def _limited_peaks(
     clippable_peaks = (
         _LimitedPeak(
             "coupling torque",
-            predicted.peak_coupling_torque_nm,
+            prediction.peak_coupling_torque_nm,
             _sensor_limit_nm(profile),
             "N·m",
             "sensor.range",
         ),
         _LimitedPeak(
             "torque",
-            predicted.peak_torque_nm,
+            prediction.peak_torque_nm,
             motor_parameters.peak_torque_nm,
             "N·m",
             "motor.peak_torque_nm",
         ),
     )
-    return fixed_peaks, clippable_peaks
+    return unclippable_peaks, clippable_peaks
 
 
-def _limited_tip_slope(profile: Profile, predicted: SessionPrediction) -> _LimitedPeak | None:
+def _limited_tip_slope(profile: Profile, prediction: SessionPrediction) -> _LimitedPeak | None:
     """Return the predicted tip slope and its limit for identification, or None without a beam."""
-    if predicted.tip is None:
+    if prediction.tip is None:
         return None
-    key, limit_rad = "limits.tip_slope_rad", profile.limits.tip_slope_rad
-    return _LimitedPeak("tip slope", predicted.tip.slope_rad, limit_rad, "rad", key)
+    limit_key, limit_rad = "limits.tip_slope_rad", profile.limits.tip_slope_rad
+    return _LimitedPeak("tip slope", prediction.tip.slope_rad, limit_rad, "rad", limit_key)
 
 
 def _largest_fraction(limited_peaks: tuple[_LimitedPeak, ...]) -> float:
@@ -643,9 +648,9 @@ def _largest_fraction(limited_peaks: tuple[_LimitedPeak, ...]) -> float:
 
 
 def _sensor_limit_nm(profile: Profile) -> float:
-    """Return the coupling torque in N·m at which the first sensor axis reaches its limit.
+    """Return the coupling torque in N·m at which a sensor axis reaches its limit.
 
-    The wrench is assumed to be the smallest one whose projection is the coupling torque.
+    The smallest of all wrenches with the same coupling torque is assumed.
     """
     sensor = profile.rig.sensor
     projection_norm_squared = sum(p * p for p in sensor.projection)

@@ -1,8 +1,7 @@
 """Quick looks, the short reports that a separate program makes of each session after its end.
 
-One program runs at a time. It is suspended during a session. It is killed if it takes too long,
-where time in which it waits for a processor does not count. It ends with the process that started
-it.
+One program runs at a time. It is suspended during a session, and killed if its run time (without
+waits for a processor) is too long. It ends with the process that started it.
 """
 
 import contextlib
@@ -25,7 +24,7 @@ from rigd.session.quick_look import quick_look_path, read_quick_look
 _MAX_RUN_TIME_S: Final = 60.0
 """Maximum run time of a quick look in seconds, without suspensions and waits for a processor."""
 _MAX_WAITING: Final = 3
-"""Maximum number of waiting quick looks; beyond it the oldest waiting quick look is skipped."""
+"""Maximum number of waiting quick looks, above which the oldest waiting quick look is skipped."""
 _MAX_ERROR_CHARACTERS: Final = 500
 """Maximum number of characters of an error message that are shown."""
 
@@ -86,7 +85,7 @@ class QuickLook:
 
 
 class QuickLookQueue:
-    """Queue of sessions at which quick looks are made, one at a time, while no session runs.
+    """Queue of sessions for quick looks, which are made one at a time while no session runs.
 
     Parameters
     ----------
@@ -156,7 +155,7 @@ class QuickLookQueue:
                 self._process = None
 
     def _ended_quick_look(self) -> Iterator[QuickLook]:
-        """Yield the result of the running quick look if it has ended; kill it if too slow."""
+        """Yield the result of the running quick look if it has ended; kill it if it is too slow."""
         if self._process is None or self._is_suspended:
             return
         self._update_run_time(self._process.pid)

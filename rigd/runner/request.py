@@ -44,8 +44,8 @@ from rigd.session.user_metadata import META_PREFIX, NOTES
 from rigd.units import unit_of
 
 _MAX_BYTES_PER_TICK = 260
-"""Maximum number of bytes that a tick adds to a session file: sample, ages of the readings,
-controller terms and index, uncompressed."""
+"""Maximum number of uncompressed bytes that a tick adds to a session file: sample, ages of the
+readings, controller terms and index."""
 _MAX_BYTES_WITHOUT_TICKS = 1_000_000
 """Assumed maximum number of bytes of a session file without its ticks."""
 _GIT_TIMEOUT_S = 2.0
@@ -53,12 +53,12 @@ _GIT_TIMEOUT_S = 2.0
 
 
 class NoRoomError(RefusedError):
-    """Raised if a session file cannot be written to its folder, such as on a full disk."""
+    """Raised if a session file cannot be written to its folder, for example if the disk is full."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionOrder:
-    """Session to run, which was already checked against the limits of the profile."""
+    """Data of a session to run, which was already checked against the limits of the profile."""
 
     profile: Profile
     """Profile of the rig."""
@@ -68,7 +68,7 @@ class SessionOrder:
     """Final path of the session file."""
     notes: tuple[tuple[str, str], ...] = ()
     """Metadata of the user (key, text), such as operator, specimen, note and number in a series."""
-    predicted: tuple[tuple[str, str], ...] = ()
+    predicted_metadata: tuple[tuple[str, str], ...] = ()
     """Metadata (key, text) with the predicted peaks and their limits."""
     ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Motion after the record, such as the return to the start."""
@@ -83,7 +83,7 @@ class SessionOrder:
 
     @property
     def search(self) -> PrecisionSearch | None:
-        """Precision at which the session ends, or None if its end is planned."""
+        """Precision that ends the session when it is reached, or None if the end is planned."""
         excitation = self.excitation
         return excitation.search if isinstance(excitation, PrecisionExcitation) else None
 
@@ -101,7 +101,7 @@ def load_rig(
     hardware: bool = False,
     obstacles: Sequence[str] = (),
 ) -> tuple[Profile, ActuationTarget]:
-    """Return a profile, and which rig its sessions move: the hardware or a simulated one.
+    """Return a profile, and whether its sessions move the hardware or a simulated rig.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def load_rig(
 
 
 def _refuse_unreachable_simulators(profile: Profile) -> None:
-    """Raise if a simulated rig of this profile is running that this command cannot reach."""
+    """Raise if a simulated rig of a profile is running but this process cannot reach it."""
     for simulator_path in unreachable_simulators(profile.rig.name):
         remedy, owner_name = "run this command as its user to use it", "by another user"
         with suppress(OSError, ValueError):
@@ -415,8 +415,8 @@ def _session_metadata(
         "uniformity_percent": repr(order.profile.uncertainty.uniformity_percent),
         # The parameters of a session may override the uniformity.
         **{
-            metadata_name: _parameter_text(metadata_value)
-            for metadata_name, metadata_value in order.excitation.parameters.items()
+            parameter_name: _parameter_text(parameter_value)
+            for parameter_name, parameter_value in order.excitation.parameters.items()
         },
         "beam_length_m": repr(rig.beam.length_m),
         "beam_density_kg_per_m": repr(rig.beam.density_kg_per_m),
@@ -435,12 +435,12 @@ def _session_metadata(
         **software_commit(),
         "host": platform.node(),
         **{
-            f"realtime_{metadata_name}": metadata_value
-            for metadata_name, metadata_value in connection.realtime.items()
+            f"realtime_{setting_name}": setting_text
+            for setting_name, setting_text in connection.realtime.items()
         },
         **connection.drive,
         **tare,
-        **dict(order.predicted),
+        **dict(order.predicted_metadata),
         **dict(order.notes),
     }
     if order.accepted:
@@ -477,11 +477,14 @@ def _session_metadata(
 
 
 def _excitation_metadata(kind: str) -> dict[str, str]:
-    """Return the package that adds an excitation, and its reason against the Welch method."""
-    added = find_excitation(kind)
-    if added is None:
+    """Return metadata of an excitation that a package adds; empty for a built-in one.
+
+    They state the package, and why the Welch method does not suit the excitation.
+    """
+    declaration_and_owner = find_excitation(kind)
+    if declaration_and_owner is None:
         return {}
-    declaration, owner = added
+    declaration, owner = declaration_and_owner
     metadata = {"excitation_package": owner.label}
     if declaration.welch_exclusion:
         metadata["welch_exclusion"] = declaration.welch_exclusion
@@ -489,13 +492,13 @@ def _excitation_metadata(kind: str) -> dict[str, str]:
 
 
 def _controller_metadata(profile: Profile) -> dict[str, str]:
-    """Return the controller that a package adds and the package; empty for the shipped one."""
+    """Return metadata of a controller that a package adds; empty for the built-in one."""
     owner = CONTROLLERS.owner(profile.control.controller)
     return {} if owner is None else {"controller": owner.name, "controller_package": owner.label}
 
 
 def _device_metadata(rig: RigParameters) -> dict[str, str]:
-    """Return the metadata that the kinds of the devices declare, and the packages that add them."""
+    """Return metadata of the devices: the packages that add them, and what their kinds declare."""
     metadata: dict[str, str] = {}
     for role, name in (("drive", rig.devices.drive), ("sensor", rig.devices.sensor)):
         kind, owner = DEVICES.get(name), DEVICES.owner(name)
@@ -509,22 +512,22 @@ def _device_metadata(rig: RigParameters) -> dict[str, str]:
 
 @cache
 def software_commit() -> dict[str, str]:
-    """Return metadata with the git commit of this program, empty if it is not a git checkout.
+    """Return metadata with the git commit of this program; empty without a git checkout.
 
     The result of the first call is cached, because the running code does not change.
     """
-    checkout = Path(__file__).resolve().parents[2]
-    if not (checkout / ".git").exists():
+    checkout_folder = Path(__file__).resolve().parents[2]
+    if not (checkout_folder / ".git").exists():
         return {}
-    command = ["git", "--no-optional-locks", "-C", str(checkout), "describe"]
+    command = ["git", "--no-optional-locks", "-C", str(checkout_folder), "describe"]
     command += ["--always", "--dirty", "--abbrev=12"]
     try:
-        git = subprocess.run(
+        git_result = subprocess.run(
             command, capture_output=True, text=True, timeout=_GIT_TIMEOUT_S, check=True
         )
     except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
         return {}
-    commit = git.stdout.strip()
+    commit = git_result.stdout.strip()
     return {"software_commit": commit} if commit.isprintable() and commit else {}
 
 

@@ -41,13 +41,13 @@ from rigd.runner.request import SessionOrder, file_header, next_free_path, part_
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.02
-"""Time between two checks of the other processes, which delays their messages to the operator."""
+"""Time in seconds between two checks of the other processes for messages and heartbeats."""
 _REPLY_TIMEOUT_S = 5.0
-"""Maximum time for a reply of the recorder, and for the control process to stop."""
+"""Maximum time in seconds for a reply of the recorder, and for the control process to stop."""
 _DRIVE_TIMEOUT_S = 30.0
-"""Maximum time for enabling or disabling a drive, which may be slow."""
+"""Maximum time in seconds for enabling or disabling a drive, which may be slow."""
 _RECORDER_START_TIMEOUT_S = 30.0
-"""Maximum time for the recorder to start on a busy computer, while nothing moves yet."""
+"""Maximum time in seconds for the recorder to start on a busy computer, before any motion."""
 _MAX_FILE_NAMES = 100
 """Maximum number of names that are tried for a session file."""
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
@@ -61,10 +61,15 @@ _COUNTER_FIELDS = {
 }
 """Name of a tick count in the result → field of the shared state with the counter."""
 _ZERO_COUNTS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTER_FIELDS, 0))
+_WITHOUT_HEARTBEAT_TEXT: Final = (
+    "Without its heartbeat the watchdog of the drive switches the torque off; check that it is "
+    "off, and press the wired stop (STO) if it is not."
+)
+"""Sentence for the operator after the control process has ended and left the drive enabled."""
 
 
 class SessionFailedError(FailureError):
-    """Raised if a session could not be run or its file not closed; it states the reason.
+    """Raised if a session could not be run, or if its file could not be closed.
 
     Attributes
     ----------
@@ -120,7 +125,7 @@ class SessionResult:
     """Result of a session: how it ended, its file, and counts of ticks."""
 
     path: Path | None
-    """Path of the session file; None if the session ended before tick 0 or it is incomplete."""
+    """Path of the session file; None if there is none or only the incomplete ``.part`` file."""
     outcome: str
     """How the session ended: ``complete``, ``stopped``, ``fault`` or ``unknown``."""
     reason: str
@@ -204,7 +209,7 @@ MessageType = TypeVar("MessageType")
 
 
 class SessionSupervisor:
-    """Supervisor of one session; :meth:`run` may be called once.
+    """Supervisor of one session, whose :meth:`run` may be called only once.
 
     Parameters
     ----------
@@ -219,8 +224,8 @@ class SessionSupervisor:
     on_progress
         Called about fifty times a second with the progress and the events since the last call.
     can_receive_stop
-        Returns whether this process can receive a stop request. If not, this process stops its
-        heartbeat, so that the control process treats it as hung.
+        Function that returns whether this process can receive a stop request. If it returns False,
+        the heartbeat stops, so that the control process treats this process as hung.
 
     Attributes
     ----------
@@ -328,8 +333,8 @@ class SessionSupervisor:
             touch_order,
             session_order.seed,
             tuple(
-                f"{metadata_item.name}: {metadata_item.text}"
-                for metadata_item in session_order.accepted
+                f"{accepted_check.name}: {accepted_check.text}"
+                for accepted_check in session_order.accepted
             ),
         )
         process_group.control.send(job)
@@ -348,12 +353,12 @@ class SessionSupervisor:
         return self._close(control_message)
 
     def _report_and_check_stop(self) -> bool:
-        """Report progress before any motion; return whether no stop is requested so far."""
+        """Report progress before any motion; return False if a stop is requested."""
         self._report()
         return self._shared_state[StateField.STOP] == StopReason.NONE
 
     def _open_file(self) -> None:
-        """Start the recorder, which creates the session file; use another name if one exists."""
+        """Start the recorder, which creates the session file; change the name if it is used."""
         process_group = self._group
         realtime_settings = None if self._is_virtual_clock else self._order.profile.realtime
         for _ in range(_MAX_FILE_NAMES):
@@ -378,7 +383,7 @@ class SessionSupervisor:
         raise name_error
 
     def _refused_realtime_settings(self) -> dict[str, str]:
-        """Return name → reason for real-time settings that the system refused.
+        """Return the real-time settings that the system refused: name → reason.
 
         Only settings of the supervisor and of the recorder are included.
         """
@@ -390,7 +395,7 @@ class SessionSupervisor:
         }
 
     def _await_control(self) -> ReadyToRecord | SessionFinished:
-        """Supervise all processes until the control process sends a message, and return that.
+        """Supervise all processes until the control process sends a message; return the message.
 
         A hung control process is killed.
         """
@@ -401,7 +406,7 @@ class SessionSupervisor:
             try:
                 control_message = self._group.control.poll(0.0 if has_waited else _POLL_S)
             except ChildError as error:
-                return self._control_died(str(error))
+                return self._control_died(f"{error} {_WITHOUT_HEARTBEAT_TEXT}")
             self._report()
             now_s = time.monotonic()
             # In lock-step with a simulated rig, a tick may wait for missing replies.
@@ -431,7 +436,7 @@ class SessionSupervisor:
                     self._shared_state[StateField.STOP] = StopReason.NO_RECORDER
 
     def _checked_control_message(self, control_message: object) -> ReadyToRecord | SessionFinished:
-        """Return the message of the control process as ``ReadyToRecord`` or ``SessionFinished``."""
+        """Return a message of the control process, with ``ControlEnded`` as the session's end."""
         match control_message:
             case ControlEnded(reason):  # before the session began
                 session_end = self._control_died(reason)
@@ -452,25 +457,24 @@ class SessionSupervisor:
         raise SessionFailedError(f"The control process answers {control_message}.")
 
     def _kill_control(self, failure_predicate: str) -> SessionFinished:
-        """Kill a hung control process, and return the session's end.
+        """Kill a hung control process, and return the message that ends the session.
 
         The drive's watchdog then switches the torque off.
         """
         self._group.control.kill()
         return self._control_died(
-            f"The control process {failure_predicate} and was killed: without its heartbeat the "
-            "drive switches itself off. Check that it is off."
+            f"The control process {failure_predicate} and was killed. {_WITHOUT_HEARTBEAT_TEXT}"
         )
 
     def _control_died(self, reason: str) -> SessionFinished:
-        """Mark the control process as ended, and return the session's end with the reason."""
+        """Store that the control process has ended; return the message that ends the session."""
         self._is_control_busy = False
         self.device_failed = True
         self._final_drive_state = reason
         return self._finished_from_shared_state(reason)
 
     def _finished_from_shared_state(self, reason: str) -> SessionFinished:
-        """Return the session's end for a dead control process, from counts in shared memory."""
+        """Return the message that a dead control process would have sent at the session's end."""
         tick_counts = self._counts()
         is_complete = covers_reference(
             self._shared_state, tick_counts["scheduled"], self._order.excitation.reference_rad.size
@@ -522,7 +526,7 @@ class SessionSupervisor:
             )
         if isinstance(recorder_message, ProcessFailed):
             self._saved_path = recorder_message.saved_path
-            raise (_FileExistsError if recorder_message.taken else SessionFailedError)(
+            raise (_FileExistsError if recorder_message.is_name_taken else SessionFailedError)(
                 recorder_message.reason
             )
         if not isinstance(recorder_message, reply_type):
@@ -530,7 +534,7 @@ class SessionSupervisor:
         return recorder_message
 
     def _report(self) -> None:
-        """Signal this process's heartbeat, and report progress, events and fits."""
+        """Increment the supervisor's heartbeat, and report progress, events and fits."""
         shared_state = self._shared_state
         if self._can_receive_stop():
             shared_state.beat(StateField.SUPERVISOR_BEAT)
@@ -640,4 +644,4 @@ def can_always_receive_stop() -> bool:
 
 
 def _ignore_stop_request() -> None:
-    """Do nothing when a stop is requested between two sessions, because its flag is read later."""
+    """Do nothing when a stop is requested between two sessions; the request is read later."""

@@ -1,4 +1,4 @@
-"""Signals of a running record for viewers of the daemon, with gauges that show their limits."""
+"""Signals of a running record for viewers of the daemon, with gauges of their peaks and limits."""
 
 import time
 from collections.abc import Iterator
@@ -18,11 +18,11 @@ from rigd.session.layout import decode_samples
 
 _SIGNAL_FIELDS: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
 _MAX_BLOCK_TICKS: Final = 2500
-"""Maximum number of ticks in a block, whose signals in base64 must fit a line of the socket."""
+"""Maximum number of ticks in a block, so that its signals in base64 fit a line of the socket."""
 _MIN_GAUGES_INTERVAL_S: Final = 0.095
-"""Minimum time in seconds between two updates of the gauges, which take more time than signals."""
+"""Minimum time in seconds between two updates of the gauges, which are slow to compute."""
 _ABANDONED_AFTER_S: Final = 1.0
-"""Time in seconds without a call after which the samples in between are skipped."""
+"""Time in seconds between two calls of `take` above which the samples in between are skipped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class SignalBlock:
     """Angle, reference angle and coupling torque by field name, arrays (n,) with NaN at missed
     ticks. They are empty while no record is running."""
     gauges: dict[str, Gauge] | None = None
-    """Peaks since the last gauges, relative to their limits; None if those are recent."""
+    """Peaks since the previous gauges, relative to their limits; None if these are too recent."""
 
     @property
     def count(self) -> int:
@@ -79,7 +79,7 @@ class SignalBlockReader:
     def take(self, channels: Channels) -> list[SignalBlock]:
         """Return the signals since the last call, in blocks of consecutive ticks.
 
-        The last block has gauges if their last update is long enough ago.
+        The last block has gauges if the previous gauges are old enough.
 
         Parameters
         ----------
@@ -121,7 +121,7 @@ class SignalBlockReader:
         return signal_blocks
 
     def _updated_gauges(self) -> dict[str, Gauge] | None:
-        """Return the gauges for the samples since their last update, or None without samples."""
+        """Return the gauges for the samples since the last update, or None if there are none."""
         if not self._samples_since_gauges:
             return None
         sample_array = np.concatenate(self._samples_since_gauges)
@@ -142,7 +142,7 @@ class SignalBlockReader:
                     yield self._signal_block(sample_run)
 
     def _signal_block(self, sample_array: npt.NDArray[Any]) -> SignalBlock:
-        """Return the signals of samples as a block, with NaN at ticks missed before or between."""
+        """Return samples as a block of signals, with NaN at missed ticks before or between them."""
         ticks = sample_array["tick"].astype(np.int64)
         first_tick, newest_tick = int(ticks[0]), int(ticks[-1])
         previous_tick, self._last_tick = self._last_tick, newest_tick
@@ -158,17 +158,17 @@ class SignalBlockReader:
         }
         if sample_array.size != newest_tick - first_tick + 1:
             for signal_name in _SIGNAL_FIELDS:
-                with_gaps = np.full(newest_tick - first_tick + 1, np.nan, dtype=np.float32)
-                with_gaps[ticks - first_tick] = signals[signal_name]
-                signals[signal_name] = with_gaps
+                values_with_gaps = np.full(newest_tick - first_tick + 1, np.nan, dtype=np.float32)
+                values_with_gaps[ticks - first_tick] = signals[signal_name]
+                signals[signal_name] = values_with_gaps
         self._samples_since_gauges.append(sample_array)
         t_ns = int(sample_array["t_ns"][0]) - round((int(ticks[0]) - first_tick) * self._period_ns)
         return SignalBlock(first_tick, t_ns, signals)
 
     def _cooled_torque_nm(self, covered_s: float) -> float:
-        """Return the motor's rms torque (i²t) after cooling for the time that no samples cover.
+        """Return the motor's rms torque (i²t) after it has cooled while there were no samples.
 
-        `covered_s` is the time that samples cover since the last call.
+        `covered_s` is the part of the time since the last call for which there are samples.
         """
         now_s = time.monotonic()
         # Under the virtual clock a record is longer than the elapsed time.

@@ -21,7 +21,7 @@ from rigd.runner._process_group import ProcessGroup
 from rigd.session.layout import decode_samples
 
 _STATISTICS_WINDOW_S: Final = 1.0
-"""Time span of the latest samples, in seconds, from which latency and rate are computed."""
+"""Time span in seconds of the latest samples from which latency and rate are computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class SignalStatus:
 
 
 class SignalStatisticsReader:
-    """Observer that computes statistics from the samples in shared memory.
+    """Reader of the samples in shared memory, which computes statistics of the record.
 
     It may miss samples, and never delays the control loop.
 
@@ -66,8 +66,8 @@ class SignalStatisticsReader:
     def poll(self, ring: Ring) -> Callable[[], SignalStatus] | None:
         """Read the samples since the last call, and return a function that computes statistics.
 
-        Returns None before the first sample. The statistics are computed only when they are needed,
-        which is less often than this call.
+        Returns None before the first sample. The caller computes the statistics only when it needs
+        them, which is less often than it polls.
         """
         if self._ring_and_observer is None or self._ring_and_observer[0] is not ring:
             window_position = max(
@@ -86,7 +86,7 @@ class SignalStatisticsReader:
         return partial(_signal_statistics, self._rate_hz, tuple(self._recent_samples), self._peaks)
 
     def _include_samples(self, samples: npt.NDArray[Any]) -> None:
-        """Update peaks and latest samples with new samples; tick 0 starts another record."""
+        """Update peaks and latest samples with new samples; reset both at tick 0 of a record."""
         if samples.size == 0:
             return
         if samples["tick"][0] == 0:  # another record
@@ -147,7 +147,7 @@ class TopicStatus:
     written: int
     """Number of messages written since the shared memory was allocated."""
     rate_hz: float | None
-    """Number of messages per second since the last call, or None at the first call."""
+    """Number of messages per second since the previous status; None for the first status."""
     expected_hz: float | None
     """Expected number of messages per second during a record, or None if irregular."""
     waiting: int
@@ -197,7 +197,7 @@ class RigStatus:
 
 
 class StatusReader:
-    """Reader of a rig's status, which computes message rates between consecutive calls.
+    """Reader of a rig's status, which computes message rates from one call to the next.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ class StatusReader:
         self._signals = SignalStatisticsReader(rate_hz)
 
     def read(self, group: ProcessGroup) -> RigStatus:
-        """Return the present status of the rig with these processes."""
+        """Return the present status of the rig that these processes operate."""
         shared_state = group.channels.shared_state
         load_ppm = shared_state.known(StateField.BUS_LOAD_PPM)
         return RigStatus(
@@ -242,17 +242,19 @@ class StatusReader:
         previous_s, previous_counts = self._last_time_and_counts or (now_s, written_counts)
         self._last_time_and_counts = now_s, written_counts
         elapsed_s = now_s - previous_s
-        for topic, topic_ring, now, previous_count in zip(
+        for topic, topic_ring, written_count, previous_count in zip(
             TOPICS, topic_rings, written_counts, previous_counts, strict=True
         ):
             # New processes have new rings, whose counts start at 0.
             rate_hz = (
-                (now - previous_count) / elapsed_s
-                if elapsed_s > 0.0 and now >= previous_count
+                (written_count - previous_count) / elapsed_s
+                if elapsed_s > 0.0 and written_count >= previous_count
                 else None
             )
             expected_hz = topic.expected_hz(self._rate_hz)
-            yield TopicStatus(topic.name, now, rate_hz, expected_hz, topic_ring.waiting_count)
+            yield TopicStatus(
+                topic.name, written_count, rate_hz, expected_hz, topic_ring.waiting_count
+            )
 
     def _process_statuses(self, group: ProcessGroup) -> Iterator[ProcessStatus]:
         """Yield the status of each started process, with the time since its last heartbeat."""

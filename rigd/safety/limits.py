@@ -78,7 +78,7 @@ class Limits:
     stale_percent: PercentageBelow100 = field(default=1.0, metadata={"optional": True})
     """Largest percentage of old angles, and of old wrenches, in the ticks scheduled so far.
 
-    It is counted as for `missed_percent`. ``analyze`` accepts no record with more than 1 %."""
+    It is counted as for `missed_percent`. ``analyze`` accepts no record with more than 5 %."""
     tip_slope_rad: Positive = field(default=SMALL_SLOPE_RAD, metadata={"optional": True})
     """Largest slope of the antenna's tip that an identification may cause.
 

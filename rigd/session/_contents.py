@@ -1,4 +1,4 @@
-"""Contents of a session file, and how much of a damaged one can be recovered by which command."""
+"""Contents of a session file, and advice on what can be recovered from a damaged one."""
 
 import mmap
 import os
@@ -19,7 +19,7 @@ from rigd.session._writer import PART_SUFFIX
 _SESSION_SUFFIX: Final = ".mcap"
 _RECOVERED_SUFFIX: Final = ".recovered.mcap"
 _SEARCHED_BYTES: Final = 1 << 20
-"""Number of bytes at the start of a file in which its first samples lie, if there are any."""
+"""Number of bytes at the start of a file that contain the first sample, if there is one."""
 
 
 def load_contents(
@@ -32,8 +32,8 @@ def load_contents(
 ) -> McapContents:
     """Return the contents of an MCAP file up to its end or its first damage.
 
-    The arguments are those of `rigd.session._mcap_reader.read_mcap`. Raises SessionError if the
-    file is missing, empty, too large or not an MCAP file.
+    The other arguments are those of `rigd.session._mcap_reader.read_mcap`. Raises SessionError if
+    the file is missing, empty, too large or not an MCAP file.
     """
     with open_mcap_file(path) as file:
         mapped_file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
@@ -74,7 +74,7 @@ def open_mcap_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def _require_nonempty_file(path: Path) -> None:
-    """Raise if the path is not that of a regular file, or if the file is empty."""
+    """Raise if a path is not the path of a regular file, or if the file is empty."""
     file_status = path.stat()
     if not stat.S_ISREG(file_status.st_mode):
         raise SessionError(f"{path} is not a file. Give the path of a session file (*.mcap).")
@@ -83,7 +83,7 @@ def _require_nonempty_file(path: Path) -> None:
 
 
 def _access_error(path: Path, error: OSError) -> SessionAccessError:
-    """Return the error for a file that the operating system does not let the program read."""
+    """Return the error for a file that the operating system does not allow to be read."""
     return SessionAccessError(
         f"{path} cannot be read: {error.strerror or error}. Check the path and its permissions."
     )
@@ -98,9 +98,9 @@ def _format_error(path: Path, error: McapError) -> SessionError:
 
 
 def recovered_path(path: Path) -> Path:
-    """Return the path of the recovered file: ``X.mcap`` for ``X.mcap.part``.
+    """Return the path of the file to which a damaged file is recovered.
 
-    For ``X.mcap`` the path is ``X.recovered.mcap``.
+    It is ``X.mcap`` for ``X.mcap.part``, and ``X.recovered.mcap`` for ``X.mcap``.
     """
     if path.name.endswith(_SESSION_SUFFIX + PART_SUFFIX):
         return path.with_name(path.name.removesuffix(PART_SUFFIX))
@@ -110,8 +110,8 @@ def recovered_path(path: Path) -> Path:
 def may_contain_samples(path: Path) -> bool:
     """Return whether `recover` may find a sample in a file.
 
-    Only the first mebibyte is searched. The result is True for a longer MCAP file, and for a file
-    that cannot be opened.
+    Only the first mebibyte is searched. A longer MCAP file, and a file that cannot be opened, may
+    contain samples.
     """
     try:
         with path.open("rb") as file:
@@ -127,10 +127,10 @@ def may_contain_samples(path: Path) -> bool:
 
 
 def recovery_advice(path: Path, *, was_whole: bool) -> str:
-    """Return the end of an error message: how much of a damaged file is intact and recoverable.
+    """Return the end of an error message on a damaged file: what is intact, and how to recover it.
 
     The text begins with the punctuation mark that follows the description of the damage.
-    `was_whole` states whether the file was complete once, so that an intact copy may exist.
+    `was_whole` states that the file was once complete, so that an intact copy may exist.
     """
     try:
         sample_count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)

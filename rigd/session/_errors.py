@@ -4,7 +4,7 @@ from rigd.errors import FailureError
 
 
 class SessionError(FailureError):
-    """Raised if a session file cannot be read or written; its text names file and remedy."""
+    """Raised if a session file cannot be read or written; the text states file and remedy."""
 
 
 class SessionAccessError(SessionError):

@@ -25,7 +25,7 @@ _RECOVERY_KEY_PREFIX: Final = "recovered_"
 _MAX_METADATA_CHARACTERS: Final = 200_000
 """Maximum number of characters of the metadata that are shown."""
 _ENTRY_OVERHEAD_CHARACTERS: Final = 120
-"""Number of characters that the text or JSON form adds to an entry, such as quotes and spaces."""
+"""Number of characters, such as quotes and spaces, that the text or JSON form adds to an entry."""
 _MAX_KEY_CHARACTERS: Final = 200
 """Maximum number of characters of a key that are shown."""
 _MAX_TEXT_CHARACTERS: Final = 50_000
@@ -40,9 +40,9 @@ _START_KEY: Final = f"start{_UTC_KEY_SUFFIX}"
 _SIGNIFICANT_DIGITS: Final = 6
 """Number of significant digits with which numbers of the metadata are shown."""
 _TARE_DIGITS: Final = 3
-"""Number of significant digits of a tare: further digits are noise in half a second."""
+"""Number of significant digits of a tare; more digits of a mean over half a second are noise."""
 _MAX_ROUNDED_CHARACTERS: Final = 200
-"""Maximum number of characters of a list of numbers that is rounded."""
+"""Maximum number of characters of a number or a list of numbers that is shown rounded."""
 _MAX_COUNT_DIGITS: Final = 12
 """Maximum number of digits of a tick count, which is enough for thirty years at 1 kHz."""
 
@@ -64,8 +64,8 @@ class SessionInfo:
     samples: int
     """Number of samples in the file."""
     ticks: int
-    """Number of ticks from the first recorded tick to the last, or the number of scheduled ticks if
-    that is larger."""
+    """Number of ticks from the first to the last recorded tick, or the number of scheduled ticks if
+    this is larger."""
     duration_s: float
     """Duration of the session: `ticks` at the nominal sample rate."""
     missing_ticks: int
@@ -230,9 +230,9 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
 
 
 def _missing_samples_sentence(session: Session) -> str:
-    """Return a sentence on samples that outcome or segments state but a trimmed file lacks.
+    """Return a sentence on the samples that were cut off from a file; empty if none were.
 
-    Returns an empty text if no sample is missing.
+    Samples are missing if the file has fewer than its record ``outcome`` or its segments state.
     """
     ticks = session.samples["tick"]
     stated_count = (session.outcome or {}).get("recorded", "")
@@ -244,11 +244,14 @@ def _missing_samples_sentence(session: Session) -> str:
             "that were "
             f"recorded are not in this file ({present_text}): it was trimmed. Take the original."
         )
-    first, end_of_samples = (int(ticks[0]), int(ticks[-1]) + 1) if len(ticks) else (0, 0)
+    first_present_tick, present_end_tick = (
+        (int(ticks[0]), int(ticks[-1]) + 1) if len(ticks) else (0, 0)
+    )
     incomplete_segments = [
         segment_name
         for segment_name, (first_tick, end_tick) in session.segments.items()
-        if end_tick > first_tick and (first_tick < first or end_tick > end_of_samples)
+        if end_tick > first_tick
+        and (first_tick < first_present_tick or end_tick > present_end_tick)
     ]
     if incomplete_segments and (session.outcome or {}).get("outcome") == "complete":
         return (
@@ -264,7 +267,7 @@ def _is_count(text: str) -> bool:
 
 
 def _shortened(long_text: str, max_characters: int) -> str:
-    """Return the first characters of a text, followed by the number of omitted characters."""
+    """Return a text cut to `max_characters`, then the number of omitted characters."""
     if len(long_text) <= max_characters:
         return long_text
     return f"{long_text[:max_characters]}… and {len(long_text) - max_characters} more characters"
@@ -278,11 +281,11 @@ def readable_texts(
     Parameters
     ----------
     file_texts : key → text, of any number and length
-    entries_noun : plural noun for the texts, for the line on omitted ones
+    entries_noun : plural noun for the texts, for the line on omitted texts
 
     Returns
     -------
-    The first texts by their keys, and a list with a line on the omitted texts, if there are any.
+    The first texts (key → text), and a list with a line on the omitted texts, if there are any.
     """
     omission_texts: list[str] = []
     shown_texts = _EntryLimiter(entries_noun, _MAX_METADATA_CHARACTERS, omission_texts).texts(
@@ -294,11 +297,11 @@ def readable_texts(
 
 
 class _EntryLimiter:
-    """Cuts one kind of a file's entries, such as its events, to a total number of characters.
+    """Limiter of the entries of one kind, such as events, to a total number of characters.
 
     `entries_noun` is a plural noun for the entries. `max_characters` is the maximum number of
-    characters in
-    text or JSON form. A line on omitted entries is appended to `omission_texts`.
+    characters of all entries in text or JSON form. A line on omitted entries is appended to
+    `omission_texts`.
     """
 
     def __init__(self, entries_noun: str, max_characters: int, omission_texts: list[str]) -> None:
@@ -345,7 +348,7 @@ class _EntryLimiter:
         return shown_events
 
     def _fits(self, *texts: str) -> bool:
-        """Return whether another entry fits; subtract its length from the available length."""
+        """Return whether an entry with these texts fits, and count its characters."""
         # A character may take twelve characters in JSON, and both forms add some to a text.
         self._remaining_characters -= (
             sum(len(json.dumps(text)) for text in texts) + _ENTRY_OVERHEAD_CHARACTERS
@@ -353,7 +356,7 @@ class _EntryLimiter:
         return self._remaining_characters >= 0
 
     def _report_omitted(self, omitted_count: int) -> None:
-        """Append a line on `omitted_count` omitted entries, unless there are none."""
+        """Append a line that states the number of omitted entries, unless it is 0."""
         if omitted_count:
             self._omission_texts.append(
                 f"… and {omitted_count} more {self._entries_noun} not shown"
@@ -361,7 +364,7 @@ class _EntryLimiter:
 
 
 def _status_counts(session: Session) -> dict[str, int]:
-    """Return name of a status flag → number of samples with it, for flags that occur."""
+    """Return the number of samples with each status flag that occurs: flag name → number."""
     status_flags = session.samples["status"]
     flag_counts = {
         flag.name or "": int(np.count_nonzero(status_flags & flag.value)) for flag in Status
@@ -374,17 +377,17 @@ def _status_counts(session: Session) -> dict[str, int]:
 
 
 def _iso_text(utc_ns: int) -> str:
-    """Return a time given in nanoseconds since the Unix epoch as ISO 8601 text."""
+    """Return a time in nanoseconds since the Unix epoch as ISO 8601 text."""
     return _utc_datetime(utc_ns).isoformat(timespec="microseconds")
 
 
 def _utc_datetime(utc_ns: int) -> datetime:
-    """Return a time given in nanoseconds since the Unix epoch as a UTC datetime."""
+    """Return a time in nanoseconds since the Unix epoch as a UTC datetime."""
     return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
 
 
 def _outcome_rows(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[str, str]]:
-    """Yield the rows (title, text) for the record ``outcome``, with its touches and its fit."""
+    """Yield the rows (title, text) for the record ``outcome``, with touches and fitted modes."""
     shown_keys = {"outcome", "reason", "touches", "fit"}
     shown_keys |= {_RECOVERY_KEY_PREFIX + key for key in _recovery_items(outcome)}
     outcome_text = outcome.get("outcome", "unknown")
@@ -407,9 +410,9 @@ def _outcome_rows(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[
 
 
 def _rounded_row(key: str, metadata_value: str) -> tuple[str, str]:
-    """Return a metadata key and its value for a row of text, with rounded numbers and units.
+    """Return a metadata key and value for a row of text, with rounded numbers and units.
 
-    A value that is not a number or a list of numbers is returned unchanged.
+    A value that is neither a number nor a list of numbers is returned unchanged.
     """
     if len(metadata_value) > _MAX_ROUNDED_CHARACTERS:
         return key, metadata_value
@@ -436,7 +439,7 @@ def _time_text(time_utc: datetime) -> str:
 
 
 def _recovery_items(outcome: dict[str, str]) -> dict[str, str]:
-    """Return the items of the record ``outcome`` that a recovery added, without the key prefix."""
+    """Return the entries of the record ``outcome`` that a recovery added, without key prefix."""
     return {
         key.removeprefix(_RECOVERY_KEY_PREFIX): outcome_value
         for key, outcome_value in outcome.items()

@@ -16,21 +16,21 @@ from mcap.opcode import Opcode
 from rigd.session import limits
 from rigd.session.layout import Buffer
 
-MAX_SKIPPED: Final = 20
+MAX_SKIPPED_TEXTS: Final = 20
 """Maximum number of damaged records that are described one by one."""
 
 CHUNK_STEPS: Final = 20
-"""Number of steps of work, of `MAX_STEPS`, for which a chunk counts."""
+"""Number of steps of work, out of `MAX_STEPS`, that reading a chunk costs."""
 DECLARATION_STEPS: Final = 15
-"""Number of steps of work, of `MAX_STEPS`, for which a schema, channel or attachment counts."""
+"""Number of steps of work, out of `MAX_STEPS`, that a schema, channel or attachment costs."""
 
 _DECLARATION_MEMORY_BYTES: Final = 1000
-"""Approximate memory in bytes of the Python object for one declaration, however short it is."""
+"""Approximate memory in bytes of the Python object for a declaration of any length."""
 
 MAX_UNPACKED_BYTES: Final = 4 << 20
-"""Size in bytes up to which a chunk is decompressed at once; a longer one is read in such parts."""
+"""Maximum size in bytes of a chunk that is decompressed at once, and of a longer chunk's parts."""
 _LZ4_INPUT_BYTES: Final = 1 << 18
-"""Number of compressed bytes that the LZ4 decompressor gets at once."""
+"""Number of compressed bytes that are passed to the LZ4 decompressor at once."""
 _MAX_ZSTD_WINDOW_BYTES: Final = 32 << 20
 """Maximum memory in bytes of the Zstandard decompressor's window."""
 
@@ -57,17 +57,17 @@ class McapDamageError(Exception):
 
 
 class ReadingBudget:
-    """Counters of the work and memory for reading one MCAP file, which raise beyond the limits."""
+    """Counters of work and memory for one MCAP file, which raise an error above the limits."""
 
     def __init__(self) -> None:
         self._used_steps = 0
         self._unpacked_bytes = 0
         self._declared_bytes = 0
         self._declared_text_bytes = 0
-        self._count_keys = 0
+        self._key_count = 0
 
     def count_steps(self, steps: int) -> None:
-        """Count steps of work; raise McapTooLargeError beyond `MAX_STEPS` for the file."""
+        """Count steps of work; raise McapTooLargeError if the file exceeds `MAX_STEPS`."""
         self._used_steps += steps
         if self._used_steps > limits.MAX_STEPS:
             raise McapTooLargeError(
@@ -90,16 +90,16 @@ class ReadingBudget:
             )
 
     def count_declared(self, opcode: int, record_content: Buffer, location_text: str) -> None:
-        """Count the memory of a schema, channel, metadata record or attachment before it is parsed.
+        """Count the memory of a schema, channel, metadata record or attachment before parsing.
 
-        `location_text` ends the error message. Raises McapError if there are too many such records
-        in the file, or if they are too long.
+        `location_text` ends the error message. Raises McapError if the file has too many such
+        records, or too long ones.
         """
         self._declared_bytes += len(record_content) + _DECLARATION_MEMORY_BYTES
         if opcode != Opcode.ATTACHMENT:
             self._declared_text_bytes += len(record_content)
         if opcode in (Opcode.METADATA, Opcode.CHANNEL):
-            self._count_keys += _count_keys(record_content, opcode, limits.MAX_ENTRIES)
+            self._key_count += _count_keys(record_content, opcode, limits.MAX_ENTRIES)
         for used_bytes, max_bytes, unit_text in (
             (
                 self._declared_bytes,
@@ -117,14 +117,14 @@ class ReadingBudget:
                     "declares channels, schemas, metadata and attachments without limit: more than "
                     f"{max_bytes >> 20} {unit_text}{location_text}"
                 )
-        if self._count_keys > limits.MAX_ENTRIES:
+        if self._key_count > limits.MAX_ENTRIES:
             raise McapError(
                 f"has more than {limits.MAX_ENTRIES} keys in its metadata{location_text}"
             )
 
 
 def zstd_decompressor() -> zstandard.ZstdDecompressor:
-    """Return a Zstandard decompressor, which is used for all chunks of a file to save time."""
+    """Return a Zstandard decompressor; one decompressor is used for all chunks of a file."""
     return zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW_BYTES)
 
 
@@ -146,7 +146,7 @@ def decompressed_chunk(
     packed_bytes
         Compressed content of the chunk.
     unpacked_bytes
-        Length of the decompressed content in bytes, as the chunk states it.
+        Length of the decompressed content in bytes that the chunk states.
     location_text
         Position of the chunk, for error messages.
 
@@ -184,8 +184,8 @@ def decompressed_parts(
 ) -> Iterator[Buffer]:
     """Yield the decompressed content of a long chunk in parts.
 
-    The parts together may exceed `stated_bytes` by one part. Parameters and errors are those of
-    :func:`decompressed_chunk`, but the caller compares the length.
+    All parts together may be longer than `stated_bytes` by one part, because the caller compares
+    the length. Otherwise parameters and errors are those of :func:`decompressed_chunk`.
     """
     unpacked_bytes = 0
     try:
@@ -219,9 +219,9 @@ def decompressed_parts(
 
 
 def _check_zstd_size(packed_bytes: memoryview, chunk_bytes: int, location_text: str) -> None:
-    """Raise if the Zstandard frame states another size than the chunk.
+    """Raise if the Zstandard frame of a chunk states another size than the chunk.
 
-    The decompressor would allocate the size that the frame states.
+    The decompressor would allocate the memory that the frame states.
     """
     stated_size = zstandard.get_frame_parameters(packed_bytes).content_size
     if stated_size not in (chunk_bytes, zstandard.CONTENTSIZE_UNKNOWN):
@@ -231,9 +231,9 @@ def _check_zstd_size(packed_bytes: memoryview, chunk_bytes: int, location_text: 
 def read_prefixed_bytes(
     record_content: memoryview, position: int, length_format: str
 ) -> tuple[memoryview, int]:
-    """Return the bytes that follow a length field at `position`, and the offset of their end.
+    """Return the bytes after the length field at `position`, and the offset where they end.
 
-    `length_format` is the length field's format for the module ``struct``.
+    `length_format` is the format of the length field for the module ``struct``.
     """
     (byte_count,) = struct.unpack_from(length_format, record_content, position)
     bytes_start = position + struct.calcsize(length_format)
@@ -243,7 +243,7 @@ def read_prefixed_bytes(
 
 
 def _count_keys(record_content: Buffer, opcode: int, max_count: int) -> int:
-    """Return the number of keys in the map of a metadata or channel record, up to `max_count` + 1.
+    """Return the number of keys in a metadata or channel record, counted up to `max_count` + 1.
 
     Counting ends at a malformed entry, which raises an error when the record is parsed.
     """

@@ -1,12 +1,11 @@
 """Reader of MCAP files that checks every length and verifies every checksum.
 
-The data section is read from its beginning, record by record, which takes a millisecond for the
-chunks of a session. This reads files with any size of chunks, with or without a summary, and finds
-how far a truncated file is readable. Messages are passed on block by block and not stored.
-Consecutive messages of equal length, as in a session, are passed on as one run of bytes.
+The data section is read from its beginning, record by record. The reader therefore needs no summary
+section, accepts chunks of any size, and finds where a truncated file ends. Messages are passed on
+block by block and not stored. Consecutive messages of equal length, as in a session, are passed on
+as one run of bytes.
 
-Every length and number in the file is checked before use, and reading stays within fixed limits of
-memory and time
+Every length and number in the file is checked before use. Memory and time for a file are limited
 (:mod:`rigd.session._mcap_limits`).
 """
 
@@ -30,7 +29,7 @@ from rigd.session import limits
 from rigd.session._mcap_limits import (
     CHUNK_STEPS,
     DECLARATION_STEPS,
-    MAX_SKIPPED,
+    MAX_SKIPPED_TEXTS,
     MAX_UNPACKED_BYTES,
     McapDamageError,
     McapError,
@@ -57,19 +56,19 @@ _CHANNEL_NUMBER_FORMAT: Final = struct.Struct("<H")
 FOOTER_FORMAT: Final = struct.Struct("<BQ QQI")
 _FOOTER_CONTENT_SIZE: Final = 20
 _MAX_GROUP_MESSAGES: Final = 250
-"""Maximum number of messages outside of chunks that are treated like one chunk."""
+"""Maximum number of messages outside of chunks that are treated as a group, like a chunk."""
 _MAX_SINGLE_COMPARISONS: Final = 8
-"""Number of messages that are compared one by one before an array comparison is faster."""
+"""Number of messages that are compared one by one; for more, an array comparison is faster."""
 _FIRST_COMPARISON_MESSAGES: Final = 256
 """Number of messages in the first array comparison of `_run_length`."""
 _MAX_BLOCK_RUNS: Final = 1 << 16
 """Maximum number of runs that are passed on in one block."""
 _RELEASE_INTERVAL_BYTES: Final = 32 << 20
-"""Number of bytes after which the memory of the part already read is released."""
+"""Number of bytes after which the memory of the file's part that was read is released."""
 
 _Record = TypeVar("_Record")
-Run = tuple[int, int, int, int]
-"""Consecutive messages of equal length: channel number, length of one message record in bytes with
+MessageRun = tuple[int, int, int, int]
+"""Consecutive messages of equal length: channel number, length in bytes of each message record with
 its head, offset of the first record in the buffer, and number of messages."""
 
 
@@ -79,8 +78,8 @@ class MessageBlock:
 
     records: Buffer
     """Bytes of the message records; the reader retains no reference to them."""
-    runs: list[Run]
-    """Runs of messages of the wanted topics, in the order of the file."""
+    runs: list[MessageRun]
+    """Runs of messages of the requested topics, in the order of the file."""
     chunk_position: int
     """Offset in the file of the chunk with these messages, or of the first of up to 250 messages
     outside of chunks."""
@@ -98,12 +97,12 @@ class McapContents:
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     message_counts: dict[int, int] = field(default_factory=lambda: defaultdict(int))
-    """Channel number → number of messages read, of wanted and unwanted topics."""
+    """Channel number → number of messages read, including topics that were not requested."""
     declared_in_chunks: set[int] = field(default_factory=set)
-    """Numbers of the channels that were declared in chunks, where a checksum covers them."""
+    """Numbers of the channels that were declared in chunks, and are covered by a checksum there."""
     skipped: list[str] = field(default_factory=list)
     """Descriptions of the damaged records that were skipped, each the end of a sentence that begins
-    with the file's name. The last one states how many more there are than `MAX_SKIPPED`."""
+    with the file's name. The last one states how many more there are than `MAX_SKIPPED_TEXTS`."""
     stated_counts: dict[int, int] = field(default_factory=dict)
     """Channel number → number of messages that the file's statistics state, for a damaged file read
     in salvage mode. It is empty for a sound file and if the statistics are damaged."""
@@ -114,9 +113,8 @@ class McapContents:
     complete: bool = False
     """Whether the file ends with the footer and the magic bytes of a complete MCAP file."""
     damage: str | None = None
-    """Why and where reading stopped, as the end of a sentence that begins with the file's name.
-
-    None if the file was read to a sound end."""
+    """Description of the damage at which reading stopped, as the end of a sentence that begins with
+    the file's name. None if the whole file was read."""
 
     def count(self, topic: str) -> int:
         """Return the number of messages of a topic that were read."""
@@ -127,7 +125,7 @@ class McapContents:
 
 
 def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return the byte offset of each message in a buffer in which the runs follow one another.
+    """Return the byte offset of each message in a buffer that consists of consecutive runs.
 
     Parameters
     ----------
@@ -149,7 +147,7 @@ def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 OnBlock = Callable[[McapContents, MessageBlock], None]
-"""Callback for each block of messages; it also gets the contents that were read before it."""
+"""Callback for each block of messages; its first argument is the contents read so far."""
 
 
 def read_mcap(
@@ -165,10 +163,10 @@ def read_mcap(
     Parameters
     ----------
     file_data : bytes of the file; pages of an ``mmap`` are released when they have been read
-    topics : topics whose messages are wanted; None for all
+    topics : topics whose messages are passed to `on_block`; None for all
     on_block
-        Called with the wanted messages, block by block in the order of the file, before it is known
-        whether the rest of the file is damaged.
+        Called with the messages of `topics`, block by block in the order of the file, before it is
+        known whether the rest of the file is damaged.
     salvage
         Read as much as possible: skip damaged records outside of chunks on which no message
         depends, and read the statistics of a damaged file.
@@ -219,7 +217,7 @@ def _has_footer(file_data: memoryview) -> bool:
 
 
 def _locate_record(data: Buffer, position: int, location_text: str) -> tuple[int, int, int]:
-    """Return the opcode of the record at byte `position`, and where its content starts and ends.
+    """Return the opcode of the record at byte `position`, and start and end of its content.
 
     `location_text` ends the error message for a truncated record.
     """
@@ -241,12 +239,12 @@ def _truncated_record_error(position: int, location_text: str) -> McapDamageErro
 
 
 def _missing_record_error(position: int, location_text: str) -> McapDamageError:
-    """Return the error for bytes that are not a record, although one must begin there."""
+    """Return the error for a position at which a record must begin but does not."""
     return McapDamageError(f"has no record where one must be, at byte {position}{location_text}")
 
 
 class _ContainerReader:
-    """Reads an MCAP file once from its start, with the arguments of `read_mcap`."""
+    """Reader of one MCAP file from its start, with the arguments of `read_mcap`."""
 
     def __init__(
         self,
@@ -261,12 +259,12 @@ class _ContainerReader:
         self._data = data
         self._topics = topics
         self._on_block = on_block
-        self._is_wanted: dict[int, bool] = {}  # channel → whether its messages are wanted
+        self._wanted_by_channel: dict[int, bool] = {}  # channel → whether its messages are wanted
         self._budget = ReadingBudget()
         self._zstd = zstd_decompressor()
         self._skipped = 0
         self._group_position = 0  # offset of the first of a group of messages outside of chunks
-        self._group_room = 0  # how many more messages can join that group
+        self._remaining_group_messages = 0  # how many more messages can join that group
         self._declarations: dict[tuple[int, bytes], bytes] = {}  # opcode and number → content
         self._crc = 0
         self._released_end = 0  # end of the part whose checksum is computed and memory released
@@ -277,10 +275,10 @@ class _ContainerReader:
         end = len(MAGIC)
         while end < len(data):
             start = end
-            opcode, content, end = _locate_record(data, start, "")
+            opcode, content_start, end = _locate_record(data, start, "")
             self._budget.count_steps(1)
             if opcode == Opcode.CHUNK:
-                self._read_chunk(data[content:end], start)
+                self._read_chunk(data[content_start:end], start)
                 if on_progress is not None:
                     on_progress(end / len(data))
             elif opcode == Opcode.MESSAGE:
@@ -288,7 +286,7 @@ class _ContainerReader:
                 if on_progress is not None:
                     on_progress(end / len(data))
             elif opcode == Opcode.DATA_END:
-                self._check_data_end(data[content:end], start)
+                self._check_data_end(data[content_start:end], start)
                 contents.intact_bytes = end
                 self._check_summary(end)
                 contents.intact_bytes = len(data)
@@ -297,7 +295,7 @@ class _ContainerReader:
                 break
             else:
                 try:
-                    self._read_declaration(opcode, data[content:end], f" at byte {start}")
+                    self._read_declaration(opcode, data[content_start:end], f" at byte {start}")
                 except McapDamageError as error:
                     if not self._salvage:
                         raise
@@ -308,12 +306,12 @@ class _ContainerReader:
         raise McapDamageError("has no end of its data section")
 
     def _add_skipped(self, damage_text: str) -> None:
-        """Store the description of a skipped record; beyond `MAX_SKIPPED` store a count only."""
+        """Store the description of a skipped record, or count it beyond `MAX_SKIPPED_TEXTS`."""
         self._skipped += 1
         skipped_texts = self.contents.skipped
-        if self._skipped > MAX_SKIPPED:
-            del skipped_texts[MAX_SKIPPED:]
-            damage_text = f"has {self._skipped - MAX_SKIPPED} more damaged records"
+        if self._skipped > MAX_SKIPPED_TEXTS:
+            del skipped_texts[MAX_SKIPPED_TEXTS:]
+            damage_text = f"has {self._skipped - MAX_SKIPPED_TEXTS} more damaged records"
         skipped_texts.append(damage_text)
 
     def _release_up_to(self, end: int) -> None:
@@ -331,7 +329,7 @@ class _ContainerReader:
         return crc
 
     def _release_pages(self) -> None:
-        """Release the pages of the mapped file, which would count as memory of the process."""
+        """Release the memory pages of the mapped file, which count as memory of the process."""
         mapped_file = self._data.obj
         if len(self._data) > _RELEASE_INTERVAL_BYTES and isinstance(mapped_file, mmap.mmap):
             mapped_file.madvise(mmap.MADV_DONTNEED)
@@ -347,17 +345,25 @@ class _ContainerReader:
         if self._is_stray_message(_RUN_HEAD_FORMAT.unpack_from(self._data, start)[2]):
             # The writing program uses chunks: this is another record, with a damaged opcode.
             raise McapDamageError(f"has a message outside of a chunk{location_text}")
-        if self._group_room == 0:
-            self._group_position, self._group_room = start, _MAX_GROUP_MESSAGES
+        if self._remaining_group_messages == 0:
+            self._group_position, self._remaining_group_messages = start, _MAX_GROUP_MESSAGES
         limit_position = min(len(self._data), max(first_end, start + MAX_UNPACKED_BYTES))
         end, message_count = self._read_messages(
-            self._data, start, limit_position, self._group_position, location_text, self._group_room
+            self._data,
+            start,
+            limit_position,
+            self._group_position,
+            location_text,
+            self._remaining_group_messages,
         )
-        self._group_room -= message_count
+        self._remaining_group_messages -= message_count
         return end
 
     def _is_stray_message(self, channel: int) -> bool:
-        """Return whether a message outside of chunks belongs to a channel declared in chunks."""
+        """Return whether a message outside of chunks is treated as damage in salvage mode.
+
+        It is if its channel was declared in chunks.
+        """
         return self._salvage and channel in self.contents.declared_in_chunks
 
     def _read_declaration(self, opcode: int, record_content: Buffer, location_text: str) -> None:
@@ -384,7 +390,9 @@ class _ContainerReader:
                 raise McapDamageError(
                     f"declares channel {channel.id} twice, differently{location_text}"
                 )
-            self._is_wanted[channel.id] = self._topics is None or channel.topic in self._topics
+            self._wanted_by_channel[channel.id] = (
+                self._topics is None or channel.topic in self._topics
+            )
             self._declarations[declaration_key] = bytes(record_content)
         elif opcode == Opcode.METADATA:
             mcap_contents.metadata.append(
@@ -446,7 +454,7 @@ class _ContainerReader:
     ) -> None:
         """Read the records of a chunk that arrives in parts; a record may span several parts."""
         remainder = b""  # beginning of a record whose end is in a later part
-        remainder_offset = 0  # offset of `rest` in the chunk
+        remainder_offset = 0  # offset of `remainder` in the chunk
         bytes_to_skip = 0  # remaining bytes of an unwanted record
         for record_part in record_parts:
             self._release_pages()
@@ -472,14 +480,14 @@ class _ContainerReader:
             raise _truncated_record_error(remainder_offset, location_text)
 
     def _skippable_bytes(self, records: bytes, buffer_offset: int, location_text: str) -> int:
-        """Return the length of the first record in bytes if it can be skipped, else 0."""
+        """Return the length in bytes of a buffer's first record if it can be skipped, else 0."""
         opcode, length, channel = _RUN_HEAD_FORMAT.unpack_from(records)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             if length > limits.MAX_TEXT_BYTES:
                 raise _truncated_record_error(buffer_offset, location_text)
             return 0
         if opcode == Opcode.MESSAGE:
-            if self._is_wanted.get(channel, True) and self._is_accepted_length(
+            if self._wanted_by_channel.get(channel, True) and self._is_accepted_length(
                 length, location_text
             ):
                 return 0
@@ -487,9 +495,9 @@ class _ContainerReader:
         return int(length) + RECORD_HEAD_FORMAT.size
 
     def _is_accepted_length(self, message_length: int, location_text: str) -> bool:
-        """Return whether a message is within the maximum length; record a longer one as skipped.
+        """Return whether a message does not exceed the maximum length.
 
-        Raises McapDamageError for a longer message unless in salvage mode.
+        For a longer message, store in salvage mode that it is skipped, else raise McapDamageError.
         """
         if message_length <= limits.MAX_MESSAGE_BYTES:
             return True
@@ -505,33 +513,33 @@ class _ContainerReader:
     def _read_records(
         self, records: bytes, buffer_offset: int, chunk_position: int, location_text: str
     ) -> int:
-        """Read the complete records of a buffer, and return the offset where the rest begins.
+        """Read the complete records of a buffer, and return the offset where the last one ends.
 
         `buffer_offset` is the offset of the buffer in its chunk.
         """
         end = 0
         while end < len(records):
-            content_start = end
+            record_start = end
             end, message_count = self._read_messages(
-                records, content_start, len(records), chunk_position, location_text
+                records, record_start, len(records), chunk_position, location_text
             )
             if message_count:
                 continue
-            if content_start + RECORD_HEAD_FORMAT.size > len(records):
-                return content_start
-            opcode, length = RECORD_HEAD_FORMAT.unpack_from(records, content_start)
+            if record_start + RECORD_HEAD_FORMAT.size > len(records):
+                return record_start
+            opcode, length = RECORD_HEAD_FORMAT.unpack_from(records, record_start)
             if opcode == 0:
-                raise _missing_record_error(buffer_offset + content_start, location_text)
-            record_content = content_start + RECORD_HEAD_FORMAT.size
-            end = record_content + length
+                raise _missing_record_error(buffer_offset + record_start, location_text)
+            content_start = record_start + RECORD_HEAD_FORMAT.size
+            end = content_start + length
             if end > len(records):
-                return content_start
+                return record_start
             self._budget.count_steps(1)
             if opcode == Opcode.MESSAGE:
                 raise McapDamageError(f"has a message that is too short{location_text}")
-            self._read_declaration(opcode, records[record_content:end], location_text)
+            self._read_declaration(opcode, records[content_start:end], location_text)
             if opcode == Opcode.CHANNEL:
-                (channel,) = _CHANNEL_NUMBER_FORMAT.unpack_from(records, record_content)
+                (channel,) = _CHANNEL_NUMBER_FORMAT.unpack_from(records, content_start)
                 self.contents.declared_in_chunks.add(channel)
         return end
 
@@ -544,14 +552,14 @@ class _ContainerReader:
         location_text: str,
         max_messages: int | None = None,
     ) -> tuple[int, int]:
-        """Pass the messages from `start` to the callback, up to another record or `limit_position`.
+        """Pass the messages from `start` on to the callback, at most up to `limit_position`.
 
-        `max_messages` limits the number of messages outside of chunks. Returns the offset after the
-        last message, and the number of messages.
+        Reading stops before a record of another kind. `max_messages` limits the number of messages
+        outside of chunks. Returns the offset after the last message, and the number of messages.
         """
         unpack_run_head = _RUN_HEAD_FORMAT.unpack_from
-        wanted_by_channel, message_counts = self._is_wanted, self.contents.message_counts
-        message_runs: list[Run] = []
+        wanted_by_channel, message_counts = self._wanted_by_channel, self.contents.message_counts
+        message_runs: list[MessageRun] = []
         position = start
         message_count = run_count = 0  # number of messages, and number of runs of messages
         try:
@@ -605,7 +613,7 @@ class _ContainerReader:
         return position, message_count
 
     def _check_data_end(self, content: memoryview, start: int) -> None:
-        """Verify the checksum over the data section, which its last record contains."""
+        """Verify the checksum over the data section; `content` is the record with the checksum."""
         if len(content) < 4:
             raise McapDamageError(f"has a malformed end of its data section at byte {start}")
         (crc,) = struct.unpack_from("<I", content)
@@ -648,14 +656,14 @@ class _ContainerReader:
         """Yield opcode and content of each record between `start` and `footer_position`."""
         data, end, released_end = self._data[:footer_position], start, start
         while end < footer_position:
-            opcode, record_content, end = _locate_record(data, end, " of the summary")
+            opcode, content_start, end = _locate_record(data, end, " of the summary")
             if end - released_end > _RELEASE_INTERVAL_BYTES:
                 released_end = end
                 self._release_pages()
             # Each channel in the statistics takes time.
             is_statistics = opcode == Opcode.STATISTICS
-            self._budget.count_steps(1 + (end - record_content) // 4 if is_statistics else 1)
-            yield opcode, data[record_content:end]
+            self._budget.count_steps(1 + (end - content_start) // 4 if is_statistics else 1)
+            yield opcode, data[content_start:end]
 
     def stated_counts(self) -> dict[int, int]:
         """Return the message count of each channel from the file's statistics.
@@ -694,12 +702,12 @@ def parse_record(
 
 
 def _run_length(records: Buffer, start: int, message_size: int, limit_position: int) -> int:
-    """Return the number of consecutive records from `start` with the same opcode, length, channel.
+    """Return the number of consecutive records from `start` with equal opcode, length and channel.
 
-    All records end before the byte offset `limit_position`. The number of records that are
-    compared at once grows, so that short runs in long chunks take little time.
+    All counted records end before the byte offset `limit_position`. The number of records that are
+    compared at once increases, so that a short run in a long chunk takes little time.
     """
-    (first_head, second_head) = np.frombuffer(
+    (first_head, first_tail) = np.frombuffer(
         records[start : start + _RUN_HEAD_DTYPE.itemsize], _RUN_HEAD_DTYPE
     )[0]
     max_count = (limit_position - start) // message_size
@@ -713,7 +721,7 @@ def _run_length(records: Buffer, start: int, message_size: int, limit_position: 
             start + equal_count * message_size,
             (message_size,),
         )
-        is_equal = (run_heads["head"] == first_head) & (run_heads["tail"] == second_head)
+        is_equal = (run_heads["head"] == first_head) & (run_heads["tail"] == first_tail)
         first_different = int(is_equal.argmin())
         if not is_equal[first_different]:
             return equal_count + first_different

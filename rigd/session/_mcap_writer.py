@@ -1,8 +1,8 @@
 """Writer of MCAP files, which writes a whole chunk at a time.
 
-The writer of the ``mcap`` package takes messages one by one, at several microseconds each. Here the
-caller passes a chunk's records and their index as arrays; the ``mcap`` package serialises all other
-records of the container. Format: https://mcap.dev/spec, version 0.
+The writer of the ``mcap`` package accepts single messages only and takes several microseconds for
+each. Here the caller passes all records of a chunk and their index at once; the ``mcap`` package
+serialises all other records of the file. Format: https://mcap.dev/spec, version 0.
 """
 
 import struct
@@ -39,7 +39,7 @@ _CHUNK_HEAD_FORMAT: Final = struct.Struct(f"<BQ QQQI I{len(COMPRESSION)}s Q")
 _INDEX_HEAD_FORMAT: Final = struct.Struct("<BQ HI")
 _FOOTER_HEAD_FORMAT: Final = struct.Struct("<BQ QQ")
 RECORD_HEAD_SIZE: Final = 9
-"""Number of bytes of a record's opcode and length, which that length does not include."""
+"""Number of bytes of a record's opcode and length field, which the length field does not count."""
 
 MESSAGE_HEAD_FORMAT: Final = struct.Struct("<BQ HIQQ")
 """Format of the bytes before a message's data: opcode, length, channel, sequence, log and publish
@@ -52,10 +52,10 @@ INDEX_DTYPE: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
 
 class McapWriter:
-    """Writes an MCAP file with LZ4-compressed chunks, message indexes and all checksums.
+    """Writer of an MCAP file with LZ4-compressed chunks, message indexes and all checksums.
 
-    `stream` is an empty file that is open for binary writing. `library` is the name of the writing
-    program in the file's header.
+    `stream` is an empty file that is open for binary writing. `library` is the program name that is
+    written to the file's header.
     """
 
     def __init__(self, stream: BinaryIO, library: str) -> None:
@@ -73,7 +73,7 @@ class McapWriter:
         self._write(MAGIC + _record_bytes(Header(profile="", library=library)))
 
     def _write(self, data: bytes) -> int:
-        """Append bytes to the data section, and return the offset in the file where they begin."""
+        """Append bytes to the data section, and return their offset in the file."""
         position = self._position
         self._stream.write(data)
         self._data_crc = zlib.crc32(data, self._data_crc)
@@ -81,7 +81,7 @@ class McapWriter:
         return position
 
     def declare(self, schemas: Iterable[Schema], channels: Iterable[Channel]) -> None:
-        """Write all schemas and channels in a chunk of their own, whose checksum covers them."""
+        """Write all schemas and channels in a separate chunk, which has a checksum."""
         self._schemas = list(schemas)
         self._channels = list(channels)
         self._message_counts = {channel.id: 0 for channel in self._channels}

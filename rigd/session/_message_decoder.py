@@ -1,9 +1,9 @@
 """Decoder of protobuf messages to NumPy arrays: samples, controller terms, ages and touches.
 
-Messages of the fixed layout (`rigd.session.layout`) are copied directly. Another writing program
-may order, number or type the fields differently, or omit zeros. The decoder then finds the offsets
-of the fields in one such message by its schema, and decodes all messages with the same tags at the
-same offsets together. It decodes the remaining messages one by one, up to a limit.
+Messages of the fixed layout (`rigd.session.layout`) are copied directly. Other programs may write
+the fields in another order, with other numbers or types, or omit zeros. The decoder then uses the
+schema to find the offsets of the fields in one such message, and decodes all messages with the same
+tags at the same offsets together. It decodes the remaining messages one by one, up to a limit.
 """
 
 from collections.abc import Callable, Sequence
@@ -55,16 +55,16 @@ if TYPE_CHECKING:
 
 
 _BLOCK_BYTES: Final = 1 << 18
-"""Number of bytes of messages that are decoded together, so that they fit the processor's cache."""
+"""Number of bytes of messages that are decoded together, chosen to fit the processor's cache."""
 _MAX_BLOCK_RUNS: Final = 1 << 16
 """Maximum number of runs of messages that are decoded together."""
 _MIN_GROUP_MESSAGES: Final = 16
-"""Number of messages below which they are decoded one by one."""
+"""Minimum number of messages that are decoded together; fewer are decoded one by one."""
 _MAX_LAYOUTS: Final = 16
 """Maximum number of field layouts for messages of one channel and length. A program that omits
 zeros writes a few layouts."""
 _MAX_LAYOUT_COMPARISONS: Final = 100_000
-"""Maximum number of comparisons of messages with a field layout, which take about 100 µs each."""
+"""Maximum number of times that messages are compared with a field layout, at about 100 µs each."""
 
 _VARINT_WIRE_TYPE, _FIXED64_WIRE_TYPE, _BYTES_WIRE_TYPE, _FIXED32_WIRE_TYPE = (
     0,
@@ -80,7 +80,7 @@ _MAX_VARINT_BYTES: Final = 9
 
 @dataclass(frozen=True, slots=True)
 class MessageLayout:
-    """Topic, schema and array types of one kind of messages with the fixed layout."""
+    """Topic, schema and array types of one kind of message with the fixed layout."""
 
     topic: str
     schema_name: str
@@ -88,12 +88,12 @@ class MessageLayout:
     required: tuple[str, ...]
     """Fields that a file's schema must have; any other field that it lacks is decoded as 0."""
     record_dtype: np.dtype[np.void]
-    """Array type of a message record in the file: its ``head``, then the ``wire`` message."""
+    """Array type of a message record: its ``head``, then the encoded message as ``wire``."""
     dtype: np.dtype[np.void]
     """Array type of a decoded message."""
 
     def dtype_of(self, field_names: Sequence[str] | None) -> np.dtype[np.void]:
-        """Return the array type of a decoded message with only the given fields, or all if None."""
+        """Return the array type of a decoded message with the given fields, or with all if None."""
         if field_names is None:
             return self.dtype
         return np.dtype(
@@ -150,18 +150,18 @@ _LOSSLESS_CONVERSIONS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _FieldOffsets:
-    """Offsets of the fields in messages of one length with the same tags at the same bytes.
+    """Offsets of the fields in messages of one length whose tags are at the same bytes.
 
-    A message has these offsets if its bytes, combined with `mask` by AND, equal `pattern`.
+    A message has these offsets if (bytes of the message) AND `mask` equals `pattern`.
     """
 
     mask: npt.NDArray[np.uint8]
     pattern: npt.NDArray[np.uint8]
     fields: tuple[tuple[str, int, int, str], ...]
-    """For each field: name, offset of its first byte, length in bytes, and NumPy type or "varint"
-    or "varint32"."""
+    """For each field: name, offset of its first byte, length in bytes, and its NumPy type or
+    "varint" or "varint32"."""
     absent_fields: tuple[str, ...]
-    """Names of the fields that such messages lack, which are decoded as 0."""
+    """Names of the fields that are absent from the messages and are decoded as 0."""
 
 
 class MessageSink(Protocol):
@@ -177,16 +177,16 @@ class MessageSink(Protocol):
 
 
 class MessageDecoder:
-    """Decodes the messages of one topic, in the order of the file.
+    """Decoder of the messages of one topic, in the order of the file.
 
-    An error is stored in `error` and raised by `finish`, so that damage of the file can be reported
-    first.
+    The first error is stored in `error` and raised by `finish`, so that damage of the file can be
+    reported first.
 
     Parameters
     ----------
     path : path of the file, for error messages
     layout : layout of the messages
-    sink : destination of the decoded messages, which it gets block by block
+    sink : destination of the decoded messages, which are passed on block by block
     fields : names of the fields to decode; None for all
     """
 
@@ -216,7 +216,7 @@ class MessageDecoder:
         self._layout_comparisons = 0
 
     def add_block(self, contents: McapContents, block: MessageBlock) -> None:
-        """Collect the messages of the topic from a block, and decode when enough are collected."""
+        """Collect the messages of the topic from a block, and decode them when there are enough."""
         if self.error is not None:
             return
         self._contents = contents
@@ -276,9 +276,10 @@ class MessageDecoder:
             raise self.error
 
     def _decode(self, record_parts: list[Buffer], runs: npt.NDArray[np.int64]) -> None:
-        """Decode the messages in `record_parts`.
+        """Decode the message records in `record_parts`.
 
-        `runs` (n, 3) are channel number, record length in bytes, and number of messages.
+        A row of `runs` (n, 3) contains channel number, record length in bytes, and number of
+        records.
         """
         channel, message_size, _ = runs[0].tolist()
         if (runs[:, :2] == runs[0, :2]).all():
@@ -290,8 +291,8 @@ class MessageDecoder:
                 if is_long
                 else len(joined_records)
             )
-            for first_message in range(0, len(joined_records), part_bytes):
-                record_part = joined_records[first_message : first_message + part_bytes]
+            for part_start in range(0, len(joined_records), part_bytes):
+                record_part = joined_records[part_start : part_start + part_bytes]
                 out = self._sink.array_for(len(record_part) // message_size)
                 self._decode_group(channel, message_size, record_part, out)
                 self._sink.store(out)
@@ -303,10 +304,10 @@ class MessageDecoder:
         for group_key in np.unique(group_keys).tolist():
             (message_indices,) = np.nonzero(group_keys == group_key)
             message_size = group_key & ((1 << 40) - 1)
-            all_offsets = np.ndarray(
+            overlapping_records = np.ndarray(
                 len(record_bytes) - message_size + 1, f"V{message_size}", record_bytes, 0, (1,)
             )
-            group_records = all_offsets[message_offsets[message_indices]].tobytes()
+            group_records = overlapping_records[message_offsets[message_indices]].tobytes()
             decoded_messages = np.empty(len(message_indices), self.dtype)
             self._decode_group(group_key >> 40, message_size, group_records, decoded_messages)
             out[message_indices] = decoded_messages
@@ -315,7 +316,7 @@ class MessageDecoder:
     def _decode_group(
         self, channel: int, record_size: int, records: bytes, out: npt.NDArray[np.void]
     ) -> None:
-        """Decode records of one channel and of `record_size` bytes each into the array `out`."""
+        """Decode message records of one channel, of `record_size` bytes each, into `out` (n,)."""
         contents, fixed_layout = self._contents, self._layout
         assert contents is not None
         if record_size > limits.MAX_DECODED_BYTES:
@@ -349,7 +350,7 @@ class MessageDecoder:
         indices: npt.NDArray[np.int64],
         out: npt.NDArray[np.void],
     ) -> None:
-        """Decode the rows `indices` of `message_bytes` (n, bytes) into the same rows of `out`.
+        """Decode the messages `indices` of `message_bytes` (n, bytes) into the same rows of `out`.
 
         Messages whose fields have the same byte offsets are decoded together.
         """
@@ -382,14 +383,14 @@ class MessageDecoder:
             )
 
     def _find_offsets(self, channel: int, message: bytes) -> _FieldOffsets | None:
-        """Return the offsets of the fields in a message.
+        """Return the offsets of the fields in a message, also for messages with the same layout.
 
         Returns None if such messages must be decoded one by one with the protobuf package.
         """
-        cls = self._message_class(channel)
-        empty_message, message_descriptor = cls(), cls.DESCRIPTOR
+        decoding_class = self._message_class(channel)
+        empty_message, message_descriptor = decoding_class(), decoding_class.DESCRIPTOR
         if not empty_message.IsInitialized() or any(
-            len(end_group.fields) > 1 for end_group in message_descriptor.oneofs
+            len(oneof_group.fields) > 1 for oneof_group in message_descriptor.oneofs
         ):
             return None
         tag_mask, found_fields = np.zeros(len(message), np.uint8), {}
@@ -429,10 +430,10 @@ class MessageDecoder:
                     position - value_start,
                     array_conversion,
                 )
-        names = self.dtype.names or ()
+        field_names = self.dtype.names or ()
         absent_fields = {
             field_name: getattr(empty_message, field_name, 0)
-            for field_name in names
+            for field_name in field_names
             if field_name not in found_fields
         }
         if any(absent_fields.values()):  # not zero by default, and possibly out of range
@@ -443,7 +444,7 @@ class MessageDecoder:
             tuple(
                 found_field
                 for field_name, found_field in found_fields.items()
-                if field_name in names
+                if field_name in field_names
             ),
             tuple(absent_fields),
         )
@@ -451,16 +452,16 @@ class MessageDecoder:
     def _array_conversion(
         self, field_descriptor: "FieldDescriptor | UpbFieldDescriptor", wire_type: int
     ) -> str | None:
-        """Return the NumPy type, "varint" or "varint32" that decodes a field in many messages.
+        """Return how a field of many messages is decoded: as a NumPy type, "varint" or "varint32".
 
         Returns None if the field must be decoded message by message. `wire_type` is the number of
-        the protobuf wire type.
+        the protobuf wire type in the messages.
         """
         lossless_conversions = _LOSSLESS_CONVERSIONS.get(
             self._layout.types.get(field_descriptor.name, ""), {}
         )
-        for field_name, array_type in lossless_conversions.items():
-            if field_descriptor.type == getattr(field_descriptor, field_name):
+        for type_name, array_type in lossless_conversions.items():
+            if field_descriptor.type == getattr(field_descriptor, type_name):
                 required_wire_types = {
                     "<f8": _FIXED64_WIRE_TYPE,
                     "<i8": _FIXED64_WIRE_TYPE,
@@ -498,8 +499,8 @@ class MessageDecoder:
         try:
             out[indices] = np.array(
                 [
-                    tuple([getattr(each, field_name, 0) for field_name in field_names])
-                    for each in decoded_messages
+                    tuple([getattr(single_message, field_name, 0) for field_name in field_names])
+                    for single_message in decoded_messages
                 ],
                 self.dtype,
             )
@@ -530,7 +531,7 @@ class MessageDecoder:
     def _check_schema(self, contents: McapContents, channel_id: int) -> bool:
         """Return whether a channel's schema has the field numbers and types of the fixed layout.
 
-        Raises SessionError if its messages cannot be decoded to the layout's fields at all.
+        Raises SessionError if the messages cannot be converted to the fields of the layout at all.
         """
         fixed_layout, path = self._layout, self._path
         channel = contents.channels[channel_id]
@@ -605,9 +606,9 @@ def class_of_channel(path: Path, contents: McapContents, channel_id: int) -> "ty
 def decoded_message(
     path: Path, topic: str, decode_message: "Callable[[bytes], Message]", message_bytes: bytes
 ) -> "Message":
-    """Return the protobuf message that `decode_message` makes from its bytes.
+    """Return the protobuf message that `decode_message` makes of some bytes.
 
-    Raises SessionError if the bytes contradict the message's schema.
+    Raises SessionError if the bytes contradict the schema of the message.
     """
     from google.protobuf.message import DecodeError
 
@@ -631,7 +632,7 @@ def _decode_at_offsets(
     indices: npt.NDArray[np.int64],
     out: npt.NDArray[np.void],
 ) -> None:
-    """Decode messages (n, bytes) of one field layout into the elements `indices` of `out`."""
+    """Decode messages (n, bytes) with equal field offsets into the elements `indices` of `out`."""
     message_rows = np.ascontiguousarray(message_rows)
     message_count, message_size = message_rows.shape
     for field_name, first_byte, field_length, array_conversion in layout.fields:
@@ -653,13 +654,13 @@ def _decode_at_offsets(
 
 
 def _read_varint(data: bytes, position: int) -> tuple[int, int]:
-    """Return the varint at `position` and the offset of its end.
+    """Return the integer of the varint at `position`, and the offset where the varint ends.
 
-    Returns -1 and an offset after the end of `data` if there is no complete varint.
+    Returns -1 and an offset beyond `data` if there is no complete varint.
     """
-    value = 0
+    varint = 0
     for i, byte in enumerate(data[position : position + 10]):
-        value |= (byte & 0x7F) << 7 * i
+        varint |= (byte & 0x7F) << 7 * i
         if byte < 0x80:
-            return value, position + i + 1
+            return varint, position + i + 1
     return -1, len(data) + 1

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
 
 ORDER_AND_FLAG_FIELDS: Final = ("t_ns", "tick", "status")
-"""Sample fields that are read to learn number, order and flags of the samples, without signals."""
+"""Sample fields that show number, order and flags of the samples; read instead of all signals."""
 MAX_EVENTS: Final = 100_000
 """Maximum number of events that are read from a session's log."""
 MAX_EVENT_BYTES: Final = 1 << 20
@@ -48,7 +48,7 @@ _MIN_ARRAY_GROWTH: Final = 1 << 16
 _MIN_SAMPLE_BYTES: Final = 60
 """Assumed minimum size of a sample in the file, in bytes after compression."""
 _MAX_NUMBER_CHARACTERS: Final = 400
-"""Maximum length of a number's text: the longest finite number has 309 digits before the point."""
+"""Maximum length of the text of a number; the longest finite number has 309 integer digits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ def read_session(
     fields : sample fields to store, which must include ``tick`` and ``t_ns``; None for all
     max_samples : maximum number of samples, each of which takes up to 112 bytes of memory
     on_samples : called with each block of samples, with all fields, while the file is read; the
-        session then has no samples
+        returned session then has no samples
 
     Raises
     ------
@@ -261,8 +261,8 @@ class TopicBuffer:
     path : path of the file, for its size and for error messages
     layout : layout of the messages
     fields : names of the fields to store; None for all
-    max_messages : maximum number of messages; more of them raise an error
-    on_messages : called with each block of messages, with all fields, which are not stored then
+    max_messages : maximum number of messages, above which an error is raised
+    on_messages : called with each block of messages, with all fields; no message is then stored
     """
 
     def __init__(
@@ -286,9 +286,9 @@ class TopicBuffer:
         self._message_count = 0
 
     def array_for(self, count: int) -> npt.NDArray[np.void]:
-        """Return the array elements for the next `count` messages.
+        """Return the elements of the array that the next `count` messages fill.
 
-        Raises SessionError if there are more than the maximum number of messages.
+        Raises SessionError if there are more messages than `max_messages`.
         """
         end = self._message_count + count
         if end > self._max_messages:
@@ -305,7 +305,7 @@ class TopicBuffer:
         return self._array[self._message_count : end]
 
     def store(self, messages: npt.NDArray[np.void]) -> None:
-        """Include the decoded messages, which are in the array, or pass them to `on_messages`."""
+        """Count the decoded messages, and pass them to `on_messages` if they are not stored."""
         if self._on_messages is not None:
             self._on_messages(messages)
         self._message_count += len(messages)
@@ -332,7 +332,7 @@ def _file_size(path: Path) -> int:
 
 
 class _UndecodedLog:
-    """Undecoded messages of a session's log, up to limits of their number and length."""
+    """Undecoded messages of a session's log, of limited number and length."""
 
     def __init__(self) -> None:
         self.first_log_time: int | None = None
@@ -355,12 +355,12 @@ class _UndecodedLog:
                     )
                 continue
             remaining_count = MAX_EVENTS - len(self._stored_messages)
-            for first_sample in range(
+            for record_start in range(
                 run_start,
                 run_start + message_size * min(message_count, remaining_count),
                 message_size,
             ):
-                log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, first_sample)[4])
+                log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, record_start)[4])
                 data_length = message_size - MESSAGE_HEAD_FORMAT.size
                 if data_length > MAX_EVENT_BYTES:
                     self._stored_messages.append((channel, log_time, data_length))
@@ -370,7 +370,7 @@ class _UndecodedLog:
                     self._stored_bytes += data_length
                     message_data = bytes(
                         records[
-                            first_sample + MESSAGE_HEAD_FORMAT.size : first_sample + message_size
+                            record_start + MESSAGE_HEAD_FORMAT.size : record_start + message_size
                         ]
                     )
                     self._stored_messages.append((channel, log_time, message_data))
@@ -455,7 +455,7 @@ def merged_metadata(contents: McapContents, record_name: str) -> dict[str, str] 
 
 
 class _SampleOrder:
-    """Check that ticks increase from each sample to the next, also from block to block."""
+    """Check that the ticks of samples, which arrive in blocks, increase strictly."""
 
     def __init__(self, path: Path) -> None:
         self.first_t_ns: int | None = None
@@ -478,7 +478,7 @@ class _SampleOrder:
             raise self._error(*ticks[backward_indices[0] :][:2].tolist())
 
     def _error(self, tick: int, next_tick: int) -> SessionError:
-        """Return the error for a tick that follows one that is not less."""
+        """Return the error for two consecutive samples whose ticks do not increase."""
         return SessionError(
             f"{self._path}: tick {next_tick} follows tick {tick} in {SAMPLE_TOPIC}, but "
             "ticks must increase from sample to sample. Those that do are saved with `rigd recover "
@@ -491,8 +491,8 @@ def _start_utc_ns(
 ) -> int:
     """Return the wall-clock time of tick 0 in nanoseconds since the Unix epoch, or 0 if unknown.
 
-    It is taken from the metadata, or from `log_time`, the log time of the first sample, whose time
-    since the session's start is `first_t_ns`.
+    The metadata state this time. If not, it is the first sample's log time minus its time
+    `first_t_ns` since the start of the session.
     """
     start_time_text = metadata.get("start_utc_ns")
     if start_time_text is not None:
@@ -509,7 +509,7 @@ def _start_utc_ns(
 
 
 def _parsed_segments(path: Path, segment_texts: dict[str, str]) -> dict[str, tuple[int, int]]:
-    """Return the segments (name → first tick, end tick) from the texts of the record."""
+    """Return the segments, name → (first tick, end tick), from the texts of record ``segments``."""
     segments = {}
     for segment_name, ticks_text in segment_texts.items():
         tick_texts = ticks_text.split(",")

@@ -3,7 +3,7 @@
 Only verified data is used: messages, channels and schemas are in chunks with a checksum each, the
 records ``session`` and ``segments`` are taken from the copy in such a chunk, and each attachment
 has its own checksum. The record ``outcome`` is used only if the checksum of the whole data section
-is correct. The file of another program may lack some checksums. It is recovered and marked as
+is correct. A file of another program, which may lack some checksums, is recovered and marked as
 unprotected.
 """
 
@@ -53,13 +53,13 @@ RECOVERED_FROM: Final = "recovered_from"
 
 _MIN_CHUNK_BYTES: Final = 1 << 14
 _LONG_CHUNK_BYTES: Final = 4 << 20
-"""Length of the collected messages, in bytes, above which a chunk is written in any case."""
+"""Maximum length in bytes of the collected messages, above which they are written as a chunk."""
 _CHUNKS_BEFORE_GROWTH: Final = 10_000
-"""Number of chunks after which new chunks become longer, since each one takes index space."""
+"""Number of chunks after which new chunks become longer, to limit the size of the chunk index."""
 _MAX_COPIED_CHANNELS: Final = 32
-"""Maximum number of channels to copy with the session's own topics, and likewise with others."""
+"""Maximum number of copied channels with topics of this program, and of those with other topics."""
 _FIRST_READING_FRACTION: Final = 0.3
-"""Fraction of the reported progress at which the first reading of the damaged file ends."""
+"""Fraction of the total progress that is reported when the damaged file has been read once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class Recovery:
     bytes_lost: int
     """Number of bytes of `source` after the last intact record."""
     skipped: tuple[str, ...]
-    """Descriptions of further damage that was left out, in the form of `damage`."""
+    """Descriptions, in the form of `damage`, of damaged records that were not copied."""
     protected: bool
     """Whether checksums cover the sample rate, the beam data and the segments."""
 
@@ -217,7 +217,7 @@ class SampleDigest:
             field_checksum.update(samples[field_name].tobytes())
 
     def digest(self) -> bytes:
-        """Return the checksum of all samples added so far."""
+        """Return the checksum of the samples that were added so far."""
         return b"".join(field_checksum.digest() for field_checksum in self._sums.values())
 
 
@@ -230,7 +230,7 @@ class _SampleSelection:
 
         It is the end of a sentence that begins with the file's name."""
         self.is_copied: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
-        """For each sample in the file, whether it is copied to the new file."""
+        """Mask of the samples in the damaged file that are copied to the new file."""
         self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)
         """Time, tick and status of the samples that are copied."""
         self._samples = TopicBuffer(
@@ -283,10 +283,10 @@ class _SampleSelection:
 
 
 def _increasing_ticks_mask(ticks: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
-    """Return a mask of the ticks to copy, so that the copied ticks increase strictly.
+    """Return a mask that selects strictly increasing ticks.
 
-    The mask selects ticks that exceed all previous ticks, or ticks below all later ticks if these
-    are more. A single tick that is far too high then does not exclude the ticks after it.
+    It selects the ticks above all earlier ticks, or the ticks below all later ticks, whichever are
+    more. A single tick that is far too high therefore does not exclude all ticks after it.
     """
     exceeds_previous, is_below_later = np.ones((2, len(ticks)), np.bool_)
     exceeds_previous[1:] = ticks[1:] > np.maximum.accumulate(ticks)[:-1]
@@ -299,14 +299,14 @@ def _increasing_ticks_mask(ticks: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool
 def _scaled_progress(
     on_progress: Callable[[float], None] | None, start_fraction: float, end_fraction: float
 ) -> Callable[[float], None] | None:
-    """Return a callback that scales the progress of one step to its range of the whole progress."""
+    """Return a callback for one step, which reports the step's progress as part of the total."""
     if on_progress is None:
         return None
     return lambda fraction: on_progress(start_fraction + (end_fraction - start_fraction) * fraction)
 
 
 def _copy_intact_file(path: Path, final_path: Path) -> Recovery:
-    """Copy a complete ``.part`` file to its final name; leave any other complete file alone."""
+    """Copy a complete ``.part`` file to its final name; do nothing with any other intact file."""
     session = read_session(
         path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
     )
@@ -337,9 +337,9 @@ def _require_target_absent(path: Path, recovered_file: Path) -> None:
 
 @contextlib.contextmanager
 def _temporary_target(path: Path, target: Path, copied_file: Path | None = None) -> Iterator[Path]:
-    """Yield a temporary path in the folder of `target`, and rename it to `target` on success.
+    """Yield the path of a temporary file, which becomes `target` if no error is raised.
 
-    The temporary file starts as a copy of the file `copied_file`, if one is given.
+    The temporary file is in the folder of `target`, and starts as a copy of `copied_file` if given.
     """
     temporary_path = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     try:
@@ -369,7 +369,7 @@ def _planned_recovery(
     damage: str,
     skipped: list[str],
 ) -> Recovery:
-    """Return the result of a recovery whose new file is still to be written."""
+    """Return the result of a recovery before the new file is written."""
     copied_samples = selection.samples
     bytes_lost = path.stat().st_size - contents.intact_bytes
     # The recorded outcome describes all samples: it is used only if none is missing.
@@ -409,12 +409,12 @@ def _planned_recovery(
 
 
 def _loss_text(lost_bytes: int) -> str:
-    """Return words for an error message with the number of lost bytes, or "" for 0."""
+    """Return text for an error message that states the number of lost bytes, or "" for 0."""
     return f"; {lost_bytes} bytes from there on were lost" if lost_bytes else ""
 
 
 def _sample_count(counts: Mapping[int, int], contents: McapContents) -> int:
-    """Return the number of samples, given the number of messages by channel number."""
+    """Return the number of samples, given ``channel number → number of messages``."""
     return sum(
         counts.get(channel.id, 0)
         for channel in contents.channels.values()
@@ -423,11 +423,11 @@ def _sample_count(counts: Mapping[int, int], contents: McapContents) -> int:
 
 
 def _tick_counts(samples: npt.NDArray[np.void], unrecovered_samples: int) -> dict[str, str]:
-    """Return the tick counts of the record ``outcome`` for a recovered file.
+    """Return the tick counts for the record ``outcome`` of a recovered file.
 
-    A gap in the ticks counts as missed if the flags of the next sample state that, and as lost
-    otherwise. `unrecovered_samples` is the number of samples that the damaged file contained once
-    and that were not recovered.
+    The ticks of a gap count as missed if the flags of the next sample state so, otherwise as lost.
+    `unrecovered_samples` is the number of samples that were in the file before it was damaged, and
+    could not be recovered.
     """
     status_flags = samples["status"]
     missing_before = np.diff(samples["tick"].astype(np.int64), prepend=-1) - 1
@@ -448,9 +448,10 @@ def _tick_counts(samples: npt.NDArray[np.void], unrecovered_samples: int) -> dic
 
 
 def _metadata_from_chunk(contents: McapContents) -> dict[str, dict[str, str]]:
-    """Return the records ``session`` and ``segments`` that are repeated in a chunk's channel.
+    """Return the records ``session`` and ``segments`` from their copy in a chunk.
 
-    Returns an empty dictionary if no chunk contains them.
+    The metadata of the samples' channel contain the copy. Returns an empty dictionary if no chunk
+    contains it.
     """
     for channel in contents.channels.values():
         if channel.topic == SAMPLE_TOPIC and channel.id in contents.declared_in_chunks:
@@ -545,7 +546,7 @@ class _MessageCopier:
         return np.empty(count, SAMPLE_DTYPE)
 
     def store(self, messages: npt.NDArray[np.void]) -> None:
-        """Add those decoded samples that are copied to the checksum."""
+        """Add the samples that are copied to the checksum."""
         decoded_end = self._samples_decoded + len(messages)
         is_copied = self._is_copied[self._samples_decoded : decoded_end]
         self._digest.add(messages if is_copied.all() else messages[: len(is_copied)][is_copied])
@@ -576,14 +577,14 @@ class _MessageCopier:
                         continue
                 elif not is_copied.all():
                     copied_ranges = [
-                        (start + message_size * first_sample, n)
-                        for first_sample, n in _true_blocks(is_copied)
+                        (start + message_size * first_sample, sample_count)
+                        for first_sample, sample_count in _true_blocks(is_copied)
                     ]
             if is_duplicate or channel not in self._declared_channels:
                 continue
-            for first_sample, range_length in copied_ranges:
+            for range_start, range_length in copied_ranges:
                 self._collected_records.append(
-                    bytes(records[first_sample : first_sample + message_size * range_length])
+                    bytes(records[range_start : range_start + message_size * range_length])
                 )
                 self._collected_runs.append((channel, message_size, range_length))
                 self._collected_bytes += message_size * range_length
@@ -602,7 +603,7 @@ class _MessageCopier:
         return self._digest
 
     def _flush(self) -> None:
-        """Write the collected messages as a chunk with a new message index."""
+        """Write the collected messages as a chunk with message indexes."""
         if not self._collected_runs:
             return
         chunk_records = b"".join(self._collected_records)
@@ -634,7 +635,7 @@ def _true_blocks(mask: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
 def _channels_to_copy(
     contents: McapContents, records: Mapping[str, Mapping[str, str]]
 ) -> list[Channel]:
-    """Return the channels to copy; the channel of the samples repeats the session's metadata."""
+    """Return the channels to copy; the samples' channel gets a copy of the session's metadata."""
     only_chunk_channels = bool(_metadata_from_chunk(contents)) and not contents.verified
     channel_metadata = metadata_for_channel(records.get("session", {}), records.get("segments", {}))
     usable_channels = [

@@ -1,4 +1,4 @@
-"""Digests of a record's samples, which show whether another file contains the same samples."""
+"""Digests of a record's samples, which show whether another record contains the same samples."""
 
 import hashlib
 from typing import Final
@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 _WINDOW_SAMPLES: Final = 128
 """Number of consecutive samples from which one digest is computed."""
 _MIN_TORQUE_CHANGES: Final = 32
-"""Minimum number of changes of the torque in a window with a digest: a sensor at rest returns the
-same values in any file."""
+"""Minimum number of changes of the torque in a window with a digest. Windows of a sensor at rest
+could be equal in different records."""
 _ANCHOR_SAMPLES: Final = 8
-"""Number of consecutive torque samples whose hash decides whether a window begins at the first."""
+"""Number of consecutive torque samples whose hash decides whether the first one begins a window."""
 _MEAN_WINDOW_DISTANCE: Final = 256
 """Average number of samples from the start of one window to the start of the next."""
 _HASH_MULTIPLIER: Final = np.uint64(0x9E3779B97F4A7C15)
@@ -32,9 +32,9 @@ def sample_digests(
     Returns
     -------
     frozenset of bytes
-        Two records with a common digest contain the same samples, since measurement noise does not
-        repeat. The samples themselves decide where windows begin, so that a record that was cut at
-        either end has digests of the original. A constant torque yields no digests.
+        Two records with a common digest contain the same samples, because measurement noise does
+        not repeat. The samples determine where windows begin. A record that was cut at either end
+        therefore has digests of the original record. A constant torque has no digests.
 
     Examples
     --------
@@ -64,11 +64,11 @@ def sample_digests(
     )
     return frozenset(
         hashlib.blake2b(
-            angle[first : first + _WINDOW_SAMPLES].tobytes()
-            + torque[first : first + _WINDOW_SAMPLES].tobytes(),
+            angle[first_sample : first_sample + _WINDOW_SAMPLES].tobytes()
+            + torque[first_sample : first_sample + _WINDOW_SAMPLES].tobytes(),
             digest_size=8,
         ).digest()
-        for first in np.flatnonzero(
+        for first_sample in np.flatnonzero(
             (anchor_hashes % np.uint64(_MEAN_WINDOW_DISTANCE) == 0) & has_enough_changes
         ).tolist()
     )

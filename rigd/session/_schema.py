@@ -43,14 +43,14 @@ def _fixed_layout_file(schema_name: str, field_types: dict[str, str]) -> "FileDe
     """Return the protobuf file descriptor of a message with the given field names and types."""
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
-    package_name, field_name = schema_name.split(".")
+    package_name, message_name = schema_name.split(".")
     file_descriptor = FileDescriptorProto(
-        name=f"{package_name}/{field_name.lower()}.proto", package=package_name, syntax="proto3"
+        name=f"{package_name}/{message_name.lower()}.proto", package=package_name, syntax="proto3"
     )
-    message_descriptor = file_descriptor.message_type.add(name=field_name)
-    for field_number, (field, protobuf_type) in enumerate(field_types.items(), start=1):
+    message_descriptor = file_descriptor.message_type.add(name=message_name)
+    for field_number, (field_name, protobuf_type) in enumerate(field_types.items(), start=1):
         message_descriptor.field.add(
-            name=field,
+            name=field_name,
             number=field_number,
             label=FieldDescriptorProto.LABEL_OPTIONAL,
             type=FieldDescriptorProto.Type.Value(f"TYPE_{protobuf_type.upper()}"),
@@ -61,7 +61,7 @@ def _fixed_layout_file(schema_name: str, field_types: dict[str, str]) -> "FileDe
 def _event_file() -> "FileDescriptorProto":
     """Return the protobuf file descriptor of the log message ``foxglove.Log``.
 
-    It contains the fields used here of https://github.com/foxglove/foxglove-sdk.
+    It contains only the fields used here; https://github.com/foxglove/foxglove-sdk defines all.
     """
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
@@ -73,8 +73,8 @@ def _event_file() -> "FileDescriptorProto":
     )
     log_descriptor = file_descriptor.message_type.add(name="Log")
     level_enum = log_descriptor.enum_type.add(name="Level")
-    for level_number, field_name in enumerate(EVENT_LEVELS):
-        level_enum.value.add(name=field_name.upper(), number=level_number)
+    for level_number, level_name in enumerate(EVENT_LEVELS):
+        level_enum.value.add(name=level_name.upper(), number=level_number)
     log_fields = (
         ("timestamp", FieldDescriptorProto.TYPE_MESSAGE, ".google.protobuf.Timestamp"),
         ("level", FieldDescriptorProto.TYPE_ENUM, ".foxglove.Log.Level"),
@@ -167,8 +167,8 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
 def metadata_for_channel(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
     """Return the records ``session`` and ``segments`` as metadata of the samples' channel.
 
-    A checksum covers the channel. MCAP has no checksum for a metadata record, and the checksum of
-    the whole file is at its end.
+    The copy in the channel is protected by the checksum of its chunk. A metadata record of MCAP has
+    no checksum, and the checksum of the whole file is missing if the file is truncated.
     """
     return {
         **{f"session.{key}": metadata_value for key, metadata_value in session.items()},
@@ -179,7 +179,7 @@ def metadata_for_channel(session: Mapping[str, str], segments: Mapping[str, str]
 def metadata_from_channel(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
     """Return the records ``session`` and ``segments`` from the metadata of the samples' channel.
 
-    This is the inverse of `metadata_for_channel`. The result lacks a record without any key.
+    This is the inverse of `metadata_for_channel`, except that empty records are missing.
     """
     records: dict[str, dict[str, str]] = {}
     for key, metadata_value in channel.items():

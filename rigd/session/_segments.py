@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 
 def segments_until(segments: Mapping[str, tuple[int, int]], end: int) -> dict[str, tuple[int, int]]:
-    """Return the segments of a record that ends at a tick.
+    """Return the segments of a record cut to the part before a tick.
 
-    Segments that begin at that tick or later are left out.
+    Segments that begin at the tick or later are omitted.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def segments_until(segments: Mapping[str, tuple[int, int]], end: int) -> dict[st
 
 
 def sweep_frequency_hz(
-    segments: Mapping[str, tuple[int, int]], ends_hz: tuple[float, float], tick: int
+    segments: Mapping[str, tuple[int, int]], start_and_end_hz: tuple[float, float], tick: int
 ) -> float | None:
     """Return the frequency of a linear sweep at a tick, or None before and after the sweep.
 
@@ -31,9 +31,9 @@ def sweep_frequency_hz(
     ----------
     segments : mapping of str to (int, int)
         ``sweep`` → first tick and end tick (exclusive). If the sweep returns to its start
-        frequency, also ``first_half`` for its first half and ``back`` for its second half.
-    ends_hz : tuple of float
-        Start and end frequency of the sweep, or of its first half.
+        frequency, also ``there`` for its first half and ``back`` for its second half.
+    start_and_end_hz : tuple of float
+        Frequencies in Hz at the start and the end of the sweep, or of its first half.
     tick : int
         Tick of the record.
 
@@ -44,7 +44,7 @@ def sweep_frequency_hz(
     >>> [sweep_frequency_hz(both, (0.0, 50.0), tick) for tick in (50, 150, 200)]
     [25.0, 25.0, None]
     """
-    start_hz, stop_hz = ends_hz
+    start_hz, stop_hz = start_and_end_hz
     first_half = segments.get("there", segments["sweep"])
     for (first_tick, end), begin_hz, end_hz in (
         (first_half, start_hz, stop_hz),

@@ -116,7 +116,7 @@ def _has_final_magic(file: BinaryIO) -> bool:
 
 
 def _read_by_summary(file: BinaryIO, file_size: int) -> McapContents | None:
-    """Return channels, message counts and metadata of a file, located by its summary section.
+    """Find the summary section of a file, and return channels, message counts and metadata.
 
     Returns None if the file of `file_size` bytes has no usable summary section with a correct
     checksum.
@@ -147,7 +147,7 @@ def _read_by_summary(file: BinaryIO, file_size: int) -> McapContents | None:
 
 
 def _contents_from_summary(file: BinaryIO, summary_bytes: bytes) -> McapContents | None:
-    """Return channels, message counts and metadata of a file from its summary section.
+    """Return channels, message counts and metadata of a file, given its summary section.
 
     Returns None if the section is incomplete, or the metadata are too long.
     """

@@ -1,7 +1,7 @@
 """Validity of numbers that are estimated from a record.
 
-It consists of the error of the linear beam model at the record's tip slopes, and of a test whether
-the model of a uniform beam predicts the modes.
+The validity consists of the error of the linear beam model at the record's tip slopes, and the
+result of a test whether the model of a uniform beam predicts the modes.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ _UNIFORM_BY_STATUS: Final = {"passed": "yes", "refused": "no", _NOT_TESTED: _NOT
 """Status of the test of a uniform beam → text for a table: whether the beam is uniform."""
 
 _MIN_SHOWN_ERROR: Final = 1e-3
-"""Smallest relative error of the linear model that is shown; a smaller one is shown as "below"."""
+"""Smallest relative error of the linear model that is shown; smaller ones are shown as "below"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +29,8 @@ class BeamUniformity:
     status
         "passed", "refused" or "not tested".
     p_value
-        Probability of so large a difference between predicted and estimated modes by chance, or
-        None if not tested.
+        Probability that chance alone causes a difference between predicted and estimated modes as
+        large as observed, or None if not tested.
 
     Examples
     --------
@@ -95,7 +95,7 @@ class BeamUniformity:
 
 @dataclass(frozen=True, slots=True)
 class Validity:
-    """Validity of the linear beam model and of a uniform beam for a record.
+    """Validity of the numbers from a record: error of the linear model, test of a uniform beam.
 
     Attributes
     ----------
@@ -162,10 +162,10 @@ class Validity:
         return f"{slope_text}, error {self._error_bound_text('≤ ', '< ')}"
 
     def _error_bound_text(self, upper_bound_words: str, below_words: str) -> str:
-        """Return the linear model's error in percent after the words for its upper bound.
+        """Return text with the upper bound of the linear model's error in percent.
 
-        These are `below_words` for an error below the smallest value that is shown, and
-        `upper_bound_words` for any other error.
+        It begins with `below_words` if the error is below the smallest value that is shown, else
+        with `upper_bound_words`.
         """
         model_error = self.linear_model_error or 0.0
         if model_error < _MIN_SHOWN_ERROR:

@@ -1,9 +1,9 @@
 """Writer of session files.
 
 Samples, controller terms and ages of readings arrive as blocks of messages. They are written chunk
-by chunk together with the events. An event that reports an error is written at once. The file has
-the suffix ``.part`` and a lock until it is complete. It is then renamed to its final name, and
-never replaces another file.
+by chunk together with the events. An event that reports an error is written at once. Until the file
+is complete, it has the suffix ``.part`` and a lock. It is then renamed to its final name, but never
+replaces another file.
 """
 
 import contextlib
@@ -63,11 +63,11 @@ PART_SUFFIX: Final = ".part"
 """Suffix that a session file has after its name until it is complete."""
 
 CHUNK_SAMPLES: Final = 250
-"""Maximum number of samples in a chunk: a killed recorder loses no more samples than that."""
+"""Maximum number of samples in a chunk, and thus of samples that a killed recorder loses."""
 CHUNK_S: Final = 0.25
-"""Time span of a chunk in seconds at low sample rates: a killed recorder loses no longer span."""
+"""Maximum time span of a chunk in seconds, and thus of what a killed recorder loses."""
 SYNC_INTERVAL_S: Final = 1.0
-"""Time in seconds between two syncs of the file to the disk: a power failure loses that much."""
+"""Time in seconds between two syncs of the file to the disk, which a power failure may lose."""
 
 _MESSAGE_HEAD_FIELDS: Final = [
     ("opcode", "u1"),
@@ -106,7 +106,7 @@ class _CountedFile(io.FileIO):
 
 
 class SessionWriter:
-    """Writes one session file: ``NAME.mcap.part`` while it is recorded, ``NAME.mcap`` at the end.
+    """Writer of a session file, ``NAME.mcap.part`` during the session and ``NAME.mcap`` afterwards.
 
     After `begin`, messages arrive in blocks. A chunk is written to the file with every 250th
     sample, and the file is synced to the disk once a second. A later failure does not destroy data
@@ -164,7 +164,7 @@ class SessionWriter:
 
     @contextlib.contextmanager
     def _io_errors_explained(self) -> Iterator[None]:
-        """Convert an OSError of the enclosed code into a SessionError with advice."""
+        """Convert an OSError of the enclosed code to a SessionError with advice."""
         try:
             yield
         except OSError as error:
@@ -181,7 +181,7 @@ class SessionWriter:
         segments: Mapping[str, tuple[int, int]],
         attachments: Mapping[str, bytes],
     ) -> None:
-        """Write metadata, attachments and channels, which precede the first sample in the file.
+        """Begin the file with metadata, attachments and channels, before the first sample.
 
         Parameters
         ----------
@@ -234,8 +234,8 @@ class SessionWriter:
     def write_controls(self, block: Buffer) -> None:
         """Append packed controller terms: a multiple of ``CONTROL_SIZE`` bytes, possibly 0.
 
-        They go into the same chunk as the samples of the same time if they are written before those
-        samples.
+        Call this before `write_samples` with the samples of the same time, so that both are written
+        to the same chunk.
         """
         self._controls += self._checked_view(block, CONTROL_SIZE)
         with self._io_errors_explained():
@@ -244,8 +244,8 @@ class SessionWriter:
     def write_timings(self, block: Buffer) -> None:
         """Append packed ages of readings: a multiple of ``TIMING_SIZE`` bytes, possibly 0.
 
-        They go into the same chunk as the samples of the same time if they are written before those
-        samples.
+        Call this before `write_samples` with the samples of the same time, so that both are written
+        to the same chunk.
         """
         self._timings += self._checked_view(block, TIMING_SIZE)
         with self._io_errors_explained():
@@ -365,7 +365,7 @@ class SessionWriter:
     def _check_part_file(self) -> None:
         """Raise if the ``.part`` file was removed, moved, shortened or changed by another program.
 
-        Writing to such a file would still succeed without an error.
+        Writing would not report an error in such a case.
         """
         if not self._is_part_in_place():
             raise SessionError(
@@ -386,9 +386,9 @@ class SessionWriter:
             return False
 
     def _path_of_contents(self) -> Path | None:
-        """Return the path of the contents, which are copied elsewhere if the file was deleted.
+        """Return the path of the recorded contents; copy them to a new file if it was deleted.
 
-        Returns None if they could not be saved.
+        Returns None if the contents could not be saved.
         """
         file_descriptor = self._stream.fileno()
         if self._is_part_in_place():
@@ -414,7 +414,7 @@ class SessionWriter:
         return self._mcap
 
     def _checked_view(self, block: Buffer, message_size: int) -> memoryview:
-        """Return a view of encoded messages; raise unless it contains a whole number of them."""
+        """Return a view of encoded messages; raise if the last message is incomplete."""
         self._require_writer()
         block_view = memoryview(block).cast("B")
         if len(block_view) % message_size:
@@ -427,8 +427,8 @@ class SessionWriter:
     def _write_chunk(self, *, include_later_messages: bool) -> None:
         """Write the collected messages as one chunk.
 
-        Controller terms and ages of readings that are later than the last sample stay for the next
-        chunk, unless `include_later_messages` is True.
+        Controller terms and ages of readings that are later than the last sample are written with
+        the next chunk, unless `include_later_messages` is True.
         """
         mcap_writer = self._require_writer()
         samples = np.frombuffer(self._samples, SAMPLE_WIRE_DTYPE)
@@ -472,7 +472,7 @@ class SessionWriter:
         self._events = []
 
     def _sync_when_due(self) -> None:
-        """Sync the file to the disk if it has changed since the last sync, a second or more ago."""
+        """Sync the file to the disk if it has changed and the last sync is a second or more ago."""
         if self._is_sync_needed and time.monotonic() - self._last_sync_s >= SYNC_INTERVAL_S:
             self._sync()
             self._check_part_file()
@@ -503,7 +503,7 @@ def _message_records(
 
 
 def _message_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
-    """Return the message index of records of equal length that begin at `offset` of a chunk."""
+    """Return the message index of equally long records that begin at `offset` in a chunk."""
     message_index = np.empty(records.shape, INDEX_DTYPE)
     message_index["log_time"] = records["log_time"]
     message_index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
@@ -534,7 +534,7 @@ def _segments_record(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
 
 
 def _chunk_samples(metadata: Mapping[str, str]) -> int:
-    """Return the number of samples per chunk: `CHUNK_SAMPLES`, or fewer at a low rate."""
+    """Return the number of samples per chunk: `CHUNK_SAMPLES`, or fewer at a low sample rate."""
     try:
         samples_in_interval = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
     except (ValueError, OverflowError):
@@ -543,7 +543,7 @@ def _chunk_samples(metadata: Mapping[str, str]) -> int:
 
 
 def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
-    """Return schemas and channels of a session; the samples' channel repeats its metadata."""
+    """Return schemas and channels of a session, with a copy of its metadata in one channel."""
     schemas, channels = [], []
     for topic, (channel_number, schema_name) in _CHANNEL_NUMBERS_AND_SCHEMAS.items():
         schemas.append(
@@ -575,7 +575,7 @@ _COPY_BLOCK_BYTES: Final = 1 << 20
 def fsync_directory(path: Path) -> None:
     """Write the entries of a folder to the disk, so that a new or renamed file survives a crash.
 
-    Windows opens no folders, and writes their entries by itself.
+    On Windows, which cannot open folders, this is neither possible nor necessary.
     """
     if not hasattr(os, "O_DIRECTORY"):
         return
@@ -587,7 +587,7 @@ def fsync_directory(path: Path) -> None:
 
 
 def copy_new(descriptor: int, target: Path) -> None:
-    """Copy the contents of an open file to a new file, and sync that to the disk.
+    """Copy the contents of an open file to a new file, and sync the new file to the disk.
 
     Raises FileExistsError if `target` exists.
     """
@@ -638,9 +638,10 @@ def rename_without_replacing(source: Path, target: Path) -> None:
 
 
 def mark_as_being_written(descriptor: int) -> None:
-    """Mark an open file as being written until it is closed or this process ends.
+    """Lock an open file, which states that it is being written until it is closed.
 
-    The mark is an advisory lock. On a file system without locks the file is not marked.
+    The lock is advisory, and ends with this process. On a file system without locks this does
+    nothing.
     """
     if fcntl is not None:
         with contextlib.suppress(OSError):
@@ -648,7 +649,7 @@ def mark_as_being_written(descriptor: int) -> None:
 
 
 def is_being_written(path: Path) -> bool:
-    """Return whether a running process is still writing a file, by the lock on it."""
+    """Return whether the lock of `mark_as_being_written` shows that a file is being written."""
     if fcntl is None:
         return False
     try:

@@ -2,9 +2,9 @@
 
 Every message of ``/rig/sample``, ``/rig/control``, ``/rig/timing`` and ``/rig/touch`` is protobuf
 of *fixed layout*: all fields are ``sfixed64``, ``fixed32`` or ``double``, numbered from 1 in the
-order below, and all are written, zero or not. Tags are then constant bytes and all messages have
-the same length: one ``struct.pack_into`` writes a message, one ``numpy.frombuffer`` reads a block
-of them, and any protobuf decoder can read them.
+order below, and all are written, even if they are 0. Tags are then constant bytes and all messages
+of a topic have the same length: one ``struct.pack_into`` writes a message, one
+``numpy.frombuffer`` reads a block of messages, and any protobuf decoder can read them.
 
 The control process packs messages with this module, which therefore imports numpy and the standard
 library only.
@@ -388,7 +388,7 @@ def _encode_messages(
 
 
 def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.NDArray[np.bool_]:
-    """Return a mask of the encoded messages that have every tag byte of the fixed layout.
+    """Return a mask of the encoded messages whose tag bytes are all those of the fixed layout.
 
     Parameters
     ----------
@@ -477,7 +477,7 @@ def decode_samples(block: Buffer) -> npt.NDArray[np.void]:
     Raises
     ------
     ValueError
-        If the length is not a multiple of ``SAMPLE_SIZE`` or a tag byte is not the expected one.
+        If the length is not a multiple of ``SAMPLE_SIZE``, or a tag byte is wrong.
     """
     return _decode_messages(block, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, SAMPLE_DTYPE)
 

@@ -10,8 +10,8 @@ MAX_SAMPLES: Final = 4_000_000
 replayed: an hour at 1 kHz, with rest and ring-down. The samples take 0.45 GB of memory. An
 analysis, which decimates a long record while it is read, takes 0.65 GB with the default band."""
 MAX_SAMPLES_WITHOUT_SIGNALS: Final = 7_200_000
-"""Maximum number of samples if only times, ticks and flags are read, or a part of the signals: two
-hours at 1 kHz, the longest recording of an earlier version."""
+"""Maximum number of samples of a file of which only times, ticks and flags are read, or some of the
+signals: two hours at 1 kHz, the longest recording of an earlier version."""
 
 MAX_FILE_BYTES: Final = 2 << 30
 """Maximum length of a session file in bytes."""
@@ -22,14 +22,14 @@ MAX_TOTAL_BYTES: Final = 2 << 30
 MAX_DECLARED_BYTES: Final = 64 << 20
 """Maximum memory in bytes for schemas, channels, metadata and attachments of a file together."""
 MAX_TEXT_BYTES: Final = 32 << 20
-"""Maximum length in bytes of schemas, channels and metadata of a file together, because their
-texts take up to four times as much memory."""
+"""Maximum length in bytes of schemas, channels and metadata of a file together. Their texts take up
+to four times as much memory."""
 MAX_ENTRIES: Final = 100_000
 """Maximum number of keys in all metadata of a file."""
 MAX_MESSAGE_BYTES: Final = 16 << 20
 """Maximum length of a message in bytes."""
 MAX_STEPS: Final = 6_000_000
-"""Maximum work for reading a file, in steps of about a microsecond, such as a run of messages."""
+"""Maximum work for reading a file, in steps of about a microsecond; a run of messages is a step."""
 
 MAX_SCHEMA_BYTES: Final = 1 << 17
 """Maximum length in bytes of a schema that is parsed; a schema of this package takes some hundred

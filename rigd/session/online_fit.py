@@ -1,4 +1,4 @@
-"""Text for the estimates of a session's fit while it runs."""
+"""Text that reports the estimates of the fit during a session."""
 
 from collections.abc import Mapping
 from math import isnan
@@ -46,7 +46,7 @@ def estimate_lines(
 
 
 def _change_text(earlier_mode: EstimatedMode, mode: EstimatedMode) -> str:
-    """Return text with the change of a mode's frequency in Hz and of its damping in percent."""
+    """Return text with the changes of a mode's frequency in Hz and of its damping in percent."""
     change_percent = mode.damping_ratio.percent_above(earlier_mode.damping_ratio)
     percent_text = "" if isnan(change_percent) else f", {change_percent:+.2g} %"
     return f"; change {mode.frequency_change_text(earlier_mode)}{percent_text}"

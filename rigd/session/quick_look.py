@@ -1,7 +1,7 @@
-"""Reader of quick looks, the short reports that the analyzer writes next to session files.
+"""Reader of quick looks, the short reports that the analyser writes next to session files.
 
 docs/quick_look.md describes the files. Since any user may have written such a file, its contents
-are checked here for the live view, the page, the library and the analyzer. The fit in a session
+are checked here for the live view, the page, the library and the analyser. The fit in a session
 file is checked in the same way.
 """
 
@@ -27,11 +27,11 @@ QUICK_LOOK_VERSION: Final = 1
 _MAX_FILE_BYTES: Final = 1 << 20
 """Maximum length in bytes of a quick look that is read."""
 _NONBLOCKING_FLAGS: Final = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-"""Flags for opening a file without blocking: a pipe then reads as empty."""
+"""Flags for opening a file without blocking, so that a pipe is read as an empty file."""
 _MAX_TEXT_CHARACTERS: Final = 1000
 """Maximum number of characters of a text that are read from a document."""
 _MAX_FILES_READ: Final = 200
-"""Maximum number of quick looks that are read to find the last one: a thousand take seconds."""
+"""Maximum number of quick looks that are read to find the last one; a thousand take seconds."""
 _TEXT_KEYS: Final = ("file", "session_id", "specimen", "excitation")
 _TIME_KEYS: Final = ("start_utc_ns", "made_utc_ns")
 _LINE_LIST_KEYS: Final = ("flags", "text")
@@ -99,7 +99,7 @@ def last_quick_look(
     excluded_session: str = "",
     is_usable: Callable[[Document], object],
 ) -> tuple[Path, Document] | None:
-    """Return the last usable quick look at a session of a specimen.
+    """Return the latest usable quick look at a session of a specimen.
 
     Parameters
     ----------
@@ -147,9 +147,10 @@ def _newest_quick_looks(folder: Path) -> list[Path]:
 
 
 def _start_utc_ns(path: Path) -> int:
-    """Return the start time of a quick look's session in ns since the Unix epoch, or 0.
+    """Return the start time, in ns since the Unix epoch, of the session of a quick look.
 
-    The file is not checked, which makes this six times faster than `read_quick_look`.
+    Returns 0 if it is unknown. This is six times faster than `read_quick_look`, because the file is
+    not checked.
     """
     try:
         return int(json.loads(_file_beginning(path)).get("start_utc_ns") or 0)
@@ -214,7 +215,7 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
 
 
 def _valid_targets(documents: object) -> Iterator[Document]:
-    """Yield the entries of a JSON value that validly state a requested precision."""
+    """Yield the entries of a JSON value that are valid statements of a requested precision."""
     for target_document in documents if isinstance(documents, list) else ():
         if isinstance(target_document, dict):
             target_numbers = {
@@ -246,7 +247,7 @@ def _valid_response(response_document: object) -> Document | None:
 
 
 def _valid_curves(curves_document: object, curve_keys: tuple[str, ...]) -> Document | None:
-    """Return lists of finite numbers by name, or None unless all have the same length above 0."""
+    """Return curves, name → list of finite numbers; None if lengths differ or are 0."""
     if not isinstance(curves_document, dict):
         return None
     curves = {
@@ -259,7 +260,7 @@ def _valid_curves(curves_document: object, curve_keys: tuple[str, ...]) -> Docum
 
 
 def _finite_numbers(json_values: object) -> list[float]:
-    """Return a list of finite numbers, or an empty list if it contains any other value."""
+    """Return a JSON list if it contains only finite numbers, otherwise an empty list."""
     numbers = (
         [finite_number(json_value) for json_value in json_values]
         if isinstance(json_values, list)
@@ -274,7 +275,7 @@ def _finite_or_none(number_text: str) -> float | None:
 
 
 def _checked_text(json_value: object) -> str:
-    """Return a text without control characters, cut to 1000 characters; raise TypeError if none."""
+    """Return a text without control characters, cut to 1000 characters; TypeError if no text."""
     if not isinstance(json_value, str):
         raise TypeError
     return printable(json_value, _MAX_TEXT_CHARACTERS)

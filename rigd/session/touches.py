@@ -1,6 +1,7 @@
 """Estimated touches (contacts of the beam with an obstacle) in a session file.
 
-They are JSON in the record ``outcome``, and messages of the topic ``/rig/touch``.
+A session file contains them as JSON in the record ``outcome``, and as messages of the topic
+``/rig/touch``.
 """
 
 import json
@@ -51,7 +52,7 @@ def touches_of(outcome: Mapping[str, str] | None) -> list[dict[str, Any]]:
 
 
 def _checked_touch(touch_document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a touch of the beam with its valid values from a JSON object."""
+    """Return the touch that a JSON object states; an invalid quantity is None."""
     touch_number, touch_kind = touch_document.get("number"), touch_document.get("kind")
     touch: dict[str, Any] = {
         "number": touch_number if isinstance(touch_number, int) and 0 < touch_number < 10**9 else 0,
@@ -60,11 +61,11 @@ def _checked_touch(touch_document: Mapping[str, Any]) -> dict[str, Any]:
             for quantity_name in _QUANTITY_UNITS
         },
     }
-    first_estimate_mark = {"final": False} if touch_document.get("final") is False else {}
+    not_final_entry = {"final": False} if touch_document.get("final") is False else {}
     return (
         touch
         | {"kind": touch_kind[:_MAX_KIND_CHARACTERS] if isinstance(touch_kind, str) else ""}
-        | first_estimate_mark
+        | not_final_entry
     )
 
 

@@ -11,7 +11,7 @@ from rigd.errors import UserError
 from rigd.units import finite_number, unit_of
 
 NOTES: Final = ("operator", "specimen", "note")
-"""Names of the texts that have options and keys of their own, and are not user metadata."""
+"""Names of texts that are not user metadata, because they have their own options and keys."""
 META_PREFIX: Final = "meta_"
 """Prefix that user metadata have in their keys in the record ``session``."""
 
@@ -86,12 +86,12 @@ def metadata_keys(metadata_values: Mapping[str, object]) -> dict[str, str]:
 
 
 def added_metadata(session_record: Mapping[str, str]) -> dict[str, float | str]:
-    """Return the metadata that users added to a session, from its record ``session_record``.
+    """Return the metadata that users added to a session, from its record ``session``.
 
     Parameters
     ----------
     session_record
-        Record ``session_record`` of a session file from any source.
+        Record ``session`` of a session file from any source.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def _number_text(metadata_name: str, metadata_value: object) -> str:
 
 
 def _finite_or_none(number_or_text: object) -> float | None:
-    """Return the finite number of a number or a text, or None if the value is something else."""
+    """Return a number, or the number that a text states, as a finite float; otherwise None."""
     try:
         return finite_number(
             float(number_or_text) if isinstance(number_or_text, str) else number_or_text

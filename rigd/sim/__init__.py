@@ -1,9 +1,9 @@
 """Simulated rig: physics of the plant, and simulated drive and sensor for the control loop.
 
 `SimulatedPlant` is the plant: motor, clamp, beam and air, stepped exactly between ticks.
-`SimulatedRig` is the plant with drive and sensor, in the process of the loop. The package `wire`
-runs the same rig in a process of its own, on a CAN bus and a serial line. This package does not
-depend on controller and sessions.
+`SimulatedRig` adds the drive and the sensor to the plant, and runs inside the control process. The
+package `wire` runs the same rig in a separate process, behind a CAN bus and a serial line. This
+package does not depend on the controller or on sessions.
 """
 
 import lazy_loader as lazy

@@ -1,9 +1,9 @@
 """Air drag on the simulated beam, computed tick by tick.
 
-The drag force per metre at the points of a `DragGrid` acts on the modes, whose poles are those of
-the beam's realisation, and by its moment on the shaft. The speeds at the points follow from the
-state. The force over the coming period is not known at its start. It is extrapolated: the held
-value is the mean over the period of the parabola through the last three forces.
+The drag force per metre at the points of a `DragGrid` drives the beam's modes, whose poles are
+those of its realisation, and the moment of the force acts on the shaft. The speeds at the points
+follow from the state. The force over the coming period is unknown when the period starts, so it is
+extrapolated: a parabola through the last three forces is averaged over the period.
 """
 
 from dataclasses import replace
@@ -29,19 +29,18 @@ Complex = NDArray[np.complex128]
 _DRAG_MODES = 5
 """Number of modes of the beam on which the drag acts.
 
-The fifth mode of the paper's link is at 145 Hz: three times the end of its sweep."""
+The fifth mode of the reference paper's beam is at 145 Hz, three times the highest frequency of its
+sweep."""
 _DRAG_POINTS = 16
 """Number of points along the beam at which the drag force is computed."""
 _EXTRAPOLATION_WEIGHTS = (23 / 12, -16 / 12, 5 / 12)
-"""Weights of the last three forces in the mean over the next period, newest first.
+"""Weights of the last three drag forces, newest first, in the extrapolated mean of the next period.
 
-They are those of the third-order Adams-Bashforth method."""
+They are the weights of the third-order Adams-Bashforth method."""
 
 
 class AirBrake:
-    """Drag of the still air on a simulated beam: its force, and its effect on the coupled model.
-
-    The coupled model is that of motor and beam.
+    """Drag of still air on a simulated beam: its force, and its effect on motor and beam.
 
     Parameters
     ----------
@@ -53,24 +52,24 @@ class AirBrake:
 
     Attributes
     ----------
-    speed
-        Matrix that gives the speeds at the points (m/s) from the state of the model that
-        `extended_model` returns, shape (points, n).
+    speed_rows
+        Matrix that gives the beam's speeds in m/s at the points of the grid from the state of the
+        model that `extended_model` returns, shape (points, n).
     """
 
     __slots__ = (
-        "_force_m",
+        "_force_per_square_speed",
         "_forces",
         "_grid",
         "_magnitude",
-        "_moment_m2",
         "_newest",
-        "_per_square",
         "_poles",
         "_shear_of_mode",
+        "_shear_per_force_m",
         "_torque_of_mode",
+        "_torque_per_force_m2",
         "_weights",
-        "speed",
+        "speed_rows",
     )
 
     def __init__(
@@ -90,20 +89,20 @@ class AirBrake:
         ) / poles
         leverage_m2 = beam.length_m * drag_grid.leverage_m
         self._torque_of_mode = _real_part_rows(leverage_m2 * load_terms / pole_slopes).sum(axis=0)
-        self._moment_m2 = leverage_m2 @ drag_grid.to_modes - drag_grid.to_moment
+        self._torque_per_force_m2 = leverage_m2 @ drag_grid.to_modes - drag_grid.to_moment
         mean_deflections_m = beam.length_m * mode_mean(mode_count)
         self._shear_of_mode = _real_part_rows(mean_deflections_m * load_terms / pole_slopes).sum(
             axis=0
         )
-        self._force_m = mean_deflections_m @ drag_grid.to_modes - drag_grid.weight_m
+        self._shear_per_force_m = mean_deflections_m @ drag_grid.to_modes - drag_grid.weight_m
 
-        coupled_states = 2 + realisation.b.size
-        self.speed: Real = np.zeros((_DRAG_POINTS, coupled_states + 2 * mode_count))
-        self.speed[:, 1] = drag_grid.x_m
+        coupled_state_count = 2 + realisation.b.size
+        self.speed_rows: Real = np.zeros((_DRAG_POINTS, coupled_state_count + 2 * mode_count))
+        self.speed_rows[:, 1] = drag_grid.x_m
         modal_rows = _real_part_rows(-drag_grid.leverage_m * load_terms / pole_slopes / poles)
-        self.speed[:, 2 : 2 + 2 * mode_count] = drag_grid.shapes.T @ modal_rows
+        self.speed_rows[:, 2 : 2 + 2 * mode_count] = drag_grid.shapes.T @ modal_rows
         force_rows = _real_part_rows(poles / pole_slopes / beam.bending_stiffness_n_m2)
-        self.speed[:, coupled_states:] = drag_grid.shapes.T @ force_rows
+        self.speed_rows[:, coupled_state_count:] = drag_grid.shapes.T @ force_rows
 
         self._forces = np.zeros((3, _DRAG_POINTS))
         self._magnitude = np.zeros(_DRAG_POINTS)
@@ -113,7 +112,7 @@ class AirBrake:
         self._weights = [
             np.array(_EXTRAPOLATION_WEIGHTS)[force_ages % 3] for force_ages in ages_by_newest
         ]
-        self._per_square = -0.5 * AIR_DENSITY_KG_PER_M3 * drag_m
+        self._force_per_square_speed = -0.5 * AIR_DENSITY_KG_PER_M3 * drag_m
 
     def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
         """Return the model of motor and beam, extended by the effect of the drag on the modes.
@@ -121,21 +120,21 @@ class AirBrake:
         Returns
         -------
         model
-            Model with two more states per mode, which act on the shaft.
-        of_force
-            Matrix that gives the contribution of the force per metre at the points to the
-            derivative of the state, shape (n, points).
+            Model with two more states per mode, whose torque acts on the shaft.
+        force_input
+            Matrix that gives the derivative of the state from the drag force per metre at the
+            points, shape (n, points).
         """
-        n, added_states = model.b.size, 2 * self._poles.size
-        a = np.zeros((n + added_states, n + added_states))
+        n, added_state_count = model.b.size, 2 * self._poles.size
+        a = np.zeros((n + added_state_count, n + added_state_count))
         a[:n, :n] = model.a
         a[:n, n:] = -np.outer(model.b, self._torque_of_mode)
-        first_states = np.arange(n, n + added_states, 2)
+        first_states = np.arange(n, n + added_state_count, 2)
         a[first_states, first_states] = a[first_states + 1, first_states + 1] = self._poles.real
         a[first_states, first_states + 1] = self._poles.imag
         a[first_states + 1, first_states] = -self._poles.imag
-        force_input = np.zeros((n + added_states, _DRAG_POINTS))
-        force_input[:n] = -np.outer(model.b, self._moment_m2)
+        force_input = np.zeros((n + added_state_count, _DRAG_POINTS))
+        force_input[:n] = -np.outer(model.b, self._torque_per_force_m2)
         force_input[first_states] = self._grid.to_modes
 
         def row(model_row: Real, per_torque: float = 0.0, direct_effect: float = 0.0) -> Real:
@@ -144,7 +143,7 @@ class AirBrake:
         extended_coupled = replace(
             model,
             a=a,
-            b=np.concatenate([model.b, np.zeros(added_states)]),
+            b=np.concatenate([model.b, np.zeros(added_state_count)]),
             angle=row(model.angle),
             velocity=row(model.velocity),
             acceleration=row(model.acceleration, model.acceleration_per_torque),
@@ -158,31 +157,31 @@ class AirBrake:
         return extended_coupled, force_input
 
     def update_force(self, speed_m_s: Real) -> tuple[float, float]:
-        """Compute and store the drag force for speeds in m/s at the points of the beam.
-
-        The immediate effect of the force is returned.
+        """Compute and store the drag force for given speeds in m/s; return its immediate effect.
 
         Returns
         -------
         torque_nm, shear_n : float
-            Immediate effect of the force on the beam's torque and shear, for unchanged modes.
+            Change of the beam's torque and shear by the force before it has moved any mode.
         """
         self._newest = (self._newest + 1) % 3
         force_n_per_m = self._forces[self._newest]
         np.absolute(speed_m_s, self._magnitude)
         np.multiply(self._magnitude, speed_m_s, force_n_per_m)
-        force_n_per_m *= self._per_square
-        return float(self._moment_m2.dot(force_n_per_m)), float(self._force_m.dot(force_n_per_m))
+        force_n_per_m *= self._force_per_square_speed
+        return float(self._torque_per_force_m2.dot(force_n_per_m)), float(
+            self._shear_per_force_m.dot(force_n_per_m)
+        )
 
     def write_held_force(self, force_output: Real) -> None:
-        """Write the drag force per metre that acts over the coming period to an array, in N/m."""
+        """Write the drag force of the coming period, in N/m, into the array `force_output`."""
         self._weights[self._newest].dot(self._forces, force_output)
 
 
 def _real_part_rows(gains: Complex) -> Real:
-    """Return rows that compute ``2 Re(gain z)`` from the states of each pole's z, (m, 2 m).
+    """Return rows that compute ``2 Re(gain z)`` for the complex state z of each pole, (m, 2 m).
 
-    The two states are the real part of z and the negative of its imaginary part.
+    The model stores z as two real states: its real part, and minus its imaginary part.
     """
     real_part_matrix = np.zeros((gains.size, 2 * gains.size))
     pole_index = np.arange(gains.size)

@@ -44,7 +44,8 @@ class StuckReadings:
     Parameters
     ----------
     refresh_every
-        Number of calls after which a new reading is returned; 0: the first is repeated for ever.
+        Number of calls after which a new reading is returned; 0: the first reading is repeated for
+        ever.
     """
 
     __slots__ = ("_count", "_refresh_every", "_value")
@@ -67,9 +68,9 @@ def open_simulated_rig(rig: RigParameters) -> Devices:
     simulated = SimulatedRig(rig)
 
     def renew_noise(seed: int | None) -> int:
-        used_seed = fresh_seed() if seed is None else seed
-        simulated.begin_session(used_seed)
-        return used_seed
+        noise_seed = fresh_seed() if seed is None else seed
+        simulated.begin_session(noise_seed)
+        return noise_seed
 
     return Devices(
         SimulatedDrive(simulated, rig.rate_hz),
@@ -96,8 +97,8 @@ class SimulatedRig:
         Simulated plant, and simulated sensor that measures it.
     records_per_period : int
         Number of readings of the sensor per period.
-    stuck_encoder : Stuck or None
-        Replacement for the readings of a failed encoder; None if it works.
+    stuck_encoder : StuckReadings or None
+        Replacement for the readings of a failed encoder; None if the encoder works.
     """
 
     def __init__(self, rig: RigParameters) -> None:
@@ -128,9 +129,9 @@ class SimulatedRig:
         self.stuck_encoder: StuckReadings | None = None
 
     def begin_session(self, seed: int) -> None:
-        """Restart the noise, and use the beam of this session if beams differ between sessions.
+        """Restart the noise for a new session, with a new beam if the beam varies by session.
 
-        The drive is off afterwards. Computing a new beam takes a tenth of a second.
+        With a new beam the drive is off afterwards; computing it takes a tenth of a second.
 
         Parameters
         ----------
@@ -178,8 +179,8 @@ class SimulatedRig:
         disturbance
             Obstacle or impact, whose times count from the first enabling of the drive.
         wait
-            Whether the disturbance is present before the next period; the caller then waits a tenth
-            of a second. Otherwise another process prepares it while the rig continues.
+            If True, block for about 0.1 s until the disturbance acts. If False, return at once;
+            another process prepares it while the rig continues.
         """
         self._added_disturbances.append(disturbance)
         if wait:
@@ -193,9 +194,13 @@ class SimulatedRig:
         self.plant.remove_obstacle(disturbance)
 
     def _plant_with_disturbances(self) -> tuple[int, SimulatedPlant]:
-        """Return a plant with all added obstacles and impacts, after their number."""
-        texts = [describe_obstacle(disturbance) for disturbance in self._added_disturbances]
-        return len(texts), SimulatedPlant(with_obstacles(self._parameters, texts))
+        """Return the number of added obstacles and impacts, and a plant that has them all."""
+        disturbance_texts = [
+            describe_obstacle(disturbance) for disturbance in self._added_disturbances
+        ]
+        return len(disturbance_texts), SimulatedPlant(
+            with_obstacles(self._parameters, disturbance_texts)
+        )
 
     def _start_preparation(self) -> None:
         """Start computing the plant with all obstacles and impacts in another process."""
@@ -208,9 +213,9 @@ class SimulatedRig:
         self._preparation = ForkedComputation(prepared)
 
     def _poll_preparation(self) -> None:
-        """Use the plant computed in the other process if it is ready.
+        """Use the plant that the other process has computed, if it is ready.
 
-        The computation of disturbances added since then is started.
+        If disturbances were added in the meantime, the computation of a plant with them is started.
         """
         assert self._preparation is not None
         if not self._preparation.has_ended():
@@ -255,7 +260,7 @@ class SimulatedDrive:
 
     @property
     def stuck_encoder(self) -> StuckReadings | None:
-        """Replacement for the readings of a failed encoder; None if it works. It can be set."""
+        """Replacement for the readings of a failed encoder, which can be set; None if it works."""
         return self._rig.stuck_encoder
 
     @stuck_encoder.setter
@@ -263,7 +268,7 @@ class SimulatedDrive:
         self._rig.stuck_encoder = stuck
 
     def connect(self) -> None:
-        """Do nothing: a drive simulated in this process has no line to open."""
+        """Do nothing: a drive simulated in this process needs no connection."""
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:  # noqa: ARG002
         """Switch the simulated drive on, or raise if the wired stop is dropped."""
@@ -282,7 +287,7 @@ class SimulatedDrive:
         return self._plant.command(torque_nm)
 
     def health(self) -> LineHealth:
-        """Return an empty line health, since there is no line."""
+        """Return a line health without values, since there is no communication line."""
         return LineHealth()
 
     def disable(self) -> None:
@@ -315,8 +320,8 @@ class SimulatedSensor:
     """Simulated six-axis sensor with white noise, hum, offset, limited resolution and range.
 
     The wrench is the smallest one whose projections are the coupling torque (with hum) and the base
-    shear; crosstalk is added to it. If the sensor streams, the value read is the output of the
-    decimating filter over the last readings.
+    shear; crosstalk is added to it. If the sensor streams, the wrench read is the output of the
+    decimating filter for the last readings.
 
     Parameters
     ----------
@@ -330,8 +335,8 @@ class SimulatedSensor:
 
     Attributes
     ----------
-    stuck : Stuck or None
-        Replacement for the readings of a failed sensor; None if it works.
+    stuck : StuckReadings or None
+        Replacement for the readings of a failed sensor; None if the sensor works.
     """
 
     def __init__(
@@ -372,7 +377,7 @@ class SimulatedSensor:
         self.wrench_saturated = False
 
     def connect(self) -> None:
-        """Do nothing: a sensor simulated in this process has no line to open."""
+        """Do nothing: a sensor simulated in this process needs no connection."""
 
     def calibration(self) -> dict[str, object]:
         """Return the calibration as a real sensor would report it."""
@@ -400,7 +405,7 @@ class SimulatedSensor:
         return fx, fy, fz, tx, ty, tz
 
     def health(self) -> LineHealth:
-        """Return the line health of a sensor without errors and without line."""
+        """Return a line health with status 0 (no error), since there is no communication line."""
         return LineHealth(status=0)
 
     def renew_noise(self, seed: int) -> None:
@@ -429,8 +434,16 @@ class SimulatedSensor:
             torque_nm += self._hum_nm * sin(tau * self._hum_cycles)
         shear_n = self._plant.sensed_shear_n
         is_saturated = False
-        for axis, per_torque, per_shear, axis_range, axis_resolution in self._loaded_axes:
-            axis_reading = noise_row[axis] + per_torque * torque_nm + per_shear * shear_n
+        for (
+            axis,
+            reading_per_torque,
+            reading_per_shear,
+            axis_range,
+            axis_resolution,
+        ) in self._loaded_axes:
+            axis_reading = (
+                noise_row[axis] + reading_per_torque * torque_nm + reading_per_shear * shear_n
+            )
             if not -axis_range < axis_reading < axis_range:
                 axis_reading = axis_range if axis_reading > 0 else -axis_range
                 is_saturated = True
@@ -445,12 +458,12 @@ class SimulatedSensor:
         return wrench if self.stuck is None else self.stuck(wrench)
 
     def close(self) -> None:
-        """Do nothing: a sensor simulated in this process has no line to release."""
+        """Do nothing: a sensor simulated in this process has no connection to close."""
 
     def _noise(self, seed: int | None) -> Iterator[list[list[float]]]:
-        """Yield blocks of readings without load: noise and offset, in N and N·m.
+        """Yield blocks of unloaded readings, that is noise and offset in N and N·m.
 
-        Without a seed the noise is random.
+        If the seed is None, the noise differs each time.
         """
         simulation = self._simulation
         random_generator = np.random.default_rng(seed)
@@ -491,15 +504,15 @@ _CROSSTALK_PATTERN = (
     (-0.88, -0.33, 0.46, 0.54, 0.0, 0.79),
     (0.41, -0.97, 0.68, -0.75, 0.29, 0.0),
 )
-"""Relative crosstalk of each axis (row) at the full range of another axis (column).
+"""Crosstalk of each axis (row) at the full range of another axis (column), relative to its range.
 
-The values are fractions of the crosstalk percentage, whose largest entry is 1."""
+The values are fractions of the profile's crosstalk percentage; the largest is 1."""
 
 
 def _unit_wrenches(
     sensor: WrenchSensorSettings, crosstalk_percent: float
 ) -> tuple[list[float], list[float]]:
-    """Return the wrenches of a coupling torque of 1 N·m alone and of a base shear of 1 N alone."""
+    """Return the wrenches that a torque of 1 N·m alone and a base shear of 1 N alone cause."""
     projections = np.array([sensor.projection, sensor.shear_projection])
     is_known = projections.any(axis=1)
     unit_wrenches = np.zeros((6, 2))

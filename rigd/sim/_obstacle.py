@@ -37,9 +37,9 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 """Array of complex numbers."""
 
-_RIGID_N_PER_M = 1e9
+_RIGID_STIFFNESS_N_PER_M = 1e9
 """Stiffness in N/m of a rigid obstacle: its deflection is a nanometre per newton."""
-_STIFFEST_N_PER_M = 1e5
+_MAX_RESOLVED_STIFFNESS_N_PER_M = 1e5
 """Stiffness in N/m of the stiffest obstacle whose contact the substeps resolve."""
 _SUBSTEPS_PER_CONTACT_TIME = 6
 """Number of substeps in the time in which a beam that is hit recedes from an obstacle."""
@@ -50,11 +50,11 @@ _MIN_SUBSTEPS = 8
 _TIP_COMPLIANCE_RATIO = 4.0
 """Compliance of a beam at its tip, relative to that of a beam without ends."""
 _CONTACT_MARGIN_M = 1e-3
-"""Distance in m, in addition to the beam's motion, within which it may touch during a period."""
+"""Distance in m, beyond the beam's motion in a period, within which an obstacle may be touched."""
 _SMALL_DISPLACEMENT_RATIO = 0.01
-"""Displacement relative to a rigid beam's, below which the absolute error of the fit counts.
+"""Displacement, relative to a rigid beam's, below which the fit limits the absolute error.
 
-There the beam hardly follows the motor."""
+A beam that moves so little hardly follows the motor, and needs no relative accuracy."""
 _CONTACT_ITERATIONS = 3
 """Number of iterations over several obstacles that the beam touches in one substep."""
 
@@ -93,10 +93,10 @@ class AttachedObstacles:
         self.bodies = bodies
         self._period_s = period_s
         self.substeps = _substeps_per_period(beam, bodies, period_s)
-        self._step_s = period_s / self.substeps
+        self._substep_s = period_s / self.substeps
         positions_m = np.array([attached_body.x_m for attached_body in bodies])
         force_realisations = [
-            realise_force(beam, damping, x, positions_m, 1 / self._step_s)
+            realise_force(beam, damping, x, positions_m, 1 / self._substep_s)
             for x in positions_m.tolist()
         ]
         # Rows: displacement at each body, torque, shear. Columns of `_force_state_rows`: states of
@@ -108,7 +108,7 @@ class AttachedObstacles:
             [force_realisation.direct for force_realisation in force_realisations]
         )
         self._a, self._b = force_realisations[0].a, force_realisations[0].b  # equal for all forces
-        self._oscillating_states = 2 * force_realisations[0].modes
+        self._oscillating_state_count = 2 * force_realisations[0].modes
         angle_outputs = [
             state_output(
                 realisation,
@@ -121,7 +121,11 @@ class AttachedObstacles:
         self._rigid_rows = np.array([[t.per_angle, t.per_velocity, *t.c] for t in angle_outputs])
         self._positions_m = positions_m
         self._obstacles = [
-            (body_index, attached_body, min(attached_body.stiffness_n_per_m, _RIGID_N_PER_M))
+            (
+                body_index,
+                attached_body,
+                min(attached_body.stiffness_n_per_m, _RIGID_STIFFNESS_N_PER_M),
+            )
             for body_index, attached_body in enumerate(bodies)
             if isinstance(attached_body, Obstacle)
         ]
@@ -134,42 +138,47 @@ class AttachedObstacles:
         self.forces_n = self._zero_forces
         # Displacement at each body at the end of the last period, and at its start.
         self._displacement_m: Real = np.zeros(len(bodies))
-        self._start_m = self._displacement_m
-        self._penetration_m = self._ends_m = dict.fromkeys(range(len(bodies)), -inf)
+        self._start_displacement_m = self._displacement_m
+        self._penetration_m = self._end_penetrations_m = dict.fromkeys(range(len(bodies)), -inf)
 
     @property
     def displacement_rows(self) -> Real:
-        """Matrix that gives the displacement in m at each body from the extended model's state."""
+        """Matrix that gives the beam's displacement in m at each obstacle or impact from the state.
+
+        The state is that of the model that `extended_model` returns.
+        """
         return np.column_stack([self._rigid_rows, self._force_state_rows[:-2]])
 
     def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
-        """Return the model of motor and beam, with more states for the effect of the forces.
+        """Return the model of motor and beam, extended by the effect of forces on the beam.
 
         Returns
         -------
         model
             Model with additional states for each force, whose torque acts on the shaft.
-        of_force
-            Contribution of each force (1 N) to the derivative of the state, shape (n, bodies).
+        force_input
+            Derivative of the state by each force, per N, shape (n, bodies).
         """
-        body_count, own_states = self._positions_m.size, self._b.size
-        n, added_states = model.b.size, body_count * own_states
+        body_count, states_per_body = self._positions_m.size, self._b.size
+        n, added_state_count = model.b.size, body_count * states_per_body
         torque_row, shear_row = self._force_state_rows[-2], self._force_state_rows[-1]
-        a = np.zeros((n + added_states, n + added_states))
+        a = np.zeros((n + added_state_count, n + added_state_count))
         a[:n, :n] = model.a
         a[:n, n:] = -np.outer(model.b, torque_row)
-        force_input = np.zeros((n + added_states, body_count))
+        force_input = np.zeros((n + added_state_count, body_count))
         force_input[:n] = -np.outer(model.b, self._direct_rows[-2])
         for body_index in range(body_count):
-            body_states = slice(n + body_index * own_states, n + (body_index + 1) * own_states)
+            body_states = slice(
+                n + body_index * states_per_body, n + (body_index + 1) * states_per_body
+            )
             a[body_states, body_states] = self._a
             force_input[body_states, body_index] = self._b
         extended_coupled = replace(
             model,
             a=a,
-            b=np.append(model.b, np.zeros(added_states)),
-            angle=np.append(model.angle, np.zeros(added_states)),
-            velocity=np.append(model.velocity, np.zeros(added_states)),
+            b=np.append(model.b, np.zeros(added_state_count)),
+            angle=np.append(model.angle, np.zeros(added_state_count)),
+            velocity=np.append(model.velocity, np.zeros(added_state_count)),
             acceleration=np.append(model.acceleration, -model.acceleration_per_torque * torque_row),
             beam_torque=np.append(
                 model.beam_torque, (1 - model.beam_torque_per_torque) * torque_row
@@ -184,7 +193,7 @@ class AttachedObstacles:
     def substep_matrices(
         self,
         model: CoupledModel,
-        of_force: Real,
+        force_input: Real,
         holding_torque: Real,
         switch_s: float,
         angle_instant_s: float,
@@ -195,43 +204,49 @@ class AttachedObstacles:
 
         Parameters
         ----------
-        model, of_force
+        model, force_input
             As `extended_model` returns them.
         holding_torque, switch_s, angle_instant_s, torque_instant_s
-            As for a step of the plant.
+            As for :func:`rigd.sim._step._step_matrix`.
         friction_effect
-            Effect of the previous period's friction (1 N·m) on the state, shape (n,).
+            Effect of 1 N·m of friction in the previous period on the state, shape (n,).
         """
-        substep_count, step_s, body_count = self.substeps, self._step_s, self._positions_m.size
+        substep_count, substep_s, body_count = (
+            self.substeps,
+            self._substep_s,
+            self._positions_m.size,
+        )
         n = model.b.size
-        phi, step_response = propagator(model, step_s)
+        phi, step_response = propagator(model, substep_s)
         displacement_rows = self.displacement_rows
 
         # Displacement without a force: rows for the states, columns for the torques.
-        displacement_by_state = np.empty((substep_count, body_count, n))
+        displacement_per_state = np.empty((substep_count, body_count, n))
         row = displacement_rows
         for j in range(substep_count):
-            displacement_by_state[j] = row = row @ phi
-        displacement_by_torque = np.empty((substep_count, body_count, 2))
+            displacement_per_state[j] = row = row @ phi
+        displacement_per_torque = np.empty((substep_count, body_count, 2))
         state_per_torque = np.zeros((n, 2))
         for j in range(substep_count):
-            before_s = min(max(switch_s - j * step_s, 0.0), step_s)
+            time_before_switch_s = min(max(switch_s - j * substep_s, 0.0), substep_s)
             response_after = (
-                propagator(model, step_s - before_s)[1] if 0 < before_s < step_s else step_response
+                propagator(model, substep_s - time_before_switch_s)[1]
+                if 0 < time_before_switch_s < substep_s
+                else step_response
             )
-            response_after = response_after * (before_s < step_s)
+            response_after = response_after * (time_before_switch_s < substep_s)
             state_per_torque = phi @ state_per_torque + np.column_stack(
                 [step_response - response_after, response_after]
             )
-            displacement_by_torque[j] = displacement_rows @ state_per_torque
+            displacement_per_torque[j] = displacement_rows @ state_per_torque
         free_matrix = np.column_stack(
-            [displacement_by_state.reshape(-1, n), displacement_by_torque.reshape(-1, 2)]
+            [displacement_per_state.reshape(-1, n), displacement_per_torque.reshape(-1, 2)]
         )
         free_matrix = np.column_stack([free_matrix, free_matrix[:, :n] @ friction_effect])
 
         # State j substeps after a force of 1 N that acted for one substep.
         decayed_states = np.empty((substep_count, n, body_count))
-        decayed_states[0] = states_after_constant_inputs(model, of_force, step_s)
+        decayed_states[0] = states_after_constant_inputs(model, force_input, substep_s)
         for j in range(1, substep_count):
             decayed_states[j] = phi @ decayed_states[j - 1]
         force_kernel = displacement_rows @ decayed_states
@@ -239,7 +254,7 @@ class AttachedObstacles:
 
         def effect_on(row: Real, direct_effect: Real, instant_s: float) -> Real:
             """Return the effect of each substep's force on an output at an instant."""
-            substeps_before = instant_s / step_s
+            substeps_before = instant_s / substep_s
             substep_index = min(int(substeps_before), substep_count - 1)
             substep_fraction = substeps_before - substep_index
             effect_matrix = np.zeros((substep_count, body_count))
@@ -270,26 +285,27 @@ class AttachedObstacles:
             ]
         )
         return SubstepMatrices(
-            free=np.asfortranarray(free_matrix).dot,
-            friction=-displacement_by_torque.sum(axis=2),
-            kernel=force_kernel,
-            history=_history_matrices(force_kernel),
-            effect=np.asfortranarray(effect_matrix).dot,
+            free_displacement=np.asfortranarray(free_matrix).dot,
+            displacement_per_friction=-displacement_per_torque.sum(axis=2),
+            displacement_kernel=force_kernel,
+            displacement_history=_history_matrices(force_kernel),
+            force_effect=np.asfortranarray(effect_matrix).dot,
             velocity_row=n + 1,
         )
 
     def cannot_touch(self, displacement_m: Real, time_s: float) -> bool:
-        """Return whether contact of the beam with any obstacle or impact is excluded in a period.
+        """Return whether no obstacle and no impact can act on the beam during a period.
 
         Parameters
         ----------
         displacement_m
-            Displacement in m at each body at the end of a period without a force, shape (bodies,).
+            Beam's displacement in m at each body at the end of the period if no force acts, shape
+            (bodies,).
         time_s
             Time in seconds at the start of the period.
         """
         end_s = time_s + self._period_s
-        before_m = self._start_m = self._displacement_m
+        start_displacement_m = self._start_displacement_m = self._displacement_m
         self._displacement_m = displacement_m.copy()
         for _, active_impact in self._impacts:
             if (
@@ -301,12 +317,15 @@ class AttachedObstacles:
             if active_body.from_s < end_s and time_s < active_body.until_s:
                 if self._penetration_m[body_index] > 0:
                     return False
-                old, new = before_m.item(body_index), displacement_m.item(body_index)
+                old_m, new_m = (
+                    start_displacement_m.item(body_index),
+                    displacement_m.item(body_index),
+                )
                 motion_m = (
-                    2 * abs(new - old)
+                    2 * abs(new_m - old_m)
                     + active_body.x_m * abs(active_body.rate_rad_s) * self._period_s
                 )
-                if active_body.side * (new - _surface_displacement_m(active_body, end_s)) > -(
+                if active_body.side * (new_m - _surface_displacement_m(active_body, end_s)) > -(
                     motion_m + _CONTACT_MARGIN_M
                 ):
                     return False
@@ -314,16 +333,18 @@ class AttachedObstacles:
         self.forces_n = self._zero_forces
         return True
 
-    def forces(self, substep_matrices: "SubstepMatrices", free_m: Real, time_s: float) -> Real:
-        """Compute the forces in N of obstacles and impacts on the beam in each substep of a period.
+    def forces(
+        self, substep_matrices: "SubstepMatrices", free_displacement_m: Real, time_s: float
+    ) -> Real:
+        """Return the forces in N of obstacles and impacts on the beam in each substep of a period.
 
         Parameters
         ----------
         substep_matrices
             Matrices for the substeps, of the free or the locked motor.
-        free_m
-            Displacement in m at the end of each substep without any force, shape (substeps,
-            bodies).
+        free_displacement_m
+            Beam's displacement in m at each body at the end of each substep if no force acts, shape
+            (substeps, bodies).
         time_s
             Time in seconds at the start of the period.
 
@@ -332,73 +353,81 @@ class AttachedObstacles:
         (substeps, bodies)
             Forces in N, positive in the direction of increasing angles.
         """
-        substep_count, step_s = self.substeps, self._step_s
-        force_kernel = substep_matrices.kernel
+        substep_count, substep_s = self.substeps, self._substep_s
+        force_kernel = substep_matrices.displacement_kernel
         forces_n = np.zeros_like(self._zero_forces)
-        free_m = free_m.copy()
+        free_displacement_m = free_displacement_m.copy()
         for body_index, active_impact in self._impacts:
-            edges_s = time_s - active_impact.at_s + step_s * np.arange(substep_count + 1)
+            substep_edges_s = time_s - active_impact.at_s + substep_s * np.arange(substep_count + 1)
             # Mean of half a sine over each substep.
             pulse_phase = (
-                pi / active_impact.duration_s * np.clip(edges_s, 0.0, active_impact.duration_s)
+                pi
+                / active_impact.duration_s
+                * np.clip(substep_edges_s, 0.0, active_impact.duration_s)
             )
             forces_n[:, body_index] = (
                 -active_impact.force_n
                 * active_impact.duration_s
                 / pi
-                / step_s
+                / substep_s
                 * np.diff(np.cos(pulse_phase))
             )
             for j in np.flatnonzero(forces_n[:, body_index]).tolist():
-                free_m[j:] += (
+                free_displacement_m[j:] += (
                     force_kernel[: substep_count - j, :, body_index] * forces_n[j, body_index]
                 )
 
-        ends_s = time_s + step_s * np.arange(1, substep_count + 1)
+        substep_ends_s = time_s + substep_s * np.arange(1, substep_count + 1)
         active_obstacles = []
         for body_index, active_body, stiffness_n_per_m in self._obstacles:
-            is_present = (ends_s > active_body.from_s) & (ends_s <= active_body.until_s)
+            is_present = (substep_ends_s > active_body.from_s) & (
+                substep_ends_s <= active_body.until_s
+            )
             if not is_present.any():
                 continue
-            surface_m = _surface_displacement_m(active_body, ends_s)
-            start_m = self._penetration_m[body_index]
-            if start_m == -inf and active_body.from_s <= time_s:
-                start_m = active_body.side * (
-                    self._start_m.item(body_index) - _surface_displacement_m(active_body, time_s)
+            surface_m = _surface_displacement_m(active_body, substep_ends_s)
+            start_penetration_m = self._penetration_m[body_index]
+            if start_penetration_m == -inf and active_body.from_s <= time_s:
+                start_penetration_m = active_body.side * (
+                    self._start_displacement_m.item(body_index)
+                    - _surface_displacement_m(active_body, time_s)
                 )
             active_obstacles.append(
                 _ActiveObstacle(
                     index=body_index,
                     side=active_body.side,
                     stiffness_n_per_m=stiffness_n_per_m,
-                    damping_n_per_m=active_body.damping_n_s_per_m / step_s,
+                    damping_n_per_m=active_body.damping_n_s_per_m / substep_s,
                     compliance_m_per_n=force_kernel.item(0, body_index, body_index),
-                    free_m=np.where(
-                        is_present, active_body.side * (free_m[:, body_index] - surface_m), -inf
+                    free_penetration_m=np.where(
+                        is_present,
+                        active_body.side * (free_displacement_m[:, body_index] - surface_m),
+                        -inf,
                     ),
-                    start_m=start_m,
+                    start_penetration_m=start_penetration_m,
                     force_n=np.zeros(substep_count),
                 )
             )
         if active_obstacles:
             self._compute_obstacle_forces(substep_matrices, active_obstacles)
-        self._ends_m = dict.fromkeys(range(self._positions_m.size), -inf)
+        self._end_penetrations_m = dict.fromkeys(range(self._positions_m.size), -inf)
         for active_obstacle in active_obstacles:
-            self._ends_m[active_obstacle.index] = active_obstacle.start_m
+            self._end_penetrations_m[active_obstacle.index] = active_obstacle.start_penetration_m
             forces_n[:, active_obstacle.index] = -active_obstacle.side * active_obstacle.force_n
         return forces_n
 
     def _compute_obstacle_forces(
         self, substep_matrices: "SubstepMatrices", obstacles: "list[_ActiveObstacle]"
     ) -> None:
-        """Compute the forces of all obstacles in the order of the substeps of a period.
+        """Compute the forces of all obstacles in a period, substep by substep.
 
-        Forces of later substeps are still zero, so that whole rows can be summed.
+        The forces of later substeps are still zero, so whole matrix rows can be multiplied.
         """
         substep_count = self.substeps
         # By how much each force moves the beam out of an obstacle until the end of each substep.
         displacement_kernels = [
-            [(one.side * other_one.side * substep_matrices.history[one.index, other_one.index],
+            [(one.side * other_one.side
+              * substep_matrices.displacement_history[one.index, other_one.index],
               other_one.force_n) for other_one in obstacles]
             for one in obstacles
         ]  # fmt: skip
@@ -410,11 +439,11 @@ class AttachedObstacles:
         iteration_count = _CONTACT_ITERATIONS if len(obstacles) > 1 else 1
         j = 0
         while j < substep_count:
-            if all(obstacle.start_m <= 0 for obstacle in obstacles):
+            if all(obstacle.start_penetration_m <= 0 for obstacle in obstacles):
                 # Nothing is touched: skip to the first substep with a contact at its end.
                 contact_substep = substep_count
                 free_penetrations_m = [
-                    obstacle.free_m
+                    obstacle.free_penetration_m
                     - sum(kernel_matrix @ force_n for kernel_matrix, force_n in kernel_pairs)
                     for obstacle, kernel_pairs in zip(obstacles, displacement_kernels, strict=True)
                 ]
@@ -426,31 +455,33 @@ class AttachedObstacles:
                     for obstacle, free_penetration_m in zip(
                         obstacles, free_penetrations_m, strict=True
                     ):
-                        obstacle.start_m = free_penetration_m.item(contact_substep - 1)
+                        obstacle.start_penetration_m = free_penetration_m.item(contact_substep - 1)
                 j = contact_substep
                 if j == substep_count:
                     return
             for _ in range(iteration_count):
                 for obstacle, row_pairs in obstacles_with_rows:
                     obstacle.force_n[j] = 0.0
-                    free_end_m = obstacle.free_m.item(j)
+                    free_end_m = obstacle.free_penetration_m.item(j)
                     for matrix_rows, force_n in row_pairs:
                         free_end_m -= matrix_rows[j].dot(force_n)
-                    mean_force_n, obstacle.end_m = obstacle.force_and_penetration(free_end_m)
+                    mean_force_n, obstacle.end_penetration_m = obstacle.force_and_penetration(
+                        free_end_m
+                    )
                     obstacle.force_n[j] = mean_force_n
             for obstacle in obstacles:
-                obstacle.start_m = obstacle.end_m
+                obstacle.start_penetration_m = obstacle.end_penetration_m
             j += 1
 
     def adopt_states(self, old_state: Real, old_obstacles: "AttachedObstacles | None") -> Real:
-        """Adopt the states of the previous obstacles, and return the plant's new state.
+        """Take over the state of a plant with fewer obstacles; return the state with all of them.
 
-        The previous obstacles are the first of these obstacles.
+        The obstacles that have acted so far come first among these obstacles.
 
         Parameters
         ----------
         old_state
-            State of the plant with the other obstacles.
+            State of the plant with the obstacles that have acted so far.
         old_obstacles
             Obstacles that have acted so far; None if there were none.
 
@@ -466,18 +497,22 @@ class AttachedObstacles:
         new_state = np.zeros(n + states_per_body * self._positions_m.size)
         new_state[:n] = old_state[:n]
         if old_obstacles is not None:
-            modal_states = min(self._oscillating_states, old_obstacles._oscillating_states)
-            real_states = min(
-                states_per_body - self._oscillating_states,
-                old_states_per_body - old_obstacles._oscillating_states,
+            modal_state_count = min(
+                self._oscillating_state_count, old_obstacles._oscillating_state_count
+            )
+            real_state_count = min(
+                states_per_body - self._oscillating_state_count,
+                old_states_per_body - old_obstacles._oscillating_state_count,
             )
             for body_index in range(old_body_count):
-                new = new_state[n + body_index * states_per_body :]
-                old = old_state[n + body_index * old_states_per_body :]
-                new[:modal_states] = old[:modal_states]
-                new[self._oscillating_states : self._oscillating_states + real_states] = old[
-                    old_obstacles._oscillating_states : old_obstacles._oscillating_states
-                    + real_states
+                new_body_states = new_state[n + body_index * states_per_body :]
+                old_body_states = old_state[n + body_index * old_states_per_body :]
+                new_body_states[:modal_state_count] = old_body_states[:modal_state_count]
+                new_body_states[
+                    self._oscillating_state_count : self._oscillating_state_count + real_state_count
+                ] = old_body_states[
+                    old_obstacles._oscillating_state_count : old_obstacles._oscillating_state_count
+                    + real_state_count
                 ]
             self._penetration_m.update(old_obstacles._penetration_m)
         self._displacement_m = self.displacement_rows @ new_state
@@ -491,47 +526,46 @@ class AttachedObstacles:
                 replace(known_body, until_s=min(known_body.until_s, time_s))
                 if known_body == removed_body
                 else known_body,
-                k,
+                stiffness_n_per_m,
             )
-            for body_index, known_body, k in self._obstacles
+            for body_index, known_body, stiffness_n_per_m in self._obstacles
         ]
 
     def store_forces(
-        self, substep_matrices: "SubstepMatrices", forces_n: Real, free_m: Real
+        self, substep_matrices: "SubstepMatrices", forces_n: Real, free_displacement_m: Real
     ) -> None:
-        """Store the forces of a period and the displacements and penetrations at its end."""
+        """Store the forces of a period, and the displacements and penetrations at its end."""
         self.forces_n = forces_n
-        self._penetration_m = self._ends_m
-        self._displacement_m = free_m[-1] + np.einsum(
-            "jab,jb->a", substep_matrices.kernel[::-1], forces_n
+        self._penetration_m = self._end_penetrations_m
+        self._displacement_m = free_displacement_m[-1] + np.einsum(
+            "jab,jb->a", substep_matrices.displacement_kernel[::-1], forces_n
         )
 
 
 @dataclass(slots=True, eq=False)
 class _ActiveObstacle:
-    """Obstacle during one period, with its penetration by the beam and its force."""
+    """Obstacle in one period: how far the beam penetrates it, and its force on the beam."""
 
     index: int
     side: int
     stiffness_n_per_m: float
     damping_n_per_m: float  # damping coefficient divided by the length of a substep
     compliance_m_per_n: float  # displacement of the beam by 1 N within a substep
-    free_m: Real  # penetration at the end of each substep without any force in this period
-    start_m: float  # penetration at the start of the present substep
+    free_penetration_m: Real  # penetration at the end of each substep if no force acts
+    start_penetration_m: float  # penetration at the start of the present substep
     force_n: Real  # forces of the substeps computed so far, else 0; positive on either side
-    end_m: float = -inf  # penetration at the end of the present substep
+    end_penetration_m: float = -inf  # penetration at the end of the present substep
 
     def force_and_penetration(self, p: float) -> tuple[float, float]:
-        """Return mean force in N and final penetration in m of the beam in a substep.
+        """Return the mean force in N over a substep, and the penetration in m at its end.
 
-        Without the force the penetration would be `p` at the end.
-
-        The mean force over the substep follows from the work, as the module's docstring explains.
+        `p` is the penetration in m that the substep would end with if the obstacle exerted no
+        force. The mean force follows from the work, as the module's docstring explains.
         """
         if p == -inf:  # the obstacle is not present
             return 0.0, p
         a, compliance_m_per_n, damping_n_per_m = (
-            self.start_m,
+            self.start_penetration_m,
             self.compliance_m_per_n,
             self.damping_n_per_m,
         )
@@ -560,11 +594,17 @@ class _ActiveObstacle:
             mean_force_n = 0.5 * stiffness_n_per_m * a * a / (a - q) - damping_n_per_m * a
         elif p > 0:
             # The beam arrives: (p - q) (q - a) / compliance = k q²/2 + damping q (q - a)
-            square = 1 + compliance_m_per_n * (0.5 * stiffness_n_per_m + damping_n_per_m)
-            linear = p + a + compliance_m_per_n * damping_n_per_m * a
-            root_m = sqrt(linear * linear - 4 * square * p * a)
+            square_coefficient = 1 + compliance_m_per_n * (
+                0.5 * stiffness_n_per_m + damping_n_per_m
+            )
+            linear_coefficient = p + a + compliance_m_per_n * damping_n_per_m * a
+            root_m = sqrt(linear_coefficient * linear_coefficient - 4 * square_coefficient * p * a)
             # Two forms of the positive root: choose the one without cancellation.
-            q = (linear + root_m) / (2 * square) if linear > 0 else 2 * p * a / (linear - root_m)
+            q = (
+                (linear_coefficient + root_m) / (2 * square_coefficient)
+                if linear_coefficient > 0
+                else 2 * p * a / (linear_coefficient - root_m)
+            )
             mean_force_n = 0.5 * stiffness_n_per_m * q * q / (q - a) + damping_n_per_m * q
         else:
             return 0.0, p
@@ -575,28 +615,28 @@ class _ActiveObstacle:
 class SubstepMatrices:
     """Matrices for computing the contact with obstacles in the substeps of a period.
 
-    They hold for a free or for a locked motor.
+    One instance is for a free motor, another for a locked motor.
     """
 
-    free: Callable[[Real], Real]
-    """Function from [state, torque before and after the switch, friction of the previous period] to
-    the displacement at the end of each substep without forces, body by body."""
-    friction: Real
-    """Effect of friction of 1 N·m on these displacements, shape (substeps, bodies)."""
-    kernel: Real
-    """Displacement at the end of the same and of each later substep by a force of 1 N in one
+    free_displacement: Callable[[Real], Real]
+    """Function that returns the displacement at the end of each substep if no force acts, body by
+    body, from [state, torque before and after the switch, friction of the previous period]."""
+    displacement_per_friction: Real
+    """Displacement at the end of each substep per friction, m per N·m, shape (substeps, bodies)."""
+    displacement_kernel: Real
+    """Displacement in m per N at the end of the substep in which a force acts, and of each later
     substep, shape (substeps, bodies, bodies)."""
-    history: Real
-    """Displacement at the end of each substep by forces of 1 N in all substeps up to it, shape
-    (bodies, bodies, substeps, substeps)."""
-    effect: Callable[[Real], Real]
-    """Function from the forces of all substeps to their effect on [next state, outputs]."""
+    displacement_history: Real
+    """Displacement in m per N at the end of each substep by a force in each substep (last axis),
+    shape (bodies, bodies, substeps, substeps)."""
+    force_effect: Callable[[Real], Real]
+    """Function that returns the effect of the forces of all substeps on [next state, outputs]."""
     velocity_row: int
-    """Row of the velocity in [next state, outputs]."""
+    """Index of the velocity in [next state, outputs]."""
 
 
 def _history_matrices(kernel: Real) -> Real:
-    """Return the effect of a force in each substep on the displacement at each later end, in m/N.
+    """Return the displacement in m per N at the end of each substep by a force in each substep.
 
     A `kernel` of shape (substeps, m, m) gives lower triangular matrices of shape (m, m, substeps,
     substeps) for m obstacles and impacts.
@@ -610,19 +650,19 @@ def _history_matrices(kernel: Real) -> Real:
 
 
 def _surface_displacement_m(body: Obstacle, time_s: Any) -> Any:  # noqa: ANN401 - one time or several
-    """Return the displacement in m of the beam, at given times, at which it touches an obstacle."""
+    """Return the displacement in m at which the beam just touches an obstacle, at given times."""
     return body.x_m * (body.angle_rad + body.rate_rad_s * (time_s - body.from_s))
 
 
 def _substeps_per_period(beam: Beam, bodies: tuple[Disturbance, ...], period_s: float) -> int:
-    """Return the number of substeps per period, which resolves the contacts of all obstacles."""
+    """Return how many substeps per period are needed to resolve the contacts with all obstacles."""
     # A force that grows like k t moves a beam without ends by k t^(3/2) / unit.
     rate_factor = 2 * sqrt(2) * beam.density_kg_per_m**0.75 * beam.bending_stiffness_n_m2**0.25
     required_rates_per_s = [_MIN_SUBSTEPS_PER_S]
     for attached_body in bodies:
         if isinstance(attached_body, Obstacle):
             rate_per_s = (
-                min(attached_body.stiffness_n_per_m, _STIFFEST_N_PER_M) / rate_factor
+                min(attached_body.stiffness_n_per_m, _MAX_RESOLVED_STIFFNESS_N_PER_M) / rate_factor
             ) ** (2 / 3)
             reach_m = (beam.density_over_stiffness * rate_per_s**2) ** -0.25
             tip_proximity = exp((attached_body.x_m - beam.length_m) / reach_m)
@@ -634,5 +674,5 @@ def _substeps_per_period(beam: Beam, bodies: tuple[Disturbance, ...], period_s: 
 
 
 def _displacement_per_angle(beam: Beam, damping: Damping, x_m: float, s: Complex) -> Complex:
-    """Return the transfer function from motor angle to displacement of the beam at a position."""
+    """Return the transfer function in m/rad from motor angle to beam displacement at `x_m`."""
     return PointForceGrid(s, beam, damping).per_angle(x_m)

@@ -22,7 +22,7 @@ from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._air_brake import AirBrake
 from rigd.sim._obstacle import AttachedObstacles, SubstepMatrices
 from rigd.sim._step import (
-    OUTPUTS,
+    OUTPUT_COUNT,
     beam_and_coupled_models,
     constant_force_effect,
     drifted_step_arrays,
@@ -35,8 +35,8 @@ Real = NDArray[np.float64]
 """Array of real numbers."""
 
 _OBSTACLE_ATTRIBUTES = (
-    "_contact", "_free_step", "_free_march", "_friction_effects", "_locked_step", "_locked_march",
-    "_state_count",
+    "_contact", "_free_step", "_free_substeps", "_friction_effects", "_locked_step",
+    "_locked_substeps", "_state_count",
 )  # fmt: skip
 """Attributes of a plant that depend on its obstacles."""
 
@@ -82,7 +82,7 @@ class SimulatedPlant:
     Raises
     ------
     RealisationError
-        If the beam's damping cannot be realised, also at the stiffness to which it drifts.
+        If the beam's damping cannot be realised at its stiffness, or at one to which it drifts.
     ObstacleError
         If an obstacle has a syntax error, or is beyond the beam's tip.
 
@@ -104,17 +104,16 @@ class SimulatedPlant:
         "_drag_torque_nm",
         "_drift",
         "_fraction_before_switch",
-        "_free_march",
         "_free_step",
+        "_free_substeps",
         "_friction_effects",
         "_friction_nm",
-        "_friction_speed",
         "_holding_beam_nm",
         "_is_stuck",
         "_jump_is_sensed",
-        "_locked_march",
         "_locked_step",
-        "_next_is_known",
+        "_locked_substeps",
+        "_next_torque_is_known",
         "_peak_nm",
         "_period_s",
         "_periods_since_enabling",
@@ -125,6 +124,7 @@ class SimulatedPlant:
         "_sensed_torque_jump_gain",
         "_sensed_torques",
         "_shear_jump_gain",
+        "_speed_per_friction",
         "_state_count",
         "_torque_instant_fraction",
         "_torque_jump_gain",
@@ -158,12 +158,12 @@ class SimulatedPlant:
         parameters = replace(parameters, beam=simulated_beam)
         beam_realisation, free_model, locked_model = beam_and_coupled_models(parameters, simulation)
         has_sensor_filter = simulation.torque_filter_hz > 0
-        self._air = _air(parameters, beam_realisation)
+        self._air = _air_brake(parameters, beam_realisation)
         if self._air is not None:
             (free_model, free_input), (locked_model, locked_input) = map(
                 self._air.extended_model, (free_model, locked_model)
             )
-        self._contact = _contact(parameters, beam_realisation, period_s)
+        self._contact = _attached_obstacles(parameters, beam_realisation, period_s)
         if self._contact is not None:
             (free_model, free_input), (locked_model, locked_input) = map(
                 self._contact.extended_model, (free_model, locked_model)
@@ -179,7 +179,7 @@ class SimulatedPlant:
         self._friction_effects: list[float] = friction_effect[n:].tolist()
         point_count = 0
         if self._air is not None:
-            point_count = len(self._air.speed)
+            point_count = len(self._air.speed_rows)
             free_drag_effect = constant_force_effect(
                 free_model, free_input, locked_model.sensor_torque, period_s, *sample_instants_s[1:]
             )
@@ -194,7 +194,7 @@ class SimulatedPlant:
                 np.vstack(
                     [
                         step_matrix := np.column_stack(matrix_parts),
-                        self._air.speed @ step_matrix[:n],
+                        self._air.speed_rows @ step_matrix[:n],
                     ]
                 )
                 for matrix_parts in (
@@ -202,14 +202,14 @@ class SimulatedPlant:
                     (locked_matrix, locked_drag_effect),
                 )
             )
-            self._friction_speed = self._air.speed @ friction_effect[:n]
+            self._speed_per_friction = self._air.speed_rows @ friction_effect[:n]
             self._drag_torque_nm = self._drag_shear_n = 0.0
             self._drag_torque_fraction = 1 - free_model.sensor_torque_per_torque
             self._drag_shear_fraction = -free_model.shear_per_torque
             self._torque_instant_fraction = 1 - torque_age_s / period_s
         if self._contact is not None:
             point_count = len(self._contact.displacement_rows)
-            self._free_march, self._locked_march = (
+            self._free_substeps, self._locked_substeps = (
                 self._contact.substep_matrices(
                     coupled_model,
                     force_input,
@@ -234,8 +234,13 @@ class SimulatedPlant:
                 np.abs(beam_realisation.poles_rad_s).max(
                     initial=0.0, where=beam_realisation.poles_rad_s.imag > 0
                 ),
-                lambda fraction: drifted_step_arrays(
-                    fraction, parameters, simulation, beam_realisation, period_s, sample_instants_s
+                lambda stiffness_ratio: drifted_step_arrays(
+                    stiffness_ratio,
+                    parameters,
+                    simulation,
+                    beam_realisation,
+                    period_s,
+                    sample_instants_s,
                 ),
             )
             free_matrix, locked_matrix = self._drift.arrays[:2]
@@ -246,7 +251,7 @@ class SimulatedPlant:
         # Two vectors that are alternately the input [state, torque before and after the switch,
         # friction, drag force] and the output [state, outputs, speeds or displacements at the
         # obstacles] of a step. Each has the views that a step needs.
-        self._vectors = _vectors(
+        self._vectors = _step_vectors(
             n, point_count, drag_points=point_count if self._air is not None else 0
         )
         self._state_count = n
@@ -257,7 +262,7 @@ class SimulatedPlant:
         self._is_stuck = self._coulomb_nm > 0
         self._holding_beam_nm = 0.0
         self._fraction_before_switch = switch_s / period_s
-        self._next_is_known = switch_s == 0 and delay_periods > 0
+        self._next_torque_is_known = switch_s == 0 and delay_periods > 0
         self._jump_is_sensed = torque_age_s == 0 and not has_sensor_filter
         self._set_jump_gains(free_model.sensor_torque_per_torque, free_model.shear_per_torque)
 
@@ -309,7 +314,7 @@ class SimulatedPlant:
         return max(self._periods_since_enabling, 0) * self._period_s
 
     def adopt(self, other_plant: "SimulatedPlant") -> None:
-        """Adopt another plant's parameters, at rest at the present angle, with the drive off.
+        """Take over another plant's parameters; the beam then rests at its angle, the drive off.
 
         Parameters
         ----------
@@ -326,23 +331,23 @@ class SimulatedPlant:
         self._sensed_angles.extend([angle_rad] * len(self._sensed_angles))
         self.angle_rad = self.sensed_angle_rad = angle_rad
 
-    def use_obstacles_of(self, prepared: "SimulatedPlant") -> None:
+    def use_obstacles_of(self, prepared_plant: "SimulatedPlant") -> None:
         """Replace the obstacles by those of another plant, without changing the present state.
 
         Parameters
         ----------
-        prepared
+        prepared_plant
             Plant of the same rig, at rest, with the obstacles of this plant and more. It is created
             beforehand, because that takes a tenth of a second.
         """
-        new_obstacles = prepared._contact
+        new_obstacles = prepared_plant._contact
         assert new_obstacles is not None
         plant_state = new_obstacles.adopt_states(
             self._vectors[0][0][: self._state_count], self._contact
         )
         for attribute_name in _OBSTACLE_ATTRIBUTES:
-            setattr(self, attribute_name, getattr(prepared, attribute_name))
-        self._vectors = _vectors(plant_state.size, len(new_obstacles.bodies), drag_points=0)
+            setattr(self, attribute_name, getattr(prepared_plant, attribute_name))
+        self._vectors = _step_vectors(plant_state.size, len(new_obstacles.bodies), drag_points=0)
         self._vectors[0][0][: plant_state.size] = plant_state
 
     def remove_obstacle(self, obstacle: Disturbance) -> None:
@@ -394,7 +399,7 @@ class SimulatedPlant:
                 self._locked_step(step_input, step_output)
                 if self._contact is not None:
                     self._add_contact_effect(
-                        self._locked_march, step_input, step_output, is_turning=False
+                        self._locked_substeps, step_input, step_output, is_turning=False
                     )
                 (
                     angle_rad,
@@ -413,7 +418,7 @@ class SimulatedPlant:
                 self._free_step(step_input, step_output)
                 if self._contact is not None:
                     self._add_contact_effect(
-                        self._free_march, step_input, step_output, is_turning=True
+                        self._free_substeps, step_input, step_output, is_turning=True
                     )
                 (
                     angle_rad, velocity_rad_s, torque_nm, holding_torque_nm, shear_n,
@@ -470,12 +475,12 @@ class SimulatedPlant:
             self.sensed_shear_n = self._sensed_shears[0]
 
     def _set_jump_gains(self, torque_per_torque: float, shear_per_torque: float) -> None:
-        """Set the gains from a jump of the motor's torque at a tick to the outputs at this tick.
+        """Set the gains by which a jump of the motor's torque at a tick changes its outputs.
 
         The gains contain the factor 0.5, since half of the jump counts at the tick.
         """
-        self._torque_jump_gain = 0.5 * torque_per_torque if self._next_is_known else 0.0
-        self._shear_jump_gain = 0.5 * shear_per_torque if self._next_is_known else 0.0
+        self._torque_jump_gain = 0.5 * torque_per_torque if self._next_torque_is_known else 0.0
+        self._shear_jump_gain = 0.5 * shear_per_torque if self._next_torque_is_known else 0.0
         self._sensed_torque_jump_gain = self._torque_jump_gain if self._jump_is_sensed else 0.0
         self._sensed_shear_jump_gain = self._shear_jump_gain if self._jump_is_sensed else 0.0
 
@@ -496,14 +501,18 @@ class SimulatedPlant:
         assert attached_obstacles is not None
         n = self._state_count
         time_s = self.elapsed_s
-        if attached_obstacles.cannot_touch(output[n + OUTPUTS :], time_s):
+        if attached_obstacles.cannot_touch(output[n + OUTPUT_COUNT :], time_s):
             return
-        free_m = substep_matrices.free(input_).reshape(attached_obstacles.substeps, -1)
+        free_displacement_m = substep_matrices.free_displacement(input_).reshape(
+            attached_obstacles.substeps, -1
+        )
         friction_nm = self._friction_nm if is_turning else 0.0
         for _ in range(_FRICTION_ITERATIONS):
-            displacement_m = free_m + friction_nm * substep_matrices.friction
+            displacement_m = (
+                free_displacement_m + friction_nm * substep_matrices.displacement_per_friction
+            )
             forces_n = attached_obstacles.forces(substep_matrices, displacement_m, time_s)
-            contact_effect = substep_matrices.effect(forces_n.ravel())
+            contact_effect = substep_matrices.force_effect(forces_n.ravel())
             if not is_turning or not self._coulomb_nm:
                 break
             velocity_rad_s = output.item(substep_matrices.velocity_row) + contact_effect.item(
@@ -529,11 +538,11 @@ class SimulatedPlant:
         sensed_torque_nm: float,
         sensed_shear_n: float,
     ) -> tuple[float, float, float, float, float]:
-        """Return the outputs at the end of a step with the immediate effect of the drag force."""
+        """Return the outputs at the end of a step, with the immediate effect of the drag added."""
         assert self._air is not None
-        speed_m_s = output[self._state_count + OUTPUTS :]
+        speed_m_s = output[self._state_count + OUTPUT_COUNT :]
         if is_shaft_free and self._friction_nm:
-            speed_m_s += self._friction_nm * self._friction_speed
+            speed_m_s += self._friction_nm * self._speed_per_friction
         old_drag_nm, old_drag_n = self._drag_torque_nm, self._drag_shear_n
         new_drag_nm, new_drag_n = self._air.update_force(speed_m_s)
         torque_fraction, shear_fraction = (
@@ -552,16 +561,16 @@ class SimulatedPlant:
         )
 
 
-def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:
+def _air_brake(parameters: RigParameters, beam_realisation: Realisation) -> AirBrake | None:
     """Return the air drag on the simulated beam, or None if the profile has no air drag."""
     simulation = parameters.simulation
     if simulation is None or not simulation.air_drag_m:
         return None
-    return AirBrake(parameters.beam, parameters.damping, beam, simulation.air_drag_m)
+    return AirBrake(parameters.beam, parameters.damping, beam_realisation, simulation.air_drag_m)
 
 
-def _contact(
-    parameters: RigParameters, beam: Realisation, period_s: float
+def _attached_obstacles(
+    parameters: RigParameters, beam_realisation: Realisation, period_s: float
 ) -> AttachedObstacles | None:
     """Return a profile's obstacles and impacts, attached to the beam; None if it has none."""
     simulation = parameters.simulation
@@ -572,13 +581,15 @@ def _contact(
         effect_name: getattr(simulation, effect_name) for effect_name in INCOMPATIBLE_WITH_OBSTACLES
     }
     check_obstacles(disturbances, parameters.beam, simulated_effects)
-    return AttachedObstacles(parameters.beam, parameters.damping, beam, disturbances, period_s)
+    return AttachedObstacles(
+        parameters.beam, parameters.damping, beam_realisation, disturbances, period_s
+    )
 
 
-def _vectors(
+def _step_vectors(
     state_count: int, point_count: int, *, drag_points: int
 ) -> tuple[tuple[Real, Real, Real], ...]:
-    """Return two vectors for steps of the plant, each with views of its input and its outputs.
+    """Return the two vectors that alternate in steps, each with views of its input and outputs.
 
     The input contains `drag_points` drag forces.
     """
@@ -586,14 +597,14 @@ def _vectors(
         (
             step_vector,
             step_vector[: state_count + 3 + drag_points],
-            step_vector[state_count : state_count + OUTPUTS],
+            step_vector[state_count : state_count + OUTPUT_COUNT],
         )
-        for step_vector in np.zeros((2, state_count + OUTPUTS + point_count))
+        for step_vector in np.zeros((2, state_count + OUTPUT_COUNT + point_count))
     )
 
 
 class GrowingDelayLine:
-    """Delay line of readings whose delay grows, for a sensor with a slower clock than the loop.
+    """Delay line of readings whose delay grows, for a sensor whose clock differs from the loop's.
 
     Between ticks the reading is interpolated by a cubic through the four nearest readings.
 

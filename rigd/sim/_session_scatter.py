@@ -7,7 +7,7 @@ import numpy as np
 from rigd.devices.parameters import RigParameters
 
 _RANDOM_STREAM = 1
-"""Number that separates these random draws from those of the noise, which has the same seed."""
+"""Number that makes these random draws differ from those of the noise with the same seed."""
 
 
 def scatters_between_sessions(rig: RigParameters) -> bool:

@@ -29,7 +29,7 @@ from rigd.sim._stiffness_drift import with_modal_displacements
 Real = NDArray[np.float64]
 """Array of real numbers."""
 
-OUTPUTS = 8
+OUTPUT_COUNT = 8
 """Number of outputs of a step in addition to the state.
 
 They are angle, velocity, sensor torque, sensor torque on a shaft that does not accelerate, base
@@ -81,16 +81,20 @@ def beam_and_coupled_models(
 
 
 def free_and_locked_steps(
-    free: CoupledModel, locked: CoupledModel, period_s: float, instants: tuple[float, float, float]
+    free_model: CoupledModel,
+    locked_model: CoupledModel,
+    period_s: float,
+    instants: tuple[float, float, float],
 ) -> tuple[Real, Real, Real]:
-    """Return step matrices of the free and the locked shaft, and the effect of friction of 1 N·m.
+    """Return the step matrices for a free and a locked shaft, and the effect of 1 N·m of friction.
 
-    The friction of a period is known only after its step, from the speed reached without friction.
-    The outputs are then corrected at once, and the state by the last column of the next step.
+    The friction of a period is known only after the period's step, from the speed reached without
+    friction. The outputs are then corrected at once, and the state by the last column of the next
+    step's matrix.
 
     Parameters
     ----------
-    free, locked
+    free_model, locked_model
         Models of motor and beam.
     period_s, instants
         As for `_step_matrix`.
@@ -100,9 +104,9 @@ def free_and_locked_steps(
     free_matrix, locked_matrix : (n + 8, n + 3)
     friction_effect : (n + 8,)
     """
-    n = free.b.size
-    free_matrix = _step_matrix(free, locked.sensor_torque, period_s, *instants)
-    locked_matrix = _step_matrix(locked, locked.sensor_torque, period_s, *instants)
+    n = free_model.b.size
+    free_matrix = _step_matrix(free_model, locked_model.sensor_torque, period_s, *instants)
+    locked_matrix = _step_matrix(locked_model, locked_model.sensor_torque, period_s, *instants)
     friction_effect = -(free_matrix[:, n] + free_matrix[:, n + 1])
     free_matrix = np.column_stack([free_matrix, free_matrix[:, :n] @ friction_effect[:n]])
     locked_matrix = np.column_stack([locked_matrix, locked_matrix[:, :n] @ friction_effect[:n]])
@@ -113,11 +117,11 @@ def drifted_step_arrays(
     stiffness_ratio: float,
     parameters: RigParameters,
     simulation: Simulation,
-    at_start: Realisation,
+    initial_realisation: Realisation,
     period_s: float,
     instants: tuple[float, float, float],
 ) -> tuple[Real, Real, Real, Real]:
-    """Return the matrices of a plant's step for a beam whose bending stiffness has drifted.
+    """Return matrices and effects of a step for a beam whose bending stiffness has drifted.
 
     Parameters
     ----------
@@ -125,7 +129,7 @@ def drifted_step_arrays(
         Bending stiffness divided by that at the start of the drift.
     parameters, simulation
         As for `beam_and_coupled_models`, at the start of the drift.
-    at_start
+    initial_realisation
         Realisation of the beam at the start of the drift.
     period_s, instants
         As for `_step_matrix`.
@@ -134,6 +138,7 @@ def drifted_step_arrays(
     -------
     free_matrix, locked_matrix : (n + 8, n + 3)
     friction_effects : (8,)
+        Effect of 1 N·m of friction on the outputs.
     effects_per_torque : (2,)
         Immediate effect of the motor's torque on torque and shear of the sensor.
 
@@ -157,7 +162,7 @@ def drifted_step_arrays(
             f"{error}"
         ) from error
     free_model, locked_model = (
-        with_modal_displacements(coupled_model, drifted_realisation, at_start)
+        with_modal_displacements(coupled_model, drifted_realisation, initial_realisation)
         for coupled_model in coupled_models
     )
     free_matrix, locked_matrix, friction_effect = free_and_locked_steps(
@@ -199,7 +204,8 @@ def _step_matrix(
     model
         Model of motor and beam.
     holding_torque
-        Row for the sensor torque on a shaft that does not accelerate, shape (n,).
+        Row that gives the sensor torque on a shaft that does not accelerate from the state, shape
+        (n,).
     period_s
         Duration of the step in seconds.
     switch_s
@@ -256,7 +262,7 @@ def _step_matrix(
 def _output_rows(
     model: CoupledModel, end_rows: Real, torque_row: Real, holding_torque: Real
 ) -> tuple[Real, ...]:
-    """Return the rows of the state after a period, and of the outputs except shear and sensors."""
+    """Return the step matrix's first rows: state after a period, angle, speed and both torques."""
     return (
         end_rows,
         model.angle @ end_rows,
@@ -268,7 +274,7 @@ def _output_rows(
 
 def constant_force_effect(
     model: CoupledModel,
-    of_force: Real,
+    force_input: Real,
     holding_torque: Real,
     period_s: float,
     angle_instant_s: float,
@@ -280,9 +286,8 @@ def constant_force_effect(
     ----------
     model
         Model of motor and beam.
-    of_force
-        Contribution of the force per metre at the points to the derivative of the state, shape (n,
-        points).
+    force_input
+        Derivative of the state by the force per metre at the points of the beam, shape (n, points).
     holding_torque, period_s, angle_instant_s, torque_instant_s
         As for `_step_matrix`.
 
@@ -292,13 +297,13 @@ def constant_force_effect(
     """
 
     def state_at(instant_s: float) -> Real:
-        return states_after_constant_inputs(model, of_force, instant_s)
+        return states_after_constant_inputs(model, force_input, instant_s)
 
-    end = state_at(period_s)
+    end_states = state_at(period_s)
     return np.vstack(
         [
-            *_output_rows(model, end, model.sensor_torque @ end, holding_torque),
-            model.shear @ end,
+            *_output_rows(model, end_states, model.sensor_torque @ end_states, holding_torque),
+            model.shear @ end_states,
             model.angle @ state_at(angle_instant_s),
             model.sensor_torque @ state_at(torque_instant_s),
             model.shear @ state_at(torque_instant_s),

@@ -37,15 +37,16 @@ class StiffnessDrift:
         Relative change of the stiffness per second; not 0.
     period_s
         Duration of a step in seconds.
-    fastest_rad_s
+    highest_mode_rad_s
         Largest natural frequency of the modelled modes in rad/s.
     arrays_at
-        Function that returns the arrays for the stiffness divided by that at the start.
+        Function that returns the arrays for a stiffness, which is given relative to the initial
+        one.
 
     Attributes
     ----------
     arrays : tuple of ndarray
-        Arrays for the present stiffness, in column order; initially those at the start.
+        Arrays for the present stiffness, in column-major order.
     """
 
     __slots__ = (
@@ -60,11 +61,11 @@ class StiffnessDrift:
         self,
         rate_per_s: float,
         period_s: float,
-        fastest_rad_s: float,
+        highest_mode_rad_s: float,
         arrays_at: Callable[[float], Sequence[Real]],
     ) -> None:
         # The phase of the fastest mode in a step, from the middle of the drift to its ends.
-        half_angle_rad = 0.25 * LARGEST_DRIFT * fastest_rad_s * period_s
+        half_angle_rad = 0.25 * LARGEST_DRIFT * highest_mode_rad_s * period_s
         point_count = 3
         while (
             2 * (0.5 * half_angle_rad) ** point_count / math.factorial(point_count)
@@ -125,23 +126,23 @@ class StiffnessDrift:
 
 
 def with_modal_displacements(
-    model: CoupledModel, beam: Realisation, at_start: Realisation
+    model: CoupledModel, beam_realisation: Realisation, initial_realisation: Realisation
 ) -> CoupledModel:
-    """Transform a coupled model so that its states are displacements and speeds of the modes.
+    """Return a coupled model with displacements and speeds of the modes as its states.
 
     Parameters
     ----------
     model
         Model of motor and beam, with the states of the realisation after angle and speed.
-    beam
+    beam_realisation
         Realisation of the beam.
-    at_start
+    initial_realisation
         Realisation at the start of the drift, which defines the units of the displacements.
     """
-    n, beam_state_count = model.b.size, beam.b.size
+    n, beam_state_count = model.b.size, beam_realisation.b.size
     from_displacements = np.eye(n)
     from_displacements[2 : 2 + beam_state_count, 2 : 2 + beam_state_count] = (
-        _states_from_displacements(beam, at_start)
+        _states_from_displacements(beam_realisation, initial_realisation)
     )
     to_displacements = np.linalg.inv(from_displacements)
 
@@ -164,20 +165,24 @@ def with_modal_displacements(
     )
 
 
-def _states_from_displacements(beam: Realisation, at_start: Realisation) -> Real:
-    """Return the matrix that computes the beam model's states from modal displacements and speeds.
+def _states_from_displacements(
+    beam_realisation: Realisation, initial_realisation: Realisation
+) -> Real:
+    """Return the matrix that computes the realisation's states from modal displacements and speeds.
 
     States that belong to no mode are unchanged.
     """
     rates_at_start = {
         beam_mode: abs(pole)
         for beam_mode, pole in zip(
-            at_start.modes.tolist(), at_start.poles_rad_s.tolist(), strict=True
+            initial_realisation.modes.tolist(),
+            initial_realisation.poles_rad_s.tolist(),
+            strict=True,
         )
     }
-    poles, pole_modes = beam.poles_rad_s, beam.modes
+    poles, pole_modes = beam_realisation.poles_rad_s, beam_realisation.modes
     first_states = np.cumsum([0, *np.where(poles.imag > 0, 2, 1)])  # state of each pole
-    state_matrix = np.zeros((beam.b.size, beam.b.size))
+    state_matrix = np.zeros((beam_realisation.b.size, beam_realisation.b.size))
     column_index = 0
     unchanged_states: list[int] = []
     for beam_mode in np.unique(pole_modes):
@@ -198,5 +203,5 @@ def _states_from_displacements(beam: Realisation, at_start: Realisation) -> Real
             np.array(state_rows) * column_scales
         )
         column_index += 2
-    state_matrix[unchanged_states, np.arange(column_index, beam.b.size)] = 1.0
+    state_matrix[unchanged_states, np.arange(column_index, beam_realisation.b.size)] = 1.0
     return state_matrix

@@ -12,7 +12,7 @@ Complex = npt.NDArray[np.complex128]
 """Array of complex numbers."""
 
 PHASE_START_DEG: Final = -90.0
-"""Smallest phase in degrees, such that phases near 0 and 180 degrees do not wrap."""
+"""Smallest phase in degrees, chosen so that phases near 0 and 180 degrees do not wrap."""
 
 
 def magnitude_db(response: Complex) -> Real:
@@ -102,7 +102,7 @@ class CurveDecimation:
         ]
 
     def extremes(self, curve_values: Real) -> npt.NDArray[np.intp]:
-        """Return the grid indices of the least and greatest value of every group, in order.
+        """Return the increasing grid indices of the least and greatest value of every group.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class CurveDecimation:
         return np.unique(self._extremes(curve_values)[1])
 
     def gaps(self, curve_values: Real) -> npt.NDArray[np.intp]:
-        """Return the grid indices of both ends of each gap between known values, in order.
+        """Return the increasing grid indices of the known values on both sides of each gap.
 
         Parameters
         ----------

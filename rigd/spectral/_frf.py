@@ -7,7 +7,7 @@ Hiv
     Response within a control loop, with the loop's reference as instrument [3]_. A controller that
     feeds a measured output back lets the sensor's noise move the input. Noise and input are then
     correlated, and the estimates that average products of the two are biased: H1 by the fraction of
-    such motion in the input's power. The reference is independent of the noise, so the
+    the input's power that the noise causes. The reference is independent of the noise, so the
     cross-spectra with it average the noise out.
 FFT
     Empirical transfer function estimate: ratio of the transforms of the whole records [4]_. The
@@ -37,7 +37,7 @@ Estimator = Literal["h1", "h2", "hv", "iv", "fft"]
 
 
 class SpectralError(ValueError):
-    """Error: the record or a setting does not allow the estimation of a frequency response."""
+    """Error if a record or a setting does not allow the estimation of a frequency response."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,9 +180,9 @@ class Segmentation:
 def segmentation_of(sample_count: int, rate_hz: float) -> Segmentation:
     """Return the default segmentation for a record of known length.
 
-    Segments have the duration and transform of the reference paper's. If the record is shorter than
-    one such segment, it is divided like the paper's record into eight segments with 15 % overlap.
-    If it is too short for that, it is a single segment.
+    Segments and zero-padded transforms have the durations of the reference paper's. A record that
+    is shorter than one such segment is divided, like the paper's record, into eight segments with
+    15 % overlap; if it is too short for that, it is a single segment.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def segmentation_of(sample_count: int, rate_hz: float) -> Segmentation:
 
 
 def segment_count(sample_count: int, segment_length: int, overlap: int) -> int:
-    """Return the number of whole segments in a record. The samples after them are not used.
+    """Return the number of whole segments in a record. The samples after the last are not used.
 
     Parameters
     ----------
@@ -230,12 +230,12 @@ def segment_count(sample_count: int, segment_length: int, overlap: int) -> int:
 def segment_lengths(
     sample_count: int, segment_total: int, overlap_fraction: float
 ) -> tuple[int, int]:
-    """Return the largest segment length and overlap for a given number of segments.
+    """Return the largest segment length, and the overlap, that give a number of segments.
 
-    The overlap is rounded to the nearest sample. If it is rounded down, as is usual, eight segments
-    with 15 % overlap exceed a record of 120 000 samples by five samples. Seven segments are then
-    averaged without a message, the estimate ends at 105.3 s, and the third resonance of a 120 s
-    chirp is lost.
+    The overlap is rounded to the nearest sample. If it were rounded down, as is usual, eight
+    segments with 15 % overlap would exceed a record of 120 000 samples by five samples. Seven
+    segments would be averaged without a message, the estimate would end at 105.3 s, and the third
+    resonance of a 120 s chirp would be lost.
 
     Parameters
     ----------
@@ -340,7 +340,7 @@ class CrossSpectra:
 
     @classmethod
     def empty(cls, bin_count: int) -> "CrossSpectra":
-        """Return sums of spectra without any segment: zero in each frequency bin."""
+        """Return sums of spectra over no segments, which are zero in each frequency bin."""
         return cls(
             np.zeros(bin_count), np.zeros(bin_count), np.zeros(bin_count, dtype=np.complex128)
         )
@@ -462,8 +462,8 @@ def welch_response(
     if estimator not in ("h1", "h2", "hv"):
         raise SpectralError(f"There is no estimator {estimator!r}; choose one of h1, h2, hv.")
     segment_weights = WINDOW.weights(segment_length)
-    segment_number = segment_count(x.size, segment_length, overlap)
-    if segment_number == 0:
+    segment_total = segment_count(x.size, segment_length, overlap)
+    if segment_total == 0:
         raise SpectralError(
             f"The record has {x.size} samples ({x.size / rate_hz:g} s), fewer than one Welch "
             f"segment of {segment_length} ({segment_length / rate_hz:g} s); "
@@ -474,7 +474,7 @@ def welch_response(
     # Allocated once, because allocating this much memory again is slow.
     fx, fy = np.empty((2, bin_count), dtype=np.complex128)
     # One segment at a time stays in the cache, unlike a whole batch.
-    for k in range(segment_number):
+    for k in range(segment_total):
         segment = slice(
             segment_start := k * (segment_length - overlap), segment_start + segment_length
         )

@@ -33,9 +33,9 @@ Real = NDArray[np.float64]
 """Array of real numbers."""
 
 MIN_SEGMENT_FRACTION: Final = 0.25
-"""Least fraction of a segment from which a response is estimated.
+"""Smallest number of samples from which a response is estimated, as a fraction of a segment.
 
-Shorter segments have too little resolution."""
+Fewer samples have too little resolution."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ class RunningResponse:
             self._summed_up_to = first_tick + self._length
 
     def estimate(self) -> RunningEstimate | None:
-        """Return the response estimated so far; None while there are too few samples."""
+        """Return the response estimated from all samples so far; None if these are too few."""
         is_final = self._segments.over
         summed_spectra, reference_power = self._sums, self._reference_power
         newest_samples = self._segments.newest(self._length)
@@ -155,7 +155,7 @@ class RunningResponse:
         )
 
     def _newest_count_as_segment(self, newest_count: int, is_final: bool) -> bool:
-        """Return whether the newest samples count as a segment in addition to the whole ones."""
+        """Return whether the newest samples count as a segment in addition to whole segments."""
         if self._segments.end == self._summed_up_to or (is_final and self._sums.segments):
             return False
         return newest_count >= MIN_SEGMENT_FRACTION * self._length
@@ -166,7 +166,7 @@ class RunningResponse:
         summed_spectra: CrossSpectra,
         reference_power: NDArray[np.float64],
     ) -> None:
-        """Add a segment (3, n) of reference, input and output to the sums."""
+        """Add a segment (3, n) of reference, input and output to the two sums, in place."""
         weights = WINDOW.weights(segment.shape[1])
         reference, input_, output = segment
         # The mean angle excites nothing, but its power would exceed that of the motion.
@@ -332,7 +332,7 @@ class _GapFiller:
 
 
 def _interpolate_to_ticks(known_ticks: NDArray[np.int64], known_values: Real) -> tuple[int, Real]:
-    """Return the first tick and the values of every tick up to the last one, interpolated."""
+    """Return the first tick, and interpolated values at every tick from the first to the last."""
     first_tick, last_tick = int(known_ticks[0]), int(known_ticks[-1])
     if last_tick - first_tick + 1 == known_ticks.size:
         return first_tick, known_values
@@ -346,18 +346,16 @@ def _interpolate_to_ticks(known_ticks: NDArray[np.int64], known_values: Real) ->
 
 
 def excited_bins(reference_power: NDArray[np.float64], resolution_bins: int) -> NDArray[np.bool_]:
-    """Return True for bins in which the reference angle has power of its own.
-
-    Power that leaks from other bins does not count.
+    """Return a mask of the bins in which the reference has power that does not leak from others.
 
     Parameters
     ----------
     reference_power : ndarray of float, shape (n,)
         Power of the reference in the bins from frequency 0 on.
     resolution_bins : int
-        Number of bins per inverse length of the shortest window. A dip that is at most twice as
-        wide is a ripple of the window, and counts as excited. At either end of a band, this number
-        of bins is excluded because of leakage.
+        Frequency resolution, the inverse length of the shortest window, in bins. A dip that is at
+        most twice as wide is a ripple of the window, and counts as excited. At each end of an
+        excited band, this number of bins is excluded because of leakage.
 
     Returns
     -------
@@ -373,9 +371,9 @@ def excited_bins(reference_power: NDArray[np.float64], resolution_bins: int) -> 
 
 
 def _is_near_marked(is_marked: NDArray[np.bool_], distance_bins: int) -> NDArray[np.bool_]:
-    """Return True for each bin within `distance_bins` bins of a bin where `is_marked` is True.
+    """Return a mask of the bins at most `distance_bins` away from a bin of the mask `is_marked`.
 
-    Bins beyond either end count like the end bin.
+    Beyond the first and the last bin, the mask is continued with the value of that bin.
     """
     marked_counts = np.cumsum(np.pad(is_marked, (distance_bins + 1, distance_bins), mode="edge"))
     is_near: NDArray[np.bool_] = (
@@ -398,8 +396,8 @@ class LowBinTransform:
 
     With ``2 n k = n² + k² − (k − n)²`` the sum over n becomes a convolution with a chirp, which two
     short transforms compute. For 17 266 samples padded to 160 000 the bins up to 60 Hz take a
-    quarter of the time of all bins. With so little padding that this would take longer, all bins
-    are computed.
+    quarter of the time of all bins. If the padding is so short that this would take longer, all
+    bins are computed.
 
     Parameters
     ----------
@@ -442,12 +440,12 @@ class LowBinTransform:
         np.fft.fft(self._work, out=self._transform)
         self._transform *= self._kernel
         np.fft.ifft(self._transform, out=self._work)
-        low: NDArray[np.complex128] = self._work[: self._bins] * self._chirp[: self._bins]
-        return low
+        lowest_bins: NDArray[np.complex128] = self._work[: self._bins] * self._chirp[: self._bins]
+        return lowest_bins
 
 
 def _fast_length(min_length: int) -> int:
-    """Return the smallest length from `min_length` on without a prime factor above 5."""
+    """Return the smallest length of at least `min_length` that has no prime factor above 5."""
     best_length = 1 << (min_length - 1).bit_length()
     power_of_five = 1
     while power_of_five < best_length:

@@ -13,7 +13,7 @@ MIN_LEVEL_DB: Final = -200.0
 _TRANSFORM_TO_WINDOW_LENGTH: Final = 4
 """Ratio of the transform's length to the window's.
 
-With this ratio the level of a sine between two bins is low by at most 0.1 dB."""
+With this ratio, the level of a sine between two bins is at most 0.1 dB too low."""
 
 
 class RunningSpectrogram:

@@ -1,4 +1,4 @@
-"""Window of Welch's method: its weights, and all that depends on its shape."""
+"""Window of Welch's method: its weights, and the limits that follow from its shape."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ class WelchWindow:
     half_power_bins: float
     """Width of the main lobe at half power, in bins of a segment's transform."""
     min_relative_power: float
-    """Least power of the reference in an excited bin, relative to the largest power; what leaks
-    into other bins is below it."""
+    """Smallest power of the reference in an excited bin, relative to its largest power; the power
+    that leaks into other bins is smaller."""
 
 
 # The side lobes have -43 dB, and where the record ends in mid-chirp the pedestal is 0.08. The power

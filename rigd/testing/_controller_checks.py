@@ -26,7 +26,7 @@ _STALE_TICKS = 20
 _MEMORY_TICKS = 4000
 """Number of ticks in which the memory of the controller must not grow."""
 _MAX_BYTES_PER_TICK = 2.0
-"""Growth of the memory in bytes a tick that counts as none; a stored number takes 32."""
+"""Largest growth of the memory in bytes per tick that counts as none; a stored number takes 32."""
 _BLOCKED_S = 2.0
 """Time in seconds for which the shaft is blocked, so that the torque reaches its limit."""
 _RECOVERY_S = 1.5
@@ -57,7 +57,7 @@ def _torques(controller: LoopController, readings: Iterable[Readings]) -> list[f
 
 
 def _random_readings(profile: Profile, ticks: int) -> Iterator[Readings]:
-    """Yield readings within the limits of angle and sensor, some of which do not change."""
+    """Yield random readings within the limits of angle and sensor, constant in some ticks."""
     numbers = random.Random(1)
     angle_rad, sensor = profile.limits.angle_rad, profile.rig.sensor
     torque_nm = sum(
@@ -76,7 +76,7 @@ def _random_readings(profile: Profile, ticks: int) -> Iterator[Readings]:
 
 
 def _check_rest_after_reset(profile: Profile) -> None:
-    """Check that a reset at any angle gives no torque there, and the same outputs each time."""
+    """Check that after a reset at an angle, the torque there is 0, and outputs are reproducible."""
     controller = _make(profile)
     readings = list(_random_readings(profile, 200))
     first_nm = _torques(controller, readings)
@@ -109,7 +109,7 @@ def _check_same_output_for_same_input(profile: Profile) -> None:
 
 
 def _check_constant_memory(profile: Profile) -> None:
-    """Check that ticks leave no memory behind, without the garbage collector, as in the loop."""
+    """Check that memory does not grow with the ticks, without garbage collector, as in the loop."""
     controller = _make(profile)
     readings = list(_random_readings(profile, 100))
 

@@ -11,7 +11,7 @@ _PERIOD_NS = 1_000_000
 _TORQUE_NM = 0.3
 """Torque that the checks command, in newton metres."""
 _MAX_ROUNDING_FRACTION = 0.1
-"""Largest relative deviation of a sent torque, by which a drive may round the command."""
+"""Largest relative difference between commanded and sent torque, as a drive may round it."""
 
 
 def _require(is_satisfied: bool, message: str) -> None:
@@ -114,7 +114,7 @@ def _check_disabling_and_closing(devices: Devices) -> None:
 
 
 def _check_line_health(devices: Devices) -> None:
-    """Check that the devices report bits, bit rate and errors of their lines."""
+    """Check that the devices report the bits, bit rate and errors of their bus or serial line."""
     _require(devices.drive.health().bits in (None, 0), "there were bits on the line before")
     _connect(devices)
     all_before = devices.drive.health(), devices.sensor.health()

@@ -24,7 +24,7 @@ def write_profile(
     folder : Path
         Folder for the file, which gets the name of the profile.
     new_values : mapping of str to value, optional
-        Different values by ``section.key``, in the unit of the key; ``name`` is the profile's name.
+        New values by ``section.key``, in the unit of the key; ``name`` is the profile's name.
         A key that the base does not have is added to its section.
     base_profile : str
         Name or path of the profile whose other values are used.

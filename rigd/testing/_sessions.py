@@ -86,12 +86,12 @@ def beam_torque(
 
     Notes
     -----
-    Eq. 25 on a line ``s = sigma + j omega``, whose ``exp(-sigma t)`` preserves the record's end,
-    where the beam still rings, from leaking into its beginning.
+    Eq. 25 is evaluated on a line ``s = sigma + j omega``. The factor ``exp(-sigma t)`` prevents the
+    end of the record, where the beam still rings, from leaking into the beginning.
 
     Examples
     --------
-    A stiff beam that turns slowly has little but its inertia.
+    A stiff beam that turns slowly acts almost like a rigid inertia.
 
     >>> import numpy as np
     >>> from rigd.beam import Beam
@@ -283,7 +283,7 @@ def _causal_response(
 ) -> NDArray[np.float64]:
     """Return the causal response (n,) of a transfer function to values that begin at rest.
 
-    Independent of `rigd.beam.CausalTransform`, so that tests with these signals verify it.
+    It does not use `rigd.beam.CausalTransform`, so that tests with these signals verify that class.
     """
     n = len(input_values)
     padded_length = 1 << (4 * n).bit_length()

@@ -70,9 +70,9 @@ def number_of(cell: str, decimal_sign: str) -> float:
 
 
 def fast_number_converter(decimal_sign: str) -> Callable[[str], float]:
-    """Return a fast function that converts a cell to its number.
+    """Return a fast function that converts a cell to its number, for cells without underscores.
 
-    The function raises ValueError for a cell that may not be a number.
+    Unlike `number_of`, the function raises ValueError for an empty cell, and reads 1_000 as 1000.
     """
     return float if decimal_sign == POINT else _number_with_comma
 
@@ -98,18 +98,20 @@ class ThousandsCheck:
 
     def __init__(self, decimal_sign: str) -> None:
         self._decimal_sign = decimal_sign
-        self.grouped_line = 0
-        self.plain = False
+        self.first_grouped_line = 0
+        self.has_short_integer = False
 
     def proves_decimal_sign(self, cell: str, line_number: int) -> bool:
-        """Check a cell; return True if it proves that the sign is not a thousands separator."""
+        """Record a cell; return whether it proves that the sign is no thousands separator."""
         cell_text = cell.strip()
         if self._decimal_sign not in cell_text:
-            self.plain = self.plain or _SHORT_INTEGER_PATTERN.fullmatch(cell_text) is not None
+            self.has_short_integer = (
+                self.has_short_integer or _SHORT_INTEGER_PATTERN.fullmatch(cell_text) is not None
+            )
             return False
         if not _GROUPED_PATTERNS[self._decimal_sign].fullmatch(cell_text):
             return True
-        self.grouped_line = self.grouped_line or line_number
+        self.first_grouped_line = self.first_grouped_line or line_number
         return False
 
 
@@ -136,7 +138,7 @@ def are_split_decimals(rows: Sequence[Sequence[str]]) -> bool:
 
 
 def without_comment_mark(cell: str) -> str:
-    """Return a title without a comment mark (# or %) at the start of the line."""
+    """Return the first title of a line without the comment mark (# or %) before it."""
     return _COMMENT_PATTERN.sub("", cell, count=1) if _COMMENT_PATTERN.match(cell) else cell
 
 
@@ -149,7 +151,7 @@ def is_comment(row: Sequence[str]) -> bool:
 def is_row_of_units(row: Sequence[str], column_indices: Sequence[int]) -> bool:
     """Return whether a line below the titles is a row of units.
 
-    It is if it contains no number, and a known unit in at least one of the columns.
+    It is one if it contains no number (except 1) and has a known unit in one of the columns.
     """
     stripped_cells = [cell.strip() for cell in row]
     if any(is_any_number(cell) for cell in stripped_cells if cell and cell != "1"):

@@ -18,8 +18,8 @@ _MAX_MARK_BYTES: Final = 4
 def encodings(first_bytes: bytes) -> tuple[str, ...]:
     """Return the possible encodings of a file from its first bytes, the most probable first.
 
-    Most programs without UTF-8 write Windows-1252. Numbers have the same bytes in both encodings;
-    only titles and units can differ.
+    Most programs that do not write UTF-8 write Windows-1252. Numbers have the same bytes in both
+    encodings; only titles and units can differ.
     """
     stated_encoding = _encoding_of_mark(first_bytes)
     if stated_encoding is not None:
@@ -56,7 +56,7 @@ def decode_text(text_bytes: bytes) -> str:
 
 
 def _encoding_of_mark(first_bytes: bytes) -> str | None:
-    """Return the encoding that a byte order mark states; None without a mark."""
+    """Return the encoding that a byte order mark states; None if there is no mark."""
     return next(
         (
             encoding_name

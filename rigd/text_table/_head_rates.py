@@ -25,7 +25,7 @@ _PERIOD_PATTERN: Final = re.compile(
 
 
 def stated_rate_hz(head_lines: Iterable[str]) -> float | None:
-    """Return the sampling rate in Hz that a line above the table states; None without one.
+    """Return the sampling rate in Hz that a line above the table states; None if none does.
 
     A rate without a unit is in Hz.
     """
@@ -47,6 +47,6 @@ def stated_rate_hz(head_lines: Iterable[str]) -> float | None:
 
 
 def _plausible_product(number_text: str, unit_factor: float) -> float | None:
-    """Return a number times its unit; None if the product is not plausible."""
+    """Return the number in a text multiplied by its unit; None if the product is not plausible."""
     product = float(number_text.replace(",", ".")) * unit_factor
     return product if 0.0 < product < 1e12 else None

@@ -39,12 +39,12 @@ class LabviewHead:
     channels: Mapping[str, tuple[str, ...]]
 
     def text(self, head_key: str, column_index: int) -> str:
-        """Return the text that a key has for a column; "" if there is none."""
+        """Return the text that the head states for a column under a key; "" if there is none."""
         key_cells = self.channels.get(head_key, ())
         return key_cells[column_index] if 0 < column_index < len(key_cells) else ""
 
     def number(self, head_key: str, column_index: int) -> float | None:
-        """Return the number that a key has for a column; None if there is none."""
+        """Return the number that the head states for a column under a key, or None."""
         try:
             return float(self.text(head_key, column_index).replace(",", "."))
         except ValueError:
@@ -73,12 +73,12 @@ class LabviewHead:
 
 
 def head_of(text_lines: Sequence[str]) -> LabviewHead | None:
-    """Return the head of a LabVIEW measurement file; None if the text is not such a file.
+    """Return the header of a LabVIEW measurement file; None if the text is not such a file.
 
     Raises
     ------
     TableError
-        If the last line of the head is missing.
+        If the last line of the header is missing.
     """
     first_line = next((text_line for text_line in text_lines if text_line.strip()), "")
     if not first_line.lstrip('"').startswith(_FIRST_LINE_TEXT):

@@ -21,7 +21,7 @@ from rigd.text_table._stamps import is_stamp
 from rigd.text_table.titles import bare_unit, is_unit
 
 MAX_HEAD_LINES: Final = 500
-"""Number of lines at the beginning of a file in which the first line of numbers must be."""
+"""Number of lines at the beginning of a file that are searched for the first line of numbers."""
 
 BLANK_SEPARATOR: Final = " "
 """Separator that means any number of blanks."""
@@ -40,12 +40,12 @@ _EXCEL_SEPARATOR_LINE: Final = "sep="
 _MAX_LINES_BELOW_TITLES: Final = 6
 """Largest number of lines between the titles and the first line of numbers."""
 _NUMBERING_LINES: Final = 5
-"""Number of rows below a row 1, 2, 3, … that are examined to find out if it numbers the columns."""
+"""Number of rows below a row 1, 2, 3, … that are read to decide whether it numbers the columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class TextRow:
-    """Row of cells: one line of a file, or several lines with a line break inside quotes.
+    """Row of cells: one line of a file, or several lines if quoted cells contain line breaks.
 
     Attributes
     ----------
@@ -187,7 +187,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
     TableError
         If the file contains no table with these columns.
     """
-    if not any(line_number.strip() for line_number in lines):
+    if not any(line_text.strip() for line_text in lines):
         raise TableError("is empty; export the record again.")
     separator_in_file = stated_separator(lines[0])
     if separator_in_file:
@@ -198,7 +198,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
     present_separators = [
         separator_character
         for separator_character in _SEPARATORS
-        if any(separator_character in line_number for line_number in lines)
+        if any(separator_character in line_text for line_text in lines)
     ]
     candidate_separators = (
         [separator_in_file] if separator_in_file else [*present_separators, BLANK_SEPARATOR]
@@ -223,9 +223,9 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
             possible_layout = _layout_with_separator(
                 nonempty_rows, separator, requested_names, labview_head
             )
-        except _NotThisTableError as unlikely:
-            unlikely.separator = separator
-            failed_attempts.append(unlikely)
+        except _NotThisTableError as failure:
+            failure.separator = separator
+            failed_attempts.append(failure)
             continue
         if separator == ",":
             _check_split_decimals(text_rows[possible_layout.rows_before_numbers :], possible_layout)
@@ -237,11 +237,11 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
     nearest_failure = max(failed_attempts, key=lambda failure: failure.rank, default=None)
     # A table that starts late does not count if earlier lines nearly form a table.
     has_earlier_titles = any(
-        failed_layout.rank == _RANK_ALL_TITLES
+        failure.rank == _RANK_ALL_TITLES
         and best_layout
-        and failed_layout.index < best_layout.rows_before_numbers
-        and failed_layout.separator != BLANK_SEPARATOR
-        for failed_layout in failed_attempts
+        and failure.row_index < best_layout.rows_before_numbers
+        and failure.separator != BLANK_SEPARATOR
+        for failure in failed_attempts
     )
     if best_layout is None or has_earlier_titles:
         assert nearest_failure is not None
@@ -254,7 +254,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
 
 
 class _NotThisTableError(Exception):
-    """Error: with a certain separator, the text is not the requested table.
+    """Error if a text, split at a certain separator, is not the requested table.
 
     `rank` states how much of the table was found, and `error` is the error for the user.
     """
@@ -263,12 +263,13 @@ class _NotThisTableError(Exception):
         super().__init__()
         self.rank = rank
         self.error = error
-        self.index = row_index
+        self.row_index = row_index
         self.separator = ""
 
 
 _RANK_NO_ROWS, _RANK_NO_TITLES, _RANK_SOME_TITLES, _RANK_ALL_TITLES = range(4)
-"""Ranks of failures. The error of the failure with the highest rank is reported."""
+"""Ranks of failures, by how much of the table was found. The failure of the separator with the
+highest rank is reported."""
 
 
 def _layout_with_separator(
@@ -277,7 +278,7 @@ def _layout_with_separator(
     requested_names: Sequence[str],
     labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout:
-    """Return the layout of the table for a given separator, or raise the most specific error."""
+    """Return the layout of the table if split at a separator, or raise the most specific error."""
     column_numbers = [_column_number(column_name) for column_name in requested_names]
     requested_titles = [
         column_name
@@ -300,12 +301,12 @@ def _layout_with_separator(
             )
             if found_layout is not None:
                 return found_layout
-        except _NotThisTableError as unlikely:
-            if unlikely.index == MAX_HEAD_LINES:
-                unlikely.index = row.index
+        except _NotThisTableError as failure:
+            if failure.row_index == MAX_HEAD_LINES:
+                failure.row_index = row.index
             if not requested_titles:
                 raise
-            best_failure = best_failure or unlikely
+            best_failure = best_failure or failure
     if best_failure is not None:
         raise best_failure
     if requested_titles:
@@ -329,7 +330,7 @@ def _column_number(column_name: str) -> int | None:
 
 
 def _plain_titles(row: TextRow) -> list[str]:
-    """Return a row's titles without a comment mark and without empty titles at the end."""
+    """Return the titles in a row without a leading comment mark and trailing empty titles."""
     title_cells = without_trailing_empty_cells(row.cells, 0)
     if title_cells and title_cells[0] in (
         "#",
@@ -469,7 +470,7 @@ def _next_row(rows: Sequence[TextRow], earlier_row: TextRow) -> TextRow | None:
 def _is_data(
     row_cells: Sequence[str], column_indices: Sequence[int], next_row: TextRow | None
 ) -> bool:
-    """Return True if a row belongs to the numbers of the table.
+    """Return whether a row is one of the table's rows of numbers.
 
     It must have numbers in the requested columns, and no text where the next row has a number.
     """
@@ -620,7 +621,7 @@ def _layout_from_numbers(
 
 
 def _is_row_of_column_numbers(text_rows: Sequence[TextRow], row_index: int) -> bool:
-    """Return whether the first row contains the numbers of the columns instead of data.
+    """Return whether a row is the first one and contains the column numbers instead of data.
 
     This is the case if it counts from 0 or 1, and no row below contains only integers.
     """
@@ -651,8 +652,8 @@ def _missing_title_error(
 
     def count_found_names(row: TextRow) -> int:
         return sum(
-            missing_name in row.cells or missing_name in _plain_titles(row)
-            for missing_name in requested_names
+            requested_name in row.cells or requested_name in _plain_titles(row)
+            for requested_name in requested_names
         )
 
     best_row = max(rows, key=count_found_names)

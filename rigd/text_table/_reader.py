@@ -206,7 +206,7 @@ class _DecimalCommaError(Exception):
 
 @contextmanager
 def _open_lines(stream: BinaryIO, encoding: str) -> Iterator[Iterator[str]]:
-    """Provide the lines of a text file, decoded, as a context manager."""
+    """Provide the decoded lines of a text file from its start, without closing the file."""
     stream.seek(0)
     text_stream = TextIOWrapper(stream, encoding, newline="")
     try:
@@ -234,7 +234,7 @@ class _NumberRows:
     """Reader of rows of numbers that checks each row against the layout of the table."""
 
     layout: TableLayout
-    names: Sequence[str]
+    requested_names: Sequence[str]
     decimal_sign: str
     """Decimal sign of the numbers."""
     columns_to_read: Sequence[int]
@@ -248,7 +248,7 @@ class _NumberRows:
     sign_is_certain: bool = False
     """Whether a cell has shown that the expected sign is the decimal sign."""
     blank_line: int = 0
-    """Number of the first empty line between lines of numbers; 0 without one."""
+    """Number of the first empty line between lines of numbers; 0 if there is none."""
     blank_count: int = 0
     """Number of interruptions of the numbers by empty lines."""
 
@@ -266,11 +266,14 @@ class _NumberRows:
     def title(self, column_index: int) -> str:
         """Return the name of a requested column for messages; its number if it has no name."""
         if column_index in self.layout.columns:
-            return self.names[self.layout.columns.index(column_index)]
+            return self.requested_names[self.layout.columns.index(column_index)]
         return f"#{column_index + 1}"
 
     def fit(self, row: Sequence[str], line_number: int) -> list[str]:
-        """Return a row with as many cells as the table has columns, or raise TableError."""
+        """Return a row with empty cells cut or added at its end to fit the table's columns.
+
+        Raise TableError if this does not make it fit.
+        """
         column_count = self.layout.width
         fitted_cells = without_trailing_empty_cells(row, column_count)
         if column_count - self.layout.optional_columns <= len(fitted_cells) < column_count:
@@ -349,13 +352,13 @@ class _NumberRows:
     def check_thousands(self) -> None:
         """Raise TableError if a column's decimal signs may be thousands separators."""
         for column_index, thousands_check in self.thousands_checks.items():
-            is_ambiguous = thousands_check.plain or (
+            is_ambiguous = thousands_check.has_short_integer or (
                 self.decimal_sign == COMMA and not self.sign_is_certain
             )
-            if thousands_check.grouped_line and is_ambiguous:
+            if thousands_check.first_grouped_line and is_ambiguous:
                 sign_noun = "commas" if self.decimal_sign == COMMA else "points"
                 raise TableError(
-                    f"line {thousands_check.grouped_line}: the {sign_noun} in "
+                    f"line {thousands_check.first_grouped_line}: the {sign_noun} in "
                     f"'{self.title(column_index)}' may be decimal signs or separators between "
                     "thousands, as each has three digits behind it; save the file with decimal "
                     "points and "
@@ -511,7 +514,7 @@ def _text_table(
     times_column: int | None,
     rows: _NumberRows,
 ) -> TextTable:
-    """Return the table from the values that were read."""
+    """Return the values that were read as a table with titles, units, rates and times."""
     table_columns = {}
     for requested_name, column_index in zip(requested_names, layout.columns, strict=True):
         period_s = start_ns = None

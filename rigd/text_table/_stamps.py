@@ -61,12 +61,15 @@ def _seconds_since_midnight(stamp: re.Match[str]) -> int:
 
 
 def _nanoseconds(stamp: re.Match[str]) -> int:
-    """Return the fraction of a time stamp's second in nanoseconds."""
+    """Return the fractional part of a time stamp's seconds, in nanoseconds."""
     return int(f"{stamp['fraction'] or '':0<9}"[:9])
 
 
 def _day_number(date_text: str | None) -> int:
-    """Return the day number of an unambiguous date: year first, or day first with points."""
+    """Return a date as a count of days; raise ValueError unless its format is unambiguous.
+
+    Unambiguous are year, month, day, and with points also day, month, year.
+    """
     date_parts = re.split(r"[-/.]", date_text or "")
     if len(date_parts) == 3 and len(date_parts[0]) == 4:
         return date(int(date_parts[0]), int(date_parts[1]), int(date_parts[2])).toordinal()

@@ -16,7 +16,7 @@ _TIME_TITLE_PATTERN: Final = re.compile(
     r"(?=$|[\s\[(/,:_])",
     re.IGNORECASE,
 )
-"""Pattern of the beginning of a column of times' title, in several languages."""
+"""Pattern of the beginning of the title of a column of times, in several languages."""
 
 TIME_UNITS_S: Final = {
     "s": 1.0,
@@ -39,7 +39,7 @@ TIME_UNITS_S: Final = {
     "minutes": 60.0,
     "h": 3600.0,
 }
-"""Units of time by their spelling, in seconds."""
+"""Length in seconds of each unit of time, by spelling."""
 
 _OTHER_UNITS: Final = (
     "rad", "mrad", "urad", "deg", "degree", "degrees", "radian", "radians", "arcmin", "arcsec",

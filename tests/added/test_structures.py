@@ -111,6 +111,7 @@ WRONG = {  # code of a package, and the reason that is stated
     "type": ("ZENER = 'zener'", "is a str and no Structure"),
     "other": (STRUCTURE, 'declares the structure "zener"'),
     "vi": (STRUCTURE, "built into the analyser"),
+    "lines": (changed(("material, and", "material\\nand")), "description is not one line"),
     "range": (changed(("lower=1e-6, upper=1.0", "lower=1.0, upper=1e-6")), "1 to 1e-06"),
     "endless": (changed((", upper=1.0", "")), "is not finite"),
     "start": (changed(("starts=(1e-2,)", "starts=(20.0,)")), "start 20 of its parameter air"),

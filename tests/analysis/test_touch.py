@@ -19,7 +19,7 @@ from rigd.session import SessionError, read_session
 def test_a_marked_touch_is_estimated(touched, touch_file):
     (touch,) = touched.touches
     found, truth = touch.estimate, touch_file.obstacle
-    assert (touched.found, touched.has_shear, touched.warnings) == ("loop", True, ())
+    assert (touched.detection_source, touched.has_shear, touched.warnings) == ("loop", True, ())
     assert found.kind == "rigid"
     assert found.x_m.value == pytest.approx(truth.x_m, abs=4e-3)
     assert touch.start_s + found.time_s.value == pytest.approx(touch_file.time_s, abs=5e-4)
@@ -33,7 +33,7 @@ def test_the_map_shows_it_where_the_obstacle_stands(touched, touch_file):
     # The obstacle is met by the straight antenna at this angle; the bent one is ahead or behind.
     assert atan2(*touch.point_m[::-1]) == pytest.approx(touch_file.obstacle.angle_rad, abs=3e-3)
     assert np.hypot(*touch.point_m) == pytest.approx(touch_file.obstacle.x_m, abs=4e-3)
-    inner, outer = np.hypot(*touch.ends_m.T)
+    inner, outer = np.hypot(*touch.interval_ends_m.T)
     assert inner < np.hypot(*touch.point_m) < outer
     assert touch.antenna_m[0] == pytest.approx([0.0, 0.0], abs=1e-9)
 
@@ -43,7 +43,7 @@ def test_one_that_is_not_marked_is_found(touch_file, touch_analysis, tmp_path, m
     path = touch_file.write(tmp_path / "a.mcap", marked=False, metadata=metadata)
     session = touch_analysis.session(path)
     (touch,) = session.touches
-    assert (session.found, session.has_shear) == ("record", not metadata)
+    assert (session.detection_source, session.has_shear) == ("record", not metadata)
     assert 0 < touch.tick - 1000 * touch_file.time_s < 40
 
 
@@ -51,7 +51,7 @@ def test_before_the_touch_nothing_is_found(touch_file, touch_analysis, tmp_path)
     length = round(1000 * touch_file.time_s) - 1
     path = touch_file.write(tmp_path / "a.mcap", marked=False, length=length)
     session = touch_analysis.session(path)
-    assert (session.found, session.touches) == ("record", ())
+    assert (session.detection_source, session.touches) == ("record", ())
 
 
 def test_missed_ticks_are_bridged(touch_file, touch_analysis, touched, tmp_path):

@@ -1,12 +1,15 @@
 """The loop is measured in the processes of a real session, for as short as it can be."""
 
 import os
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from rigd.bench import _loops as loops
 from rigd.profile import load_profile
+from rigd.runner.session import SessionResult
 
 pytestmark = pytest.mark.process
 
@@ -53,6 +56,18 @@ def test_a_loop_that_fails_is_told(profile, monkeypatch):
     monkeypatch.setattr("rigd.bench._loops.ProcessGroup", no_memory)
     with pytest.raises(loops.LoopError, match="no shared memory"):
         loops.run_alone("alone", profile, SECONDS, lambda: None)
+
+
+def test_a_session_that_is_not_complete_is_no_measurement(profile, monkeypatch):
+    reason = "The drive does not answer."
+    result = SessionResult(None, "fault", reason, 150, 10, 0, 0, 0, fault=True)
+    rig = SimpleNamespace(run=lambda *_: result)
+    processes = SimpleNamespace(control=SimpleNamespace(pid=os.getpid()))
+    monkeypatch.setattr(
+        "rigd.bench._loops.connected_rig", lambda *_, **__: nullcontext((rig, processes))
+    )
+    with pytest.raises(loops.LoopError, match=reason):
+        loops.run_session("session", profile, SECONDS, lambda: None)
 
 
 def test_the_stranger_is_gone_afterwards():

@@ -97,7 +97,7 @@ def test_error_of_a_forecast_is_that_of_the_torque(done, short_sessions, truth):
     found, _ = done
     (forecast, *_) = models_without_session(found.sessions, 0)
     link, damping = truth
-    true = replace(forecast, plant=Plant(link, damping), own=None)
+    true = replace(forecast, plant=Plant(link, damping), own_plant=None)
     light = replace(link, density_kg_per_m=1e-12, bending_stiffness_n_m2=1e-12)
     none = replace(true, plant=Plant(light, damping))
     exact, nothing = leave_one_out_results(short_sessions[0], [true, none], BAND_HZ)

@@ -36,6 +36,12 @@ def test_results_come_in_order_and_each_call_counts(cluster):
     assert sorted(seen) == list(range(9))
 
 
+@pytest.mark.process
+def test_an_error_of_a_task_is_none_of_the_cluster(cluster):
+    with dask_cluster(cluster.scheduler_address) as workers, pytest.raises(ZeroDivisionError):
+        workers.run(divmod, [(1, 0)])
+
+
 @pytest.mark.fit
 @pytest.mark.process
 def test_a_campaign_finds_what_it_finds_here(cluster, short_sessions, settings, monkeypatch):

@@ -12,7 +12,7 @@ from ended_workers import call_unless_one
 from analysis.campaigns import CampaignError, analyse_session, campaign
 from analysis.campaigns.workers import FailedTask, process_pool
 from analysis.cli.campaign import campaign_command
-from analysis.cli.sessions import Outputs
+from analysis.cli.sessions import OutputOptions
 from analysis.report import campaign_document
 from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 
@@ -110,7 +110,7 @@ def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tm
     monkeypatch.setattr("analysis.campaigns.campaign", lambda *_, **__: shaken)
     monkeypatch.setattr("analysis.report.campaign_report.write_campaign", lambda *_, **__: None)
     paths = [each.path for each in shaken.sessions]
-    outputs = Outputs(report=tmp_path / "new")
+    outputs = OutputOptions(report=tmp_path / "new")
     code = campaign_command(paths, shaken.settings, outputs, structures=("III",))
     assert code == 1
     assert "1.mcap is not predicted from the others: its worker" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import pytest
 from shipped_profile import load_shipped
 
 from rigd.engine import shared_memory_fd
-from rigd.engine.channels import DESCRIPTORS, create_channels
+from rigd.engine.channels import DESCRIPTOR_COUNT, create_channels
 from rigd.engine.messages import FileHeader
 from rigd.engine.recorder import Recorder
 from rigd.engine.shared_state import Phase, StateField
@@ -22,7 +22,7 @@ from rigd.session.layout import pack_sample_into
 
 @pytest.fixture
 def channels():
-    descriptors = [shared_memory_fd() for _ in range(DESCRIPTORS)]
+    descriptors = [shared_memory_fd() for _ in range(DESCRIPTOR_COUNT)]
     channels = create_channels(1000.0, descriptors)
     yield channels
     channels.close()
@@ -77,7 +77,10 @@ def test_a_control_process_that_dies_on_the_way_back_leaves_a_whole_record(tmp_p
     finally:
         rig.disconnect()
     assert result.outcome == "complete"
-    assert result.reason == "After the record: The control process was killed by signal 9."
+    assert result.reason.startswith(
+        "After the record: The control process was killed by signal 9. Without its heartbeat"
+    )
+    assert "check that it is off" in result.reason
     assert not result.is_successful
     assert result.scheduled == 400 == result.recorded
     assert read_session(result.path).outcome["outcome"] == "complete"

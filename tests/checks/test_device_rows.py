@@ -106,12 +106,13 @@ def test_a_range_beyond_the_sensors_fails(can_profile, stand_ins, profile_range,
 
 def test_what_a_sensor_does_not_tell(can_profile, stand_ins):
     found = stand_ins.sensor.found
-    found |= {"range_n_nm": "not stated by the sensor", "calibration_date": ""}
+    found |= {"range_n_nm": "not stated by the sensor", "calibration_date": "", "owner": ""}
     del found["firmware"]
     rows = by_name(inspect_devices(can_profile))
     for what in ("range", "calibration date", "firmware"):
         assert rows["sensor", what].found == "not stated by the sensor"
         assert rows["sensor", what].verdict is CheckResult.OK
+    assert rows["sensor", "more"].detail == "Sensor: counts per force 1000000."
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ from rigd.session.layout import SAMPLE_SIZE, TIMING_SIZE, Status, pack_sample_in
 from rigd.view import draw_session
 from rigd.view._recorded import describe_recorded_session
 from rigd.view.frequency_charts import MAGNITUDE_ENTITY, ResponseCharts
-from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
+from rigd.view.plots import AGES, GREEN, GREY, ORANGE, SKY_BLUE
 
 pytestmark = pytest.mark.process
 
@@ -245,6 +245,17 @@ def test_it_is_played_from_its_start_in_the_layout_of_the_live_view(chirp):
     assert starts_ns[-1][-1] == session.start_utc_ns
 
 
+def test_ages_are_a_plot_if_a_real_rig_states_them(write):
+    path = write("ages.mcap", np.arange(10))
+    session, timings = read_session(path), read_timings(path)
+    samples = session.samples.copy()
+    samples["work_ns"] = 1000  # in simulated time there is none
+    of_a_rig = replace(session, samples=samples)
+    assert AGES.component not in describe_recorded_session(of_a_rig, timings).absent
+    for without in (None, timings[:0]):
+        assert AGES.component in describe_recorded_session(of_a_rig, without).absent
+
+
 LEAST = {
     "rate_hz": "1000.0",
     "beam_length_m": "0.98",
@@ -412,13 +423,16 @@ def test_a_full_disk_is_told_and_leaves_nothing_behind(short, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_progress_appears_when_it_takes_long(rigd_here, write, monkeypatch, tmp_path):
-    monkeypatch.setattr("rigd.cli.options._PROGRESS_DELAY_S", -1.0)
+@pytest.mark.parametrize(("delay_s", "appears"), [(-1.0, True), (600.0, False)])
+def test_progress_appears_when_it_takes_long(
+    rigd_here, write, monkeypatch, tmp_path, delay_s, appears
+):
+    monkeypatch.setattr("rigd.cli.options._PROGRESS_DELAY_S", delay_s)
     monkeypatch.setenv("FORCE_COLOR", "1")
     path = write("brief.mcap", np.arange(700))
     done = rigd_here("replay", path, "--save", tmp_path / "out.rrd")
     assert done.returncode == 0, done.stderr
-    assert path.name in done.stderr.partition("open it with")[0]
+    assert (path.name in done.stderr.partition("open it with")[0]) == appears
 
 
 def test_without_a_screen_it_says_what_else_there_is(rigd_here, write, monkeypatch):

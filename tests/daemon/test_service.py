@@ -2,10 +2,11 @@
 
 import asyncio
 import json
+import re
 
 import pytest
 from cases import further
-from operated_daemons import CommandError, Peer, parse_request, shown_status
+from operated_daemons import CommandError, Peer, parse_request, printed_status, shown_status
 
 from rigd.devices import ActuationTarget
 from rigd.devices.contracts import DeviceError, LineHealth
@@ -196,6 +197,8 @@ def test_only_reset_leaves_a_fault(operated):
     operated.ask("reset")
     assert operated.state == "ready"
     assert transitions(operated)[-2:] == [("fault", "idle"), ("idle", "ready")]
+    _, *printed = re.findall(r"(\w+) → (\w+)", printed_status(operated.ask("status")))
+    assert printed == transitions(operated)[-4:]
     operated.ask("start", **SHORT)
     assert operated.last["sessions"][0]["outcome"] == "complete"
 

@@ -9,7 +9,7 @@ from shipped_profile import load_shipped
 from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
 from rigd.engine import shared_memory_fd
-from rigd.engine.channels import DESCRIPTORS, create_channels
+from rigd.engine.channels import DESCRIPTOR_COUNT, create_channels
 from rigd.engine.control_process import run_control
 from rigd.engine.messages import SessionFinished, SessionJob
 from rigd.engine.reference import write_reference
@@ -146,7 +146,9 @@ class Session:
             stop_hz=5.0,
         )
         self.channels = create_channels(
-            self.profile.rig.rate_hz, [shared_memory_fd() for _ in range(DESCRIPTORS)], buffered_s
+            self.profile.rig.rate_hz,
+            [shared_memory_fd() for _ in range(DESCRIPTOR_COUNT)],
+            buffered_s,
         )
         self.shared_state = self.channels.shared_state
         self.parent = FakeParent(self.shared_state)

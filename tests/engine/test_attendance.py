@@ -73,6 +73,7 @@ def test_limits_are_relative_to_the_zero(make_session):
     refused, fine = session.parent.said(SessionFinished)
     assert refused.outcome == "fault"
     assert "outside limits.angle_rad" in refused.reason
+    assert "turn it back and start again" in refused.reason
     assert refused.device_failed is False
     assert fine.outcome == "complete"
 

@@ -11,7 +11,7 @@ from cases import further
 from rigd.control import close_loop
 from rigd.devices.contracts import Devices
 from rigd.engine.cycle import make_limit_monitor
-from rigd.engine.messages import SessionFinished, TareOrder
+from rigd.engine.messages import MeasurementRefused, SessionFinished, TareOrder
 from rigd.engine.shared_state import StateField
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp, hold
@@ -330,6 +330,15 @@ def test_a_zero_that_moves_between_two_sessions_is_refused_unless_it_is_tared(
         assert re.match(r"Drift of .* zero -0\.0\d+ N·m exceeds limit", second.reason)
         assert "rigd tare" in second.reason
         assert second.counts["scheduled"] == 0
+
+
+def test_the_tare_of_a_frozen_sensor_is_refused(make_session):
+    session = make_session()
+    sensor(session, wrong_from=0, stuck=StuckReadings())
+    session.obey(TareOrder())
+    (refused,) = session.parent.said(MeasurementRefused)
+    assert refused.reason.startswith("Run of identical readings of all sensor channels")
+    session.assert_safe()
 
 
 def test_a_small_drift_is_a_warning(make_session):

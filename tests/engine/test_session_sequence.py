@@ -552,7 +552,7 @@ def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session)
     session = make_session(excitation=BRIEF)
     order = session.order()
     refused = {"supervisor_scheduling": "refused: not permitted"}
-    session.obey(replace(order, refused=refused))
+    session.obey(replace(order, refused_settings=refused))
     [warning] = [event for event in session.events if event.level == "warning"]
     assert warning.message == (
         "The system did not grant supervisor_scheduling (refused: not permitted): a computer that "

@@ -88,7 +88,7 @@ def run(search, until=None):
         contact = search.monitor.step(tick, 0)
         if contact is not None:
             contacts[tick] = contact
-            if contact.ends:
+            if contact.session_outcome:
                 break
     return contacts
 
@@ -105,7 +105,7 @@ def test_after_a_touch_it_brakes_holds_and_goes_back(search):
     contacts = run(search, tick + 1)
     assert search.cycle.flags & Status.TOUCHED
     assert contacts[tick].message == f"Touch detected at {tick / RATE_HZ:.3f} s."
-    assert not contacts[tick].ends
+    assert not contacts[tick].session_outcome
     reference = np.array(search.reference)
     speed = np.diff(reference) * RATE_HZ
     assert speed[tick - 1] == pytest.approx(1.0)
@@ -140,7 +140,7 @@ def test_a_touch_on_the_way_back_stops_the_session(search):
     tick = search.one.returns + 20
     search.detector.at = {tick}
     (contact,) = run(search).values()
-    assert contact.ends == "stopped"
+    assert contact.session_outcome == "stopped"
     assert "way back" in contact.message
     assert search.cycle.flags & Status.TOUCHED
 
@@ -150,7 +150,7 @@ def test_too_great_a_force_ends_as_a_fault(search):
     search.detector.force_n = {tick - 20: -6.0, tick: -6.0, tick + 1: -6.0}
     contacts = run(search)
     assert list(contacts) == [tick + 1]
-    assert contacts[tick + 1].ends == "fault"
+    assert contacts[tick + 1].session_outcome == "fault"
     assert "6 N exceeds force_limit_n = 5 N" in contacts[tick + 1].message
 
 

@@ -364,6 +364,10 @@ WRONG_MODAL = {**MODAL.as_json(), "poles_rad_s": [[1.0, 16.0]] * 3}
         (document(parameters={}), (), 1, ("density_over_stiff",)),
         (document({**NOMINAL, "alpha": 3.0}), (), 1, ("alpha.value = 3.0", "below 2")),
         (document({**NOMINAL, "stiffness": 3.0}), (), 1, ("not known to this version",)),
+        (
+            document({**NOMINAL, "stiffness_offset_51": 0.01}),
+            (), 1, ("stiffness_offset_51 is of a mode beyond the band",),
+        ),
         (document() | {"files": []}, (), 1, ("beam_length_m",)),
         (
             document(covariance={"names": ["ln_zeta"], "matrix": [[-1.0]]}),

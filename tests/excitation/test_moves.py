@@ -143,6 +143,7 @@ def test_a_move_takes_out_what_rings_at_its_start(plant, ring_down_nm, robust):
     )
     assert not_taken_out > 0.02
     assert left < 0.05 * not_taken_out
+    assert left < move.residual_nm < 0.3 * not_taken_out  # for wrong frequencies
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from rigd.control import close_loop
 from rigd.excitation import ExcitationError
 from rigd.identification import _records, read_recording
-from rigd.identification.estimate import MotorEstimateError
+from rigd.identification.estimate import MotorEstimateError, estimate_motor
 from rigd.identification.experiments import (
     SpeedPass,
     multisine_session,
@@ -19,6 +19,7 @@ from rigd.identification.experiments import (
     trial_session,
 )
 from rigd.runner.planning import plan_session
+from rigd.testing import Signals, write_session
 
 SESSIONS = (trial_session, multisine_session, speeds_session)
 
@@ -120,6 +121,26 @@ def test_other_metadata_hold_no_layout(profile, change):
     assert read_schedule(metadata) is not None
     changed = {k: v for k, v in (metadata | change).items() if v is not None}
     assert read_schedule(changed) is None
+
+
+@pytest.mark.parametrize(
+    ("make", "end", "words"),
+    [
+        (speeds_session, 5000, "Constant speeds alone .* motor-multisine"),
+        (multisine_session, 100, "Too few passes: 0 of 0"),  # stopped before the first
+    ],
+)
+def test_what_does_not_suffice_is_named(profile, tmp_path, make, end, words):
+    excitation = make(profile, torque_percent=40.0, stroke_rad=0.8)
+    reference = excitation.reference_rad
+    signals = Signals(
+        reference, reference, np.zeros(reference.size), excitation.segments, excitation.rate_hz,
+        as_text(excitation),
+    )  # fmt: skip
+    path = write_session(tmp_path / "a.mcap", signals.part(slice(end)))
+    with pytest.raises(MotorEstimateError, match=words):
+        recording = read_recording([path], 0.0)
+        estimate_motor(recording.windows, recording.timing)
 
 
 @pytest.mark.process

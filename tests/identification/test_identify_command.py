@@ -3,10 +3,13 @@
 import json
 import re
 import tomllib
+from pathlib import Path
 
 import pytest
 
 from rigd.profile import load_profile
+from rigd.runner.session import SessionResult
+from rigd.runtime import StopRequest
 from rigd.session import read_session
 
 
@@ -113,6 +116,15 @@ def test_wrong_use(rigd_here, tmp_path, options, code, words):
     assert "Traceback" not in text
     assert len(text) < 1500
     assert not list(tmp_path.rglob("*.mcap*"))
+
+
+@pytest.mark.parametrize("outcome", ["fault", "complete"])
+def test_no_estimate_follows_a_trial_that_ended_early(rigd_here, monkeypatch, outcome):
+    trial = SessionResult(Path("a.mcap"), outcome, "The tare drifted.", 9, 9, 0, 0, 0, fault=True)
+    monkeypatch.setattr("rigd.cli.identify.start_processes", lambda **_: (StopRequest(), None))
+    monkeypatch.setattr("rigd.runner.run_in_foreground", lambda *_, **__: [trial])
+    done = rigd_here("identify", "motor", "--fast")
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "")
 
 
 @pytest.mark.process

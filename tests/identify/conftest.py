@@ -296,7 +296,9 @@ def candidates():
 
     def of(*made_up):
         ranked = tuple(sorted(made_up, key=lambda each: each.bic))
-        return CandidateSet(comparison=None, noise=None, free=(), candidates=ranked, columns=())
+        return CandidateSet(
+            comparison=None, noise=None, free_settings=(), candidates=ranked, effect_spectra=()
+        )
 
     return of
 

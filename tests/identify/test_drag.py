@@ -53,8 +53,8 @@ def test_drag_is_named_and_nothing_else(braked):
 
 
 def test_drag_leaves_noise_only(uniform, refitted):
-    assert not uniform.is_nearly_white(uniform.likeliest)
-    assert refitted.is_nearly_white(refitted.likeliest)
+    assert not uniform.is_nearly_white(uniform.likeliest_fit)
+    assert refitted.is_nearly_white(refitted.likeliest_fit)
     names = [candidate.name for candidate in refitted.candidates]
     assert sorted(names) == sorted(STRUCTURES)
 

@@ -54,7 +54,9 @@ def test_the_torque_is_that_of_steps_in_time(brake, law):
     damping = Damping(zeta=5.4e-5, alpha=1.0, gamma=0.02, lambda_=1.0)
     comparison = compared(angle_rad)
     found = response(comparison, Plant(LINK, damping)).torque(law).torque_nm[comparison.retained]
-    stepped = brake.drag_torque(angle_rad, RATE_HZ, LINK, damping, law.constant_m, law.slowing)
+    stepped = brake.drag_torque(
+        angle_rad, RATE_HZ, LINK, damping, law.constant_m, law.decreasing_part
+    )
     truth = comparison.decimation.apply(stepped)[comparison.retained]
     assert np.abs(truth).max() > 0.02
     spectra = comparison.spectrum(found), comparison.spectrum(truth)
@@ -88,11 +90,11 @@ LAW = DragLaw(2e-3, 5e-4)
 
 @pytest.mark.parametrize("place", [0, 1])
 def test_derivatives_by_the_law(short, place):
-    numbers = np.array([LAW.constant_m, LAW.slowing])
+    numbers = np.array([LAW.constant_m, LAW.decreasing_part])
     step = 1e-3 * numbers * np.eye(2)[place]
     beam = response(short, plant())
     above, below = (beam.torque(DragLaw(*(numbers + sign * step))).torque_nm for sign in (1, -1))
-    exact = beam.torque(LAW).by_law[place]
+    exact = beam.torque(LAW).law_derivatives[place]
     assert deviation((above - below) / (2 * step[place]), exact) < 1e-4
 
 
@@ -113,19 +115,19 @@ def test_derivatives_by_the_beam_go_through_its_poles(short, name, value, step, 
     foreseen = np.zeros(above.size)
     for one, other in zip(*poles, strict=True):
         apart = one.at_rad_s - other.at_rad_s
-        foreseen += np.array([apart.real, apart.imag]) @ here.by_pole[one.mode]
+        foreseen += np.array([apart.real, apart.imag]) @ here.pole_derivatives[one.mode]
     if name == "gamma":
-        foreseen += 2 * step * here.by_external[:, 1].sum(axis=0)
+        foreseen += 2 * step * here.external_derivatives[:, 1].sum(axis=0)
     if name == "density":
-        foreseen += 2 * step / value * here.by_ln_density
+        foreseen += 2 * step / value * here.ln_density_derivative
     if name == "delay_s":
-        foreseen += 2 * step * here.by_delay
+        foreseen += 2 * step * here.delay_derivative
     assert deviation(foreseen, above - below) < tolerance
 
 
 def test_a_small_drag_is_the_first_order(short):
     beam = response(short, plant())
-    assert deviation(beam.torque(DragLaw(1e-7)).torque_nm / 1e-7, beam.first_order()) < 1e-3
+    assert deviation(beam.torque(DragLaw(1e-7)).torque_nm / 1e-7, beam.first_order_torque()) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -192,7 +194,7 @@ def test_the_torque_has_the_measured_phase_of_each_mode(short):
 
     def drag_spectrum(*plant_and_modes):
         drag = DragResponse(short.angle_rad, short.decimation.rate_hz, *plant_and_modes)
-        return short.spectrum(drag.first_order()[short.retained])[near_mode_1]
+        return short.spectrum(drag.first_order_torque()[short.retained])[near_mode_1]
 
     def lag_rad(residue):
         modes = SimpleNamespace(poles_rad_s=true_modes.poles_rad_s, residue=residue)
@@ -210,5 +212,5 @@ def test_modes_beyond_those_that_drag_moves_are_left_out(short):
     modes = SimpleNamespace(poles_rad_s=poles, residue=lambda mode: 1j * poles[mode] ** 4)
     drag = DragResponse(short.angle_rad, short.decimation.rate_hz, soft, modes)
     torque = drag.torque(DragLaw(1e-3), range(1, 8))
-    assert list(torque.by_pole) == [1, 2, 3, 4, 5]
+    assert list(torque.pole_derivatives) == [1, 2, 3, 4, 5]
     assert np.isfinite(torque.torque_nm).all()

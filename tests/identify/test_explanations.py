@@ -330,18 +330,18 @@ def test_losses_of_a_beam_that_is_not_uniform_have_a_tolerance():
         {},
         {"lumps": ((1.0, 2e-4),), "gravity_m_s2": 0.3},
         {"clamp_compliance": 0.01, "clamp_loss": 0.1, "lag_s": 1e-4},
-        {"relaxation": (0.02, 0.01), "sensor": (3e-4, 0.5)},
+        {"relaxation": (0.02, 0.01), "sensor_lag": (3e-4, 0.5)},
     ],
 )
 def test_derivatives_of_modal_constants_are_those_of_differences(plain, altered):
     fit, rig = fitted(plain), replace(NOMINAL, filter_time_constant_s=2e-4, delay_s=1e-3)
     problem = UniformBeamProblem(fit, fit.visible, rig)
     terms = galerkin_mode_terms(Alteration(**altered), rig.beam, problem.modes)
-    x, unit, step = problem.starts()[0], np.eye(problem.compared), 1e-5
-    slopes = problem.deviations(x, unit, terms)[1]()
+    x, unit, step = problem.starts()[0], np.eye(problem.constant_count), 1e-5
+    slopes = problem.residual_and_slopes(x, unit, terms)[1]()
     differences = [
-        problem.deviations(x + change, unit, terms)[0]
-        - problem.deviations(x - change, unit, terms)[0]
+        problem.residual_and_slopes(x + change, unit, terms)[0]
+        - problem.residual_and_slopes(x - change, unit, terms)[0]
         for change in step * np.eye(x.size)
     ]
     np.testing.assert_allclose(slopes, np.array(differences) / (2 * step), rtol=1e-5, atol=1e-8)

@@ -387,7 +387,7 @@ def test_what_moved_in_a_gap_of_the_angle_biases_nothing(sessions, moved_unseen,
     analysis = fit_record(moved.measured(noise_nm=5e-4, **unseen), [STRUCTURES["VI"]])
     (found,) = analysis.fits
     assert_within(found, true_parameters("VI"))
-    counts = analysis.noise.counts
+    counts = analysis.noise.is_compared
     assert whiteness(found.residual[counts], analysis.comparison.frequency_hz[counts]).is_white
     # Nothing of what moved counts as noise.
     at_rest = fit(sessions("VI").measured(noise_nm=5e-4, **unseen), "VI")

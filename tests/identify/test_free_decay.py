@@ -59,7 +59,7 @@ def test_spectra_are_those_of_the_decays():
     derivative = np.array([1 + 2j, -0.5j, 0.3])
     some = [Pole(1, -0.15 + 16j, derivative), Pole(2, -4.0 + 0j, derivative.real + 0j)]
     expected = np.fft.rfft([wave for pole in some for wave in signal(pole, t)])[:, bins]
-    assert spectra.columns(some) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    assert spectra.spectra(some) == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
     assert_gradient(spectra, some)
 
@@ -72,7 +72,7 @@ def assert_gradient(spectra, some):
             [Pole(p.mode, p.at_rad_s + h * p.derivative[k], p.derivative) for p in some]
             for h in (1e-6, -1e-6)
         )
-        numeric = amplitudes @ (spectra.columns(after) - spectra.columns(before)) / 2e-6
+        numeric = amplitudes @ (spectra.spectra(after) - spectra.spectra(before)) / 2e-6
         assert gradient[k] == pytest.approx(numeric, rel=1e-5, abs=1e-5)
 
 
@@ -95,14 +95,14 @@ def test_spectra_of_decays_that_begin_within_a_filtered_record(decimation):
         for pole in some
         for wave in signal(pole, np.maximum(since_s, 0.0))
     ]
-    columns = spectra.columns(some)
+    columns = spectra.spectra(some)
     assert np.abs(columns - expected).max() < 1e-4 * np.abs(columns).max()
     assert_gradient(spectra, some)
 
 
 def test_no_mode_no_column():
     spectra = DecaySpectra(100, 125.0, np.array([1.0, 2.0]))
-    assert spectra.columns(()).shape == (0, 2)
+    assert spectra.spectra(()).shape == (0, 2)
     assert Plant(BEAM, FRACTIONAL).mode_poles(0, NAMES) == ()
 
 

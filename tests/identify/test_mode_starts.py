@@ -19,8 +19,8 @@ def test_a_mode_that_is_overdamped_in_the_best_beam_is_searched_at_a_uniform_bea
         ModeEstimate(3, 45.0, 1e-3, 9e-3, 1e-4),
     )
     candidates = SimpleNamespace(
-        misread=False, likeliest=SimpleNamespace(modes=modes), columns=np.empty((0, 3)), noise=None,
-        comparison=SimpleNamespace(drag=None),
+        misread_findings=False, likeliest_fit=SimpleNamespace(modes=modes), noise=None,
+        effect_spectra=np.empty((0, 3)), comparison=SimpleNamespace(drag=None),
     )  # fmt: skip
     (number, frequency_hz, damping_ratio), *others = fit_modal_model(candidates)
     assert number == 1

@@ -29,17 +29,17 @@ def deviation(one, other):
 def test_a_rise_of_two_percent_is_found_by_substitution(forces, stiffening):
     comparison, modal = forces
     truth = spectrum(comparison, stiffening("III", 0.02)) / 0.02
-    assert deviation(modal.column(MODE_1, 0.02), truth) < 0.03
-    assert deviation(modal.column(MODE_1), truth) > 0.1
+    assert deviation(modal.torque_spectrum(MODE_1, 0.02), truth) < 0.03
+    assert deviation(modal.torque_spectrum(MODE_1), truth) > 0.1
 
 
 def test_a_delay_delays_the_column(forces, plants, link):
     comparison, modal = forces
-    late = NonlinearForceSpectra(comparison, Plant(link, plants["III"], delay_s=2e-3)).column(
-        MODE_1
-    )
+    late = NonlinearForceSpectra(
+        comparison, Plant(link, plants["III"], delay_s=2e-3)
+    ).torque_spectrum(MODE_1)
     turn = np.exp(-2j * np.pi * comparison.frequency_hz * 2e-3)
-    assert deviation(late, modal.column(MODE_1) * turn) < 1e-3
+    assert deviation(late, modal.torque_spectrum(MODE_1) * turn) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_which_harmonics_a_force_makes(link, plants, kind, multiples):
     known = np.ones(t.size, dtype=bool)
     measurement = Measurement("m", angle, np.zeros(t.size), 1000.0, link, known, known, 0.0)
     comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
-    column = NonlinearForceSpectra(comparison, Plant(link, plants["III"])).column(
+    column = NonlinearForceSpectra(comparison, Plant(link, plants["III"])).torque_spectrum(
         NonlinearTerm(kind, 1)
     )
     samples = np.zeros(comparison.samples // 2 + 1, dtype=complex)
@@ -69,15 +69,15 @@ def test_which_harmonics_a_force_makes(link, plants, kind, multiples):
 def test_a_force_too_large_to_substitute_has_no_column(forces):
     """Without a warning: they are errors here."""
     _, modal = forces
-    column = modal.column(MODE_1, 1e3)
-    assert column.shape == modal.column(MODE_1).shape
+    column = modal.torque_spectrum(MODE_1, 1e3)
+    assert column.shape == modal.torque_spectrum(MODE_1).shape
     assert np.isnan(column).all()
-    assert np.isfinite(modal.column(MODE_1)).all()
+    assert np.isfinite(modal.torque_spectrum(MODE_1)).all()
 
 
 def test_a_filter_of_the_torque_filters_the_column(forces, plants, link):
     comparison, modal = forces
     plant = Plant(link, plants["III"], filter_time_constant_s=3e-3)
-    filtered = NonlinearForceSpectra(comparison, plant).column(MODE_1)
+    filtered = NonlinearForceSpectra(comparison, plant).torque_spectrum(MODE_1)
     divisor = 1 + 2j * np.pi * comparison.frequency_hz * 3e-3
-    assert deviation(filtered, modal.column(MODE_1) / divisor) < 1e-3
+    assert deviation(filtered, modal.torque_spectrum(MODE_1) / divisor) < 1e-3

@@ -104,8 +104,8 @@ def test_what_all_but_vanishes_may_vanish_and_keeps_its_order():
 def test_without_a_free_order_steps_are_straight():
     steps = StepRule.for_unknowns(Unknowns.for_structure(STRUCTURES["III"], NOMINAL, SETTINGS))
     x, step = np.array([1.0, 1.0, *REST]), np.array([2.0, -3.0, 0.1, 0.1, 0.1, 0.1])
-    assert steps.dampings == ()
-    assert steps.losses == (0, 1)
+    assert steps.damping_indices == ()
+    assert steps.loss_indices == (0, 1)
     assert steps.end(x, step) == pytest.approx(x + step)
 
 

@@ -43,7 +43,7 @@ def test_a_descent_goes_on_as_one_begun_there_but_evaluates_once_less(objective,
     start = unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8]))
     first = Refit.descend(comparison, unknowns, start, noise, max_evaluations=1)
     evaluated.clear()
-    on = first.further(4)
+    on = first.continue_descent(4)
     going_on = len(evaluated)
     evaluated.clear()
     anew = Refit.descend(comparison, unknowns, first.x, noise, max_evaluations=4)

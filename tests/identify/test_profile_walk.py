@@ -33,9 +33,9 @@ class DoubleWell(OrderProfiler):
         self.costs, self._refits = {}, {}
         self._start_at(self._descend(np.array([start]), 1))
 
-    def _descend(self, start, max_evaluations, *, hold=(), hopeless=None):
+    def _descend(self, start, max_evaluations, *, held_unknowns=(), hopeless=None):
         order = float(start[0])
-        if not hold:
+        if not held_unknowns:
             order = min(BOTTOMS, key=lambda at: ((order - at) / WIDTH) ** 2 + BOTTOMS[at])
         at = NormalEquations(cost(order), np.zeros(1), np.array([[1 / WIDTH**2]]))
         return SimpleNamespace(x=np.array([order]), cost=at.cost, equations=at)
@@ -81,8 +81,8 @@ class Astray(DoubleWell):
 
     BEYOND = 1.9
 
-    def _descend(self, start, max_evaluations, *, hold=(), hopeless=None):
-        found = super()._descend(start, max_evaluations, hold=hold)
+    def _descend(self, start, max_evaluations, *, held_unknowns=(), hopeless=None):
+        found = super()._descend(start, max_evaluations, held_unknowns=held_unknowns)
         if hopeless is not None and found.x[0] > self.BEYOND:
             found.cost = 1e3 * COUNT
             assert found.cost > hopeless[1]

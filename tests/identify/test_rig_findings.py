@@ -106,10 +106,10 @@ def test_clocks_of_different_rates_are_found_with_their_difference(candidates_of
     """A positive difference: the torque with a time stamp is that of a later time."""
     uniform = candidates_of(record(clock=clock))
     with_clock, (change,) = find_temporal_changes(uniform)
-    assert change.what == "clock"
+    assert change.effect == "clock"
     assert abs(change.size - clock) < 3.5 * change.std
     assert change.std < 0.05 * abs(clock)
-    assert with_clock.is_nearly_white(with_clock.likeliest)
+    assert with_clock.is_nearly_white(with_clock.likeliest_fit)
 
 
 @pytest.mark.further  # as other rigs that are no uniform beam
@@ -290,7 +290,7 @@ def changing_record(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, back=Fals
 def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted(candidates_of):
     uniform = candidates_of(changing_record(damping=0.2))
     with_change, (change,) = find_temporal_changes(uniform)
-    assert change.what == "damping"
+    assert change.effect == "damping"
     assert abs(change.size - 0.2) < 3.5 * change.std
     # A fact only where time and frequency do not vary together.
     findings = {

@@ -351,7 +351,7 @@ def test_candidates_start_from_those_of_a_part(
     again = candidates.refit_from_earlier(earlier, whole, (), (0.0, 50.0))
     assert sorted(each.name for each in again.candidates) == sorted(STRUCTURES)
     truth = true_parameters("III")
-    fit = again.likeliest
+    fit = again.likeliest_fit
     assert {"zeta", "gamma"} <= set(fit.determined)
     for name in fit.determined:
         assert abs(fit.parameters[name] - truth[name]) < 4 * fit.std[name], name

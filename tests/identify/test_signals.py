@@ -113,11 +113,11 @@ def test_a_hum_is_a_line(hz, amplitude):
     (line,) = noise.lines
     assert line.frequency_hz == pytest.approx(hz, abs=0.003)
     assert line.amplitude_nm == pytest.approx(amplitude, rel=0.06)
-    assert np.count_nonzero(~noise.counts) < 400
-    assert (noise.weight[~noise.counts] == 0).all()
-    assert not noise.counts[np.argmin(np.abs(FREQUENCY_HZ - hz))]
+    assert np.count_nonzero(~noise.is_compared) < 400
+    assert (noise.weight[~noise.is_compared] == 0).all()
+    assert not noise.is_compared[np.argmin(np.abs(FREQUENCY_HZ - hz))]
     rest = spectrum(white(6) + hum) * noise.weight
-    assert np.sum(np.abs(rest) ** 2) == pytest.approx(2 * np.sum(noise.counts), rel=0.05)
+    assert np.sum(np.abs(rest) ** 2) == pytest.approx(2 * np.sum(noise.is_compared), rel=0.05)
 
 
 def test_what_comes_and_goes_is_no_line():
@@ -127,7 +127,7 @@ def test_what_comes_and_goes_is_no_line():
         spectrum(white(7) + 0.2 * passing), FREQUENCY_HZ, SAMPLES, near_mode=NOWHERE
     )
     assert noise.lines == ()
-    assert noise.counts.all()
+    assert noise.is_compared.all()
     assert np.abs(spectrum(0.2 * passing)).max() ** 2 > 100 * np.median(noise.power)
 
 
@@ -149,7 +149,7 @@ def test_a_resonance_is_never_left_out():
     for near_mode in (None, np.abs(FREQUENCY_HZ - 16.6) < 0.2):
         noise = estimate_noise(hum, FREQUENCY_HZ, SAMPLES, near_mode=near_mode)
         assert noise.lines == ()
-        assert noise.counts.all()
+        assert noise.is_compared.all()
 
 
 def test_a_peak_of_the_noise_continues_towards_a_mode_and_does_not_begin_there():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.identify.modal_headline import NOT_UNIFORM, effective_reason
+from analysis.identify.modal_headline import NOT_UNIFORM_REASON, effective_reason
 from analysis.identify.tolerant_estimate import TolerantEstimate
 from analysis.identify.uniform_beam import PARAMETERS
 from rigd.beam import Damping, Plant
@@ -46,6 +46,6 @@ def test_an_order_that_only_the_frequencies_support_flags_the_internal_damping(
     assert estimate.rests_on_frequencies is rests
     for name in ("zeta", "alpha"):
         reason = effective_reason(estimate, name, refused=True)
-        assert reason == (NOT_UNIFORM if rests else None)
+        assert reason == (NOT_UNIFORM_REASON if rests else None)
         assert effective_reason(estimate, name, refused=False) is None
-    assert effective_reason(estimate, "lambda", refused=True) == NOT_UNIFORM
+    assert effective_reason(estimate, "lambda", refused=True) == NOT_UNIFORM_REASON

@@ -52,8 +52,9 @@ def test_modes_come_with_the_validity_of_their_source(
     assert {row.id: row.validity for row in list_sessions(tmp_path)}["without_modes"] is None
 
 
-def test_a_rate_that_no_rig_has_gives_no_length(record_briefly, tmp_path):
-    record_briefly("first", rate_hz="1e-310")
+@pytest.mark.parametrize("rate_hz", ["1e-310", "0"])
+def test_a_rate_that_no_rig_has_gives_no_length(record_briefly, tmp_path, rate_hz):
+    record_briefly("first", rate_hz=rate_hz)
     (row,) = list_sessions(tmp_path)
     assert row.duration_s is None
 
@@ -168,6 +169,7 @@ def test_dates_are_local_and_the_last_day_is_included(record_briefly, tmp_path, 
             return [row.id for row in list_sessions(tmp_path, **filters)]
 
         assert ids(since="2023-11-15", until="2023-11-15") == ["a"]
+        assert ids(since="2023-11-15T07:13:20") == ["b", "a"]
         assert ids(since="2023-11-15T07:14") == ["b"]
         assert ids(until="2023-11-15T07:14") == ["a"]
         assert ids(until="2023-11-14T22:14+00:00") == ["a"]

@@ -334,12 +334,17 @@ class Operated:
         return [event for event in self.events if event["event"] == "series"][-1]
 
 
-def shown_status(status):
-    """Return what `rigd status` shows, by the names of the rows at its head."""
+def printed_status(status):
+    """Return what `rigd status` prints."""
     console = Console(width=300)
     with console.capture() as captured:
         console.print(status_table(status))
-    head = captured.get().partition("\n\n")[0]
+    return captured.get()
+
+
+def shown_status(status):
+    """Return what `rigd status` shows, by the names of the rows at its head."""
+    head = printed_status(status).partition("\n\n")[0]
     return {name: text for name, _, text in (line.partition(" ") for line in head.splitlines())}
 
 

@@ -264,6 +264,7 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, an
     [
         (("--types", "VIII"), ("VIII", "I, II, III, IV, V, VI, VII")),
         (("--types", ","), ("--types", "I, II, III")),
+        (("--weights", ","), ("--weights", "no weighting was named; choose from const, omega")),
         (("--weights", "log"), ("log", "const, omega")),
         (("--weights", "omega^nan"), ("omega^nan", "omega^K")),
         (("--weights", "omega^1e308"), ("omega^1e308",)),
@@ -514,10 +515,10 @@ def test_help_and_wrong_options_import_nothing_heavy(tmp_path):
 def test_options_of_one_record_hold_in_a_campaign_too(monkeypatch, files):
     fixed, formats, uniformity = [], [], []
 
-    def run(_files, routes, *_):
-        fixed.append(routes.fixed)
-        formats.append(routes.figures)
-        uniformity.append(routes.uniformity)
+    def run(_files, options, *_):
+        fixed.append(options.fixed)
+        formats.append(options.figures)
+        uniformity.append(options.uniformity)
         return 0
 
     def campaign(*_, **options):

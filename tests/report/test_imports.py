@@ -40,7 +40,7 @@ import pickle, sys
 from dataclasses import replace
 from pathlib import Path
 import analysis.results
-from analysis.cli.sessions import Outputs, session_command
+from analysis.cli.sessions import OutputOptions, session_command
 from analysis.models import WelchSettings
 from analysis.results import AnalysisOptions
 from contextlib import redirect_stdout
@@ -51,9 +51,9 @@ def whole_record(record, *_):  # as does the search of a structure
     return replace(pickle.loads(Path(sys.argv[3]).read_bytes()), record=record)
 analysis.results.whole_record = whole_record
 settings = WelchSettings(types=("I",), weightings=("const",), estimator="fft", band_hz=(1.0, 20.0))
-routes = AnalysisOptions(settings, paper=True, whole_record=True, fixed=())
+options = AnalysisOptions(settings, paper=True, whole_record=True, fixed=())
 with redirect_stdout(sys.stderr):
-    assert session_command([Path(sys.argv[1])], routes, Outputs(Path(sys.argv[2]))) == 0
+    assert session_command([Path(sys.argv[1])], options, OutputOptions(Path(sys.argv[2]))) == 0
 print(*sys.modules)
 """
 

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from analysis.cli.app import app
 from analysis.report.table import csv_text
 from analysis.report.touch_report import touches_document, touches_table, write_touch_report
+from rigd.session import SessionWriter
 
 
 @pytest.fixture
@@ -79,6 +80,14 @@ def test_a_session_may_be_called_touch(touch_file, tmp_path):
     (tmp_path / "touch.mcap").write_bytes(b"")
     result = CliRunner().invoke(app, [str(tmp_path / "touch.mcap"), "--method", "record"])
     assert "is empty, nothing was recorded to it" in result.stderr
+
+
+def test_a_session_without_samples_is_refused(analyze, tmp_path):
+    writer = SessionWriter(tmp_path / "a.mcap")
+    writer.begin(0, {"rate_hz": "1000.0"}, {}, {})
+    result = analyze(writer.close({"outcome": "complete"}))
+    assert result.exit_code == 1
+    assert "a.mcap: the session holds no samples" in result.stderr
 
 
 def test_the_report_has_a_map_and_the_evidence(touched, tmp_path, without_drawing):

@@ -185,7 +185,7 @@ def test_a_record_that_stays_doubtful_is_given_up_with_its_findings(bench):
     assert not ends[0].reached
     assert ends[0].reason == (
         "The record is doubtful: part of the record is unexplained. Something struck the beam. "
-        "Take a chirp."
+        "Record a chirp instead: rigd run chirp."
     )
     assert told[0].document["text"][-1].count("doubtful") == 3
 
@@ -263,14 +263,20 @@ def test_a_decision_that_took_long_may_leave_no_time(profile, quick_pieces, over
         assert told[-1].reason == "Not reached within 12 s (--at-most)."
 
 
-def test_what_goes_too_slowly_is_out_of_reach(profile, quick_pieces):
-    """The information grows by so little that an hour would not do: it is said, with a remedy."""
+@pytest.mark.parametrize(
+    ("ratio_of_std", "reason"),
+    [(0.98, "it would take about"), (0.999, "it would take more than a day")],
+)
+def test_what_goes_too_slowly_is_out_of_reach(profile, quick_pieces, ratio_of_std, reason):
+    """The information grows by so little that an hour would not do: the reason has a remedy."""
     bench = Bench(profile, "damping 0.1%", at_most_s=60.0)
     share, ends = ON_THE_WAY, []
     while not ends:
-        ends = [m for m in bench.told(share) if isinstance(m, SearchEnded)]
-        share *= 0.999
-    assert ends[0].reason.startswith("Out of reach: it would take about")
+        messages = bench.told(share)
+        ends = [m for m in messages if isinstance(m, SearchEnded)]
+        share *= ratio_of_std
+    assert ends[0].reason.startswith(f"Out of reach: {reason}")
+    assert (messages[0].document["search"]["left_s"] is None) == ("day" in reason)
     assert bench.writer.ticks < 40 * RATE_HZ
 
 

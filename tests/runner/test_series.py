@@ -81,9 +81,9 @@ def test_a_lone_session_is_not_numbered(make_series):
     make_series().run(rig, StopRequest(), Watcher(), live=False)
     (order,) = rig.orders
     assert order.notes == ()
-    assert dict(order.predicted)["limit_angle_rad"] == "1.57"
-    assert float(dict(order.predicted)["predicted_peak_velocity_rad_s"]) >= 0.0
-    assert float(dict(order.predicted)["predicted_peak_tip_slope_rad"]) >= 0.0
+    assert dict(order.predicted_metadata)["limit_angle_rad"] == "1.57"
+    assert float(dict(order.predicted_metadata)["predicted_peak_velocity_rad_s"]) >= 0.0
+    assert float(dict(order.predicted_metadata)["predicted_peak_tip_slope_rad"]) >= 0.0
     assert order.path.stem.endswith("-hold")
 
 

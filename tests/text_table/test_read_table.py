@@ -46,6 +46,21 @@ def test_heads_and_rows_of_units(head, units):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("text", "first"),
+    [
+        ("0;1\n0,5;2\n0,6;2\n", 0.5),
+        ("1;2;\n0,5;2;\n0,6;2;\n", 0.5),
+        ("1;3\n0,5;2\n0,6;2\n", 1.0),
+        ("0;1\n1;2\n2;3\n", 0.0),  # all are whole numbers
+        ("1\n0.5\n0.6\n", 1.0),
+        ("0;1\n", 0.0),
+    ],
+)
+def test_a_first_line_that_numbers_the_columns_is_no_data(text, first):
+    assert table(text, "#1").columns["#1"].values[0] == first
+
+
 LABVIEW = """LabVIEW Measurement\t
 Separator\tTab
 Decimal_Separator\t,

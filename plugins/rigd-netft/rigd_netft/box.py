@@ -1,4 +1,4 @@
-"""Simulated Net F/T box in the process of its driver: web page, stream, and faults of both."""
+"""Simulated Net F/T box that runs inside its driver: web page, stream, and faults of both."""
 
 import random
 from collections.abc import Callable, Mapping, Sequence
@@ -10,21 +10,21 @@ from urllib.parse import parse_qsl, urlsplit
 from rigd.devices.contracts import DeviceError, Wrench, WrenchSensor
 from rigd.devices.parameters import RigParameters
 from rigd_netft import protocol
-from rigd_netft.pages import COMMUNICATION, PAGE, SETTING
+from rigd_netft.pages import COMMUNICATION_FORM, SENSOR_FORM, SETTINGS_PATH
 from rigd_netft.settings import NetFtSettings
 
-_TAGS: Final = {
+_DELIVERED_TAGS: Final = {
     "runstat": "0x00000000", "runrate": "7000", "cfgcpf": "1000000", "cfgcpt": "1000000.0",
     "scfgfu": "N", "scfgtu": "Nm", "cfgcalsn": "FT00001", "cfgcalsel": "0",
     "cfgmr": "20;20;60;1;1;1", "cfgtfx": "0;0;0;0;0;0", "setuserfilter": "0",
     "setbias": "745;17;447;184;-596;-253", "comrdte": "Enabled", "comrdtrate": "7000",
     "comrdtbsiz": "1", "mfgdigver": "2.2.59",
 }  # fmt: skip
-"""Settings of the box on its page, as it is delivered."""
+"""Settings on the page of a box as delivered, by tag."""
 _LONGEST_PAUSE_S = 0.1
-"""Longest time between two ticks for which records are sent."""
+"""Time in seconds up to which the records since the last tick are sent; older ones are dropped."""
 _PROBABILITIES, _DURATIONS = ("loss", "duplicate", "reorder", "malformed"), ("burst", "saturate")
-"""Faults with a probability, and those with a duration in seconds."""
+"""Names of the faults whose value is a probability, and of those with a duration in seconds."""
 FAULTS: Final = (
     *_PROBABILITIES, *_DURATIONS, "silence", "restart", "threshold", "status", "no_page",
 )  # fmt: skip
@@ -32,10 +32,10 @@ FAULTS: Final = (
 
 
 class SimulatedBox:
-    """Box that measures a wrench in N and N·m, with one record or more for each tick.
+    """Simulated box that measures a wrench in N and N·m, and sends at least one record per tick.
 
-    Tags are settings on the page that differ from those of a delivered box. A fault is ``name``,
-    ``name=value`` or ``name=value@seconds`` after the start of the stream.
+    `tags` are settings on the page that differ from those of a box as delivered. A fault is
+    ``name``, ``name=value`` or ``name=value@seconds``, counted from the start of the stream.
     """
 
     def __init__(
@@ -44,24 +44,28 @@ class SimulatedBox:
         tags: Mapping[str, str] | None = None,
         faults: Sequence[str] = (),
     ) -> None:
-        self._read_wrench, self.tags, self._forms = read_wrench, {**_TAGS, **(tags or {})}, 0
-        self._faults = dict(map(_read_fault, faults))
+        self._read_wrench, self.tags, self._form_count = (
+            read_wrench,
+            {**_DELIVERED_TAGS, **(tags or {})},
+            0,
+        )
+        self._faults = dict(map(_parse_fault, faults))
         self._random = random.Random(1)
-        self._streams, self._restarted, self._due_ns = False, False, 0
-        self._sequence, self._index = 0, 700
-        self._held: list[bytes] = []
+        self._is_streaming, self._has_restarted, self._due_ns = False, False, 0
+        self._sequence, self._record_index = 0, 700
+        self._held_packets: list[bytes] = []
 
     def get(self, path: str) -> str:
-        """Return the answer to a request for a path of the page; raise OSError without one."""
+        """Return the web server's answer to a request for a path, or raise OSError."""
         if "no_page" in self._faults:
             raise ConnectionRefusedError("connection refused")
-        if path == PAGE:
+        if path == SETTINGS_PATH:
             text = "".join(f"<{tag}>{value}</{tag}>\n" for tag, value in self.tags.items())
             return f"<netft>\n{text}</netft>\n"
-        if (form := urlsplit(path)).path not in (COMMUNICATION, SETTING):
+        if (form := urlsplit(path)).path not in (COMMUNICATION_FORM, SENSOR_FORM):
             raise OSError("HTTP status 404")
-        self._forms += 1
-        if self._forms > 3:  # a box drops some of several forms
+        self._form_count += 1
+        if self._form_count > 3:  # a box drops some of several forms
             return ""
         values = dict(parse_qsl(form.query))
         if "comrdte" in values:
@@ -77,37 +81,41 @@ class SimulatedBox:
         """Do nothing: there is no socket."""
 
     def send(self, request: bytes) -> None:
-        """Act on a request from the driver."""
-        if request[:4] in (protocol.STOP[:4], protocol.STREAM[:4]):
-            self._streams, self._sequence = request[:4] == protocol.STREAM[:4], 0
+        """Start or end the stream, as a request from the driver says."""
+        if request[:4] in (protocol.STOP_REQUEST[:4], protocol.STREAM_REQUEST[:4]):
+            self._is_streaming, self._sequence = request[:4] == protocol.STREAM_REQUEST[:4], 0
 
     def receive(self, due_ns: int) -> tuple[list[bytes], int]:
-        """Return the packets since the last tick, and the time, which is that of the tick.
+        """Return the packets since the last tick, and `due_ns`, the time of this tick.
 
-        Before the first tick, at 0 ns, each call is a tick, whose time has no relation to others.
+        Before the first tick `due_ns` is 0: each call then returns the packets of 1 ms, and a time
+        later than that of any tick.
         """
         since_last_s = (due_ns - self._due_ns) / 1e9 if self._due_ns else 1e-3
         self._due_ns = due_ns
         return self.packets(min(since_last_s, _LONGEST_PAUSE_S)), due_ns or 1 << 62
 
     def packets(self, duration_s: float) -> list[bytes]:
-        """Return the packets of a time: one record or more, as the faults have them."""
-        if not self._streams or duration_s <= 0:
+        """Return the packets of the records in a time span, at least one, after the faults."""
+        if not self._is_streaming or duration_s <= 0:
             return []
-        tags, per_axis = self.tags, list[float]()
+        tags, counts_per_unit = self.tags, list[float]()
         for tag, unit_tag, units in (
-            ("cfgcpf", "scfgfu", protocol.NEWTONS), ("cfgcpt", "scfgtu", protocol.NEWTON_METRES)
+            ("cfgcpf", "scfgfu", protocol.FORCE_UNITS_N),
+            ("cfgcpt", "scfgtu", protocol.TORQUE_UNITS_NM),
         ):  # fmt: skip
-            per_axis += 3 * [float(tags[tag]) / units[protocol.unit_key(tags[unit_tag])]]
-        counts = tuple(map(round, map(mul, self._read_wrench(), per_axis)))
+            counts_per_unit += 3 * [float(tags[tag]) / units[protocol.unit_key(tags[unit_tag])]]
+        counts = tuple(map(round, map(mul, self._read_wrench(), counts_per_unit)))
         count = max(1, round(duration_s * float(tags["comrdtrate"])))
-        return [packet for _ in range(count) for packet in self._sent(self._record(counts))]
+        return [
+            packet for _ in range(count) for packet in self._arriving_packets(self._record(counts))
+        ]
 
     def close(self) -> None:
         """Do nothing: there is no socket."""
 
-    def _at(self, fault: str) -> bool:
-        """Return whether a fault acts at the present record."""
+    def _is_active(self, fault: str) -> bool:
+        """Return whether a fault acts on the present record."""
         value, from_s = self._faults.get(fault, (0.0, inf))
         elapsed_s = self._sequence / float(self.tags["comrdtrate"]) - from_s
         if fault in _PROBABILITIES:
@@ -115,38 +123,42 @@ class SimulatedBox:
         return 0 <= elapsed_s < (value if fault in _DURATIONS else inf)
 
     def _record(self, counts: tuple[int, ...]) -> bytes:
-        """Return the next record."""
-        if self._at("restart") and not self._restarted:
-            self._restarted, self._sequence, self._index = True, 0, 0
-        self._sequence, self._index = self._sequence + 1, self._index + 1
+        """Return the next record of the stream, with these counts of the six axes."""
+        if self._is_active("restart") and not self._has_restarted:
+            self._has_restarted, self._sequence, self._record_index = True, 0, 0
+        self._sequence, self._record_index = self._sequence + 1, self._record_index + 1
         status = 0
         for fault, bits in (
-            ("saturate", protocol.NETFT.saturated), ("threshold", protocol.THRESHOLD),
+            ("saturate", protocol.NETFT.saturation_bits), ("threshold", protocol.THRESHOLD_BIT),
             ("status", int(self._faults.get("status", (0, 0))[0])),
         ):  # fmt: skip
-            status |= bits | protocol.ANY_ERROR if self._at(fault) else 0
+            status |= bits | protocol.ANY_ERROR_BIT if self._is_active(fault) else 0
         # By the index and not by the clock, so that a burst has no equal counters.
-        counter = round(self._index * protocol.INTERNAL_HZ / float(self.tags["comrdtrate"]))
-        return protocol.RECORD.pack(self._sequence, counter & 0xFFFFFFFF, status, *counts)
+        counter = round(self._record_index * protocol.COUNTER_HZ / float(self.tags["comrdtrate"]))
+        return protocol.RECORD_LAYOUT.pack(self._sequence, counter & 0xFFFFFFFF, status, *counts)
 
-    def _sent(self, record: bytes) -> list[bytes]:
-        """Return the packets that the faults make of a record and of those that were held back."""
-        if self._at("silence") or self._at("loss"):
+    def _arriving_packets(self, record: bytes) -> list[bytes]:
+        """Apply the faults of the network to a record; return the packets that arrive now."""
+        if self._is_active("silence") or self._is_active("loss"):
             return []
-        if self._at("malformed"):
+        if self._is_active("malformed"):
             record = record[:20]
-        packets = [record, record] if self._at("duplicate") else [record]
-        if self._at("burst") or (not self._held and self._at("reorder")):
-            self._held += packets
+        packets = [record, record] if self._is_active("duplicate") else [record]
+        if self._is_active("burst") or (not self._held_packets and self._is_active("reorder")):
+            self._held_packets += packets
             return []
         # A reordered record follows the next one; a burst comes in its own order.
-        packets = self._held + packets if len(self._held) > 2 else packets + self._held
-        self._held = []
+        packets = (
+            self._held_packets + packets
+            if len(self._held_packets) > 2
+            else packets + self._held_packets
+        )
+        self._held_packets = []
         return packets
 
 
-def _read_fault(text: str) -> tuple[str, tuple[float, float]]:
-    """Return name, value and start in seconds of a fault."""
+def _parse_fault(text: str) -> tuple[str, tuple[float, float]]:
+    """Parse a fault; return its name, and its value and start time in seconds."""
     name_and_value, _, from_s = text.partition("@")
     name, _, value = name_and_value.partition("=")
     try:
@@ -161,10 +173,10 @@ def _read_fault(text: str) -> tuple[str, tuple[float, float]]:
 def simulated_box(
     rig: RigParameters, settings: NetFtSettings, plant_sensor: WrenchSensor
 ) -> SimulatedBox:
-    """Create a simulated box that suits the profile and measures a simulated plant."""
+    """Create a simulated box with the profile's settings, which measures a simulated plant."""
     tags = {
         "cfgtfx": ";".join(f"{value:g}" for value in settings.tool_transform),
         "cfgmr": ";".join(f"{value:g}" for value in rig.sensor.range),
-        "cfgcalsn": settings.serial_number or _TAGS["cfgcalsn"],
+        "cfgcalsn": settings.serial_number or _DELIVERED_TAGS["cfgcalsn"],
     }
     return SimulatedBox(plant_sensor.read_wrench, tags, settings.faults)

@@ -11,7 +11,7 @@ from rigd_netft.settings import NetFtSettings
 
 
 def open_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
-    """Create the driver of the box; with a rig simulated in the process, that of a simulated box.
+    """Create the driver of the box, or of a simulated box if this process simulates the drive.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def open_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
 
 
 def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages on values of a profile that do not suit the box."""
+    """Yield messages on values of a profile that contradict each other or that no box has."""
     rate_hz, loop_hz = values["netft.rate_hz"], values["rig.rate_hz"]
     reached_hz = rate_reached_hz(rate_hz)
     if abs(reached_hz - rate_hz) > 0.5:
@@ -61,7 +61,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def metadata(rig: RigParameters) -> dict[str, str]:
-    """Return the metadata of a session file on the box's settings."""
+    """Return the box's settings as metadata for a session file."""
     settings = rig.settings_of(NetFtSettings)
     return {
         "netft_rate_hz": repr(settings.rate_hz),
@@ -71,7 +71,7 @@ def metadata(rig: RigParameters) -> dict[str, str]:
 
 
 def address(rig: RigParameters) -> str:
-    """Return address and port of the box."""
+    """Return address and UDP port of the box, as a phrase."""
     settings = rig.settings_of(NetFtSettings)
     return f"{settings.host}, UDP port {settings.port}"
 
@@ -86,4 +86,4 @@ NETFT: Final = DeviceKind(
     contradictions=contradictions,
     metadata=metadata,
 )
-"""The device ``netft`` of a profile."""
+"""Declaration of the device that profiles call ``netft``."""

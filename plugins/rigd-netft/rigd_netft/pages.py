@@ -1,4 +1,4 @@
-"""The box's web page: its settings, how they are read, set and checked."""
+"""Web page of the box: read, set and check the box's settings."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -11,36 +11,36 @@ from rigd.devices.contracts import DeviceError
 from rigd_netft import protocol
 from rigd_netft.settings import NetFtSettings
 
-PAGE, COMMUNICATION, SETTING = "/netftapi2.xml", "/comm.cgi", "/setting.cgi"
-"""Paths on the box: its settings, and the forms by which two groups of them are set."""
-_TAG: Final = re.compile(r"<(\w{1,32})>([^<]{0,400})</\1>")
-"""Pattern of a setting on the page."""
-_IDENTITY: Final = {
+SETTINGS_PATH, COMMUNICATION_FORM, SENSOR_FORM = "/netftapi2.xml", "/comm.cgi", "/setting.cgi"
+"""Paths on the box's web server: page of settings, and the forms that set two groups of them."""
+_SETTING_PATTERN: Final = re.compile(r"<(\w{1,32})>([^<]{0,400})</\1>")
+"""Pattern of a setting on the page: tag and value."""
+_IDENTITY_TAGS: Final = {
     "serial_number": "cfgcalsn", "firmware": "mfgdigver", "calibration": "cfgcalsel",
     "bias_counts": "setbias", "tool_transform": "cfgtfx", "mac_address": "nethwaddr",
     "unit_of_force": "scfgfu", "unit_of_torque": "scfgtu",
 }  # fmt: skip
-"""Settings that the session file states, with their tags on the page."""
+"""Tags of the settings that the session file states, by their keys in the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoxSettings:
-    """Settings of a box that bear on its records."""
+    """Settings of a box that are needed to interpret its records."""
 
-    scales: tuple[float, ...]
-    """N or N·m per count of each axis."""
+    units_per_count: tuple[float, ...]
+    """Force in N or torque in N·m per count, for each axis."""
     kind: protocol.BoxKind = protocol.NETFT
     """Kind of box."""
-    counter_hz: float = protocol.INTERNAL_HZ
+    counter_hz: float = protocol.COUNTER_HZ
     """Rate in Hz of the box's own counter."""
     identity: Mapping[str, object] = field(default_factory=dict)
     """Identity and settings that the box reported, for the session file."""
 
 
 def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings:
-    """Set rate, filter and bias where they differ from the profile, and read all back.
+    """Set rate, filter and bias of the box as the profile says; read and check all settings.
 
-    `get` returns the answer to a request for a path, or raises OSError without one.
+    `get` returns the web server's answer to a request for a path, or raises OSError.
 
     Raises
     ------
@@ -48,9 +48,9 @@ def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings
         If the page does not answer, or a value does not suit the profile.
     """
     if settings.counts_per_n > 0:
-        scales = (1 / settings.counts_per_n,) * 3 + (1 / settings.counts_per_nm,) * 3
-        assumed = {"assumed": "counts, N and N·m, rate and filter of netft"}
-        return BoxSettings(scales, identity=assumed)
+        units_per_count = (1 / settings.counts_per_n,) * 3 + (1 / settings.counts_per_nm,) * 3
+        assumed_settings = {"assumed": "counts, N and N·m, rate and filter of netft"}
+        return BoxSettings(units_per_count, identity=assumed_settings)
     communication = {
         "comrdte": "Enabled", "comrdtrate": f"{settings.rate_hz:g}", "comrdtbsiz": "1"
     }  # fmt: skip
@@ -58,23 +58,26 @@ def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings
     if settings.bias == "zero":
         setting |= {f"setbias{axis}": "0" for axis in range(6)}
     try:
-        tags = _tags(get(PAGE))
-        for form, values in ((COMMUNICATION, communication), (SETTING, setting)):
-            if not all(_agrees(tags, *each) for each in values.items()):
+        tags = _tags(get(SETTINGS_PATH))
+        for form, values in ((COMMUNICATION_FORM, communication), (SENSOR_FORM, setting)):
+            if not all(_has_value(tags, *name_and_value) for name_and_value in values.items()):
                 # All in one request: a box drops some of several. The form has 1 for Enabled.
                 get(f"{form}?{urlencode(values).replace('Enabled', '1')}")
-        tags = _tags(get(PAGE))
+        tags = _tags(get(SETTINGS_PATH))
     except OSError as error:
         raise DeviceError(
-            f"{settings.box_name}: its web page http://{settings.host}:{settings.http_port}{PAGE} "
-            f"does not answer ({error}). Check address and cable; for a box without a page, state "
+            f"{settings.box_name}: its web page "
+            f"http://{settings.host}:{settings.http_port}{SETTINGS_PATH} does not answer "
+            f"({error}). Check address and cable; for a box without a page, state "
             "netft.counts_per_n and netft.counts_per_nm."
         ) from error
     try:
         for tag, value in (communication | setting).items():
-            _require(_agrees(tags, tag, value), tags, tag, f"{value} was set; set it on the page")
+            _require(
+                _has_value(tags, tag, value), tags, tag, f"{value} was set; set it on the page"
+            )
         _require(
-            _agrees(tags, "cfgtfx", ";".join(map(str, settings.tool_transform))), tags, "cfgtfx",
+            _has_value(tags, "cfgtfx", ";".join(map(str, settings.tool_transform))), tags, "cfgtfx",
             f"netft.tool_transform is {settings.tool_transform}; correct the one or the other",
         )  # fmt: skip
         _require(
@@ -88,53 +91,58 @@ def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings
 
 
 def _tags(page: str) -> dict[str, str]:
-    """Return the settings on a page by their tags; the bias also by axis, as in the form."""
-    tags = {tag: value.strip() for tag, value in _TAG.findall(page)}
+    """Return the settings on a page by tag, the bias also as one setting per axis."""
+    tags = {tag: value.strip() for tag, value in _SETTING_PATTERN.findall(page)}
     offsets = tags.get("setbias", "").split(";")
     return tags | {f"setbias{axis}": counts for axis, counts in enumerate(offsets) if counts}
 
 
 def _box_settings(tags: Mapping[str, str]) -> BoxSettings:
-    """Return scales, kind and identity from the settings on the page."""
-    counts, scales = list[float](), list[float]()
+    """Return units per count, kind, counter rate and identity of a box from its settings."""
+    counts_per_unit, units_per_count = list[float](), list[float]()
     for tag, unit_tags, units in (
-        ("cfgcpf", ("scfgfu", "cfgfu"), protocol.NEWTONS),
-        ("cfgcpt", ("scfgtu", "cfgtu"), protocol.NEWTON_METRES),
+        ("cfgcpf", ("scfgfu", "cfgfu"), protocol.FORCE_UNITS_N),
+        ("cfgcpt", ("scfgtu", "cfgtu"), protocol.TORQUE_UNITS_NM),
     ):
         unit_tag = next((each for each in unit_tags if each in tags), unit_tags[0])
         unit = protocol.unit_key(tags.get(unit_tag, ""))
         _require(unit in units, tags, unit_tag, "unknown unit; choose another")
         per_unit = _numbers(tags.get(tag, ""))
-        positive = len(per_unit) == 1 and per_unit[0] > 0
-        _require(positive, tags, tag, "no number above 0; check the box")
-        counts += 3 * per_unit
-        scales += 3 * [units[unit] / per_unit[0]]
-    identity: dict[str, object] = {name: tags.get(tag, "") for name, tag in _IDENTITY.items()}
+        is_positive = len(per_unit) == 1 and per_unit[0] > 0
+        _require(is_positive, tags, tag, "no number above 0; check the box")
+        counts_per_unit += 3 * per_unit
+        units_per_count += 3 * [units[unit] / per_unit[0]]
+    identity: dict[str, object] = {name: tags.get(tag, "") for name, tag in _IDENTITY_TAGS.items()}
     ratings = _numbers(tags.get("cfgmr", ""))
     if len(ratings) == 6:
-        identity["range"] = list(map(prod, zip(ratings, counts, scales, strict=True)))
-    counter_hz = max(0.0, *_numbers(tags.get("runrate", "0"))) or protocol.INTERNAL_HZ
+        identity["range"] = list(
+            map(prod, zip(ratings, counts_per_unit, units_per_count, strict=True))
+        )
+    counter_hz = max(0.0, *_numbers(tags.get("runrate", "0"))) or protocol.COUNTER_HZ
     is_axia = (
         "axia" in tags.get("prodname", "").lower() or "setadcrate" in tags or "setrate" in tags
     )
     kind = protocol.AXIA if is_axia else protocol.NETFT
-    return BoxSettings(tuple(scales), kind, counter_hz, identity)
+    return BoxSettings(tuple(units_per_count), kind, counter_hz, identity)
 
 
-def _require(suits: bool, tags: Mapping[str, str], tag: str, reason: str) -> None:
-    """Raise ValueError for a setting that does not suit."""
-    if not suits:
+def _require(is_suitable: bool, tags: Mapping[str, str], tag: str, reason: str) -> None:
+    """Raise ValueError with the setting's value and the reason unless the setting is suitable."""
+    if not is_suitable:
         raise ValueError(f'{tag} is "{tags.get(tag, "")}", but {reason}')
 
 
-def _agrees(tags: Mapping[str, str], tag: str, wanted: str) -> bool:
-    """Return whether a setting has the wanted value; an absent one is not compared."""
-    found = tags.get(tag, wanted)
-    return found.lower() == wanted.lower() or _numbers(found) == _numbers(wanted) != []
+def _has_value(tags: Mapping[str, str], tag: str, wanted_value: str) -> bool:
+    """Return whether a setting has the wanted_value value, or is not on the page."""
+    found_value = tags.get(tag, wanted_value)
+    return (
+        found_value.lower() == wanted_value.lower()
+        or _numbers(found_value) == _numbers(wanted_value) != []
+    )
 
 
 def _numbers(text: str) -> list[float]:
-    """Return the numbers of a setting, separated by semicolons; none if one is not a number."""
+    """Parse numbers separated by semicolons; return an empty list if any is not a number."""
     try:
         return [float(part) for part in text.split(";")]
     except ValueError:

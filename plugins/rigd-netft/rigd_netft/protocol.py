@@ -1,4 +1,4 @@
-"""RDT, the box's protocol over UDP: requests, records, status words."""
+"""RDT, the box's protocol on UDP: requests, records, status words."""
 
 import re
 from collections.abc import Mapping
@@ -8,16 +8,22 @@ from typing import Final, Literal
 
 PORT: Final = 49152
 """UDP port of the box."""
-INTERNAL_HZ: Final = 7000.0
-"""Rate of the Net F/T box's own counter in Hz."""
-STOP, STREAM = bytes.fromhex("12340000 00000000"), bytes.fromhex("12340002 00000000")
-"""Requests to end the stream and to start it in real time: header, command, number of records (0:
-endless)."""
-RECORD: Final = Struct(">IIIiiiiii")
-"""Record: RDT sequence, box's counter, status word, then the counts of fx, fy, fz, tx, ty, tz."""
+COUNTER_HZ: Final = 7000.0
+"""Rate in Hz of the counter that a Net F/T box writes into its records."""
+STOP_REQUEST, STREAM_REQUEST = (
+    bytes.fromhex("12340000 00000000"),
+    bytes.fromhex("12340002 00000000"),
+)
+"""Requests to end the stream, and to start it without an end.
 
-ANY_ERROR, THRESHOLD = 1 << 31, 1 << 16
-"""Bits of a status word that are no fault: set with every other one; a latched threshold."""
+They consist of header, command and number of records, of which 0 means endless."""
+RECORD_LAYOUT: Final = Struct(">IIIiiiiii")
+"""Layout of a record: sequence number, box's counter, status word, counts of fx to tz."""
+
+ANY_ERROR_BIT, THRESHOLD_BIT = 1 << 31, 1 << 16
+"""Bits of a status word that are no fault.
+
+The first is set if any other bit is set, the second while a threshold is latched."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,15 +32,15 @@ class BoxKind:
 
     device: str
     """Name of the kind."""
-    saturated: int
-    """Bits for a value out of range."""
-    bits: Mapping[int, str]
-    """Meaning of each bit."""
+    saturation_bits: int
+    """Mask of the status bits that mean that a value is out of range."""
+    bit_meanings: Mapping[int, str]
+    """Meaning of each status bit, by bit number."""
 
     def status_texts(self, word: int) -> list[str]:
-        """Return the meaning of each bit of a status word that is set."""
+        """Return the meanings of the bits that are set in a status word, highest bit first."""
         set_bits = (bit for bit in range(30, -1, -1) if word >> bit & 1)
-        return [self.bits.get(bit, f"bit {bit}") for bit in set_bits]
+        return [self.bit_meanings.get(bit, f"bit {bit}") for bit in set_bits]
 
 
 NETFT: Final = BoxKind("Net F/T", 1 << 17, {
@@ -52,31 +58,36 @@ AXIA: Final = BoxKind("Axia", 1 << 27 | 1 << 30, {
     29: "calibration checksum", 30: "force or torque out of range",
 })  # fmt: skip
 
-NEWTONS: Final = {
+FORCE_UNITS_N: Final = {
     "lbf": 4.4482216152605, "n": 1.0, "klbf": 4448.2216152605, "kn": 1000.0, "kgf": 9.80665,
     "gf": 9.80665e-3,
 }  # fmt: skip
-"""Units of force that a box can have, in N."""
-NEWTON_METRES: Final = {
+"""Units of force that a box can use, in N, by name without punctuation."""
+TORQUE_UNITS_NM: Final = {
     "lbfin": 0.1129848290276, "lbin": 0.1129848290276, "lbfft": 1.3558179483314,
     "lbft": 1.3558179483314, "nm": 1.0, "nmm": 1e-3, "kgfcm": 0.0980665, "knm": 1000.0,
 }  # fmt: skip
-"""Units of torque that a box can have, in N·m, without the characters between their parts."""
+"""Units of torque that a box can use, in N·m, by name without punctuation."""
 
 CutOffHz = Literal[0, 838, 326, 152, 73, 35, 18, 8, 5, 1500, 2000, 2500, 3000]
-"""Cut-off in Hz of the box's low-pass filter, in the order of their numbers; 0: no filter."""
+"""Cut-off frequency in Hz of the box's low-pass filter; 0: no filter.
+
+The position in this list is the number by which the box selects the filter."""
 
 
 def unit_key(name: str) -> str:
-    """Return the key of a unit in `NEWTONS` or `NEWTON_METRES`, from its name on the page."""
+    """Convert a unit's name on the page to its key in `FORCE_UNITS_N` or `TORQUE_UNITS_NM`."""
     return re.sub(r"[^a-z]", "", name.lower())
 
 
-def difference(later: int, earlier: int) -> int:
-    """Return the signed difference of two counters of 32 bits, which wrap around."""
+def counter_difference(later: int, earlier: int) -> int:
+    """Return `later` minus `earlier` for 32-bit counters that wrap around."""
     return (later - earlier + 0x80000000 & 0xFFFFFFFF) - 0x80000000
 
 
 def rate_reached_hz(requested_hz: float) -> float:
-    """Return the rate in Hz that a box takes for a requested one: its own over a whole number."""
-    return INTERNAL_HZ / max(1, int(INTERNAL_HZ / requested_hz + 1e-9))
+    """Return the rate in Hz that a box uses if a rate is requested: 7000 Hz over an integer.
+
+    It is the lowest such rate that is not below `requested_hz`.
+    """
+    return COUNTER_HZ / max(1, int(COUNTER_HZ / requested_hz + 1e-9))

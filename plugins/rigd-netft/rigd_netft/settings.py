@@ -39,5 +39,5 @@ class NetFtSettings:
 
     @property
     def box_name(self) -> str:
-        """Name of the box in messages."""
+        """Name of the box in messages, with its address."""
         return f"Net F/T box at {self.host}"

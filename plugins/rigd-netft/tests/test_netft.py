@@ -1,4 +1,4 @@
-"""The driver on the simulated box: what suits, what is refused, and what each fault leads to."""
+"""Driver on the simulated box: settings that are accepted or refused, and effects of faults."""
 
 import os
 import socket
@@ -40,7 +40,7 @@ def rig(tmp_path):
 
 @pytest.fixture
 def connect(rig):
-    """Return a function that makes a connected driver and its box, in step with each other."""
+    """Return a function that returns a connected driver and its simulated box."""
 
     def connect(tags=None, faults=(), **settings):
         box = SimulatedBox(lambda: WRENCH, tags, faults)
@@ -58,8 +58,8 @@ def streaming_box():
 
 
 @pytest.fixture
-def distant(rig, streaming_box):
-    """Return a connected driver of a box that streams by the clock on the loopback interface."""
+def loopback_sensor(rig, streaming_box):
+    """Return a driver connected to a box that streams in real time on the loopback interface."""
     with serve_page(streaming_box.box) as http_port:
         sensor = NetFtSensor(
             rig, NetFtSettings("127.0.0.1", port=streaming_box.port, http_port=http_port)
@@ -70,7 +70,7 @@ def distant(rig, streaming_box):
 
 
 def run(sensor, ticks, first=0):
-    """Run ticks and return the number of stale ones and of saturated ones."""
+    """Run ticks; return the numbers of stale and of saturated wrenches."""
     stale = saturated = 0
     for tick in range(first, first + ticks):
         sensor.request(tick * PERIOD_NS)
@@ -214,50 +214,50 @@ def test_faults_of_the_box_end_the_session(connect, fault, tags, message):
         run(sensor, 1000)
 
 
-def test_a_second_client_takes_the_stream_and_the_cause_is_stated(distant, streaming_box):
-    assert not distant.health().cause
+def test_a_second_client_takes_the_stream_and_the_cause_is_stated(loopback_sensor, streaming_box):
+    assert not loopback_sensor.health().cause
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
         thief.connect(("127.0.0.1", streaming_box.port))
-        thief.send(protocol.STREAM)
+        thief.send(protocol.STREAM_REQUEST)
         assert thief.recv(64)
-        distant.read_wrench()
+        loopback_sensor.read_wrench()
         time.sleep(0.05)
-        distant.read_wrench()
-    assert distant.wrench_stale
-    assert "another program has started a stream" in distant.health().cause
+        loopback_sensor.read_wrench()
+    assert loopback_sensor.wrench_stale
+    assert "another program has started a stream" in loopback_sensor.health().cause
 
 
-def test_packets_from_elsewhere_are_ignored(distant):
-    port = distant._line._socket.getsockname()[1]
+def test_packets_from_elsewhere_are_ignored(loopback_sensor):
+    port = loopback_sensor._line._socket.getsockname()[1]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for sequence in range(50):
-            record = protocol.RECORD.pack(sequence, sequence, 0xFFFFFFFF, *(6 * [10**9]))
+            record = protocol.RECORD_LAYOUT.pack(sequence, sequence, 0xFFFFFFFF, *(6 * [10**9]))
             stranger.sendto(record, ("127.0.0.1", port))
     time.sleep(0.01)
-    assert distant.read_wrench() == pytest.approx(WRENCH)
-    assert not any(distant.counts.values())
+    assert loopback_sensor.read_wrench() == pytest.approx(WRENCH)
+    assert not any(loopback_sensor.counts.values())
 
 
 def test_counters_may_wrap_around():
-    assert protocol.difference(3, 0xFFFFFFFE) == 5
-    assert protocol.difference(0xFFFFFFFE, 3) == -5
+    assert protocol.counter_difference(3, 0xFFFFFFFE) == 5
+    assert protocol.counter_difference(0xFFFFFFFE, 3) == -5
     assert protocol.NETFT.status_texts(0x80010000) == ["a monitor condition is latched"]
 
 
-def test_a_box_that_streams_by_the_clock_is_read_without_a_growing_delay(distant):
-    assert distant.calibration()["serial_number"] == "FT00001"
+def test_a_box_that_streams_by_the_clock_is_read_without_a_growing_delay(loopback_sensor):
+    assert loopback_sensor.calibration()["serial_number"] == "FT00001"
     time.sleep(0.1)  # 700 records wait
-    distant.read_wrench()
-    newest_ns = distant.wrench_time_ns
+    loopback_sensor.read_wrench()
+    newest_ns = loopback_sensor.wrench_time_ns
     time.sleep(0.02)
-    distant.read_wrench()
-    assert distant.wrench_time_ns > newest_ns
-    assert not any(distant.counts.values())
-    measured = distant.measure(0.3)
+    loopback_sensor.read_wrench()
+    assert loopback_sensor.wrench_time_ns > newest_ns
+    assert not any(loopback_sensor.counts.values())
+    measured = loopback_sensor.measure(0.3)
     assert measured["records_hz"] > 0
     assert measured["lost"] == 0
-    sequence, _ = distant._last
-    assert sequence == distant._records  # all came, and none waits
+    sequence, _ = loopback_sensor._last_numbers
+    assert sequence == loopback_sensor._record_count  # all came, and none waits
 
 
 @pytest.mark.parametrize("port", ["port", "http_port"])

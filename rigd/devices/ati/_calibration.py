@@ -4,8 +4,8 @@ A force is ``F_i = unit · Σ_j M_ij g_j / counts_per_force`` in N; a torque in 
 with the unit of torque and the counts per torque. NETCANOEM sends the matrix row by row, Digital
 F/T in a block of registers.
 
-The status words of both sensors are described in words, and some of their bits forbid measuring.
-Sources: the manuals of NETCANOEM and of Digital F/T. The sensors differ in bits 9, 10 and 13.
+The module also describes the sensors' status words, and lists the bits with which no session may
+start. Sources: the manuals of NETCANOEM and of Digital F/T, which differ in bits 9, 10 and 13.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,10 +50,10 @@ _AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 _FULL_SCALE_COUNTS = 32768
 """Gauge counts at full scale."""
-_LARGEST_ENTRY, _SMALLEST_ENTRY = 1e6, 1e-6
-"""Limits of a plausible matrix entry: N or N·m of one gauge at full scale.
+_MAX_MATRIX_ENTRY, _MIN_MATRIX_ENTRY = 1e6, 1e-6
+"""Largest and smallest plausible matrix entry, in N or N·m for one gauge at full scale.
 
-No sensor is built for more or for less: the largest has 40 kN, the smallest resolves 1 mN."""
+No sensor is beyond them: the largest is for 40 kN, the smallest resolves 1 mN."""
 _MIN_SINGULAR_VALUE_RATIO = 1e-6
 """Smallest permitted ratio of smallest to largest singular value of the scaled matrix.
 
@@ -122,23 +122,23 @@ class Calibration:
                         f"the entry {axis}, gauge {gauge} of its calibration matrix is "
                         f"{matrix_entry}, which is not a number. Choose another calibration."
                     )
-                if abs(matrix_entry) * full_scale_unit > _LARGEST_ENTRY:
+                if abs(matrix_entry) * full_scale_unit > _MAX_MATRIX_ENTRY:
                     raise ValueError(
                         f"the entry {axis}, gauge {gauge} of its calibration matrix is "
                         f"{matrix_entry:.4g} ({abs(matrix_entry) * full_scale_unit:.2g} "
                         f"{unit_name} for a gauge at full scale), more than any sensor has "
-                        f"({_LARGEST_ENTRY:g} {unit_name}): its memory is damaged. Choose another "
-                        "calibration, or have the sensor repaired."
+                        f"({_MAX_MATRIX_ENTRY:g} {unit_name}): its memory is damaged. Choose "
+                        "another calibration, or have the sensor repaired."
                     )
             if not any(row):
                 raise ValueError(
                     f"the row {axis} of its calibration matrix is zero: that calibration is "
                     "empty. Choose another calibration."
                 )
-            if max(map(abs, row)) * full_scale_unit < _SMALLEST_ENTRY:
+            if max(map(abs, row)) * full_scale_unit < _MIN_MATRIX_ENTRY:
                 raise ValueError(
                     f"no entry of the row {axis} of its calibration matrix is beyond "
-                    f"{max(map(abs, row)):.2g} (less than {_SMALLEST_ENTRY:g} {unit_name} for a "
+                    f"{max(map(abs, row)):.2g} (less than {_MIN_MATRIX_ENTRY:g} {unit_name} for a "
                     "gauge at full scale): its memory is damaged. Choose another calibration, or "
                     "have the sensor repaired."
                 )
@@ -182,7 +182,7 @@ class Calibration:
         return tuple(tuple(row[gauge] for gauge in WIRE_ORDER) for row in self.wrench_per_count())
 
     def as_dict(self) -> dict[str, object]:
-        """Return the calibration for the session file; ranges are in N and N·m."""
+        """Return the calibration as a dictionary for the session file, ranges in N and N·m."""
         ranges: list[float] | str = "not stated by the sensor"
         if self.ratings is not None and all(map(isfinite, self.ratings)):
             ranges = [
@@ -206,9 +206,9 @@ class Calibration:
 def wrench_function(
     matrix_rows: MatrixRows,
 ) -> Callable[[float, float, float, float, float, float], Wrench]:
-    """Return a function that multiplies six gauge counts by a 6x6 matrix.
+    """Return a function that multiplies a 6x6 matrix by six gauge counts, its arguments.
 
-    The written-out product takes half the time of NumPy for six Python integers.
+    Its product, written out, takes half the time that NumPy takes for six Python integers.
     """
     (
         (xa, xb, xc, xd, xe, xf),
@@ -233,13 +233,13 @@ def wrench_function(
 
 
 def same_serial_number(profile_number: str, sensor_number: str) -> bool:
-    """Return whether a sensor's serial number is that of the profile; an empty one accepts any."""
+    """Return whether a sensor has the profile's serial number, or the profile states none."""
     return not profile_number or profile_number.strip().upper() == sensor_number.strip().upper()
 
 
-def printable_text(raw: Sequence[int]) -> str:
-    """Decode bytes to text without padding, or to hexadecimal digits if they are not printable."""
-    unpadded_bytes = bytes(raw).rstrip(b"\0\xff ")
+def printable_text(raw_bytes: Sequence[int]) -> str:
+    """Decode bytes to text, without padding; return hexadecimal digits if it is not printable."""
+    unpadded_bytes = bytes(raw_bytes).rstrip(b"\0\xff ")
     decoded_text = unpadded_bytes.decode("latin-1").strip()
     return (
         decoded_text
@@ -284,10 +284,10 @@ def parse_block(registers: Sequence[int]) -> CalibrationBlock:
     ValueError
         If no wrench can be computed with the calibration; the message is for the operator.
     """
-    raw = pack(f">{BLOCK_LENGTH_REGISTERS}H", *registers)
+    raw_bytes = pack(f">{BLOCK_LENGTH_REGISTERS}H", *registers)
 
     def register_bytes(first: int, count: int) -> bytes:
-        return raw[2 * first : 2 * (first + count)]
+        return raw_bytes[2 * first : 2 * (first + count)]
 
     matrix_entries = unpack(">36f", register_bytes(32, 72))
     counts_per_force, counts_per_torque = unpack(">ii", register_bytes(117, 4))
@@ -312,11 +312,11 @@ def parse_block(registers: Sequence[int]) -> CalibrationBlock:
 
 # Status words
 
-CAN_WATCHDOG_RESET = 0x0001
+CAN_WATCHDOG_RESET_BIT = 0x0001
 """Status bit of a NETCANOEM box: its watchdog has reset it."""
-CAN_BAD_CALIBRATION = 0x0040
+CAN_BAD_CALIBRATION_BIT = 0x0040
 """Status bit of a NETCANOEM box: the active calibration is bad."""
-CAN_BUS_ERROR = 0x4000
+CAN_BUS_ERROR_BIT = 0x4000
 """Status bit of a NETCANOEM box: it has seen errors on the CAN bus."""
 
 _COMMON_STATUS_BITS = {

@@ -7,9 +7,9 @@ from math import ceil
 
 from rigd.devices.ati import _netcanoem as netcanoem
 from rigd.devices.ati._calibration import (
-    CAN_BAD_CALIBRATION,
-    CAN_BUS_ERROR,
-    CAN_WATCHDOG_RESET,
+    CAN_BAD_CALIBRATION_BIT,
+    CAN_BUS_ERROR_BIT,
+    CAN_WATCHDOG_RESET_BIT,
     CRITICAL_CAN_STATUS_BITS,
     Calibration,
     MatrixRows,
@@ -26,21 +26,21 @@ _REPLY_TIMEOUT_S = 0.2
 """Time in seconds to wait for the reply to one request during set-up."""
 _REQUEST_ATTEMPTS = 3
 """Number of attempts of one request during set-up."""
-_LATE_REPLY_S = 0.5
+_LATE_REPLY_WAIT_S = 0.5
 """Time in seconds in which late replies are discarded after a repeated request.
 
 A repeated request may be answered twice, and no reply states which row of the matrix it holds."""
-_LOST_POLL_S = 0.02
+_POLL_TIMEOUT_S = 0.02
 """Time in seconds after which a poll of `measure` counts as lost."""
-_RESTART_S = 0.005
-"""Silence in seconds after which a box may have restarted; no box starts faster."""
+_MIN_RESTART_S = 0.005
+"""Time in seconds without reply after which a box may have restarted; no box starts faster."""
 
 _ASSUMED_SCALE_TEXT = (
-    f"{netcanoem.COUNTS_BEFORE_SCALE} counts per N and per N·m: firmware before "
+    f"{netcanoem.COUNTS_OF_OLD_FIRMWARE} counts per N and per N·m: firmware before "
     f"{'.'.join(map(str, netcanoem.FIRST_FIRMWARE_WITH_SCALE))} tells neither counts per unit nor "
     "units"
 )
-"""Scale assumed for old firmware, as text for the session file and the operator."""
+"""Counts per unit assumed for old firmware, as text for the session file and the operator."""
 
 
 class AtiCanSensor:
@@ -56,8 +56,8 @@ class AtiCanSensor:
     Attributes
     ----------
     wrench_stale, wrench_saturated, wrench_time_ns
-        Whether the last wrench is old, whether a gauge is saturated, and the time in nanoseconds
-        (``time.monotonic_ns``) at which the poll of the last wrench was sent.
+        Whether the last wrench is stale, whether one of its gauges is saturated, and the time in
+        nanoseconds (``time.monotonic_ns``) at which it was requested.
     polls : GaugePolls
         Polls of the box, with the time from the last poll to its reply and the number of lost
         replies.
@@ -86,12 +86,12 @@ class AtiCanSensor:
         self._deadline_ns = int(acquisition.deadline_us * 1e3)
         self._waits_for_reply = acquisition.mode == "same_tick"
         self._lock_step = acquisition.deadline_us * rig.rate_hz > 1e6
-        poll_frame = netcanoem.request(settings.base_id, netcanoem.GAUGES)
+        poll_frame = netcanoem.request(settings.base_id, netcanoem.GAUGES_OPCODE)
         self.polls = GaugePolls(poll_frame, self._name)
         self._is_connected = False
         self._subscribed_to: CanExchange | None = None
         self._inbox: dict[int, bytes] = {}
-        self._restart_ticks = max(1, ceil(_RESTART_S * rig.rate_hz))
+        self._restart_ticks = max(1, ceil(_MIN_RESTART_S * rig.rate_hz))
         self._unanswered_ticks = 0
         self._calibration_in_doubt = False
         self._row_read_before = b""
@@ -127,7 +127,7 @@ class AtiCanSensor:
         try:
             self._subscribe(exchange)
             self._firmware = netcanoem.firmware(
-                self._request_reply("its firmware version", netcanoem.FIRMWARE)
+                self._request_reply("its firmware version", netcanoem.FIRMWARE_OPCODE)
             )
             self._select_calibration()
             serial_number = self._read_serial_number()  # belongs to the calibration, not to the box
@@ -141,7 +141,7 @@ class AtiCanSensor:
             self._calibration = self._read_scale(serial_number, calibration_matrix)
             self._wrench_from_counts = wrench_function(self._calibration.wrench_per_wire_count())
             self._evaluate(self._first_reading())
-            self.polls.forget()
+            self.polls.reset_pairing()
             self._previous_reply = None
             self._unanswered_ticks = 0
             self._calibration_in_doubt = False
@@ -227,7 +227,7 @@ class AtiCanSensor:
         return self._evaluate(poll_reply)
 
     def health(self) -> LineHealth:
-        """Return the number of errors on the line to the sensor, and the sensor's status word."""
+        """Return the number of errors on the bus to the sensor, and the sensor's status word."""
         error_count = self.polls.lost + self.bus_errors
         return LineHealth(errors=error_count, status=self._status_word)
 
@@ -250,14 +250,14 @@ class AtiCanSensor:
         begin_ns = time.monotonic_ns()
         end_ns = begin_ns + int(duration_s * 1e9)
         while time.monotonic_ns() < end_ns:
-            poll_reply = self._poll(_LOST_POLL_S)
+            poll_reply = self._poll(_POLL_TIMEOUT_S)
             if poll_reply is None:
                 lost_polls += 1
                 continue
             self._evaluate(poll_reply)
             turnarounds_ns.append(self.polls.turnaround_ns)
         elapsed_s = (time.monotonic_ns() - begin_ns) * 1e-9
-        self.polls.forget()
+        self.polls.reset_pairing()
         turnarounds_ns.sort()
         return {
             "polls_hz": len(turnarounds_ns) / elapsed_s,
@@ -275,14 +275,15 @@ class AtiCanSensor:
         self._calibration = None
 
     def _subscribe(self, exchange: CanExchange) -> None:
-        """Subscribe to the sensor's replies, once per exchange, and discard queued frames."""
+        """Subscribe to the sensor's replies, unless this was done, and discard queued frames."""
         if exchange is not self._subscribed_to:
             base_id = self._settings.base_id
             self.polls.subscribe(
-                identifier(base_id, netcanoem.GAUGES), identifier(base_id, netcanoem.GAUGES_REST)
+                identifier(base_id, netcanoem.GAUGES_OPCODE),
+                identifier(base_id, netcanoem.REMAINING_GAUGES_OPCODE),
             )
             for opcode in REPLY_LENGTHS:
-                if opcode not in (netcanoem.GAUGES, netcanoem.GAUGES_REST):
+                if opcode not in (netcanoem.GAUGES_OPCODE, netcanoem.REMAINING_GAUGES_OPCODE):
                     store_reply = partial(self._inbox.__setitem__, opcode)
                     exchange.subscribe(identifier(base_id, opcode), store_reply)
             self._subscribed_to = exchange
@@ -306,14 +307,14 @@ class AtiCanSensor:
 
     def _check_status(self, status_word: int, previous_word: int) -> None:
         """Count bus errors in a status word, and raise on a restart or a critical status bit."""
-        if status_word & CAN_BUS_ERROR:
+        if status_word & CAN_BUS_ERROR_BIT:
             self.bus_errors += 1
-        if status_word & ~previous_word & CAN_WATCHDOG_RESET:
+        if status_word & ~previous_word & CAN_WATCHDOG_RESET_BIT:
             raise self._restart_error(f"its watchdog has reset it (status word {status_word:#06x})")
         if status_word & CRITICAL_CAN_STATUS_BITS:
             remedy = (
                 "choose another (ati_can.calibration)"
-                if status_word & CAN_BAD_CALIBRATION
+                if status_word & CAN_BAD_CALIBRATION_BIT
                 else "it does not measure properly: check sensor, cable and supply"
             )
             raise DeviceError(
@@ -334,12 +335,14 @@ class AtiCanSensor:
     def _has_same_calibration(self) -> bool:
         """Return whether a box that was silent still has the calibration that was read from it.
 
-        A box does not report a short loss of power: bit 0 of its status is only for the watchdog.
-        So row 0 of its calibration matrix is read again.
+        Row 0 of the calibration matrix is read again for this, because a box does not report a
+        short loss of power: bit 0 of its status means a restart by its watchdog only.
         """
         inbox, calibration = self._inbox, self._calibration
-        row_frames = [inbox.get(opcode, b"") for opcode in netcanoem.MATRIX_ROW_REPLIES]
-        if all(len(row_entry) == REPLY_LENGTHS[netcanoem.MATRIX_ROW] for row_entry in row_frames):
+        row_frames = [inbox.get(opcode, b"") for opcode in netcanoem.MATRIX_ROW_REPLY_OPCODES]
+        if all(
+            len(row_entry) == REPLY_LENGTHS[netcanoem.MATRIX_ROW_OPCODE] for row_entry in row_frames
+        ):
             row_read, earlier_row = b"".join(row_frames), self._row_read_before
             if calibration is None or netcanoem.matrix_row(row_read) == calibration.matrix[0]:
                 self._calibration_in_doubt = False
@@ -352,14 +355,14 @@ class AtiCanSensor:
             self._row_read_before = row_read
             inbox.clear()
         base_id = self._settings.base_id
-        self.polls.exchange.send(netcanoem.request(base_id, netcanoem.MATRIX_ROW, 0))
+        self.polls.exchange.send(netcanoem.request(base_id, netcanoem.MATRIX_ROW_OPCODE, 0))
         return False
 
     def _poll(self, timeout_s: float) -> PollReply | None:
         """Poll the sensor once outside the control loop; return the reply, or None on timeout."""
         gauge_polls = self.polls
         gauge_polls.drain()
-        gauge_polls.forget()
+        gauge_polls.reset_pairing()
         gauge_polls.send()
         return gauge_polls.wait(gauge_polls.sent_ns + int(timeout_s * 1e9))
 
@@ -388,7 +391,8 @@ class AtiCanSensor:
             ):
                 reply_frames = [inbox[reply_opcode] for reply_opcode in reply_opcodes]
                 if attempt:
-                    exchange.wait_until(lambda: False, _ns_after(_LATE_REPLY_S))  # all is dropped
+                    # All frames that arrive are dropped.
+                    exchange.wait_until(lambda: False, _ns_after(_LATE_REPLY_WAIT_S))
                 break
         else:
             raise self._no_reply_error(requested_item)
@@ -412,7 +416,7 @@ class AtiCanSensor:
     def _read_serial_number(self) -> str:
         """Read the sensor's serial number, compare it with the profile, and return it."""
         reported_number = netcanoem.serial_number(
-            self._request_reply("its serial number", netcanoem.SERIAL_NUMBER)
+            self._request_reply("its serial number", netcanoem.SERIAL_NUMBER_OPCODE)
         )
         profile_number = self._settings.serial_number
         if not same_serial_number(profile_number, reported_number):
@@ -433,7 +437,7 @@ class AtiCanSensor:
         calibration_index = self._settings.calibration
         requested_item = f"calibration {calibration_index}"
         selected_index = self._request_reply(
-            requested_item, netcanoem.SELECT_CALIBRATION, calibration_index
+            requested_item, netcanoem.SELECT_CALIBRATION_OPCODE, calibration_index
         )[0]
         if selected_index != calibration_index:
             raise DeviceError(
@@ -442,7 +446,7 @@ class AtiCanSensor:
             )
         # The status shows whether the selected calibration is valid.
         status_word = self._status_word = netcanoem.read_gauges(self._first_reading()[0])[0]
-        if status_word & CAN_BAD_CALIBRATION:
+        if status_word & CAN_BAD_CALIBRATION_BIT:
             self._check_status(status_word, status_word)
 
     def _read_matrix(self) -> MatrixRows:
@@ -451,9 +455,9 @@ class AtiCanSensor:
             netcanoem.matrix_row(
                 self._request_reply(
                     f"row {axis} of its calibration matrix",
-                    netcanoem.MATRIX_ROW,
+                    netcanoem.MATRIX_ROW_OPCODE,
                     axis,
-                    replies=netcanoem.MATRIX_ROW_REPLIES,
+                    replies=netcanoem.MATRIX_ROW_REPLY_OPCODES,
                 )
             )
             for axis in range(6)
@@ -461,13 +465,15 @@ class AtiCanSensor:
 
     def _read_scale(self, serial_number: str, calibration_matrix: MatrixRows) -> Calibration:
         """Read counts per unit and unit codes, and return the complete calibration."""
-        counts_per_force = counts_per_torque = netcanoem.COUNTS_BEFORE_SCALE
-        force_unit, torque_unit = netcanoem.NEWTON, netcanoem.NEWTON_METRE
+        counts_per_force = counts_per_torque = netcanoem.COUNTS_OF_OLD_FIRMWARE
+        force_unit, torque_unit = netcanoem.NEWTON_CODE, netcanoem.NEWTON_METRE_CODE
         if self._reports_scale:
             counts_per_force, counts_per_torque = netcanoem.counts_per_unit(
-                self._request_reply("its counts per unit", netcanoem.COUNTS_PER_UNIT)
+                self._request_reply("its counts per unit", netcanoem.COUNTS_PER_UNIT_OPCODE)
             )
-            force_unit, torque_unit = self._request_reply("its unit codes", netcanoem.UNIT_CODES)
+            force_unit, torque_unit = self._request_reply(
+                "its unit codes", netcanoem.UNIT_CODES_OPCODE
+            )
         try:
             return Calibration(
                 serial_number=serial_number,
@@ -484,7 +490,7 @@ class AtiCanSensor:
 
 
 def _ns_after(duration_s: float) -> int:
-    """Return the time in nanoseconds (``time.monotonic_ns``) after a duration from now."""
+    """Return the time in nanoseconds (``time.monotonic_ns``) at which a duration will be over."""
     return time.monotonic_ns() + int(duration_s * 1e9)
 
 

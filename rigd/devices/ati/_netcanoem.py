@@ -3,10 +3,9 @@
 A CAN identifier consists of seven bits of base and four of opcode. A reply has the base of the
 request, and one of the opcodes defined here. Numbers of several bytes are big-endian.
 
-A poll is answered by two frames, which `GaugePolls` combines. The protocol has no counter: nothing
-in a reply states to which poll it belongs. So the frames of each kind are counted (`ReplyPairing`
-in `rigd.devices.canbus`), since either may be lost or late. In case of doubt one tick is run
-without a poll.
+A poll is answered by two frames, which `GaugePolls` combines. Either may be lost or late, and
+nothing in it states to which poll it belongs. So polls and the frames of each kind are counted
+(`ReplyPairing` in `rigd.devices.canbus`). In case of doubt one tick is run without a poll.
 """
 
 import time
@@ -17,42 +16,42 @@ from rigd.devices.canbus import CanExchange, ReplyPairing
 from rigd.devices.canbus.port import pack_frame
 from rigd.devices.contracts import DeviceError
 
-GAUGES = 0x0
+GAUGES_OPCODE = 0x0
 """Opcode of a poll, and of its first reply with status word and gauges 0, 2, 4."""
-GAUGES_REST = 0x1
+REMAINING_GAUGES_OPCODE = 0x1
 """Opcode of the second reply to a poll, with gauges 1, 3, 5."""
-MATRIX_ROW = 0x2
+MATRIX_ROW_OPCODE = 0x2
 """Opcode of the request for a row of the calibration matrix."""
-MATRIX_ROW_REPLIES = (0x2, 0x3, 0x4)
+MATRIX_ROW_REPLY_OPCODES = (0x2, 0x3, 0x4)
 """Opcodes of the three replies with a row of the calibration matrix."""
-SERIAL_NUMBER = 0x5
-"""Opcode for the serial number."""
-SELECT_CALIBRATION = 0x6
-"""Opcode for the selection of a calibration."""
-COUNTS_PER_UNIT = 0x7
-"""Opcode for the counts per unit of force and of torque."""
-UNIT_CODES = 0x8
-"""Opcode for the codes of the units of force and torque."""
-FIRMWARE = 0xF
-"""Opcode for the version of the firmware."""
+SERIAL_NUMBER_OPCODE = 0x5
+"""Opcode of the request for the sensor's serial number."""
+SELECT_CALIBRATION_OPCODE = 0x6
+"""Opcode of the request to select a calibration."""
+COUNTS_PER_UNIT_OPCODE = 0x7
+"""Opcode of the request for the counts per unit of force and of torque."""
+UNIT_CODES_OPCODE = 0x8
+"""Opcode of the request for the codes of the units of force and torque."""
+FIRMWARE_OPCODE = 0xF
+"""Opcode of the request for the version of the firmware."""
 
 REPLY_LENGTHS = {
-    GAUGES: 8,
-    GAUGES_REST: 6,
-    **dict.fromkeys(MATRIX_ROW_REPLIES, 8),
-    SERIAL_NUMBER: 8,
-    SELECT_CALIBRATION: 1,
-    COUNTS_PER_UNIT: 8,
-    UNIT_CODES: 2,
-    FIRMWARE: 4,
+    GAUGES_OPCODE: 8,
+    REMAINING_GAUGES_OPCODE: 6,
+    **dict.fromkeys(MATRIX_ROW_REPLY_OPCODES, 8),
+    SERIAL_NUMBER_OPCODE: 8,
+    SELECT_CALIBRATION_OPCODE: 1,
+    COUNTS_PER_UNIT_OPCODE: 8,
+    UNIT_CODES_OPCODE: 2,
+    FIRMWARE_OPCODE: 4,
 }
 """Number of data bytes in the reply with each opcode that the driver uses."""
 
 FIRST_FIRMWARE_WITH_SCALE = (3, 7)
 """First firmware version (major, minor) that reports counts per unit and unit codes."""
-COUNTS_BEFORE_SCALE = 1_000_000
+COUNTS_OF_OLD_FIRMWARE = 1_000_000
 """Counts per unit of force and of torque with older firmware, which does not report them."""
-NEWTON, NEWTON_METRE = 2, 3
+NEWTON_CODE, NEWTON_METRE_CODE = 2, 3
 """Unit codes of force and torque assumed for older firmware, which does not report them."""
 
 read_gauges = Struct(">Hhhh").unpack
@@ -100,7 +99,7 @@ PollReply = tuple[bytes, bytes]
 
 
 class _FrameReceiver:
-    """Receiver of one of the two frames that answer a poll: its last data, and a count."""
+    """Receiver of one of the two frames that answer a poll; stores the last one and counts all."""
 
     __slots__ = ("_length", "data", "replies")
 
@@ -110,7 +109,7 @@ class _FrameReceiver:
         self.replies = 0
 
     def store(self, data: bytes) -> None:
-        """Count a received frame and store its data; data of the wrong length counts as empty."""
+        """Count a received frame and store its data, or no data if the length is wrong."""
         self.replies += 1
         self.data = data if len(data) == self._length else b""
 
@@ -152,21 +151,21 @@ class GaugePolls:
         self.turnaround_ns = 0
         self.sent_ns = 0
         self._exchange: CanExchange | None = None
-        self._first_frame = _FrameReceiver(REPLY_LENGTHS[GAUGES])
-        self._second_frame = _FrameReceiver(REPLY_LENGTHS[GAUGES_REST])
+        self._first_frame = _FrameReceiver(REPLY_LENGTHS[GAUGES_OPCODE])
+        self._second_frame = _FrameReceiver(REPLY_LENGTHS[REMAINING_GAUGES_OPCODE])
         self._first_pairing = ReplyPairing(self._first_frame)
         self._second_pairing = ReplyPairing(self._second_frame)
         self.answer: PollReply | None = None
 
     def open(self, exchange: CanExchange) -> None:
-        """Poll over this open CAN exchange from now on, and expect no reply to earlier polls."""
+        """Start polling on an open CAN exchange; replies to earlier polls are not expected."""
         self._exchange = exchange
-        self.forget()
+        self.reset_pairing()
 
     def close(self) -> None:
         """Stop using the CAN exchange."""
         self._exchange = None
-        self.forget()
+        self.reset_pairing()
 
     @property
     def exchange(self) -> CanExchange:
@@ -235,8 +234,8 @@ class GaugePolls:
                 self.turnaround_ns = time.monotonic_ns() - self.sent_ns
         return self.answer
 
-    def forget(self) -> None:
-        """Reset the pairing of polls and replies: no reply is outstanding."""
+    def reset_pairing(self) -> None:
+        """Reset the pairing of polls and replies; from then on no reply is outstanding."""
         self._first_pairing.start()
         self._second_pairing.start()
         self.answer = None

@@ -16,16 +16,16 @@ load are nearly equal, so that a wrong offset that fits once may well fit again.
 from collections.abc import Sequence
 from struct import pack, unpack
 
-ADDRESS = 0x0A
+MODBUS_ADDRESS = 0x0A
 """Modbus address of every Digital F/T sensor."""
 MAX_REGISTERS = 64
 """Largest number of registers in one read request."""
 
-STATUS_WORD = 0x001D
+STATUS_REGISTER = 0x001D
 """Address of the register with the status word."""
-ACTIVE_GAINS = 0x0000
+GAINS_REGISTER = 0x0000
 """Address of the first of six registers with the active amplifier gains."""
-ACTIVE_OFFSETS = 0x0006
+OFFSETS_REGISTER = 0x0006
 """Address of the first of six registers with the active amplifier offsets."""
 
 _READ_FUNCTION = 0x03
@@ -58,7 +58,7 @@ _EXCEPTION_MEANINGS = {
 
 
 class InvalidReplyError(ValueError):
-    """Error: the reply is missing, damaged or for another request; a repetition may help."""
+    """Error: the reply is missing, damaged or for another request; repeating it may help."""
 
 
 class ModbusExceptionError(ValueError):
@@ -92,15 +92,15 @@ def frame(function_code: int, request_content: bytes) -> bytes:
 
     Address and checksum are added.
     """
-    address_and_content = bytes((ADDRESS, function_code)) + request_content
+    address_and_content = bytes((MODBUS_ADDRESS, function_code)) + request_content
     return address_and_content + crc16(address_and_content).to_bytes(2, "little")
 
 
-START_STREAMING = frame(_START_FUNCTION, bytes((_STREAM_PARAMETER,)))
+START_STREAM_REQUEST = frame(_START_FUNCTION, bytes((_STREAM_PARAMETER,)))
 """Request that starts the stream."""
-UNLOCK = frame(_LOCK_FUNCTION, bytes((_UNLOCK_CODE,)))
+UNLOCK_REQUEST = frame(_LOCK_FUNCTION, bytes((_UNLOCK_CODE,)))
 """Request that unlocks the sensor's memory."""
-LOCK = frame(_LOCK_FUNCTION, bytes((_LOCK_CODE,)))
+LOCK_REQUEST = frame(_LOCK_FUNCTION, bytes((_LOCK_CODE,)))
 """Request that locks the sensor's memory."""
 
 
@@ -157,7 +157,7 @@ def reply_content(request: bytes, reply: bytes) -> bytes:
         )
     if crc16(reply):
         raise InvalidReplyError(f"the checksum of the reply is wrong ({reply[:16].hex(' ')})")
-    if reply[0] != ADDRESS or reply[1] & ~_EXCEPTION_FLAG != request[1]:
+    if reply[0] != MODBUS_ADDRESS or reply[1] & ~_EXCEPTION_FLAG != request[1]:
         raise InvalidReplyError(f"the reply belongs to another request ({reply[:16].hex(' ')})")
     reply_data = reply[2:-2]
     if is_refusal(reply):
@@ -223,7 +223,7 @@ class RecordStream:
 
     __slots__ = (
         "_expected_offset",
-        "_held_bytes",
+        "_stored_bytes",
         "checksum_errors",
         "dropped_bytes",
         "records",
@@ -237,25 +237,25 @@ class RecordStream:
         self.start(aligned=False)
 
     def start(self, *, aligned: bool) -> None:
-        """Restart the stream without received bytes; the counts continue.
+        """Discard the stored bytes and search for the first record; the counts continue.
 
         Parameters
         ----------
         aligned
             Whether the next byte is probably the first byte of a record.
         """
-        self._held_bytes = b""
+        self._stored_bytes = b""
         self._expected_offset = 0 if aligned else None
         self.synchronised = False
 
     @property
     def pending(self) -> int:
         """Number of bytes that wait for more bytes to complete a record."""
-        return len(self._held_bytes)
+        return len(self._stored_bytes)
 
     def feed(self, chunk: bytes) -> bytes:
         """Process received bytes; return the complete valid records, concatenated, oldest first."""
-        pending_bytes = self._held_bytes + chunk if self._held_bytes else chunk
+        pending_bytes = self._stored_bytes + chunk if self._stored_bytes else chunk
         valid_records = b""
         while True:
             if not self.synchronised:
@@ -274,7 +274,7 @@ class RecordStream:
             )
             pending_bytes = pending_bytes[valid_length:]
             if valid_length == whole_length:
-                self._held_bytes = pending_bytes
+                self._stored_bytes = pending_bytes
                 break
             self.checksum_errors += 1
             self.synchronised = False
@@ -303,14 +303,14 @@ class RecordStream:
             ):
                 return record_offset
         self.dropped_bytes += undecided_offset
-        self._held_bytes = data[undecided_offset:]
+        self._stored_bytes = data[undecided_offset:]
         if self._expected_offset is not None:
             self._expected_offset = (self._expected_offset - undecided_offset) % RECORD_SIZE
         return None
 
 
 def _length_of_valid_records(data: bytes, whole_length: int) -> int:
-    """Return the number of bytes in ``data[:whole_length]`` before the first invalid record."""
+    """Return the number of bytes of ``data[:whole_length]`` before the first invalid record."""
     for record_offset in range(0, whole_length, RECORD_SIZE):
         if (
             sum(data[record_offset : record_offset + _CHECKSUM_OFFSET])
@@ -321,6 +321,6 @@ def _length_of_valid_records(data: bytes, whole_length: int) -> int:
 
 
 def _records_fit(data: bytes, begin: int) -> bool:
-    """Return whether enough consecutive records for synchronisation fit at an offset."""
+    """Return whether `SYNC_RECORDS` consecutive valid records begin at the offset `begin`."""
     sync_bytes = data[begin : begin + _SYNC_SIZE]
     return _length_of_valid_records(sync_bytes, _SYNC_SIZE) == _SYNC_SIZE

@@ -1,7 +1,7 @@
 """Driver of a Digital F/T sensor on a serial line, whose stream is read record by record.
 
 The sensor streams several records per tick of the loop. The profile's decimating filter and the
-calibration form one matrix, by which the newest records are multiplied.
+calibration form one matrix, which is multiplied by the gauge counts of the newest records.
 """
 
 import time
@@ -19,7 +19,7 @@ from rigd.devices.ati._calibration import (
 )
 from rigd.devices.ati._serial_protocol import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
 from rigd.devices.ati._serial_setup import (
-    SILENCE_S,
+    FRAME_SILENCE_S,
     SerialLine,
     SerialSetup,
     describe_adapter_delay,
@@ -31,24 +31,24 @@ from rigd.devices.running_simulator import SimulatorAddress
 _FIRST_RECORDS_TIMEOUT_S = 0.5
 """Time in seconds to wait for the first valid records of the stream."""
 _MAX_ERROR_RECORDS = 7
-"""Number of consecutive records with the error bit that end a session.
+"""Number of consecutive records with the error bit set that end a session.
 
-The checksum does not cover the error bit, and one flipped bit must not end a session."""
-_IDLE_NS = 20_000_000
+It is above 1 because the checksum does not protect this bit against errors of the line."""
+_MAX_IDLE_NS = 20_000_000
 """Time in nanoseconds without reading after which received bytes are discarded.
 
 After a longer time the kernel's buffer of 4 kB may overflow at 91 kB/s, and its content is old."""
-_GAP_PERIODS = 2.5
+_MIN_GAP_PERIODS = 2.5
 """Number of periods without a byte that count as a gap; the stream has several records per
 period."""
 _STORED_GAPS, _MIN_EVALUATED_GAPS = 8, 4
 """Number of the latest gaps that are stored, and smallest number that is evaluated."""
-_LARGEST_GAP_RATIO = 1.5
+_MAX_EQUAL_GAP_RATIO = 1.5
 """Largest ratio of a gap to the median gap for which gaps count as equal."""
-_GAP_EVALUATION_NS = 500_000_000
-"""Time in nanoseconds for which a gap is evaluated."""
+_MAX_GAP_AGE_NS = 500_000_000
+"""Age in nanoseconds up to which a gap is evaluated."""
 _STEADY_TICKS = 3
-"""Number of consecutive ticks with their own records after which missing records count as lost."""
+"""Number of consecutive ticks that bring only their own records, before missing ones are lost."""
 
 _BITS_PER_BYTE = RECORD_BITS // RECORD_SIZE
 """Number of bits on the line per byte."""
@@ -69,8 +69,8 @@ class AtiSerialSensor:
     Attributes
     ----------
     wrench_stale, wrench_saturated, wrench_time_ns
-        Whether the last wrench is old, whether a gauge is saturated, and the time in nanoseconds
-        (``time.monotonic_ns``) at which the newest record of the last wrench was read.
+        Whether the last wrench is stale, whether one of its gauges is saturated, and the time in
+        nanoseconds (``time.monotonic_ns``) at which its newest record was read.
     stream : RecordStream
         Record stream, which counts records and checksum errors.
     status : list of str
@@ -194,14 +194,14 @@ class AtiSerialSensor:
             elapsed_periods = max(1, round((due_ns - self._tick_ns) / self._period_ns))
         self._tick_ns = due_ns
         self._due_bytes += elapsed_periods * self._bytes_per_tick
-        if now_ns - self._last_read_ns > _IDLE_NS and not self._lock_step:
+        if now_ns - self._last_read_ns > _MAX_IDLE_NS and not self._lock_step:
             # Queued bytes are old and may have gaps: only bytes that arrive from now on count.
             self._split_records(self._open_line().read())
             self._history = b""
             self._due_bytes = self._arrived_bytes - self.stream.pending + RECORD_SIZE
 
     def read_wrench(self) -> Wrench:
-        """Return the wrench in N and N·m: the filter over the newest records.
+        """Return the wrench in N and N·m, filtered from the newest records.
 
         Raises
         ------
@@ -209,7 +209,7 @@ class AtiSerialSensor:
             If the line has failed or the sensor reports an error.
         """
         serial_line = self._open_line()
-        new = self._split_records(serial_line.read())
+        new_records = self._split_records(serial_line.read())
         while self._arrived_bytes < self._due_bytes:
             lacks_one_record = self._due_bytes - self._arrived_bytes <= RECORD_SIZE
             patience_ns = self._patience_ns if lacks_one_record else self._deadline_ns
@@ -217,12 +217,12 @@ class AtiSerialSensor:
             if remaining_ns <= 0:
                 break
             serial_line.wait(remaining_ns * 1e-9)
-            new += self._split_records(serial_line.read())
+            new_records += self._split_records(serial_line.read())
         self._last_read_ns = time.monotonic_ns()
-        self.wrench_stale = self._is_lagging(len(new)) or not new
+        self.wrench_stale = self._is_lagging(len(new_records)) or not new_records
         if self.wrench_stale:
             return self._wrench
-        gauge_counts = self._unpack_gauges(new)
+        gauge_counts = self._unpack_gauges(new_records)
         self.gauges = gauge_counts[-6:]
         self.wrench_saturated = (
             max(gauge_counts) >= self._saturation_counts
@@ -231,18 +231,18 @@ class AtiSerialSensor:
         return self._filtered_wrench()
 
     def _is_lagging(self, new_bytes: int) -> bool:
-        """Return whether the newest record is a tick or more late; `new_bytes` have come.
+        """Return whether the newest record is a tick or more late.
 
-        Late records arrive in addition to the records of later ticks, lost records do not. If some
-        consecutive ticks bring only their own records, the missing records count as lost. Since
-        records have no counter, all later records may instead be late by as much, unless the loss
-        left an incomplete record. This doubt is reported. A lag below one tick is the drift between
-        two clocks, or the phase of the sensor.
+        `new_bytes` is the number of bytes received in this tick. Late records arrive in addition to
+        those of later ticks, lost records do not. If some consecutive ticks bring only their own
+        records, the missing records count as lost. Since records have no counter, all later records
+        may instead be delayed, unless the loss left an incomplete record. This doubt is reported. A
+        lag below one tick is caused by the drift between two clocks, or by the sensor's phase.
         """
         complete_bytes = self._arrived_bytes - self.stream.pending
         if self._due_bytes - complete_bytes >= self._bytes_per_tick:
-            in_step = abs(new_bytes - self._bytes_per_tick) <= RECORD_SIZE
-            self._steady_ticks = self._steady_ticks + 1 if in_step else 0
+            is_in_step = abs(new_bytes - self._bytes_per_tick) <= RECORD_SIZE
+            self._steady_ticks = self._steady_ticks + 1 if is_in_step else 0
             if self._steady_ticks < _STEADY_TICKS:
                 return True
             if self.stream.checksum_errors == self._known_checksum_errors:
@@ -253,7 +253,7 @@ class AtiSerialSensor:
         return False
 
     def health(self) -> LineHealth:
-        """Return the health of the serial line, with the sensor's status word.
+        """Return load and errors of the serial line, and the sensor's status word.
 
         The status word was read before the stream started.
         """
@@ -290,22 +290,22 @@ class AtiSerialSensor:
         )
 
     def _describe_cause(self) -> str:
-        """Return a message if records arrive in regular blocks, else an empty text.
+        """Return a message that a USB adapter delays the records, or an empty text.
 
-        The message says that the USB adapter delays the records.
+        The adapter is recognised by records that arrive in blocks at regular intervals.
         """
         now_ns = time.monotonic_ns()
         gaps_ns = sorted(
-            gap for arrival_ns, gap in self._latest_gaps if now_ns - arrival_ns < _GAP_EVALUATION_NS
+            gap for arrival_ns, gap in self._latest_gaps if now_ns - arrival_ns < _MAX_GAP_AGE_NS
         )
         if len(gaps_ns) < _MIN_EVALUATED_GAPS:
             return ""
         median_ns = gaps_ns[len(gaps_ns) // 2]
         if (
-            not 1 / _LARGEST_GAP_RATIO
+            not 1 / _MAX_EQUAL_GAP_RATIO
             < gaps_ns[0] / median_ns
             <= gaps_ns[-1] / median_ns
-            < _LARGEST_GAP_RATIO
+            < _MAX_EQUAL_GAP_RATIO
         ):
             return ""
         return describe_adapter_delay(median_ns * 1e-9, self._port)
@@ -378,20 +378,20 @@ class AtiSerialSensor:
             return received_bytes
         now_ns = time.monotonic_ns()
         gap_ns = now_ns - self._arrived_ns
-        if self._arrived_ns and gap_ns > _GAP_PERIODS * self._period_ns:
+        if self._arrived_ns and gap_ns > _MIN_GAP_PERIODS * self._period_ns:
             self._latest_gaps.append((now_ns, gap_ns))
         self._arrived_bytes += len(received_bytes)
         self._arrived_ns = now_ns
-        new = self.stream.feed(received_bytes)
-        if new:
-            if max(new[RECORD_SIZE - 1 :: RECORD_SIZE]) & ERROR_BIT:
-                self._count_errors(new)
+        new_records = self.stream.feed(received_bytes)
+        if new_records:
+            if max(new_records[RECORD_SIZE - 1 :: RECORD_SIZE]) & ERROR_BIT:
+                self._count_errors(new_records)
             else:
                 self._error_records = 0
             # Before a tick's worth of records has arrived, the oldest one is repeated.
-            previous_records = self._history or new[:RECORD_SIZE] * len(self._weights)
-            self._history = (previous_records + new)[-self._history_size :]
-        return new
+            previous_records = self._history or new_records[:RECORD_SIZE] * len(self._weights)
+            self._history = (previous_records + new_records)[-self._history_size :]
+        return new_records
 
     def _filtered_wrench(self) -> Wrench:
         """Compute, store and return the filtered wrench, in N and N·m, from the newest records."""
@@ -412,7 +412,7 @@ class AtiSerialSensor:
                 )
 
     def _unpack_gauges(self, records: bytes) -> tuple[int, ...]:
-        """Return the gauge counts of some records, without the checksums."""
+        """Return the gauge counts in the given records, six per record, in wire order."""
         n = len(records) // RECORD_SIZE
         unpack_counts = self._unpackers.get(n)
         if unpack_counts is None:
@@ -422,10 +422,10 @@ class AtiSerialSensor:
     def _check_line_rate(self) -> None:
         """Raise if the line is too slow for the stream, or the stream is slower than the loop."""
         settings = self._settings
-        needed_bit_s = settings.stream_hz * RECORD_BITS
-        if needed_bit_s > settings.baud:
+        stream_bit_s = settings.stream_hz * RECORD_BITS
+        if stream_bit_s > settings.baud:
             raise DeviceError(
-                f"{self._name}: {settings.stream_hz:g} records a second need {needed_bit_s:.0f} "
+                f"{self._name}: {settings.stream_hz:g} records a second need {stream_bit_s:.0f} "
                 f"bit/s on the line, more than {settings.baud} baud; change ati_serial.stream_hz "
                 "or ati_serial.baud."
             )
@@ -465,7 +465,7 @@ class AtiSerialSensor:
                     f"{_FIRST_RECORDS_TIMEOUT_S} s only {self.stream.records - records_before} "
                     "were sound records. Check cable, ati_serial.baud and ati_serial.stream_hz."
                 )
-            serial_line.wait(SILENCE_S)
+            serial_line.wait(FRAME_SILENCE_S)
             self._split_records(serial_line.read())
         if self._history:
             # Value that is used if the first tick finds no new records.

@@ -165,22 +165,20 @@ class SerialLine:
     def drain(self, quiet_s: float, limit_s: float) -> bool:
         """Discard received bytes until the line has been silent for `quiet_s`.
 
-        Return True on success, and False if `limit_s` has passed before.
-
         Returns
         -------
         bool
-            Whether the line became silent within the limit.
+            Whether the line became silent before `limit_s` had passed.
         """
-        now = time.monotonic()
-        last_received_s, end = now, now + limit_s
-        while now < end:
+        now_s = time.monotonic()
+        last_received_s, end_s = now_s, now_s + limit_s
+        while now_s < end_s:
             if self.read():
-                last_received_s = now
-            elif now - last_received_s >= quiet_s:
+                last_received_s = now_s
+            elif now_s - last_received_s >= quiet_s:
                 return True
             self.wait(quiet_s)
-            now = time.monotonic()
+            now_s = time.monotonic()
         return False
 
     def close(self) -> None:
@@ -201,18 +199,18 @@ def _parity(port: str) -> str:
 
     A pseudo-terminal refuses even parity.
     """
-    is_pseudo = os.path.realpath(port).startswith("/dev/pts/")
-    return str(serial.PARITY_NONE if is_pseudo else serial.PARITY_EVEN)
+    is_pseudo_terminal = os.path.realpath(port).startswith("/dev/pts/")
+    return str(serial.PARITY_NONE if is_pseudo_terminal else serial.PARITY_EVEN)
 
 
 def _error_text(error: Exception) -> str:
-    """Return the reason of an error in words."""
+    """Return the reason of a serial port's error in words."""
     error_number = error.args[0] if error.args else None
     return os.strerror(error_number) if isinstance(error_number, int) else str(error)
 
 
 def _opening_remedy(error: Exception) -> str:
-    """Return the remedy for a port that cannot be opened."""
+    """Return the remedy for a serial port that cannot be opened, chosen by the error."""
     if isinstance(error, BlockingIOError) or "exclusively lock" in str(error):
         return "another program has it open: close that first"
     if isinstance(error, ValueError):
@@ -225,11 +223,11 @@ def _opening_remedy(error: Exception) -> str:
 
 # Set-up over Modbus
 
-SILENCE_S = 0.002
+FRAME_SILENCE_S = 0.002
 """Silence in seconds that ends a Modbus frame."""
 
 _STOP_BYTES = bytes(range(1, 15))
-"""Bytes that stop the stream, as any bytes do; other drivers send 14 bytes."""
+"""Bytes sent to stop the stream; any bytes stop it, and other drivers send 14."""
 _STOP_ATTEMPTS = 3
 """Number of attempts to stop the stream."""
 _STREAM_STOPPED_SILENCE_S = 0.05
@@ -240,7 +238,7 @@ _REPLY_TIMEOUT_S = 0.3
 """Time in seconds to wait for the reply to one request."""
 _REQUEST_ATTEMPTS = 3
 """Number of attempts of one request."""
-_LATE_REPLY_S = 0.5
+_LATE_REPLY_WAIT_S = 0.5
 """Silence in seconds to wait for after a repeated request.
 
 A repeated request may be answered twice, and no reply states which registers it holds."""
@@ -255,7 +253,7 @@ class SerialSetup:
     Parameters
     ----------
     line
-        Open line.
+        Open serial line to the sensor.
     settings
         Settings of the sensor.
     name
@@ -280,7 +278,7 @@ class SerialSetup:
 
     def read_status(self) -> int:
         """Read the status word of the Digital F/T sensor by Modbus, and return it."""
-        return self._read_register_values(modbus.STATUS_WORD, 1, "report its status")[0]
+        return self._read_register_values(modbus.STATUS_REGISTER, 1, "report its status")[0]
 
     def read_block(self) -> CalibrationBlock:
         """Read the calibration block that the profile selects, and check its serial number."""
@@ -309,21 +307,21 @@ class SerialSetup:
 
     def load_amplifiers(self, block: CalibrationBlock) -> None:
         """Write the calibration's amplifier gains and offsets, and read them back."""
-        self._request_content(modbus.UNLOCK, "unlock its memory")
+        self._request_content(modbus.UNLOCK_REQUEST, "unlock its memory")
         try:
             for first_register, register_values in (
-                (modbus.ACTIVE_GAINS, block.gains),
-                (modbus.ACTIVE_OFFSETS, block.offsets),
+                (modbus.GAINS_REGISTER, block.gains),
+                (modbus.OFFSETS_REGISTER, block.offsets),
             ):
                 self._request_content(
                     modbus.write_registers(first_register, register_values),
                     "load gains and offsets",
                 )
         finally:
-            self._request_content(modbus.LOCK, "lock its memory")
+            self._request_content(modbus.LOCK_REQUEST, "lock its memory")
         written_values = tuple(chain(block.gains, block.offsets))
         active_values = self._read_register_values(
-            modbus.ACTIVE_GAINS, len(written_values), "report its gains and offsets"
+            modbus.GAINS_REGISTER, len(written_values), "report its gains and offsets"
         )
         if active_values != written_values:
             raise DeviceError(
@@ -334,8 +332,8 @@ class SerialSetup:
 
     def start_streaming(self) -> bytes:
         """Start the sensor's stream of records; return the bytes received after the reply."""
-        request = modbus.START_STREAMING
-        time.sleep(SILENCE_S)
+        request = modbus.START_STREAM_REQUEST
+        time.sleep(FRAME_SILENCE_S)
         reply_size = modbus.reply_length(request)
         reply = self._line.transact(request, reply_size, _REPLY_TIMEOUT_S)
         try:
@@ -348,11 +346,11 @@ class SerialSetup:
         """Send a request and return the content of its reply; repeat a request that failed."""
         last_error = ""
         for attempt_number in range(_REQUEST_ATTEMPTS):
-            time.sleep(SILENCE_S)
+            time.sleep(FRAME_SILENCE_S)
             reply_size = modbus.reply_length(request)
             reply = self._line.transact(request, reply_size, _REPLY_TIMEOUT_S)
             if attempt_number:
-                self._line.drain(_LATE_REPLY_S, 2 * _LATE_REPLY_S)
+                self._line.drain(_LATE_REPLY_WAIT_S, 2 * _LATE_REPLY_WAIT_S)
             try:
                 return modbus.reply_content(request, reply)
             except modbus.ModbusExceptionError as error:

@@ -45,7 +45,7 @@ _NODE_SERVICES = {
 
 
 def sensor_identifiers(sensor: AtiCan) -> range:
-    """Return the range of CAN identifiers that an ATI sensor uses: its base with 16 opcodes."""
+    """Return the 16 CAN identifiers that an ATI sensor uses: its base with every opcode."""
     first_id = sensor.base_id << 4
     return range(first_id, first_id + 16)
 
@@ -113,9 +113,9 @@ TPDO_LENGTH = 8
 """Number of data bytes in the drive's TPDO: statusword, position and actual torque."""
 HEARTBEAT_LENGTH = 1
 """Number of data bytes in a heartbeat frame."""
-REQUEST_LENGTH = 0
+SENSOR_REQUEST_LENGTH = 0
 """Number of data bytes in a request to an ATI sensor."""
-REPLY_LENGTHS = (8, 6)
+SENSOR_REPLY_LENGTHS = (8, 6)
 """Numbers of data bytes in the two replies of an ATI sensor to one request.
 
 The first contains the status word and gauges 0, 2, 4, the second gauges 1, 3, 5."""
@@ -151,7 +151,7 @@ class CyclicFrame:
 
 @dataclass(frozen=True, slots=True)
 class BusLoad:
-    """Cyclic frames of a CAN bus, and the load: the fraction of time in which the bus is busy."""
+    """Cyclic frames of a CAN bus, and the fraction of time in which they keep the bus busy."""
 
     traffic: tuple[CyclicFrame, ...]
     """Cyclic frames of the bus."""
@@ -230,7 +230,9 @@ def bus_load(rig: RigParameters) -> BusLoad:
         ]
     if (sensor := rig.ati_can) is not None:
         first_id = sensor.base_id << 4
-        cyclic_frames.append(CyclicFrame("sensor's request", first_id, REQUEST_LENGTH, rig.rate_hz))
+        cyclic_frames.append(
+            CyclicFrame("sensor's request", first_id, SENSOR_REQUEST_LENGTH, rig.rate_hz)
+        )
         cyclic_frames += [
             CyclicFrame(
                 f"sensor's reply {reply_index + 1}",
@@ -238,6 +240,6 @@ def bus_load(rig: RigParameters) -> BusLoad:
                 reply_length,
                 rig.rate_hz,
             )
-            for reply_index, reply_length in enumerate(REPLY_LENGTHS)
+            for reply_index, reply_length in enumerate(SENSOR_REPLY_LENGTHS)
         ]
     return load_of_frames(tuple(cyclic_frames), rig.can.bitrate_bit_s)

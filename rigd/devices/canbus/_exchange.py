@@ -127,7 +127,7 @@ class ReplyPairing:
         return 0 < self.outstanding <= self._inbox.replies
 
     def process_replies(self) -> bool:
-        """Count the received replies; return whether that to this tick's request is among them.
+        """Count the received replies; return whether this tick's request has been answered.
 
         If replies to earlier requests were outstanding, too, the result is False: a faulty line may
         deliver a delayed reply after later replies. The next tick is then the first valid one.
@@ -178,10 +178,11 @@ _NO_ACKNOWLEDGE_CLASS = 0x20
 """Class of an error frame: no device has acknowledged a sent frame."""
 
 _MAX_DRAIN_FAILURES = 10
-"""Most receive errors that one `drain` ignores within `ignore_errors`, since an adapter may queue
-them."""
+"""Largest number of receive errors, which an adapter may queue, that one `drain` ignores.
+
+The limit applies within `ignore_errors`."""
 _MAX_WAIT_FAILURES = 100
-"""Most receive errors within one wait in `ignore_errors` before the wait ends."""
+"""Number of receive errors that end one wait within `ignore_errors`."""
 _FAILURE_PAUSE_S = 0.001
 """Pause in seconds after a receive error."""
 
@@ -287,14 +288,14 @@ class CanExchange:
     def _deliver(self) -> None:
         """Deliver all frames that have arrived, and register error frames of the controller."""
         receive_frame, frame_handlers = self._receive, self._handlers
-        while (raw := receive_frame()) is not None:
-            can_id, data_length = unpack_header(raw)
+        while (raw_frame := receive_frame()) is not None:
+            can_id, data_length = unpack_header(raw_frame)
             frame_handler = frame_handlers.get(can_id)
             if frame_handler is not None:
                 self.bits += FRAME_BITS + 8 * data_length
-                frame_handler(raw[8 : 8 + data_length])
+                frame_handler(raw_frame[8 : 8 + data_length])
             elif can_id & ERROR_FLAG:
-                self._register_error(can_id & ERROR_MASK, raw[8:16])
+                self._register_error(can_id & ERROR_MASK, raw_frame[8:16])
 
     def wait_until(self, is_ready: Callable[[], bool], deadline_ns: int) -> bool:
         """Deliver frames until `is_ready` returns True, or the deadline passes.
@@ -356,7 +357,7 @@ class CanExchange:
 
 
 class BusLock:
-    """Lock of one CAN bus against other programs, held from opening the bus to closing it.
+    """Lock that prevents other programs from using a CAN bus while this one has it open.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""python-can bus on one of the project's CAN ports, with which canopen configures a drive."""
+"""python-can bus on one of this package's CAN ports, by which canopen configures a drive."""
 
 import sys
 import time
@@ -42,9 +42,9 @@ class SetupBus(can.BusABC):
         return to_message(raw_frame), False
 
 
-def to_message(raw: bytes) -> can.Message:
+def to_message(raw_frame: bytes) -> can.Message:
     """Convert a raw frame of 16 bytes to a python-can message."""
-    can_id, data = unpack_frame(raw)
+    can_id, data = unpack_frame(raw_frame)
     is_standard_id = not can_id & (EXTENDED_FLAG | ERROR_FLAG)
     return can.Message(
         timestamp=time.time(),

@@ -27,11 +27,9 @@ if TYPE_CHECKING:
 _RECEIVE_BUFFER_SIZE = 212_992
 """Size in bytes of a socket's receive buffer, for a late reader: some 200 ms of a full bus."""
 _SIMULATOR_SEND_BUFFER_SIZE = 4_194_304
-"""Size in bytes of the send buffer to a simulated rig, as large as the system allows.
+"""Requested size in bytes of the send buffer to a simulated rig; the system may grant less.
 
-A stopped simulated rig is then detected by its missing replies.
-
-A simulated rig that has stopped is detected by its missing replies, not by a full buffer."""
+A simulated rig that has stopped is then detected by its missing replies, not by a full buffer."""
 _CAN_RAW_ERR_FILTER = 2
 """Number of the socket option that selects the error frames to receive (linux/can/raw.h)."""
 _MAX_DAMAGED_FRAMES = 20
@@ -72,14 +70,14 @@ class SocketPort:
     def receive(self) -> bytes | None:
         """Return the next received raw frame of 16 bytes, or None if no frame has arrived."""
         try:
-            raw = self._recv(FRAME_SIZE)
+            raw_frame = self._recv(FRAME_SIZE)
         except BlockingIOError:
             return None
         except OSError as error:
             raise DeviceError(self._error_message("cannot be read", error)) from None
-        if len(raw) != FRAME_SIZE:
+        if len(raw_frame) != FRAME_SIZE:
             raise DeviceError(f"CAN bus {self.name}: it was cut off; {self._remedy}.")
-        return raw
+        return raw_frame
 
     def wait(self, timeout_s: float) -> None:
         """Wait until a frame may have arrived on the bus, at most for `timeout_s`."""
@@ -150,7 +148,7 @@ class PythonCanPort:
         self._to_message, self._from_message = to_message, from_message
         self._error = can.CanError
         self._next_frame: bytes | None = None
-        self._damaged_in_a_row = 0
+        self._consecutive_damaged_frames = 0
         self.name = name
 
     def send(self, frame: bytes) -> None:
@@ -166,8 +164,8 @@ class PythonCanPort:
     def receive(self) -> bytes | None:
         """Return the next received raw frame of 16 bytes, or None if no frame has arrived."""
         if self._next_frame is not None:
-            raw, self._next_frame = self._next_frame, None
-            return raw
+            raw_frame, self._next_frame = self._next_frame, None
+            return raw_frame
         return self._receive(0.0)
 
     def wait(self, timeout_s: float) -> None:
@@ -176,7 +174,10 @@ class PythonCanPort:
             self._next_frame = self._receive(timeout_s)
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
-        """Do nothing: python-can's filters end a poll at each dropped frame and drop errors."""
+        """Do nothing: a filter of python-can would end a wait at each dropped frame.
+
+        It would also drop error frames.
+        """
 
     def open_bus(self) -> "can.BusABC":
         """Return a python-can bus that sends and receives through this port."""
@@ -193,25 +194,25 @@ class PythonCanPort:
         """Return the next frame from the adapter, or None if none arrives within `timeout_s`."""
         try:
             message = self._bus.recv(timeout_s)
-            raw = None if message is None else self._from_message(message)
+            raw_frame = None if message is None else self._from_message(message)
         except (self._error, OSError) as error:
             raise DeviceError(
                 f"CAN bus {self.name}: it cannot be read ({_error_text(error)}); check cable and "
                 "adapter."
             ) from None
         except Exception as error:
-            self._damaged_in_a_row += 1
-            if self._damaged_in_a_row < _MAX_DAMAGED_FRAMES:
+            self._consecutive_damaged_frames += 1
+            if self._consecutive_damaged_frames < _MAX_DAMAGED_FRAMES:
                 return DAMAGED_FRAME
-            self._damaged_in_a_row = 0
+            self._consecutive_damaged_frames = 0
             raise DeviceError(
                 f"CAN bus {self.name}: the adapter sends what is no CAN frame, "
                 f"{_MAX_DAMAGED_FRAMES} times in a row ({_error_text(error)}); check the adapter, "
                 "its cable and its firmware."
             ) from None
-        if raw is not None and not unpack_header(raw)[0] & ERROR_FLAG:
-            self._damaged_in_a_row = 0
-        return raw
+        if raw_frame is not None and not unpack_header(raw_frame)[0] & ERROR_FLAG:
+            self._consecutive_damaged_frames = 0
+        return raw_frame
 
 
 def _error_text(error: Exception) -> str:

@@ -1,10 +1,10 @@
 """A CiA 402 servo drive over CANopen, in cyclic synchronous torque mode.
 
-Offers the driver (`Cia402Drive`), the check of a drive's EDS file (`check_suitability`), and
-the parser of a profile's own settings of objects (`parse_assignment`).
+Offers the driver (`Cia402Drive`), the check of a drive's EDS file (`check_suitability`), and the
+parser of the objects that a profile sets (`parse_assignment`).
 
 Drives differ in what they support: the table in `requirements` lists what rigd needs; `objects` has
-the indices. Which torque is commanded is not decided here.
+the indices of objects. Another package computes the torque that the driver commands.
 """
 
 import lazy_loader as lazy

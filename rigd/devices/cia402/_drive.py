@@ -14,7 +14,7 @@ from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
     FAULT_BIT,
-    FOLLOWS_TARGET,
+    FOLLOWS_TARGET_BIT,
     OPERATION_ENABLED_BITS,
     STATE_BITS,
     DriveState,
@@ -107,7 +107,7 @@ class Cia402Drive:
         self.off_doubt = ""
 
     def connect(self) -> None:
-        """Open the bus, verify, configure and start the drive, and set its present angle to zero.
+        """Open the bus, verify, configure and start the drive; its present angle becomes zero.
 
         No SYNC and no heartbeat is sent between this call and the first tick.
 
@@ -163,7 +163,7 @@ class Cia402Drive:
         return {} if self._capabilities is None else dict(self._capabilities.identity)
 
     def capabilities(self) -> DriveCapabilities | None:
-        """Return the drive's capabilities found at :meth:`connect`, or None before."""
+        """Return the drive's capabilities found at :meth:`connect`, or None before `connect`."""
         return self._capabilities
 
     def statement(self) -> dict[str, str]:
@@ -231,7 +231,7 @@ class Cia402Drive:
             raise
         self._enabled = True
         self._torque_check.start()
-        follows_target_bit = FOLLOWS_TARGET if node.settings.follows_target_bit else 0
+        follows_target_bit = FOLLOWS_TARGET_BIT if node.settings.follows_target_bit else 0
         self._inbox.require_status(
             STATE_BITS | follows_target_bit, OPERATION_ENABLED_BITS | follows_target_bit
         )
@@ -245,7 +245,8 @@ class Cia402Drive:
         Parameters
         ----------
         due_ns
-            Time in nanoseconds at which the tick was due; it times the heartbeats of both sides.
+            Time in nanoseconds at which the tick was due. The heartbeats of computer and drive are
+            due by this time.
 
         Raises
         ------
@@ -324,7 +325,7 @@ class Cia402Drive:
         return sent_per_mille / self._per_mille_per_nm
 
     def health(self) -> LineHealth:
-        """Return bit count, bit rate and errors of the bus, as seen by this driver."""
+        """Return number of bits, bit rate and errors of the bus, as this driver sees them."""
         if self._node is None:
             return LineHealth()
         exchange = self._node.exchange
@@ -355,8 +356,8 @@ class Cia402Drive:
     def disable(self) -> None:
         """Zero the torque and disable the drive; works in every state and never raises.
 
-        If the statusword does not confirm it within some 50 ms, the command is also sent by SDO,
-        and finally the node is stopped.
+        If the statusword does not confirm within some 50 ms that the drive is off, the command is
+        also sent by SDO, and finally the node is stopped.
         """
         self._enabled = False
         self._inbox.require_status(FAULT_BIT, 0)
@@ -415,7 +416,7 @@ class Cia402Drive:
             self._link.close()
 
     def _describe_watchdog(self) -> str:
-        """Describe by which watchdog a drive that cannot be switched off removes its torque."""
+        """Return which watchdog removes the torque of a drive that cannot be switched off."""
         capabilities = self._capabilities
         if capabilities is None or capabilities.watchdog is Watchdog.NONE:
             return "It has no watchdog that would end it by itself."
@@ -456,9 +457,9 @@ class Cia402Drive:
         self._store_reply(node)
 
     def _store_reply(self, node: Node) -> None:
-        """Store the angle and compare the torque if the last TPDO answers the last SYNC.
+        """Store the angle and check the torque if the last TPDO answers the last SYNC.
 
-        Otherwise the angle is registered as stale.
+        Otherwise the stored angle is registered as stale.
         """
         is_fresh = node.pairing.process_replies() and self._inbox.is_last_tpdo_valid
         self.angle_stale = not is_fresh

@@ -7,9 +7,9 @@ from struct import error as LengthError  # noqa: N812
 
 from rigd.devices.canbus import CanExchange, ReplyPairing
 from rigd.devices.cia402._protocol import (
-    BOOT_UP,
+    BOOT_UP_STATE,
     NMT_STATES,
-    OPERATIONAL,
+    OPERATIONAL_STATE,
     TORQUE_FREE_STATES,
     DriveState,
     NodeFrames,
@@ -171,8 +171,8 @@ class ReceivedFrames:
         nmt_state = data[0] & ~_TOGGLE_BIT
         self.nmt_state = nmt_state
         self.heartbeat_received = True
-        if self.must_stay_operational and nmt_state != OPERATIONAL and not self.alarm:
-            if nmt_state == BOOT_UP:
+        if self.must_stay_operational and nmt_state != OPERATIONAL_STATE and not self.alarm:
+            if nmt_state == BOOT_UP_STATE:
                 event_text = "it has restarted by itself; check its supply"
             else:
                 state_name = NMT_STATES.get(nmt_state, f"state {nmt_state}")
@@ -228,8 +228,8 @@ class Node:
     sync_ns : int
         Time in nanoseconds (``time.monotonic_ns``) at which the last SYNC was sent.
     now_ns : int
-        Time in nanoseconds that times the heartbeats: of the last tick, or in lock-step the
-        drive's own time.
+        Time in nanoseconds by which heartbeats become due: that of the last tick, or in lock-step
+        the drive's own time.
     """
 
     def __init__(
@@ -289,8 +289,8 @@ class Node:
                 else f"its heartbeat says {inbox.nmt_state}"
             )
             raise DeviceError(
-                f"{self.name}: it does not become operational ({heartbeat_text}, {OPERATIONAL} was "
-                "expected); check its own diagnosis."
+                f"{self.name}: it does not become operational ({heartbeat_text}, "
+                f"{OPERATIONAL_STATE} was expected); check its own diagnosis."
             )
         inbox.must_stay_operational = True
 
@@ -352,9 +352,9 @@ class Node:
         self.inbox.heartbeat_received = True
 
     def await_reply(self, patience_ns: int = 0) -> bool:
-        """Wait for a TPDO for the given time or one period; return whether one has arrived.
+        """Wait for a TPDO after the last SYNC, and return whether one has arrived in time.
 
-        In lock-step the waiting time is the deadline of the profile.
+        The time is `patience_ns`, one period if that is 0, or in lock-step the profile's deadline.
         """
         patience_ns = self.deadline_ns if self.lock_step else patience_ns or self.period_ns
         return self.exchange.wait_until(self._is_answered, self.sync_ns + patience_ns)
@@ -386,7 +386,7 @@ class Node:
         return self._request_if_possible(request, lambda: is_written(inbox.sdo_reply, index, sub))
 
     def is_off(self) -> bool:
-        """Read the statusword by SDO, and return whether it shows that the drive has no torque."""
+        """Read the statusword by SDO; return whether it shows that the motor has no torque."""
         inbox = self.inbox
         inbox.sdo_reply = b""
         self._request_if_possible(
@@ -448,7 +448,7 @@ class Node:
 
     def _is_operational(self) -> bool:
         """Return whether the drive's last heartbeat shows the NMT state operational."""
-        return self.inbox.nmt_state == OPERATIONAL
+        return self.inbox.nmt_state == OPERATIONAL_STATE
 
     def _is_answered(self) -> bool:
         """Return whether a TPDO has arrived since the last SYNC."""

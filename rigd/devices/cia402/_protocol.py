@@ -51,10 +51,10 @@ FAULT_RESET: Final = 0x80
 
 FAULT_BIT: Final = 0x0008
 """Statusword bit that is set in the states fault and fault reaction active."""
-VOLTAGE_ENABLED: Final = 0x0010
+VOLTAGE_ENABLED_BIT: Final = 0x0010
 """Statusword bit that is set while the power stage is supplied; STO cuts the supply of most
 drives."""
-FOLLOWS_TARGET: Final = 0x1000
+FOLLOWS_TARGET_BIT: Final = 0x1000
 """Statusword bit 12 in cyclic torque mode: without it the drive ignores the target torque."""
 STATE_BITS: Final = 0x006F
 """Statusword bits that encode the drive's state."""
@@ -101,19 +101,19 @@ NMT_STOP: Final = 0x02
 NMT_PRE_OPERATIONAL: Final = 0x80
 """NMT command that brings a node to pre-operational."""
 
-BOOT_UP: Final = 0x00
+BOOT_UP_STATE: Final = 0x00
 """NMT state in the first heartbeat after the start of a node."""
-STOPPED: Final = 0x04
+STOPPED_STATE: Final = 0x04
 """NMT state of a stopped node, in its heartbeat."""
-OPERATIONAL: Final = 0x05
+OPERATIONAL_STATE: Final = 0x05
 """NMT state of an operational node, in its heartbeat."""
-PRE_OPERATIONAL: Final = 0x7F
+PRE_OPERATIONAL_STATE: Final = 0x7F
 """NMT state of a pre-operational node, in its heartbeat."""
 NMT_STATES: Final = {
-    BOOT_UP: "starting up",
-    STOPPED: "stopped",
-    OPERATIONAL: "operational",
-    PRE_OPERATIONAL: "pre-operational",
+    BOOT_UP_STATE: "starting up",
+    STOPPED_STATE: "stopped",
+    OPERATIONAL_STATE: "operational",
+    PRE_OPERATIONAL_STATE: "pre-operational",
 }
 """Names of the NMT states in messages, by the value in a heartbeat."""
 
@@ -175,7 +175,7 @@ class NodeFrames:
         self.reply_id = 0x580 + node_id
         request_id = 0x600 + node_id
         self.sync = pack_frame(SYNC_ID)
-        self.heartbeat = pack_frame(0x700 + host_node_id, bytes([OPERATIONAL]))
+        self.heartbeat = pack_frame(0x700 + host_node_id, bytes([OPERATIONAL_STATE]))
         self.start = pack_frame(0, bytes([NMT_START, node_id]))
         self.stop = pack_frame(0, bytes([NMT_STOP, node_id]))
         self.pre_operational = pack_frame(0, bytes([NMT_PRE_OPERATIONAL, node_id]))

@@ -1,6 +1,6 @@
 """Read and write the drive's objects by SDO, while the control loop does not run.
 
-The canopen library transfers the values and starts a thread that receives; both end with the
+The canopen library transfers the values, and receives replies in a thread that ends with the
 context. An object's data type is taken from the drive's EDS file if the profile names one, else
 from ``drive.eds`` in this folder.
 """
@@ -45,7 +45,7 @@ _SDO_ATTEMPTS = 2
 _HURRIED_TIMEOUT_S = 0.05
 """Time in seconds to wait for an SDO reply while the torque has to be switched off quickly."""
 _MAX_LATE_REPLIES = 3
-"""Most replies to earlier, abandoned requests that may arrive before the awaited reply."""
+"""Largest number of replies to abandoned requests that may arrive before the awaited reply."""
 _LATE_REPLY_SILENCE_S = 0.25
 """Silence in seconds after which all replies to abandoned requests have arrived."""
 _TIMEOUT_MESSAGE_START = "No SDO response"
@@ -64,9 +64,9 @@ _ABSENT_OBJECT_ABORTS = {
 }
 """SDO abort codes that mean that the drive has no such object, with their meanings.
 
-They count when the object is read, or written after reading failed. Codes of a state in which
-the object cannot be accessed (0x08000022) and of an access in the wrong direction are not among
-them."""
+They have this meaning when the object is read, or is written after reading it failed. Codes for an
+object that is not accessible in the present state (0x08000022), or only in the other direction, are
+not in the table."""
 _WRITE_ONLY_ABORT = 0x0601_0001
 """SDO abort code for reading a write-only object."""
 _WRONG_LENGTH_ABORTS = (0x0607_0010, 0x0607_0012, 0x0607_0013)
@@ -101,11 +101,11 @@ class SdoAbortError(DeviceError):
 
 
 class ValueNotStoredError(DeviceError):
-    """Error: an object reads another value than was written to it; `got` is the value read."""
+    """Error: the value read back from an object (`value_read`) differs from that written."""
 
-    def __init__(self, message: str, got: int) -> None:
+    def __init__(self, message: str, value_read: int) -> None:
         super().__init__(message)
-        self.got = got
+        self.value_read = value_read
 
 
 class _Receiver(MessageListener):
@@ -281,13 +281,13 @@ class SdoAccess:
             in the bits of `mask` (:class:`ValueNotStoredError`).
         """
         self.write(index, sub, value)
-        got = self.read(index, sub)
-        if (got ^ value) & mask:
+        value_read = self.read(index, sub)
+        if (value_read ^ value) & mask:
             raise ValueNotStoredError(
                 f"{self._name}: {self._object_name(index, sub)} was set to {show_value(value)} "
-                f"and reads {show_value(got)}; check with the drive's own tool why it does not "
-                "keep it.",
-                got,
+                f"and reads {show_value(value_read)}; check with the drive's own tool why it does "
+                "not keep it.",
+                value_read,
             )
 
     def assign(self, assignment: Assignment) -> None:
@@ -359,7 +359,10 @@ class SdoAccess:
 def _transfer_skipping_late_replies(
     client: SdoClient, variable: SdoVariable, value: int | None
 ) -> object:
-    """Read or write a value by SDO, and skip late replies to abandoned requests."""
+    """Read an object by SDO, or write `value` unless it is None; return the value.
+
+    Late replies to abandoned requests are skipped.
+    """
     for attempts_left in reversed(range(_MAX_LATE_REPLIES + 1)):
         try:
             if value is None:
@@ -386,9 +389,9 @@ def _discard_late_replies(sdo_client: SdoClient) -> None:
 def _load_integer_types(
     dictionary: ObjectDictionary, eds_path: str, node_id: int
 ) -> tuple[int, int]:
-    """Copy integer data types from a drive's EDS file into the object dictionary `dictionary`.
+    """Copy integer data types from a drive's EDS file into an object dictionary.
 
-    Returned are the vendor and product code of the EDS file.
+    Return vendor and product code in the EDS file.
     """
     try:
         drive_eds = read_eds(Path(eds_path), node_id)
@@ -413,7 +416,7 @@ def _variables(entry: object) -> list[ODVariable]:
 
 
 def _communication_parameter_type(index: int, sub: int) -> str:
-    """Return the integer type by CiA 301 of a PDO's parameter or of a heartbeat consumer."""
+    """Return the integer type that CiA 301 defines for a PDO parameter or heartbeat consumer."""
     if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
         return {0: "u8", 1: "u32", 2: "u8"}.get(sub, "u16")
     return "u32" if sub else "u8"

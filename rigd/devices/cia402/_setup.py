@@ -58,10 +58,9 @@ _ABORT_MEANINGS = {
 _MODE_TIMEOUT_S = 0.3
 """Time in seconds to wait until the drive shows the commanded mode of operation."""
 _RATED_TORQUE_TOLERANCE = 0.02
-"""Largest difference, relative, between the rated torques of the drive and of the profile."""
+"""Largest relative difference between the rated torques of the drive and of the profile."""
 _SCALE_TOLERANCE = 0.02
-"""Largest difference, relative, between gear ratio or encoder step of the drive and of the
-profile."""
+"""Largest relative difference between the gear ratios, or encoder steps, of drive and profile."""
 _MAX_HEARTBEAT_CONSUMERS = 127
 """Largest number of heartbeat consumer entries in object 1016."""
 
@@ -78,7 +77,7 @@ class DriveCapabilities:
         Watchdog that removes the torque if this computer stops communicating, and its timeout in
         seconds, which is infinite if there is no watchdog.
     lacks
-        Requirements on objects that the drive lacks or that are not usable.
+        Requirements that the drive does not meet: the object is absent or not usable.
     assigned
         Manufacturer-specific objects that the profile has set.
     """
@@ -162,7 +161,9 @@ def set_up_drive(port: CanPort, rig: RigParameters, drive_name: str) -> DriveCap
         configuration.read_stop_options(identity)
         configuration.set_object(requirement(objects.MODE))
         # Some drives show the mode only when enabled: it is checked again then.
-        wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_TIMEOUT_S)
+        wait_for(
+            lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE_MODE, _MODE_TIMEOUT_S
+        )
     return DriveCapabilities(
         identity,
         active_watchdog,
@@ -200,7 +201,7 @@ def _check_identity(
     A drive without cyclic synchronous torque mode is refused as well.
     """
     eds_vendor, eds_product = eds_identity
-    for key, value_source, required_number in (
+    for key, requirement_source, required_number in (
         ("vendor_id", "cia402.vendor_id", settings.vendor_id),
         ("product_code", "cia402.product_code", settings.product_code),
         ("vendor_id", f"VendorNumber in {settings.eds}", eds_vendor),
@@ -210,12 +211,12 @@ def _check_identity(
         if required_number and reported_number != required_number:
             reported_text = "nothing" if reported_number is None else f"0x{reported_number:08X}"
             raise DeviceError(
-                f"{drive_name}: it is another drive: {value_source} is 0x{required_number:08X}, it "
-                f"says {reported_text}. Check cia402.node_id, or write into the profile what is "
-                "really there."
+                f"{drive_name}: it is another drive: {requirement_source} is "
+                f"0x{required_number:08X}, it says {reported_text}. Check cia402.node_id, or write "
+                "into the profile what is really there."
             )
     mode_bits = identity["supported_modes"]
-    if not (isinstance(mode_bits, int) and mode_bits & objects.SUPPORTS_CYCLIC_TORQUE):
+    if not (isinstance(mode_bits, int) and mode_bits & objects.CYCLIC_TORQUE_MODE_BIT):
         raise DeviceError(
             f"{drive_name}: it has no cyclic synchronous torque mode over CANopen (object 6502 = "
             f"{show_value(mode_bits)}, bit 9 is not set); this drive or its firmware cannot be "
@@ -278,7 +279,7 @@ class _DriveConfiguration:
         try:
             self._sdo.configure(row.index, row.sub, required)
         except ValueNotStoredError as not_stored:
-            present_value = not_stored.got
+            present_value = not_stored.value_read
             readback_error: DeviceError = not_stored
         except SdoAbortError as refusal:
             if present_value is None and refusal.is_absent:
@@ -432,7 +433,7 @@ class _DriveConfiguration:
         row = requirement(objects.SYNC_COB_ID)
         if (
             cob_id is not None
-            and cob_id & ~objects.PDO_DISABLED != self._required_values[row.index, 0]
+            and cob_id & ~objects.PDO_DISABLED_BIT != self._required_values[row.index, 0]
         ):
             self.set_object(row)
         if sdo.read_or_none(objects.SYNC_OVERFLOW):
@@ -446,7 +447,7 @@ class _DriveConfiguration:
             self.set_object(requirement(objects.INTERPOLATION_TIME, sub))
 
     def configure_watchdog(self) -> Watchdog:
-        """Set up the drive's watchdog over this computer, and the drive's own heartbeat.
+        """Set up the watchdog by which the drive monitors this computer, and the drive's heartbeat.
 
         Returns
         -------
@@ -481,7 +482,7 @@ class _DriveConfiguration:
         return active_watchdog
 
     def configure_pdos(self, active_watchdog: Watchdog) -> None:
-        """Map one RPDO and one TPDO, and disable all other PDOs."""
+        """Map and enable the one RPDO and the one TPDO that the rig uses; disable all others."""
         settings, sdo = self._settings, self._sdo
         for communication_index in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
             _disable_unused_pdos(sdo, communication_index)
@@ -492,7 +493,7 @@ class _DriveConfiguration:
             tpdo_entries = tpdo_entries[:-1]
         self._configure_pdo(
             objects.TPDO_COMMUNICATION,
-            objects.NO_REMOTE_REQUEST,
+            objects.NO_REMOTE_REQUEST_BIT,
             tpdo_entries,
             {objects.INHIBIT_TIME: 0},
         )
@@ -545,7 +546,7 @@ class _DriveConfiguration:
         )
 
     def _configure_heartbeat_consumer(self) -> bool:
-        """Make the drive monitor this computer's heartbeat; return whether it can do that."""
+        """Make the drive monitor this computer's heartbeat; return whether the drive can do so."""
         settings, sdo = self._settings, self._sdo
         index, host_id = objects.HEARTBEAT_CONSUMER, settings.host_node_id
         required_value = host_id << 16 | round(settings.heartbeat_timeout_s * 1000)
@@ -588,7 +589,7 @@ class _DriveConfiguration:
         sdo, mapping_index = self._sdo, communication + 0x200
         can_id = self._required_values[communication, 1] | flags
         transmission_type = self._required_values[communication, 2]
-        cob_id_bits = EVERY_BIT & ~objects.NO_REMOTE_REQUEST
+        cob_id_bits = EVERY_BIT & ~objects.NO_REMOTE_REQUEST_BIT
         is_mapped = self._holds_values(mapping_index, (len(entries), *entries))
         has_transmission_type = sdo.read_or_none(communication, 2) == transmission_type
         cob_id_found = sdo.read_or_none(communication, 1)
@@ -600,7 +601,7 @@ class _DriveConfiguration:
         has_cob_id = cob_id_found is not None and not (cob_id_found ^ can_id) & cob_id_bits
         if has_cob_id and is_mapped and has_transmission_type and not other_parameters:
             return
-        sdo.configure(communication, 1, can_id | objects.PDO_DISABLED, cob_id_bits)
+        sdo.configure(communication, 1, can_id | objects.PDO_DISABLED_BIT, cob_id_bits)
         if not is_mapped:
             self._write_mapping(communication, mapping_index, entries)
         if not has_transmission_type:
@@ -634,7 +635,7 @@ class _DriveConfiguration:
         sdo.configure(mapping_index, 0, len(entries))
 
     def _holds_values(self, index: int, required_values: tuple[int, ...]) -> bool:
-        """Return whether sub-indices 0, 1, 2, … of a drive's object hold the given values."""
+        """Return whether the sub-indices of an object, from 0 on, hold the given values."""
         return all(
             self._sdo.read_or_none(index, sub) == held_value
             for sub, held_value in enumerate(required_values)
@@ -642,7 +643,7 @@ class _DriveConfiguration:
 
 
 def _is_ratio_equal(drive_value: float, profile_value: float) -> bool:
-    """Return whether two values, of the drive and of the profile, agree within 2 %."""
+    """Return whether a drive's value agrees with the profile's value within 2 %."""
     return abs(drive_value - profile_value) <= _SCALE_TOLERANCE * profile_value
 
 
@@ -654,10 +655,10 @@ def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:
             # Above the PDOs that CiA 301 predefines, indices are used without gaps.
             if pdo_offset >= objects.PREDEFINED_PDO_COUNT:
                 return
-        elif not cob_id & objects.PDO_DISABLED:
-            sdo.configure(communication + pdo_offset, 1, cob_id | objects.PDO_DISABLED)
+        elif not cob_id & objects.PDO_DISABLED_BIT:
+            sdo.configure(communication + pdo_offset, 1, cob_id | objects.PDO_DISABLED_BIT)
 
 
 def _abort_meaning(refusal: SdoAbortError) -> str:
-    """Return the short meaning of the abort code of a refusal."""
+    """Return the meaning of a refusal's SDO abort code in a few words."""
     return _ABORT_MEANINGS.get(refusal.code, "see CiA 301")

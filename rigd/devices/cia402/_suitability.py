@@ -95,8 +95,8 @@ _COB_ID_ADDRESSES: Final = (
 """Index and sub-index of the objects that hold a CAN identifier."""
 _UNCONFIGURED_WATCHDOGS: Final = (Watchdog.OWN, Watchdog.NONE)
 """Kinds of watchdog that rigd does not configure in the drive."""
-_REPORTED_ELSEWHERE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
-"""Indices of objects that findings other than those of the table report."""
+_SEPARATELY_REPORTED_INDICES: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
+"""Indices of objects in the table of requirements that have findings of their own."""
 
 
 def check_suitability(eds: Eds, rig: "RigParameters | None" = None) -> SuitabilityReport:
@@ -131,7 +131,7 @@ class _SuitabilityCheck:
         yield self._torque_mode_finding()
         yield self._watchdog_finding()
         for row in REQUIREMENTS:
-            if row.index in _REPORTED_ELSEWHERE or row.accept == WATCHDOG:
+            if row.index in _SEPARATELY_REPORTED_INDICES or row.accept == WATCHDOG:
                 continue
             eds_entry = self._eds.get(row.index, row.sub)
             yield (
@@ -198,7 +198,7 @@ class _SuitabilityCheck:
             return SuitabilityFinding(object_text, "absent", wanted_text, Grade.REFUSED, sentence)
         if modes_entry.default:
             value_text = f"0x{modes_entry.default:X}"
-            if modes_entry.default & objects.SUPPORTS_CYCLIC_TORQUE:
+            if modes_entry.default & objects.CYCLIC_TORQUE_MODE_BIT:
                 return SuitabilityFinding(object_text, value_text, wanted_text, Grade.FITS)
             sentence = (
                 f"No cyclic synchronous torque mode: {object_address} = {value_text} lacks bit 9; "
@@ -230,7 +230,7 @@ class _SuitabilityCheck:
         )
 
     def _expected_watchdog(self) -> Watchdog:
-        """Return the kind of watchdog that the drive will use, by EDS file and profile."""
+        """Return the kind of watchdog that the drive will use, judging by EDS file and profile."""
         heartbeat_entry = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
         deadline_entry = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         return watchdog(
@@ -279,7 +279,7 @@ class _SuitabilityCheck:
         return SuitabilityFinding(object_text, found_text, wanted_text, grade, sentence, row.accept)
 
     def _is_set_by_profile(self, row: Requirement) -> bool:
-        """Return whether the profile needs this object, because nothing else can do its work."""
+        """Return whether the profile sets a value that only this object can give the drive."""
         settings = self._settings
         if settings is None:
             return False
@@ -346,7 +346,7 @@ class _SuitabilityCheck:
             is_acceptable = None
         elif (row.index, row.sub) in _COB_ID_ADDRESSES:
             # Drives are free to set the bit that forbids remote requests.
-            is_acceptable = (eds_entry.default ^ wanted) & ~objects.NO_REMOTE_REQUEST == 0
+            is_acceptable = (eds_entry.default ^ wanted) & ~objects.NO_REMOTE_REQUEST_BIT == 0
             mapping_index = row.index + 0x200
             if (
                 is_acceptable
@@ -394,7 +394,7 @@ class _SuitabilityCheck:
         return ""
 
     def _default_mapping(self, mapping_index: int) -> tuple[int | None, ...]:
-        """Return the default mapping entries of a PDO in the EDS file; None for one without."""
+        """Return a PDO's default mapping entries in the EDS file; None for an unstated entry."""
         count_entry = self._eds.get(mapping_index, 0)
         default_entries = [
             self._eds.get(mapping_index, sub)
@@ -434,5 +434,5 @@ def _format_limit(row: Requirement, value: int | None) -> str:
 
 
 def _capitalise(sentence: str) -> str:
-    """Capitalise the first letter of a text that was meant to follow the name of a drive."""
+    """Return a text with a capital first letter, so that it can begin a sentence."""
     return sentence[0].upper() + sentence[1:]

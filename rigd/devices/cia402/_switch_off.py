@@ -1,4 +1,4 @@
-"""Fault reset while the loop does not run: switch off, reset, check that the drive gets ready.
+"""Reset a drive's fault while the loop does not run: switch off, reset, check that it gets ready.
 
 All commands are sent by SDO, which a drive answers in every NMT state except stopped. Whether the
 motor has torque is decided by the statusword, never by what was commanded.
@@ -16,7 +16,7 @@ from rigd.devices.cia402._protocol import (
     FAULT_RESET,
     SHUTDOWN,
     TORQUE_FREE_STATES,
-    VOLTAGE_ENABLED,
+    VOLTAGE_ENABLED_BIT,
     DriveState,
     describe_error,
     drive_state,
@@ -238,7 +238,7 @@ def _confirm_ready(
             f"{name}: {progress_text}; when it was commanded to get ready it went to fault: "
             f"{_describe_fault(sdo)}. Remove the cause, then: {command}"
         )
-    supply_text = "is there" if statusword & VOLTAGE_ENABLED else "is not there"
+    supply_text = "is there" if statusword & VOLTAGE_ENABLED_BIT else "is not there"
     raise DeviceError(
         f"{name}: {progress_text}, and it is disabled, but it does not get ready: on that command "
         f'it stays in "{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply '

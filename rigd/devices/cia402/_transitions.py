@@ -10,19 +10,19 @@ from rigd.devices.cia402._node import Node
 from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
-    FOLLOWS_TARGET,
+    FOLLOWS_TARGET_BIT,
     SHUTDOWN,
     SWITCH_ON,
     TORQUE_FREE_STATES,
-    VOLTAGE_ENABLED,
+    VOLTAGE_ENABLED_BIT,
     DriveState,
     drive_state,
     read_mode,
 )
-from rigd.devices.cia402.objects import CONTROLWORD, CYCLIC_TORQUE
+from rigd.devices.cia402.objects import CONTROLWORD, CYCLIC_TORQUE_MODE
 from rigd.devices.contracts import DeviceError, wired_stop_dropped
 
-_OTHER_SENDER: Final = (
+_OTHER_SENDER_HINT: Final = (
     "a command came over the bus that this computer did not give (a corrupt frame, a second master)"
 )
 """Part of a message: another sender on the bus may have commanded the drive."""
@@ -50,23 +50,23 @@ def operation_left_error(drive_name: str, statusword: int) -> DeviceError:
     )
     if present_state is DriveState.SWITCH_ON_DISABLED:
         # The usual cause is a lost motor supply; a bus command would leave the supply on.
-        is_supplied = bool(statusword & VOLTAGE_ENABLED)
+        is_supplied = bool(statusword & VOLTAGE_ENABLED_BIT)
         supply_hint = (
             ", and its bit 4 says that the supply is there, which indicates such a command"
         )
         sto_error = wired_stop_dropped(
             drive_name,
-            f", or the motor's supply failed, or {_OTHER_SENDER}: {transition_text}"
+            f", or the motor's supply failed, or {_OTHER_SENDER_HINT}: {transition_text}"
             f"{supply_hint if is_supplied else ''}",
         )
         return DeviceError(f"{sto_error} If nobody pressed it, {_CHECK_BUS_ADVICE}.")
     if present_state in (DriveState.READY, DriveState.SWITCHED_ON):
         return DeviceError(
-            f"{drive_name}: {transition_text}: {_OTHER_SENDER}; {_CHECK_BUS_ADVICE}."
+            f"{drive_name}: {transition_text}: {_OTHER_SENDER_HINT}; {_CHECK_BUS_ADVICE}."
         )
     return DeviceError(
-        f"{drive_name}: {transition_text}, by itself or because {_OTHER_SENDER}; check STO, supply "
-        f"and its own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
+        f"{drive_name}: {transition_text}, by itself or because {_OTHER_SENDER_HINT}; check STO, "
+        f"supply and its own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
     )
 
 
@@ -77,7 +77,9 @@ A single lost command is no error, since the next tick repeats it."""
 
 
 class TorqueFollowingCheck:
-    """Check that the drive's actual torque follows the commands, in 1/1000 of the rated torque.
+    """Check of each tick whether the drive's actual torque follows the commands.
+
+    All torques are in 1/1000 of the rated torque.
 
     The drive may sample its torque before or after it applies the command of the previous tick, so
     the torque is compared with the last two commands. If the drive measures its torque, the torque
@@ -211,7 +213,7 @@ def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
             node,
             ENABLE_OPERATION,
             sync_grid_ns,
-            lambda: inbox.statusword & FOLLOWS_TARGET != 0,
+            lambda: inbox.statusword & FOLLOWS_TARGET_BIT != 0,
             lambda: (
                 "it is enabled and ignores the target torque: bit 12 of its statusword "
                 f"0x{inbox.statusword:04X} is not set; check its own diagnosis, and if this "
@@ -254,9 +256,9 @@ def _check_mode(node: Node, sync_grid_ns: int, stop: Callable[[], bool]) -> None
         if mode_read is None:
             return False
         mode, inbox.sdo_reply = mode_read, b""
-        if mode != CYCLIC_TORQUE:
+        if mode != CYCLIC_TORQUE_MODE:
             send_frame(node_frames.read_mode_request)
-        return mode == CYCLIC_TORQUE
+        return mode == CYCLIC_TORQUE_MODE
 
     inbox.sdo_reply = b""
     send_frame(node_frames.read_mode_request)
@@ -266,7 +268,7 @@ def _check_mode(node: Node, sync_grid_ns: int, stop: Callable[[], bool]) -> None
         sync_grid_ns,
         in_cyclic_torque,
         lambda: (
-            f"its mode of operation (object 6061) is {mode}, not {CYCLIC_TORQUE} (cyclic "
+            f"its mode of operation (object 6061) is {mode}, not {CYCLIC_TORQUE_MODE} (cyclic "
             "synchronous torque)"
         ),
         stop,

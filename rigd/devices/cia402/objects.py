@@ -93,13 +93,13 @@ seconds."""
 SUPPORTED_MODES: Final = 0x6502
 """Index of the bits for the modes of operation that the drive supports."""
 
-CYCLIC_TORQUE: Final = 10
+CYCLIC_TORQUE_MODE: Final = 10
 """Number of the cyclic synchronous torque mode, for objects 6060 and 6061."""
-SUPPORTS_CYCLIC_TORQUE: Final = 0x200
+CYCLIC_TORQUE_MODE_BIT: Final = 0x200
 """Bit in object 6502 that means that the drive supports the cyclic synchronous torque mode."""
-PDO_DISABLED: Final = 0x8000_0000
+PDO_DISABLED_BIT: Final = 0x8000_0000
 """Bit in the COB-ID of a PDO that means that the PDO is disabled."""
-NO_REMOTE_REQUEST: Final = 0x4000_0000
+NO_REMOTE_REQUEST_BIT: Final = 0x4000_0000
 """Bit in the COB-ID of a TPDO that forbids remote requests; drives may set it by themselves."""
 SYNC_ID: Final = 0x080
 """CAN identifier of SYNC."""

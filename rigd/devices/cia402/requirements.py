@@ -583,8 +583,8 @@ MAY_BE_WRITE_ONLY: Final = (
 )
 """Indices of objects that are written without verification if they cannot be read.
 
-They are set whatever they held before. (6060 is write-only in the first editions of CiA 402; 6061
-shows the mode.)"""
+They are written even if they may already hold the value. (6060 is write-only in the first editions
+of CiA 402; 6061 shows the mode.)"""
 
 _BY_ADDRESS: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
 """Requirement by index and sub-index."""
@@ -621,7 +621,7 @@ def profile_independent_values(node_id: int) -> dict[tuple[int, int], int]:
     """
     return {
         **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.must_be_zero},
-        (objects.MODE, 0): objects.CYCLIC_TORQUE,
+        (objects.MODE, 0): objects.CYCLIC_TORQUE_MODE,
         (objects.SYNC_COB_ID, 0): objects.SYNC_ID,
         (objects.EMERGENCY_COB_ID, 0): 0x080 + node_id,
         (objects.TPDO_COMMUNICATION, 1): 0x180 + node_id,

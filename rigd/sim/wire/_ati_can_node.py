@@ -8,14 +8,12 @@ big-endian. The following behaviour, which is not documented for the box, is def
 * after power-up or a reset calibration 0 is active; after a reset, by request or by its watchdog,
   bit 0 of the status is set as well, up to the next power-up;
 * a calibration that is not in the box is selected and confirmed nevertheless, but from then on bit
-6
-  of the status is set and the matrix reads as not-a-number, like erased memory; serial number,
+  6 of the status is set and the matrix reads as not-a-number, like erased memory; serial number,
   units and counts do not depend on the calibration;
 * counts per unit and units are reported from firmware 3.7 on, the diagnostic channels from 3.8 on;
   older firmware does not answer these requests;
 * a new base is acknowledged with the old one and is used from the next power-up on; a new bit rate
-is
-  acknowledged and has no effect, since the simulated bus has no bit rate.
+  is acknowledged and has no effect, since the simulated bus has no bit rate.
 """
 
 from collections.abc import Callable, Collection
@@ -97,8 +95,8 @@ class AtiCanNode:
     saturate : int or None
         Number of a gauge that reads ±32767; None: none.
     status_bits : int
-        Bits set in the status word in addition to those that the box sets itself; bit 15 follows.
-        They remain until they are cleared, even after a reset.
+        Bits set in the status word in addition to those that the box sets itself, which include bit
+        15 if any other is set. They remain until they are cleared, even after a reset.
 
     Raises
     ------
@@ -181,7 +179,7 @@ class AtiCanNode:
         self._log("sensor", "power-up", base_id=self._base)
 
     def _reply(self, opcode: int, data: bytes) -> None:
-        """Send the reply to a request, with an opcode."""
+        """Send a reply with an opcode and data."""
         self._send(self._base << 4 | opcode, data)
 
     def _read_gauges(self, _: bytes) -> None:

@@ -42,7 +42,7 @@ _SATURATED_COUNTS = 32767
 
 
 class AtiGauges:
-    """Six strain gauges under a wrench, with the calibration matrix that inverts them.
+    """Six strain gauges that a wrench loads, and the matrix that computes it from their counts.
 
     The counts are ``round(M⁻¹ · (wrench · counts per unit)) + bias``, with the calibration matrix M
     in single precision, as it is transmitted. They saturate at 16 bits.
@@ -66,26 +66,26 @@ class AtiGauges:
         Largest error of each axis by the rounding of the gauges, in N and N·m. With the range and
         resolution of the Mini40 SI-20-1 it is less than half the resolution on every axis, and so
         is the effect of one count of one gauge.
-    stuck : tuple of int and Stuck, or None
-        Number of a gauge that has failed, and replacement for its readings.
+    stuck : tuple of int and StuckReadings, or None
+        Number of a gauge that has failed, and replacement for its readings; None if none has.
     """
 
     def __init__(
         self, sensor: WrenchSensorSettings, counts_per_unit: tuple[int, int] = COUNTS_PER_UNIT
     ) -> None:
         self.counts_per_unit = counts_per_unit
-        counts_by_axis = np.repeat(np.array(counts_per_unit, dtype=np.float64), 3)
-        range_counts = counts_by_axis * np.array(sensor.range)
+        axis_counts_per_unit = np.repeat(np.array(counts_per_unit, dtype=np.float64), 3)
+        range_counts = axis_counts_per_unit * np.array(sensor.range)
         self.matrix = np.linalg.inv(np.array(_COUNTS_AT_FULL_RANGE) / range_counts).astype(
             np.float32
         )
         calibration_matrix = self.matrix.astype(np.float64)
         self.quantisation: NDArray[np.float64] = (
-            0.5 * np.abs(calibration_matrix).sum(axis=1) / counts_by_axis
+            0.5 * np.abs(calibration_matrix).sum(axis=1) / axis_counts_per_unit
         )
         # For wrenches in rows.
         self._counts_per_wrench = np.ascontiguousarray(
-            (np.linalg.inv(calibration_matrix) * counts_by_axis).T
+            (np.linalg.inv(calibration_matrix) * axis_counts_per_unit).T
         )
         self.stuck: tuple[int, StuckReadings] | None = None
         self._bias = np.array(_BIAS_COUNTS, dtype=np.float64)

@@ -2,13 +2,12 @@
 
 The following behaviour, which is not documented for the sensor, is defined here:
 
-* frames for another address, with a wrong checksum, or of other bytes get no answer; * a request is
-complete as soon as its length is reached and its checksum is right; a request that is
-  still incomplete after 50 ms of silence is discarded (a real sensor discards it after 3.5
+* frames for another address, with a wrong checksum, or of other bytes get no answer;
+* a request is complete as soon as its length is reached and its checksum is right; a request that
+  is still incomplete after 50 ms of silence is discarded (a real sensor discards it after 3.5
   characters, which a pseudo-terminal cannot reproduce);
 * a request to start the stream or to lock, with an undocumented parameter, is answered with 0
-instead
-  of 1;
+  instead of 1;
 * polled gauges (input registers 0 to 5) are in their natural order;
 * gains and offsets are zero after power-up; writing them while locked is an illegal address.
 
@@ -85,9 +84,9 @@ _CALIBRATION_LAYOUT = Struct(">8s32s4s20s36f2B6f2i6H6H")
 
 _STOP_BYTE_COUNT = 14
 """Number of received bytes that end the stream."""
-_SILENCE_S = 0.05
+_REQUEST_TIMEOUT_S = 0.05
 """Silence in seconds after which an incomplete request is discarded."""
-_LONGEST_FRAME = 256
+_MAX_FRAME_BYTES = 256
 """Longest Modbus frame in bytes."""
 _RECORD_SIZE = 13
 """Size of a record of the stream in bytes."""
@@ -110,8 +109,8 @@ class AtiSerialDevice:
         number of the filled calibration block (the fifteen others read 0xFFFF), and the baud
         register after power-up.
     simulated_rig
-        Simulated rig, whose sensor measures. The stream sends the newest readings that the sensor
-        has taken in a period, without new ones.
+        Simulated rig, whose sensor measures. The stream sends the readings that the sensor has
+        taken in a period, and takes none itself.
     write
         Function that sends the bytes of an answer, or the records of one period.
     log
@@ -210,7 +209,7 @@ class AtiSerialDevice:
         if self._has_received:
             self._has_received = False
             self._silent_since_s = now_s
-        elif now_s - self._silent_since_s > _SILENCE_S:
+        elif now_s - self._silent_since_s > _REQUEST_TIMEOUT_S:
             self._incomplete_request = b""
 
     def emit(self) -> None:
@@ -394,7 +393,7 @@ def _answer_with_registers(
     )
 
 
-def _next_request(received: bytes) -> tuple[bytes | None, bytes]:
+def _next_request(received_bytes: bytes) -> tuple[bytes | None, bytes]:
     """Return the first complete request in received bytes, and the remaining bytes.
 
     Every byte that could be the address is tried. So noise before a request is skipped without
@@ -406,42 +405,42 @@ def _next_request(received: bytes) -> tuple[bytes | None, bytes]:
         Request with its checksum, or None if there is none. Bytes after the request, or from the
         first position at which a request may have begun.
     """
-    possible_start = len(received)
-    request_start = received.find(_ADDRESS)
+    possible_start = len(received_bytes)
+    request_start = received_bytes.find(_ADDRESS)
     while request_start >= 0:
-        available_bytes = len(received) - request_start
-        request_length = _request_length(received, request_start)
+        available_bytes = len(received_bytes) - request_start
+        request_length = _request_length(received_bytes, request_start)
         if request_length <= available_bytes:
-            if _checksum(received[request_start : request_start + request_length]) == 0:
-                return received[request_start : request_start + request_length], received[
-                    request_start + request_length :
-                ]
-        elif available_bytes < _LONGEST_FRAME:
+            if _checksum(received_bytes[request_start : request_start + request_length]) == 0:
+                return received_bytes[
+                    request_start : request_start + request_length
+                ], received_bytes[request_start + request_length :]
+        elif available_bytes < _MAX_FRAME_BYTES:
             possible_start = min(possible_start, request_start)
-        request_start = received.find(_ADDRESS, request_start + 1)
-    return None, received[possible_start:]
+        request_start = received_bytes.find(_ADDRESS, request_start + 1)
+    return None, received_bytes[possible_start:]
 
 
-def _request_length(received: bytes, start: int) -> int:
+def _request_length(received_bytes: bytes, start: int) -> int:
     """Return the length in bytes of the request at `start`.
 
     If the length is unknown, a length is returned that exceeds the data.
     """
-    available_bytes = len(received) - start
+    available_bytes = len(received_bytes) - start
     unknown_length = available_bytes + 1
     if available_bytes < 4:
         return unknown_length
-    function_code = received[start + 1]
+    function_code = received_bytes[start + 1]
     if function_code in (_READ_HOLDING_FUNCTION, _READ_INPUT_FUNCTION):
         return 8
     if function_code in (_STREAM_FUNCTION, _LOCK_FUNCTION):
         return 5
     if function_code == _WRITE_FUNCTION:
-        return 9 + received[start + 6] if available_bytes > 6 else unknown_length
+        return 9 + received_bytes[start + 6] if available_bytes > 6 else unknown_length
     # A request with an unknown function ends where its checksum holds.
     return (
         unknown_length
-        if available_bytes > _LONGEST_FRAME or _checksum(received[start:])
+        if available_bytes > _MAX_FRAME_BYTES or _checksum(received_bytes[start:])
         else available_bytes
     )
 

@@ -19,7 +19,7 @@ from rigd.sim import SimulatedRig, StuckReadings
 from rigd.sim.wire._faults import (
     DISTURBANCE_KINDS,
     LINE_KINDS,
-    SERIAL,
+    SERIAL_PSEUDO_ID,
     EventLog,
     Fault,
     FaultError,
@@ -32,9 +32,9 @@ _AVERAGED_SYNCS = 256
 
 A single late SYNC then hardly changes the phase."""
 _OBSTACLE_LEAD_TIME_S = 0.5
-"""Time in seconds until an injected obstacle is present in real time.
+"""Time in seconds from the injection of an obstacle in real time until the obstacle is present.
 
-It is longer than the preparation of the obstacle takes."""
+Preparing the obstacle takes less."""
 _NEW_PHASE_PERIODS = 100
 """Number of periods without SYNC after which the next SYNC may have a new phase (another host)."""
 _LOCK_STEP_WAIT_NS = 5_000_000_000
@@ -47,9 +47,9 @@ _LOCK_STEP_WAIT_NS = 5_000_000_000
 class WallClock:
     """Clock of a simulated rig in real time, whose tick grid follows the received SYNCs.
 
-    A SYNC belongs to the nearest tick, up to half a period earlier or later. A tick without SYNC
-    until half a period later passes without it. The grid follows the mean phase of the last SYNCs,
-    so that it does not need to know when the host's loop started.
+    A SYNC belongs to the nearest tick, at most half a period away. If none has arrived half a
+    period after a tick, the tick passes without SYNC. The grid follows the mean phase of the last
+    SYNCs, so that it does not need to know when the host's loop started.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class WallClock:
 class LockStep:
     """Clock of a simulated rig in lock-step: each SYNC advances it by one period.
 
-    It does not wait for ever. Five seconds after the last SYNC, and at once if no client is
+    The clock does not wait for ever. Five seconds after the last SYNC, or at once if no client is
     connected any more, time continues by the wall clock, so that a drive notices a dead host. Time
     also runs by the wall clock before the first SYNC.
 
@@ -312,14 +312,14 @@ class BusSimulation:
         return self.periods * self._period_s
 
     def wait_s(self, now_ns: int, longest_s: float) -> float:
-        """Return the time in s until something is due without input, at most `longest_s`."""
+        """Return the time in s until an action is due even without input, at most `longest_s`."""
         due_ns = float("inf") if self.clock.is_idle else float(self.clock.due_ns)
         if self._delayed_deliveries and not self._lock_step:
             due_ns = min(due_ns, self._delayed_deliveries[0][0])
         return min(longest_s, max(0.0, (due_ns - now_ns) * 1e-9))
 
     @property
-    def disturbed(self) -> list[str]:
+    def disturbed_senders(self) -> list[str]:
         """Names of the senders whose next frames a fault may affect."""
         return [
             sender_name for sender_name, faulty_line in self._lines.items() if faulty_line.disturbed
@@ -351,7 +351,7 @@ class BusSimulation:
             self._advance_rig()
 
     def receive_frames(self, frames: list[bytes], origin: object, now_ns: int) -> None:
-        """Process frames of a host, in order, that were read at a time in nanoseconds.
+        """Process frames of a host, in order; `now_ns` is the time at which they were read.
 
         Frames that are read together may have been sent at different times: after a pause of this
         process there may be several SYNCs, which were sent a period apart.
@@ -483,9 +483,11 @@ class BusSimulation:
         serial_line = self._lines["sensor"]
         if self._is_streaming and serial_line.disturbed:  # record by record
             for record_offset in range(0, len(data), _RECORD_SIZE):
-                serial_line.send(SERIAL, data[record_offset : record_offset + _RECORD_SIZE])
+                serial_line.send(
+                    SERIAL_PSEUDO_ID, data[record_offset : record_offset + _RECORD_SIZE]
+                )
         else:
-            serial_line.send(SERIAL, data)
+            serial_line.send(SERIAL_PSEUDO_ID, data)
 
     def _deliver_to_serial_host(self, _: int, data: bytes, __: object) -> None:
         """Pass bytes of the simulated sensor to the host, unless the line has dropped them."""
@@ -620,7 +622,8 @@ class BusSimulation:
     def _end_override(self, override: "_AttributeOverride") -> None:
         """End a fault that overrides an attribute of a device.
 
-        The attribute gets the value of the latest remaining fault on it, or its normal value.
+        The attribute gets the value of the latest other fault that overrides it, or else its normal
+        value.
         """
         if override not in self._overrides:  # it was ended before its scheduled end
             return
@@ -662,7 +665,7 @@ class BusSimulation:
         )
 
     def _schedule_delivery(self, delay_s: float, action: Callable[[], None]) -> None:
-        """Deliver a frame after a delay in simulated time, or by the wall clock in real time."""
+        """Deliver a frame after a delay: simulated time in lock-step, otherwise wall-clock time."""
         self._action_count += 1
         now_ns = self.periods * self._period_ns if self._lock_step else self._now_ns
         heapq.heappush(

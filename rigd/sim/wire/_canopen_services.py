@@ -19,7 +19,7 @@ _EMERGENCY_LAYOUT = Struct("<HB5s")
 """Layout of an emergency message: error code, error register, vendor's bytes."""
 _GENERIC_ERROR_BIT = 0x01
 """Generic bit of the error register."""
-_HISTORY_LENGTH = 8
+_ERROR_HISTORY_LENGTH = 8
 """Number of error codes in the error history."""
 
 
@@ -37,7 +37,7 @@ class EmergencyMessages:
 
     Attributes
     ----------
-    active : dict
+    active_errors : dict
         Bits in the error register by active error code.
     """
 
@@ -45,20 +45,20 @@ class EmergencyMessages:
         self, objects: ObjectDictionary, node_id: int, send: Callable[[int, bytes], None]
     ) -> None:
         self._send = send
-        self.active: dict[int, int] = {}
+        self.active_errors: dict[int, int] = {}
         self._history: list[int] = []
-        objects.add(0x1001, Entry("B", access="ro", mapping="t", read_value=self._register))
+        objects.add(0x1001, Entry("B", access="ro", mapping="t", read_value=self._error_register))
         count_entry = Entry(
             "B", read_value=lambda: len(self._history), high=0, after_write=self._history.clear
         )
         objects.add(0x1003, count_entry)
-        for sub in range(1, _HISTORY_LENGTH + 1):
+        for sub in range(1, _ERROR_HISTORY_LENGTH + 1):
             objects.add(0x1003, Entry("I", access="ro", read_value=self._history_reader(sub)), sub)
         self._cob_id = objects.add(0x1014, Entry("I", 0x80 + node_id, check=self._check_cob_id))
 
     def reset(self) -> None:
         """Clear active errors and error history, as at power-on."""
-        self.active.clear()
+        self.active_errors.clear()
         self._history.clear()
 
     def report(self, error_code: int, register_bits: int, vendor_bytes: bytes = b"") -> bool:
@@ -78,32 +78,36 @@ class EmergencyMessages:
         bool
             Whether the error was not active before.
         """
-        if error_code in self.active:
+        if error_code in self.active_errors:
             return False
-        self.active[error_code] = register_bits | _GENERIC_ERROR_BIT
+        self.active_errors[error_code] = register_bits | _GENERIC_ERROR_BIT
         self._history.insert(0, error_code)
-        del self._history[_HISTORY_LENGTH:]
+        del self._history[_ERROR_HISTORY_LENGTH:]
         self._transmit(error_code, vendor_bytes)
         return True
 
     def clear(self, *codes: int) -> None:
-        """Remove errors from the active ones, and send an emergency message if any was active."""
+        """Remove errors from the active errors; send an emergency message if any was active."""
         cleared_codes = [
-            error_code for error_code in codes if self.active.pop(error_code, None) is not None
+            error_code
+            for error_code in codes
+            if self.active_errors.pop(error_code, None) is not None
         ]
         if cleared_codes:
             self._transmit(0, b"")
 
     def _transmit(self, error_code: int, vendor_bytes: bytes) -> None:
         """Send an emergency message of the node, unless object 1014 disables such messages."""
-        if not self._cob_id.value & COB_ID_DISABLED:
-            message_bytes = _EMERGENCY_LAYOUT.pack(error_code, self._register(), vendor_bytes[:5])
+        if not self._cob_id.value & COB_ID_DISABLED_BIT:
+            message_bytes = _EMERGENCY_LAYOUT.pack(
+                error_code, self._error_register(), vendor_bytes[:5]
+            )
             self._send(self._cob_id.value & 0x7FF, message_bytes)
 
-    def _register(self) -> int:
+    def _error_register(self) -> int:
         """Return the error register: the bits of all active errors."""
         error_register = 0
-        for error_bits in self.active.values():
+        for error_bits in self.active_errors.values():
             error_register |= error_bits
         return error_register
 
@@ -121,24 +125,24 @@ class EmergencyMessages:
         """Raise `Abort` if object 1014 may not be set to a value now."""
         present_value = self._cob_id.value
         if new_cob_id & 0x7FFF_F800 or not is_free_id(new_cob_id & 0x7FF):
-            raise Abort(AbortCode.VALUE)
+            raise Abort(AbortCode.INVALID_VALUE)
         if (
-            not (present_value | new_cob_id) & COB_ID_DISABLED
+            not (present_value | new_cob_id) & COB_ID_DISABLED_BIT
             and (present_value ^ new_cob_id) & 0x7FF
         ):
-            raise Abort(AbortCode.STATE)
+            raise Abort(AbortCode.WRONG_STATE)
 
 
 # Heartbeats
 
 DEFAULT_MONITOR_COUNT = 2
-"""Number of heartbeats that a node can monitor, without a device file."""
+"""Number of heartbeats that a node without a device file can monitor."""
 _TIME_TOLERANCE_S = 1e-9
 """Tolerance in seconds for rounding errors of times."""
 
 
 class HeartbeatProducer:
-    """Schedule of the node's own heartbeat, by object 1017."""
+    """Schedule of the node's own heartbeat, whose period is in object 1017."""
 
     def __init__(self, objects: ObjectDictionary) -> None:
         self._period_ms = objects.add(0x1017, Entry("H", after_write=self.restart))
@@ -160,7 +164,9 @@ class HeartbeatProducer:
 
 
 class HeartbeatMonitor:
-    """Monitor of one heartbeat by an entry of object 1016, active after the first heartbeat.
+    """Monitor of another node's heartbeat, which an entry of object 1016 configures.
+
+    The monitor is active after the first heartbeat.
 
     Attributes
     ----------
@@ -220,14 +226,14 @@ def add_heartbeat_monitors(
 
     def check(monitor_entry: Entry, value: int) -> None:
         if value >> 24 or value >> 16 > 0x7F:
-            raise Abort(AbortCode.VALUE)
+            raise Abort(AbortCode.INVALID_VALUE)
         other_nodes = {
             _monitored_node(other_entry.value)
             for other_entry in monitor_entries.values()
             if other_entry is not monitor_entry
         }
         if _monitored_node(value) and _monitored_node(value) in other_nodes:
-            raise Abort(AbortCode.INCOMPATIBLE)
+            raise Abort(AbortCode.INCOMPATIBLE_PARAMETERS)
 
     def restart(monitor: HeartbeatMonitor) -> None:
         monitor.restart()
@@ -243,15 +249,15 @@ def add_heartbeat_monitors(
 
 # PDOs
 
-COB_ID_DISABLED = 0x8000_0000
+COB_ID_DISABLED_BIT = 0x8000_0000
 """Bit in the COB-ID of a PDO or emergency message that disables it."""
 MAX_MAPPING_ENTRIES = 8
 """Largest number of objects in a PDO."""
 _MAX_PDO_BITS = 64
 """Largest length of a PDO in bits."""
-_LAST_SYNC_TYPE = 240
+_MAX_SYNCHRONOUS_TYPE = 240
 """Largest transmission type of a synchronous PDO."""
-_EVENT_TYPES = (254, 255)
+_EVENT_DRIVEN_TYPES = (254, 255)
 """Transmission types of event-driven PDOs."""
 
 
@@ -277,14 +283,15 @@ class Pdo:
     communication, mapping
         Indices of the parameters, such as 1400 and 1600.
     direction
-        "r" or "t", which mapped entries must have in `Entry.mapping`.
+        "r" (received) or "t" (transmitted), which the `Entry.mapping` of mapped objects must
+        contain.
     cob_id
-        COB-ID at power-on, with or without `COB_ID_DISABLED`.
+        COB-ID at power-on, with or without `COB_ID_DISABLED_BIT`.
     default_mapping
         Mapping at power-on; each entry is index << 16 | sub-index << 8 | bits.
     slots
         Largest number of mapped objects.
-    changed
+    on_change
         Function that is called after identifier, type or mapping have changed.
 
     Attributes
@@ -308,10 +315,10 @@ class Pdo:
         cob_id: int,
         default_mapping: tuple[int, ...],
         slots: int,
-        changed: Callable[[], None],
+        on_change: Callable[[], None],
     ) -> None:
         self._objects = objects
-        self._changed = changed
+        self._on_change = on_change
         self._cob_id = Entry("I", cob_id, check=self._check_cob_id, after_write=self._rebuild)
         self._type = Entry("B", 255, check=_check_transmission_type, after_write=self._rebuild)
         self._inhibit = Entry("H", check=self._check_inhibit)
@@ -327,11 +334,6 @@ class Pdo:
             objects.add(mapping, Entry("I", mapping_value, check=self._check_slot), sub)
             for sub, mapping_value in enumerate((default_mapping + (0,) * slots)[:slots], 1)
         ]
-        self.can_id = -1
-        self.size = 0
-        self.entries: list[Entry] = []
-        self._struct = Struct("<")
-        self.reset_exchange()
 
     def compile(self) -> None:
         """Rebuild the PDO's mapping from the object dictionary."""
@@ -342,7 +344,7 @@ class Pdo:
             self.entries = []
         self._struct = Struct("<" + "".join(entry.kind for entry in self.entries))
         self.size = self._struct.size
-        is_enabled = self.entries and not self._cob_id.value & COB_ID_DISABLED
+        is_enabled = self.entries and not self._cob_id.value & COB_ID_DISABLED_BIT
         self.can_id = self._cob_id.value & 0x7FF if is_enabled else -1
         self.reset_exchange()
 
@@ -353,12 +355,12 @@ class Pdo:
     @property
     def is_synchronous(self) -> bool:
         """Whether the PDO is synchronous with SYNC."""
-        return self._type.value <= _LAST_SYNC_TYPE
+        return self._type.value <= _MAX_SYNCHRONOUS_TYPE
 
     def _rebuild(self) -> None:
         """Rebuild the mapping after a parameter was written, and report the change."""
         self.compile()
-        self._changed()
+        self._on_change()
 
     def _mapped_entry(self, mapping_value: int) -> Entry:
         """Return the entry of the dictionary that a mapping entry names.
@@ -375,34 +377,34 @@ class Pdo:
 
     def _check_cob_id(self, new_cob_id: int) -> None:
         """Raise `Abort` if the PDO's COB-ID may not be set to a value now."""
-        was_enabled = not self._cob_id.value & COB_ID_DISABLED
+        was_enabled = not self._cob_id.value & COB_ID_DISABLED_BIT
         if new_cob_id & 0x3FFF_F800 or not is_free_id(new_cob_id & 0x7FF):
-            raise Abort(AbortCode.VALUE)
+            raise Abort(AbortCode.INVALID_VALUE)
         if (
             was_enabled
-            and not new_cob_id & COB_ID_DISABLED
+            and not new_cob_id & COB_ID_DISABLED_BIT
             and (new_cob_id ^ self._cob_id.value) & 0x7FF
         ):
-            raise Abort(AbortCode.STATE)
+            raise Abort(AbortCode.WRONG_STATE)
 
     def _check_inhibit(self, new_time: int) -> None:  # noqa: ARG002
         """Raise `Abort` if the PDO's inhibit time may not be set to a value now."""
-        if not self._cob_id.value & COB_ID_DISABLED:
-            raise Abort(AbortCode.STATE)
+        if not self._cob_id.value & COB_ID_DISABLED_BIT:
+            raise Abort(AbortCode.WRONG_STATE)
 
     def _check_slot(self, new_entry: int) -> None:
         """Raise `Abort` if a mapping entry of the PDO may not be set to a value now."""
-        if not self._cob_id.value & COB_ID_DISABLED or self._count.value:
-            raise Abort(AbortCode.STATE)
+        if not self._cob_id.value & COB_ID_DISABLED_BIT or self._count.value:
+            raise Abort(AbortCode.WRONG_STATE)
         if new_entry:
             self._mapped_entry(new_entry)
 
     def _check_count(self, new_count: int) -> None:
         """Raise `Abort` if the number of mapped objects may not be set to a value now."""
-        if not self._cob_id.value & COB_ID_DISABLED:
-            raise Abort(AbortCode.STATE)
+        if not self._cob_id.value & COB_ID_DISABLED_BIT:
+            raise Abort(AbortCode.WRONG_STATE)
         if new_count > len(self._slots):
-            raise Abort(AbortCode.PDO_LENGTH)
+            raise Abort(AbortCode.PDO_TOO_LONG)
         if (
             sum(
                 self._mapped_entry(mapping_slot.value).bits
@@ -410,7 +412,7 @@ class Pdo:
             )
             > _MAX_PDO_BITS
         ):
-            raise Abort(AbortCode.PDO_LENGTH)
+            raise Abort(AbortCode.PDO_TOO_LONG)
 
 
 class ReceivePdo(Pdo):
@@ -465,9 +467,9 @@ class TransmitPdo(Pdo):
         ]
 
     def reset_exchange(self) -> None:
-        """Reset what was sent, as on entering operational, so that the next event sends the PDO."""
+        """Forget the data sent before, as on entering operational; the next event sends the PDO."""
         self._syncs = 0
-        self._last: bytes | None = None
+        self._last_data: bytes | None = None
         self._sent_s = -math.inf
 
     def build(self) -> bytes:
@@ -490,13 +492,13 @@ class TransmitPdo(Pdo):
         return self._data_by_transmission_type()
 
     def _data_by_transmission_type(self) -> bytes | None:
-        """Return the data to send at a SYNC by the PDO's transmission type, or None for no PDO."""
+        """Return the data that the transmission type requires to send at a SYNC, or None."""
         transmission_type = self._type.value
         if transmission_type == 1:
             return self.build()
         if transmission_type == 0:
             pdo_data = self.build()
-            has_changed, self._last = pdo_data != self._last, pdo_data
+            has_changed, self._last_data = pdo_data != self._last_data, pdo_data
             return pdo_data if has_changed else None
         self._syncs += 1
         if self._syncs < transmission_type:
@@ -505,20 +507,24 @@ class TransmitPdo(Pdo):
         return self.build()
 
     def data_at_event(self, now_s: float) -> bytes | None:
-        """Return the data to send because values have changed or the timer has expired, or None."""
+        """Return the data to send if a value has changed or the timer has expired, else None."""
         pdo_data = self.build()
         age_s = now_s - self._sent_s
         timer_s = 1e-3 * self._timer.value
         is_due = timer_s > 0 and age_s >= timer_s - 1e-9
         is_inhibited = age_s < 1e-4 * self._inhibit.value - 1e-9
-        if self._last is not None and not is_due and (pdo_data == self._last or is_inhibited):
+        if (
+            self._last_data is not None
+            and not is_due
+            and (pdo_data == self._last_data or is_inhibited)
+        ):
             return None
-        self._last = pdo_data
+        self._last_data = pdo_data
         self._sent_s = now_s
         return pdo_data
 
 
 def _check_transmission_type(new_type: int) -> None:
     """Raise `Abort` if a value is not a supported transmission type of a PDO."""
-    if new_type > _LAST_SYNC_TYPE and new_type not in _EVENT_TYPES:
-        raise Abort(AbortCode.VALUE)
+    if new_type > _MAX_SYNCHRONOUS_TYPE and new_type not in _EVENT_DRIVEN_TYPES:
+        raise Abort(AbortCode.INVALID_VALUE)

@@ -15,7 +15,7 @@ from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 from rigd.sim import SimulatedRig
 from rigd.sim.wire._canopen_services import (
-    COB_ID_DISABLED,
+    COB_ID_DISABLED_BIT,
     DEFAULT_MONITOR_COUNT,
     MAX_MAPPING_ENTRIES,
     EmergencyMessages,
@@ -44,8 +44,8 @@ Log = Callable[..., None]
 SYNC_TIMEOUT_PERIODS = 30
 """Default number of periods without a SYNC after which a drive in operation goes to fault.
 
-It is more than a host may omit by its profile, and less than the host's heartbeat timeout. Real
-drives have values from 2 upwards."""
+A host whose profile lets it omit SYNCs omits fewer, and the host's heartbeat timeout is longer.
+Real drives have values from 2 upwards."""
 
 # Error codes of CiA 301 and 402.
 _CONNECTION_ENDED_CODE = 0x8100
@@ -73,12 +73,12 @@ _WARNING_BIT, _TARGET_REACHED_BIT, _INTERNAL_LIMIT_BIT, _FOLLOWS_TARGET_BIT = (
 )
 _HALT_BIT = 0x0100
 """Controlword bit that halts the motor."""
-_UNCHANGED_OPERATION = 0x8F, 0x0F
+_UNCHANGED_OPERATION_BITS = 0x8F, 0x0F
 """Mask and value of a controlword that changes nothing in operation enabled."""
 
 _LAST_COMMUNICATION_INDEX, _LAST_INDEX = 0x1FFF, 0xFFFF
 _DEFAULT_PDO_COUNT = 4
-"""Number of PDOs per direction, without a device file."""
+"""Number of PDOs per direction of a drive without a device file."""
 _LAST_PDO_OFFSET = 0x1FF
 """Largest offset of a PDO's index from that of the first PDO."""
 _TIME_TOLERANCE_S = 1e-9
@@ -376,7 +376,7 @@ class DriveNode:
         self._log("nmt", state=new_state.name.lower().replace("_", "-"))
 
     def _end_connection(self) -> None:
-        """Leave operation enabled before the NMT state changes, as the abort option says."""
+        """Leave operation enabled before the NMT state changes, as the abort option (6007) says."""
         if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
         abort_option = self._entries.abort_option.value
@@ -397,7 +397,7 @@ class DriveNode:
                 self._report(_SYNC_LENGTH_CODE, _COMMUNICATION_ERROR_BIT, bytes([len(data)]))
             return
         if is_operational:
-            if self._emergencies.active:
+            if self._emergencies.active_errors:
                 self._clear(_SYNC_LENGTH_CODE)
             self._last_sync_s = self._now_s
             is_first_sync, self._sync_alive = not self._sync_alive, True
@@ -436,7 +436,7 @@ class DriveNode:
         if len(data) > pdo.size:  # the first bytes are used (CiA 301)
             self._report(_PDO_TOO_LONG_CODE, _COMMUNICATION_ERROR_BIT, bytes([len(data), pdo.size]))
             data = data[: pdo.size]
-        elif self._emergencies.active:
+        elif self._emergencies.active_errors:
             self._clear(_PDO_TOO_SHORT_CODE, _PDO_TOO_LONG_CODE)
         pdo.received_s = self._now_s
         if pdo.is_synchronous:
@@ -456,7 +456,7 @@ class DriveNode:
         for heartbeat_monitor in self._heartbeat_monitors:
             if heartbeat_monitor.node_id == node_id:
                 heartbeat_monitor.register_heartbeat(self._now_s)
-        if self._emergencies.active:
+        if self._emergencies.active_errors:
             self._clear_heartbeat_error()
 
     def _transmit(self, can_id: int, data: bytes) -> None:
@@ -498,7 +498,7 @@ class DriveNode:
     # Watchdogs and errors ----------------------------------------------------------------------
 
     def _check_heartbeats(self, now_s: float) -> None:
-        """React to heartbeats that have just been lost, as the options in the dictionary say."""
+        """React to heartbeats that have just been lost, as objects 6007 and 1029:1 prescribe."""
         for heartbeat_monitor in self._heartbeat_monitors:
             if not heartbeat_monitor.check(now_s):
                 continue
@@ -553,7 +553,7 @@ class DriveNode:
             self._clear(_HEARTBEAT_LOST_CODE)
 
     def _has_all_heartbeats(self) -> bool:
-        """Return whether no missing heartbeat forbids operation."""
+        """Return whether no heartbeat is missing, or object 6007 ignores missing heartbeats."""
         return not (
             self._entries.abort_option.value
             and any(heartbeat_monitor.lost for heartbeat_monitor in self._heartbeat_monitors)
@@ -598,7 +598,7 @@ class DriveNode:
     def _on_controlword(self) -> None:
         """Process a changed controlword."""
         controlword = self._entries.controlword.value
-        operation_mask, unchanged_value = _UNCHANGED_OPERATION
+        operation_mask, unchanged_value = _UNCHANGED_OPERATION_BITS
         if (
             self._state_machine.state is not PdsState.OPERATION_ENABLED
             or controlword & operation_mask != unchanged_value
@@ -633,10 +633,10 @@ class DriveNode:
                 if any(heartbeat_monitor.lost for heartbeat_monitor in self._heartbeat_monitors)
                 else set()
             )
-            self._emergencies.clear(*(self._emergencies.active.keys() - remaining_codes))
+            self._emergencies.clear(*(self._emergencies.active_errors.keys() - remaining_codes))
 
     def _refresh_torque(self) -> None:
-        """Pass the torque that follows from the dictionary to the plant, if it has changed."""
+        """Compute the torque from the object dictionary; pass a changed torque to the plant."""
         if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
         drive_entries = self._entries
@@ -688,7 +688,10 @@ class DriveNode:
                 statusword |= _INTERNAL_LIMIT_BIT
         elif pds_state is PdsState.QUICK_STOP and self._is_at_rest():
             statusword |= _TARGET_REACHED_BIT
-        if self._emergencies.active and pds_state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
+        if self._emergencies.active_errors and pds_state not in (
+            PdsState.FAULT,
+            PdsState.FAULT_REACTION,
+        ):
             statusword |= _WARNING_BIT
         return statusword
 
@@ -721,10 +724,11 @@ class DriveNode:
 def _pdo_parameters(
     communication: int, cob_id: int, first_mapped_index: int, file: "DeviceFile | None"
 ) -> Iterator[tuple[int, int, int, tuple[int, ...], int]]:
-    """Yield index of parameters and mapping, COB-ID, mapping and number of slots of each PDO.
+    """Yield the properties of each PDO: two indices, COB-ID, mapping entries, number of slots.
 
-    By default the first PDO carries one object of 16 bits, the others none. With a device file, the
-    PDOs are those of the file. Only the first four have predefined identifiers.
+    The indices are those of the communication and mapping parameters. By default the first PDO
+    carries one object of 16 bits, the others none. With a device file, the PDOs are those of the
+    file. Only the first four have predefined identifiers.
     """
     pdo_numbers: Iterable[int] = range(_DEFAULT_PDO_COUNT)
     if file is not None:
@@ -737,7 +741,7 @@ def _pdo_parameters(
         yield (
             communication + pdo_number,
             mapping_index,
-            default_cob_id | (COB_ID_DISABLED if pdo_number else 0),
+            default_cob_id | (COB_ID_DISABLED_BIT if pdo_number else 0),
             default_mapping,
             slot_count,
         )

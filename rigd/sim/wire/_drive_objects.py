@@ -36,7 +36,7 @@ _SWITCH_ON_BIT, _ENABLE_VOLTAGE_BIT, _NO_QUICK_STOP_BIT, _ENABLE_OPERATION_BIT =
 _FAULT_RESET_BIT = 0x80
 """Controlword bit whose rise resets a fault."""
 
-_FIRST_STAYING_OPTION = 5
+_MIN_STAYING_STOP_OPTION = 5
 """Smallest value of object 605A for which the drive stays in quick stop active."""
 
 
@@ -159,7 +159,7 @@ class PdsStateMachine:
             return
         if self.state is PdsState.FAULT_REACTION:
             self._enter(PdsState.FAULT)
-        elif self._quick_stop_option.value < _FIRST_STAYING_OPTION:
+        elif self._quick_stop_option.value < _MIN_STAYING_STOP_OPTION:
             self._enter(PdsState.SWITCH_ON_DISABLED)
 
     def _shut_down(self, reset_bit: int) -> None:
@@ -184,7 +184,7 @@ class PdsStateMachine:
             self._enter(PdsState.SWITCHED_ON)
         is_quick_stopped = (
             self.state is PdsState.QUICK_STOP
-            and self._quick_stop_option.value >= _FIRST_STAYING_OPTION
+            and self._quick_stop_option.value >= _MIN_STAYING_STOP_OPTION
         )
         if (
             enable_bit
@@ -301,7 +301,7 @@ def add_drive_objects(
     rate_hz: float,
     resolution_rad: float,
 ) -> DriveObjects:
-    """Add the drive's objects with their values at power-on; return those that the drive uses."""
+    """Add the drive's objects to a dictionary; return the entries that the simulation uses."""
 
     def add(object_index: int, entry: Entry) -> Entry:
         return objects.add(object_index, entry)
@@ -319,9 +319,9 @@ def add_drive_objects(
 
     def check_overflow(written_value: int) -> None:
         if written_value == 1 or written_value > 240:
-            raise Abort(AbortCode.VALUE)
+            raise Abort(AbortCode.INVALID_VALUE)
         if sync_period_us.value:
-            raise Abort(AbortCode.STATE)
+            raise Abort(AbortCode.WRONG_STATE)
 
     sync_overflow = add(0x1019, Entry("B", check=check_overflow))
     communication_error = Entry("B", high=2)
@@ -337,7 +337,7 @@ def add_drive_objects(
         if written_value != NO_MODE and not (
             written_value > 0 and supported_modes.value >> (written_value - 1) & 1
         ):
-            raise Abort(AbortCode.VALUE)
+            raise Abort(AbortCode.INVALID_VALUE)
 
     gear_ratio = Fraction(drive.gear_ratio).limit_denominator(_LARGEST_GEAR_REVOLUTIONS)
     increments_per_turns = round(
@@ -385,9 +385,9 @@ def add_drive_objects(
 def adopt_device_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
     """Restrict the dictionary to the objects of a drive's file, with their values at power-on.
 
-    Values that the file does not state remain as without a file: rated torque, limits of zero, and
-    identity. If the file does not state the supported modes, cyclic synchronous torque is assumed
-    if the file has a target torque.
+    Rated torque, gear, encoder, limits that the file states as zero, and an identity that it does
+    not state remain as without a file. If the file does not state the supported modes, cyclic
+    synchronous torque is assumed, provided that the file has a target torque.
 
     Raises
     ------
@@ -423,10 +423,10 @@ def _check_sync_id(sync_id: int) -> None:
     """Raise `Abort` if an identifier cannot be used for SYNC."""
     # Bit 30 would make the drive the producer of SYNC, bit 29 would mean an identifier of 29 bits.
     if sync_id > 0x7FF or not is_free_id(sync_id):
-        raise Abort(AbortCode.VALUE)
+        raise Abort(AbortCode.INVALID_VALUE)
 
 
 def _check_quick_stop(stop_option: int) -> None:
     """Raise `Abort` if a quick stop option is not supported."""
     if stop_option not in _QUICK_STOP_OPTIONS:
-        raise Abort(AbortCode.VALUE)
+        raise Abort(AbortCode.INVALID_VALUE)

@@ -25,12 +25,12 @@ class WrongUseError(UserError, ValueError):
 
 # Specification of a fault
 
-Value = int | float | str
+FaultValue = int | float | str
 """Value of a fault's key."""
 Deliver = Callable[[int, bytes, object], None]
 """Function that delivers a frame: identifier, data and origin."""
 
-SERIAL = -1
+SERIAL_PSEUDO_ID = -1
 """Pseudo-identifier of data on a serial line."""
 
 
@@ -42,11 +42,11 @@ class FaultError(WrongUseError):
 class _FaultKey:
     """Key of a fault: its parser, its allowed values and its default."""
 
-    read: Callable[[str], Value]
+    read: Callable[[str], FaultValue]
     """Function that parses the value, or raises ValueError."""
     allowed_text: str
     """Description of the allowed values, for error messages."""
-    default: Value | None = None
+    default: FaultValue | None = None
     """Value if the key is omitted; None: the key is then absent."""
     is_required: bool = False
     """Whether the key must be given."""
@@ -65,7 +65,7 @@ def _integer_key(low: int, high: int, **key_options: Any) -> _FaultKey:  # noqa:
 
 
 def _positive_number_key(**key_options: Any) -> _FaultKey:  # noqa: ANN401 - passed on
-    """Describe a key of the fault description whose value must be a number above 0."""
+    """Return a key whose value is a number above 0."""
 
     def read(text: str) -> float:
         parsed_number = float(text)
@@ -168,7 +168,7 @@ class Fault:
 
     kind: str
     """Kind of the fault, one of :data:`KINDS`."""
-    values: Mapping[str, Value]
+    values: Mapping[str, FaultValue]
     """Values by key; an omitted key without default is absent."""
     after_s: float | None = None
     """Time in seconds from the first enabling of the drive to the fault; None: at once."""
@@ -203,14 +203,14 @@ def parse_fault(spec: str) -> Fault:
     >>> parse_fault("drop,from=drive,frames=3@10").kind
     'drop'
     """
-    fault_text, at, time_text = spec.partition("@")
+    fault_text, at_sign, time_text = spec.partition("@")
     fault_kind, *assignments = (assignment.strip() for assignment in fault_text.split(","))
     if fault_kind not in KINDS:
         raise FaultError(
             _error_message(spec, f"unknown fault '{fault_kind}'; choose {', '.join(KINDS)}")
         )
     allowed_keys = KINDS[fault_kind]
-    fault_values: dict[str, Value] = {}
+    fault_values: dict[str, FaultValue] = {}
     for assignment in assignments:
         key, _, value_text = assignment.partition("=")
         if key not in allowed_keys:
@@ -236,7 +236,7 @@ def parse_fault(spec: str) -> Fault:
             )
         if fault_key.default is not None and not (key_name == "frames" and "bytes" in fault_values):
             fault_values.setdefault(key_name, fault_key.default)
-    fault = Fault(fault_kind, fault_values, _parse_start_time(spec, time_text) if at else None)
+    fault = Fault(fault_kind, fault_values, _parse_start_time(spec, time_text) if at_sign else None)
     if fault_kind in DISTURBANCE_KINDS:
         try:
             disturbance_of(fault, 0.0)
@@ -248,7 +248,7 @@ def parse_fault(spec: str) -> Fault:
 
 
 def disturbance_of(fault: Fault, now_s: float) -> Disturbance:
-    """Return the obstacle or impact of a fault, which begins now.
+    """Return the obstacle or impact that a fault describes, beginning at `now_s`.
 
     Parameters
     ----------
@@ -282,13 +282,13 @@ def _parse_start_time(spec: str, text: str) -> float:
     return start_s
 
 
-def _format_value(key: str, value: Value) -> str:
+def _format_value(key: str, value: FaultValue) -> str:
     """Format the value of a fault's key."""
     return f"{value:#x}" if key in ("id", "code", "bits") else f"{value}"
 
 
 def _error_message(spec: str, reason: str) -> str:
-    """Return the message for a wrong text of a fault: the text and what is wrong."""
+    """Return the message for a text that describes no valid fault: the text and the reason."""
     return f"Fault '{spec}': {reason}."
 
 
@@ -302,16 +302,18 @@ class _ActiveFault:
         fault_values = fault.values
         self.kind = fault.kind
         self.can_id = fault_values.get("id")
-        self.in_bytes = "bytes" in fault_values
-        self.remaining = int(fault_values["bytes"] if self.in_bytes else fault_values["frames"])
+        self.counts_bytes = "bytes" in fault_values
+        self.remaining_count = int(
+            fault_values["bytes"] if self.counts_bytes else fault_values["frames"]
+        )
         self.delay_s = float(fault_values.get("ms", 0)) * 1e-3
-        self.byte = int(fault_values.get("byte", 0))
+        self.byte_index = int(fault_values.get("byte", 0))
 
     def matches(self, can_id: int, data: bytes) -> bool:
         """Return whether the fault acts on a frame with this identifier and data."""
         if self.can_id is not None and self.can_id != can_id:
             return False
-        return self.kind != "corrupt" or self.byte < len(data)
+        return self.kind != "corrupt" or self.byte_index < len(data)
 
 
 class FaultyLine:
@@ -384,23 +386,23 @@ class FaultyLine:
 
     def _disturb(self, fault: _ActiveFault, can_id: int, data: bytes, origin: object) -> None:
         """Apply a fault to a frame: drop, delay, corrupt or hold it, and log it."""
-        affected_bytes = min(fault.remaining, len(data)) if fault.in_bytes else 1
-        fault.remaining -= affected_bytes
-        if fault.remaining == 0:
+        affected_bytes = min(fault.remaining_count, len(data)) if fault.counts_bytes else 1
+        fault.remaining_count -= affected_bytes
+        if fault.remaining_count == 0:
             self._active_faults.remove(fault)
-        logged_identifier = {} if can_id == SERIAL else {"can_id": can_id}
+        logged_identifier = {} if can_id == SERIAL_PSEUDO_ID else {"can_id": can_id}
         self._log(
             "simulator", fault.kind, sender=self._sender, data=data.hex(), **logged_identifier
         )
         if fault.kind == "delay":
             self._postpone(fault.delay_s, lambda: self._deliver(can_id, data, origin))
         elif fault.kind == "corrupt":
-            corrupted_byte = data[fault.byte] ^ 0xFF
-            data = data[: fault.byte] + bytes([corrupted_byte]) + data[fault.byte + 1 :]
+            corrupted_byte = data[fault.byte_index] ^ 0xFF
+            data = data[: fault.byte_index] + bytes([corrupted_byte]) + data[fault.byte_index + 1 :]
             self._deliver(can_id, data, origin)
         elif fault.kind == "reorder":
             self._held_frames.append((can_id, data, origin))
-        elif fault.in_bytes and affected_bytes < len(data):
+        elif fault.counts_bytes and affected_bytes < len(data):
             self._deliver(can_id, data[affected_bytes:], origin)
 
 
@@ -473,7 +475,10 @@ class EventLog:
                 log_file.close()
 
     def discard(self) -> None:
-        """Close and remove the log file, since nothing was simulated; a pipe or device remains."""
+        """Close and remove the log file of a simulation that did not start.
+
+        A pipe or device is not removed.
+        """
         self.close()
         if self._path is not None and self._path.is_file():
             self._path.unlink()

@@ -23,15 +23,15 @@ from rigd.devices.parameters import RigParameters
 
 
 def without_transport_delay(rig: RigParameters) -> RigParameters:
-    """Return the rig with the delays that remain to be simulated in addition to the exchange.
+    """Return a rig's parameters without the part of its delays that the exchange itself causes.
 
-    If replies are used one tick later, the exchange itself causes one period of the delays in the
-    profile. :class:`rigd.sim._devices.SimulatedRig` subtracts the decimating filter's delay.
+    If replies are used one tick later, this part is one period; otherwise it is zero.
+    :class:`rigd.sim._devices.SimulatedRig` subtracts the decimating filter's delay.
 
     Raises
     ------
     DeviceError
-        If a delay in the profile is shorter than the exchange takes.
+        If a delay in the profile is shorter than the part that the exchange causes.
     """
     if rig.acquisition is None or rig.acquisition.mode == "same_tick":
         return rig
@@ -81,8 +81,8 @@ class _LinkConnection:
     def __init__(self, link: socket.socket, number: int) -> None:
         self.link = link
         self.number = number
-        self.received = b""
-        self.unsent = b""
+        self.received_bytes = b""
+        self.unsent_bytes = b""
 
 
 class VirtualBus:
@@ -170,9 +170,11 @@ class VirtualBus:
         if not received_bytes:
             self._drop(client)
             return
-        pending_bytes = client.received + received_bytes if client.received else received_bytes
+        pending_bytes = (
+            client.received_bytes + received_bytes if client.received_bytes else received_bytes
+        )
         complete_size = len(pending_bytes) - len(pending_bytes) % FRAME_SIZE
-        client.received = pending_bytes[complete_size:]
+        client.received_bytes = pending_bytes[complete_size:]
         self._on_frames(
             [pending_bytes[i : i + FRAME_SIZE] for i in range(0, complete_size, FRAME_SIZE)], client
         )
@@ -181,16 +183,18 @@ class VirtualBus:
         """Send a frame to a client, after unsent bytes of the previous frame; count lost frames."""
         # The rest of a frame has to be sent before the next one, or all later frames are
         # misaligned.
-        if client.unsent:
-            client.unsent = client.unsent[_send_without_blocking(client.link, client.unsent) :]
-            if client.unsent:
+        if client.unsent_bytes:
+            client.unsent_bytes = client.unsent_bytes[
+                _send_without_blocking(client.link, client.unsent_bytes) :
+            ]
+            if client.unsent_bytes:
                 self.lost += 1
                 return
         sent_bytes = _send_without_blocking(client.link, frame)
         if sent_bytes == 0:
             self.lost += 1
         elif sent_bytes < len(frame):
-            client.unsent = frame[sent_bytes:]
+            client.unsent_bytes = frame[sent_bytes:]
 
     def _drop(self, client: _LinkConnection) -> None:
         """Close the connection of a client."""
@@ -307,7 +311,7 @@ def listen(path: Path) -> socket.socket:
 
 
 def is_virtual(interface_name: str) -> bool:
-    """Return whether a network interface is a CAN bus without hardware.
+    """Return whether a network interface is a virtual CAN bus; False if it does not exist.
 
     Raises
     ------

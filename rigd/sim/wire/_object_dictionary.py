@@ -24,18 +24,18 @@ _MAX_TEXT_BYTES = 1024
 class AbortCode(IntEnum):
     """SDO abort code, which states why an access failed."""
 
-    TOGGLE = 0x0503_0000
-    COMMAND = 0x0504_0001
+    WRONG_TOGGLE = 0x0503_0000
+    UNKNOWN_COMMAND = 0x0504_0001
     WRITE_ONLY = 0x0601_0001
     READ_ONLY = 0x0601_0002
     NO_OBJECT = 0x0602_0000
     NOT_MAPPABLE = 0x0604_0041
-    PDO_LENGTH = 0x0604_0042
-    INCOMPATIBLE = 0x0604_0043
-    LENGTH = 0x0607_0010
+    PDO_TOO_LONG = 0x0604_0042
+    INCOMPATIBLE_PARAMETERS = 0x0604_0043
+    WRONG_LENGTH = 0x0607_0010
     NO_SUB_INDEX = 0x0609_0011
-    VALUE = 0x0609_0030
-    STATE = 0x0800_0022
+    INVALID_VALUE = 0x0609_0030
+    WRONG_STATE = 0x0800_0022
     NO_DATA = 0x0800_0024
 
 
@@ -142,14 +142,14 @@ class Entry:
         self._set_range(self.low, self.high)
 
     def adopt_description(self, description: EntryDescription, default: int | None) -> None:
-        """Adopt type, access, mapping and limits from a device's file.
+        """Take over type, access, mapping and limits from a device's file.
 
-        The functions that read, check and react to the value remain.
+        The functions that read the value, check it and react to it remain.
 
         Parameters
         ----------
         description
-            Description in the file, of an integer as this entry.
+            Description in the file, which like this entry must be an integer's.
         default
             New value at power-on; None leaves it unchanged.
         """
@@ -206,7 +206,7 @@ class Entry:
             If the value is outside the range, or not allowed now.
         """
         if not self._low <= received_integer <= self._high:
-            raise Abort(AbortCode.VALUE)
+            raise Abort(AbortCode.INVALID_VALUE)
         if self.check is not None:
             self.check(received_integer)
         self.value = received_integer
@@ -229,7 +229,7 @@ class Entry:
             If the number of bytes is wrong, or the value is not allowed.
         """
         if not self.accepts_length(len(data)):
-            raise Abort(AbortCode.LENGTH)
+            raise Abort(AbortCode.WRONG_LENGTH)
         if self.kind == "s":
             self.text = data
             return data.hex()
@@ -247,7 +247,7 @@ def _type_range(type_letter: str) -> tuple[int, int]:
 
 
 def _clamped_value(read_value: Callable[[], int], lowest: int, largest: int) -> int:
-    """Return a read value, limited to a range."""
+    """Call `read_value`, and return its result limited to the range `lowest` to `largest`."""
     return min(max(read_value(), lowest), largest)
 
 
@@ -276,10 +276,10 @@ class ObjectDictionary:
     def adopt_file_entries(
         self, file: Mapping[tuple[int, int], EntryDescription], unchanged_indices: Container[int]
     ) -> None:
-        """Restrict the dictionary to the entries of a device's file, and adopt their descriptions.
+        """Restrict the dictionary to the entries in a device's file, with the file's descriptions.
 
-        Entries that are integers in both retain their function. The other entries of the file only
-        store values.
+        Entries that are integers in dictionary and file retain their functions. All other entries
+        of the file only store values.
 
         Parameters
         ----------
@@ -302,7 +302,7 @@ class ObjectDictionary:
             self.add(index, adopted_entry, sub)
 
     def override_entry(self, index: int, sub: int, value: int | None) -> None:
-        """Set the value of an entry, also at power-on; None removes the entry.
+        """Set the present value and the power-on value of an entry; None removes the entry.
 
         An entry that does not exist is added.
         """
@@ -447,7 +447,7 @@ class SdoServer:
             elif specifier == _UPLOAD:
                 self._start_upload()
             elif specifier != _ABORTED:  # block transfers and invalid specifiers
-                raise Abort(AbortCode.COMMAND)
+                raise Abort(AbortCode.UNKNOWN_COMMAND)
         except Abort as abort:
             self._reply(_SDO_ABORT.pack(0x80, self._index, self._sub, abort.code))
             self.reset()
@@ -465,7 +465,7 @@ class SdoServer:
             # An integer has one length, so the segments need not be compared with this length.
             stated_size = int.from_bytes(data[4:8], "little")
             if command_byte & _SIZE_STATED_BIT and not target_entry.accepts_length(stated_size):
-                raise Abort(AbortCode.LENGTH)
+                raise Abort(AbortCode.WRONG_LENGTH)
             self._expected_specifier = _DOWNLOAD_SEGMENT
         self._reply(_SDO_HEADER.pack(0x60, self._index, self._sub).ljust(8, b"\0"))
 
@@ -489,9 +489,9 @@ class SdoServer:
         """Process the request for the next segment: store or send it."""
         command_byte = data[0]
         if specifier != self._expected_specifier:
-            raise Abort(AbortCode.COMMAND)
+            raise Abort(AbortCode.UNKNOWN_COMMAND)
         if command_byte & _TOGGLE_BIT != self._toggle:
-            raise Abort(AbortCode.TOGGLE)
+            raise Abort(AbortCode.WRONG_TOGGLE)
         toggle_bit, self._toggle = self._toggle, self._toggle ^ _TOGGLE_BIT
         if specifier == _UPLOAD_SEGMENT:
             segment_bytes, self._buffer = self._buffer[:_SEGMENT_SIZE], self._buffer[_SEGMENT_SIZE:]
@@ -506,7 +506,7 @@ class SdoServer:
             self._buffer += data[1 : 1 + _SEGMENT_SIZE - (command_byte >> 1 & 0x07)]
             # No writable entry is longer. Without this check a client could fill the memory.
             if len(self._buffer) > self._objects.find_writable(self._index, self._sub).max_bytes:
-                raise Abort(AbortCode.LENGTH)
+                raise Abort(AbortCode.WRONG_LENGTH)
             is_last = bool(command_byte & _LAST_SEGMENT_BIT)
             if is_last:
                 self._write(self._buffer)
@@ -526,7 +526,7 @@ _FIRST_INDEX = 0x1000
 _IDENTITY_INDEX = 0x1018
 """Index of the identity object."""
 _HEARTBEAT_CONSUMER_INDEX, _NODE_ID_UNIT = 0x1016, 0x1_0000
-"""Index of the consumer heartbeat time."""
+"""Index of the consumer heartbeat time, and value in its entries per unit of the node number."""
 
 _BOOLEAN_TYPE: Final = 0x01
 """Data type (CiA 301) of a boolean."""
@@ -548,7 +548,7 @@ _TIME_TYPE_LENGTHS: Final = {0x0C: 6, 0x0D: 6}
 _SDO_ACCESS: Final = {"const": "ro", "rwr": "rw", "rww": "rw"}
 """Access right by SDO for an access right in a file that also concerns PDOs."""
 _PDO_DIRECTIONS: Final = {"ro": "t", "const": "t", "wo": "r", "rwr": "t", "rww": "r"}
-"""Kinds of PDO into which an object of an access right can be mapped."""
+"""Kinds of PDO into which an object can be mapped, by its access right."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from rigd.devices.running_simulator import (
     ask_simulator,
     described,
     find_simulator,
-    forget,
+    remove_address_file,
 )
 from rigd.runtime.addresses import runtime_folder
 from rigd.sim import SimulatedRig
@@ -58,7 +58,7 @@ __all__ = [
     "run_simulator",
 ]
 
-_LONGEST_SOCKET_NAME = 107
+_MAX_SOCKET_NAME_BYTES = 107
 """Longest name of a Unix socket in bytes."""
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that end the simulator."""
@@ -92,15 +92,15 @@ def reserve_rig_name(rig_name: str) -> Iterator[None]:
                 "it first, or use that one."
             ) from None
         # Remove the address file of a dead simulator first: it names the sockets to be created.
-        forget(rig_name)
+        remove_address_file(rig_name)
         yield
 
 
 @contextmanager
 def socket_folder(rig_name: str) -> Iterator[Path]:
-    """Yield a folder for the sockets whose name is short enough; it may be temporary."""
+    """Yield a folder whose path is short enough for sockets in it; temporary if necessary."""
     runtime_path = runtime_folder()
-    if len(os.fsencode(runtime_path / f"{rig_name}.control")) <= _LONGEST_SOCKET_NAME:
+    if len(os.fsencode(runtime_path / f"{rig_name}.control")) <= _MAX_SOCKET_NAME_BYTES:
         yield runtime_path
         return
     with tempfile.TemporaryDirectory(prefix="rigd-", dir="/tmp") as short_folder:
@@ -138,7 +138,7 @@ def stop_requested() -> Iterator[Callable[[], bool]]:
 RequestHandler = Callable[[dict[str, Any]], dict[str, Any]]
 """Function that returns the reply to a request."""
 
-_LONGEST_REQUEST = 65_536
+_MAX_REQUEST_BYTES = 65_536
 """Longest request in bytes."""
 
 
@@ -182,7 +182,7 @@ class ControlSocket:
     def _receive(self, client_socket: socket.socket) -> None:
         """Receive bytes of a client, and reply to each complete line with a request."""
         try:
-            received_bytes = client_socket.recv(_LONGEST_REQUEST)
+            received_bytes = client_socket.recv(_MAX_REQUEST_BYTES)
         except BlockingIOError:
             return
         except OSError:
@@ -190,7 +190,7 @@ class ControlSocket:
         *complete_lines, incomplete_line = (self._links[client_socket] + received_bytes).split(
             b"\n"
         )
-        if not received_bytes or len(incomplete_line) > _LONGEST_REQUEST:
+        if not received_bytes or len(incomplete_line) > _MAX_REQUEST_BYTES:
             self._drop(client_socket)
             return
         self._links[client_socket] = incomplete_line
@@ -274,7 +274,7 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
         If the profile cannot be simulated on a bus or has unknown values, a fault is not possible
         on this rig, or the log file exists.
     DeviceError
-        If its simulated rig is already running, or if sockets or files cannot be created.
+        If another process already simulates this rig, or sockets or files cannot be created.
     """
     check_on_wire(rig)
     if unknown_text := describe_unknown_values(rig):
@@ -409,7 +409,7 @@ class _SimulatorProcess:
         for start_line in self._start_messages():
             self._log.print_line(start_line)
         announce(self._rig.name, self._address)
-        self._exit_stack.callback(forget, self._rig.name)
+        self._exit_stack.callback(remove_address_file, self._rig.name)
         # Set-up leaves objects that are never freed: exclude them from garbage collection.
         gc.collect()
         gc.freeze()
@@ -590,7 +590,7 @@ class _SimulatorProcess:
                 "clients": self._bus.clients,
                 "lost_frames": self._bus.lost,
                 "lost_bytes": 0 if self._serial_line is None else self._serial_line.lost,
-                "disturbed": self._bus_simulation.disturbed,
+                "disturbed": self._bus_simulation.disturbed_senders,
             }
         return {"error": "A request has to be 'inject', 'status' or 'renew_noise'."}
 

@@ -43,7 +43,7 @@ def bench(fakes, can_rig):
 def quick(monkeypatch):
     """No long waits for replies that never come."""
     monkeypatch.setattr("rigd.devices.ati._can_sensor._REPLY_TIMEOUT_S", 0.01)
-    monkeypatch.setattr("rigd.devices.ati._can_sensor._LATE_REPLY_S", 0.01)
+    monkeypatch.setattr("rigd.devices.ati._can_sensor._LATE_REPLY_WAIT_S", 0.01)
 
 
 def with_ati(rig, **changes):

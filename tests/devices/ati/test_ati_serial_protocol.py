@@ -17,26 +17,26 @@ def hexed(text):
 
 
 def test_requests_have_the_published_bytes():
-    assert hexed("0A 46 55 A3 9D") == protocol.START_STREAMING
-    assert hexed("0A 6A AA FF 1D") == protocol.UNLOCK
-    assert hexed("0A 6A 18 7F 68") == protocol.LOCK
-    assert protocol.read_registers(protocol.STATUS_WORD, 1) == hexed("0A 03 00 1D 00 01 15 77")
+    assert hexed("0A 46 55 A3 9D") == protocol.START_STREAM_REQUEST
+    assert hexed("0A 6A AA FF 1D") == protocol.UNLOCK_REQUEST
+    assert hexed("0A 6A 18 7F 68") == protocol.LOCK_REQUEST
+    assert protocol.read_registers(protocol.STATUS_REGISTER, 1) == hexed("0A 03 00 1D 00 01 15 77")
     assert protocol.read_registers(0x00E3, 0x40) == hexed("0A 03 00 E3 00 40 B4 B7")
 
 
 def test_published_replies_are_understood():
-    assert protocol.reply_content(protocol.START_STREAMING, hexed("0A 46 01 A2 62")) == b"\x01"
-    assert protocol.reply_content(protocol.UNLOCK, hexed("0A 6A 01 BE A2")) == b"\x01"
-    assert protocol.reply_content(protocol.LOCK, hexed("0A 6A 01 BE A2")) == b"\x01"
+    assert protocol.reply_content(protocol.START_STREAM_REQUEST, hexed("0A 46 01 A2 62")) == b"\x01"
+    assert protocol.reply_content(protocol.UNLOCK_REQUEST, hexed("0A 6A 01 BE A2")) == b"\x01"
+    assert protocol.reply_content(protocol.LOCK_REQUEST, hexed("0A 6A 01 BE A2")) == b"\x01"
 
 
 def test_gains_and_offsets_are_written_in_twelve_bytes(fakes):
     body = hexed("0A 10 00 06 00 06 0C 7C 62 7D 00 80 00 80 E8 84 D0 88 6F")
     request = protocol.write_registers(
-        protocol.ACTIVE_OFFSETS, (31842, 32000, 32768, 33000, 34000, 34927)
+        protocol.OFFSETS_REGISTER, (31842, 32000, 32768, 33000, 34000, 34927)
     )
     assert request == body + fakes.crc_bitwise(body)
-    assert protocol.ACTIVE_GAINS == 0
+    assert protocol.GAINS_REGISTER == 0
     confirmed = body[:6] + fakes.crc_bitwise(body[:6])
     assert protocol.reply_length(request) == len(confirmed) == 8
     assert protocol.reply_content(request, confirmed) == body[2:6]
@@ -62,7 +62,7 @@ def test_the_checksum_of_the_standard_example():
 
 def reply_to_status(fakes, body):
     return protocol.reply_content(
-        protocol.read_registers(protocol.STATUS_WORD, 1), body + fakes.crc_bitwise(body)
+        protocol.read_registers(protocol.STATUS_REGISTER, 1), body + fakes.crc_bitwise(body)
     )
 
 
@@ -75,7 +75,7 @@ def test_a_refusal_is_told_in_words(fakes, code, words):
 
 
 def test_a_declined_start_and_lock_are_refusals(fakes):
-    for request in (protocol.START_STREAMING, protocol.UNLOCK):
+    for request in (protocol.START_STREAM_REQUEST, protocol.UNLOCK_REQUEST):
         body = request[:2] + b"\x00"
         with pytest.raises(protocol.ModbusExceptionError, match="code 0"):
             protocol.reply_content(request, body + fakes.crc_bitwise(body))
@@ -105,7 +105,7 @@ def test_confirmation_of_other_registers(fakes):
 
 def test_silence_is_a_bad_reply():
     with pytest.raises(protocol.InvalidReplyError, match="no reply"):
-        protocol.reply_content(protocol.UNLOCK, b"")
+        protocol.reply_content(protocol.UNLOCK_REQUEST, b"")
 
 
 @settings(max_examples=60)
@@ -120,7 +120,7 @@ def test_a_damaged_reply_is_never_taken(fakes, at, mask, cut, extra):
     sound = body + fakes.crc_bitwise(body)
     damaged = bytearray(sound)
     damaged[at] ^= mask
-    request = protocol.read_registers(protocol.STATUS_WORD, 1)
+    request = protocol.read_registers(protocol.STATUS_REGISTER, 1)
     for reply in (bytes(damaged), sound[:cut] + extra):
         if reply != sound:
             with pytest.raises(protocol.InvalidReplyError):

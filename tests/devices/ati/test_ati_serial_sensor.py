@@ -43,7 +43,7 @@ def open_sensor(serial_rig, digital_ft):
 @pytest.fixture
 def unhurried(monkeypatch):
     """However slowly a test runs, no tick comes after a pause that the driver distrusts."""
-    monkeypatch.setattr("rigd.devices.ati._serial_sensor._IDLE_NS", 10**12)
+    monkeypatch.setattr("rigd.devices.ati._serial_sensor._MAX_IDLE_NS", 10**12)
 
 
 def refusal(sensor):
@@ -325,7 +325,7 @@ def test_another_clock_is_no_lag(follow, extra):
 
 
 def test_after_a_pause_only_new_records_count(open_sensor, digital_ft, fakes, monkeypatch, settled):
-    monkeypatch.setattr("rigd.devices.ati._serial_sensor._IDLE_NS", 1_000_000)
+    monkeypatch.setattr("rigd.devices.ati._serial_sensor._MAX_IDLE_NS", 1_000_000)
     sensor = open_sensor()
     sensor.connect()
     settled(sensor)
@@ -419,7 +419,7 @@ def test_measuring(open_sensor, digital_ft, fakes):
 @pytest.fixture
 def impatient(monkeypatch):
     """Have late replies awaited for no longer than a fake sensor takes."""
-    monkeypatch.setattr("rigd.devices.ati._serial_setup._LATE_REPLY_S", 0.05)
+    monkeypatch.setattr("rigd.devices.ati._serial_setup._LATE_REPLY_WAIT_S", 0.05)
 
 
 def test_a_silent_sensor(impatient, open_sensor, digital_ft, monkeypatch):

@@ -124,7 +124,7 @@ def test_who_does_not_read_loses_whole_frames_and_nobody_waits(bench):
 def test_a_frame_that_went_half_is_finished_before_the_next(bench):
     link = bench.connect()
     client = bench.hub._clients[0]
-    client.unsent = frame(1)[5:]
+    client.unsent_bytes = frame(1)[5:]
     bench.hub.send(frame(2))
     assert read(link) == frame(1)[5:] + frame(2)
     assert bench.hub.lost == 0

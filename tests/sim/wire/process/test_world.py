@@ -190,7 +190,7 @@ def test_two_faults_hit_one_frame_after_the_other(make_world):
     rig.world.inject(parse_fault("drop,from=host,frames=2"))
     rig.world.inject(parse_fault("corrupt,from=host,frames=2"))
     assert through(rig, 0, 6) == [2 ^ 0xFF, 3 ^ 0xFF, 4, 5]
-    assert rig.world.disturbed == []
+    assert rig.world.disturbed_senders == []
     hits = [what for _, device, what, _ in rig.log.entries if what in ("drop", "corrupt")]
     assert hits == ["drop", "drop", "corrupt", "corrupt"]
 
@@ -421,9 +421,9 @@ def test_faults_of_a_line_are_ended(make_world, kind):
     rig = make_world()
     more = ",ms=1" if kind == "delay" else ""
     rig.world.inject(parse_fault(f"{kind},from=host,frames=1000{more}"))
-    assert rig.world.disturbed == ["host"]
+    assert rig.world.disturbed_senders == ["host"]
     rig.world.inject(parse_fault("end"))
-    assert rig.world.disturbed == []
+    assert rig.world.disturbed_senders == []
     assert through(rig, 0, 3) == [0, 1, 2]
 
 
