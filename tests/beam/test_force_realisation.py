@@ -80,7 +80,9 @@ def test_displacement_as_output_of_the_states(damping, x_m):
         inertial=False,
     )
     assert output.output_per_acceleration == 0
-    assert errors(realisation, output, damping, lambda grid: grid.displacement_per_angle(x_m)) < 2e-3
+    assert (
+        errors(realisation, output, damping, lambda grid: grid.displacement_per_angle(x_m)) < 2e-3
+    )
 
 
 @pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
