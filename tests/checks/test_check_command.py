@@ -52,12 +52,12 @@ def rows_of_can():
 
 
 @pytest.fixture
-def computed_already(rows_of_can, monkeypatch):
+def cached_rows(rows_of_can, monkeypatch):
     """Reuse the rows computed for the shipped profile, as in the table above."""
     monkeypatch.setattr("rigd.checks._check._rows_without_devices", lambda _: list(rows_of_can))
 
 
-@pytest.mark.usefixtures("computed_already")
+@pytest.mark.usefixtures("cached_rows")
 def test_json_is_one_document(rigd, stand_ins):
     code, text, _ = rigd("check", "--profile", "antenna_can", "--json")
     assert code == 0
@@ -71,7 +71,7 @@ def test_json_is_one_document(rigd, stand_ins):
     assert {row["verdict"] for row in document["rows"]} <= {"ok", "warning", "failed", "skipped"}
 
 
-@pytest.mark.usefixtures("computed_already")
+@pytest.mark.usefixtures("cached_rows")
 def test_a_dead_device_fails_with_its_message(rigd, stand_ins, silent):
     stand_ins.drive.fails_at["connect"] = silent
     code, text, _ = rigd("check", "--profile", "antenna_can", "--json")

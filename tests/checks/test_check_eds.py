@@ -15,11 +15,11 @@ pytestmark = pytest.mark.process
 @pytest.fixture
 def rigd(rigd_here, monkeypatch):
     monkeypatch.setattr("rigd.cli.check.signal.signal", lambda *_: None)  # of the test runner
-    monkeypatch.setattr("rigd.checks.devices.open_devices", not_to_be_called)
+    monkeypatch.setattr("rigd.checks.devices.open_devices", fail_if_called)
     return rigd_here
 
 
-def not_to_be_called(*_, **__):
+def fail_if_called(*_, **__):
     raise AssertionError("nothing is connected")
 
 

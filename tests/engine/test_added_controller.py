@@ -124,9 +124,7 @@ def test_a_failing_controller_ends_the_session_without_torque(
 
 
 @pytest.mark.parametrize("name", ["law", "shift"])
-def test_a_torque_beyond_the_limits_is_clipped_and_ends_the_session(
-    make_session, law, monkeypatch, name
-):
+def test_a_torque_beyond_the_limits_ends_the_session_clipped(make_session, law, monkeypatch, name):
     monkeypatch.setattr(law.Law, "step", lambda *_: 1e3)
     monkeypatch.setattr(law.Shift, "step", lambda *_: 1e3)
     session = run_hold(make_session, name).run()
@@ -136,9 +134,7 @@ def test_a_torque_beyond_the_limits_is_clipped_and_ends_the_session(
     session.assert_safe()
 
 
-def test_a_reset_that_fails_ends_the_session_before_the_first_torque(
-    make_session, law, monkeypatch
-):
+def test_a_failing_reset_ends_the_session_without_torque(make_session, law, monkeypatch):
     monkeypatch.setattr(law, "AT_TICK", 0)
     monkeypatch.setattr(law, "ACTION", failing(KeyError("state")))
     session = run_hold(make_session).run()

@@ -15,7 +15,7 @@ RATE_HZ = 1000.0
 
 
 @pytest.fixture
-def struck():
+def vibrating():
     """Some periods at the first mode, after which the beam vibrates for long."""
     return chirp(
         rate_hz=RATE_HZ, amplitude_rad=0.02, start_hz=2.57, stop_hz=2.57, duration_s=1.6,
@@ -24,16 +24,16 @@ def struck():
 
 
 @pytest.fixture
-def stepped():
+def step_excitation():
     """A step, so that the record ends elsewhere than it starts."""
     return step(rate_hz=RATE_HZ, amplitude_rad=0.05, duration_s=0.5, rest_s=0.3, ring_down_s=0.0)
 
 
 @pytest.fixture
-def two_sessions(make_session, struck):
+def two_sessions(make_session, vibrating):
     """Run a session and a brief one with an ending; returns it and the virtual time (s)."""
 
-    def run(ending, excitation=struck):
+    def run(ending, excitation=vibrating):
         session = make_session(excitation=excitation)
         brief = hold(rate_hz=RATE_HZ, duration_s=0.1, rest_s=0.0, ring_down_s=0.0)
         orders = [session.order(), session.order(brief)]
@@ -46,8 +46,8 @@ def two_sessions(make_session, struck):
     return run
 
 
-def test_no_wait_for_the_beam_before_the_next_session(two_sessions, struck):
-    ending = plan_session_of(struck)
+def test_no_wait_for_the_beam_before_the_next_session(two_sessions, vibrating):
+    ending = plan_session_of(vibrating)
     damped, damped_s = two_sessions(ending)
     left, left_s = two_sessions(replace(ending, damper=None))
     assert damped_s < left_s - 2.0
@@ -71,14 +71,16 @@ def starts_rad(session):
     ]
 
 
-def test_the_motor_returns_to_where_it_started(two_sessions, stepped):
-    session, _ = two_sessions(plan_session_of(stepped), stepped)
+def test_the_motor_returns_to_where_it_started(two_sessions, step_excitation):
+    session, _ = two_sessions(plan_session_of(step_excitation), step_excitation)
     first_rad, second_rad = starts_rad(session)
     assert second_rad == pytest.approx(first_rad, abs=1e-3)
 
 
-def test_the_motor_stays_after_a_move(two_sessions, stepped):
-    session, _ = two_sessions(replace(plan_session_of(stepped), stays=True), stepped)
+def test_the_motor_stays_after_a_move(two_sessions, step_excitation):
+    session, _ = two_sessions(
+        replace(plan_session_of(step_excitation), stays=True), step_excitation
+    )
     first_rad, second_rad = starts_rad(session)
     assert second_rad - first_rad == pytest.approx(0.05, abs=1e-3)
 
@@ -129,11 +131,11 @@ def test_a_damper_that_excites_the_beam_ends(two_sessions):
     ],
     ids=["inertia", "friction", "delay", "feed-forward", "stiffness"],
 )
-def test_active_damping_tolerates_a_rig_unlike_the_profile(make_session, struck, unlike):
+def test_active_damping_tolerates_a_rig_unlike_the_profile(make_session, vibrating, unlike):
     """The damper planned for the profile damps a different rig."""
     profile = unlike(make_session().profile)
-    session = make_session(excitation=struck, profile=profile)
-    ending = plan_session_of(struck)
+    session = make_session(excitation=vibrating, profile=profile)
+    ending = plan_session_of(vibrating)
     session.obey(replace(session.order(), ending=ending))
     assert session.finished.outcome == "complete"
     assert session.finished.reason == ""

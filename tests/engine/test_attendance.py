@@ -149,7 +149,7 @@ def test_a_silent_encoder_between_sessions_is_reported(make_session):
     session.assert_safe()
 
 
-def test_stale_readings_of_a_session_do_not_count_in_the_next(make_session, monkeypatch):
+def test_stale_readings_do_not_count_in_the_next_session(make_session, monkeypatch):
     session = make_session()
     tare = round(session.profile.session.tare_s * session.profile.rig.rate_hz)
     ends = []

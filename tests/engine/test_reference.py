@@ -29,7 +29,7 @@ UNIT_RAD = 1e-7
 """Unit of the angles here: segments begin and end at rest."""
 
 
-class InUnits:
+class ScaledReference:
     """Writer and reader of angles that are whole numbers of `UNIT_RAD`."""
 
     def __init__(self, writer, reader):
@@ -61,7 +61,7 @@ def growing(planned=3, space=40):
     reference_rad[:planned] = UNIT_RAD * np.arange(1, planned + 1)
     spec = write_reference(shared_memory_fd(), reference_rad, planned)
     reader = ReferenceReader(map_reference(spec), planned, shared_state)
-    both = InUnits(ReferenceWriter(spec, shared_state), reader)
+    both = ScaledReference(ReferenceWriter(spec, shared_state), reader)
     return both, both, shared_state
 
 
@@ -86,7 +86,7 @@ def test_a_record_is_whole_after_its_last_segment():
     assert not covers_reference(shared_state, 0, 43)
 
 
-def test_a_record_of_a_given_reference_is_whole_at_its_end():
+def test_a_given_reference_is_whole_at_its_end():
     shared_state = SharedState.create(shared_memory_fd())
     assert [covers_reference(shared_state, scheduled, 9) for scheduled in (0, 8, 9)] == [
         False,
@@ -118,7 +118,7 @@ def test_the_segment_after_a_hold_is_reported():
 
 
 @pytest.mark.parametrize(("space", "expected"), [(4, [10, 11]), (3, [3])])
-def test_a_segment_beyond_the_end_of_the_record_is_not_begun(space, expected):
+def test_a_segment_beyond_the_record_is_not_begun(space, expected):
     """The motor would have to stop at full swing."""
     writer, reader, shared_state = growing(room=space)
     assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
@@ -233,9 +233,7 @@ def test_a_session_follows_segments_appended_while_running(make_session):
 
 
 @pytest.mark.parametrize(("bits", "held"), [(None, False), (0, True)])
-def test_pauses_of_virtual_time_are_short_for_a_drive_with_heartbeat(
-    make_session, monkeypatch, bits, held
-):
+def test_virtual_pauses_are_short_for_a_drive_with_heartbeat(make_session, monkeypatch, bits, held):
     """A drive on a line takes a host that is silent for 5 s for dead, the torque being on."""
     monkeypatch.setattr("rigd.engine._session_sequence.MAX_VIRTUAL_PAUSE_S", 0.1)
     session = make_session()

@@ -1,4 +1,4 @@
-"""A session from rest to rest, and every way out of it: the torque is off, the books balance."""
+"""A session from rest to rest, and every way out of it: the torque is off, the counts add up."""
 
 import itertools
 import time
@@ -19,13 +19,13 @@ from rigd.session.layout import Status, decode_samples
 from rigd.session.limits import MAX_SAMPLES
 
 
-def books(**counts):
+def counts_of(**counts):
     """The counts of a session, of which all but those given are zero."""
     nothing = ("scheduled", "missed", "late", "lost", "stale_angles", "stale_wrenches")
     return dict.fromkeys(nothing, 0) | counts
 
 
-def assert_books_balance(session, samples):
+def assert_counts_add_up(session, samples):
     counts = session.finished.counts
     assert counts["scheduled"] == len(samples) + counts["missed"] + counts["lost"]
 
@@ -37,7 +37,7 @@ def test_a_complete_session_has_every_tick(complete_session):
     session, samples = complete_session
     assert session.finished.outcome == "complete"
     assert session.finished.reason == ""
-    assert session.finished.counts == books(scheduled=3000)
+    assert session.finished.counts == counts_of(scheduled=3000)
     assert np.array_equal(samples["tick"], np.arange(3000))
     assert np.array_equal(samples["t_ns"], 1_000_000 * np.arange(3000))
     assert not samples["lateness_ns"].any()
@@ -67,9 +67,7 @@ def test_the_tare_removes_the_offset(complete_session):
     assert np.array_equal(rest["coupling_torque_nm"], rest["tz_nm"])
 
 
-def test_without_friction_and_noise_the_rig_is_the_computed_closed_loop(
-    make_session, quiet_profile
-):
+def test_an_ideal_rig_is_the_computed_closed_loop(make_session, quiet_profile):
     session = make_session(profile=quiet_profile).run()
     response = close_loop(quiet_profile.loop_model()).simulate(session.excitation.reference_rad)
     samples = session.samples
@@ -148,7 +146,7 @@ def assert_stop_leaves_torque_off(session, action, outcome, words, at_s):
         assert samples["status"][-1] & Status.TORQUE_OFF
         assert samples["torque_command_nm"][-1] == 0.0
         assert samples["tick"][-1] + 1 == session.finished.counts["scheduled"]
-        assert_books_balance(session, samples)
+        assert_counts_add_up(session, samples)
     else:
         assert session.finished.counts["scheduled"] == 0
 
@@ -162,9 +160,7 @@ def assert_stop_leaves_torque_off(session, action, outcome, words, at_s):
     ],
 )
 @pytest.mark.parametrize("read", [1200, further(1501), further(2000)])
-def test_a_reading_beyond_its_limit_ends_in_a_fault_in_the_same_tick(
-    make_session, fault, words, read
-):
+def test_a_reading_beyond_its_limit_is_a_fault_at_once(make_session, fault, words, read):
     session = make_session()
     session.drive.fault_at, session.drive.fault = read, fault
     session.run()
@@ -178,7 +174,7 @@ def test_a_reading_beyond_its_limit_ends_in_a_fault_in_the_same_tick(
     if samples is not None:
         assert samples["status"][-1] & Status.TORQUE_OFF
         assert samples["torque_command_nm"][-1] == 0.0
-        assert_books_balance(session, samples)
+        assert_counts_add_up(session, samples)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +199,7 @@ def test_a_device_that_fails_leaves_the_torque_off(make_session, read, error):
             expected = Status.TORQUE_OFF | Status.ANGLE_STALE | Status.WRENCH_STALE
             assert samples["status"][-1] & expected == expected
             assert samples["torque_command_nm"][-1] == 0.0
-            assert_books_balance(session, samples)
+            assert_counts_add_up(session, samples)
     else:
         with pytest.raises(ZeroDivisionError):
             session.run()
@@ -222,7 +218,7 @@ def test_the_motor_does_not_run_away_without_encoder(make_session, read):
     assert session.drive.reads == read + 3 + after  # three are let through
     samples = session.samples
     if samples is not None:
-        assert_books_balance(session, samples)
+        assert_counts_add_up(session, samples)
         stale = samples["status"] & Status.ANGLE_STALE
         assert np.flatnonzero(stale).size == min(4, len(samples))
         last = Status(int(samples["status"][-1]))
@@ -245,7 +241,7 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
         type(session.drive).angle_stale = original
     assert session.finished.outcome == "complete"
     assert np.flatnonzero(session.samples["status"] & Status.ANGLE_STALE).size == len(stale)
-    assert session.finished.counts == books(scheduled=3000, stale_angles=len(stale))
+    assert session.finished.counts == counts_of(scheduled=3000, stale_angles=len(stale))
     assert session.shared_state[StateField.STALE_ANGLES] == len(stale)
     # Four per cent of ten seconds, of which there may be six: reported once, and past half of it.
     [warning] = [event.message for event in session.events if event.level == "warning"]
@@ -267,7 +263,7 @@ def test_two_of_three_angles_may_not_be_old(make_session):
     assert counts["stale_angles"] in (101, 102), "one may come with the last sample"
     assert counts["stale_wrenches"] == 0
     assert np.flatnonzero(samples["status"] & Status.ANGLE_STALE).size == counts["stale_angles"]
-    assert_books_balance(session, samples)
+    assert_counts_add_up(session, samples)
     assert samples["status"][-1] & Status.TORQUE_OFF
 
 
@@ -280,7 +276,7 @@ def test_old_readings_before_the_record_do_not_count(make_session):
     assert session.finished.counts["stale_angles"] <= 2
 
 
-def test_a_device_that_fails_at_the_stop_does_not_spoil_the_ending(make_session):
+def test_device_failure_at_the_stop_does_not_change_the_outcome(make_session):
     def fail(angle_rad):
         raise OSError("the line is dead")
 
@@ -293,7 +289,7 @@ def test_a_device_that_fails_at_the_stop_does_not_spoil_the_ending(make_session)
     assert session.finished.outcome == "stopped"
     assert samples["status"][-1] & Status.TORQUE_OFF
     assert samples["torque_command_nm"][-1] == 0.0
-    assert_books_balance(session, samples)
+    assert_counts_add_up(session, samples)
 
 
 def test_no_start_while_the_motor_moves(make_session):
@@ -320,7 +316,7 @@ def test_no_start_if_the_reference_exceeds_the_limit(make_session, sign):
     session.assert_safe()
     assert session.drive.torques == []
     assert session.finished.outcome == "fault"
-    assert session.finished.counts == books()
+    assert session.finished.counts == counts_of()
     goal = f"{sign * 1.585:g} rad, outside limits.angle_rad = 1.57 rad"
     assert f"The motor is at {sign * 1.56:g} rad" in session.finished.reason
     assert goal in session.finished.reason
@@ -348,8 +344,8 @@ def test_missed_ticks_are_skipped_flagged_and_counted(make_session):
     samples = session.samples
     counts = session.finished.counts
     assert session.finished.outcome == "complete"
-    assert counts == books(scheduled=3000, missed=3, late=1)
-    assert_books_balance(session, samples)
+    assert counts == counts_of(scheduled=3000, missed=3, late=1)
+    assert_counts_add_up(session, samples)
     gap = int(np.flatnonzero(np.diff(samples["tick"]) > 1)[0])
     assert samples["tick"][gap + 1] - samples["tick"][gap] == 4
     after = np.flatnonzero(samples["status"] & Status.AFTER_MISSED)
@@ -400,7 +396,7 @@ def test_too_many_missed_ticks_in_a_row_end_the_session(make_session):
     assert "missed ticks" in session.finished.reason
     assert session.finished.counts["missed"] == 80
     assert samples["status"][-1] & Status.TORQUE_OFF
-    assert_books_balance(session, samples)
+    assert_counts_add_up(session, samples)
 
 
 def test_missed_ticks_explain_a_drive_fault_just_after(make_session):
@@ -427,13 +423,13 @@ def test_missed_ticks_explain_a_drive_fault_just_after(make_session):
     )
 
 
-def test_ticks_missed_beyond_the_end_of_the_record_do_not_count(make_session):
+def test_ticks_missed_after_the_record_do_not_count(make_session):
     # The last tick, and ten after it.
     late = make_session(clock=LateAt({4_002_000_000: 11_400_000}))
     late.run()
     assert late.finished.outcome == "complete"
-    assert late.finished.counts == books(scheduled=3000, missed=1)
-    assert_books_balance(late, late.samples)
+    assert late.finished.counts == counts_of(scheduled=3000, missed=1)
+    assert_counts_add_up(late, late.samples)
 
 
 def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
@@ -454,8 +450,8 @@ def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
     samples = np.concatenate([decode_samples(read_late[0]), session.samples])
     assert session.finished.outcome == "fault"
     assert "recorder" in session.finished.reason
-    assert session.finished.counts == books(scheduled=2002, lost=1)
-    assert_books_balance(session, samples)
+    assert session.finished.counts == counts_of(scheduled=2002, lost=1)
+    assert_counts_add_up(session, samples)
     assert samples["tick"][-2:].tolist() == [1999, 2001]
     assert session.drive.torques[-1] != 0.0
     assert samples["status"][-1] & Status.AFTER_LOST
@@ -469,12 +465,12 @@ def test_a_paused_computer_does_not_count_as_recorder_lag(make_session, monkeypa
     session = make_session(excitation=excitation, buffered_s=2.0)
     now_s, taken = [0.0], []
 
-    def stand_still(_):
+    def pause(_):
         now_s[0] += 5.0
         if len(taken) < 2:  # the first time the recorder is paused as well
             taken.append(b"" if not taken else session.channels.samples.take(1500))
 
-    clock = SimpleNamespace(monotonic=lambda: now_s[0], sleep=stand_still)
+    clock = SimpleNamespace(monotonic=lambda: now_s[0], sleep=pause)
     monkeypatch.setattr("rigd.engine._publish.time", clock)
     session.run()
     assert session.finished.outcome == "complete", session.finished.reason
@@ -493,10 +489,10 @@ def test_the_wait_for_a_blocked_recorder_has_a_timeout(make_session, monkeypatch
     session.assert_safe()
     assert session.finished.outcome == "fault"
     assert session.finished.counts["lost"] == 2  # and the one that has the torque off
-    assert_books_balance(session, session.samples)
+    assert_counts_add_up(session, session.samples)
 
 
-def test_a_sample_lost_in_the_last_tick_is_a_fault_too(make_session):
+def test_a_sample_lost_in_the_last_tick_is_a_fault(make_session):
     profile = make_session().profile
     session = make_session(
         clock=LateAt({}),
@@ -507,7 +503,7 @@ def test_a_sample_lost_in_the_last_tick_is_a_fault_too(make_session):
     session.assert_safe()
     assert session.finished.outcome == "fault"
     assert session.finished.counts["lost"] == 1
-    assert_books_balance(session, session.samples)
+    assert_counts_add_up(session, session.samples)
 
 
 def test_ticks_missed_at_the_end_count_like_all_others(make_session):
@@ -520,7 +516,7 @@ def test_ticks_missed_at_the_end_count_like_all_others(make_session):
     counts = session.finished.counts
     assert counts["scheduled"] == 3000
     assert counts["missed"] == 101
-    assert_books_balance(session, session.samples)
+    assert_counts_add_up(session, session.samples)
 
 
 def test_a_swinging_beam_is_no_drift_of_the_sensor(make_session):
@@ -571,7 +567,7 @@ def test_torque_ends_without_action_of_the_supervisor(make_session, monkeypatch)
     assert session.finished.counts["scheduled"] == 0
 
 
-def test_the_drive_is_disabled_by_the_cycle_after_the_session_and_at_the_end(make_session):
+def test_the_cycle_disables_the_drive_after_a_session(make_session):
     session = make_session()
     session.clock = StopAt(2_000_000_000, session.stop.request)
     calls = []
@@ -590,7 +586,7 @@ def test_a_drive_possibly_still_on_is_reported(make_session):
     assert finished.reason == "After the record: Drive: it does not show that it is off."
 
 
-class StallOnTheWayBack(VirtualClock):
+class StallWhileReturning(VirtualClock):
     """Pauses for 60 periods, once, after the record."""
 
     shared_state = None
@@ -604,7 +600,7 @@ class StallOnTheWayBack(VirtualClock):
 
 
 def test_missed_ticks_while_returning_have_their_limit(make_session):
-    clock = StallOnTheWayBack()
+    clock = StallWhileReturning()
     session = make_session(clock=clock, excitation=BRIEF)
     clock.shared_state = session.shared_state
     finished = session.run().finished

@@ -13,7 +13,7 @@ TOUCH = 2000
 RATE_HZ = 1000.0
 
 
-class Growing:
+class RecordingFollower:
     """Records its calls, each with the number of samples after the detection."""
 
     def __init__(self, requests):
@@ -47,7 +47,9 @@ def followed():
     def follow(ends, *touches, realtime=True, off=False):
         requests, reports = [], []
         job = TouchJob(None, 0, RATE_HZ, None, None, SimpleNamespace() if realtime else None)
-        follower = RunningTouchEstimator(SimpleNamespace(follow=lambda: Growing(requests)), job)
+        follower = RunningTouchEstimator(
+            SimpleNamespace(follow=lambda: RecordingFollower(requests)), job
+        )
         for first, last in zip([0, *ends], ends, strict=False):
             follower.take(samples(first, last, *touches, off=off and last == ends[-1]))
             while some := follower.reports():
@@ -85,7 +87,7 @@ def test_a_record_is_estimated_to_its_end(followed, end, requests):
     assert followed([1000, end], TOUCH, off=True)[0] == requests
 
 
-def test_the_beam_is_in_contact_for_a_time_after_a_touch(followed):
+def test_the_beam_stays_in_contact_after_a_touch(followed):
     _, reports = followed(range(50, 3400, 50), TOUCH, TOUCH + 900)
     assert [(each.number, each.final) for each in reports] == [
         (1, False), (1, True), (2, False), (2, True),

@@ -127,7 +127,7 @@ def test_the_detector_is_armed_again_in_the_next_pass(search):
     assert search.detector.armed_at == [search.one.begins, search.two.begins]
 
 
-def test_a_touch_in_the_pause_leaves_the_motor_where_it_is(search):
+def test_the_motor_stays_after_a_touch_in_the_pause(search):
     tick = search.one.returns - 10
     search.detector.at = {tick}
     run(search, tick + 1)

@@ -380,7 +380,7 @@ def test_unsupported_disturbances_are_refused(refuse, sim_toml, more, message):
     assert line.startswith(message)
 
 
-def test_a_hum_may_be_faster_than_the_ticks_of_a_stream(loaded):
+def test_a_hum_of_a_stream_may_exceed_the_tick_rate(loaded):
     path = Path(__file__).resolve().parents[2] / "hw_profiles" / "antenna_serial.toml"
     lines = [
         f'{key} = {{ value = {value}, source = "assumed" }}'
@@ -459,7 +459,7 @@ def test_barely_exceedable_limits_are_accepted(sim_toml, tmp_path, old, new):
     load_profile(path)
 
 
-def test_a_seed_of_the_noise_is_optional_and_a_whole_number(sim_toml, tmp_path):
+def test_the_seed_of_the_noise_is_an_optional_integer(sim_toml, tmp_path):
     path = tmp_path / "sim.toml"
     commented = next(line for line in sim_toml.splitlines() if line.startswith("# seed = "))
     for value, refused in (("5", ""), ("-1", "-1"), ("1.5", "1.5"), ('"a"', '"a"')):

@@ -85,7 +85,7 @@ def test_a_session_may_state_another_uniformity(header_of):
     assert header_of(text, uniformity_percent=0.0).metadata["uniformity_percent"] == "0.0"
 
 
-def test_tip_mass_and_tilt_are_in_the_file_only_if_stated(header_of):
+def test_stated_tip_mass_and_tilt_are_in_the_file(header_of):
     def stated(text):
         metadata = header_of(text).metadata
         return metadata.get("tip_mass_kg"), metadata.get("axis_tilt_deg")

@@ -31,7 +31,7 @@ def test_every_number_has_a_source(name):
 
 
 @pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
-def test_the_papers_chirp_is_within_the_limits_and_the_loop_stable(name):
+def test_the_paper_s_chirp_is_stable_and_within_the_limits(name):
     profile = load_profile(name)
     assert check_stability(close_loop(profile.loop_model())) is None
     assert plan_session(profile, chirp(rate_hz=profile.rig.rate_hz)).warnings == ()

@@ -59,7 +59,7 @@ def test_advice_to_copy_a_file_damaged_before_any_sample(original, tmp_path, run
     assert run("recover", path).exit_code == 1
 
 
-def test_readable_samples_are_those_that_can_be_recovered(original, torn, run):
+def test_readable_samples_are_the_recoverable_ones(original, torn, run):
     data = bytearray(torn.read_bytes())
     data[data.index(b"profile.toml") + 40] ^= 1  # an attachment, before all samples
     torn.write_bytes(data)

@@ -124,11 +124,11 @@ def test_a_name_taken_meanwhile_is_refused(torn, monkeypatch):
     target = torn.with_name("a.mcap")
     read = read_session
 
-    def reading_takes_a_while(path, **options):
+    def slow_reading(path, **options):
         target.write_bytes(b"precious")
         return read(path, **options)
 
-    monkeypatch.setattr("rigd.session._recovery.read_session", reading_takes_a_while)
+    monkeypatch.setattr("rigd.session._recovery.read_session", slow_reading)
     with pytest.raises(SessionExistsError, match=r"a\.mcap exists and is not overwritten"):
         recover(torn)
     assert target.read_bytes() == b"precious"
@@ -221,9 +221,7 @@ def write_plainly(path, samples, *, use_chunking):
 
 
 @pytest.mark.parametrize("use_chunking", [True, False])
-def test_a_torn_file_of_another_writer_is_recovered_with_a_warning(
-    original, tmp_path, use_chunking
-):
+def test_a_torn_third_party_file_is_recovered_with_a_warning(original, tmp_path, use_chunking):
     rows = original.session.samples[:700]
     messages = [packed(row) for row in rows]
     path = tmp_path / "b.mcap.part"

@@ -39,7 +39,7 @@ def follow(watch, angles_rad):
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("counts", [20, 50, 5000])
-def test_a_slip_of_the_encoder_at_rest_is_found_at_once(watch, counts, sign):
+def test_an_encoder_slip_at_rest_is_found_at_once(watch, counts, sign):
     tick, violation = follow(watch, [0.0] * 10 + [sign * counts * STEP_RAD])
     assert tick == 10
     assert violation.channel == "encoder jump"
@@ -144,18 +144,18 @@ def test_heat_lag_and_disk_mark_samples_until_normal(watch):
 def test_a_channel_is_reported_again_after_a_second(watch):
     near = 0.9 * LIMITS.angle_rad
 
-    def be_at(angle_rad, checks):
+    def hold_angle(angle_rad, checks):
         for _ in range(checks):
             watch.reset(angle_rad)
             assert watch.check(angle_rad, angle_rad, REST) is None
             assert watch.check_slow(0) is None
         return len(watch.take_notices())
 
-    assert be_at(near, 50) == 1
-    assert be_at(0.0, 10) == 0
-    assert be_at(near, 1) == 0  # back after 0.6 s
-    assert be_at(0.0, 20) == 0
-    assert be_at(near, 1) == 1  # back after 1.3 s
+    assert hold_angle(near, 50) == 1
+    assert hold_angle(0.0, 10) == 0
+    assert hold_angle(near, 1) == 0  # back after 0.6 s
+    assert hold_angle(0.0, 20) == 0
+    assert hold_angle(near, 1) == 1  # back after 1.3 s
 
 
 def test_no_notice_beyond_the_limit(watch):
@@ -226,16 +226,16 @@ def test_a_session_too_large_for_the_disk_is_refused(tmp_path, monkeypatch):
 OVERLOADED_ADVICE = "The computer is overloaded: close other programs."
 
 
-def left_behind(watch):
+def tracking_violation(watch):
     """Have the shaft fall far behind its reference, and return the message."""
     return str(watch.check(2.0 * LIMITS.tracking_error_rad, 0.0, REST))
 
 
 def test_a_violation_after_a_pause_is_due_to_the_computer(watch):
-    assert "lower the amplitude" in left_behind(watch)
+    assert "lower the amplitude" in tracking_violation(watch)
     watch.reset(0.0)
     assert watch.check_missed(20, 20, 1000) is None
-    message = left_behind(watch)
+    message = tracking_violation(watch)
     assert message.endswith(f"It came after 20 missed ticks. {OVERLOADED_ADVICE}")
     assert "amplitude" not in message
 
@@ -249,7 +249,7 @@ def test_missed_ticks_of_several_gaps_are_reported_together(watch):
 
 def test_few_missed_ticks_do_not_explain_a_violation(watch):
     watch.skip(1)
-    message = left_behind(watch)
+    message = tracking_violation(watch)
     assert "It came after 1 missed tick." in message
     assert "lower the amplitude" in message
     assert OVERLOADED_ADVICE not in message
@@ -261,7 +261,7 @@ def test_missed_ticks_expire_after_two_checks(watch):
     assert watch.after_missed
     watch.check_slow(SLOW_CHECK_TICKS * PERIOD_NS)
     assert watch.after_missed == ""
-    assert "amplitude" in left_behind(watch)
+    assert "amplitude" in tracking_violation(watch)
 
 
 def test_missed_ticks_do_not_explain_a_full_disk(watch):

@@ -124,9 +124,7 @@ def test_bit_flips_anywhere(recorded, tmp_path):
 
 
 @pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])
-def test_bit_flips_in_files_with_fewer_checksums_never_give_wrong_samples(
-    kit, tmp_path, compression
-):
+def test_bit_flips_without_checksums_never_give_wrong_samples(kit, tmp_path, compression):
     from mcap.writer import CompressionType
 
     samples = kit.make_samples(300)

@@ -91,7 +91,7 @@ def test_indexes_lead_to_the_messages_of_a_time(kit, recorded):
     assert sorted(found) == sorted(expected)
 
 
-def test_a_chunk_has_250_samples_and_the_controls_of_their_time(kit, tmp_path):
+def test_a_chunk_has_250_samples_and_their_controls(kit, tmp_path):
     writer = kit.begin(tmp_path / "a.mcap")
     writer.write_controls(kit.packed_controls(range(0, 600, 10)))
     writer.write_samples(kit.packed(kit.make_samples(600)))
@@ -105,7 +105,7 @@ def test_a_chunk_has_250_samples_and_the_controls_of_their_time(kit, tmp_path):
         assert ticks[i] == {1: list(range(first, end)), 2: list(range(first, end, 10))}
 
 
-def test_ages_are_in_the_chunk_of_their_samples_and_read_back(kit, tmp_path):
+def test_ages_are_stored_with_their_samples(kit, tmp_path):
     writer = kit.begin(tmp_path / "a.mcap")
     writer.write_timings(kit.packed_timings(range(300)))
     writer.write_samples(kit.packed(kit.make_samples(250)))

@@ -82,7 +82,7 @@ def started(*obstacles, **changes):
     return Record(rig_with(*obstacles, inertia_kg_m2=HEAVY_KG_M2, **changes), torques)
 
 
-class OtherSolution:
+class ReferenceSolution:
     """Kernels of the exact beam for a force at a position, by inversion along a shifted line."""
 
     def __init__(self, at_m, step_s):
@@ -107,7 +107,7 @@ class OtherSolution:
         self.shear_by_force = in_time(grid.shear_per_force(at_m) * hat)
         self.surface = TOUCH_RAD * at_m
 
-    def meet(self, stiffness):
+    def solve(self, stiffness):
         """Force, torque and shear at each point."""
         motion, force = self.free.copy(), np.zeros(self.points)
         for j in range(1, self.points):
@@ -127,14 +127,14 @@ class OtherSolution:
         return np.fft.irfft(spectrum, length)[1 : self.points + 1]
 
 
-other_solution = cache(OtherSolution)
+reference_solution = cache(ReferenceSolution)
 
 
 @pytest.mark.parametrize("stiffness", [further(100.0), 3000.0, further(100_000.0)])
 @pytest.mark.parametrize("at_m", [further(0.1), 0.4, further(0.7), further(0.97)])
 def test_force_torque_and_shear_of_a_touch(at_m, stiffness):
     fine_s = FINE_S[stiffness]
-    force, torque, shear = other_solution(at_m, fine_s).meet(stiffness)
+    force, torque, shear = reference_solution(at_m, fine_s).solve(stiffness)
     record = started(f"x={at_m},angle={TOUCH_RAD},stiffness={stiffness}")
     peak = np.abs(force).max()
     assert np.abs(record.forces).max() == pytest.approx(peak, rel=0.01)

@@ -131,7 +131,7 @@ def test_coupling_torque_at_a_jump_is_the_mean_of_both_sides():
     assert np.max(error) < 1e-4 * np.max(jumps)
 
 
-def test_sensed_torque_at_a_jump_within_the_period_is_the_mean_too():
+def test_sensed_torque_at_a_jump_within_a_period_is_the_mean():
     torques = noise(300)
     before, mean, after = (
         run(enabled(rig(delay=0.5e-3, torque_delay=delay)), torques)[:, 4]

@@ -228,7 +228,7 @@ def test_a_decimating_filter_reduces_noise(streaming, shape, gain):
     assert wrenches[20:, 5].std() == pytest.approx(5e-3 * np.sqrt(gain), rel=0.06)
 
 
-def test_one_saturated_record_makes_the_wrench_of_its_tick_saturated(streaming):
+def test_one_saturated_record_saturates_the_wrench_of_its_tick(streaming):
     narrow = replace(
         streaming, sensor=replace(streaming.sensor, range=(20.0, 20.0, 60.0, 1.0, 1.0, 0.03))
     )

@@ -422,7 +422,7 @@ def test_half_a_reply_never_pairs_with_the_next(numbered, lost):
     assert numbered.read() == (4, False)
 
 
-def test_a_reply_after_the_deadline_is_dropped_and_costs_one_tick(numbered):
+def test_a_reply_after_the_deadline_costs_one_tick(numbered):
     assert numbered.read() == (1, False)
     numbered.filter_frames = numbered.hold
     assert numbered.read() == (1, True)

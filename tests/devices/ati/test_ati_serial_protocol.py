@@ -297,7 +297,7 @@ def test_records_are_not_delivered_before_enough_fit(fakes):
 
 
 @pytest.mark.parametrize("part", ["stream, disturbed", "stream, rubbish", "Modbus"])
-def test_rubbish_raises_nothing_and_delivers_nothing_wrong(fuzz, part):
+def test_no_error_and_no_wrong_record_from_rubbish(fuzz, part):
     _, function = fuzz.PARTS[part]
     counts = function(3_000, seed=7)
     # One damaged record in 128 passes; of rubbish, six in a row that fit are next to impossible.

@@ -197,7 +197,7 @@ def test_wait_for_the_last_record_is_one_record_long(
     assert all(timeout_s <= 1 / 7000 for timeout_s in waits[1:])
 
 
-def test_a_tick_without_records_repeats_the_last_value_and_a_flag(
+def test_a_tick_without_records_repeats_the_last_value(
     open_sensor, digital_ft, fakes, unhurried, after_first_tick
 ):
     sensor = open_sensor(deadline_us=2000.0)

@@ -114,7 +114,7 @@ def test_every_reading_is_fresh_without_losses():
     assert line.paused == 0
 
 
-def test_replies_read_too_late_do_not_count_for_the_next_tick():
+def test_replies_read_late_do_not_count_for_the_next_tick():
     # After one pause of the host each reply would be found a tick later.
     line = Line()
     line.tick()

@@ -27,7 +27,7 @@ def written(scripted):
     return {(index, sub): value for index, sub, value in scripted.writes}
 
 
-class TestTheTwoRealDrives:
+class TestRealDrives:
     """Limits and objects of their public EDS files."""
 
     def test_elmo_gold_has_far_read_only_torque_limits(self, make, scripted):
@@ -62,7 +62,7 @@ class TestTheTwoRealDrives:
 
 
 @pytest.mark.parametrize("index", [0x60E0, 0x60E1])
-def test_a_read_only_limit_below_the_wanted_one_is_refused_by_name(make, scripted, index):
+def test_a_low_read_only_limit_is_refused_by_name(make, scripted, index):
     scripted.objects[index, 0] = 1799
     scripted.read_only.add((index, 0))
     words = rf"{index:04X} .*is 1799, needed is 1800.*read-only.*motor\.peak_torque_nm"
@@ -76,14 +76,14 @@ def test_a_read_only_object_with_the_needed_value_is_accepted(make, scripted):
     make().connect()
 
 
-def test_a_read_only_limit_that_is_too_high_does_not_count(make, scripted):
+def test_a_high_read_only_limit_does_not_count(make, scripted):
     scripted.objects[0x6072, 0] = 5000
     scripted.read_only.add((0x6072, 0))
     with pytest.raises(DeviceError, match=r"6072 .*is 5000, needed is 1800"):
         make().connect()
 
 
-def test_a_limit_that_is_too_high_may_be_accepted_by_name(make, scripted):
+def test_a_high_limit_may_be_accepted_by_name(make, scripted):
     scripted.objects[0x6072, 0] = 5000
     scripted.read_only.add((0x6072, 0))
     drive = make(accept_without=("torque_limit",))
@@ -122,7 +122,7 @@ def test_abort_codes_of_absent_objects(make, scripted, code):
     assert {row.address for row in drive.capabilities().lacks} == {"1006", "60C2:1", "60C2:2"}
 
 
-class TestTheWatchdog:
+class TestWatchdog:
     """A missing watchdog is always reported."""
 
     def test_the_heartbeat_consumer(self, make):
@@ -202,7 +202,7 @@ class TestTheWatchdog:
         assert replace(settings, **changes).watchdog_s == time_s
 
 
-class TestWhatADriveHoldsFromBefore:
+class TestValuesFromBefore:
     @pytest.mark.parametrize(
         ("address", "value"), [((0x1007, 0), 100), ((0x1019, 0), 10), ((0x1800, 3), 10)]
     )
@@ -248,7 +248,7 @@ class TestWhatADriveHoldsFromBefore:
             make().connect()
         assert (0x607E, 0) not in written(scripted)
 
-    def test_a_polarity_that_the_profile_sets_to_0_is_fine(self, make, scripted):
+    def test_a_polarity_set_to_0_by_the_profile_is_accepted(self, make, scripted):
         scripted.objects[0x607E, 0] = 0x80
         make(set_objects=("607E:0 u8 0",)).connect()
 
@@ -282,7 +282,7 @@ def test_an_unmappable_target_torque_is_named(make, scripted):
         make().connect()
 
 
-class TestWithoutItsTorque:
+class TestMissingActualTorque:
     def test_a_drive_without_torque_is_refused(self, make, scripted):
         scripted.refuse_value[0x1A00, 3] = ABSENT
         with pytest.raises(DeviceError, match=r'no object 6077.*\["torque_feedback"\]'):
@@ -324,7 +324,7 @@ def test_no_torque_mode_is_refused_within_a_second(make, scripted):
     assert time.monotonic() - began < 1
 
 
-class TestWithAnEds:
+class TestEds:
     TEXT = """[DeviceInfo]
 VendorName=any
 VendorNumber={vendor}

@@ -148,7 +148,7 @@ def test_a_late_reply_does_not_count_for_the_next_tick(make_drive, rig, scripted
     assert angles == [(True, 0), (True, 0), (False, 3), (False, 4)]
 
 
-def test_a_reply_of_another_length_counts_as_an_error_of_the_bus(make_drive, rig):
+def test_a_reply_of_another_length_is_a_bus_error(make_drive, rig):
     drive = make_drive(rig)
     drive.connect()
     drive._inbox.store_tpdo(b"\x27\x16")
@@ -386,7 +386,7 @@ def test_faults_that_end_a_session(make_drive, rig, scripted, happens, words):
     assert scripted.torque == 0
 
 
-def test_the_code_of_the_profile_is_reported_as_the_wired_stop(make_drive, rig, scripted):
+def test_the_code_of_the_wired_stop_is_reported(make_drive, rig, scripted):
     settings = replace(rig.cia402, sto_error_code=0xFF20)
     ticks = Ticks(make_drive(replace(rig, cia402=settings)))
     ticks.drive.connect()

@@ -255,7 +255,7 @@ def test_disabling_never_raises(make_drive, rig, scripted):
     drive.close()
 
 
-class TestAnAdapterThatRaisesAnything:
+class TestFailingAdapter:
     """No error of its library prevents switching the torque off."""
 
     @pytest.fixture
@@ -345,7 +345,7 @@ def test_ticks_continue_after_enabling(drive, scripted):
     assert 11 <= len(scripted.frames(0x764)) <= 14
 
 
-class TestByTheClock:
+class TestRealTime:
     """A real drive does not wait: the loop paces itself."""
 
     @pytest.fixture
@@ -393,7 +393,7 @@ class TestByTheClock:
             drive.connect()
 
 
-def test_a_drive_that_stays_on_is_reported_and_left_to_its_watchdog(make_drive, rig, scripted):
+def test_a_drive_that_stays_on_is_left_to_its_watchdog(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
     drive.connect()
     drive.enable()

@@ -64,7 +64,7 @@ def chirp_commands():
     return np.rint(per_mille).astype(int).tolist()
 
 
-class TestADriveThatMeasuresItsTorque:
+class TestMeasuredTorque:
     """Object 6077 follows the command with a lag of first order, here of 50 Hz."""
 
     LAG_S = 3.2e-3

@@ -298,7 +298,7 @@ def test_a_drive_in_fault_is_left_to_the_operator(drive, scripted):
     assert scripted.state == "fault"
 
 
-def test_a_fault_without_a_code_is_named_by_its_emergency_message(drive, scripted):
+def test_the_emergency_message_names_a_fault_without_code(drive, scripted):
     scripted.state = "fault"
 
     def alarm_on_read(can_id, data, take=scripted._take):
@@ -342,7 +342,7 @@ def test_no_reset_without_a_fault(drive, scripted):
     assert scripted.state == "switch-on disabled"
 
 
-class TestResettingADriveThatTurns:
+class TestResetOfTurningDrive:
     """Operation enabled, with torque; NMT pre-operational changes nothing for it."""
 
     @pytest.fixture
@@ -365,7 +365,7 @@ class TestResettingADriveThatTurns:
         seen_off = turning.off_read_after
         assert 0 < seen_off <= watch
 
-    def test_a_drive_that_stays_on_is_reported_and_retains_its_watchdog(self, drive, turning):
+    def test_a_drive_that_stays_on_retains_its_watchdog(self, drive, turning):
         turning.obeys = False
         began = time.monotonic()
         with pytest.raises(DeviceError) as caught:

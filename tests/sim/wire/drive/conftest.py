@@ -182,7 +182,7 @@ class Bench:
     def nmt_state(self):
         return [v["state"] for _, what, v in self.events if what == "nmt"][-1]
 
-    def witness(self):
+    def logged_torque(self):
         """The last torque (N·m) and whether the drive is on, from the log."""
         last = [v for _, what, v in self.events if what == "torque"][-1]
         return last["torque_nm"], last["enabled"]
@@ -197,7 +197,7 @@ class Bench:
         assert not self.plant.enabled
         assert self.exerting() == 0.0
         assert not any(self.plant._torques)
-        assert self.witness() == (0.0, False)
+        assert self.logged_torque() == (0.0, False)
         assert self.read_torque() == 0
 
     def read_torque(self):

@@ -107,11 +107,11 @@ def fuzz(count: int, seed: int) -> Counter:
     simulated = SimulatedRig(rig)
     plant = simulated.plant
     seen: Counter = Counter()
-    witness = {"torque_nm": 0.0, "enabled": False}
+    logged = {"torque_nm": 0.0, "enabled": False}
 
     def log(source, what, **values):
         if what == "torque":
-            witness.update(values)
+            logged.update(values)
         elif what == "state":
             seen[values["state"]] += 1
 
@@ -139,9 +139,9 @@ def fuzz(count: int, seed: int) -> Counter:
         node.receive(can_id, data)
         torque_nm = plant._torque_nm
         assert -limit_nm <= torque_nm <= limit_nm
-        # The log is the witness of what the plant does.
-        assert plant.enabled == witness["enabled"]
-        assert torque_nm == witness["torque_nm"]
+        # The log agrees with the plant.
+        assert plant.enabled == logged["enabled"]
+        assert torque_nm == logged["torque_nm"]
         assert plant.enabled or torque_nm == 0.0
         seen["frames"] += 1
         seen["torques"] += torque_nm != 0.0

@@ -118,7 +118,7 @@ def test_a_drive_with_torque_mode_turns(eds_bench, name):
     bench.enable()
     bench.drive(300)
     assert bench.drive(300)[2] == 300
-    assert bench.witness() == (pytest.approx(0.15), True)
+    assert bench.logged_torque() == (pytest.approx(0.15), True)
 
 
 @pytest.mark.parametrize("name", WITHOUT_TORQUE)

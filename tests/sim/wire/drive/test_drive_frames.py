@@ -172,7 +172,7 @@ def test_a_download_longer_than_the_object_ends(bench):
     assert bench.read(0x1017) == 0
 
 
-def test_an_abort_by_the_client_ends_the_transfer_without_a_reply(bench):
+def test_an_abort_by_the_client_gets_no_reply(bench):
     bench.request("40 08 10 00 00 00 00 00")
     bench.take()
     bench.node.receive(0x605, bytes.fromhex("80 08 10 00 00 00 04 05"))

@@ -113,27 +113,27 @@ def test_an_rpdo_value_out_of_range_is_ignored(bench):
 def test_a_tpdo_comes_with_every_nth_sync(bench, every):
     bench.map_pdo(2, "t", every, 0x6041_0010)
     bench.nmt(1)
-    came = []
+    received = []
     for _ in range(2 * every):
         bench.sent.clear()
         bench.node.receive(0x80, b"")
-        came.append(0x285 in dict(bench.sent))
-    assert came == 2 * ([False] * (every - 1) + [True])
+        received.append(0x285 in dict(bench.sent))
+    assert received == 2 * ([False] * (every - 1) + [True])
 
 
-def test_a_tpdo_of_type_0_comes_with_a_sync_after_a_change(bench):
+def test_a_tpdo_of_type_0_follows_the_sync_after_a_change(bench):
     bench.map_pdo(1, "t", 0, 0x6041_0010)
     bench.nmt(1)
 
-    def came():
+    def received():
         bench.sent.clear()
         bench.node.receive(0x80, b"")
         return [data.hex() for can_id, data in bench.sent if can_id == 0x185]
 
-    assert came() == ["5002"]
-    assert came() == []
+    assert received() == ["5002"]
+    assert received() == []
     bench.write(0x6040, 0, 6, 2)
-    assert came() == ["3102"]
+    assert received() == ["3102"]
 
 
 def test_an_event_tpdo_follows_changes_and_its_timer(bench):

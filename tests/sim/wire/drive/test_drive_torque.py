@@ -65,7 +65,7 @@ def test_the_offset_is_added_and_the_limits_clip(running):
     running.write(0x6072, 0, 90, 2)
     assert running.sync()[::2] == (0x1A37, -90)
     assert running.drive(-140)[::2] == (0x1237, -90)
-    assert running.witness() == (pytest.approx(-0.045), True)
+    assert running.logged_torque() == (pytest.approx(-0.045), True)
 
 
 def test_no_setting_allows_more_than_the_peak(running):
@@ -75,7 +75,7 @@ def test_no_setting_allows_more_than_the_peak(running):
     assert running.drive(32767)[::2] == (0x1A37, 1800)
     running.write(0x60B2, 0, -32768, 2)
     assert running.drive(-32768)[::2] == (0x1A37, -1800)
-    assert running.witness() == (pytest.approx(-0.9), True)
+    assert running.logged_torque() == (pytest.approx(-0.9), True)
 
 
 def test_the_direction_reverses_torque_and_angle(make_bench):
@@ -98,7 +98,7 @@ def test_halt_and_other_modes_end_the_torque_only(running):
     assert running.drive(200)[::2] == (0x1237, 200)
     running.write(0x6060, 0, 0, 1)
     assert running.sync()[::2] == (0x0237, 0)
-    assert running.witness() == (0.0, True)
+    assert running.logged_torque() == (0.0, True)
     running.write(0x6060, 0, 10, 1)
     assert running.sync()[::2] == (0x1237, 200)
 

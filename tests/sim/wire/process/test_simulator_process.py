@@ -469,10 +469,10 @@ def test_a_log_replaces_no_other_file(simulate, runtime, rigd_here, tmp_path):
     assert session.read_bytes() == b"two minutes of the rig"
     before = simulate()
     before.end()
-    witness = before.log.read_bytes()
-    assert witness
+    content = before.log.read_bytes()
+    assert content
     assert rigd_here("simulate", "--profile", "antenna_can", "--log", before.log).returncode == 2
-    assert before.log.read_bytes() == witness
+    assert before.log.read_bytes() == content
 
 
 def test_no_log_of_a_rig_that_did_not_start(runtime, rigd_here, tmp_path):

@@ -159,7 +159,7 @@ def test_other_kinds_of_frames_are_dropped(make_world):
 # Faults of a line
 
 
-def through(rig, first, last):
+def received_frames(rig, first, last):
     for n in range(first, last):
         rig.world.receive_frames([numbered(n)], "host", n * 1000)
     return numbers(rig.drive.received)
@@ -182,14 +182,14 @@ def through(rig, first, last):
 def test_line_faults_hit_exactly_the_requested_frames(make_world, spec, expected):
     rig = make_world()
     rig.world.inject(parse_fault(spec))
-    assert through(rig, 0, 8) == expected
+    assert received_frames(rig, 0, 8) == expected
 
 
 def test_two_faults_hit_one_frame_after_the_other(make_world):
     rig = make_world()
     rig.world.inject(parse_fault("drop,from=host,frames=2"))
     rig.world.inject(parse_fault("corrupt,from=host,frames=2"))
-    assert through(rig, 0, 6) == [2 ^ 0xFF, 3 ^ 0xFF, 4, 5]
+    assert received_frames(rig, 0, 6) == [2 ^ 0xFF, 3 ^ 0xFF, 4, 5]
     assert rig.world.disturbed_senders == []
     hits = [what for _, device, what, _ in rig.log.entries if what in ("drop", "corrupt")]
     assert hits == ["drop", "drop", "corrupt", "corrupt"]
@@ -199,7 +199,7 @@ def test_other_hosts_receive_what_the_nodes_receive(make_world):
     rig = make_world()
     rig.world.inject(parse_fault("drop,from=host"))
     rig.world.inject(parse_fault("corrupt,from=host"))
-    through(rig, 0, 3)
+    received_frames(rig, 0, 3)
     assert [raw for raw, _ in rig.sent] == [numbered(0xFE), numbered(2)]
 
 
@@ -331,7 +331,7 @@ def test_every_lasting_fault_is_tested():
     assert {*held, *LINE_KINDS, "cut", "obstacle"} == set(lasting.split(" or "))
 
 
-def turned_into_an_obstacle(rig, ticks):
+def torques_against_obstacle(rig, ticks):
     """Torque of the sensor tick by tick, the motor under a constant torque."""
     plant = rig.simulated.plant
     torques = []
@@ -350,17 +350,17 @@ def test_an_injected_obstacle_is_hit_and_ended(make_world):
     )
     for world in (free, rig, ended):
         world.simulated.plant.enable()
-    before = [turned_into_an_obstacle(world, range(1, 60)) for world in (free, rig, ended)]
+    before = [torques_against_obstacle(world, range(1, 60)) for world in (free, rig, ended)]
     assert (before[0] == before[1]).all()
     fault = parse_fault("obstacle,x=0.6,angle=0.15,stiffness=3000")
     for world in (rig, ended):
         world.world.inject(fault)
-    later = [turned_into_an_obstacle(world, range(60, 200)) for world in (free, rig, ended)]
+    later = [torques_against_obstacle(world, range(60, 200)) for world in (free, rig, ended)]
     assert np.abs(later[1] - later[0]).max() > 0.01
     assert np.array_equal(later[1], later[2])
     ended.world.inject(parse_fault("end,fault=obstacle"))
     assert [values["fault"] for *_, values in ended.log.of("fault over")] == [str(fault)]
-    last = [turned_into_an_obstacle(world, range(200, 400)) for world in (free, rig, ended)]
+    last = [torques_against_obstacle(world, range(200, 400)) for world in (free, rig, ended)]
     assert last[1].mean() > last[2].mean() + 0.01
 
 
@@ -424,7 +424,7 @@ def test_faults_of_a_line_are_ended(make_world, kind):
     assert rig.world.disturbed_senders == ["host"]
     rig.world.inject(parse_fault("end"))
     assert rig.world.disturbed_senders == []
-    assert through(rig, 0, 3) == [0, 1, 2]
+    assert received_frames(rig, 0, 3) == [0, 1, 2]
 
 
 def test_a_cut_line_is_mended_once(make_world):
