@@ -58,27 +58,27 @@ def test_campaign_agrees_with_a_local_one(cluster, short_sessions, settings, mon
 class Elsewhere:
     """A client whose one worker reports these versions."""
 
-    def __init__(self, versions):
-        self.versions = versions
+    def __init__(self, reported):
+        self.reported = reported
 
     def wait_for_workers(self, *_, **__):
         pass
 
     def run(self, *_, **__):
-        return {"tcp://10.0.0.7:1": self.versions}
+        return {"tcp://10.0.0.7:1": self.reported}
 
 
 @pytest.mark.parametrize(
-    ("versions", "words"),
+    ("reported", "words"),
     [
         (versions() | {"rigd": "9.9"}, f"7:1 has rigd 9.9 and not {versions()['rigd']}: install"),
         (ModuleNotFoundError("no", name="analysis"), "7:1 has no module analysis: install rigd"),
         (OSError("no"), "7:1 cannot be used: no"),
     ],
 )
-def test_worker_of_other_versions_is_reported(versions, words):
+def test_worker_of_other_versions_is_reported(reported, words):
     with pytest.raises(CampaignError, match=re.escape(words)):
-        dask_workers._check_workers(Elsewhere(versions), "tcp://10.0.0.5:8786")
+        dask_workers._check_workers(Elsewhere(reported), "tcp://10.0.0.5:8786")
     dask_workers._check_workers(Elsewhere(versions()), "tcp://10.0.0.5:8786")
 
 

@@ -45,7 +45,7 @@ def make_session(tmp_path):
 
 @pytest.fixture
 def make_plan():
-    """Plan the import of columns `angle` and `torque` at 1 kHz, but for what is said otherwise."""
+    """Plan the import of columns `angle` and `torque` at 1 kHz, unless stated otherwise."""
 
     def make(angle="angle:rad", torque="torque:N.m", time=None, others=(), **options):
         channels = {

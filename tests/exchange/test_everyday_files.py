@@ -17,7 +17,7 @@ ALL = range(28, 308)
 
 
 def wrong_values(made, session):
-    """Say what of a session is not what was measured, "" if nothing."""
+    """Return the part of a session that differs from the measurement, "" if none."""
     samples = session.samples
     rate_hz = float(session.metadata["rate_hz"])
     if abs(rate_hz / made.rate_hz - 1) > 1e-4:
@@ -74,12 +74,12 @@ pytestmark = [
 
 
 @pytest.mark.parametrize("seed", SAMPLE)
-def test_an_everyday_file_is_read_right_or_refused(tmp_path, make_plan, seed):
+def test_everyday_file_is_read_correctly_or_refused(tmp_path, make_plan, seed):
     check(tmp_path, make_plan, seed)
 
 
 @pytest.mark.slow
-def test_everyday_files_are_read_right_or_refused(tmp_path, make_plan):
+def test_everyday_files_are_read_correctly_or_refused(tmp_path, make_plan):
     counts = {"read": 0, "refused": 0}
     wrong = []
     for seed in ALL:

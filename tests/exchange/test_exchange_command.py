@@ -1,4 +1,4 @@
-"""`analyze import` and `analyze export` beside `analyze FILE`: options, messages, exit codes."""
+"""`analyze import` and `analyze export` next to `analyze FILE`: options, messages, exit codes."""
 
 import subprocess
 import sys
@@ -28,7 +28,7 @@ def arguments(source, profile, tmp_path):
 MAPPING = ("--angle", "q:deg", "--torque", "T:N.mm", "--time", "t:s")
 
 
-def test_an_import_says_what_it_made(analyze, arguments, tmp_path):
+def test_import_reports_its_session(analyze, arguments, tmp_path):
     result = analyze(
         *arguments,
         *MAPPING,
@@ -71,7 +71,7 @@ def test_an_import_says_what_it_made(analyze, arguments, tmp_path):
         ((*MAPPING, "--angle-delay-s", "5"), ("--angle-delay-s",)),
     ],
 )
-def test_wrong_use_is_explained_and_makes_nothing(analyze, arguments, tmp_path, options, words):
+def test_wrong_use_is_explained_without_output(analyze, arguments, tmp_path, options, words):
     result = analyze(*arguments, *options)
     assert result.exit_code == 2, result.output
     for word in words:
@@ -87,7 +87,7 @@ def test_wrong_use_is_explained_and_makes_nothing(analyze, arguments, tmp_path, 
         ((*MAPPING, "--profile", "absent.toml"), ("absent.toml", "cannot be read")),
     ],
 )
-def test_a_file_that_cannot_be_imported_is_explained(analyze, arguments, tmp_path, options, words):
+def test_unusable_file_is_explained(analyze, arguments, tmp_path, options, words):
     result = analyze(*arguments, *options)
     assert result.exit_code == 1
     assert result.stdout == ""
@@ -97,7 +97,7 @@ def test_a_file_that_cannot_be_imported_is_explained(analyze, arguments, tmp_pat
     assert not list(tmp_path.glob("*.mcap*"))
 
 
-def test_a_wrong_unit_of_the_time_is_refused_where_the_beam_shows_it(analyze, csv_of, arguments):
+def test_wrong_time_unit_is_refused_by_the_beam(analyze, csv_of, arguments):
     csv_of(t=1.0 * np.arange(N), q=np.sin(np.arange(N) / 50), T=np.cos(np.arange(N) / 9))
     result = analyze(*arguments, *MAPPING)
     assert result.exit_code == 1
@@ -109,19 +109,19 @@ def test_a_wrong_unit_of_the_time_is_refused_where_the_beam_shows_it(analyze, cs
     assert analyze(*arguments, *MAPPING, "--time", "t:ms").exit_code == 0
 
 
-def test_a_record_shorter_than_a_period_of_the_beam_is_doubted(analyze, arguments):
+def test_record_shorter_than_a_period_has_a_warning(analyze, arguments):
     result = analyze(*arguments, *MAPPING, "--time", "t:ms")
     assert result.exit_code == 0
     assert "lasts 0.003 s at 1e+06 Hz, less than one period of the first mode" in result.stderr
 
 
-def test_a_session_has_its_ending(analyze, source, profile, tmp_path):
+def test_session_needs_its_suffix(analyze, source, profile, tmp_path):
     result = analyze("import", source, tmp_path / "a.csv", "--profile", profile, *MAPPING)
     assert result.exit_code == 2
     assert ".mcap" in result.stderr
 
 
-def test_doubts_are_told_on_standard_error(analyze, source, arguments):
+def test_warnings_are_printed_on_standard_error(analyze, source, arguments):
     source.write_text(source.read_text().replace("t,q,T", "t,q_rad,T"))
     result = analyze(*arguments, *MAPPING, "--angle", "q_rad:deg")
     assert result.exit_code == 0
@@ -144,9 +144,7 @@ def session(analyze, arguments, tmp_path):
         ("absent/a.csv", (), 1, ("absent/a.csv cannot be written",)),
     ],
 )
-def test_what_cannot_be_exported_is_explained(
-    analyze, session, tmp_path, out, options, code, words
-):
+def test_impossible_export_is_explained(analyze, session, tmp_path, out, options, code, words):
     before = sorted(tmp_path.iterdir())
     for what in ("record", "frf"):
         own = () if what == "record" else ("--segment", "1000")
@@ -157,7 +155,7 @@ def test_what_cannot_be_exported_is_explained(
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_the_analysis_own_messages_are_those_of_an_export(analyze, session, tmp_path):
+def test_messages_of_the_analysis_are_those_of_an_export(analyze, session, tmp_path):
     result = analyze("export", "frf", session, tmp_path / "f.csv")
     assert result.exit_code == 1
     assert "fewer than one Welch segment" in result.stderr
@@ -170,7 +168,7 @@ def test_the_analysis_own_messages_are_those_of_an_export(analyze, session, tmp_
     assert not list(tmp_path.glob("[fr].csv"))
 
 
-def test_a_disk_that_fills_up_leaves_no_part_of_a_file(analyze, session, tmp_path, monkeypatch):
+def test_full_disk_leaves_no_partial_file(analyze, session, tmp_path, monkeypatch):
     def full(_table, stream):
         stream.write(b"half")
         raise OSError(28, "No space left on device")
@@ -182,7 +180,7 @@ def test_a_disk_that_fills_up_leaves_no_part_of_a_file(analyze, session, tmp_pat
     assert not (tmp_path / "r.csv").exists()
 
 
-def test_the_analysis_stands_beside_its_subcommands(analyze):
+def test_analysis_works_with_its_subcommands(analyze):
     text = analyze("--help").stdout
     assert "[OPTIONS] [FILE]..." in text  # optional, because of --latest
     commands = text[text.index("Commands:") :]

@@ -24,7 +24,7 @@ def blocks(language):
 
 
 @pytest.fixture
-def foreign_files(simulated, tmp_path):
+def third_party_files(simulated, tmp_path):
     """The simulated session as four other programs would have recorded it, with 1 s of rest."""
     nptdms = pytest.importorskip("nptdms", reason="the document imports a TDMS file")
     pyuff = pytest.importorskip("pyuff", reason="the document imports a universal file")
@@ -55,8 +55,8 @@ def foreign_files(simulated, tmp_path):
 
 
 @pytest.mark.further  # parsed in tests/docs
-def test_every_example_runs_as_written(analyze, foreign_files, tmp_path, monkeypatch, capsys):
-    angle, torque = foreign_files
+def test_every_example_runs_as_written(analyze, third_party_files, tmp_path, monkeypatch, capsys):
+    angle, torque = third_party_files
     (profile,), shells, (python, _, _) = blocks("toml"), blocks("sh"), blocks("python")
     (tmp_path / "beam.toml").write_text(profile)
     monkeypatch.chdir(tmp_path)
@@ -88,7 +88,7 @@ def exported_models(simulated, analyze, tmp_path, monkeypatch):
         assert result.exit_code == 0, result.output
 
 
-@pytest.mark.further  # what is read is tested in test_model_export.py
+@pytest.mark.further  # the content is tested in test_model_export.py
 def test_the_examples_read_a_model(exported_models, capsys):
     _, with_scipy, with_control = blocks("python")
     exec(with_scipy, {})

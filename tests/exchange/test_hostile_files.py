@@ -1,4 +1,4 @@
-"""Files that claim what they do not hold, or hold what nobody can: refused, in bounded memory."""
+"""Files with false claims or oversized contents: refused, in bounded memory."""
 
 import json
 import os
@@ -67,7 +67,7 @@ def test_ten_million_columns(refused, tmp_path):
     assert megabytes < 100
 
 
-def test_a_quotation_that_never_ends(refused, tmp_path):
+def test_unterminated_quotation_is_refused(refused, tmp_path):
     path = tmp_path / "quote.csv"
     path.write_bytes(b'a,b\n"' + b"1,2\n" * 1_000_000)
     message, megabytes = refused(path, "a")
@@ -87,13 +87,13 @@ MAT_HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<HH", 0x0100, 0x4D
 
 
 @pytest.mark.parametrize("dims", [further((1, 2**28)), (1, 1000)])
-def test_two_gigabytes_in_two_megabytes(refused, tmp_path, dims):
-    """Zeros, compressed; the dimensions say so, or do not."""
+def test_two_gigabytes_in_two_megabytes_are_refused(refused, tmp_path, dims):
+    """Zeros, compressed; with right or wrong dimensions."""
     size = 2**31
     body = mat_element(dims, size, b"")
     packer = zlib.compressobj(9)
     data = packer.compress(struct.pack("<2I", 14, len(body) + size) + body)
-    data += packer.flush(zlib.Z_FULL_FLUSH)  # what follows can be repeated as it is
+    data += packer.flush(zlib.Z_FULL_FLUSH)  # the rest can be repeated unchanged
     data += (size >> 20) * (packer.compress(bytes(2**20)) + packer.flush(zlib.Z_FULL_FLUSH))
     path = tmp_path / "bomb.mat"
     path.write_bytes(MAT_HEADER + struct.pack("<2I", 15, len(data)) + data)
@@ -103,7 +103,7 @@ def test_two_gigabytes_in_two_megabytes(refused, tmp_path, dims):
 
 
 @pytest.mark.parametrize("dims", [(1, 2**30), further((1, 10))])
-def test_four_gigabytes_that_are_not_there(refused, tmp_path, dims):
+def test_absent_four_gigabytes_are_refused(refused, tmp_path, dims):
     claimed = 0xFFFFFFF0
     body = mat_element(dims, claimed, bytes(80))
     path = tmp_path / "claim.mat"
@@ -112,7 +112,7 @@ def test_four_gigabytes_that_are_not_there(refused, tmp_path, dims):
     assert megabytes < 200
 
 
-def test_matlab_7_3_reads_nothing_but_what_is_in_it(tmp_path):
+def test_matlab_7_3_reads_only_its_own_content(tmp_path):
     """A link or a data set may lead to any file that the importer can read, or to a pipe."""
     h5py = pytest.importorskip("h5py", reason="MATLAB 7.3 is read if h5py is there")
     secret, other, path = (tmp_path / name for name in ("secret", "other.h5", "a.mat"))
@@ -144,7 +144,7 @@ def test_matlab_7_3_reads_nothing_but_what_is_in_it(tmp_path):
             read_source(path, [name])
 
 
-def test_a_universal_file_of_nothing_but_marks(refused, tmp_path):
+def test_universal_file_of_marks_is_refused(refused, tmp_path):
     pytest.importorskip("pyuff", reason="UFF58 needs pyuff")
     path = tmp_path / "marks.uff"
     path.write_bytes(b"    -1\n" * 3_000_000)
@@ -162,7 +162,7 @@ def tdms_object(number):
     return struct.pack(f"<I{len(name)}sII", len(name), name, 0xFFFFFFFF, 0)
 
 
-def test_a_tdms_file_of_ten_million_channels(refused, tmp_path):
+def test_tdms_of_ten_million_channels(refused, tmp_path):
     pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
     path = tmp_path / "wide.tdms"
     contents = struct.pack("<I", 10_000_000) + tdms_object(1) * 1_000_000
@@ -172,7 +172,7 @@ def test_a_tdms_file_of_ten_million_channels(refused, tmp_path):
     assert megabytes < 200
 
 
-def test_a_tdms_file_that_lists_its_channels_again_and_again(refused, tmp_path):
+def test_tdms_with_repeated_channel_lists(refused, tmp_path):
     pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
     path = tmp_path / "often.tdms"
     contents = struct.pack("<I", 20_000) + b"".join(map(tdms_object, range(20_000)))
@@ -183,7 +183,7 @@ def test_a_tdms_file_that_lists_its_channels_again_and_again(refused, tmp_path):
     assert megabytes < 200
 
 
-def test_a_tdms_file_that_claims_a_text_of_four_gigabytes(refused, tmp_path):
+def test_tdms_with_a_claimed_text_of_four_gigabytes(refused, tmp_path):
     pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
     path = tmp_path / "text.tdms"
     path.write_bytes(lead_in(6, 100) + struct.pack("<II", 1, 0xFFFFFFF0) + b"abc")

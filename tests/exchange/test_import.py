@@ -1,4 +1,4 @@
-"""What becomes of a record: numbers, flags, gaps, provenance, and doubts that are told."""
+"""Imported records: numbers, flags, gaps, provenance, and warnings."""
 
 import hashlib
 import os
@@ -29,7 +29,7 @@ ANGLE = 0.02 * np.sin(2 * np.pi * 1.3 * TIME_S**2)
 TORQUE = np.random.default_rng(0).normal(size=N)
 
 
-def test_units_are_applied_and_everything_is_said(csv_of, make_plan, tmp_path):
+def test_units_are_applied_and_documented(csv_of, make_plan, tmp_path):
     source = csv_of(
         t=1e3 * TIME_S + 250, angle=np.degrees(ANGLE), torque=1e3 * TORQUE, fx=TORQUE, tz=TORQUE
     )
@@ -51,8 +51,8 @@ def test_units_are_applied_and_everything_is_said(csv_of, make_plan, tmp_path):
     np.testing.assert_allclose(samples["coupling_torque_nm"], TORQUE, rtol=1e-15)
     np.testing.assert_allclose(samples["fx_n"], 1e3 * TORQUE, rtol=1e-15)
     np.testing.assert_allclose(samples["tz_nm"], 1e-2 * TORQUE, rtol=1e-15)
-    for untold in ("angle_reference_rad", "torque_command_nm", "fy_n", "status", "work_ns"):
-        assert not samples[untold].any()
+    for absent in ("angle_reference_rad", "torque_command_nm", "fy_n", "status", "work_ns"):
+        assert not samples[absent].any()
     np.testing.assert_array_equal(samples["tick"], np.arange(N))
     np.testing.assert_array_equal(samples["t_ns"], 1_000_000 * np.arange(N))
     assert session.segments == {"rest": (0, 500), "sweep": (500, 3500), "ring_down": (3500, 4000)}
@@ -84,7 +84,7 @@ def test_units_are_applied_and_everything_is_said(csv_of, make_plan, tmp_path):
     assert record.warnings == ()
 
 
-def test_a_rate_that_is_stated_stands_in_for_times(csv_of, make_plan, tmp_path):
+def test_stated_rate_replaces_times(csv_of, make_plan, tmp_path):
     source = csv_of(angle=ANGLE, torque=TORQUE)
     done = import_record(source, tmp_path / "a.mcap", make_plan(rate_hz=819.2))
     session = read_session(done.path)
@@ -96,11 +96,11 @@ def test_a_rate_that_is_stated_stands_in_for_times(csv_of, make_plan, tmp_path):
 
 
 def test_gaps_become_missing_ticks(csv_of, make_plan, tmp_path):
-    kept = np.delete(np.arange(N), [100, 101, 102, 2000])
-    source = csv_of(t=TIME_S[kept], angle=ANGLE[kept], torque=TORQUE[kept])
+    present = np.delete(np.arange(N), [100, 101, 102, 2000])
+    source = csv_of(t=TIME_S[present], angle=ANGLE[present], torque=TORQUE[present])
     done = import_record(source, tmp_path / "a.mcap", make_plan(time="t:s"))
     session = read_session(done.path)
-    np.testing.assert_array_equal(session.samples["tick"], kept)
+    np.testing.assert_array_equal(session.samples["tick"], present)
     after_gap = np.flatnonzero(session.samples["status"])
     assert session.samples["tick"][after_gap].tolist() == [103, 2001]
     assert (session.samples["status"][after_gap] == Status.AFTER_LOST).all()
@@ -109,7 +109,7 @@ def test_gaps_become_missing_ticks(csv_of, make_plan, tmp_path):
     assert load_record(done.path).gaps.missing_ticks == 4
 
 
-def test_values_that_are_none_are_held_and_flagged(csv_of, make_plan, tmp_path):
+def test_invalid_values_are_held_and_flagged(csv_of, make_plan, tmp_path):
     angle, torque = ANGLE.copy(), TORQUE.copy()
     angle[[0, 1, 500]] = np.nan, np.inf, -np.inf
     torque[[500, 600, 601]] = np.nan
@@ -149,9 +149,7 @@ def test_values_that_are_none_are_held_and_flagged(csv_of, make_plan, tmp_path):
         ({"ref": np.full(N, 1e308)}, ("'ref'", "not finite in 4000")),
     ],
 )
-def test_too_many_or_the_wrong_values_missing_are_refused(
-    csv_of, make_plan, tmp_path, change, words
-):
+def test_too_many_missing_values_are_refused(csv_of, make_plan, tmp_path, change, words):
     columns = {"angle": ANGLE, "torque": TORQUE, "ref": np.zeros(N)} | change
     plan = make_plan(others={"angle_reference_rad": parse_choice("ref:rev", "angle")})
     with pytest.raises(ExchangeError) as refusal:
@@ -168,7 +166,7 @@ def test_a_segment_outside_the_record_is_refused(csv_of, make_plan, tmp_path, se
         import_record(source, tmp_path / "a.mcap", make_plan(segments_s={"sweep": segment}))
 
 
-def test_a_unit_that_the_file_contradicts_is_refused(csv_of, make_plan, tmp_path):
+def test_unit_contradicted_by_the_file_is_refused(csv_of, make_plan, tmp_path):
     source = csv_of(**{"Angle [deg]": ANGLE, "torque": TORQUE})
     with pytest.raises(ExchangeError, match=r"is in deg, and rad was stated"):
         import_record(source, tmp_path / "a.mcap", make_plan(angle="Angle [deg]:rad"))
@@ -186,7 +184,7 @@ def test_a_unit_that_the_file_contradicts_is_refused(csv_of, make_plan, tmp_path
 @pytest.mark.parametrize(
     ("title", "unit"), [("Tz (N·mm) ", "N.mm"), ("Tz [mNm]", "mN.m"), ("Tz (raw)", None)]
 )
-def test_a_unit_in_brackets_is_the_file_s_word(csv_of, make_plan, tmp_path, title, unit):
+def test_unit_in_brackets_is_a_statement_of_the_file(csv_of, make_plan, tmp_path, title, unit):
     source = csv_of(**{"angle": ANGLE, title: TORQUE})
     plan = make_plan(torque=f"{title}:N.m")
     if unit is None:
@@ -204,7 +202,7 @@ def test_a_unit_in_brackets_is_the_file_s_word(csv_of, make_plan, tmp_path, titl
         ("motor_angle:rad", "coupling_torque_nm:N.m", []),
     ],
 )
-def test_a_name_that_sounds_like_another_unit_is_told(
+def test_name_that_suggests_another_unit_is_reported(
     csv_of, make_plan, tmp_path, angle, torque, suggestions
 ):
     names = (choice.rpartition(":")[0] for choice in (angle, torque))
@@ -215,7 +213,7 @@ def test_a_name_that_sounds_like_another_unit_is_told(
         assert suggestion in warning
 
 
-def test_what_a_file_says_of_rate_and_unit_is_compared(make_plan, tmp_path):
+def test_stated_rate_and_unit_are_compared(make_plan, tmp_path):
     tdms = pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
     source = tmp_path / "a.tdms"
 
@@ -262,7 +260,7 @@ def motion():
         ({"reverse_torque": True}, ("opposite sign", "--reverse-torque")),
     ],
 )
-def test_the_beam_tells_wrong_units_and_a_wrong_sign(
+def test_wrong_units_and_sign_are_found_by_the_beam(
     csv_of, make_plan, tmp_path, motion, options, words
 ):
     source = csv_of(angle=motion[0], torque=motion[1])
@@ -282,7 +280,7 @@ def test_a_reaction_is_reversed(csv_of, make_plan, tmp_path, motion):
     assert session.metadata["import_coupling_torque_nm"] == "torque:N.m, reversed"
 
 
-def test_nothing_is_overwritten_and_nothing_left_behind(csv_of, make_plan, tmp_path, monkeypatch):
+def test_nothing_is_overwritten_or_left_behind(csv_of, make_plan, tmp_path, monkeypatch):
     source = csv_of(angle=ANGLE, torque=TORQUE)
     import_record(source, tmp_path / "a.mcap", make_plan())
     before = (tmp_path / "a.mcap").read_bytes()
@@ -297,7 +295,7 @@ def test_nothing_is_overwritten_and_nothing_left_behind(csv_of, make_plan, tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "record.csv"]
 
 
-def test_a_plan_is_complete(profile):
+def test_incomplete_plan_is_refused(profile):
     specimen = read_specimen(profile)
     choice = parse_choice("a:rad", "angle")
     both = {"angle_rad": choice, "coupling_torque_nm": choice}
@@ -308,7 +306,7 @@ def test_a_plan_is_complete(profile):
             ImportPlan(both, specimen, **times)
 
 
-def test_the_specimen_of_a_profile_or_of_three_lines(profile, tmp_path):
+def test_specimen_from_a_profile_or_three_lines(profile, tmp_path):
     specimen = read_specimen(profile)
     assert (specimen.beam, specimen.tool_inertia_kg_m2) == (BEAM, 0.0)
     path = tmp_path / "beam.toml"
@@ -376,7 +374,7 @@ def test_the_uniformity_of_the_specimen_goes_into_the_session(
         ("#" * 250_001, ("at most 0.25 MB",)),
     ],
 )
-def test_what_is_no_specimen_is_refused(tmp_path, text, words):
+def test_invalid_specimen_is_refused(tmp_path, text, words):
     path = tmp_path / "beam.toml"
     path.write_text(text)
     with pytest.raises(ExchangeError) as refusal:
@@ -385,7 +383,7 @@ def test_what_is_no_specimen_is_refused(tmp_path, text, words):
         assert word in str(refusal.value)
 
 
-def test_a_specimen_that_cannot_be_read_is_refused(tmp_path):
+def test_unreadable_specimen_is_refused(tmp_path):
     with pytest.raises(ExchangeError, match="cannot be read"):
         read_specimen(tmp_path / "absent.toml")
 
@@ -398,7 +396,7 @@ def test_a_specimen_may_begin_with_a_byte_order_mark(profile, tmp_path, encoding
 
 
 @pytest.mark.parametrize("year", [2300, 1960])
-def test_a_time_stamp_that_no_session_can_have_does_not_matter(csv_of, make_plan, tmp_path, year):
+def test_impossible_time_stamp_is_ignored(csv_of, make_plan, tmp_path, year):
     source = csv_of(angle=ANGLE, torque=TORQUE)
     seconds = (year - 1970) * 365.2425 * 86_400
     os.utime(source, (seconds, seconds))
@@ -408,7 +406,7 @@ def test_a_time_stamp_that_no_session_can_have_does_not_matter(csv_of, make_plan
     assert begun_ns <= read_session(done.path).start_utc_ns <= time.time_ns()
 
 
-def test_nothing_is_left_where_writing_fails_at_once(tmp_path):
+def test_immediate_write_error_leaves_nothing(tmp_path):
     samples = {"tick": np.arange(3), "angle_rad": np.zeros(3)}
     with pytest.raises(Exception, match=r"."):
         write_session(tmp_path / "a.mcap", samples, 1000.0, 2**64, {}, {}, ("a warning",))
@@ -426,9 +424,7 @@ START = np.datetime64("2026-11-25T12:00:00.000000")
 
 
 @pytest.mark.parametrize(("micros", "skip", "delay_s"), [(8000, 8, 0.0), (8300, 8, -3e-4)])
-def test_channels_that_begin_later_are_cut_and_the_rest_is_their_delay(
-    make_plan, tmp_path, micros, skip, delay_s
-):
+def test_late_channels_are_cut_with_a_residual_delay(make_plan, tmp_path, micros, skip, delay_s):
     later = START + np.timedelta64(micros, "us")
     source = tdms_of(
         tmp_path / "a.tdms",
@@ -462,7 +458,7 @@ def test_channels_without_a_common_time_or_of_other_lengths_are_refused(make_pla
             import_record(source, tmp_path / "a.mcap", plan)
 
 
-def test_a_scale_that_is_not_known_is_refused_by_name(make_plan, tmp_path):
+def test_unknown_scale_is_refused_by_name(make_plan, tmp_path):
     scale = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Reciprocal"}
     source = tdms_of(tmp_path / "a.tdms", ("angle", ANGLE), ("torque", TORQUE, scale))
     with pytest.raises(ExchangeError, match=r"'g/torque' are raw.*Reciprocal"):
@@ -473,7 +469,7 @@ def test_a_scale_that_is_not_known_is_refused_by_name(make_plan, tmp_path):
     assert "Reciprocal" in session.metadata["import_ignored"]
 
 
-def test_the_default_rate_of_labview_gives_way(make_plan, tmp_path):
+def test_default_rate_of_labview_is_overridden(make_plan, tmp_path):
     waveform = {"wf_increment": 1.0, "wf_start_offset": 0.0}
     source = tdms_of(
         tmp_path / "a.tdms",

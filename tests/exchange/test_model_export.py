@@ -179,7 +179,7 @@ def response(model, frequency_hz):
         *(slow(seed, "angle") for seed in range(3, 20) if seed != 4),
     ],
 )
-def test_the_order_chosen_is_accurate_to_a_thousandth(exported, seed, given):
+def test_chosen_order_is_accurate_to_a_thousandth(exported, seed, given):
     values = random_beam(seed)
     model = exported(document(values, modal=False), "--input", given, "--samples", 0)
     frequency_hz = np.geomspace(*BAND_HZ, 5000)
@@ -207,7 +207,7 @@ def test_inputs_outputs_and_states_have_names_and_units(nominal, exported):
     assert angle["B"].shape == (angle["order"], 3)
 
 
-def test_a_number_of_states_is_taken_and_its_error_stated(nominal, exported, export):
+def test_requested_number_of_states_has_its_error_stated(nominal, exported, export):
     best = nominal
     fewer = exported(document(), "--samples", 0, "--order", 14, name="fewer.npz")
     assert fewer["order"] == 14 < best["order"]
@@ -236,7 +236,7 @@ def test_a_rate_holds_the_input_exactly(nominal, exported):
             np.testing.assert_allclose(mine, theirs, atol=1e-12)
 
 
-def test_samples_are_of_the_posterior_and_have_the_same_states(nominal):
+def test_posterior_samples_have_the_same_states(nominal):
     model = nominal
     n = int(model["order"])
     assert model["A_samples"].shape == (50, n, n)
@@ -283,7 +283,7 @@ def test_every_format_has_the_same_variables(exported, export, tmp_path):
 
 
 @pytest.mark.parametrize("given", ["acceleration", further("angle")])
-def test_the_modal_model_is_exported_where_the_beam_was_refused(exported, given):
+def test_modal_model_is_exported_for_a_refused_beam(exported, given):
     model = exported(document(gate="refused"), "--input", given)
     assert model["model"] == "modal"
     assert model["band_hz"].tolist() == [0.05, 50.0]
@@ -306,7 +306,7 @@ def test_the_modal_model_is_exported_where_the_beam_was_refused(exported, given)
     assert np.median(ratio) == pytest.approx(1.0, abs=0.2)
 
 
-def test_the_beam_is_exported_on_request_with_what_is_doubtful(export, exported):
+def test_beam_is_exported_on_request_with_its_doubts(export, exported):
     result = export(document(gate="refused"), "beam.npz", "--beam", *FEW)
     assert result.exit_code == 0
     assert "Note: whether a uniform beam predicts the modes: refused" in result.stdout
@@ -328,7 +328,7 @@ def test_the_beam_is_exported_on_request_with_what_is_doubtful(export, exported)
         assert words in result.stdout
 
 
-def test_the_beam_that_fits_exactly_is_taken_where_its_covariance_is_stated(exported):
+def test_exact_beam_is_used_if_its_covariance_is_stated(exported):
     other = NOMINAL | {"density_over_stiffness": 0.0521}
     block = document(other)["headlines"][0]
     exact_geometry = {"parameters": block["parameters"], "covariance": block["covariance"]}
@@ -390,7 +390,7 @@ WRONG_MODAL = {**MODAL.as_json(), "poles_rad_s": [[1.0, 16.0]] * 3}
         (document(), ("--samples", "-1"), 2, ("--samples",)),
     ],
 )  # fmt: skip
-def test_what_cannot_be_exported_is_refused_in_a_sentence(
+def test_impossible_export_is_refused_in_one_sentence(
     export, tmp_path, content, options, code, words
 ):
     result = export(content, "model.npz", *options)
@@ -437,7 +437,7 @@ def identified(simulated):
 
 
 @pytest.mark.process
-def test_a_session_is_analysed_on_the_spot(simulated, identified, analyze, tmp_path, monkeypatch):
+def test_session_is_analysed_for_the_export(simulated, identified, analyze, tmp_path, monkeypatch):
     found = {simulated: identified}
     monkeypatch.setattr("analysis.linear_model.identify_session", found.__getitem__)
     result = analyze("export", "model", simulated, tmp_path / "a.npz", "--samples", 2)
@@ -453,7 +453,7 @@ def test_a_session_is_analysed_on_the_spot(simulated, identified, analyze, tmp_p
 
 
 @pytest.mark.process
-def test_beam_and_modal_model_of_a_session_agree_within_what_the_record_knows(identified):
+def test_beam_and_modal_model_agree_within_uncertainty(identified):
     found = identified
     assert found.uniform_beam_test.status == "passed"
     beam = linear_model(found, ModelOptions(order=20, samples=0))

@@ -63,10 +63,10 @@ def regular(length):
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
     max_examples=20,
 )
-@example(samples=regular(40), rate_hz=333.3)  # of which six digits of the period tell too little
+@example(samples=regular(40), rate_hz=333.3)  # six digits of the period are too few
 @given(samples=sessions(), rate_hz=st.sampled_from([1000.0, 1024.0, 333.3, 5e4]))
 @pytest.mark.parametrize("suffix", [".csv", further(".mat"), further(".uff")])
-def test_what_was_exported_is_imported_as_it_was(
+def test_exported_record_is_imported_unchanged(
     make_session, specimen, tmp_path, suffix, samples, rate_hz
 ):
     if suffix == ".uff":
@@ -87,7 +87,7 @@ def test_what_was_exported_is_imported_as_it_was(
 
 
 @pytest.mark.fit
-def test_an_imported_record_is_analysed_as_the_session_itself(simulated, specimen, tmp_path):
+def test_imported_record_has_the_same_analysis(simulated, specimen, tmp_path):
     record = load_record(simulated)
     export_record(simulated, tmp_path / "a.csv")
     segments_s = {"rest": (0, 0.5), "sweep": (0.5, 20.5), "ring_down": (20.5, 21.5)}
@@ -102,7 +102,7 @@ def test_an_imported_record_is_analysed_as_the_session_itself(simulated, specime
     assert one.models[0].fit.parameters == other.models[0].fit.parameters
 
 
-def test_in_other_units_it_is_the_same_to_rounding(simulated, specimen, tmp_path):
+def test_record_in_other_units_agrees_to_rounding(simulated, specimen, tmp_path):
     record = load_record(simulated)
     samples = read_session(simulated).samples
     source = tmp_path / "a.csv"
@@ -135,7 +135,7 @@ def response(simulated):
     return estimate(load_record(simulated), SETTINGS)[0]
 
 
-def test_the_response_as_csv(simulated, response, tmp_path):
+def test_response_as_csv(simulated, response, tmp_path):
     export_frf(simulated, tmp_path / "f.csv", SETTINGS)
     names = (
         "frequency_hz", "response_real_nm_per_rad", "response_imaginary_nm_per_rad", "coherence"
@@ -147,7 +147,7 @@ def test_the_response_as_csv(simulated, response, tmp_path):
     np.testing.assert_array_equal(real + 1j * imaginary, response.response)
 
 
-def test_the_response_as_mat(simulated, response, tmp_path):
+def test_response_as_mat(simulated, response, tmp_path):
     export_frf(simulated, tmp_path / "f.mat", SETTINGS)
     contents = scipy.io.loadmat(tmp_path / "f.mat", squeeze_me=True)
     np.testing.assert_array_equal(contents["frequency_hz"], response.frequency_hz)
@@ -164,7 +164,7 @@ def test_one_transform_of_the_whole_record_has_no_coherence(simulated, tmp_path)
     assert "nfft_samples" not in table.information
 
 
-def test_a_record_as_mat_keeps_integers_and_what_the_session_says(simulated, tmp_path):
+def test_mat_preserves_integers_and_metadata(simulated, tmp_path):
     export_record(simulated, tmp_path / "r.mat")
     contents = scipy.io.loadmat(tmp_path / "r.mat", squeeze_me=True)
     samples = read_session(simulated).samples
@@ -179,10 +179,10 @@ def test_a_record_as_mat_keeps_integers_and_what_the_session_says(simulated, tmp
     assert information["id"] == stated["id"]
 
 
-def test_what_users_wrote_stays_a_text_in_mat(make_session, tmp_path):
+def test_user_metadata_stay_texts_in_mat(make_session, tmp_path):
     added = {"note": "12", "specimen": "7", "meta_batch": "007", "meta_length_m": "0.98"}
     path = make_session("a.mcap", metadata=added, **regular(3))
     export_record(path, tmp_path / "r.mat")
     information = scipy.io.loadmat(tmp_path / "r.mat", squeeze_me=True)["information"]
-    told = {key: information[key].item() for key in added}
-    assert told == {"note": "12", "specimen": "7", "meta_batch": "007", "meta_length_m": 0.98}
+    metadata = {key: information[key].item() for key in added}
+    assert metadata == {"note": "12", "specimen": "7", "meta_batch": "007", "meta_length_m": 0.98}

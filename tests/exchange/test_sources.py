@@ -1,4 +1,4 @@
-"""Files of other programs, as these write them, and what is wrong with some."""
+"""Files of other programs, as these write them, and errors in some."""
 
 import struct
 import sys
@@ -94,15 +94,13 @@ def test_a_csv_without_names_has_numbers(text):
     ],
 )
 @pytest.mark.parametrize("ending", ["dat", "txt"])
-def test_columns_between_blanks_are_read_from_the_first_line_of_numbers_on(
-    text, content, names, ending
-):
+def test_columns_begin_at_the_first_line_of_numbers(text, content, names, ending):
     first, second = values(text(content, f"a.{ending}"), *names)
     assert first.tolist() == [1.0, -0.3]
     assert second.tolist() == [2.5, 4.0]
 
 
-def test_a_first_line_of_numbers_is_data_though_a_cell_of_it_is_empty(text):
+def test_first_line_with_an_empty_cell_is_data(text):
     first, third = values(text("1,,3\n4,5,6\n"), "#1", "#3")
     assert (first.tolist(), third.tolist()) == ([1, 4], [3, 6])
     np.testing.assert_array_equal(values(text("1,,3\n4,5,6\n"), "#2"), [np.nan, 5])
@@ -135,7 +133,7 @@ def test_an_empty_cell_is_not_a_number(text):
         ("a" * 70_000 + ",b\n1,2\n", "b", ("a line of more than 65536",)),
     ],
 )
-def test_what_is_no_table_of_numbers_is_refused(text, content, name, words):
+def test_other_text_than_a_table_is_refused(text, content, name, words):
     message = refused(text(content), name)
     for word in words:
         assert word in message
@@ -149,7 +147,7 @@ def test_encodings_are_recognised(text, encoding):
 
 @settings(max_examples=25)
 @given(columns=NUMBERS)
-def test_csv_keeps_every_digit(folder, columns):
+def test_csv_preserves_every_digit(folder, columns):
     path = folder / "digits.csv"
     path.write_text("a\n" + "".join(f"{value!r}\n" for value in columns.tolist()))
     np.testing.assert_array_equal(values(path, "a"), columns)
@@ -224,7 +222,7 @@ def test_matlab_integers_are_numbers(tmp_path):
         ("empty", ("0 samples",)),
     ],
 )
-def test_what_is_no_vector_of_matlab_is_refused(tmp_path, name, words):
+def test_non_vector_of_matlab_is_refused(tmp_path, name, words):
     path = tmp_path / "a.mat"
     contents = {
         "m": np.ones((4, 3)),
@@ -244,7 +242,7 @@ def test_what_is_no_vector_of_matlab_is_refused(tmp_path, name, words):
 @pytest.mark.parametrize(
     "content", [b"", b"MATLAB 5.0 MAT-file", b"\0" * 200, b"text, not MATLAB\n" * 20]
 )
-def test_what_is_no_matlab_file_is_refused(tmp_path, content):
+def test_non_matlab_file_is_refused(tmp_path, content):
     path = tmp_path / "a.mat"
     path.write_bytes(content)
     assert "save('-v7'" in refused(path, "a")
@@ -303,7 +301,7 @@ def test_tdms_channels(folder, numbers, whole):
     np.testing.assert_array_equal(values(path, "Rig/1/Counts"), whole)
 
 
-def test_tdms_says_unit_and_rate(tdms, tmp_path):
+def test_tdms_states_unit_and_rate(tdms, tmp_path):
     path = tmp_path / "a.tdms"
     properties = {"unit_string": "deg", "wf_increment": 1e-3}
     with tdms.TdmsWriter(str(path)) as writer:
@@ -314,7 +312,7 @@ def test_tdms_says_unit_and_rate(tdms, tmp_path):
     assert channels["Rig/Angle"].remark == ""
 
 
-def test_tdms_that_was_cut_off_says_so_and_no_foreign_index_is_read(tdms, tmp_path):
+def test_truncated_tdms_is_reported_without_using_another_index(tdms, tmp_path):
     path = tmp_path / "a.tdms"
     with tdms.TdmsWriter(str(path), index_file=True) as writer:
         writer.write_segment([tdms.ChannelObject("Rig", "Angle", np.arange(100.0))])
@@ -324,7 +322,7 @@ def test_tdms_that_was_cut_off_says_so_and_no_foreign_index_is_read(tdms, tmp_pa
     assert "cut off" in channels["Rig/Angle"].remark
 
 
-def test_what_is_no_channel_of_numbers_in_tdms_is_refused(tdms, tmp_path):
+def test_nonnumeric_tdms_channel_is_refused(tdms, tmp_path):
     path = tmp_path / "a.tdms"
     with tdms.TdmsWriter(str(path)) as writer:
         writer.write_segment([tdms.ChannelObject("Rig", "Angle", np.arange(5.0))])
@@ -359,7 +357,7 @@ def uff_of(path, *functions):
     numbers=arrays(np.float64, st.integers(2, 40), elements=st.floats(-1e9, 1e9)),
     binary=st.booleans(),
 )
-def test_uff_that_another_program_wrote(folder, numbers, binary):
+def test_uff_of_another_program(folder, numbers, binary):
     x = np.arange(len(numbers)) * 1e-3
     path = uff_of(
         folder / "a.uff",
@@ -401,7 +399,7 @@ def test_real_functions_of_frequency_are_refused(tmp_path, kind, axis, unit, wor
     assert words in refused(path, "a")
 
 
-def test_what_is_no_function_of_time_is_refused(tmp_path):
+def test_uff_other_than_functions_of_time_is_refused(tmp_path):
     x = np.arange(4) * 1e-3
     path = uff_of(
         tmp_path / "a.uff", ("G", x, x + 1j, {}), ("a", x, x, {}), ("b", x[:3], x[:3], {})
@@ -416,14 +414,14 @@ def test_what_is_no_function_of_time_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("suffix", "package"), [("tdms", "nptdms"), ("uff", "pyuff")])
-def test_a_library_that_is_missing_is_named_with_the_extra(tmp_path, monkeypatch, suffix, package):
+def test_missing_library_is_named_with_the_extra(tmp_path, monkeypatch, suffix, package):
     path = tmp_path / f"a.{suffix}"
     path.write_bytes(b"x")
     monkeypatch.setitem(sys.modules, package, None)
     assert "pip install 'rigd[exchange]'" in refused(path, "a")
 
 
-def test_what_is_no_file_that_is_known_is_refused(tmp_path):
+def test_unknown_file_format_is_refused(tmp_path):
     assert ".csv" in refused(tmp_path / "a.xlsx", "a")
     assert "cannot be read" in refused(tmp_path / "absent.csv", "a")
     (tmp_path / "folder.csv").mkdir()
@@ -439,7 +437,7 @@ def test_more_samples_than_a_session_has_are_refused(tmp_path):
     assert "cut the session out" in refused(path, "a")
 
 
-def test_a_damaged_matlab_file_never_ends_in_a_traceback(tmp_path):
+def test_damaged_matlab_file_gives_no_traceback(tmp_path):
     path = tmp_path / "a.mat"
     scipy.io.savemat(path, {"a": np.arange(50.0), "s": {"b": np.arange(50.0)}})
     whole = path.read_bytes()
@@ -457,7 +455,7 @@ def test_a_damaged_matlab_file_never_ends_in_a_traceback(tmp_path):
     assert refusals > 100
 
 
-def test_a_damaged_tdms_file_never_ends_in_a_traceback(tdms, tmp_path):
+def test_damaged_tdms_file_gives_no_traceback(tdms, tmp_path):
     path = tmp_path / "a.tdms"
     with tdms.TdmsWriter(str(path)) as writer:
         for _ in range(2):

@@ -24,7 +24,7 @@ def found(time_s):
     gap=st.integers(0, 50),
     data=st.data(),
 )
-def test_rate_and_ticks_are_those_the_times_were_made_of(rate_hz, start_s, samples, gap, data):
+def test_rate_and_ticks_are_recovered_from_times(rate_hz, start_s, samples, gap, data):
     ticks = np.arange(samples)
     if samples > 25:
         ticks[data.draw(st.integers(1, samples - 1)) :] += gap
@@ -36,7 +36,7 @@ def test_rate_and_ticks_are_those_the_times_were_made_of(rate_hz, start_s, sampl
 
 
 @pytest.mark.parametrize(("rate_hz", "digits"), [(1000, 3), (1000, 4), (600, 4), (1024, 6)])
-def test_times_of_few_digits_do_not_bend_the_rate(rate_hz, digits):
+def test_times_of_few_digits_do_not_bias_the_rate(rate_hz, digits):
     ticks = np.arange(100_000)
     base = found(np.round(ticks / rate_hz, digits))
     np.testing.assert_array_equal(base.ticks, ticks)
@@ -48,7 +48,7 @@ def test_a_round_rate_is_found_exactly():
     assert found(17.3 + np.arange(136_000) * 1e-3).rate_hz == 1000.0
 
 
-def test_a_clock_that_is_off_is_not_rounded_to_its_nominal_rate():
+def test_inaccurate_clock_is_not_rounded_to_its_nominal_rate():
     assert found(np.arange(10_000) * (1e-3 * (1 + 3e-5))).rate_hz == pytest.approx(999.97, abs=1e-3)
 
 
@@ -66,19 +66,19 @@ def test_a_clock_that_is_off_is_not_rounded_to_its_nominal_rate():
         ([0, 1e-3, 2e-3, *(1e-3 * np.arange(5000, 5040))], ("span 5040 periods",)),
     ],
 )
-def test_what_is_no_time_base_is_refused(times, words):
+def test_invalid_time_base_is_refused(times, words):
     with pytest.raises(ExchangeError) as refusal:
         found(times)
     for word in ("record.csv", *words):
         assert word in str(refusal.value)
 
 
-def test_a_rate_is_taken_as_it_is_stated():
+def test_stated_rate_is_used_unchanged():
     base = uniform_timebase(PATH, 5, 512.5)
     assert (base.ticks.tolist(), base.rate_hz, base.missing) == ([0, 1, 2, 3, 4], 512.5, 0)
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, np.nan, np.inf, 1e9])
-def test_a_rate_that_is_none_is_refused(rate_hz):
+def test_invalid_rate_is_refused(rate_hz):
     with pytest.raises(ExchangeError, match="outside the range of sessions"):
         uniform_timebase(PATH, 5, rate_hz)

@@ -86,7 +86,7 @@ def test_a_binary_body_has_the_bytes_that_its_header_states(length, complex_, ev
     assert size == 8 * length * (1 + complex_ + uneven)
 
 
-def test_the_text_is_that_of_the_definition():
+def test_text_matches_the_definition():
     """By hand from the SDRL's definition of data set 58: fields, columns and codes."""
     values = np.array([1.0, complex(0.0, -2.5), 3.25])
     column = ExportColumn("g_nm_per_rad", "Torque / Angle", "N.m/rad", values)
@@ -109,7 +109,7 @@ def test_the_text_is_that_of_the_definition():
     ]
 
 
-def test_times_that_six_digits_cannot_give_are_refused_in_text_only(pyuff, path):
+def test_times_beyond_six_digits_are_refused_in_text(pyuff, path):
     axis = 1000.0 + np.delete(np.arange(40), 7) * 1e-3
     content = table(axis, ExportColumn("a", "A", "N", np.arange(39.0)))
     with pytest.raises(ExchangeError, match="--binary"):
@@ -125,7 +125,7 @@ def test_an_increment_of_more_than_six_digits_is_not_rounded(pyuff, path):
     np.testing.assert_allclose(function["x"], axis, atol=1e-5)
 
 
-def test_integers_have_no_place_and_names_are_tamed(pyuff, path):
+def test_integers_are_refused_and_names_sanitised(pyuff, path):
     columns = (
         ExportColumn("status", "Bits", "", np.arange(3)),
         ExportColumn("coherence\r\n    -1", "Coherence", "", np.arange(3.0)),

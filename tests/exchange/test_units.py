@@ -34,12 +34,12 @@ UNITS = {
         ("force", "lbf", 4.4482216152605),
         ("time", "ms", 1e-3),
         ("time", " s ", 1.0),
-        ("angle", "0.02 rad", 0.02),  # what one volt stands for
+        ("angle", "0.02 rad", 0.02),  # equivalent of one volt
         ("angle", "2.5e-1deg", math.radians(0.25)),
         ("torque", "-1.5 mN.m", -1.5e-3),
     ],
 )
-def test_a_unit_has_its_size(quantity, unit, size):
+def test_unit_has_its_factor(quantity, unit, size):
     assert parse_choice(f"x:{unit}", quantity).factor == pytest.approx(size, rel=1e-14)
 
 
@@ -57,7 +57,7 @@ def test_a_unit_has_its_size(quantity, unit, size):
         ("angle", "0.02 N.m"),
     ],
 )
-def test_what_is_no_unit_of_the_quantity_is_refused_with_those_that_are(quantity, unit):
+def test_wrong_unit_is_refused_with_the_valid_ones(quantity, unit):
     with pytest.raises(ExchangeError, match="choose from") as refusal:
         parse_choice(f"x:{unit}", quantity)
     assert f"choose from {', '.join(UNITS[quantity])}. " in str(refusal.value)
@@ -65,23 +65,23 @@ def test_what_is_no_unit_of_the_quantity_is_refused_with_those_that_are(quantity
     assert "CHANNEL:0.02" in str(refusal.value)
 
 
-def test_capitals_tell_milli_from_mega():
+def test_capitals_distinguish_milli_from_mega():
     assert parse_choice("x:mNm", "torque").unit == "mN.m"
     with pytest.raises(ExchangeError, match="'MNm' is not a unit of torque"):
         parse_choice("x:MNm", "torque")
 
 
-def test_no_two_units_share_a_spelling():
+def test_spellings_of_units_are_unique():
     for quantity, names in UNITS.items():
         assert [parse_choice(f"x:{name}", quantity).unit for name in names] == list(names)
 
 
-def test_a_signal_s_unit_is_told_as_it_was_stated():
+def test_unit_of_a_signal_is_reported_as_stated():
     choice = parse_choice("lame:0.5 Nm", "torque")
     assert (str(choice), choice.factor) == ("lame:0.5 N.m", 0.5)
 
 
-def test_a_choice_is_taken_apart_at_its_last_colon():
+def test_choice_is_split_at_its_last_colon():
     choice = parse_choice("Rig: motor/Angle:deg", "angle")
     assert (choice.channel, choice.unit) == ("Rig: motor/Angle", "deg")
     assert str(choice) == "Rig: motor/Angle:deg"

@@ -206,11 +206,11 @@ class Drive:
                 if each.value is None and each.default is None:
                     blank = bytes(len(each) // 8) if each.data_type in od.NUMBER_TYPES else b"?"
                     self._store(each.index, each.subindex, blank)
-        consumer_entry = node.object_dictionary.device_information
+        identity = node.object_dictionary.device_information
         numbers = (
-            consumer_entry.vendor_number,
-            consumer_entry.product_number,
-            consumer_entry.revision_number,
+            identity.vendor_number,
+            identity.product_number,
+            identity.revision_number,
         )
         for sub, number in enumerate(numbers, 1):
             if self._has(0x1018, sub) and not self._get(0x1018, sub) and number:

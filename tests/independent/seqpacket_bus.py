@@ -103,7 +103,7 @@ class SeqpacketHub(can.BusABC):
         return messages, [source for source in ready if isinstance(source, int)]
 
     def _take(self, source: socket.socket) -> list[can.Message]:
-        """Take and distribute the next frame of a participant: one at a time preserves the order."""
+        """Take and distribute the next frame of a participant: one at a time, to preserve order."""
         with contextlib.suppress(ConnectionError):
             raw = source.recv(_FRAME.size)
             if len(raw) == _FRAME.size:

@@ -87,7 +87,7 @@ def fits(noisy_frf, link):
 
 @pytest.fixture(scope="module")
 def cost(noisy_frf, link):
-    """Eq. (26) on all points from the parameters themselves, apart from the code under test."""
+    """Eq. (26) on all points from the parameters themselves, independent of the code under test."""
     omega = 2 * np.pi * noisy_frf.frequency_hz
     grid = TransferGrid(1j * omega)
     p = {"const": np.full(omega.size, 1 / omega.size), "omega": 1 / omega / np.sum(1 / omega)}
@@ -110,8 +110,8 @@ def test_every_structure_with_every_weighting(fits, cost):
 
 @pytest.mark.parametrize("weighting", SOME_WEIGHTINGS)
 @pytest.mark.parametrize("name", SOME)
-def test_no_neighbour_is_lower(fits, cost, name, weighting):
-    """A local grid from close by to far off, along the parameters and along their valleys."""
+def test_neighbours_are_not_lower(fits, cost, name, weighting):
+    """A local grid from close by to far off, along the parameters and along flat directions."""
     fit = fits[name, weighting]
     for width in (1e-3, 1e-2, 1e-1):
         for steps in itertools.product((-width, 0.0, width), repeat=len(fit.structure.free)):
@@ -121,7 +121,7 @@ def test_no_neighbour_is_lower(fits, cost, name, weighting):
                 moved[order] = min(max(moved[order] + step[order], 0.001), 1.999)
             for coefficient, order, rad_s in (("zeta", "alpha", 134.0), ("gamma", "lambda", 19.0)):
                 if coefficient in step:
-                    # What changes is the damping at a mode; the order alone leaves that as it is.
+                    # The damping at a mode changes; the order alone does not change it.
                     turn = fit.parameters[order] - moved[order]
                     moved[coefficient] *= math.exp(step[coefficient]) * rad_s**turn
             assert cost(weighting, fit.structure.damping(moved)) >= fit.cost * (1 - 1e-9)
@@ -129,7 +129,7 @@ def test_no_neighbour_is_lower(fits, cost, name, weighting):
 
 @pytest.mark.parametrize("weighting", SOME_WEIGHTINGS)
 @pytest.mark.parametrize("name", SOME)
-def test_no_random_start_ends_lower(fits, cost, noisy_frf, link, name, weighting):
+def test_random_starts_do_not_end_lower(fits, cost, noisy_frf, link, name, weighting):
     """Twenty random starts of scipy's solver on every tenth point, the best carried to all."""
     structure = STRUCTURES[name]
     every = weights(2 * np.pi * noisy_frf.frequency_hz, weighting)
@@ -176,11 +176,11 @@ def test_no_random_start_ends_lower(fits, cost, noisy_frf, link, name, weighting
     [("III", "I"), ("III", "II"), ("IV", "I"), ("V", "II"), ("VII", "III"), ("VI", "VII"),
      ("VI", "IV"), ("VI", "V")],
 )  # fmt: skip
-def test_more_freedom_never_costs(fits, wider, narrower, weighting):
+def test_more_freedom_never_increases_cost(fits, wider, narrower, weighting):
     assert fits[wider, weighting].cost <= fits[narrower, weighting].cost * (1 + 1e-9)
 
 
-def test_the_paper_s_bias(synthetic_frf, link, plant):
+def test_bias_of_the_paper(synthetic_frf, link, plant):
     """Welch's leakage is read as damping: the biases measured over twenty other sessions."""
     expected = {
         "const": (-0.034, -0.015, -0.356, 0.282),
@@ -196,7 +196,7 @@ def test_the_paper_s_bias(synthetic_frf, link, plant):
         assert fit["lambda"] - plant.lambda_ == pytest.approx(lambda_, abs=0.015)
 
 
-def test_alone_or_together_is_the_same(fits, noisy_frf, link):
+def test_fits_do_not_depend_on_each_other(fits, noisy_frf, link):
     for name in ("II", "VI"):
         alone = fit_frf(noisy_frf.frequency_hz, noisy_frf.response, link, STRUCTURES[name], "omega")
         assert alone == fits[name, "omega"]
@@ -209,7 +209,7 @@ def test_standard_deviations_of_the_free_parameters_only(fits):
             assert std > 0 if name in fit.structure.free else std == 0
 
 
-def test_standard_deviations_agree_with_scatter_where_errors_are_chance(link, plant, paper_grid_hz):
+def test_standard_deviations_agree_with_scatter(link, plant, paper_grid_hz):
     exact = transfer(2j * np.pi * paper_grid_hz, link, plant)
     rng = np.random.default_rng(60_221)
     repeats = [
@@ -227,7 +227,7 @@ def test_standard_deviations_agree_with_scatter_where_errors_are_chance(link, pl
         assert np.mean([fit.std[name] for fit in repeats]) == pytest.approx(scatter, rel=0.5)
 
 
-def test_damping_that_is_not_there_rests_on_its_bound(link, paper_grid_hz, paper_dampings):
+def test_absent_damping_rests_on_its_bound(link, paper_grid_hz, paper_dampings):
     truth = paper_dampings["II", "const"]
     measured = transfer(2j * np.pi * paper_grid_hz, link, truth)
     measured *= 1 + 1e-4j  # a lead that internal damping cannot explain
@@ -245,7 +245,7 @@ def test_weighting_by_a_function(noisy_frf, link, fits):
     assert fit.cost == pytest.approx(fits["III", "omega"].cost, rel=1e-9)
 
 
-def test_what_cannot_be_fitted(noisy_frf, link):
+def test_unusable_responses_are_refused(noisy_frf, link):
     few = noisy_frf.band(2.5, 2.51)
     with pytest.raises(ValueError, match="2 points"):
         fit_many(few.frequency_hz, few.response, link)

@@ -46,7 +46,7 @@ def test_agrees_with_scatter(noise, tolerance, power):
     np.testing.assert_allclose(ratio, 1.0, atol=tolerance)
 
 
-def test_undetermined_unknowns_have_none():
+def test_undetermined_unknowns_have_no_deviation():
     weights = np.full(N, 1 / N)
     deviation = white(np.random.default_rng(1))
     for slopes in (
@@ -62,14 +62,14 @@ def test_a_perfect_fit_has_no_spread():
     np.testing.assert_array_equal(covariance, np.zeros((3, 3)))
 
 
-def test_one_valley_one_start():
+def test_one_minimum_gives_one_start():
     target = np.array([np.log(1e-3), 0.8, np.log(0.1), 1.3])
     found = starting_points(STRUCTURES["VI"], lambda x: float(np.sum((x - target) ** 2)))
     assert len(found) == 1
     np.testing.assert_allclose(found[0], target)
 
 
-def test_two_valleys_two_starts_the_deeper_first():
+def test_two_minima_give_two_starts_deeper_first():
     def cost(x):
         left, right = (x[0] - np.log(1e-4)) ** 2, (x[0] - np.log(1e-1)) ** 2
         return float(min(left + 0.5, right) + (x[1] - 1.3) ** 2)

@@ -41,7 +41,7 @@ def test_seven_segments_lose_the_third_peak(sweep, plant, mode_hz):
     assert peaks[2] is None or abs(peaks[2].magnitude_db - 26.19) > 3
 
 
-def test_peak_that_is_damped_away_is_none(link, paper_grid_hz, mode_hz):
+def test_overdamped_peak_is_none(link, paper_grid_hz, mode_hz):
     heavy = transfer(2j * np.pi * paper_grid_hz, link, Damping(zeta=0.01, alpha=1.0))
     peaks = resonant_peaks(paper_grid_hz, heavy, mode_hz)
     assert peaks[0] is not None

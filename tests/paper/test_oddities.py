@@ -48,15 +48,17 @@ class Session:
 
 
 def of_modes(s, beam, damping, offsets):
-    """Modes 1, 2, … with another stiffness in place of their own."""
+    """Modes 1, 2, … with another stiffness instead of their own."""
     p = beam.density_kg_per_m * s**2
     p = p + damping.gamma * beam.bending_stiffness_n_m2 * s**damping.lambda_
     q = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
     stiffness = (clamped_free_eigenvalues(len(offsets)) / beam.length_m) ** 4
     more = 0
-    for share, k, offset in zip(participation(beam, len(offsets)), stiffness, offsets, strict=True):
+    for fraction, k, offset in zip(
+        participation(beam, len(offsets)), stiffness, offsets, strict=True
+    ):
         loose = k * (1 + offset)
-        more = more + share * p * q * (loose / (q * loose + p) - k / (q * k + p))
+        more = more + fraction * p * q * (loose / (q * loose + p) - k / (q * k + p))
     return more
 
 
@@ -106,7 +108,7 @@ def test_type_iii_hardly_depends_on_the_weights(found):
 
 
 @pytest.mark.fit
-def test_stiffness_offsets_are_read_as_a_fractional_order(found, session, link):
+def test_stiffness_offsets_appear_as_a_fractional_order(found, session, link):
     assert found["VI", "const"]["alpha"] > 1.25
     assert found["VI", "const"]["zeta"] < INTEGER.zeta / 3
     uniform = paper_route(session(INTEGER).h1(noise_nm=1e-2, seed=1), link, ["VI"])
@@ -117,8 +119,8 @@ def test_the_first_peak_saturates(session, link):
     """However little the damping, Welch's peak is no higher and no narrower than the window's."""
     hz = np.linspace(2.2, 2.9, 14_001)
     true_db, welch_db, welch_hz = [], [], []
-    for share in (0.05, 0.1, 0.2):
-        damping = Damping(INTEGER.zeta, 1.0, INTEGER.gamma * share, INTEGER.lambda_)
+    for fraction in (0.05, 0.1, 0.2):
+        damping = Damping(INTEGER.zeta, 1.0, INTEGER.gamma * fraction, INTEGER.lambda_)
         true_db.append(20 * np.log10(np.abs(transfer(2j * np.pi * hz, link, damping)).max()))
         h1 = session(damping).h1().band(2.2, 2.9)
         size = np.abs(h1.response)
@@ -131,7 +133,7 @@ def test_the_first_peak_saturates(session, link):
 
 
 @pytest.mark.fit
-def test_the_first_mode_s_damping_is_the_window_s(session, link):
+def test_first_damping_is_that_of_the_window(session, link):
     damping = Damping(INTEGER.zeta, 1.0, INTEGER.gamma * 0.1, INTEGER.lambda_)
     true = modes(link, damping, 1)[0].damping_ratio
     h1 = session(damping).h1(noise_nm=1e-3, seed=1)

@@ -23,27 +23,27 @@ def test_the_paper_s_settings_and_grid(paper_analysis):
     assert len(paper_analysis.whole_record.frequency_hz) == 7907
 
 
-def test_durations_are_the_paper_s_at_another_rate():
+def test_durations_do_not_depend_on_the_rate():
     assert WelchSettings().segmentation(2000.0) == Segmentation(34532, 5180, 320_000)
 
 
-def test_an_own_segment_brings_its_own_overlap_and_transform():
+def test_segment_determines_overlap_and_transform():
     own = WelchSettings(segment_length=200_000).segmentation(1000.0)
     assert own == Segmentation(200_000, 30_000, 200_000)
 
 
-def test_fits_come_by_type_and_then_weighting(paper_analysis):
+def test_fits_are_ordered_by_type_and_weighting(paper_analysis):
     names = [(m.fit.structure.name, m.fit.weighting) for m in paper_analysis.models]
     assert names == [(t, w) for t in ("I", "III", "VI") for w in ("const", "omega")]
 
 
-def test_the_cost_is_the_index_it_minimises(paper_analysis):
+def test_cost_is_the_minimised_index(paper_analysis):
     for model in paper_analysis.models:
         index = {"const": model.indices.mse, "omega": model.indices.wmse}[model.fit.weighting]
         assert model.fit.cost == pytest.approx(index, rel=1e-9)
 
 
-def test_the_true_structure_fits_best_and_near_the_truth(paper_analysis):
+def test_true_structure_fits_best(paper_analysis):
     """The bias of the paper's method on this plant: zeta +20 %, alpha -0.025, lambda +0.13."""
     by_name = {(m.fit.structure.name, m.fit.weighting): m for m in paper_analysis.models}
     best = by_name["VI", "omega"]
@@ -63,7 +63,7 @@ def test_measured_peaks_lie_on_the_modes(paper_analysis):
     assert magnitudes_db == pytest.approx([23.65, 30.59, 26.19], abs=0.3)
 
 
-def test_known_delays_and_tool_inertia_are_taken_out(write_session, make_signals, tmp_path):
+def test_known_delays_and_tool_inertia_are_removed(write_session, make_signals, tmp_path):
     """The same plant seen through late channels and under a clamp gives the same parameters."""
     plain, late = (
         make_signals(noise_nm=0, quantum_rad=0, sweep_s=60.0, ring_down_s=2.0, **channels)
@@ -101,9 +101,10 @@ def test_a_constant_angle_changes_nothing(write_session, paper_signals, paper_an
     )
 
 
-def test_one_percent_of_missing_ticks_does_little(write_session, paper_signals, paper_analysis,
-                                                  tmp_path):  # fmt: skip
-    """What the interpolation costs at the most that is let through: far less than the bias."""
+def test_one_percent_of_missing_ticks_has_little_effect(
+    write_session, paper_signals, paper_analysis, tmp_path
+):
+    """The error of interpolation at the admitted limit is far less than the bias."""
     rng = np.random.default_rng(3)
     present = np.ones(136_000, bool)
     for first in rng.choice(np.arange(2000, 120_000, 10), 380, replace=False):
@@ -146,27 +147,27 @@ def test_a_short_sweep_is_refused_with_settings_that_fit(write_session, short_si
     assert not any("segment(s)" in warning for warning in found.warnings)
 
 
-def test_fewer_segments_than_the_paper_s_are_warned_of(paper_file):
+def test_fewer_segments_than_in_the_paper_give_a_warning(paper_file):
     record = load_record(paper_file)
     found = analyse(record, WelchSettings(segment_length=60_000, types=("I",)))
     assert found.response.segments == 2
     assert any("Only 2 Welch segment(s)" in warning for warning in found.warnings)
 
 
-def test_a_band_beyond_the_excitation_is_warned_of(write_session, paper_signals, tmp_path):
+def test_band_beyond_the_excitation_gives_a_warning(write_session, paper_signals, tmp_path):
     path = write_session(tmp_path / "a.mcap", paper_signals, metadata={"stop_hz": "20"})
     found = analyse(load_record(path), WelchSettings(types=("I",)))
     assert any("beyond the excitation (0.05 to 20 Hz)" in w for w in found.warnings)
 
 
-def test_a_sweep_downwards_excites_as_much(write_session, paper_signals, tmp_path):
+def test_falling_sweep_excites_as_much(write_session, paper_signals, tmp_path):
     metadata = {"start_hz": "50.0", "stop_hz": "0.05"}
     path = write_session(tmp_path / "a.mcap", paper_signals, metadata=metadata)
     found = analyse(load_record(path), WelchSettings(types=("I",)))
     assert found.warnings == ()
 
 
-def test_an_angle_that_does_not_move_is_refused(write_session, paper_signals, tmp_path):
+def test_constant_angle_is_refused(write_session, paper_signals, tmp_path):
     still = replace(paper_signals, angle_rad=np.full(136_000, 0.25))
     record = load_record(write_session(tmp_path / "a.mcap", still))
     with pytest.raises(FrequencyResponseError, match=r"a\.mcap.*nothing was excited"):
@@ -184,13 +185,13 @@ def test_an_angle_that_does_not_move_is_refused(write_session, paper_signals, tm
         (WelchSettings(weightings=("omega^11",)), "from -10 to 10"),
     ],
 )
-def test_settings_without_sense_are_told_apart(paper_file, settings, message):
+def test_invalid_settings_are_distinguished(paper_file, settings, message):
     record = load_record(paper_file)
     with pytest.raises(SettingsError, match=message):
         analyse(record, settings)
 
 
-def test_a_file_with_only_what_is_required(write_session, paper_signals, paper_analysis, tmp_path):
+def test_file_with_required_content_only(write_session, paper_signals, paper_analysis, tmp_path):
     """No segments: the whole record is the sweep, rest and ring-down included."""
     path = write_session(
         tmp_path / "a.mcap", paper_signals, segments={},
@@ -203,7 +204,7 @@ def test_a_file_with_only_what_is_required(write_session, paper_signals, paper_a
     assert zeta == pytest.approx(paper_analysis.models[-1].fit.parameters["zeta"], rel=0.3)
 
 
-def test_it_is_told_which_modes_a_fit_follows(paper_analysis, paper_file):
+def test_modes_followed_by_a_fit_are_reported(paper_analysis, paper_file):
     assert all(model.followed == (True, True, True) for model in paper_analysis.models)
     # One segment of 20 s of the sweep, whose resonances the window fades out.
     record = load_record(paper_file)
@@ -218,7 +219,7 @@ def test_it_is_told_which_modes_a_fit_follows(paper_analysis, paper_file):
         assert all(0 < mode.damping_ratio < 1 for mode in followed)
 
 
-def test_hiv_without_a_reference_is_refused_kindly(paper_file):
+def test_hiv_without_a_reference_is_refused(paper_file):
     record = load_record(paper_file)
     still = replace(record, reference_rad=np.full_like(record.reference_rad, 0.3))
     with pytest.raises(FrequencyResponseError, match=r"no reference that moves.*--frf h1"):

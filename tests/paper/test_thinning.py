@@ -11,20 +11,20 @@ from rigd.beam import transfer
 
 
 @given(n=st.integers(3, 900), count=st.integers(2, 900), seed=st.integers(0, 2**32 - 1))
-def test_weights_are_shared_out(n, count, seed):
+def test_weights_are_distributed(n, count, seed):
     rng = np.random.default_rng(seed)
     measured = rng.normal(size=n) + 1j * rng.normal(size=n)
     every = rng.random(n)
     every /= every.sum()
-    index, share = representative_points(measured, every, count)
-    assert index.size == share.size <= max(count, 1)
+    index, weight_sums = representative_points(measured, every, count)
+    assert index.size == weight_sums.size <= max(count, 1)
     assert (np.diff(index) > 0).all()
     # Every point counts for the chosen one that is nearest, of two the later.
     distance = np.abs(np.arange(n)[:, None] - index[::-1])
     owner = index.size - 1 - np.argmin(distance, axis=1)
-    np.testing.assert_allclose(share, np.bincount(owner, every, index.size), rtol=1e-9)
-    assert share.sum() == pytest.approx(1.0)
-    assert (share > 0).all()
+    np.testing.assert_allclose(weight_sums, np.bincount(owner, every, index.size), rtol=1e-9)
+    assert weight_sums.sum() == pytest.approx(1.0)
+    assert (weight_sums > 0).all()
     if count >= n:
         np.testing.assert_array_equal(index, np.arange(n))
 
@@ -35,11 +35,11 @@ def test_flat_zero_response_is_thinned_evenly():
 
 
 @pytest.mark.parametrize("weighting", ["const", "omega"])
-def test_costs_of_models_are_kept(noisy_frf, link, paper_dampings, weighting):
+def test_costs_of_models_are_preserved(noisy_frf, link, paper_dampings, weighting):
     """Within 5 % of the whole cost, for all models that the paper fitted."""
     every = weights(2 * np.pi * noisy_frf.frequency_hz, weighting)
-    index, share = representative_points(noisy_frf.response, every, 800)
+    index, weight_sums = representative_points(noisy_frf.response, every, 800)
     s = 2j * np.pi * noisy_frf.frequency_hz
     for damping in paper_dampings.values():
         square = np.abs(transfer(s, link, damping) - noisy_frf.response) ** 2
-        assert share @ square[index] == pytest.approx(every @ square, rel=0.05)
+        assert weight_sums @ square[index] == pytest.approx(every @ square, rel=0.05)

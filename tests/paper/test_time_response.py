@@ -36,11 +36,11 @@ def test_a_sine_settles_to_the_transfer_function(frequency_hz):
     s = 2j * np.pi * frequency_hz
     response = transfer(np.array([s]), BEAM, DAMPING)[0] + 1e-5 * s**2
     steady = 0.01 * np.imag(response * np.exp(s * t))
-    settled = slice(30_000, 39_900)  # the end is cut off, which rings in the last few samples
-    assert np.abs(torque - steady)[settled].max() < 2e-3 * np.abs(steady).max()
+    steady_part = slice(30_000, 39_900)  # the end is cut off, which rings in the last few samples
+    assert np.abs(torque - steady)[steady_part].max() < 2e-3 * np.abs(steady).max()
 
 
-def test_it_is_causal():
+def test_response_is_causal():
     angle, _ = smooth_start(8192, 5.0)
     late = np.concatenate((np.zeros(2000), angle))
     torque = modelled_torque(record_of(late), DAMPING)
@@ -48,7 +48,7 @@ def test_it_is_causal():
     assert early < 1e-4 * later
 
 
-def test_the_angle_at_rest_asks_no_torque():
+def test_constant_angle_needs_no_torque():
     angle, _ = smooth_start(8192, 5.0)
     expected = modelled_torque(record_of(angle), DAMPING)
     offset = modelled_torque(record_of(angle + 0.3, rest=0.3), DAMPING)
@@ -59,21 +59,21 @@ def test_delays_shift_the_torque():
     angle, t = smooth_start(40_000, 12.0)
     torque = modelled_torque(record_of(angle, torque_delay=3e-3, angle_delay=1e-3), DAMPING)
     undelayed = modelled_torque(record_of(angle), DAMPING)
-    settled = slice(20_000, 39_000)
+    steady_part = slice(20_000, 39_000)
     shifted = np.interp(t - 2e-3, t, undelayed)
-    assert np.abs(torque - shifted)[settled].max() < 1e-3 * np.abs(undelayed).max()
+    assert np.abs(torque - shifted)[steady_part].max() < 1e-3 * np.abs(undelayed).max()
 
 
-def test_band_limited_keeps_the_band_and_nothing_else():
+def test_band_limited_passes_only_the_band():
     t = np.arange(10_000) / 1000
     low, high = np.sin(2 * np.pi * 5 * t), np.sin(2 * np.pi * 200 * t)
     inside = slice(1000, 9000)
-    kept = band_limited(low + high, 1000.0, (0.0, 50.0))
-    np.testing.assert_allclose(kept[inside], low[inside], atol=0.02)
+    filtered = band_limited(low + high, 1000.0, (0.0, 50.0))
+    np.testing.assert_allclose(filtered[inside], low[inside], atol=0.02)
 
 
 @pytest.mark.parametrize("centre_s", [2.0, 7.5])
-def test_the_loudest_moment_is_where_the_burst_is(centre_s):
+def test_loudest_time_is_that_of_the_burst(centre_s):
     t = np.arange(10_000) / 1000
     burst = np.exp(-(((t - centre_s) / 0.5) ** 2)) * np.sin(2 * np.pi * 16 * t)
     louder_elsewhere = 5 * np.exp(-(((t - 5.0) / 0.5) ** 2)) * np.sin(2 * np.pi * 60 * t)
