@@ -247,16 +247,8 @@ def campaign_result(
 ) -> CampaignResult:
     """Return the combined result of sessions of one experiment.
 
-    Parameters
-    ----------
-    sessions : sequence of SessionAnalysis
-        Results of the sessions, at least one.
-    failures : sequence of SessionFailure, optional
-        Sessions that are not used.
-    validation : sequence of LeaveOneOutResult, optional
-        Errors of the sessions that were predicted from the others.
-    lost : sequence of FailedPrediction, optional
-        Sessions that could not be predicted from the others.
+    There is at least one session. Those in `failures` are not used. `validation` are the errors of
+    the sessions that were predicted from the others, and `lost` the sessions that could not be.
     """
     session_names = distinct_names(
         [*(session.path for session in sessions), *(session.path for session in failures)]

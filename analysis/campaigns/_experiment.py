@@ -220,13 +220,7 @@ class SessionFailure:
 
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:
-    """Return for each path the shortest trailing part that identifies it among the paths.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Paths of session files.
-    """
+    """Return for each path the shortest trailing part that identifies it among the paths."""
     short_names = [path.name for path in paths]
     for part_count in range(2, max((len(path.parts) for path in paths), default=0) + 1):
         name_counts = Counter(short_names)
@@ -258,12 +252,8 @@ def stated_specimens(
 ) -> tuple[StatedSpecimen, ...]:
     """Group files by the specimen named in them; the specimen of the campaign comes first.
 
-    Parameters
-    ----------
-    stated_experiments : iterable of (str, Experiment or None)
-        Name and experiment of each file; None for a file that could not be read.
-    campaign_experiment : Experiment
-        Experiment of the sessions that are pooled.
+    Each file has a name and an experiment, None for a file that could not be read.
+    `campaign_experiment` is that of the sessions that are pooled.
     """
     files_by_specimen: list[tuple[Experiment, list[str]]] = [(campaign_experiment, [])]
     for file_name, experiment in stated_experiments:

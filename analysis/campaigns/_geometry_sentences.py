@@ -67,12 +67,8 @@ def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate
 def describe_slope(pooled_order: PooledOrder, modal_model: PooledModalModel) -> str:
     """Describe an order of the damping as the slope of a loss against frequency.
 
-    Parameters
-    ----------
-    pooled_order : PooledOrder
-        Order estimated for a beam that may be uneven.
-    modal_model : PooledModalModel
-        Modal model of all sessions, with the estimate `tolerant`.
+    The order is estimated for a beam that may be uneven; the modal model has the estimate
+    `tolerant`.
     """
     estimate = modal_model.tolerant
     assert estimate is not None

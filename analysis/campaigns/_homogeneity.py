@@ -173,14 +173,8 @@ def homogeneity(
 ) -> Homogeneity:
     """Test whether sessions are of one specimen by comparing their fits of one damping structure.
 
-    Parameters
-    ----------
-    sessions : sequence of SessionAnalysis
-        Sessions of the campaign.
-    pooled_fits : sequence of PooledEstimate
-        Pooled estimates, the lowest BIC first.
-    specimens : sequence of StatedSpecimen
-        Different specimens stated in the files.
+    The pooled estimates are in the order of rising BIC. `specimens` are the different specimens
+    that the files state.
     """
     structure_name = common_structure(sessions)
     common_estimates = [
@@ -286,16 +280,11 @@ def split_groups(
 ) -> tuple[tuple[int, ...], ...]:
     """Split estimates at clear gaps into groups of session indices, the lowest values first.
 
-    There are at most half as many groups as sessions, rounded up, so that one group or more has two
-    members.
-    A gap is clear if it exceeds `_CLEAR_GAP_STDS` times the standard deviation within the groups,
-    or the standard deviation of a single session if this is larger. Without clear gaps, there are
-    no groups.
-
-    Parameters
-    ----------
-    estimates, std : ndarray, shape (K,)
-        Estimate of each session, and its standard deviation.
+    The estimates of the sessions and their standard deviations have the shape (K,). There are at
+    most half as many groups as sessions, rounded up, so that one group or more has two members. A
+    gap is clear if it exceeds `_CLEAR_GAP_STDS` times the standard deviation within the groups, or
+    the standard deviation of a single session if this is larger. Without clear gaps, there are no
+    groups.
     """
     sorted_indices = np.argsort(estimates)
     value_gaps = np.diff(estimates[sorted_indices])

@@ -108,13 +108,7 @@ class PooledModalModel(ModalEstimate):
 
 
 def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None:
-    """Return the modal model of all sessions, or None if no two sessions show a common mode.
-
-    Parameters
-    ----------
-    sessions : sequence of SessionAnalysis
-        Sessions of the campaign.
-    """
+    """Return the modal model of all sessions, or None if no two sessions show a common mode."""
     modal_sessions = [
         session for session in sessions if session.modal is not None and session.nominal is not None
     ]
@@ -269,13 +263,7 @@ class OppositeSweeps:
 
 
 def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | None:
-    """Compare rising with falling sweeps by the modes of both; None if they have none in common.
-
-    Parameters
-    ----------
-    sessions : sequence of SessionAnalysis
-        Sessions of the campaign.
-    """
+    """Compare rising with falling sweeps by the modes of both; None if they have none in common."""
     rising_estimates = [
         session.modal for session in sessions if session.modal and session.experiment.rising is True
     ]

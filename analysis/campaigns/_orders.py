@@ -95,16 +95,7 @@ def pooled_order(
 ) -> PooledOrder:
     """Assess one order of the damping from all sessions, by the same rules as for one record.
 
-    Parameters
-    ----------
-    order : str
-        "alpha" or "lambda".
-    ranked_estimates : sequence of PooledEstimate
-        Pooled estimates, the lowest BIC first; not empty.
-    verdicts : sequence of Verdict
-        Verdicts of the sessions.
-    homogeneity : Homogeneity
-        Whether the sessions are of one specimen.
+    There is at least one pooled estimate, and they are in the order of rising BIC.
     """
     session_orders = [
         verdict.alpha if order == "alpha" else verdict.lambda_ for verdict in verdicts
@@ -150,16 +141,9 @@ def tolerant_pooled_order(
 ) -> PooledOrder:
     """Assess one order of the damping, with a tolerance for deviations from a uniform beam.
 
-    Parameters
-    ----------
-    exact_order : PooledOrder
-        The same order on an exactly uniform beam.
-    estimate : TolerantEstimate
-        Estimate from the modal constants of all sessions.
-    verdicts : sequence of Verdict
-        Verdicts of the sessions.
-    refused : bool
-        Whether a uniform beam does not predict the pooled constants.
+    `exact_order` is the same order on an exactly uniform beam, and `estimate` is from the modal
+    constants of all sessions. `refused` states whether a uniform beam does not predict the pooled
+    constants.
     """
     order = exact_order.order
     order_status, doubt_reason = order_status_with_geometry_tolerance(

@@ -191,12 +191,7 @@ def mean_deviations(
 ) -> tuple[MeanPeakDeviation, ...]:
     """Return the deviation of each resonant peak, averaged over the sessions (Eqs. 31 and 32).
 
-    Parameters
-    ----------
-    measured_peaks : sequence of sequence of Peak or None
-        Peaks of each session, one for each mode.
-    model_peaks : sequence of Peak or None
-        Peaks of the model, one for each mode.
+    The model and each session have one peak, or None, for each mode.
     """
     deviations = []
     for mode_number, (model_peak, session_peaks) in enumerate(
@@ -319,12 +314,7 @@ def ranked_structures(
 ) -> tuple[RankedStructure, ...]:
     """Rank all fitted damping structures: first the pooled ones by BIC, then the others.
 
-    Parameters
-    ----------
-    sessions : sequence of SessionAnalysis
-        Sessions of the campaign.
-    pooled_fits : sequence of PooledEstimate
-        Pooled estimates, the lowest BIC first.
+    The pooled estimates are in the order of rising BIC.
     """
     estimates_by_name = estimates_by_structure(sessions)
     fitted_sessions = max(map(len, estimates_by_name.values()), default=0)

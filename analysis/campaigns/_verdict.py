@@ -206,22 +206,9 @@ def campaign_verdict(
 ) -> CampaignVerdict | None:
     """Return the verdict on a campaign, or None if no damping structure could be pooled.
 
-    Parameters
-    ----------
-    sessions : sequence of SessionAnalysis
-        Sessions of the campaign.
-    pooled : sequence of PooledEstimate
-        Pooled estimates, the lowest BIC first.
-    homogeneity : Homogeneity
-        Whether the sessions are of one specimen.
-    validation : sequence of LeaveOneOutResult
-        Errors of sessions predicted from the others.
-    lost_sessions : sequence of FailedPrediction
-        Sessions that could not be predicted from the others.
-    biases : sequence of WelchBias, optional
-        Differences of the Welch fits from the pooled estimates.
-    modal_model : PooledModalModel, optional
-        Modal model of all sessions.
+    The pooled estimates are in the order of rising BIC. `validation` are the errors of the sessions
+    that were predicted from the others, and `lost_sessions` the sessions that could not be.
+    `biases` are differences of the Welch fits from the pooled estimates.
     """
     verdicts = [session.verdict for session in sessions if session.verdict is not None]
     if not pooled or not verdicts:

@@ -99,18 +99,9 @@ def welch_biases(
 ) -> tuple[WelchBias, ...]:
     """Compare the Welch fits with the pooled estimates that describe the records.
 
-    Parameters
-    ----------
-    sessions : sequence of SessionAnalysis
-        Sessions of the campaign.
-    pooled : sequence of PooledEstimate
-        Pooled whole-record estimates, which serve as references.
-
-    Returns
-    -------
-    tuple of WelchBias
-        Biases by damping structure, then by weighting. A structure whose whole-record residual is
-        more than noise is left out, because its pooled estimate is no reference.
+    The pooled estimates serve as references. The biases are in the order of damping structure, then
+    of weighting. A structure whose whole-record residual is more than noise is left out, because
+    its pooled estimate is no reference.
     """
     biases = []
     pooled_by_name = {

@@ -94,10 +94,7 @@ class Dynamics:
     def filtered(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the response in N·m/rad with the filters of the torque channel, without delay.
 
-        Parameters
-        ----------
-        s : ndarray of complex
-            Points in rad/s.
+        The points s are in rad/s.
         """
         filtered_response = self.response(s)
         for time_constant_s, filter_order in self.filters:
@@ -138,13 +135,7 @@ class UncertainDynamics:
         return self.dynamics_of(self.by_name(self.values))
 
     def by_name(self, parameter_values: NDArray[np.float64]) -> dict[str, float]:
-        """Return parameter values as a dict by name.
-
-        Parameters
-        ----------
-        parameter_values : ndarray, shape (k,)
-            Values in the order of `names`.
-        """
+        """Return parameter values as a dict by name; they are in the order of `names`."""
         return dict(zip(self.names, parameter_values.tolist(), strict=True))
 
 
@@ -153,11 +144,6 @@ class UncertainDynamics:
 
 def beam_dynamics(plant: Plant) -> Dynamics:
     """Return the motor-to-torque dynamics of a beam with tip mass, clamp and torque channel.
-
-    Parameters
-    ----------
-    plant : Plant
-        Rig and beam.
 
     Raises
     ------
@@ -234,16 +220,8 @@ def modal_dynamics(
     """Return the motor-to-torque dynamics of a modal model within the band of its record.
 
     The background is a polynomial in s, which no state space realises: its two powers above s² are
-    approximated by well-damped pairs of poles above the band.
-
-    Parameters
-    ----------
-    modal_model : ModalModel
-        Fitted modal model.
-    band_hz : tuple of float
-        First and last frequency of the band.
-    mode_numbers : sequence of int
-        Mode number of each pole, 0 for a resonance that is not of the beam.
+    approximated by well-damped pairs of poles above the band. The number of a resonance that is not
+    of the beam is 0.
     """
     modal_poles = np.array(modal_model.poles_rad_s, dtype=np.complex128)
     normalized_pole = complex(-_RESIDUAL_DAMPING_RATIO, math.sqrt(1 - _RESIDUAL_DAMPING_RATIO**2))

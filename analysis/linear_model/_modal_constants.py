@@ -65,12 +65,7 @@ _BACKGROUND_NAME: Final = "background"
 def constant_value(modal: ModalModel, constant_name: str) -> float | None:
     """Return the value of a constant of a modal model, or None if there is no such constant.
 
-    Parameters
-    ----------
-    modal : ModalModel
-        Fitted modal model.
-    constant_name : str
-        Name of the constant, such as ``ln_frequency_1`` or ``background_0``.
+    Names are, for example, ``ln_frequency_1`` and ``background_0``.
     """
     name_prefix, name_number = _split_name(constant_name)
     if name_prefix == _BACKGROUND_NAME and 0 <= name_number < len(modal.background):
@@ -84,12 +79,7 @@ def constant_value(modal: ModalModel, constant_name: str) -> float | None:
 def with_changed_constants(modal: ModalModel, constant_changes: Mapping[str, float]) -> ModalModel:
     """Return a modal model with some of its constants changed.
 
-    Parameters
-    ----------
-    modal : ModalModel
-        Fitted modal model.
-    constant_changes : mapping of str to float
-        Amount to be added to each constant, by name.
+    `constant_changes` are the amounts to be added to the constants, by name.
     """
     poles_and_residues = list(zip(modal.poles_rad_s, modal.residues, strict=True))
     background_terms = list(modal.background)

@@ -36,15 +36,9 @@ def realise_response(
 ) -> tuple[PoleStructure, StateSpace]:
     """Approximate a response by a state space with a given number of states, or as few as suffice.
 
-    Parameters
-    ----------
-    fit : PoleFit
-        Fit of the response.
-    order : int or None
-        Number of states, including those of filters. None for as few as suffice for an error of
-        `MAX_RELATIVE_ERROR`.
-    input_kind : str
-        Input: "acceleration", or "angle" for angle, velocity and acceleration.
+    `order` is the number of states, including those of filters; None for as few as suffice for an
+    error of `MAX_RELATIVE_ERROR`. The input is "acceleration", or "angle" for angle, velocity and
+    acceleration.
 
     Raises
     ------

@@ -99,12 +99,7 @@ class PoleStructure:
 class PoleFit:
     """Least-squares fits of one response by state spaces of any pole structure.
 
-    Parameters
-    ----------
-    dynamics : Dynamics
-        Response and poles to be realised.
-    similar_fit : PoleFit, optional
-        Fit of almost the same dynamics, from whose zeros the search for zeros starts.
+    The search for zeros starts from those of `similar_fit`, a fit of almost the same dynamics.
     """
 
     def __init__(self, dynamics: Dynamics, similar_fit: PoleFit | None = None) -> None:
@@ -146,29 +141,14 @@ class PoleFit:
         return self.dynamics.filtered(self.check_points_s)
 
     def real_poles(self, pole_structure: PoleStructure) -> tuple[float, ...]:
-        """Return all real poles of a pole structure in rad/s, those of over-damped modes first.
-
-        Parameters
-        ----------
-        pole_structure : PoleStructure
-            States of the realisation.
-        """
+        """Return all real poles of a pole structure in rad/s, those of over-damped modes first."""
         return (*self.dynamics.real_poles, *pole_structure.added_real_poles_rad_s)
 
     def solve(self, pole_structure: PoleStructure) -> tuple[NDArray[np.float64], float]:
         """Fit the coefficients of a pole structure to the response.
 
-        Parameters
-        ----------
-        pole_structure : PoleStructure
-            States of the realisation.
-
-        Returns
-        -------
-        fit_coefficients : ndarray
-            Residues, then D, and V and K if the structure has these integrators.
-        error : float
-            Largest relative error in the band, at the points of the fit.
+        Return the coefficients (residues, then D, and V and K if the structure has these
+        integrators), and the largest relative error in the band, at the points of the fit.
         """
         real_poles = self.real_poles(pole_structure)
         direct_term_count = 1 + pole_structure.integrators
@@ -194,14 +174,8 @@ class PoleFit:
     ) -> StateSpace:
         """Return the state space of a fit, with tool inertia, filters and delay.
 
-        Parameters
-        ----------
-        pole_structure : PoleStructure
-            States of the realisation.
-        fit_coefficients : ndarray
-            Coefficients that `solve` returned.
-        input_kind : str
-            Input: "acceleration", or "angle" for angle, velocity and acceleration.
+        The coefficients are those of `solve`. The input is "acceleration", or "angle" for angle,
+        velocity and acceleration.
         """
         state_space = self._system_without_filters(pole_structure, fit_coefficients, input_kind)
         for time_constant_s, filter_order in self.dynamics.filters:
@@ -211,10 +185,7 @@ class PoleFit:
     def error(self, state_space: StateSpace) -> NDArray[np.float64]:
         """Return the relative error of a state space at each point of `check_points_s`.
 
-        Parameters
-        ----------
-        state_space : StateSpace
-            Realisation of the response in continuous time.
+        The state space is a realisation in continuous time.
         """
         return np.abs(angle_response(state_space, self.check_points_s) / self.exact - 1)
 
@@ -223,12 +194,7 @@ class PoleFit:
     ) -> bool:
         """Return whether a frictionless motor of the beam's inertia is stable with the fitted beam.
 
-        Parameters
-        ----------
-        pole_structure : PoleStructure
-            States of the realisation.
-        fit_coefficients : ndarray
-            Coefficients that `solve` returned.
+        The coefficients are those of `solve`.
         """
         motor_inertia_kg_m2 = self.dynamics.motor_inertia_kg_m2
         if motor_inertia_kg_m2 is None:
@@ -393,26 +359,15 @@ class PoleFit:
 
 
 def imaginary_axis(frequency_hz: Real) -> NDArray[np.complex128]:
-    """Return s = j omega in rad/s for each frequency.
-
-    Parameters
-    ----------
-    frequency_hz : ndarray
-        Frequencies in hertz.
-    """
+    """Return s = j omega in rad/s for each frequency."""
     return np.asarray(2j * np.pi * frequency_hz, dtype=np.complex128)
 
 
 def angle_response(state_space: StateSpace, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Return the response of a state space to the motor angle, without its delay, in N·m/rad.
 
-    Parameters
-    ----------
-    state_space : StateSpace
-        System in continuous time, whose inputs are the acceleration, or angle, velocity and
-        acceleration.
-    s : ndarray of complex
-        Points in rad/s.
+    The system is in continuous time. Its inputs are the acceleration, or angle, velocity and
+    acceleration. The points s are in rad/s.
     """
     motion_per_angle = np.array([np.ones_like(s), s, s * s])[-state_space.d.shape[1] :]
     torque_response: NDArray[np.complex128] = np.einsum(

@@ -63,10 +63,7 @@ class StateSpace:
     def response(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the frequency response in continuous time without delay, shape (len(s), p, m).
 
-        Parameters
-        ----------
-        s : ndarray of complex
-            Points in rad/s, none of them a pole.
+        The points s are in rad/s, and none of them is a pole.
         """
         frequency_response = np.empty((s.size, *self.d.shape), dtype=np.complex128)
         for first_point in range(0, s.size, _POINTS_PER_BLOCK):
@@ -80,13 +77,7 @@ class StateSpace:
         return frequency_response
 
     def sampled(self, rate_hz: float) -> StateSpace:
-        """Return the discrete-time system, which is exact for inputs held between the samples.
-
-        Parameters
-        ----------
-        rate_hz : float
-            Sampling rate.
-        """
+        """Return the discrete-time system, which is exact for inputs held between the samples."""
         from scipy.signal import cont2discrete
 
         a, b, c, d, period_s = cont2discrete(
@@ -98,14 +89,8 @@ class StateSpace:
 def with_filter(state_space: StateSpace, time_constant_s: float, order: int) -> StateSpace:
     """Return the system with a low-pass filter (order 1, or Butterworth of order 2) at its output.
 
-    Parameters
-    ----------
-    state_space : StateSpace
-        System in continuous time with one output.
-    time_constant_s : float
-        Reciprocal of the corner frequency, in s/rad.
-    order : int
-        Order of the filter: 1 or 2.
+    The system is in continuous time and has one output. `time_constant_s` is the reciprocal of the
+    corner frequency, in s/rad.
     """
     n, m = state_space.b.shape
     cutoff_rad_s = 1.0 / time_constant_s
