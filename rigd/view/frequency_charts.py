@@ -65,7 +65,7 @@ NOT_ESTIMATED_ENTRY: Final = LegendEntry("not estimated", GREY, is_area=True)
 
 NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
 """Text in the coherence chart of a running session before the end of the second segment."""
-NO_COHERENCE: Final = "Of a single segment there is no coherence"
+NO_COHERENCE: Final = "A single segment gives no coherence"
 """Text in the coherence chart of a finished response from a single segment."""
 
 _MAX_WIDTH_FOR_FOUR_ENTRIES: Final = 700.0

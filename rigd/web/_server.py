@@ -94,6 +94,7 @@ class OperatorPageServer:
         self._gauges_message: Document | None = None
         self._envelopes = SignalEnvelopes()
         self._session: str | None = None
+        self._latest_session = ""
         self._response: SessionResponse | None = None
         self._shown: Document | None = None
         self._last_response: Document | None = None
@@ -253,6 +254,7 @@ class OperatorPageServer:
     def _prepare_session(self, session_path: str, session_series: Document) -> None:
         """Prepare the frequency responses that the pages show during a new session."""
         session_plan = session_series["plan"]
+        self._latest_session = session_path
         self._nominal_response = self._nominal_message(session_plan)
         self._shown = self._last_response = None
         self._response = None
@@ -265,7 +267,7 @@ class OperatorPageServer:
             )
         self.pages.send(self._nominal_response)  # the pages then clear the other responses
         specimen_name = str(session_series["notes"].get("specimen", ""))
-        self._start_search(self._send_last_response(specimen_name, Path(session_path).stem))
+        self._start_search(self._send_last_response(specimen_name, session_path))
 
     def _nominal_message(self, beam_document: Document) -> Document:
         """Return the message with the nominal frequency response of a beam with its damping."""
@@ -316,14 +318,17 @@ class OperatorPageServer:
             recorded_specimens = await self._library.specimens()
             self._specimens = list(dict.fromkeys([*recorded_specimens, *specimen_files()]))
 
-    async def _send_last_response(self, specimen: str, excluded_session: str) -> None:
+    async def _send_last_response(self, specimen: str, session_path: str) -> None:
         """Send the open pages the frequency response of a specimen's last session.
 
-        The session `excluded_session` does not count as the last one.
+        The running session in `session_path` does not count as the last one. Nothing is sent if
+        another session has begun when the response is found.
         """
         with suppress(OSError, ValueError):
-            self._last_response = await self._library.last_response(specimen, excluded_session)
-            self.pages.send(self._last_response)
+            response = await self._library.last_response(specimen, Path(session_path).stem)
+            if session_path == self._latest_session:
+                self._last_response = response
+                self.pages.send(response)
 
 
 def _excitations() -> Iterator[tuple[str, list[Document]]]:

@@ -179,7 +179,7 @@ def test_an_empty_coherence_chart_says_why(description, shown):
     charts.update(1_000_000_000, single)
     assert note() == ["Coherence begins with the second segment"]
     charts.update(2_000_000_000, replace(single, final=True))
-    assert note() == ["Of a single segment there is no coherence"]
+    assert note() == ["A single segment gives no coherence"]
     charts.update(3_000_000_000, known)
     assert note() == []
 

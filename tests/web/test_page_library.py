@@ -118,6 +118,21 @@ def test_list_and_overlay_with_a_damaged_quick_look(served, two_sessions, quick_
     assert asyncio.run_coroutine_threadsafe(finding, served.loop).result(30.0) is None
 
 
+@pytest.mark.usefixtures("two_sessions")
+def test_last_response_of_an_earlier_session_is_dropped(served):
+    """The search of a session may end after the next one has begun."""
+    server = served.server
+
+    def search(session_path):
+        sent = server._send_last_response("antenna", session_path)
+        asyncio.run_coroutine_threadsafe(sent, served.loop).result(30.0)
+        return server._last_response
+
+    server._latest_session = "second.mcap"
+    assert search("older.mcap") is None
+    assert search("second.mcap") is not None
+
+
 def test_download_in_another_format(served, two_sessions):
     assert eventually(lambda: not served.server._jobs.paused)
     status, head, body = get(served, "/api/sessions/first/file.mat")
