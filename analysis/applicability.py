@@ -50,7 +50,7 @@ end."""
 
 
 def highest_frequency_hz(requested_hz: Band | None = None) -> float:
-    """Return the highest frequency in Hz of the analyses with the requested or default band.
+    """Return the highest frequency in Hz that any analysis of a record uses.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ class OutputOptions:
 
     @property
     def json_to_stdout(self) -> bool:
-        """Whether the JSON results go to standard output, so that texts go to standard error."""
+        """Whether the JSON results go to standard output; messages then go to standard error."""
         return self.json is not None and str(self.json) == "-"
 
     def console(self) -> Console:

@@ -60,7 +60,7 @@ class ImportedRecord:
     warnings: tuple[str, ...]
 
 
-_REPORTED_JITTER: Final = 0.01
+_JITTER_WARNING_LIMIT: Final = 0.01
 """Distance of a time stamp from its tick, in sample periods, above which the user is warned."""
 
 
@@ -108,7 +108,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     si_columns, status_bits, first_sample = hold_last_values(source, channel_titles, si_columns)
     ticks = timebase.ticks[first_sample:]
     is_after_gap = np.diff(ticks, prepend=-1) > 1
-    if timebase.jitter > _REPORTED_JITTER:
+    if timebase.jitter > _JITTER_WARNING_LIMIT:
         warnings.append(
             f"The time stamps lie up to {timebase.jitter:.2g} periods from equidistant ones."
         )

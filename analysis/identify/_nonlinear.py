@@ -293,7 +293,8 @@ def add_nonlinear_forces(
 def _start_candidates(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
     """Return the candidates from which the search for nonlinear forces starts.
 
-    The best candidate is the last. If its internal order is free, those with order 1 come first.
+    The best candidate comes last. If its internal order is free, the candidates with the internal
+    order 1 precede it.
     """
     best_candidate = candidate_set.best
     if "alpha" not in best_candidate.structure.free:

@@ -105,7 +105,8 @@ class Refit:
     def continue_descent(self, max_evaluations: int) -> Refit:
         """Continue the descent with no unknown fixed, as `descend` from the same point would.
 
-        The evaluation at this point counts, but is not repeated unless torques are unknown.
+        The evaluation made at this point counts as the first one. It is repeated only if torques of
+        impacts are unknown.
         """
         objective, minimum = self.objective.minimum(
             self.x,

@@ -144,11 +144,11 @@ def select(
     """Select the model of beam and damping that a record supports, and report its parameters.
 
     The modal model is fitted to the record without hum, impacts and gaps. Its modes are reported.
-    If its residual is noise, the beam is linear and constant. Otherwise drag, nonlinear forces,
-    changes along the record and impacts are tested. A uniform beam is tested against the modal
-    constants. Orders, coefficients and stiffness are estimated from these constants, with the
-    tolerance of the geometry that the measurement states. All structures are also fitted to the
-    record on an exactly uniform beam. Their values are conditional estimates.
+    If its residual is noise, the beam is linear and time-invariant. Otherwise drag, nonlinear
+    forces, changes along the record and impacts are tested. The constants of the modes show
+    whether the beam is uniform. Orders, coefficients and stiffness are estimated from these
+    constants, with the stated tolerance of the geometry. All structures are also fitted to the
+    record on an exactly uniform beam; their values are conditional on it.
 
     Parameters
     ----------

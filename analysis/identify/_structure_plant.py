@@ -114,12 +114,12 @@ class StructurePlant(Plant):
 
 @dataclass(frozen=True)
 class StructureUnknowns(Unknowns):
-    """Vector of unknowns of a package's structure: its free parameters, then the settings.
+    """Unknowns of the fit of a damping structure that an installed package adds.
 
-    The unknown of a logarithmic parameter is its logarithm, that of another parameter is its value
-    relative to the range. Density over stiffness and stiffness are effective values, which include
-    the real part of the damping at the first two modes: a step of a parameter then does not move
-    the modes.
+    The free parameters of the structure come first, then those of beam and rig. A parameter on a
+    logarithmic scale is represented by its logarithm, any other by its value over its range. The
+    stiffness, and the ratio of density to stiffness, are effective values, which include the real
+    part of the damping at the first two modes: a step of a parameter then does not move the modes.
     """
 
     decay_poles: tuple[Pole, ...] = ()

@@ -121,7 +121,7 @@ def _main_results(whole_record: WholeRecord) -> RenderableType:
 
 
 def _with_mark_notes_only(table: Table, caption: str = "") -> Table:
-    """Return a table without notes, except those on numbers marked as not reported."""
+    """Return a table with only the notes that explain the marks of parameters not reported."""
     mark_notes = tuple(
         table_note for table_note in table.notes if table_note.startswith(NOT_REPORTED_MARK)
     )

@@ -281,9 +281,9 @@ def _frequency_limits(trend: "ModeTrend") -> tuple[float, float]:
 
 
 def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> str:
-    """Return a line of characters that draws a session's frequency and its interval.
+    """Return a text plot, one line, of the frequency of a session's mode with its interval.
 
-    The line extends from `lowest_hz` to `highest_hz`.
+    The axis extends from `lowest_hz` to `highest_hz`.
     """
     if highest_hz <= lowest_hz:
         return ""

@@ -99,7 +99,7 @@ def run_control(
     stop_request: StopRequest,
     realtime_results: dict[str, str],
 ) -> None:
-    """Connect the devices, execute the supervisor's orders, and close the devices in any case.
+    """Connect the devices, execute the supervisor's orders, and always close the devices.
 
     Parameters
     ----------

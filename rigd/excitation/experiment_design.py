@@ -98,7 +98,7 @@ def next_segment(
     estimate
         Present estimate of beam, damping and noise.
     angle_rad_so_far
-        Angle of the motor from the beginning of the record to that of the segment, at the rig's
+        Angle of the motor from the start of the record to the start of the segment, at the rig's
         rate; shape (n,). It is measured, or predicted (`Segment.angle_rad`) for segments that are
         not run yet. The beam is at rest at the first tick.
     targets

@@ -137,7 +137,7 @@ class EstimatorThread:
         self._inputs.put(new_samples)
 
     def request(self, request: EstimateRequest) -> None:
-        """Request an estimate from the samples that were passed so far."""
+        """Request an estimate from the samples passed to the estimator so far."""
         self._inputs.put(request)
 
     def next_estimate(self) -> dict[str, Any] | None:

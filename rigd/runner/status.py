@@ -1,4 +1,4 @@
-"""Status of a rig and statistics of the running record, read from shared memory."""
+"""Status of a rig and statistics of the session in progress, read from shared memory."""
 
 import os
 import time

@@ -33,7 +33,7 @@ _REMAINDER_RAD_S = 300.0
 
 @dataclass(frozen=True, slots=True)
 class ProbedRig:
-    """Values of a rig's profile that a probing move uses or verifies."""
+    """Values of a rig's profile that the probing move before a session uses or verifies."""
 
     rate_hz: float
     """Loop rate in ticks per second."""

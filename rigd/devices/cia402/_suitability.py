@@ -213,7 +213,7 @@ class _SuitabilityCheck:
         )
 
     def _watchdog_finding(self) -> SuitabilityFinding:
-        """Return the finding on the watchdog that removes the torque if this computer is silent."""
+        """Return the finding on the watchdog that removes the torque if the computer is silent."""
         found_watchdog = self._expected_watchdog()
         checked_item, wanted_text = "watchdog", "one of three"
         if found_watchdog is Watchdog.HEARTBEAT:
