@@ -258,7 +258,7 @@ CASES = {
 ON_THE_WIRE = {
     "bus-off": "controller off the bus",
     "emergency message": "emergency message",
-    "wired stop": "wired stop dropped",
+    "wired stop": "wired stop (STO) opened",
 }
 """Rows of docs/faults.md that have separate tests."""
 AT_REST = {"tare drift"}

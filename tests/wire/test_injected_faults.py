@@ -30,7 +30,7 @@ MESSAGES = {
     "drive silent": rf"angle.*{STALE} ticks",
     "sensor silent": rf"wrench.*{STALE} ticks",
     "emergency message": r"Drive .*0x2310",
-    "wired stop dropped": r"Drive .*wired stop \(STO\) was dropped.*switch-on disabled",
+    "wired stop (STO) opened": r"Drive .*wired stop \(STO\) was dropped.*switch-on disabled",
     "controller off the bus": r"CAN bus .*bus-off",
     "drive's heartbeat lost": r"Drive .*no heartbeat for 0\.1",
     "drive restarts": r"Drive .*it has restarted by itself; check its supply",
@@ -60,7 +60,7 @@ NOISE = {"simulation.torque_noise_nm": "5e-3", "simulation.force_noise_n": "2e-2
 READY = "the next session can be started"
 UNTIL_MENDED = {
     "drive silent": "no answer",
-    "wired stop dropped": r"does not get ready.*STO is open",
+    "wired stop (STO) opened": r"does not get ready.*STO is open",
     "controller off the bus": "no answer",
     "bus cut": "does not answer",
 }
