@@ -95,7 +95,7 @@ def pooled_order(
 ) -> PooledOrder:
     """Assess one order of the damping from all sessions, by the same rules as for one record.
 
-    There is at least one pooled estimate, and they are in the order of rising BIC.
+    The pooled estimates, at least one, are in the order of rising BIC.
     """
     session_orders = [
         verdict.alpha if order == "alpha" else verdict.lambda_ for verdict in verdicts

@@ -86,13 +86,9 @@ def canonical_unit(unit_text: str) -> str | None:
 def unit_factor(quantity: str, unit: str) -> float:
     """Return the size of a unit of a quantity in the base unit of the quantity: rad, N·m, N or s.
 
-    Parameters
-    ----------
-    quantity : {"angle", "torque", "force", "time"}
-        Quantity that the unit measures.
-    unit : str
-        Unit in any spelling of `canonical_unit`, with or without a number before it: ``0.02 N.m``
-        may be the value of one volt of a sensor's signal.
+    The quantity is "angle", "torque", "force" or "time". The unit has any spelling of
+    `canonical_unit`, with or without a number before it: ``0.02 N.m`` may be the value of one volt
+    of a sensor's signal.
 
     Raises
     ------
@@ -309,14 +305,7 @@ def uniform_timebase(path: Path, samples: int, rate_hz: float) -> Timebase:
 def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) -> Timebase:
     """Return the sampling rate and the tick of each sample, determined from time stamps.
 
-    Parameters
-    ----------
-    path : Path
-        File, for messages.
-    channel : str
-        Name of the channel of times, for messages.
-    time_s : ndarray of float, shape (n,)
-        Time stamps of at least two samples.
+    There are at least two time stamps. Path and name of the channel are for messages.
 
     Raises
     ------

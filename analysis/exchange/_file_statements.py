@@ -272,13 +272,9 @@ class FileStatements:
     ) -> tuple[Mapping[str, SourceChannel], Mapping[str, float]]:
         """Cut channels that begin at different times to their common interval.
 
-        Returns
-        -------
-        channels : mapping of str to SourceChannel
-            Channels of equal length.
-        delays_s : mapping of str to float
-            Time in seconds by which each channel's values are older than the angle of the same
-            index: the fraction of a sample period that remains after cutting whole samples.
+        The channels returned have equal length. Return also the time in seconds by which each
+        channel's values are older than the angle of the same index: the fraction of a sample period
+        that remains after cutting whole samples.
 
         Raises
         ------

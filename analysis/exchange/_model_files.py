@@ -16,13 +16,6 @@ def write_json(variables: Variables, stream: BinaryIO) -> None:
     """Write the variables of a linear model as a JSON object, with a line for each variable.
 
     Complex numbers are pairs of real and imaginary part; unknown values are null.
-
-    Parameters
-    ----------
-    variables : mapping
-        Variables by name.
-    stream : binary file
-        Destination.
     """
     from analysis.results import finite
 
@@ -38,15 +31,7 @@ def write_json(variables: Variables, stream: BinaryIO) -> None:
 
 
 def write_npz(variables: Variables, stream: BinaryIO) -> None:
-    """Write the variables of a linear model as NumPy arrays that can be loaded without pickle.
-
-    Parameters
-    ----------
-    variables : mapping
-        Variables by name.
-    stream : binary file
-        Destination.
-    """
+    """Write the variables of a linear model as NumPy arrays that can be loaded without pickle."""
     np.savez_compressed(
         stream,
         **{
@@ -60,13 +45,6 @@ def write_mat(variables: Variables, stream: BinaryIO) -> None:
     """Write the variables of a linear model to a MATLAB file of version 7.
 
     Lists of strings become cell arrays.
-
-    Parameters
-    ----------
-    variables : mapping
-        Variables by name.
-    stream : binary file
-        Destination.
     """
     from scipy.io import savemat
 

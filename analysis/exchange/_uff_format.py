@@ -297,17 +297,9 @@ def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     """Write a table to a universal file: units (data set 164) and a function per column (58).
 
     Times and frequencies are stated by first value and increment, with six digits each. In a record
-    with gaps, or if six digits are not enough, each abscissa is written.
-
-    Parameters
-    ----------
-    table : ExportTable
-        Columns to be written; integer columns (ticks, flags) are left out, as the format cannot
-        store them.
-    stream : file, open for writing bytes
-        Destination.
-    binary : bool
-        Whether numbers are written as 8-byte floats (58b) or as text with 13 digits.
+    with gaps, or if six digits are not enough, each abscissa is written. Numbers are 8-byte floats
+    if `binary` (58b), else text with 13 digits. Integer columns (ticks, flags) are left out, as the
+    format cannot store them.
 
     Raises
     ------

@@ -245,10 +245,10 @@ def loss_figure(
     """Draw internal, external and total loss factor, and twice the damping ratio of each mode.
 
     The modes are points, hollow for those whose damping ratio is flagged. The loss factors are
-    those of `loss_model`, drawn only in the band `supported_hz`: no curves if `loss_model`
-    is None, because no beam explains the losses, or `supported_hz` is None, because the data do not
-    support the curves at any frequency. If the data do not support one of the orders, the total is
-    not split into its parts. The frequencies of the axis are positive.
+    those of `loss_model`, drawn only in the band `supported_hz`. There are no curves if
+    `loss_model` is None, because no beam explains the losses, or `supported_hz` is None, because
+    the data do not support the curves at any frequency. If the data do not support one of the
+    orders, the total is not split into its parts. The frequencies of the axis are positive.
     """
     figure = style.new_figure(9.0, 3.6)
     axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))

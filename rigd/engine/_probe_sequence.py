@@ -50,11 +50,8 @@ class ProbeSequence(SessionSequence):
     def move(self) -> dict[str, Any]:
         """Run the probing move on the enabled drive, switch the torque off, and return the result.
 
-        Returns
-        -------
-        dict
-            Name of the reason why the move ended (key ``end``), and the fields of a
-            `rigd.safety.probe_estimate.ProbeEstimate`.
+        The result has the name of the reason why the move ended (key ``end``), and the fields of a
+        `rigd.safety.probe_estimate.ProbeEstimate`.
 
         Raises
         ------

@@ -17,12 +17,7 @@ from rigd.session.layout import Status, pack_control_into, pack_sample_into, pac
 class ReadingPublisher:
     """Writer of the latest readings to the shared state, called several times a second.
 
-    Parameters
-    ----------
-    shared_state
-        State to write to.
-    devices
-        Devices whose bus and serial line are monitored.
+    Bus and serial line of the devices are monitored.
 
     Attributes
     ----------
@@ -43,13 +38,8 @@ class ReadingPublisher:
     def publish(self, cycle: Cycle, now_ns: int) -> None:
         """Write the control process's heartbeat and last readings to the shared state.
 
-        Parameters
-        ----------
-        cycle
-            Cycle with the last readings.
-        now_ns
-            Present time of the loop's clock. The load of a line is averaged over the time since the
-            last call.
+        `now_ns` is the present time of the loop's clock. The load of a line is averaged over the
+        time since the last call.
         """
         shared_state = self._shared_state
         shared_state.beat(StateField.CONTROL_BEAT)
@@ -143,16 +133,7 @@ class SampleLog:
     """Log of a record in shared memory, from which the recorder writes the session file.
 
     It contains a sample and the ages of the readings for each tick, and the controller's terms for
-    every tenth tick.
-
-    Parameters
-    ----------
-    cycle, scheduler, clock
-        Cycle, schedule and clock, whose values a sample contains.
-    channels
-        Channels to write to.
-    late_ns
-        Lateness in ns above which a tick is flagged as late.
+    every tenth tick. A tick that is more than `late_ns` late is flagged.
 
     Attributes
     ----------
@@ -185,17 +166,9 @@ class SampleLog:
     ) -> None:
         """Write the sample of the last tick to the ring that the recorder reads.
 
-        Parameters
-        ----------
-        tick
-            Number of the tick in the record.
-        reference_rad
-            Reference angle.
-        missed_ticks
-            Number of ticks that were missed directly before this tick.
-        wait_for_slot
-            Whether to wait for free space if the ring is full, which is harmless if nothing moves
-            or time is virtual. Otherwise the sample is lost.
+        `tick` is the number of the tick in the record, and `missed_ticks` the number of ticks that
+        were missed directly before it. With `wait_for_slot`, wait for free space if the ring is
+        full, which is harmless if nothing moves or time is virtual. Otherwise the sample is lost.
         """
         cycle, scheduler, ring = self._cycle, self._scheduler, self._ring
         lateness_ns = scheduler.lateness_ns

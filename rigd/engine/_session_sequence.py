@@ -110,30 +110,12 @@ class SessionEnd(Exception):
 class SessionSequence:
     """Steps of one session on connected devices, from the tare to the check for drift of the tare.
 
-    Parameters
-    ----------
-    profile
-        Profile of the rig.
-    reference_rad
-        Angle per tick, relative to the start angle.
-    cycle, clock, scheduler
-        Cycle that runs each tick, the clock, and the schedule of the ticks.
-    standstill
-        Monitor of the angles that are read while the torque is off.
-    channels
-        Rings for samples, the controller's terms and events.
-    reading_publisher
-        Writer of the latest readings to the shared state.
-    parent
-        Connection to the supervisor process.
-    stop_request
-        Stop requests that reached this process as signals.
-    ending
-        Plan of the steps after the record.
-    touch
-        Detector of touches, or None if the session does not search for an obstacle.
-    reference_reader
-        Reader of a reference that grows during the record, or None if the reference is complete.
+    `reference_rad` is the angle per tick, relative to the start angle. `reference_reader` reads a
+    reference that grows during the record; None if the reference is complete. `standstill` monitors
+    the angles that are read while the torque is off. `channels` are the rings for samples, the
+    controller's terms and events. `parent` is the connection to the supervisor process, and
+    `stop_request` has the stop requests that reached this process as signals. `ending` plans the
+    steps after the record. `touch` is None if the session does not search for an obstacle.
     """
 
     def __init__(
@@ -190,10 +172,8 @@ class SessionSequence:
     def tare(self) -> dict[str, str]:
         """Tare the sensor at rest before the drive is enabled; return the tare as metadata.
 
-        Returns
-        -------
-        dict
-            Metadata: mean and standard deviation of each axis in N and N·m, and the start angle.
+        The metadata are the mean and the standard deviation of each axis in N and N·m, and the
+        start angle.
 
         Raises
         ------

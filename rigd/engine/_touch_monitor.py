@@ -35,17 +35,9 @@ class TouchMonitor:
     the start of the pass. After a touch on the way back the motor cannot avoid the obstacle, so the
     session is stopped.
 
-    Parameters
-    ----------
-    order
-        Passes of the search, and settings of the touch detector.
-    cycle
-        Cycle with the readings of the last tick.
-    reference_rad
-        Reference of the session, relative to the start angle. After a touch this array is
-        overwritten with the motor's reaction.
-    rate_hz
-        Ticks a second.
+    `order` has the passes of the search, and the settings of the touch detector. `reference_rad` is
+    relative to the start angle. After a touch this array is overwritten with the motor's reaction.
+    `rate_hz` is the number of ticks a second.
     """
 
     def __init__(
@@ -65,12 +57,8 @@ class TouchMonitor:
     def step(self, tick: int, missed_ticks: int) -> DetectedContact | None:
         """Check the last tick for a touch; return the contact, or None if nothing was touched.
 
-        Parameters
-        ----------
-        tick
-            Number of the tick in the record.
-        missed_ticks
-            Number of ticks that were missed directly before this tick.
+        `tick` is the number of the tick in the record, and `missed_ticks` the number of ticks that
+        were missed directly before it.
         """
         cycle, detector = self._cycle, self._detector
         status_flags = cycle.flags

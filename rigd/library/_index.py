@@ -77,10 +77,7 @@ StampedRow = tuple[str, SessionRow]
 class Index:
     """Index file with the data of the sessions in one folder (SQLite).
 
-    Parameters
-    ----------
-    folder
-        Folder of the sessions, which need not have an index or be writable.
+    The folder need not have an index or be writable.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -117,12 +114,7 @@ class Index:
     def write(self, new_rows: Mapping[str, StampedRow], missing_files: Collection[str]) -> None:
         """Store new rows in the index and remove rows of missing files, if the index is writable.
 
-        Parameters
-        ----------
-        new_rows
-            New and changed rows by file name.
-        missing_files
-            Names of files that no longer exist.
+        New and changed rows are given by file name.
         """
         if self._path.exists() and not self._is_own_index():
             return  # the file is not an index of this program

@@ -118,23 +118,9 @@ def read_row(
 ) -> tuple[SessionRow, bool]:
     """Return the data of a session, and whether they can be stored in the index.
 
-    A file that cannot be read is reported in the row.
-
-    Parameters
-    ----------
-    path
-        Path of the session file.
-    quick_look
-        File with the session's quick look; None if there is none.
-    report_folder
-        Folder of the session's last report; None if there is none.
-
-    Returns
-    -------
-    SessionRow
-        Row of the session.
-    bool
-        Whether the index may store the row; not after a system error, which may be temporary.
+    A file that cannot be read is reported in the row. After a system error, which may be temporary,
+    the index must not store the row. `quick_look` is the file with the session's quick look, and
+    `report_folder` the folder of its last report; None if there is none.
 
     Raises
     ------

@@ -137,18 +137,8 @@ def decompressed_chunk(
 ) -> bytes:
     """Return the decompressed content of a chunk, which must have exactly `unpacked_bytes` bytes.
 
-    Parameters
-    ----------
-    zstd
-        Decompressor made by :func:`zstd_decompressor`.
-    compression
-        Name of the compression in the chunk: ``zstd``, ``lz4``, or empty for none.
-    packed_bytes
-        Compressed content of the chunk.
-    unpacked_bytes
-        Length of the decompressed content in bytes that the chunk states.
-    location_text
-        Position of the chunk, for error messages.
+    The compression is ``zstd``, ``lz4``, or empty for none. `zstd` is made by
+    :func:`zstd_decompressor`. `location_text` is the position of the chunk, for error messages.
 
     Raises
     ------

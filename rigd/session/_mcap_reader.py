@@ -127,13 +127,8 @@ class McapContents:
 def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Return the byte offset of each message in a buffer that consists of consecutive runs.
 
-    Parameters
-    ----------
-    runs : array (n, 3) with channel number, length of a message record in bytes, and message count
-
-    Returns
-    -------
-    array (sum of the counts,) of offsets from the beginning of the first message
+    `runs`, shape (n, 3), are the channel number, the length of a message record in bytes, and the
+    message count. The offsets, one for each message, count from the beginning of the first message.
     """
     _, message_sizes, run_message_counts = runs.T
     run_bytes = message_sizes * run_message_counts
@@ -160,21 +155,14 @@ def read_mcap(
 ) -> McapContents:
     """Read an MCAP file up to its end or its first damage.
 
-    Parameters
-    ----------
-    file_data : bytes of the file; pages of an ``mmap`` are released when they have been read
-    topics : topics whose messages are passed to `on_block`; None for all
-    on_block
-        Called with the messages of `topics`, block by block in the order of the file, before it is
-        known whether the rest of the file is damaged.
-    salvage
-        Read as much as possible: skip damaged records outside of chunks on which no message
-        depends, and read the statistics of a damaged file.
-    on_progress : called repeatedly with the fraction of the file that was read, from 0 to 1
+    Pages of an ``mmap`` are released when they have been read. `on_block` is called with the
+    messages of `topics` (None: all), block by block in the order of the file, before it is known
+    whether the rest of the file is damaged. `on_progress` is called repeatedly with the fraction of
+    the file that was read, from 0 to 1.
 
-    Returns
-    -------
-    The contents; `McapContents.damage` states whether, where and why reading stopped.
+    With `salvage`, read as much as possible: skip damaged records outside of chunks on which no
+    message depends, and read the statistics of a damaged file. `McapContents.damage` states
+    whether, where and why reading stopped.
 
     Raises
     ------

@@ -118,10 +118,8 @@ class McapWriter:
     def add_chunk(self, records: bytes, indexes: Mapping[int, npt.NDArray[np.void]]) -> None:
         """Compress and append a chunk of records, with its message indexes.
 
-        Parameters
-        ----------
-        records : records of the chunk, one after another
-        indexes : channel number → array (n > 0,) of `INDEX_DTYPE`, in the order of the messages
+        The records follow one after another. `indexes` has for each channel number an array of
+        `INDEX_DTYPE`, which is not empty, in the order of the messages.
         """
         first_log_time = min(
             (int(message_index["log_time"].min()) for message_index in indexes.values()), default=0

@@ -182,12 +182,8 @@ class MessageDecoder:
     The first error is stored in `error` and raised by `finish`, so that damage of the file can be
     reported first.
 
-    Parameters
-    ----------
-    path : path of the file, for error messages
-    layout : layout of the messages
-    sink : destination of the decoded messages, which are passed on block by block
-    fields : names of the fields to decode; None for all
+    The decoded messages are passed to `sink` block by block. `fields` are the names of the fields
+    to decode; None for all. The path of the file is for error messages.
     """
 
     def __init__(

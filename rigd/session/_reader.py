@@ -256,13 +256,10 @@ def _read_topic(path: Path, layout: MessageLayout) -> npt.NDArray[np.void]:
 class TopicBuffer:
     """Growing array of the decoded messages of one topic.
 
-    Parameters
-    ----------
-    path : path of the file, for its size and for error messages
-    layout : layout of the messages
-    fields : names of the fields to store; None for all
-    max_messages : maximum number of messages, above which an error is raised
-    on_messages : called with each block of messages, with all fields; no message is then stored
+    The path of the file is for its size and for error messages. `fields` are the names of the
+    fields to store; None for all. More than `max_messages` messages raise an error. If there is
+    `on_messages`, it is called with each block of messages, with all fields, and no message is
+    stored.
     """
 
     def __init__(

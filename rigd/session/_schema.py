@@ -120,11 +120,8 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
     """Return the protobuf class that decodes the messages of a schema.
 
     Building a class takes as long as decoding dozens of messages, so the last few are cached.
-
-    Parameters
-    ----------
-    schema_name : full name of the message type, such as ``rigd.Sample``
-    data : serialised ``FileDescriptorSet``
+    `schema_name` is the full name of the message type, such as ``rigd.Sample``, and `data` a
+    serialised ``FileDescriptorSet``.
 
     Raises
     ------

@@ -184,19 +184,10 @@ LONGEST_GAP_S: Final = 0.1
 class Segments:
     """Splitter of samples that arrive in blocks of any length into segments of equal length.
 
-    Segment k begins at tick ``k * hop``. Short gaps between samples are interpolated.
-
-    Parameters
-    ----------
-    channel_count : int
-        Number of values per tick.
-    segment_length, hop_ticks : int
-        Number of ticks in a segment, and from its start to the start of the next one.
-    longest_gap_ticks : int
-        Largest number of successive missing ticks that are interpolated.
-    end_tick : int, optional
-        First tick after the record. Samples outside the record, before tick 0 or from this tick on,
-        are only used to close gaps at the ends of the record.
+    Segment k begins at tick ``k * hop_ticks``. Gaps of at most `longest_gap_ticks` missing ticks
+    are interpolated. There are `channel_count` values per tick. `end_tick` is the first tick after
+    the record. Samples outside the record, before tick 0 or from this tick on, are only used to
+    close gaps at the ends of the record.
 
     Attributes
     ----------
@@ -228,24 +219,14 @@ class Segments:
         self._next = 0
 
     def feed(self, ticks: ArrayLike, channel_values: ArrayLike) -> Iterator[tuple[int, Real]]:
-        """Add samples and yield each segment that they complete.
+        """Add samples and yield the first tick and the values of each segment that they complete.
 
-        A segment must be used before the next one is requested, which overwrites it. The iteration
-        must be consumed completely, because it adds the samples.
+        The samples have increasing numbers, also from call to call, and values of the shape
+        (channels, n). A tick with a value that is not finite counts as missing.
 
-        Parameters
-        ----------
-        ticks : array_like of int, shape (n,)
-            Increasing numbers of the samples, also from call to call.
-        channel_values : array_like, shape (channels, n)
-            Values of each tick. A tick with a value that is not finite counts as missing.
-
-        Yields
-        ------
-        first : int
-            First tick of the segment.
-        segment : ndarray of float, shape (channels, length)
-            Values of the segment, as a view of the internal array.
+        A segment, shape (channels, length), is a view of the internal array. It must be used before
+        the next one is requested, which overwrites it. The iteration must be consumed completely,
+        because it adds the samples.
         """
         for first_tick, sample_block in self._gaps.fill(ticks, channel_values):
             block_start, end_tick = max(first_tick, 0), first_tick + sample_block.shape[1]
@@ -348,18 +329,10 @@ def _interpolate_to_ticks(known_ticks: NDArray[np.int64], known_values: Real) ->
 def excited_bins(reference_power: NDArray[np.float64], resolution_bins: int) -> NDArray[np.bool_]:
     """Return a mask of the bins in which the reference has power that does not leak from others.
 
-    Parameters
-    ----------
-    reference_power : ndarray of float, shape (n,)
-        Power of the reference in the bins from frequency 0 on.
-    resolution_bins : int
-        Frequency resolution, the inverse length of the shortest window, in bins. A dip that is at
-        most twice as wide is a ripple of the window, and counts as excited. At each end of an
-        excited band, this number of bins is excluded because of leakage.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
+    The bins of `reference_power` are those from frequency 0 on. `resolution_bins` is the frequency
+    resolution, the inverse length of the shortest window. A dip that is at most twice as wide is a
+    ripple of the window, and counts as excited. At each end of an excited band, `resolution_bins`
+    bins are excluded because of leakage.
     """
     largest_power = reference_power.max(initial=0.0)
     if not largest_power > 0.0:
@@ -399,14 +372,8 @@ class LowBinTransform:
     quarter of the time of all bins. If the padding is so short that this would take longer, all
     bins are computed.
 
-    Parameters
-    ----------
-    sample_count : int
-        Largest number of samples to transform.
-    nfft : int
-        Number of samples of the padded transform, at least `sample_count`.
-    bin_count : int
-        Number of bins, from frequency 0 on; at most ``nfft // 2 + 1``.
+    At most `sample_count` samples can be transformed. They are padded to `nfft` samples, at least
+    `sample_count`. There are at most ``nfft // 2 + 1`` bins.
     """
 
     def __init__(self, sample_count: int, nfft: int, bin_count: int) -> None:
