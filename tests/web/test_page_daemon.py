@@ -50,8 +50,8 @@ def operate(serve, open_page):
 
 WATCH = """() => {
     const word = document.querySelector("#state-word");
-    window.told = {};
-    new MutationObserver(() => { window.told[word.textContent] = Date.now() / 1e3; })
+    window.shownAt = {};
+    new MutationObserver(() => { window.shownAt[word.textContent] = Date.now() / 1e3; })
         .observe(word, { childList: true, characterData: true, subtree: true });
 }"""
 
@@ -71,7 +71,7 @@ def start(page):
 def delay_s(page, word, event):
     """Return the time from an event, as the daemon dates it, to its state on the page."""
     entry = page.locator("#event-list li", has_text=event).first
-    return page.evaluate("() => window.told")[word] - float(entry.get_attribute("data-at")) / 1e9
+    return page.evaluate("() => window.shownAt")[word] - float(entry.get_attribute("data-at")) / 1e9
 
 
 def expect_rows(page, count, outcome):
@@ -125,13 +125,13 @@ def test_failures_are_shown(operate, open_page):
     expect_text(page, "#state-word", "OFFLINE")
     assert "press the STO" in page.inner_text("#state-reason")
     # The daemon's status, sent twice a second, may just have come.
-    assert page.evaluate("() => window.told.OFFLINE") - stopped_s < SHOWN_WITHIN_S + 0.2
+    assert page.evaluate("() => window.shownAt.OFFLINE") - stopped_s < SHOWN_WITHIN_S + 0.2
     daemon.process.send_signal(signal.SIGCONT)
     expect_text(page, "#state-word", "RUNNING")
     killed_s = time.time()
     daemon.process.kill()
     expect_text(page, "#state-word", "OFFLINE")
-    assert page.evaluate("() => window.told.OFFLINE") - killed_s < SHOWN_WITHIN_S
+    assert page.evaluate("() => window.shownAt.OFFLINE") - killed_s < SHOWN_WITHIN_S
     # The page's server ends too, and the browser logs that it does not answer.
     page.close()
     open_page.complaints.clear()
