@@ -74,7 +74,7 @@ def test_segments_follow_each_other_without_a_gap():
 
 
 def test_a_record_is_whole_after_its_last_segment():
-    writer, reader, shared_state = growing(planned=3, room=40)
+    writer, reader, shared_state = growing(planned=3, space=40)
     assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
     writer.append(np.array([10.0, 11.0]))
     assert [reader.at(tick) for tick in range(5, 7)] == [10, 11]
@@ -120,7 +120,7 @@ def test_the_segment_after_a_hold_is_reported():
 @pytest.mark.parametrize(("space", "expected"), [(4, [10, 11]), (3, [3])])
 def test_a_segment_beyond_the_record_is_not_begun(space, expected):
     """The motor would have to stop at full swing."""
-    writer, reader, shared_state = growing(room=space)
+    writer, reader, shared_state = growing(space=space)
     assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
     writer.append(np.array([10.0, 11.0]))
     assert not reader.waits(5)
@@ -154,7 +154,7 @@ def test_the_end_is_after_the_last_planned_segment():
 
 
 def test_a_segment_without_space_is_refused():
-    writer, _, shared_state = growing(room=2)
+    writer, _, shared_state = growing(space=2)
     with pytest.raises(ValueError, match="room for 2"):
         writer.append(np.zeros(3))
     assert shared_state[StateField.PLANNED] == 0
@@ -179,7 +179,7 @@ def test_a_segment_not_beginning_and_ending_at_rest_is_refused(segment_rad):
 )
 def test_angles_of_segments_are_followed_in_order(segments, missed):
     """With any lateness: segments are followed and held in between, without missed ticks."""
-    writer, reader, shared_state = growing(room=100)
+    writer, reader, shared_state = growing(space=100)
     arrivals = sorted(segments, key=lambda segment: segment[1])
     appended, tick, followed = 3, -1, []
     for skipped in missed:
