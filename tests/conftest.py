@@ -33,7 +33,7 @@ pytest_plugins = [
     "touch_sessions", "web_daemon",
 ]  # fmt: skip
 
-# Nothing of what collecting makes is garbage: see `pytest_collection_finish`.
+# Collecting makes no garbage: see `pytest_collection_finish`.
 gc.disable()
 
 # As in the commands, before anything here imports numpy; threads would fight each other.
@@ -53,11 +53,11 @@ _RUNTIME = tempfile.mkdtemp(prefix="rigd-tests-")
 os.environ["XDG_RUNTIME_DIR"] = _RUNTIME
 # Nor a profile of the user's own that hides a shipped one.
 os.environ["XDG_CONFIG_HOME"] = f"{_RUNTIME}/config"
-# No session pays for a quick look but where that is tested.
+# Sessions make no quick look, except where that is tested.
 os.environ["RIGD_NO_LOOK"] = "1"
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
-# The same examples each time, and however long they take: what fails is a change's fault. Others,
+# The same examples each time, without a time limit: a failure is due to a change. Others,
 # and more, are searched for by `make fuzz`.
 settings.register_profile("same", settings.get_profile("ci"), max_examples=40)
 settings.register_profile("others", settings.get_profile("ci"), derandomize=False)
@@ -70,7 +70,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Seven thousand tests stay to the end: no garbage collection need look at them."""
+    """Seven thousand tests stay to the end: no garbage collection needs to visit them."""
     gc.freeze()
     gc.enable()
 
@@ -78,9 +78,9 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 RIGD = Path(sys.executable).parent / "rigd"
 HW_PROFILES = Path(__file__).parents[1] / "hw_profiles"
 
-# A machine that stands still, or is slow, keeps no times: ticks are missed, replies come late, and
-# the torque that is held meanwhile swings the motor out. It ends no session in real time here; what
-# limits and time-outs do is tested where time is simulated.
+# A machine at a standstill, or a slow one, meets no deadlines: ticks are missed, replies come late,
+# and the torque held meanwhile swings the motor out. It ends no session in real time here; the
+# effect of limits and time-outs is tested with simulated time.
 PATIENT = {
     "motor.thermal_time_constant_s": "1.0e3",
     "limits.angle_rad": "100.0",
@@ -125,7 +125,7 @@ def write_profile_in():
 def write_profile(tmp_path, write_profile_in):
     """Write a shipped profile with other values (by `section.key`) and short ways from and to rest.
 
-    One that is `patient` bears that the machine stands still.
+    One that is `patient` tolerates a standstill of the machine.
     """
     return partial(write_profile_in, tmp_path)
 
@@ -187,7 +187,7 @@ def start_rigd(tmp_path):
     def start(*arguments, folder=tmp_path, cold=False, packages=None):
         """A `cold` start is of a new interpreter, whose command line others may read.
 
-        What is in a folder of `packages` is installed for any other.
+        Packages in a folder `packages` are installed for any other.
         """
         started.append(
             (subprocess.Popen if cold else partial(warm_start.start, packages=packages))(
@@ -204,7 +204,7 @@ def start_rigd(tmp_path):
     yield start
     for process in started:
         process.kill()
-        # What it said helps where a test failed without asking.
+        # Its output helps if a test failed without checking it.
         sys.stdout.write("\n".join(process.communicate()))
 
 
@@ -233,7 +233,7 @@ def rigd_here(tmp_path, monkeypatch):
 
 @pytest.fixture
 def analyze_here(tmp_path, monkeypatch):
-    """Run `analyze` in this process, which has imported what takes long."""
+    """Run `analyze` in this process, which has the slow imports already."""
     from analysis.cli.app import app
 
     monkeypatch.chdir(tmp_path)
@@ -286,18 +286,18 @@ def start_simulator(runtime_folder, tmp_path):
     started = []
 
     def start(profile, *options) -> subprocess.Popen:
-        with (tmp_path / f"simulator-{len(started)}.txt").open("w") as said:
+        with (tmp_path / f"simulator-{len(started)}.txt").open("w") as log:
             process = warm_start.start(
                 [RIGD, "simulate", "--profile", str(profile), *map(str, options)],
                 cwd=tmp_path,
-                stdout=said,
+                stdout=log,
                 stderr=subprocess.STDOUT,
             )
         started.append(process)
         name = load_profile(profile).name
         deadline = time.monotonic() + 300.0
         while find_simulator(name) is None:
-            assert process.poll() is None, Path(said.name).read_text()
+            assert process.poll() is None, Path(log.name).read_text()
             assert time.monotonic() < deadline, "the simulator does not answer"
             time.sleep(0.02)
         return process
@@ -314,7 +314,7 @@ def start_simulator(runtime_folder, tmp_path):
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory, request):
-    """Have a folder filled once for all workers, by whoever comes first; nobody changes it."""
+    """Fill a folder once for all workers, by the first of them; nothing changes it later."""
     base = tmp_path_factory.getbasetemp()
     if hasattr(request.config, "workerinput"):
         base = base.parent
@@ -348,15 +348,15 @@ def computed_once(made_once):
 
 @pytest.fixture(scope="session")
 def paper_session(made_once):
-    """The paper's session on the simulated rig as shipped: its file, and what the command told."""
+    """The paper's session on the shipped simulated rig: its file, and the output of the command."""
 
     def make(folder):
         command = [RIGD, "run", "chirp", "--fast", "--seed", "1", "--json", "--output", folder]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
-        (folder / "told.json").write_text(done.stdout)
+        (folder / "session.json").write_text(done.stdout)
 
-    told = (made_once("paper_session", make) / "told.json").read_text()
-    (session,) = json.loads(told)["sessions"]
+    report = (made_once("paper_session", make) / "session.json").read_text()
+    (session,) = json.loads(report)["sessions"]
     return Path(session["path"]), session
 
 

@@ -10,7 +10,7 @@ from rigd.documents import DocumentError, parse_toml, read_json, read_text
 NESTED = 20_000
 
 
-def test_what_is_in_order_is_read(tmp_path):
+def test_valid_document_is_read(tmp_path):
     path = tmp_path / "a"
     path.write_text('\ufeffa = { value = 1.5, source = "measured" }\n', encoding="utf-8")
     assert parse_toml(read_text(path)) == {"a": {"value": 1.5, "source": "measured"}}
@@ -35,12 +35,12 @@ def test_what_is_in_order_is_read(tmp_path):
     ],
     ids=lambda given: given[:12] if isinstance(given, str) else None,
 )
-def test_a_text_that_is_too_much_is_refused(text, words):
+def test_too_long_text_is_refused(text, words):
     with pytest.raises(DocumentError, match=words):
         parse_toml(text)
 
 
-def test_digits_beyond_the_interpreter_s_limit():
+def test_digits_beyond_the_interpreter_limit():
     before = sys.get_int_max_str_digits()
     sys.set_int_max_str_digits(1000)
     try:
@@ -60,14 +60,14 @@ def test_digits_beyond_the_interpreter_s_limit():
         (b" " * 2000, "at most 0.001 MB"),
     ],
 )
-def test_json_that_is_too_much_is_refused(tmp_path, data, words):
+def test_too_large_json_is_refused(tmp_path, data, words):
     path = tmp_path / "a.json"
     path.write_bytes(data)
     with pytest.raises(DocumentError, match=words):
         read_json(path, 1000 if words.startswith("at most") else 12_000_000)
 
 
-def test_what_is_not_an_ordinary_file_is_neither_waited_for_nor_read(tmp_path):
+def test_special_files_are_refused_without_waiting(tmp_path):
     pipe, loop = tmp_path / "pipe", tmp_path / "loop"
     os.mkfifo(pipe)
     loop.symlink_to(loop)

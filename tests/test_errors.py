@@ -29,11 +29,11 @@ def drawn():
             yield from ((name, parent) for name in names)
 
 
-def test_the_drawing_names_every_error_under_its_base():
+def test_drawing_has_every_error_under_its_base():
     assert sorted((name, base) for name, base in drawn() if base in BASES) == sorted(derived())
 
 
-def test_the_bases_tell_the_two_kinds_apart():
+def test_base_classes_distinguish_the_two_kinds():
     assert errors.UserError("x").wrong_use
     assert not errors.FailureError("x").wrong_use
     assert errors.FailureError("what to do").full_message() == "what to do"

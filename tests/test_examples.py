@@ -1,4 +1,4 @@
-"""Each example runs in an empty folder, and says what it should; its device passes the contract."""
+"""Each example runs in an empty folder with the right output; its device passes the contract."""
 
 import re
 import subprocess
@@ -26,7 +26,7 @@ def module_at(path):
 
 
 def run(example, folder, *arguments, cold=False):
-    """Run an example in a folder; what it prints. A `cold` start makes errors of warnings, too."""
+    """Run an example in a folder; return its output. A `cold` start turns warnings into errors."""
     command = [EXAMPLES / f"{example}.py", *arguments]
     if cold:
         command = [sys.executable, "-W", "error", *command]
@@ -44,7 +44,7 @@ def values(pattern, printed):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """What the example that runs sessions prints, and its files, which the others read."""
+    """Output of the example that runs sessions, and its files, which the others read."""
     folder = tmp_path_factory.mktemp("sessions")
     printed = run("run_session", folder)
     return printed, sorted((folder / "sessions").glob("*.mcap"))
@@ -98,13 +98,13 @@ def test_sessions_are_pooled(made, tmp_path):
     assert values(r"  (44[\d.]+) Hz, damping ratio", printed)
 
 
-def test_a_device_of_one_s_own_turns(tmp_path):
+def test_user_device_turns(tmp_path):
     printed = run("own_device", tmp_path, cold=True)
     assert values(r"999 ms: ([\d.]+) rad", printed) == pytest.approx([0.1], abs=1e-3)
 
 
 @pytest.mark.parametrize("check", DEVICE_CHECKS, ids=lambda check: check.__name__.strip("_"))
-def test_a_device_of_one_s_own_passes_the_devices_contract(check):
+def test_user_device_passes_the_contract(check):
     check(module_at(EXAMPLES / "own_device.py").open_rigid_hub())
 
 

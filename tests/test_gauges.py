@@ -1,4 +1,4 @@
-"""Gauges: peaks of a block beside their limits."""
+"""Gauges: peaks of a block with their limits."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from rigd.gauges import Gauge, Gauges
 from rigd.session.layout import Status
 
 
-def test_peaks_stand_beside_their_limits_with_units(make_samples):
+def test_peaks_are_shown_with_limits_and_units(make_samples):
     samples = make_samples(
         100, angle_rad=-0.02, angle_reference_rad=0.01, torque_command_nm=0.3, fz_n=-4.0, ty_nm=0.5
     )
@@ -23,7 +23,7 @@ def test_peaks_stand_beside_their_limits_with_units(make_samples):
     assert found["i2t"].limit is None
 
 
-def test_speed_is_taken_over_missed_and_stale_ticks(make_samples):
+def test_speed_bridges_missed_and_stale_ticks(make_samples):
     samples = make_samples(200, angle_rad=np.arange(200) * 1e-3)  # 1 rad/s
     samples["angle_rad"][50] = samples["angle_rad"][49]
     samples["status"][50] = Status.ANGLE_STALE
@@ -35,14 +35,14 @@ def test_speed_is_taken_over_missed_and_stale_ticks(make_samples):
     assert speeds[2] is None
 
 
-def test_rms_torque_follows_the_motor_s_time_constant(make_samples):
+def test_rms_torque_follows_the_motor_time_constant(make_samples):
     gauges = Gauges(1000.0, {"i2t": 0.9}, thermal_time_constant_s=2.0)
     for _ in range(20):
         found = gauges.take(make_samples(100, torque_command_nm=0.6))
     assert found["i2t"].value == pytest.approx(0.6 * np.sqrt(1.0 - np.exp(-1.0)), rel=0.03)
 
 
-def test_what_is_no_number_is_not_shown_as_one(make_samples):
+def test_nonnumeric_values_are_not_shown(make_samples):
     found = Gauges(1000.0, {"angle": 1.0}).take(make_samples(5, angle_rad=np.nan))
     assert found["angle"].value is None
     assert found["angle"].fraction is None

@@ -1,4 +1,4 @@
-"""The beam of an analysis, from its JSON document: what is used, and what is refused by name."""
+"""The beam of an analysis, from its JSON document: values used, and effects refused by name."""
 
 import json
 from dataclasses import replace
@@ -44,7 +44,7 @@ def test_the_beam_of_an_analysis_is_read(analysed, profile):
 
 
 @pytest.mark.parametrize(
-    ("other", "says"),
+    ("other", "message"),
     [
         ({"density_over_stiffness": None}, "density_over_stiffness is missing"),
         ({"zeta": {"value": -1.0, "std": 0.0}}, r"zeta\.value = -1\.0 must be"),
@@ -56,8 +56,8 @@ def test_the_beam_of_an_analysis_is_read(analysed, profile):
         ({"tip_mass_kg": {"value": 1e-4}, **OFFSETS}, "together are not defined"),
     ],
 )
-def test_what_is_wrong_with_the_document_is_said(analysed, other, says):
-    with pytest.raises(IdentifiedBeamError, match=says) as refused:
+def test_errors_of_the_document_are_reported(analysed, other, message):
+    with pytest.raises(IdentifiedBeamError, match=message) as refused:
         read_identified_beam(analysed(**other), STATED, MOVE)
     assert "model.json" in str(refused.value)
 
@@ -65,7 +65,7 @@ def test_what_is_wrong_with_the_document_is_said(analysed, other, says):
 @pytest.mark.parametrize(
     "text", ["", "[]", '{"headlines": []}', '{"headlines": [{}]}', '{"headlines": 3}', "\x00"]
 )
-def test_a_file_that_is_no_document_is_refused(tmp_path, text):
+def test_other_file_is_refused(tmp_path, text):
     path = tmp_path / "model.json"
     path.write_text(text)
     with pytest.raises(IdentifiedBeamError, match="analyze session"):
@@ -82,7 +82,7 @@ def test_a_file_that_is_no_document_is_refused(tmp_path, text):
         (OFFSETS, (0.0, 0.0, (0.03, -0.05))),
     ],
 )
-def test_a_move_takes_the_ends_and_the_modes_and_a_touch_refuses_them(analysed, effect, read):
+def test_move_accepts_ends_and_modes_but_touch_does_not(analysed, effect, read):
     path = analysed(**effect)
     loaded = read_identified_beam(path, STATED, MOVE).plant
     found = loaded.tip_mass_kg, loaded.root_compliance_rad_per_nm, loaded.stiffness_offsets
@@ -94,7 +94,7 @@ def test_a_move_takes_the_ends_and_the_modes_and_a_touch_refuses_them(analysed, 
 
 @pytest.mark.parametrize("use", [MOVE, TOUCH])
 @pytest.mark.parametrize(
-    ("effect", "says"),
+    ("effect", "message"),
     [
         (
             {"filter_time_constant_s": {"value": 2e-3}},
@@ -107,11 +107,11 @@ def test_a_move_takes_the_ends_and_the_modes_and_a_touch_refuses_them(analysed, 
         ({"stiffness_offset_": {"value": 0.0}}, "'stiffness_offset_' is not known"),
     ],
 )
-def test_what_neither_accounts_for_is_refused_by_name(analysed, use, effect, says):
-    assert says in refusal(analysed(**effect), use)
+def test_unsupported_effect_is_refused_by_name(analysed, use, effect, message):
+    assert message in refusal(analysed(**effect), use)
 
 
-def test_an_effect_of_no_size_changes_nothing(analysed):
+def test_effect_of_size_zero_has_no_influence(analysed):
     none = {"drag": {"value": 0.0}, "filter_time_constant_s": {"value": 0.0}}
     assert read_identified_beam(analysed(**none), STATED, TOUCH).plant.is_uniform_cantilever
 
@@ -127,7 +127,7 @@ def test_an_effect_of_no_size_changes_nothing(analysed):
         *((what, False) for what in ("unexplained", "unit", "of a later version", None)),
     ],
 )
-def test_findings_that_no_parameter_carries_are_refused(analysed, use, what, accepted):
+def test_findings_without_a_parameter_are_refused(analysed, use, what, accepted):
     finding = {"what": what, "value": None, "interval_95": None, "sentence": "It was found."}
     path = changed(analysed(), named=[{"what": "hum"}, finding])
     if accepted:
@@ -137,7 +137,7 @@ def test_findings_that_no_parameter_carries_are_refused(analysed, use, what, acc
 
 
 @pytest.mark.parametrize("stated", [{"status": "refused"}, {"status": []}, [], "passed"])
-def test_a_test_of_uniformity_that_cannot_be_read_is_refused(analysed, stated):
+def test_unreadable_uniformity_test_is_refused(analysed, stated):
     path = changed(analysed(), validity={"uniform_beam": stated})
     with pytest.raises(
         IdentifiedBeamError, match=r"model\.json: validity\.uniform_beam = .* is not"
@@ -160,7 +160,7 @@ def test_a_flagged_number_is_refused(analysed):
     assert "tip_mass_kg is flagged" in refusal(analysed(tip_mass_kg=flagged(1e-4)), MOVE)
 
 
-def test_of_a_flagged_damping_a_touch_takes_the_deviation_if_there_is_one(analysed):
+def test_touch_uses_the_deviation_of_a_flagged_damping(analysed):
     path = analysed(gamma=flagged(0.05, interval_95=[0.03, 0.07]))
     assert read_identified_beam(path, STATED, TOUCH).std["gamma"] == pytest.approx(0.0102, 1e-2)
     path = analysed(gamma={"value": 0.05, "std": None, "flag": "not identifiable"})
@@ -207,7 +207,7 @@ REFUSED = {"uniform_beam": {"status": "refused", "p_value": 3e-7}}
 PASSED = {"uniform_beam": {"status": "passed", "p_value": 0.4}}
 
 
-def test_of_a_uniform_beam_the_exact_parameters_are_read(analysed, profile):
+def test_exact_parameters_of_a_uniform_beam_are_read(analysed, profile):
     """They predict the record best; those with a tolerance of the geometry hold for its modes."""
     exact = json.loads(analysed().read_text())["headlines"][0]["parameters"]
     exact = {name: entry | {"flag": None} for name, entry in exact.items()}
@@ -221,9 +221,7 @@ def test_of_a_uniform_beam_the_exact_parameters_are_read(analysed, profile):
     assert found.pole_uncertainty(1)[0] == pytest.approx(1e-3 / 2.57, rel=0.02)
 
 
-def test_of_a_beam_that_is_not_uniform_a_move_takes_the_modes_and_a_touch_refuses(
-    analysed, profile
-):
+def test_nonuniform_beam_is_accepted_by_moves_only(analysed, profile):
     """No effective beam: frequencies and inertia are those of the modes."""
     beam = replace(profile.rig.beam, density_kg_per_m=5.1e-3, bending_stiffness_n_m2=0.1)
     true = Plant(beam, profile.rig.damping, stiffness_offsets=(0.02, -0.03))
@@ -249,7 +247,7 @@ def test_of_a_beam_that_is_not_uniform_a_move_takes_the_modes_and_a_touch_refuse
         read_identified_beam(path, STATED, TOUCH)
 
 
-def test_damping_that_is_not_that_of_the_modes_counts_as_uncertainty(analysed, profile):
+def test_damping_unlike_that_of_modes_counts_as_uncertainty(analysed, profile):
     modes = shown(Plant(profile.rig.beam, profile.rig.damping))
     modes[0]["damping_ratio"]["value"] += 0.002
     found = read_identified_beam(changed(analysed(), validity=REFUSED, modes=modes), STATED, MOVE)

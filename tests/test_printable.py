@@ -5,12 +5,12 @@ import pytest
 from rigd.printable import counts_text, progress_bar, readable_errors, readable_message
 
 
-def test_counts_that_nobody_could_read_are_unknown():
+def test_unreadable_counts_are_unknown():
     counts = {"recorded": None, "scheduled": 12_000, "missed": 2, "late": 0, "lost": None}
     assert counts_text(counts) == "unknown of 12 000 samples, 2 missed, 0 late, unknown lost"
 
 
-def test_an_error_keeps_its_beginning_and_its_remedy_whatever_it_quotes():
+def test_error_preserves_its_beginning_and_remedy():
     shown = readable_message(f"a.toml: {'x' * 1_000_000} is unknown; remove it.")
     assert len(shown) < 2100
     assert shown.startswith("a.toml: xxx")
@@ -18,13 +18,13 @@ def test_an_error_keeps_its_beginning_and_its_remedy_whatever_it_quotes():
     assert readable_message("a\x1b[2J\r.\nb.") == "a?[2J?.\nb."
 
 
-def test_of_very_many_lines_the_first_are_shown_and_the_others_counted():
+def test_first_of_many_lines_are_shown():
     lines = readable_message("\n".join(f"line {i}." for i in range(100_000))).split("\n")
     assert lines[39:] == ["line 39.", "… and 99 960 more lines."]
     assert readable_message("\n".join(["a"] * 40)).count("\n") == 39
 
 
-def test_a_usage_error_is_made_readable_and_no_other():
+def test_only_usage_errors_are_reformatted():
     class UsageError(Exception):
         exit_code = 2
         message = "y" * 10_000
@@ -36,7 +36,7 @@ def test_a_usage_error_is_made_readable_and_no_other():
     assert len(str(error)) == 10_000
 
 
-def test_the_remaining_time_is_known_where_a_step_takes_minutes():
+def test_remaining_time_is_known_for_long_steps():
     bar = progress_bar()
     now_s = [0.0]
     bar.get_time = lambda: now_s[-1]

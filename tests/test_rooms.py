@@ -1,4 +1,4 @@
-"""Folders are entered by their doors: private modules stay private in `rigd` and `analysis`."""
+"""Private modules of `rigd` and `analysis` are imported in their own package only."""
 
 import ast
 import importlib
@@ -8,16 +8,18 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SOURCES = sorted(path for room in ("rigd", "analysis") for path in (ROOT / room).rglob("*.py"))
-DOORS = sorted(path for room in ("rigd", "analysis") for path in (ROOT / room).rglob("*.pyi"))
+SOURCES = sorted(
+    path for package in ("rigd", "analysis") for path in (ROOT / package).rglob("*.py")
+)
+STUBS = sorted(path for package in ("rigd", "analysis") for path in (ROOT / package).rglob("*.pyi"))
 
 
 IMPORTS = re.compile(r"^\s*(?:from ([\w.]+) import (\([^)]*\)|.*)|import (.*))$", re.MULTILINE)
-"""Statement of an import: a module and what is taken from it, or modules."""
+"""Statement of an import: a module and the imported names, or modules."""
 
 
 def name_of(path):
-    """Dotted name of a module or of a folder's door."""
+    """Dotted name of a module or of a package."""
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
@@ -37,23 +39,23 @@ def is_private(module):
     )
 
 
-@pytest.mark.parametrize("room", sorted({path.parent for path in SOURCES}), ids=name_of)
-def test_private_modules_are_imported_in_their_own_folder_only(room):
-    foreign = {
+@pytest.mark.parametrize("package", sorted({path.parent for path in SOURCES}), ids=name_of)
+def test_private_modules_are_imported_in_their_own_folder_only(package):
+    violations = {
         (path.name, module)
-        for path in room.glob("*.py")
+        for path in package.glob("*.py")
         for module in imported_modules(path)
-        if is_private(module) and module.split("._")[0] != name_of(room)
+        if is_private(module) and module.split("._")[0] != name_of(package)
     }
-    assert not foreign
+    assert not violations
 
 
-@pytest.mark.parametrize("path", DOORS, ids=name_of)
-def test_a_door_says_what_the_room_is_and_offers_what_it_names(path):
-    room = importlib.import_module(name_of(path))
-    assert room.__doc__
+@pytest.mark.parametrize("path", STUBS, ids=name_of)
+def test_stub_matches_package(path):
+    package = importlib.import_module(name_of(path))
+    assert package.__doc__
     offered = [each.name for node in ast.parse(path.read_text()).body for each in node.names]
     assert offered
     for name in offered:
-        assert hasattr(room, name)
-    assert sorted(room.__all__) == sorted(offered)
+        assert hasattr(package, name)
+    assert sorted(package.__all__) == sorted(offered)

@@ -53,7 +53,7 @@ def test_final_response_is_that_of_the_analyser(path, record, settings):
 
 
 @pytest.mark.process
-def test_missing_and_held_values_are_made_up_for_as_the_analyser_does(path, record, settings):
+def test_missing_and_held_values_are_treated_as_in_the_analyser(path, record, settings):
     samples = read_session(path).samples.copy()
     faulty = np.random.default_rng(1).choice(np.arange(1500, 20_000), 60, replace=False)
     held, missing = faulty[:40], faulty[40:]
@@ -99,7 +99,7 @@ def test_missing_and_held_values_are_made_up_for_as_the_analyser_does(path, reco
         ), False),
     ],
 )  # fmt: skip
-def test_the_nominal_damping_is_the_profile_s_if_it_states_one_that_can_be(profile, known):
+def test_nominal_damping_comes_from_a_valid_profile(profile, known):
     damping = nominal_damping(profile)
     assert (damping is not None) == known
     if known:

@@ -48,7 +48,7 @@ def packages(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", SECTIONS)
-def test_a_profile_takes_it_and_it_behaves_as_the_loop_relies_on(packages, tmp_path, name):
+def test_added_controller_meets_the_contract_in_a_profile(packages, tmp_path, name):
     profile = load_profile(write_rig(tmp_path, name))
     assert profile.control.controller == name
     assert run_offline_checks(profile).failed == ()
@@ -107,7 +107,7 @@ def test_wrong_values_are_named_as_those_of_other_sections(
         load_profile(write_rig(tmp_path, name, section, **values))
 
 
-def test_an_unstable_loop_and_a_failed_row_of_theirs_refuse_a_session(packages, tmp_path):
+def test_unstable_loop_and_failed_row_refuse_a_session(packages, tmp_path):
     unstable = write_rig(
         tmp_path, "statespace",
         SECTIONS["statespace"] + '\ngain = { value = 30.0, source = "assumed" }',
@@ -121,9 +121,7 @@ def test_an_unstable_loop_and_a_failed_row_of_theirs_refuse_a_session(packages, 
     assert "30 N·m/rad" in failed.text
 
 
-def test_own_code_without_matrices_is_checked_and_predicted_as_far_as_it_is_known(
-    packages, tmp_path
-):
+def test_code_without_matrices_is_partly_predicted(packages, tmp_path):
     profile = load_profile(write_rig(tmp_path, "own"))
     rows = {(row.group, row.what): row for row in check_rig(profile)}
     assert rows["controller", "own"].found == "lab-laws 2.1"
@@ -139,7 +137,7 @@ def test_own_code_without_matrices_is_checked_and_predicted_as_far_as_it_is_know
 
 
 @pytest.mark.process
-def test_commands_check_run_and_list_them(packages, tmp_path, rigd_here):
+def test_commands_check_run_and_list_added_controllers(packages, tmp_path, rigd_here):
     path, out = write_rig(tmp_path, "dashpot"), tmp_path / "out"
     done = rigd_here("check", "--profile", path, "--json")
     assert done.returncode == 0, done.stderr
@@ -183,9 +181,7 @@ WRONG = {  # code of a package, and the reason that is stated
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
-    packages, tmp_path, monkeypatch, name
-):
+def test_unusable_package_is_named_without_affecting_others(packages, tmp_path, monkeypatch, name):
     code, reason = WRONG[name]
     entry_points = f"[{GROUP}]\n{name} = v_{name}:OWN\n"
     install(tmp_path / "wrong", f"v-{name}", "0.3", code, entry_points)
@@ -218,7 +214,7 @@ def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
         ("make=Own", "linear=lambda rig: LinearController([[1, 2]], [], [], [])", "a must have"),
     ],
 )  # fmt: skip
-def test_code_that_fails_refuses_a_session_with_the_name_of_the_package(
+def test_failing_code_refuses_a_session_with_its_package(
     packages, tmp_path, monkeypatch, old, new, reason
 ):
     install(tmp_path / "b", "u-bad", "1", renamed("bad", old, new), f"[{GROUP}]\nbad = u_bad:OWN\n")
@@ -230,7 +226,7 @@ def test_code_that_fails_refuses_a_session_with_the_name_of_the_package(
     sys.modules.pop("u_bad", None)
 
 
-def test_a_package_that_is_gone_is_an_error_and_not_the_pid(packages, tmp_path, monkeypatch):
+def test_missing_package_is_an_error(packages, tmp_path, monkeypatch):
     profile = load_profile(write_rig(tmp_path, "own"))
     monkeypatch.setattr(sys, "path", [each for each in sys.path if each != str(packages)])
     with pytest.raises(PluginError, match='"own": no installed package adds it'):
@@ -239,7 +235,7 @@ def test_a_package_that_is_gone_is_an_error_and_not_the_pid(packages, tmp_path, 
         profile.loop_model()
 
 
-def test_two_parts_of_one_section_are_named(packages, tmp_path, monkeypatch):
+def test_two_controllers_of_one_section_are_named(packages, tmp_path, monkeypatch):
     load_profile(write_rig(tmp_path, "own"))
     code = (
         "from dataclasses import dataclass\nfrom rigd.devices.declaration import DeviceKind\n"
@@ -264,7 +260,7 @@ def test_two_parts_of_one_section_are_named(packages, tmp_path, monkeypatch):
         ({"d": [0.0, float("nan"), 0.0]}, "d has a number that is not finite"),
     ],
 )
-def test_matrices_that_do_not_go_together_are_refused(matrices, message):
+def test_inconsistent_matrices_are_refused(matrices, message):
     good = {"a": [[0.5]], "b": [[1.0, -1.0, 0.0]], "c": [1.0], "d": [0.0, 0.0, 1.0]}
     assert LinearController(**{key: np.array(value) for key, value in good.items()}).order == 1
     with pytest.raises(ValueError, match=message):

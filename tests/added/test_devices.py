@@ -44,7 +44,7 @@ def packages(tmp_path, monkeypatch):
     sys.modules.pop("lab_devices", None)
 
 
-def test_a_profile_takes_their_sections(packages, tmp_path):
+def test_profile_reads_their_sections(packages, tmp_path):
     profile = load_profile(write_rig(tmp_path))
     twin, scaled = profile.rig.added_settings
     assert (twin.serial_number, twin.limit_nm) == ("T1", 5.0)  # the default
@@ -72,20 +72,20 @@ def test_wrong_values_are_named_as_those_of_other_sections(packages, tmp_path, o
         load_profile(write_rig(tmp_path, SECTIONS.replace(old, new)))
 
 
-def test_they_pass_the_checks_of_devices(packages, tmp_path):
+def test_added_devices_pass_the_checks(packages, tmp_path):
     rig = load_profile(write_rig(tmp_path)).rig
     for check in DEVICE_CHECKS:
         check(open_devices(rig))
 
 
-def test_a_sensor_that_needs_another_drive_is_refused_with_what_there_is(packages, tmp_path):
+def test_sensor_without_its_drive_is_refused(packages, tmp_path):
     profile = load_profile(write_rig(tmp_path, SECTIONS.partition("[scaled]")[0], sensor="sim"))
     with pytest.raises(ValueError, match=r"no known combination.*packages add .*scaled, twin"):
         check_selection(profile.rig.devices, profile.path)
 
 
 @pytest.mark.process
-def test_commands_check_run_and_list_them(packages, tmp_path, rigd_here):
+def test_commands_check_run_and_list_added_devices(packages, tmp_path, rigd_here):
     path, out = write_rig(tmp_path), tmp_path / "out"
     done = rigd_here("check", "--profile", path, "--json")
     rows = {(row["group"], row["what"]): row for row in json.loads(done.stdout)["rows"]}
@@ -108,7 +108,7 @@ def test_commands_check_run_and_list_them(packages, tmp_path, rigd_here):
     assert '# limit_nm = { value = 5.0, source = "assumed" }' in shown
 
 
-def test_a_failed_row_of_theirs_refuses_a_session(packages, tmp_path, rigd_here):
+def test_failed_row_refuses_a_session(packages, tmp_path, rigd_here):
     path = write_rig(tmp_path, SECTIONS.replace("110.0", "300.0"))
     done = rigd_here("run", "hold", "--profile", path, "--fast")
     assert done.returncode != 0
@@ -123,9 +123,7 @@ def test_a_failed_row_of_theirs_refuses_a_session(packages, tmp_path, rigd_here)
         ("gains, gain = [gain] * 2000, None", "IndexError: pop from empty list"),  # in a tick
     ],
 )
-def test_an_error_of_their_code_ends_the_session_and_names_the_package(
-    packages, tmp_path, statement, reason
-):
+def test_error_in_a_package_ends_the_session(packages, tmp_path, statement, reason):
     module = packages / "lab_devices.py"
     code = module.read_text().replace("    measure = ", f"    {statement}\n    measure = ")
     module.write_text(code.replace("(gain * each", "((gain or gains.pop()) * each"))
@@ -133,10 +131,10 @@ def test_an_error_of_their_code_ends_the_session_and_names_the_package(
         packages, "run", "hold", "--profile", write_rig(tmp_path), "--fast", "--output",
         tmp_path / "out",
     )  # fmt: skip
-    told = " ".join(f"{output} {errors}".split())
+    printed = " ".join(f"{output} {errors}".split())
     assert code == 1
-    assert "Traceback" not in told
-    assert re.search(rf"Package lab-devices 1\.2, .*: its code failed \({reason}\)", told)
+    assert "Traceback" not in printed
+    assert re.search(rf"Package lab-devices 1\.2, .*: its code failed \({reason}\)", printed)
 
 
 WRONG = {  # code of a package, its entry points, and the reason that is stated
@@ -163,9 +161,7 @@ WRONG = {  # code of a package, its entry points, and the reason that is stated
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
-    packages, tmp_path, monkeypatch, name
-):
+def test_unusable_package_is_named_without_affecting_others(packages, tmp_path, monkeypatch, name):
     code, reference, reason = WRONG[name]
     folder = tmp_path / "wrong"
     install(folder, f"w-{name}", "0.3", code, f"[rigd.devices]\n{name} = {reference}\n")
@@ -181,9 +177,7 @@ def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
             load_profile(write_rig(tmp_path, sensor=name))
 
 
-def test_two_packages_of_one_name_are_both_named_and_neither_is_used(
-    packages, tmp_path, monkeypatch
-):
+def test_packages_of_one_name_are_named_and_unused(packages, tmp_path, monkeypatch):
     install(tmp_path / "b", "other-lab", "2.0", DEVICES, "[rigd.devices]\ntwin = other_lab:TWIN\n")
     monkeypatch.syspath_prepend(tmp_path / "b")
     with pytest.raises(PluginError, match=r"lab-devices 1\.2.*other-lab 2\.0|other-lab 2\.0.*1\.2"):
@@ -191,7 +185,7 @@ def test_two_packages_of_one_name_are_both_named_and_neither_is_used(
     assert find_plugin("rigd.devices", "scaled").package == "lab-devices"
 
 
-def test_code_of_a_package_that_fails_is_an_error_with_its_name(packages, tmp_path, monkeypatch):
+def test_failing_code_is_an_error_with_its_package(packages, tmp_path, monkeypatch):
     rig = load_profile(write_rig(tmp_path)).rig
     monkeypatch.delattr("rigd.devices.parameters.RigParameters.settings_of")
     with pytest.raises(DeviceError, match=r"lab-devices 1\.2.*AttributeError"):
@@ -199,7 +193,7 @@ def test_code_of_a_package_that_fails_is_an_error_with_its_name(packages, tmp_pa
 
 
 @pytest.mark.process
-def test_nothing_comes_from_the_working_folder_and_help_does_not_search(packages, tmp_path):
+def test_packages_are_not_searched_in_the_working_folder(packages, tmp_path):
     install(tmp_path / "here", "here-only", "1", "KIND = 1", "[rigd.devices]\nhere = here_only:K\n")
     code, output, _ = rigd_with(
         packages, "plugins", "--json", cwd=tmp_path / "here", program=("-m", "rigd"), cold=True

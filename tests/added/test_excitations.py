@@ -31,7 +31,7 @@ def packages(tmp_path, monkeypatch):
     sys.modules.pop("lab_signals", None)
 
 
-def test_it_is_made_by_name_like_those_of_rigd(packages):
+def test_added_excitation_is_made_by_name(packages):
     assert "triangle" in KINDS
     assert list(KINDS)[-1] == "triangle"
     excitation = make_excitation("triangle", {"amplitude_rad": 0.02}, rate_hz=1000)
@@ -41,7 +41,7 @@ def test_it_is_made_by_name_like_those_of_rigd(packages):
     assert excitation.parameters["period_s"] == 1.0
 
 
-def test_its_options_are_declared_for_the_form_and_the_command(packages):
+def test_options_are_declared_for_form_and_command(packages):
     options = {option.name: option for option in excitation_options("triangle")}
     assert list(options) == ["amplitude_rad", "period_s", "duration_s", "rest_s", "ring_down_s"]
     assert options["amplitude_rad"].help == "peak of the triangle"
@@ -54,7 +54,7 @@ def test_its_options_are_declared_for_the_form_and_the_command(packages):
         assert helps == {options[name].help}
 
 
-def test_the_page_s_form_offers_it(packages, request):
+def test_form_of_the_page_offers_it(packages, request):
     served = request.getfixturevalue("served")  # started with the package installed
 
     async def hello():
@@ -75,7 +75,7 @@ def test_the_page_s_form_offers_it(packages, request):
     }  # fmt: skip
 
 
-def test_the_socket_takes_it_with_its_parameters(packages):
+def test_socket_accepts_it_with_its_parameters(packages):
     request = {"command": "start", "excitation": "triangle", "parameters": {"period_s": 2}}
     assert parse_request(json.dumps(request).encode()).parameters == {"period_s": 2.0}
     for parameters, message in (
@@ -127,9 +127,7 @@ WRONG = {  # code of a package, and the reason that is stated
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
-    packages, tmp_path, monkeypatch, name
-):
+def test_unusable_package_is_named_without_affecting_others(packages, tmp_path, monkeypatch, name):
     code, reason = WRONG[name]
     entry_points = f"[{GROUP}]\n{name} = x_{name}:TRIANGLE\n"
     install(tmp_path / "wrong", f"x-{name}", "0.3", code, entry_points)
@@ -144,7 +142,7 @@ def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
 
 
 @pytest.mark.process
-def test_commands_run_it_and_file_and_analysis_know_it(packages, tmp_path, rigd_here):
+def test_commands_and_analysis_support_it(packages, tmp_path, rigd_here):
     done = rigd_here("run", "--help")
     assert done.returncode == 0, done.stderr
     assert "triangle" in done.stdout

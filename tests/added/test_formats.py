@@ -1,4 +1,4 @@
-"""An import format in one file outside: reading takes it, and names what is wrong with it."""
+"""An import format in one file outside: reading uses it, and reports its errors."""
 
 import sys
 from pathlib import Path
@@ -26,7 +26,7 @@ def archive(tmp_path, monkeypatch):
     sys.modules.pop("lab_npz", None)
 
 
-def test_its_channels_are_read(archive):
+def test_channels_of_an_added_format_are_read(archive):
     name, channels = read_source(archive, ["angle", "torque"])
     assert name == "NumPy archive"
     assert channels["torque"].values.dtype == float
@@ -35,7 +35,7 @@ def test_its_channels_are_read(archive):
 
 
 @pytest.mark.parametrize(("channel", "message"), [("x", "no channel x"), ("few", "1 samples")])
-def test_errors_of_its_files_are_those_of_other_formats(archive, channel, message):
+def test_errors_match_those_of_other_formats(archive, channel, message):
     with pytest.raises(ExchangeError, match=message):
         read_source(archive, [channel])
 
@@ -46,7 +46,7 @@ def test_a_damaged_file_is_an_error_with_the_name_of_the_package(archive):
         read_source(archive, ["angle"])
 
 
-def test_an_unknown_suffix_is_refused_with_what_there_is(archive):
+def test_unknown_suffix_is_refused_with_the_known_ones(archive):
     with pytest.raises(ExchangeError, match=r"\.csv, .*\.npz"):
         read_source(archive.with_suffix(".xyz"), ["angle"])
 
@@ -65,9 +65,7 @@ WRONG = {  # code of a package, and the reason that is stated
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
-    archive, tmp_path, monkeypatch, name
-):
+def test_unusable_package_is_named_without_affecting_others(archive, tmp_path, monkeypatch, name):
     code, reason = WRONG[name]
     install(tmp_path / "b", f"y-{name}", "1", code, f"[{GROUP}]\n{name} = y_{name}:NPZ\n")
     monkeypatch.syspath_prepend(tmp_path / "b")
@@ -80,7 +78,7 @@ def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
     assert read_source(archive, ["angle"])[0] == "NumPy archive"
 
 
-WRONG_READERS = {  # what a reader returns for the channel "angle", and the message
+WRONG_READERS = {  # value of a reader for the channel "angle", and the message
     "nothing": ("None", "TypeError"),
     "lacks": ("{}", "KeyError"),
     "text": ("{'angle': SourceChannel(np.array(['a', 'b']))}", "does not hold real numbers"),
@@ -93,7 +91,7 @@ WRONG_READERS = {  # what a reader returns for the channel "angle", and the mess
 
 
 @pytest.mark.parametrize("name", WRONG_READERS)
-def test_a_reader_that_fails_is_an_error_on_the_file(archive, tmp_path, monkeypatch, name):
+def test_failing_reader_is_an_error_on_the_file(archive, tmp_path, monkeypatch, name):
     returned, message = WRONG_READERS[name]
     code = f"{FORMAT}\nNPZ = ImportFormat('x', lambda path, names: {returned}, 1000)\n"
     install(tmp_path / "b", f"z-{name}", "1", code, f"[{GROUP}]\n{name} = z_{name}:NPZ\n")
@@ -106,7 +104,7 @@ def test_a_reader_that_fails_is_an_error_on_the_file(archive, tmp_path, monkeypa
 
 
 @pytest.mark.process
-def test_analyze_import_takes_it(archive, tmp_path):
+def test_analyze_import_accepts_it(archive, tmp_path):
     angle = 0.02 * np.sin(np.arange(4000) / 50)
     np.savez(archive, angle=angle, torque=0.1 * angle)
     code, output, errors = rigd_with(

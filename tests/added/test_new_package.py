@@ -35,7 +35,7 @@ def made(folder, name, *options):
 
 
 @pytest.mark.process
-def test_new_packages_pass_their_tests_and_join(tmp_path):
+def test_new_packages_pass_their_tests_and_are_found(tmp_path):
     device = made(tmp_path / "device", "mypart")
     law = made(tmp_path / "law", "mylaw", "--kind", "controller")
     done = subprocess.run(
@@ -70,7 +70,7 @@ def test_new_packages_pass_their_tests_and_join(tmp_path):
         ),
     ],
 )
-def test_it_runs_as_its_page_says(
+def test_new_package_runs_as_documented(
     runtime_folder, tmp_path, monkeypatch, name, options, page, line_of_profile, with_part
 ):
     package = made(tmp_path / "own", name, *options)
@@ -93,7 +93,7 @@ def test_it_runs_as_its_page_says(
 
 
 @pytest.mark.process
-def test_the_new_driver_reads_an_instrument_as_its_page_says(tmp_path):
+def test_new_driver_reads_an_instrument_as_documented(tmp_path):
     (code,) = blocks("your_own_device", "python")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as instrument:
         instrument.bind(("127.0.0.1", 0))
@@ -121,7 +121,7 @@ def blocks(page, language):
 @pytest.mark.parametrize(
     "arguments", [["Upper"], ["cia402"], ["a b"], ["../x"], ["pid", "--kind", "controller"]]
 )
-def test_a_name_that_cannot_be_is_refused(tmp_path, monkeypatch, arguments):
+def test_invalid_name_is_refused(tmp_path, monkeypatch, arguments):
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(app, ["plugins", "new", *arguments])
     assert result.exit_code == 2

@@ -39,7 +39,7 @@ def selection(session):
     return select(Measurement.from_record(load_record(session)))
 
 
-def test_it_is_found_by_name(packages):
+def test_added_structure_is_found_by_name(packages):
     (added,) = added_structures(["zener"])
     assert added.structure.free == ("relaxation_strength", "relaxation_time_s", "air")
     assert added.plugin.label == "lab-zener 0.1"
@@ -67,7 +67,7 @@ def order(name):
 
 
 @pytest.mark.fit
-def test_its_fit_is_that_of_the_same_law_in_the_analyser(selection):
+def test_fit_equals_that_of_the_same_law_in_the_analyser(selection):
     parameters = (
         coefficient("inside", 1e-4), order("order_inside"),
         coefficient("outside", 1e-2), order("order_outside"),
@@ -87,7 +87,7 @@ def test_its_fit_is_that_of_the_same_law_in_the_analyser(selection):
 
 
 @pytest.mark.fit
-def test_a_law_that_fails_in_its_range_is_named_with_its_values(selection):
+def test_failing_law_is_named_with_its_values(selection):
     def breaks(s, values):
         return 1 + values["inside"] * s, float("nan") * s if values["inside"] > 1.2e-5 else 0 * s
 
@@ -126,9 +126,7 @@ WRONG = {  # code of a package, and the reason that is stated
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
-    packages, tmp_path, monkeypatch, name
-):
+def test_unusable_package_is_named_without_affecting_others(packages, tmp_path, monkeypatch, name):
     code, reason = WRONG[name]
     if name not in ("other", "vi"):
         code = code.replace('"zener"', f'"{name}"')
@@ -151,9 +149,7 @@ def test_two_packages_that_add_the_same_name_are_named(packages, tmp_path, monke
 
 
 @pytest.mark.fit
-def test_analyze_offers_fits_and_reports_it(
-    packages, session, tmp_path, analyze_here, without_drawing
-):
+def test_analyze_fits_and_reports_it(packages, session, tmp_path, analyze_here, without_drawing):
     entry_points = f"[{GROUP}]\nbroken = lab_broken:BROKEN\n"
     install(packages, "lab-broken", "1", "raise SystemExit(3)", entry_points)
     done = analyze_here("--help")

@@ -27,7 +27,7 @@ def record(workspace):
 
 
 @pytest.mark.further  # each of its steps is tested below
-def test_the_document_s_example_runs_as_written(workspace, monkeypatch, capsys):
+def test_example_of_the_document_runs_as_written(workspace, monkeypatch, capsys):
     monkeypatch.chdir(workspace)
     blocks = re.findall(r"^```python\n(.*?)^```$", DOCUMENT, re.MULTILINE | re.DOTALL)
     assert len(blocks) == 7
@@ -46,7 +46,7 @@ def test_the_document_s_example_runs_as_written(workspace, monkeypatch, capsys):
     assert "PooledParameter(name='zeta'" in printed
 
 
-def test_load_and_frf_are_the_command_s(record, workspace):
+def test_load_and_frf_match_the_command(record, workspace):
     own = load_record(workspace / "session.mcap")
     np.testing.assert_array_equal(record.torque_nm, own.torque_nm)
     np.testing.assert_array_equal(
@@ -69,7 +69,7 @@ def test_fit_by_either_method(record):
     assert paper.response.frequency_hz[-1] <= 40.0
 
 
-def test_wrong_use_is_told(record, workspace):
+def test_wrong_use_is_reported(record, workspace):
     with pytest.raises(ValueError, match="no model type 'VIII', 'x'; choose from I, II"):
         api.fit(record, ["III", "VIII", "x"])
     with pytest.raises(ValueError, match="no method 'bayes'; choose 'record' or 'welch'"):
@@ -80,7 +80,7 @@ def test_wrong_use_is_told(record, workspace):
         api.load(workspace / "none.mcap")
 
 
-def test_the_names_are_at_the_top_too_and_cost_nothing_until_used():
+def test_names_are_imported_lazily_at_the_top():
     for name in analysis.__all__:
         assert getattr(analysis, name) is getattr(api, name)
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):

@@ -1,4 +1,4 @@
-"""The page on the control socket is normative: it names what a plan tells."""
+"""The page on the control socket is normative: it documents every key of a plan."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ def plan(tmp_path_factory):
     return Series(load_profile("sim"), chirp(rate_hz=1000.0), folder).plan_document()
 
 
-def test_all_that_a_plan_tells_is_on_the_page(plan):
+def test_every_key_of_a_plan_is_documented(plan):
     section = PAGE[PAGE.index("### The plan") : PAGE.index("## Control\n")]
-    told = {*plan, *plan["tip"], *plan["limits"]}
-    assert {name for name in told if f"`{name}`" in section} == told
+    keys = {*plan, *plan["tip"], *plan["limits"]}
+    assert {name for name in keys if f"`{name}`" in section} == keys

@@ -34,7 +34,7 @@ def run(tmp_path, runtime_folder):
 
 @pytest.mark.process
 @pytest.mark.further  # its commands are parsed in test_documents.py
-def test_from_its_eds_to_the_first_session(run, tmp_path):
+def test_documented_steps_from_eds_to_first_session(run, tmp_path):
     shutil.copy(eds_path("epos4_0170"), tmp_path / "drive.eds")
     assert len(SHELLS) == 4
     done = run("\n".join(SHELLS))
@@ -54,6 +54,6 @@ def test_a_drive_without_torque_ends_at_the_first_step(run, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["drive.eds"]
 
 
-def test_every_name_that_can_be_accepted_is_explained():
+def test_every_accepted_name_is_explained():
     for name in ACCEPTABLE:
         assert f"accepted as `{name}`" in PAGE

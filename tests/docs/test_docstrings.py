@@ -1,6 +1,6 @@
-"""Docstrings: what a door offers is described to the last argument, and the examples run.
+"""Docstrings: public names are described to the last argument, and the examples run.
 
-What has to be described are the arguments of functions, of classes and of their public methods,
+To be described are the arguments of functions, of classes and of their public methods,
 and the fields of dataclasses, by these names and no others. A function or a method of one argument
 may do without a section: its summary is about it.
 """
@@ -21,8 +21,12 @@ import pytest
 from cases import further
 
 PROJECT = Path(__file__).parents[2]
-SOURCES = sorted(path for room in ("rigd", "analysis") for path in (PROJECT / room).rglob("*.py"))
-DOORS = sorted(path for room in ("rigd", "analysis") for path in (PROJECT / room).rglob("*.pyi"))
+SOURCES = sorted(
+    path for package in ("rigd", "analysis") for path in (PROJECT / package).rglob("*.py")
+)
+STUBS = sorted(
+    path for package in ("rigd", "analysis") for path in (PROJECT / package).rglob("*.pyi")
+)
 PUBLIC = [
     path
     for path in SOURCES
@@ -32,12 +36,12 @@ PUBLIC = [
 
 
 def name_of(path):
-    """Dotted name of a module or of a folder's door."""
+    """Dotted name of a module or of a package."""
     return ".".join(path.relative_to(PROJECT).with_suffix("").parts).removesuffix(".__init__")
 
 
 def offered(path):
-    """Functions and classes that a door offers, or that a public module defines."""
+    """Functions and classes of a public interface or a public module."""
     module = importlib.import_module(name_of(path))
     if path.suffix == ".pyi":
         names = [each.name for node in ast.parse(path.read_text()).body for each in node.names]
@@ -61,7 +65,7 @@ def described(text, title):
 
 
 def with_string(cls):
-    """Fields of a dataclass that a string stands under."""
+    """Fields of a dataclass that are followed by a string."""
     body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
     return [
         field.target.id
@@ -101,7 +105,7 @@ def complaints_on_class(cls):
                 yield f"{name}: {each}"
 
 
-@pytest.mark.parametrize("path", [*DOORS, *PUBLIC], ids=name_of)
+@pytest.mark.parametrize("path", [*STUBS, *PUBLIC], ids=name_of)
 def test_every_argument_and_field_is_described_by_its_name(path):
     found = [
         f"{thing.__module__}.{thing.__name__}: {complaint}"
@@ -127,11 +131,11 @@ def test_every_argument_and_field_is_described_by_its_name(path):
         ("Sum of `a` and `b`.", ["a is not described", "b is not described"]),
     ],
 )
-def test_the_check_finds_what_is_missing(text, complaints):
+def test_check_finds_missing_descriptions(text, complaints):
     assert list(complaints_on_function(lambda a, b: a + b, text)) == complaints
 
 
-def test_descriptions_name_the_thing():
+def test_descriptions_begin_with_a_noun():
     """Not "Of the copy.", but "Name of the copy."."""
     found = {
         name_of(path): lines
@@ -141,7 +145,7 @@ def test_descriptions_name_the_thing():
     assert not found
 
 
-# Those that fit sessions or design them show once more what the tests of their functions show.
+# Those that fit or design sessions repeat the tests of their functions.
 COSTLY = ("analysis.api", "analysis.online", "rigd.excitation.experiment_design")
 EXAMPLES = [
     further(path) if name_of(path) in COSTLY else path
@@ -161,7 +165,7 @@ def folder_of_examples(short_chirps, tmp_path, monkeypatch):
 @pytest.mark.process
 @pytest.mark.usefixtures("folder_of_examples")
 @pytest.mark.parametrize("path", EXAMPLES, ids=name_of)
-def test_examples_give_what_they_say(path):
+def test_examples_have_the_stated_output(path):
     failed, tried = doctest.testmod(importlib.import_module(name_of(path)))
     assert tried
     assert not failed

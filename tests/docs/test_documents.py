@@ -30,7 +30,7 @@ def anchors(path):
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(PROJECT)))
-def test_links_lead_somewhere(path):
+def test_links_are_valid(path):
     for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text("utf-8")):
         if re.match(r"https?:", target):
             continue
@@ -42,7 +42,7 @@ def test_links_lead_somewhere(path):
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(PROJECT)))
-def test_files_of_the_project_that_are_named_exist(path):
+def test_named_files_of_the_project_exist(path):
     named = re.findall(
         r"`((?:rigd|analysis|tests|benchmarks|examples|hw_profiles)/[\w/.]*)`",
         path.read_text("utf-8"),
@@ -97,8 +97,8 @@ PROGRAMS = {
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(PROJECT)))
-def test_commands_and_options_are_those_of_the_programs(path):
-    """What is run as written elsewhere; here it only has to be understood."""
+def test_commands_and_options_exist(path):
+    """Commands run as written elsewhere; here they only have to be parsed."""
     for line in shell_lines(path):
         for program, words in commands(line):
             try:
@@ -153,8 +153,8 @@ def test_every_kind_of_identification_is_shown():
         for line, kind, parameters in IDENTIFICATIONS.values()
     ],
 )
-def test_identifications_keep_the_limit_of_the_tip_s_slope(kind, parameters, tmp_path):
-    """As every default does; the reference paper's chirp alone is beyond it, and says so."""
+def test_identifications_stay_within_the_tip_slope(kind, parameters, tmp_path):
+    """As every default does; the reference paper's chirp alone is beyond it, and states so."""
     if kind in FILES:
         parameters = parameters | {"path": tmp_path / "file"}
         parameters["path"].write_text(FILES[kind])

@@ -26,7 +26,7 @@ def test_fifteen_faults_are_shown_quoted_and_explained():
 @pytest.mark.further
 @pytest.mark.process
 @pytest.mark.fit
-def test_its_script_draws_a_fault_and_quotes_what_the_page_has(tmp_path, runtime_folder):
+def test_script_reproduces_figure_and_quotation_of_a_fault(tmp_path, runtime_folder):
     script = DOCS / "gallery" / "make.py"
     command = [sys.executable, script, tmp_path, "--only", "wrong_unit"]
     subprocess.run(command, check=True, capture_output=True)

@@ -35,7 +35,7 @@ def assert_went_well(process):
 
 
 def tear(session, torn):
-    """Leave what a recorder leaves that dies: a session file without its end."""
+    """Leave a session file without its end, as a killed recorder does."""
     torn.parent.mkdir(parents=True)
     torn.write_bytes(session.read_bytes()[:-2000])
 
@@ -62,7 +62,7 @@ case "${0##*/} $*" in
 esac
 exec "FOLDER/${0##*/}" "$@"
 """
-"""Stands before both programs: the same commands, but for sessions of minutes, real time, and a
+"""Wraps both programs: the same commands, except for sessions of minutes, real time, and a
 second time that everything is fitted."""
 
 OTHER_PAGES = {
@@ -148,14 +148,14 @@ def start(request, tmp_path, runtime_folder):
 
 def script_of(shells):
     # Job control, as on a terminal: the simulated rig of one how-to is ended by its job's number.
-    # What a how-to that failed has left in the background ends with it.
+    # Background processes of a failed how-to end with it.
     trap = "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT"
     return "\n".join(("set -em", trap, *shells))
 
 
 @pytest.mark.process
 @pytest.mark.timeout(900)
-def test_every_how_to_from_a_session_to_what_becomes_of_it_runs_as_written(start, tmp_path):
+def test_every_how_to_on_sessions_runs_as_written(start, tmp_path):
     shells, python = list(filter(of_one_session, blocks("sh"))), blocks("python")
     assert len(shells) >= 6
     assert len(python) == 1
@@ -179,16 +179,16 @@ def test_every_how_to_from_a_session_to_what_becomes_of_it_runs_as_written(start
 def test_every_other_how_to_runs_as_written(start, write_profile, tmp_path):
     shells = [shell for shell in blocks("sh") if not of_one_session(shell)]
     assert len(shells) >= 6
-    # The one in real time waits most of its time: beside the others, as a separate rig, and one
-    # that bears a machine that stands still.
+    # The one in real time waits most of its time: it runs with the others, as a separate rig, and
+    # tolerates a standstill of the machine.
     (live,) = (shell for shell in shells if "--live" in shell)
     shells.remove(live)
     patient = write_profile("sim", {"name": '"patient"'}, patient=True)
     live = live.replace("--live", f"--live --profile {patient}")
-    with start("bash", "-c", live) as beside:
+    with start("bash", "-c", live) as live_view:
         with start("bash", "-c", script_of(shells)) as process:
             assert_went_well(process)
-        assert_went_well(beside)
+        assert_went_well(live_view)
     assert len(list((tmp_path / "tryouts").glob("*.mcap"))) == 3
 
 
@@ -204,7 +204,7 @@ def test_every_other_how_to_runs_as_written(start, write_profile, tmp_path):
         ("docs/tutorials/campaign.md", ["campaign/*-chirp-*.mcap", "together/report.html"]),
     ],
 )
-def test_what_a_beginner_does_runs_as_written(page, made, start, tmp_path):
+def test_steps_of_a_beginner_run_as_written(page, made, start, tmp_path):
     shutil.copy(TUTORIALS / "antenna.mcap", tmp_path)
     shutil.copy(eds_path("epos4_0170"), tmp_path / "drive.eds")
     for number, content in enumerate(blocks("toml", [PROJECT / page])):
@@ -222,7 +222,7 @@ def test_what_a_beginner_does_runs_as_written(page, made, start, tmp_path):
     "start", [pytest.param("short sessions", marks=pytest.mark.further)], indirect=True
 )
 @pytest.mark.parametrize("page", OTHER_PAGES)
-def test_a_how_to_by_itself_runs_as_written(page, start, tmp_path):
+def test_single_how_to_runs_as_written(page, start, tmp_path):
     shutil.copy(TUTORIALS / "antenna.mcap", tmp_path)
     paths = [PROJECT / "docs" / f"{page}.md"]
     shells = blocks("sh", paths)
@@ -240,8 +240,8 @@ def test_a_how_to_by_itself_runs_as_written(page, start, tmp_path):
 
 
 @pytest.mark.process
-@pytest.mark.further  # what is exported is tested in tests/exchange
-def test_matlab_s_lines_read_what_is_exported(analyze_here, tmp_path):
+@pytest.mark.further  # the export is tested in tests/exchange
+def test_matlab_lines_read_an_export(analyze_here, tmp_path):
     page = [PROJECT / "docs" / "export_to_matlab.md"]
     shutil.copy(TUTORIALS / "antenna.mcap", tmp_path)
     (command,), (lines,) = blocks("sh", page), blocks("matlab", page)
@@ -270,7 +270,7 @@ def all_blocks():
             yield path.stem, block[1], block[2]
 
 
-def test_every_block_is_run_or_says_why_not():
+def test_every_block_is_run_or_has_a_reason():
     """``sh`` and other code is run, ``console`` is not and has a reason, ``text`` is output."""
     found = list(all_blocks())
     assert len(found) > 80

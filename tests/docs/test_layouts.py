@@ -1,4 +1,4 @@
-"""The layouts for session files that are opened directly, and the page that says how."""
+"""The layouts for session files that are opened directly, and the page that describes this."""
 
 import importlib.util
 import io
@@ -33,7 +33,7 @@ BIN = Path(sys.executable).parent
 def make():
     spec = importlib.util.spec_from_file_location("make_layouts", LAYOUTS / "make.py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look
+    sys.modules[spec.name] = module  # dataclasses search there
     spec.loader.exec_module(module)
     yield module
     del sys.modules[spec.name]
@@ -66,7 +66,7 @@ def fields(session):
 
 
 def contents(path: Path) -> dict:
-    """What a layout of Rerun's says, without the moments at which it was said."""
+    """Content of a layout of Rerun's, without its times."""
     from rerun.chunk import RrdReader
 
     reader = RrdReader(path)
@@ -80,7 +80,7 @@ def contents(path: Path) -> dict:
     return found
 
 
-def test_the_files_are_what_the_script_makes(make, tmp_path):
+def test_files_match_the_script(make, tmp_path):
     make.write(tmp_path)
     for name in (make.RERUN, make.FOXGLOVE):
         assert (LAYOUTS / name).exists()
@@ -88,7 +88,7 @@ def test_the_files_are_what_the_script_makes(make, tmp_path):
     assert contents(tmp_path / make.RERUN) == contents(LAYOUTS / make.RERUN)
 
 
-def test_rerun_s_layout_is_of_fields_that_there_are(make, fields):
+def test_layout_of_rerun_uses_existing_fields(make, fields):
     found = contents(LAYOUTS / make.RERUN)
     text = repr(list(found.values()))
     selectors = set(re.findall(r"'selector': '\.(\w+)'", text))
@@ -113,7 +113,7 @@ def panels(layout) -> list[str]:
     return panels(layout["first"]) + panels(layout["second"])
 
 
-def test_foxglove_s_layout_is_of_paths_that_there_are(make, fields):
+def test_layout_of_foxglove_uses_existing_paths(make, fields):
     layout = json.loads((LAYOUTS / make.FOXGLOVE).read_text("utf-8"))
     shown = panels(layout["layout"])
     assert sorted(shown) == sorted(layout["configById"])
@@ -147,7 +147,7 @@ def test_foxglove_s_layout_is_of_paths_that_there_are(make, fields):
     assert f"{output}.{computed}" in paths
     (log,) = (c for name, c in layout["configById"].items() if name.startswith("RosOut!"))
     assert log["topicToRender"] == EVENT_TOPIC
-    # The log panel needs what a foxglove.Log has.
+    # The log panel needs the fields of a foxglove.Log.
     assert {"timestamp", "level", "message", "name"} <= fields[EVENT_TOPIC]
 
 
@@ -156,11 +156,11 @@ def blocks(language: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def look(session):
-    """Open files in Rerun's viewer, without a screen; return what it shows once that is right.
+def views_in_viewer(session):
+    """Open files in Rerun's viewer, without a screen; return its views once they are right.
 
-    `is_right` is asked about pictures of its views, by name; where that does not come, what it
-    shows in the end is returned. Beside the pictures come the views' reports of errors.
+    `is_right` gets pictures of its views, by name; if they never become right, the last
+    ones are returned. The second value is the views' reports of errors.
     """
     from rerun.experimental import ViewerClient
 
@@ -236,8 +236,8 @@ def environment() -> dict[str, str]:
     return os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}", "CI": "1"}
 
 
-@pytest.mark.further  # that there is what the layout shows is tested above
-def test_the_commands_of_the_page_show_plots_in_rerun(session, look):
+@pytest.mark.further  # the existence of the fields is tested above
+def test_commands_of_the_page_show_plots_in_rerun(session, views_in_viewer):
     (block,) = (block for block in blocks("sh") if "mcap convert" in block)
     *prepare, show = block.splitlines()
     done = subprocess.run(
@@ -247,7 +247,7 @@ def test_the_commands_of_the_page_show_plots_in_rerun(session, look):
     assert done.returncode == 0, done.stderr
     words = show.split()
     assert words[:3] == ["rerun", "--bind", "127.0.0.1"]
-    views, reports = look(
+    views, reports = views_in_viewer(
         *words[3:], is_right=lambda views: views.keys() == COLORS.keys() and not unseen(views)
     )
     assert views.keys() == COLORS.keys()
@@ -255,7 +255,7 @@ def test_the_commands_of_the_page_show_plots_in_rerun(session, look):
     assert reports == []
 
 
-def test_the_python_of_the_page_puts_session_and_layout_into_one_file(session):
+def test_python_of_the_page_writes_session_and_layout(session):
     from rerun.chunk import RrdReader
 
     (block,) = blocks("python")
@@ -272,35 +272,35 @@ def test_the_python_of_the_page_puts_session_and_layout_into_one_file(session):
     assert count == 21_500
 
 
-@pytest.mark.further  # what another program does
-def test_a_session_file_opened_as_it_is_shows_the_events_at_most(look):
-    """As the page says: should Rerun ever do better, the page is to say so.
+@pytest.mark.further  # the behaviour of another program
+def test_session_file_opened_directly_shows_only_events(views_in_viewer):
+    """As on the page: if a later Rerun does better, the page has to change.
 
     Now and then it shows nothing at all: the application of the layout, which has no recording.
     """
-    looks = []
+    counts = []
 
     def has_had_time(views: dict) -> bool:
-        looks.append(len(views))
-        return sum(looks) > 4 or len(looks) > 100
+        counts.append(len(views))
+        return sum(counts) > 4 or len(counts) > 100
 
-    views, _ = look(EXAMPLE, "docs/layouts/rigd.rbl", is_right=has_had_time)
+    views, _ = views_in_viewer(EXAMPLE, "docs/layouts/rigd.rbl", is_right=has_had_time)
     assert len(views) <= 1
     assert "Motor angle (rad)" not in views
 
 
 @pytest.mark.further  # parsed in test_documents.py
-def test_the_other_commands_of_the_page(session):
+def test_other_commands_of_the_page(session):
     (replay,) = (b.strip() for b in blocks("sh") if b.startswith("rigd replay"))
     command = ["bash", "-ec", f"{replay} --save seen.rrd"]
     subprocess.run(command, cwd=session, env=environment(), capture_output=True, check=True)
     assert (session / "seen.rrd").exists()
-    # What these do is tested where the analyser is.
+    # Their effect is tested with the analyser.
     (fits,) = (b for b in blocks("sh") if b.startswith("analyze"))
     assert fits.splitlines() == [f"analyze {EXAMPLE} --rerun fits.rrd", "rigd replay fits.rrd"]
 
 
-def test_its_links_lead_somewhere():
+def test_links_of_the_page_are_valid():
     headings = {
         re.sub(r"[^\w -]", "", line.lstrip("# ").lower()).replace(" ", "-")
         for line in PAGE.splitlines()

@@ -114,7 +114,7 @@ def test_pages_load_nothing_from_elsewhere(pages):
         ("What is a flag?", "flags"),
     ],
 )
-def test_a_question_is_answered_by_menu_and_by_search(pages, browser, question, page):
+def test_answer_is_found_by_menu_and_search(pages, browser, question, page):
     text = (SITE / f"{page}.html").read_text("utf-8")
     assert f"<title>{question}" in text
     groups = [(SITE / f"{group}.html").read_text("utf-8") for group in ("how_to", "explanation")]
@@ -124,7 +124,7 @@ def test_a_question_is_answered_by_menu_and_by_search(pages, browser, question, 
         address = (SITE / "search.html").resolve().as_uri()
         window.goto(f"{address}?q={quote(question)}")
         window.wait_for_selector("#search-results li a")
-        window.wait_for_function(  # what it says when all pages have been looked at
+        window.wait_for_function(  # its text when all pages have been searched
             "document.querySelector('#search-results .search-summary')?.innerText.includes('found')"
         )
         found = window.locator("#search-results li > a").evaluate_all(

@@ -1,4 +1,4 @@
-"""The references: what they ask of the rig, and that their passes are where the layout says."""
+"""The references: their demands on the rig, and their passes as in the layout."""
 
 import shutil
 from dataclasses import replace
@@ -45,7 +45,7 @@ def test_predicted_peaks_stay_within_the_options(profile, make, percent, stroke)
 
 
 @pytest.mark.parametrize("make", SESSIONS)
-def test_the_speed_keeps_its_sign_in_every_pass(profile, make):
+def test_speed_has_one_sign_in_every_pass(profile, make):
     excitation = make(profile, torque_percent=40.0, stroke_rad=0.8)
     speed = close_loop(profile.loop_model()).simulate(excitation.reference_rad).velocity_rad_s
     passes = passes_of(excitation)
@@ -57,7 +57,7 @@ def test_the_speed_keeps_its_sign_in_every_pass(profile, make):
     assert passes[-1].end < excitation.reference_rad.size
 
 
-def test_the_multisine_moves_all_of_its_band_alike(profile):
+def test_multisine_excites_its_band_uniformly(profile):
     excitation = multisine_session(profile, torque_percent=60.0, stroke_rad=0.8)
     speed = close_loop(profile.loop_model()).simulate(excitation.reference_rad).velocity_rad_s
     run = passes_of(excitation)[4]
@@ -68,15 +68,15 @@ def test_the_multisine_moves_all_of_its_band_alike(profile):
 
 
 @pytest.mark.parametrize("make", SESSIONS)
-def test_cycles_are_equal_but_for_a_small_offset(profile, make):
+def test_cycles_are_equal_except_for_a_small_offset(profile, make):
     excitation = make(profile, torque_percent=40.0, stroke_rad=0.8)
     by_speed: dict[float, list[SpeedPass]] = {}
     for run in passes_of(excitation):
         by_speed.setdefault(run.speed_rad_s, []).append(run)
     for runs in by_speed.values():
-        pieces = np.array([excitation.reference_rad[run.first : run.end] for run in runs])
-        offsets = pieces[:, 0] - pieces[0, 0]
-        assert np.ptp(pieces - offsets[:, None], axis=0).max() < 1e-12
+        passes = np.array([excitation.reference_rad[run.first : run.end] for run in runs])
+        offsets = passes[:, 0] - passes[0, 0]
+        assert np.ptp(passes - offsets[:, None], axis=0).max() < 1e-12
         steps = offsets / profile.rig.encoder.resolution_rad
         assert np.abs(steps).max() < 45
         assert len(set(np.round(steps % 1.0, 2))) > len(runs) // 2
@@ -90,7 +90,7 @@ def test_a_smaller_stroke_is_swept_more_slowly(profile):
     assert passes_of(narrow)[0].speed_rad_s < 0.4 * passes_of(wide)[0].speed_rad_s
 
 
-def test_half_of_the_speed_limit_is_left(profile):
+def test_half_of_the_speed_limit_remains(profile):
     slow = replace(profile, limits=replace(profile.limits, velocity_rad_s=0.6))
     excitation = multisine_session(slow, torque_percent=40.0, stroke_rad=0.8)
     assert passes_of(excitation)[0].speed_rad_s == pytest.approx(0.3)
@@ -130,7 +130,7 @@ def test_other_metadata_hold_no_layout(profile, change):
         (multisine_session, 100, "Too few passes: 0 of 0"),  # stopped before the first
     ],
 )
-def test_what_does_not_suffice_is_named(profile, tmp_path, make, end, words):
+def test_insufficient_sessions_are_reported(profile, tmp_path, make, end, words):
     excitation = make(profile, torque_percent=40.0, stroke_rad=0.8)
     reference = excitation.reference_rad
     signals = Signals(

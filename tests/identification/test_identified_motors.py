@@ -32,7 +32,7 @@ OPTIONS = {"torque_percent": 40.0, "stroke_rad": 0.8}
 
 @dataclass(frozen=True)
 class Motor:
-    """What is to be found."""
+    """The true parameters."""
 
     inertia_kg_m2: float
     viscous_nm_s_per_rad: float
@@ -64,7 +64,7 @@ class Motor:
 
 
 class ScaledDrive:
-    """A drive whose torque constant is not what it says."""
+    """A drive with a wrong torque constant."""
 
     angle_stale = False
 
@@ -181,7 +181,7 @@ def random_case(number):
     return motor, replace(profile, rig=replace(profile.rig, motor=wrong))
 
 
-def test_a_trial_finds_a_motor_and_tunes_its_controller():
+def test_trial_identifies_a_motor_and_tunes_its_controller():
     motor, nominal = random_case(0)
     trial, *_ = begin(nominal, motor, seed=0)
     errors = motor.normalised_errors(trial)
@@ -221,15 +221,15 @@ def without_antenna(rig):
 
 
 @pytest.mark.further  # as test_motor_estimate.py
-def test_without_an_antenna_the_scale_is_not_told():
+def test_scale_is_not_reported_without_an_antenna():
     profile = load_profile("sim")
     motor = Motor(1.6e-3, 0.025, 0.02, 1.1, 1.3e-3)
 
-    class Bare(Motor):
+    class MotorAlone(Motor):
         def rig(self, rig, seed):
             return without_antenna(super().rig(rig, seed))
 
-    estimate = identify(profile, Bare(**motor.__dict__), seed=5)
+    estimate = identify(profile, MotorAlone(**motor.__dict__), seed=5)
     assert estimate.torque_scale.std is None
     assert estimate.torque_scale.value == 1.0
     # In the torque that the drive states.

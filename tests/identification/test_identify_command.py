@@ -14,7 +14,7 @@ from rigd.session import read_session
 
 
 def pasted(text, toml):
-    """A profile's text with the proposed lines in place of its own."""
+    """A profile's text with the proposed lines instead of its own."""
     section = ""
     lines = text.splitlines()
     for line in toml.splitlines():
@@ -30,7 +30,7 @@ def pasted(text, toml):
 
 @pytest.mark.process
 @pytest.mark.further  # as test_identified_motors.py, without processes
-def test_from_the_rig_to_lines_for_its_profile(rigd, tmp_path):
+def test_command_proposes_lines_for_the_profile(rigd, tmp_path):
     done = rigd(
         "identify",
         "motor",
@@ -77,7 +77,7 @@ def test_from_the_rig_to_lines_for_its_profile(rigd, tmp_path):
     found = document["parameters"]["motor.inertia_kg_m2"]
     assert abs(measured.rig.motor.inertia_kg_m2 - found["value"]) < 0.1 * found["std"]
 
-    # Again from the files, beside a profile that is wrong; nothing moves.
+    # Again from the files, with a wrong profile; nothing moves.
     wrong = tmp_path / "wrong.toml"
     wrong.write_text(
         profile.text.replace("inertia_kg_m2 = { value = 2.0e-3", "inertia_kg_m2 = { value = 2.5e-3")

@@ -27,7 +27,7 @@ REPEATS = 8
 
 @dataclass(frozen=True)
 class Truth:
-    """A motor that turns a flywheel on a spring in the beam's place."""
+    """A motor that turns a flywheel on a spring instead of the beam."""
 
     inertia_kg_m2: float = 1.3e-3
     viscous_nm_s_per_rad: float = 0.021
@@ -148,7 +148,7 @@ def test_the_motor_is_found_within_its_deviations(truth):
     assert estimate.misfit < 2.0
 
 
-def test_without_noise_the_estimate_is_exact():
+def test_estimate_without_noise_is_exact():
     truth = Truth(noise_nm=0.0, resolution_rad=0.0)
     estimate = estimate_motor(windows_for(truth), timing_for(truth))
     assert estimate.inertia_kg_m2.value == pytest.approx(truth.inertia_kg_m2, rel=2e-4)
@@ -168,7 +168,7 @@ def test_a_wrong_age_of_the_torque_reading_shows_as_a_misfit():
     assert wrong.inertia_kg_m2.std > 2 * right.inertia_kg_m2.std
 
 
-def test_a_rigid_load_does_not_tell_the_scale():
+def test_rigid_load_does_not_determine_the_scale():
     truth = Truth(load_inertia_kg_m2=2e-4, load_rad_s=600.0, torque_scale=1.1)
     estimate = estimate_motor(windows_for(truth), timing_for(truth))
     assert estimate.torque_scale.std is None
@@ -194,7 +194,7 @@ def test_too_few_passes_are_refused():
             estimate_motor(few, timing_for(OLD_READINGS))
 
 
-def test_a_record_without_torque_tells_nothing():
+def test_record_without_torque_gives_no_estimate():
     still = [
         replace(window, torque_command_nm=np.zeros_like(window.torque_command_nm))
         for window in windows_for(OLD_READINGS)
@@ -204,6 +204,6 @@ def test_a_record_without_torque_tells_nothing():
 
 
 @pytest.mark.parametrize("freedom", [5, 8, 15, 30, 100])
-def test_three_deviations_cover_as_much_as_of_a_normal(freedom):
+def test_three_deviations_have_normal_coverage(freedom):
     quantile = scipy.special.stdtrit(freedom, scipy.special.ndtr(3.0)) / 3.0
     assert _student_factor(np.array(float(freedom))) == pytest.approx(quantile, rel=0.06)

@@ -23,32 +23,32 @@ ESTIMATE = MotorEstimate(
 )
 
 
-def test_the_verdict_is_by_three_deviations(profile):
+def test_verdict_uses_three_deviations(profile):
     differs = {row.key: row.differs for row in propose(ESTIMATE, profile).rows}
     assert differs["motor.inertia_kg_m2"] is True
     assert differs["motor.viscous_nm_s_per_rad"] is False
     assert differs["actuation.delay_s"] is False
 
 
-def test_the_rated_torque_takes_the_scale(profile):
+def test_scale_is_applied_to_the_rated_torque(profile):
     toml = tomllib.loads("\n".join(propose(ESTIMATE, profile).toml()))
     assert toml["motor"]["rated_torque_nm"]["value"] == pytest.approx(0.55)
     assert toml["motor"]["inertia_kg_m2"] == {"value": 2.0123e-3, "source": "measured"}
 
 
-def test_the_drive_s_own_rated_torque_is_compared_in_the_same_measure():
+def test_rated_torque_of_the_drive_is_compared_in_one_unit():
     proposal = propose(ESTIMATE, load_profile("antenna_can"))
     toml = tomllib.loads("\n".join(proposal.toml()))
     ratio = toml["motor"]["rated_torque_nm"]["value"] / 0.5
     assert toml["cia402"]["rated_torque_unit_nm"]["value"] == pytest.approx(1e-3 * ratio)
 
 
-def test_what_cannot_be_negative_is_proposed_as_zero(profile):
+def test_negative_values_are_proposed_as_zero(profile):
     toml = tomllib.loads("\n".join(propose(ESTIMATE, profile).toml()))
     assert toml["motor"]["coulomb_nm"]["value"] == 0.0
 
 
-def test_a_scale_that_is_not_told_is_not_proposed(profile):
+def test_unreported_scale_is_not_proposed(profile):
     proposal = propose(replace(ESTIMATE, torque_scale=MotorQuantity(1.0, None)), profile)
     assert "rated_torque_nm" not in "\n".join(proposal.toml())
     assert any("not identifiable" in line for line in proposal.table())
@@ -57,7 +57,7 @@ def test_a_scale_that_is_not_told_is_not_proposed(profile):
     assert proposal.as_dict()["parameters"]["motor.rated_torque_nm"]["differs"] is None
 
 
-def test_misfit_and_missing_passes_are_told(profile):
+def test_misfit_and_missing_passes_are_reported(profile):
     notes = propose(replace(ESTIMATE, misfit=7.3, dropped=2), profile, unusable_count=3).notes
     assert any("7.3 times" in note for note in notes)
     assert any("5 of 77 passes were left out" in note for note in notes)
@@ -83,7 +83,7 @@ def test_numbers_show_two_figures_of_their_deviation(profile, value, std, expect
 
 
 @pytest.mark.parametrize(("delay_s", "pasted"), [(9.96e-4, 1e-3), (1.004e-3, 1.004e-3)])
-def test_a_delay_just_below_what_the_protocol_takes_is_pasted_as_that(delay_s, pasted):
+def test_delay_near_the_protocol_minimum_is_rounded_to_it(delay_s, pasted):
     estimate = replace(ESTIMATE, actuation_delay_s=MotorQuantity(delay_s, 8e-6))
     proposal = propose(estimate, load_profile("antenna_can"))
     toml = tomllib.loads("\n".join(proposal.toml()))
@@ -91,7 +91,7 @@ def test_a_delay_just_below_what_the_protocol_takes_is_pasted_as_that(delay_s, p
     assert not any("on_arrival" in note for note in proposal.notes)
 
 
-def test_a_drive_that_takes_its_torque_on_arrival_is_recognised():
+def test_drive_that_applies_torque_on_arrival_is_recognised():
     estimate = replace(ESTIMATE, actuation_delay_s=MotorQuantity(6.0e-4, 8e-6))
     proposal = propose(estimate, load_profile("antenna_can"))
     assert any('torque_delivery = "on_arrival"' in note for note in proposal.notes)

@@ -1,4 +1,4 @@
-"""The index beside the files: always equal to them, whatever happens to either."""
+"""The index next to the files: always equal to them, after any change of either."""
 
 import errno
 import json
@@ -31,7 +31,7 @@ def read_files(monkeypatch):
     return read
 
 
-def test_only_what_is_new_or_has_changed_is_read(
+def test_only_new_and_changed_files_are_read(
     record_briefly, write_quick_look, write_report, tmp_path, read_files
 ):
     paths = [record_briefly(name) for name in "abc"]
@@ -57,7 +57,7 @@ def test_only_what_is_new_or_has_changed_is_read(
     assert [row.id for row in brought_up] == ["e", "d", "c"]
 
 
-def test_a_file_that_cannot_be_opened_for_a_moment_is_read_the_next_time(
+def test_temporarily_unreadable_file_is_read_next_time(
     record_briefly, tmp_path, monkeypatch, read_files
 ):
     record_briefly("good")
@@ -67,7 +67,7 @@ def test_a_file_that_cannot_be_opened_for_a_moment_is_read_the_next_time(
         rows = list_sessions(tmp_path)
     assert [row.outcome for row in rows] == ["unreadable", "unreadable"]
     assert all("Permission denied" in row.problem for row in rows)
-    for expected in (["good.mcap", "text.mcap"], []):  # what is damaged is known by then
+    for expected in (["good.mcap", "text.mcap"], []):  # damage is known by then
         read_files.clear()
         assert {row.id: row.outcome for row in list_sessions(tmp_path)} == {
             "good": "complete", "text": "unreadable"
@@ -79,7 +79,7 @@ def refuse(path, *_):
     raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
 
 
-def test_an_index_goes_with_its_folder(
+def test_index_moves_with_its_folder(
     record_briefly, write_quick_look, write_report, tmp_path, read_files
 ):
     path = record_briefly("a")
@@ -112,9 +112,7 @@ def spoil(path, statement):
         lambda path: spoil(path, "PRAGMA user_version = 99"),
     ],
 )
-def test_an_index_that_is_none_is_made_anew_from_the_files(
-    record_briefly, tmp_path, harm, read_files
-):
+def test_invalid_index_is_rebuilt_from_the_files(record_briefly, tmp_path, harm, read_files):
     for name in "abc":
         record_briefly(name, specimen="antenna 3")
     rows = list_sessions(tmp_path)
@@ -126,7 +124,7 @@ def test_an_index_that_is_none_is_made_anew_from_the_files(
 
 
 @pytest.mark.parametrize("content", [b"a letter to my mother", None])
-def test_a_file_of_somebody_else_is_left_as_it_is(record_briefly, tmp_path, content):
+def test_unrelated_file_is_left_unchanged(record_briefly, tmp_path, content):
     path = tmp_path / INDEX_NAME
     if content is None:
         spoil(path, "CREATE TABLE sessions (file TEXT, stamp TEXT)")
@@ -145,7 +143,7 @@ def test_a_folder_without_room_for_an_index_is_listed(record_briefly, tmp_path):
         assert [row.id for row in list_sessions(tmp_path)] == ["a"]
 
 
-def test_an_index_that_is_locked_is_done_without(record_briefly, tmp_path, monkeypatch):
+def test_locked_index_is_not_used(record_briefly, tmp_path, monkeypatch):
     monkeypatch.setattr("rigd.library._index._MAX_LOCK_WAIT_S", 0.05)
     record_briefly("a")
     list_sessions(tmp_path)
@@ -166,11 +164,11 @@ def lister(folder, number):
     return rows
 
 
-def test_several_writers_share_an_index(record_briefly, tmp_path, read_files):
+def test_several_writers_use_one_index(record_briefly, tmp_path, read_files):
     record_briefly("a")
     with multiprocessing.get_context("fork").Pool(3) as pool:
-        told = pool.starmap(lister, [(tmp_path, number) for number in range(3)])
-    assert all(counts == sorted(counts) for counts in told)
+        results = pool.starmap(lister, [(tmp_path, number) for number in range(3)])
+    assert all(counts == sorted(counts) for counts in results)
     rows = list_sessions(tmp_path)
     assert len(rows) == 16
     read_files.clear()

@@ -1,4 +1,4 @@
-"""Sessions of a folder: what is told of each, whatever lies beside them, and filters."""
+"""Sessions of a folder: their rows, with any other files next to them, and filters."""
 
 import os
 import time
@@ -12,7 +12,7 @@ from rigd.library import list_sessions
 from rigd.session import SessionWriter, Validity
 
 
-def test_what_file_look_and_report_say_stands_in_the_row(
+def test_row_combines_file_quick_look_and_report(
     record_briefly, write_quick_look, write_report, tmp_path
 ):
     path = record_briefly("first", specimen="antenna 3", operator="Ada", note="dry air",
@@ -36,14 +36,14 @@ def test_what_file_look_and_report_say_stands_in_the_row(
 def test_modes_come_with_the_validity_of_their_source(
     record_briefly, write_quick_look, write_report, tmp_path
 ):
-    of_look, of_report = Validity(0.6, 0.12).as_json(), Validity(0.1, 0.003).as_json()
-    for name, look, report, expected in (
-        ("a", of_look, None, of_look),
-        ("b", of_look, of_report, of_report),
+    of_quick_look, of_report = Validity(0.6, 0.12).as_json(), Validity(0.1, 0.003).as_json()
+    for name, quick_look, report, expected in (
+        ("a", of_quick_look, None, of_quick_look),
+        ("b", of_quick_look, of_report, of_report),
         ("c", {}, None, Validity().as_json()),  # of before an update: not known
     ):
         path = record_briefly(name)
-        write_quick_look(path, mode(2.5), validity=look)
+        write_quick_look(path, mode(2.5), validity=quick_look)
         if report is not None:
             write_report(path, mode(2.6), validity=report)
         for _ in "read", "from the index":
@@ -53,13 +53,15 @@ def test_modes_come_with_the_validity_of_their_source(
 
 
 @pytest.mark.parametrize("rate_hz", ["1e-310", "0"])
-def test_a_rate_that_no_rig_has_gives_no_length(record_briefly, tmp_path, rate_hz):
+def test_impossible_rate_gives_no_duration(record_briefly, tmp_path, rate_hz):
     record_briefly("first", rate_hz=rate_hz)
     (row,) = list_sessions(tmp_path)
     assert row.duration_s is None
 
 
-def test_without_a_report_the_modes_are_of_the_look(record_briefly, write_quick_look, tmp_path):
+def test_modes_come_from_the_quick_look_without_a_report(
+    record_briefly, write_quick_look, tmp_path
+):
     modes = [mode(2.5) | {"shown": True}, mode(16.3) | {"shown": False}]
     write_quick_look(record_briefly("first"), *modes)
     (row,) = list_sessions(tmp_path)
@@ -72,13 +74,13 @@ def test_without_a_report_the_modes_are_of_the_look(record_briefly, write_quick_
     [b"", b"{", b"[1]", b'{"version": 1, "modes": 7}', b"[" * 100_000,
      b'{"version": 1, "modes": [7, {}, {"frequency_hz": {"value": "a"}}]}'],
 )  # fmt: skip
-def test_a_look_that_is_none_gives_no_modes(record_briefly, tmp_path, content):
+def test_invalid_quick_look_gives_no_modes(record_briefly, tmp_path, content):
     record_briefly("first").with_suffix(".look.json").write_bytes(content)
     (row,) = list_sessions(tmp_path)
     assert (row.modes, row.outcome) == ((), "complete")
 
 
-def test_torn_and_foreign_files_are_listed_with_their_problem(record_briefly, tmp_path):
+def test_truncated_and_other_files_are_listed_with_their_error(record_briefly, tmp_path):
     torn = record_briefly("torn", specimen="antenna 3", day=1)
     content = torn.read_bytes()
     (tmp_path / "torn.mcap.part").write_bytes(content[: len(content) // 2])
@@ -105,7 +107,7 @@ def test_torn_and_foreign_files_are_listed_with_their_problem(record_briefly, tm
         assert name in rows[name].problem
 
 
-def test_a_session_that_is_being_recorded_is_told_from_a_torn_one(tmp_path):
+def test_running_session_is_distinguished_from_a_truncated_one(tmp_path):
     writer = SessionWriter(tmp_path / "now.mcap")
     writer.begin(START_UTC_NS, {"rate_hz": "1000.0", "specimen": "antenna 3"}, {}, {})
     (row,) = list_sessions(tmp_path)
@@ -115,7 +117,7 @@ def test_a_session_that_is_being_recorded_is_told_from_a_torn_one(tmp_path):
     assert (row.path.name, row.outcome, row.recorded) == ("now.mcap", "complete", 0)
 
 
-def test_a_damaged_file_with_its_end_says_so(record_briefly, tmp_path):
+def test_damaged_file_with_its_end_is_reported(record_briefly, tmp_path):
     path = record_briefly("first")
     content = bytearray(path.read_bytes())
     content[len(content) // 3 :: 50] = bytes(len(content[len(content) // 3 :: 50]))
@@ -126,14 +128,14 @@ def test_a_damaged_file_with_its_end_says_so(record_briefly, tmp_path):
     assert row.problem
 
 
-def test_texts_of_a_file_do_nothing_to_a_terminal(record_briefly, tmp_path):
+def test_texts_of_a_file_are_escaped_for_a_terminal(record_briefly, tmp_path):
     record_briefly("first", specimen="\x1b[2J" + "x" * 5000)
     (row,) = list_sessions(tmp_path)
     assert row.specimen.isprintable()
     assert len(row.specimen) < 1100
 
 
-def test_a_name_that_is_no_text_is_listed(record_briefly, tmp_path):
+def test_name_with_invalid_text_is_listed(record_briefly, tmp_path):
     record_briefly("first").rename(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.mcap"))
     for _ in range(2):
         (row,) = list_sessions(tmp_path)
@@ -181,13 +183,13 @@ def test_dates_are_local_and_the_last_day_is_included(record_briefly, tmp_path, 
 
 
 @pytest.mark.parametrize("given", ["yesterday", "2026-13-01", "9" * 400])
-def test_what_is_no_date_is_refused(tmp_path, given):
+def test_invalid_date_is_refused(tmp_path, given):
     with pytest.raises(UserError, match=r"since = .* 2026-11-20"):
         list_sessions(tmp_path, since=given)
 
 
 @pytest.mark.parametrize("name", ["nowhere", "file"])
-def test_what_is_no_folder_is_refused(tmp_path, name):
+def test_non_folder_is_refused(tmp_path, name):
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=f"{name}: the folder cannot be listed"):
         list_sessions(tmp_path / name)

@@ -52,12 +52,12 @@ def test_modes_are_followed_by_their_frequency():
     assert second.points[1].frequency_change.significant is False
 
 
-def test_two_modes_of_a_session_are_never_one():
+def test_two_modes_of_a_session_are_never_merged():
     trends = mode_trends([row(1, mode(2.60)), row(2, mode(2.60), mode(2.65))])
     assert [len(trend.points) for trend in trends] == [2, 1]
 
 
-def test_a_trend_is_a_document():
+def test_trend_is_a_json_document():
     (trend,) = mode_trends([row(1, mode(2.60)), row(2, mode(2.70))])
     first, second = trend.as_dict()["points"]
     assert (first["id"], first["frequency_change"]) == ("day-1", None)

@@ -1,4 +1,4 @@
-"""Curves of a response: a decimated curve keeps every peak, each where it is; phases."""
+"""Curves of a response: a decimated curve preserves every peak at its frequency; phases."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ GRID = np.arange(9601) / 160.0
     groups=st.integers(1, 300),
     unknown=st.floats(0.0, 1.0),
 )
-def test_no_extreme_is_lost_and_none_is_made_up(seed, groups, unknown):
+def test_decimation_preserves_extremes(seed, groups, unknown):
     rng = np.random.default_rng(seed)
     values = rng.normal(size=GRID.size)
     values[rng.random(GRID.size) < unknown] = np.nan
@@ -44,7 +44,7 @@ def test_every_local_peak_wider_than_a_group_survives():
         assert points[near, 1].max() == values[near_all].max()
 
 
-def test_a_curve_is_broken_where_it_is_not_known():
+def test_curve_is_interrupted_at_unknown_values():
     values = np.zeros(GRID.size)
     values[(GRID > 5.0) & (GRID < 10.0)] = np.nan
     below, above = CurveDecimation.logarithmic(GRID, 0.5, 60.0, 200).strips(values)
@@ -56,13 +56,13 @@ def test_a_curve_is_broken_where_it_is_not_known():
     assert np.isnan(values[thinning.gaps(values)]).all()
     assert 5.0 < first < 5.4
     assert 9.5 < last < 10.0
-    # Nothing lies between what is known before and the unknown end of a curve.
+    # Nothing is between the known values and the unknown end of a curve.
     assert thinning.gaps(np.where(GRID > 5.0, np.nan, 0.0)).size == 0
     assert thinning.gaps(np.full(GRID.size, np.nan)).size == 0
 
 
 @pytest.mark.parametrize("grid", [[], [0.1, 0.2]])
-def test_of_a_curve_outside_the_band_nothing_is_left(grid):
+def test_curve_outside_the_band_is_empty(grid):
     grid = np.array(grid)
     thinning = CurveDecimation.logarithmic(grid, 0.5, 60.0, 200)
     assert thinning.extremes(np.ones(grid.size)).size == 0

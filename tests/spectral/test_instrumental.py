@@ -31,12 +31,12 @@ def exact(frequency_hz):
     return scipy.signal.freqz(*PLANT, worN=frequency_hz, fs=RATE_HZ)[1]
 
 
-def test_the_loop_is_what_it_says():
+def test_loop_matches_its_equations():
     reference, x, y = closed_loop(0.5, samples=200)
     np.testing.assert_allclose(x[1:], reference[1:] + 0.4 * y[:-1], atol=1e-12)
 
 
-def test_noise_that_the_loop_feeds_back_is_averaged_out():
+def test_feedback_of_noise_is_averaged_out():
     reference, x, y = closed_loop(1.0)
     h1 = welch_response(x, y, RATE_HZ, **SETTINGS).band(1.0, 99.0)
     hiv = instrumental_response(reference, x, y, RATE_HZ, **SETTINGS).band(1.0, 99.0)
@@ -46,7 +46,7 @@ def test_noise_that_the_loop_feeds_back_is_averaged_out():
     assert abs(off_hiv) < 0.02
 
 
-def test_the_sign_of_the_phase_is_that_of_h1():
+def test_sign_of_the_phase_is_that_of_h1():
     reference, x, y = closed_loop(0.0)
     h1 = welch_response(x, y, RATE_HZ, **SETTINGS).band(5.0, 95.0)
     hiv = instrumental_response(reference, x, y, RATE_HZ, **SETTINGS).band(5.0, 95.0)
@@ -56,7 +56,7 @@ def test_the_sign_of_the_phase_is_that_of_h1():
     np.testing.assert_allclose(h1.response, plant, atol=0.05)
 
 
-def test_without_noise_in_an_open_loop_it_is_h1():
+def test_open_loop_without_noise_equals_h1():
     rng = np.random.default_rng(5)
     x = rng.normal(size=6000)
     y = scipy.signal.lfilter(*PLANT, x) + 0.2 * rng.normal(size=x.size)
@@ -76,13 +76,13 @@ def test_unit_and_delay_of_the_reference_cancel():
 
 
 @pytest.mark.parametrize("which", ["input", "output"])
-def test_what_is_not_finite_is_named(which):
+def test_nonfinite_values_are_named(which):
     records = {"reference": np.ones(600), "input": np.ones(600), "output": np.ones(600)}
     records[which] = np.full(600, np.nan)
     with pytest.raises(SpectralError, match=f"of the {which} are NaN"):
         instrumental_response(*records.values(), RATE_HZ, **SETTINGS)
 
 
-def test_a_reference_that_stands_still_is_refused():
+def test_constant_reference_is_refused():
     with pytest.raises(SpectralError, match="reference is zero"):
         instrumental_response(np.zeros(600), np.ones(600), np.ones(600), RATE_HZ, **SETTINGS)

@@ -16,7 +16,7 @@ def grid(n=8001, step_hz=1 / 160):
 
 
 @given(first=st.integers(0, 8000), last=st.integers(0, 8000))
-def test_band_holds_both_its_ends(first, last):
+def test_band_includes_both_ends(first, last):
     first, last = sorted((first, last))
     band = grid().band(first * 0.00625, last * 0.00625)
     np.testing.assert_array_equal(band.frequency_hz, grid().frequency_hz[first : last + 1])
@@ -32,7 +32,7 @@ def test_band_without_bins_is_refused(band_hz):
 
 
 @pytest.mark.parametrize(("input_age", "output_age"), [(0, 3), (4, 0), (2, 5), (3, 3)])
-def test_ages_of_the_samples_are_undone(input_age, output_age):
+def test_ages_of_the_samples_are_compensated(input_age, output_age):
     """Two channels stamped late by some samples give the response of the channels themselves."""
     rng = np.random.default_rng(31)
     x = np.zeros(1000)

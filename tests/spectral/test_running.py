@@ -96,7 +96,7 @@ def assert_equals_welch(found, whole, rtol=1e-9):
         np.testing.assert_allclose(found.response.coherence, whole.coherence, atol=1e-9)
 
 
-def test_ends_as_welchs_estimate(noisy):
+def test_final_estimate_equals_welchs(noisy):
     samples = noisy.reference.size
     running = RunningResponse(RATE_HZ, samples, last_hz=LAST_HZ)
     for first in range(0, samples, 50):
@@ -114,7 +114,7 @@ def test_ends_as_welchs_estimate(noisy):
 
 
 @pytest.mark.parametrize("duration_s", [5.0, 10.0, 20.0])
-def test_short_records_end_as_analyze_divides_them(duration_s):
+def test_short_records_use_the_segments_of_analyze(duration_s):
     sweep = sweep_of_excitation(chirp(rate_hz=RATE_HZ, duration_s=duration_s, ring_down_s=0.0))
     samples = sweep.reference.size
     chosen = segmentation_of(samples, RATE_HZ)
@@ -133,7 +133,7 @@ def test_short_records_end_as_analyze_divides_them(duration_s):
     assert shown[0] <= 0.3
 
 
-def test_is_near_the_truth_throughout_the_sweep(paper):
+def test_estimate_is_near_the_truth_throughout_the_sweep(paper):
     """Where the reference has been, from above the first resonance, which Welch itself blurs."""
     last_hz = []
     for end, found in estimates(paper, 6000):
@@ -164,8 +164,8 @@ def test_is_near_the_truth_throughout_the_sweep(paper):
         (5.0, 40.0, 40.0, 0.0),
     ],
 )
-def test_a_chirp_has_excited_as_far_as_it_has_come(start_hz, stop_hz, duration_s, taper_s):
-    """To within what the shortest window resolves, and half a second of the sweep."""
+def test_chirp_excites_up_to_its_frequency(start_hz, stop_hz, duration_s, taper_s):
+    """To within the resolution of the shortest window, and half a second of the sweep."""
     excitation = chirp(
         rate_hz=RATE_HZ,
         start_hz=start_hz,
@@ -188,13 +188,13 @@ def test_a_chirp_has_excited_as_far_as_it_has_come(start_hz, stop_hz, duration_s
         lead_hz = (front_hz - now_hz) * np.sign(hz_per_s)
         resolution_hz = RATE_HZ / min(end, length)
         assert lead_hz < resolution_hz, end
-        # What is faded at the end is not seen before.
+        # The fade at the end is not visible before.
         behind_s = 0.5 + (taper_s if end > reference.size - 1000 * taper_s else 0.0)
         assert lead_hz > -resolution_hz - behind_s * abs(hz_per_s), end
         if end >= length and min(start_hz, stop_hz) < now_hz - 1.0:
             assert lead_hz < max(0.2, 0.5 * resolution_hz), end
         assert abs(back_hz - start_hz) < resolution_hz + (0.5 + taper_s) * abs(hz_per_s), end
-        # One band, but perhaps for what was passed in a moment at its lower end.
+        # One band, except perhaps for frequencies passed quickly at its lower end.
         within = (frequency_hz > max(first_hz, 0.5)) & (frequency_hz < last_hz)
         assert found.excited[within].all(), end
     assert looked >= 20
@@ -210,7 +210,7 @@ def test_a_multisine_has_excited_its_band_from_the_beginning():
         assert excited_hz.size == np.ptp(excited_hz).round(6) * 160 + 1
 
 
-def test_a_step_excites_nothing_that_segments_could_tell_and_a_hold_nothing():
+def test_step_and_hold_have_no_excited_band():
     excitation = step(rate_hz=RATE_HZ, duration_s=20.0)
     stepped = sweep_of_excitation(excitation)
     held = replace(stepped, reference=np.zeros(stepped.reference.size))
@@ -223,7 +223,7 @@ def test_a_step_excites_nothing_that_segments_could_tell_and_a_hold_nothing():
 
 
 @pytest.mark.parametrize("offset_rad", [0.05, -0.3])
-def test_where_the_motor_stands_does_not_hide_what_is_excited(paper, offset_rad):
+def test_excited_band_does_not_depend_on_the_mean_angle(paper, offset_rad):
     there = replace(paper, reference=paper.reference + offset_rad)
     for (_, here), (_, shifted) in zip(
         estimates(paper, 20_000), estimates(there, 20_000), strict=True
@@ -259,7 +259,7 @@ def small_welch(record):
 
 
 @given(data=st.data())
-def test_blocks_do_not_matter(data):
+def test_estimate_does_not_depend_on_blocks(data):
     record = small_record()
     rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
     ticks = np.arange(3000)
@@ -285,7 +285,7 @@ def test_blocks_do_not_matter(data):
 
 @pytest.mark.parametrize("first", [0, -300])
 def test_short_gaps_are_interpolated_as_analyze_does(first):
-    """With what comes before and after the record, or without."""
+    """With or without samples before and after the record."""
     ticks = np.arange(first, 3000 - first)
     record = small_record(ticks.size)
     missing = np.random.default_rng(8).random(ticks.size) < 0.05
@@ -327,7 +327,7 @@ def test_segments_with_a_long_gap_are_left_out():
     assert_equals_welch(running.estimate(), small_welch(record[:, 1020:]))
 
 
-def test_the_stretch_since_a_long_gap_counts_when_it_is_long_enough():
+def test_long_enough_part_after_a_gap_counts():
     record, ticks = small_record(), np.arange(3000)
     known = (ticks < 900) | (ticks >= 1000)
     seen = []
@@ -339,7 +339,7 @@ def test_the_stretch_since_a_long_gap_counts_when_it_is_long_enough():
     assert seen == [3, 2, 3]
 
 
-def test_a_record_that_ends_in_a_long_gap_is_over_with_what_follows_it():
+def test_trailing_gap_is_closed_by_later_samples():
     record, ticks = small_record(3300), np.arange(3300)
     known = (ticks < 2900) | (ticks >= 3100)
     running = small()
@@ -351,7 +351,7 @@ def test_a_record_that_ends_in_a_long_gap_is_over_with_what_follows_it():
     assert_equals_welch(found, small_welch(record[:, :2900]))
 
 
-def test_nothing_is_said_of_next_to_nothing():
+def test_no_estimate_from_too_few_samples():
     record = small_record()
     running = small()
     assert running.estimate() is None
@@ -385,6 +385,6 @@ def test_memory_does_not_grow_with_the_record():
         (Segmentation(100, 10, 99), "nfft = 99"),
     ],
 )
-def test_settings_that_make_no_sense(segmentation, message):
+def test_invalid_settings_are_refused(segmentation, message):
     with pytest.raises(SpectralError, match=message):
         RunningResponse(RATE_HZ, 1000, last_hz=LAST_HZ, segmentation=segmentation)

@@ -40,7 +40,7 @@ def expected(ticks, values, end):
 
 
 @given(data=st.data())
-def test_segments_are_those_of_the_whole_record_however_it_comes(data):
+def test_segments_do_not_depend_on_blocks(data):
     samples = data.draw(st.integers(1, 400))
     seed = data.draw(st.integers(0, 10**6))
     rng = np.random.default_rng(seed)
@@ -72,7 +72,7 @@ def test_the_newest_samples_reach_back_to_the_last_long_gap(block):
     np.testing.assert_allclose(segments.newest(12)[0], 2.0 * np.arange(138, 150), rtol=1e-14)
 
 
-def test_a_value_is_held_where_the_record_begins_with_a_short_gap_only():
+def test_only_a_short_initial_gap_is_held():
     for missing, value in ((LONGEST_GAP, 3.0), (LONGEST_GAP + 1, None)):
         ticks = np.arange(missing, 60)
         _, found = cut(ticks, np.full((1, ticks.size), 3.0), [])

@@ -1,4 +1,4 @@
-"""Segments of a record of which only the length is known, against what `analyze` takes."""
+"""Segments of a record of which only the length is known, against those of `analyze`."""
 
 import pytest
 
@@ -19,7 +19,7 @@ def test_long_records_are_divided_as_analyze_does_by_default(rate_hz, duration_s
 
 
 @pytest.mark.parametrize("samples", [30, 1000, 10_000, 17_265])
-def test_short_ones_as_analyze_advises(samples):
+def test_short_records_are_divided_as_analyze_advises(samples):
     length, overlap = segment_lengths(samples, 8, 0.15)
     analysts = WelchSettings(segment_length=length, overlap=overlap).segmentation(1000.0)
     assert segmentation_of(samples, 1000.0) == Segmentation(length, overlap, analysts.nfft)
@@ -27,10 +27,10 @@ def test_short_ones_as_analyze_advises(samples):
 
 
 @pytest.mark.parametrize("samples", [2, 3, 5, 7])
-def test_the_shortest_are_one_segment(samples):
+def test_shortest_records_are_one_segment(samples):
     assert segmentation_of(samples, 1000.0) == Segmentation(samples, 0, 160_000)
     assert segmentation_of(samples, 1e-3).segment_length == samples
 
 
-def test_the_papers():
+def test_record_of_the_paper():
     assert segmentation_of(120_000, 1000.0) == Segmentation() == Segmentation(17_266, 2590, 160_000)

@@ -1,4 +1,4 @@
-"""Levels of signals that are known, whatever blocks they come in."""
+"""Levels of known signals, in blocks of any size."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_a_sine_shows_its_amplitude_at_its_frequency(amplitude, frequency_hz, ph
     assert level_db[:, away].max() < 20 * np.log10(amplitude) - 28
 
 
-def test_a_constant_shows_at_frequency_zero_and_silence_has_a_floor():
+def test_constant_is_at_zero_frequency_and_silence_at_the_floor():
     _, _, level_db = columns(np.full(1500, -0.2))
     np.testing.assert_allclose(level_db[:, 0], 20 * np.log10(0.2), atol=1e-9)
     spectrogram, _, level_db = columns(np.zeros(1500))
@@ -52,7 +52,7 @@ def test_columns_follow_a_chirp_in_time():
 
 
 @given(edges=st.lists(st.integers(0, 4000), max_size=12), seed=st.integers(0, 100))
-def test_blocks_do_not_matter(edges, seed):
+def test_spectrogram_does_not_depend_on_blocks(edges, seed):
     rng = np.random.default_rng(seed)
     ticks = np.cumsum(np.where(rng.random(4000) < 1e-3, rng.integers(1, 200, 4000), 1))
     signal = np.cumsum(rng.normal(size=4000))
@@ -80,7 +80,7 @@ def test_short_gaps_are_bridged_and_long_ones_leave_columns_out():
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 999.0])
-def test_never_beyond_half_the_rate(rate_hz):
+def test_frequencies_end_at_half_the_rate(rate_hz):
     spectrogram = RunningSpectrogram(rate_hz, last_hz=60.0)
     assert spectrogram.frequency_hz[-1] == pytest.approx(min(60.0, rate_hz / 2), abs=0.26)
     signal = np.ones(2 * round(rate_hz))

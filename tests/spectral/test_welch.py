@@ -85,7 +85,7 @@ def test_segment_trap():
         a = welch_response(x, y, 1000.0, overlap=overlap)
         b = welch_response(x, changed, 1000.0, overlap=overlap)
         assert a.segments == segments
-        # With seven segments the end of the record, and what was excited there, goes unseen.
+        # With seven segments the end of the record, and its excitation, is not used.
         assert np.array_equal(a.response, b.response) == (segments == 7)
 
 
@@ -98,7 +98,7 @@ def test_segments_of_the_paper():
     segments=st.integers(1, 24),
     fraction=st.floats(0.0, 0.9),
 )
-def test_segments_fit_and_are_as_long_as_can_be(samples, segments, fraction):
+def test_segments_are_as_long_as_possible(samples, segments, fraction):
     length, overlap = segment_lengths(samples, segments, fraction)
     assert segment_count(samples, length, overlap) >= segments
     assert overlap == round(fraction * length) < length
@@ -110,7 +110,7 @@ def test_segments_fit_and_are_as_long_as_can_be(samples, segments, fraction):
 @pytest.mark.parametrize(
     ("samples", "segments", "fraction"), [(10, 8, 0.0), (0, 1, 0.0), (100, 0, 0.1), (100, 2, 1.0)]
 )
-def test_segments_that_cannot_be(samples, segments, fraction):
+def test_impossible_segments_are_refused(samples, segments, fraction):
     with pytest.raises(SpectralError, match="segments"):
         segment_lengths(samples, segments, fraction)
 
@@ -165,7 +165,7 @@ def _ratios(system, x, y, first_hz, last_hz):
     return found, coherence
 
 
-def test_coherence_is_the_share_of_output_that_input_explains():
+def test_coherence_is_the_explained_fraction_of_output():
     rng = np.random.default_rng(21)
     x, noise = rng.normal(size=(2, 200_000))
     got = welch_response(x, x + 0.5 * noise, 100.0, segment_length=500, overlap=0, nfft=500)
@@ -178,7 +178,7 @@ def test_coherence_is_the_share_of_output_that_input_explains():
 
 
 @given(in_scale=st.floats(1e-6, 1e6), out_scale=st.floats(1e-6, 1e6), sign=st.sampled_from([-1, 1]))
-def test_units_scale_the_response_and_nothing_else(in_scale, out_scale, sign):
+def test_units_scale_only_the_response(in_scale, out_scale, sign):
     rng = np.random.default_rng(2)
     x, y = rng.normal(size=(2, 400))
     y += x
@@ -210,7 +210,7 @@ def test_silent_input_bins_are_nan_and_silent_output_is_zero():
         ({"estimator": "h3"}, "'h3'.*h1, h2, hv"),
     ],
 )
-def test_settings_that_make_no_sense(changes, message):
+def test_invalid_settings_are_refused(changes, message):
     x = np.sin(np.arange(1000.0))
     settings = {"segment_length": 100, "overlap": 10, "nfft": 128} | changes
     with pytest.raises(SpectralError, match=message):
@@ -229,6 +229,6 @@ def test_settings_that_make_no_sense(changes, message):
         (np.ones(500), np.ones(500), np.nan, "rate"),
     ],
 )
-def test_records_that_make_no_sense(x, y, rate_hz, message):
+def test_invalid_records_are_refused(x, y, rate_hz, message):
     with pytest.raises(SpectralError, match=message):
         welch_response(x, y, rate_hz, segment_length=100, overlap=10, nfft=128)

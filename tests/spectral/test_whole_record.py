@@ -1,4 +1,4 @@
-"""The whole-record estimate: exact for what starts and ends at rest."""
+"""The whole-record estimate: exact for signals that start and end at rest."""
 
 import numpy as np
 import pytest
@@ -31,11 +31,11 @@ def test_zero_padding_sets_the_grid(system, nfft):
     np.testing.assert_allclose(got.response, system.response(got.frequency_hz), rtol=1e-8)
 
 
-def test_never_cuts_the_record():
+def test_record_is_never_cut():
     with pytest.raises(SpectralError, match=r"nfft = 100 .* 4000"):
         fft_response(burst(), burst(), 200.0, 100)
 
 
-def test_input_of_nothing_is_refused():
+def test_zero_input_is_refused():
     with pytest.raises(SpectralError, match="zero in all"):
         fft_response(np.zeros(10), np.ones(10), 200.0)

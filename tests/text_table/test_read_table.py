@@ -30,7 +30,7 @@ def refused(text, *names):
         ("", "(s);[rad];<Nm>\n---;---;---\n"),
     ],
 )
-def test_heads_and_rows_of_units(head, units):
+def test_headers_and_rows_of_units(head, units):
     found = table(
         f"{head}t;angle;torque;\n{units}0,0;1,5;-2;\n0,1;2,5;,5\n", "angle", "torque", "t"
     )
@@ -57,7 +57,7 @@ def test_heads_and_rows_of_units(head, units):
         ("0;1\n", 0.0),
     ],
 )
-def test_a_first_line_that_numbers_the_columns_is_no_data(text, first):
+def test_line_of_column_numbers_is_no_data(text, first):
     assert table(text, "#1").columns["#1"].values[0] == first
 
 
@@ -79,7 +79,7 @@ X_Value\tangle\ttorque\tComment
 """
 
 
-def test_the_head_of_labview_states_rate_and_start():
+def test_header_of_labview_states_rate_and_start():
     found = table(LABVIEW, "angle", "torque")
     angle, torque = found.columns["angle"], found.columns["torque"]
     assert (angle.values.tolist(), torque.values.tolist()) == ([1.5, 1.6], [2.5, 2.6])
@@ -102,7 +102,7 @@ def test_the_head_of_labview_states_rate_and_start():
         ("Time 18:18:05", None),
     ],
 )
-def test_a_head_states_the_rate_in_words(line, rate_hz):
+def test_header_states_the_rate_in_words(line, rate_hz):
     found = table(f"{line}\nu,v\n1,2\n3,4\n", "u").columns["u"].rate_hz
     assert found == (rate_hz and pytest.approx(rate_hz))
 
@@ -132,13 +132,13 @@ def test_a_head_states_the_rate_in_words(line, rate_hz):
         ("t;a\n2026-11-25;1\n", "t", ("line 2: 't' is a date", "2026-11-25 12:00:00.001")),
     ],
 )
-def test_what_does_not_fit_is_refused_with_its_line(text, name, words):
+def test_inconsistent_line_is_refused_with_its_number(text, name, words):
     message = refused(text, name)
     for word in words:
         assert word in message
 
 
-def test_a_column_that_is_not_there_is_named_with_those_that_are():
+def test_missing_column_is_named_with_the_existing_ones():
     with pytest.raises(MissingColumnError) as refusal:
         table("Rig 4\nt;q\n0;1\n1;2\n", "t", "angle")
     assert str(refusal.value) == "has no channel 'angle'; it has 't', 'q' (line 2)."
@@ -155,36 +155,36 @@ def test_times_of_day_are_seconds():
     assert (found.title, found.values.tolist(), found.unit_s) == ("when", [0.0, 0.2], 1.0)
 
 
-def test_times_that_nobody_asked_for_are_found_with_their_unit():
+def test_unrequested_times_are_found_with_their_unit():
     for title, unit_s in (("t", None), ("Time [ms]", 1e-3), ("zeit_us", 1e-6), ("x [s]", 1.0)):
         assert table(f"{title};a\n0;1\n1;2\n", "a").times.unit_s == unit_s
     assert table("target;a\n0;1\n1;2\n", "a").times is None
 
 
-def test_reading_ends_after_the_most_rows():
+def test_reading_ends_at_the_maximum_of_rows():
     assert len(table("a\n" + "1\n" * 50, "a", max_rows=10).columns["a"].values) == 11
 
 
-def test_empty_lines_within_are_remarked():
+def test_empty_lines_are_reported():
     found = table("t,a\n0,1\n\n1,2\n,,\n2,3\n,\n", "a")
     np.testing.assert_array_equal(found.columns["a"].values, [1, 2, np.nan, 3])
     assert "line 3" in found.remark
 
 
 def test_units_of_titles():
-    said = {
+    unit_of_title = {
         "q [deg]": "deg",
         "t/ms": "ms",
         "M in Nm": "Nm",
         "Tz (mN·m)": "mN·m",
         "a [1e-3]": "1e-3",
     }
-    for title, unit in said.items():
+    for title, unit in unit_of_title.items():
         assert stated_unit_of(title) == unit
     for title in ("Rig/Angle", "angle (filtered)", "Angle", "in"):
         assert stated_unit_of(title) == ""
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32"])
-def test_marks_of_byte_order_are_no_text(encoding):
+def test_byte_order_marks_are_no_text(encoding):
     assert decode_text("[beam] # µ".encode(encoding)) == "[beam] # µ"

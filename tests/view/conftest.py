@@ -1,4 +1,4 @@
-"""What drawings send, read back from a file of Rerun's."""
+"""Output of drawings, read back from a file of Rerun's."""
 
 from dataclasses import dataclass, field
 
@@ -45,7 +45,7 @@ def drawn(tmp_path):
 
 @dataclass
 class Shown:
-    """What was sent to one entity: of each component its values by time, timeless ones first."""
+    """Data sent to one entity: of each component its values by time, timeless ones first."""
 
     times_ns: dict[str, list] = field(default_factory=dict)
     values: dict[str, list] = field(default_factory=dict)
@@ -65,7 +65,7 @@ class Shown:
                 self._add(entry.name, [row for row in rows if row[1] is not None])
 
     def _add(self, name: str, rows: list) -> None:
-        # Of one time the earlier batch comes first: Rerun may split what is sent at any row.
+        # Of one time the earlier batch comes first: Rerun may split the data at any row.
         rows = [*zip(self.times_ns.get(name, []), self.values.get(name, []), strict=True), *rows]
         rows.sort(key=lambda row: -1 if row[0] is None else row[0])
         self.times_ns[name] = [time_ns for time_ns, _ in rows]
@@ -79,7 +79,7 @@ class Shown:
 
 @pytest.fixture
 def shown(drawn):
-    """Execute drawings; return what was recorded, by entity."""
+    """Execute drawings; return the recorded data by entity."""
 
     def draw(drawings) -> dict[str, Shown]:
         found = {}
@@ -93,7 +93,7 @@ def shown(drawn):
 
 
 class _LayoutTaker:
-    """A stream that keeps the layout sent to it and drops everything else."""
+    """A stream that stores the layout sent to it and drops everything else."""
 
     layout = None
 

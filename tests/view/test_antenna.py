@@ -25,7 +25,7 @@ def angle_rad(n: int) -> np.ndarray:
 
 
 def moments(batches) -> list[tuple[int, np.ndarray]]:
-    """Times in ns and lines (n, points, 3) of what was sent to an entity, in order of time."""
+    """Times in ns and lines (n, points, 3) sent to an entity, in order of time."""
     found = []
     for batch in batches:
         if STRIPS in batch.schema.names:
@@ -41,7 +41,7 @@ def blocks(samples, size: int):
 
 @pytest.fixture
 def follow(description, drawn):
-    """Feed a scene with blocks of samples; return what it sent, by entity."""
+    """Feed a scene with blocks of samples; return its output by entity."""
 
     def run(blocks_of_samples, of=description):
         scene = Scene(of)
@@ -56,7 +56,7 @@ def samples(make_samples):
     return make_samples(3000, angle_rad=angle_rad(3000))
 
 
-def test_what_is_drawn_is_the_computed_shape_times_the_factor(description, samples, follow):
+def test_drawn_shape_is_the_computed_one_times_the_factor(description, samples, follow):
     beams = moments(follow(blocks(samples, 50))[BEAM])
     assert len(beams) == 60
     bends = DeflectionFilter(description.beam, description.damping, description.rate_hz)
@@ -67,7 +67,7 @@ def test_what_is_drawn_is_the_computed_shape_times_the_factor(description, sampl
         assert t_ns == block["t_ns"][-1]
         length_m = description.beam.length_m
         np.testing.assert_allclose(beam[:, 0] * length_m, bends.x_m, atol=1e-6)
-        # What moves it across the line it rests on: the angle, and what it bends from there.
+        # Its motion across its line at rest: the angle, and the deflection from there.
         np.testing.assert_allclose(
             beam[:, 1] * length_m / ENLARGEMENT,
             block["angle_rad"][-1] * bends.x_m + deflection_m,
@@ -80,7 +80,7 @@ def test_what_is_drawn_is_the_computed_shape_times_the_factor(description, sampl
     assert largest_m > 0.05
 
 
-def test_the_factor_stands_at_the_tip(samples, follow):
+def test_factor_is_shown_at_the_tip(samples, follow):
     sent = follow(blocks(samples, 50))[LABEL]
     labels = [label for batch in sent for label in batch.column("Points3D:labels").to_pylist()]
     assert all(f"drawn × {ENLARGEMENT:g}" in label[0] for label in labels)
@@ -102,7 +102,7 @@ def last_label(batches):
 
 
 @pytest.mark.parametrize("excitation", ["move", further("touch")])
-def test_where_the_motor_goes_far_all_is_drawn_to_scale(description, samples, drawn, excitation):
+def test_large_motion_is_drawn_to_scale(description, samples, drawn, excitation):
     scene = Scene(dataclasses.replace(description, excitation=excitation))
     turned = samples.copy()
     turned["angle_rad"] += 1.0
@@ -121,7 +121,7 @@ def test_where_the_motor_goes_far_all_is_drawn_to_scale(description, samples, dr
 
 
 @pytest.mark.parametrize("amplitude", [further(0.0), 0.01, further(0.1), 1.0])
-def test_the_label_tells_the_largest_deflection_of_late(description, samples, follow, amplitude):
+def test_label_shows_the_largest_recent_deflection(description, samples, follow, amplitude):
     samples = samples[:1500]
     samples["angle_rad"] = amplitude * (samples["angle_rad"] - 0.3)
     last_ns, last = last_label(follow(blocks(samples, 50))[LABEL])
@@ -131,7 +131,7 @@ def test_the_label_tells_the_largest_deflection_of_late(description, samples, fo
     assert last == label(tips_m[lately][9::10].max())
 
 
-def test_the_trail_is_what_the_beam_has_been(samples, follow):
+def test_trail_shows_earlier_shapes_of_the_beam(samples, follow):
     sent = follow(blocks(samples, 50))
     beams, trail = moments(sent[BEAM]), moments(sent[TRAIL])
     assert 55 <= len(trail) <= 60  # it follows a quarter of a second behind
@@ -141,7 +141,7 @@ def test_the_trail_is_what_the_beam_has_been(samples, follow):
 
 
 @pytest.mark.parametrize("size", [further(1), 7, further(64), 3000])
-def test_blocks_make_no_difference(size, samples, follow):
+def test_drawing_does_not_depend_on_blocks(size, samples, follow):
     expected = moments(follow(blocks(samples, 50))[BEAM])
     found = moments(follow(blocks(samples, size))[BEAM])
     assert [t_ns for t_ns, _ in found] == [t_ns for t_ns, _ in expected]
@@ -151,16 +151,16 @@ def test_blocks_make_no_difference(size, samples, follow):
 
 def test_missing_samples_are_bridged(samples, follow):
     expected = moments(follow(blocks(samples, 50))[BEAM])
-    kept = np.ones(3000, dtype=bool)
-    kept[1000:1020] = kept[1500] = kept[2037:2061] = False
-    found = moments(follow(blocks(samples[kept], 50))[BEAM])
+    present = np.ones(3000, dtype=bool)
+    present[1000:1020] = present[1500] = present[2037:2061] = False
+    found = moments(follow(blocks(samples[present], 50))[BEAM])
     assert [t_ns for t_ns, _ in found] == [t_ns for t_ns, _ in expected]
     largest = max(np.abs(lines[1, :, 1] - lines[0, :, 1]).max() for _, lines in expected)
     for (_, lines), (_, expected_lines) in zip(found, expected, strict=True):
         np.testing.assert_allclose(lines, expected_lines, atol=0.05 * largest)
 
 
-def test_after_a_gap_of_hours_it_goes_on_at_once(make_samples, follow):
+def test_drawing_continues_after_a_gap_of_hours(make_samples, follow):
     blocks_of_samples = [
         make_samples(100, angle_rad=angle_rad(100)),
         make_samples(100, first_tick=30_000_000, angle_rad=angle_rad(100)),
@@ -183,7 +183,7 @@ def test_other_rates_are_drawn_at_most_20_times_a_second(
     assert all(np.isfinite(lines).all() for _, lines in beams)
 
 
-def test_without_a_damping_the_beam_swings_on(description, make_samples, follow):
+def test_beam_without_damping_continues_to_swing(description, make_samples, follow):
     n = 4000
     step = make_samples(n, angle_rad=np.where(np.arange(n) < 500, 0.0, 0.02))
     unknown = dataclasses.replace(description, damping=None)
@@ -193,11 +193,11 @@ def test_without_a_damping_the_beam_swings_on(description, make_samples, follow)
     assert 0.5 < np.abs(bends[-20:]).max() / np.abs(bends[10:30]).max() < 1.0
 
 
-def test_nothing_comes_of_nothing(description, make_samples):
+def test_no_samples_give_no_drawing(description, make_samples):
     assert Scene(description).samples(make_samples(0)) == []
 
 
-def test_frame_draws_the_motor_and_how_the_beam_looks(description, drawn):
+def test_frame_draws_the_motor_and_the_shape_of_the_beam(description, drawn):
     sent = drawn(Scene(description).frame())
     assert {f"{ANTENNA}/motor", f"{ANTENNA}/positive", BEAM, TRAIL, LABEL} <= sent.keys()
     # Nothing of it moves, so nothing of it has a time.
@@ -236,7 +236,7 @@ def values_of(batches, component):
     return times, np.array(batch.column(component).to_pylist()[0])
 
 
-def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(description, samples, drawn):
+def test_touch_is_drawn_at_the_beam_against_its_motion(description, samples, drawn):
     scene = Scene(description)
     for block in blocks(samples, 100):
         scene.samples(block)
@@ -249,7 +249,7 @@ def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(description,
     place = 0.49 / description.beam.length_m
     across = np.interp(0.49, filter_.x_m, deflection_m) / description.beam.length_m
     y = ENLARGEMENT * (samples["angle_rad"][2012] * place + across)
-    # Between two drawn shapes, 50 ms apart, it is interpolated.
+    # Between two drawn shapes, at 50 ms, it is interpolated.
     assert point == pytest.approx([place, y, 0.0], abs=4e-3)
     _, (interval,) = values_of(sent[f"{TOUCH}/3/interval"], STRIPS)
     assert interval[:, 0] * description.beam.length_m == pytest.approx([0.47, 0.51], abs=1e-6)
@@ -269,12 +269,12 @@ def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(description,
 @pytest.mark.parametrize(
     "changes", [{"x_m": None}, {"time_s": None}, {"time_s": known(0.01, 0.001)}]
 )
-def test_a_touch_of_unknown_place_or_time_is_not_drawn(description, samples, changes):
+def test_touch_of_unknown_position_or_time_is_not_drawn(description, samples, changes):
     scene = Scene(description)
     scene.samples(samples)
     assert scene.touches([TOUCH_AT_2_S | changes]) == []
     assert scene.touches([TOUCH_AT_2_S])
 
 
-def test_before_the_beam_is_drawn_there_is_no_place_for_a_touch(description):
+def test_touch_before_the_first_shape_is_not_drawn(description):
     assert Scene(description).touches([TOUCH_AT_2_S]) == []

@@ -1,4 +1,4 @@
-"""The overview says the state of a session, and how near its values are to their limits."""
+"""The overview shows the state of a session, and its values relative to their limits."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ FAULT = ended("fault", "The disk is full.")
 
 @pytest.fixture
 def sweep(description):
-    """The paper's session with all that a banner tells."""
+    """The paper's session with everything that a banner shows."""
     return replace(
         description,
         excitation="chirp",
@@ -39,9 +39,9 @@ def packed(color) -> int:
     return int.from_bytes(bytes((*color, 255)), "big")
 
 
-def test_a_running_session_says_what_is_run_and_how_long_it_takes(sweep):
-    said = banner(sweep, RUNNING, 61_000_000_000, Health(missed_ticks=0))
-    heading, what = said.split("\n\n")
+def test_running_session_shows_excitation_and_time_left(sweep):
+    text = banner(sweep, RUNNING, 61_000_000_000, Health(missed_ticks=0))
+    heading, what = text.split("\n\n")
     assert heading == "# RUNNING · 75 s left"
     assert what == (
         "**chirp** 0.05 → 50 Hz, now **25 Hz**, specimen **A\\_3**, session 20261121-101500-chirp"
@@ -49,8 +49,8 @@ def test_a_running_session_says_what_is_run_and_how_long_it_takes(sweep):
 
 
 def test_an_overloaded_computer_is_named(sweep):
-    said = banner(sweep, RUNNING, 10_000_000_000, Health(missed_ticks=50))
-    assert "Computer overloaded: 50 ticks missed (0.5 %)." in said
+    text = banner(sweep, RUNNING, 10_000_000_000, Health(missed_ticks=50))
+    assert "Computer overloaded: 50 ticks missed (0.5 %)." in text
     assert "overloaded" not in banner(sweep, FAULT, 10_000_000_000, Health(missed_ticks=50))
 
 
@@ -64,17 +64,17 @@ def test_an_overloaded_computer_is_named(sweep):
         (SUPERVISOR_LOST, "# SUPERVISOR LOST\n\n**The supervising process ended."),
     ],
 )
-def test_every_state_says_its_word_and_its_reason(sweep, state, heading):
-    said = banner(sweep, state, 30_000_000_000, Health())
-    assert said.startswith(heading)
-    assert "left" not in said.split("\n")[0]
+def test_every_state_shows_its_name_and_reason(sweep, state, heading):
+    text = banner(sweep, state, 30_000_000_000, Health())
+    assert text.startswith(heading)
+    assert "left" not in text.split("\n")[0]
     if state.over:
-        assert "now" not in said
+        assert "now" not in text
 
 
-def test_a_recorded_session_is_not_taken_for_one_that_runs(sweep):
-    said = banner(replace(sweep, recorded=True), FAULT, 0, Health())
-    assert said.startswith("# Recorded: FAULT")
+def test_recorded_session_is_not_shown_as_running(sweep):
+    text = banner(replace(sweep, recorded=True), FAULT, 0, Health())
+    assert text.startswith("# Recorded: FAULT")
 
 
 def test_only_a_linear_sweep_has_a_frequency(description, sweep):
@@ -90,8 +90,8 @@ def test_a_sweep_there_and_back_has_a_frequency_on_both_ways(sweep):
     both = replace(sweep, sweep_hz=(0.0, 50.0), back=(121_000, 241_000), ticks=256_000)
     frequencies = [both.frequency_hz(tick) for tick in (61_000, 121_000, 181_000, 241_000)]
     assert frequencies == [25.0, 50.0, 25.0, None]
-    said = banner(both, RUNNING, 181_000_000_000, Health())
-    assert "0 → 50 → 0 Hz, now **25 Hz**" in said
+    text = banner(both, RUNNING, 181_000_000_000, Health())
+    assert "0 → 50 → 0 Hz, now **25 Hz**" in text
     segments = {"sweep": (1000, 241_000), "there": (1000, 121_000), "back": (121_000, 241_000)}
     assert sweep_ticks(segments) == (1000, 121_000)
 
@@ -112,12 +112,12 @@ def test_a_gauge_turns_orange_near_its_limit_and_red_at_it(value, color):
         (Gauge(None, 1.0, "N"), "speed unknown"),
     ],
 )
-def test_a_gauge_is_told_to_a_thousandth_of_its_limit(gauge, text):
+def test_gauge_is_shown_to_a_thousandth_of_its_limit(gauge, text):
     assert gauge_text("speed", gauge) == text
 
 
 @pytest.mark.process
-def test_state_and_values_are_drawn_as_they_come(sweep, make_samples, shown):
+def test_state_and_values_are_drawn_on_arrival(sweep, make_samples, shown):
     scene = Scene(sweep)
     drawings = scene.frame()
     drawings += scene.state(0, RUNNING)
@@ -157,5 +157,5 @@ def test_events_are_shown_in_full_the_newest_first(sweep, shown):
     assert newest.startswith("**2.5 s** ⚠ The \\*torque\\* command is above")
     assert newest.endswith("level now.")
     assert first == "**0.0 s** Record starts."
-    # A log cuts what is longer than its view.
+    # A log cuts texts longer than its view.
     assert max(map(len, found["/events"].last("TextLog:text").split("\n"))) <= 150

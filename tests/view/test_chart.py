@@ -1,4 +1,4 @@
-"""The charts' mapping: a value, its tick label and its curve are at one place."""
+"""The charts' mapping: a value, its tick label and its curve are at one position."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def axes(logarithmic: bool):
     width=st.floats(300.0, 2000.0),
     height=st.floats(200.0, 1200.0),
 )
-def test_tick_labels_sit_where_values_are(x, y, width, height):
+def test_tick_labels_are_at_their_values(x, y, width, height):
     chart = Chart("/chart", width, height, x, y)
     left, top, right, bottom = chart.frame
     labels = chart.tick_labels()
@@ -54,18 +54,18 @@ def test_tick_labels_sit_where_values_are(x, y, width, height):
 
 
 @given(axes(True), st.lists(st.floats(0.0, 1.0), min_size=2, max_size=9))
-def test_equal_ratios_are_equally_long(axis, fractions):
+def test_equal_ratios_have_equal_lengths(axis, fractions):
     values = axis.first * (axis.last / axis.first) ** np.array(fractions)
     assert axis.fraction(values) == pytest.approx(fractions, abs=1e-9)
 
 
-def test_a_chart_counts_up_where_the_canvas_counts_down():
+def test_vertical_axis_points_upwards():
     chart = Chart("/c", 800.0, 400.0, Axis("", 0.0, 10.0, ()), Axis("", -1.0, 1.0, ()))
     left, top, right, bottom = chart.frame
     assert chart.to_canvas([0.0, 10.0, 5.0], [-1.0, 1.0, 0.0]) == pytest.approx(
         np.array([[left, bottom], [right, top], [(left + right) / 2, (top + bottom) / 2]])
     )
-    # What lies beyond stays on the edge.
+    # Values beyond are drawn on the edge.
     assert chart.to_canvas([-5.0, 99.0], [-9.0, 9.0]) == pytest.approx(
         np.array([[left, bottom], [right, top]])
     )
@@ -80,7 +80,7 @@ def test_ticks_are_round():
     assert tick_text(-20.0) == "−20"
 
 
-def test_what_is_drawn_is_where_it_is_said_to_be(shown):
+def test_curves_are_at_their_stated_positions(shown):
     axis = Axis("Frequency (Hz)", 1.0, 100.0, (1.0, 10.0, 100.0), logarithmic=True)
     key = LegendEntry("measured", SKY_BLUE, width=3.0)
     chart = Chart("/c", 800.0, 400.0, axis, Axis("Level (dB)", 0.0, 1.0, (0.0, 1.0)), (key,))
@@ -107,6 +107,6 @@ def test_what_is_drawn_is_where_it_is_said_to_be(shown):
     size = found["/c/beyond"].last("Transform3D:scale")
     assert corner[:2] == pytest.approx([middle, top])
     assert size[:2] == pytest.approx([right - middle, bottom - top])
-    # The frame stays for whoever joins late; a curve belongs to its time.
+    # The frame stays for later connections; a curve belongs to its time.
     assert found["/c/frame"].times_ns["LineStrips2D:strips"] == [None]
     assert found["/c/curve"].times_ns["LineStrips2D:strips"] == [3_000_000_000]

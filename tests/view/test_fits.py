@@ -23,7 +23,7 @@ def fitted(description):
 
 @pytest.fixture
 def curves(fitted, shown):
-    """Low and high of what each plot shows as requested and of the interval; the estimate."""
+    """Low and high of the target and of the interval in each plot; the estimate."""
 
     def last(fit, modes=3):
         scene = Scene(fitted(modes))
@@ -39,13 +39,13 @@ def fit_table(fitted, shown):
     return lambda fit: shown(Scene(fitted()).fit(fit))[TABLE].last("TextDocument:text")
 
 
-def test_a_plot_has_the_estimate_its_interval_and_what_is_asked_for(curves):
+def test_plot_has_estimate_interval_and_target(curves):
     shown = curves(online_fit(width=2.0))
     half = 1.96 * 2e-4
     assert shown["damping_1_percent"] == pytest.approx(
         [100 * (0.0091 + side) for side in (-1.96 * 9.1e-5, 1.96 * 9.1e-5, -half, half, 0.0)]
     )
-    # Nothing is asked of its frequency.
+    # Its frequency has no target.
     assert shown["frequency_1_hz"][2:] == pytest.approx(
         [2.5697 - 2 * half, 2.5697 + 2 * half, 2.5697]
     )
@@ -61,22 +61,22 @@ def test_a_plot_has_the_estimate_its_interval_and_what_is_asked_for(curves):
         (None, "damping_1_percent"),
     ],
 )
-def test_what_is_not_known_is_not_plotted(curves, fit, component):
+def test_unknown_values_are_not_plotted(curves, fit, component):
     assert np.isnan(curves(fit)[component]).all()
 
 
-def test_where_nothing_can_be_asked_for_there_are_estimate_and_interval(fitted, shown):
+def test_plot_without_a_target_has_estimate_and_interval(fitted, shown):
     scene = Scene(replace(fitted(2), excitation="chirp"))
     found = shown(scene.fit(online_fit()))["/fits"]
     assert len(found.values) == 4
     assert all(len(values[-1]) == 3 for values in found.values.values())
 
 
-def test_modes_without_a_plot_are_left_to_the_table(curves):
+def test_modes_without_a_plot_are_in_the_table_only(curves):
     assert curves(online_fit(), modes=1).keys() == {"damping_1_percent", "frequency_1_hz"}
 
 
-def test_the_table_says_what_is_reached_and_how_long_it_takes(fit_table):
+def test_table_shows_progress_and_remaining_time(fit_table):
     table = fit_table(online_fit(width=2.0))
     assert "| damping of mode 1 | 0.0091 | **0.0002 (2.2 %)** | 9.1e-05 (1 %) |" in table
     assert "| damping of mode 3 | – | – | – |" in table
@@ -97,7 +97,7 @@ def test_the_table_says_what_is_reached_and_how_long_it_takes(fit_table):
     assert "doubtful: It depends" in fit_table(online_fit(third="doubtful"))
 
 
-def test_sessions_that_are_fitted_have_a_tab_with_two_plots_of_each_mode(description, layout_of):
+def test_fitted_sessions_have_two_plots_per_mode(description, layout_of):
     first, *others = [tab.name for tab in layout_of().contents]
     layout = layout_of(replace(description, fit_modes=2))
     assert [tab.name for tab in layout.contents] == [first, "Fit", *others]
@@ -111,7 +111,7 @@ def test_sessions_that_are_fitted_have_a_tab_with_two_plots_of_each_mode(descrip
     assert only.origin == TABLE
 
 
-def test_fits_grow_with_the_session_and_are_all_there_for_new_connections(fitted, shown):
+def test_new_connections_get_all_fits(fitted, shown):
     picture = Scene(fitted(2))
     assert shown(picture.frame())[TABLE].last("TextDocument:text") == "No fit yet."
     picture.fit(online_fit(6.0, 2.0))
@@ -127,7 +127,7 @@ def test_fits_grow_with_the_session_and_are_all_there_for_new_connections(fitted
     assert (high - low)[1:] == pytest.approx([2 * 2 * 1.96 * 3e-3, 2 * 1.96 * 3e-3])
 
 
-def test_a_session_that_is_not_fitted_draws_none(description, shown):
+def test_session_without_fits_draws_none(description, shown):
     picture = Scene(description)
     assert picture.fit(online_fit()) == []
     assert TABLE not in shown(picture.frame())

@@ -1,4 +1,4 @@
-"""The layout shows all of what is drawn, each thing where it is drawn."""
+"""The layout shows all drawings, each at its entity."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def time_series(tabs):
     ]
 
 
-def test_tabs_are_in_order_and_the_overview_is_in_front(tabs, layout_of):
+def test_tabs_are_in_order_with_the_overview_in_front(tabs, layout_of):
     assert list(tabs) == [
         "Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events",
     ]  # fmt: skip
@@ -72,18 +72,18 @@ def test_every_plot_has_a_view_with_all_its_curves(time_series):
     assert seen == {plot for source in sources.values() for plot in source.plots}
 
 
-def test_ticks_are_among_the_values_but_not_seen(time_series, description, shown):
+def test_tick_values_are_sent_but_invisible(time_series, description, shown):
     seen = []
     for view, lines in time_series:
         for entity in {*view.visualizer_overrides} - {view.origin}:
             ticks = view.visualizer_overrides[entity]
             assert component(ticks.overrides, "marker_sizes") == [0.0]
-            # The legend has one entry for what is called alike.
+            # The legend has one entry for equal names.
             for name in ("names", "colors"):
                 assert component(ticks.overrides, name) == component(lines.overrides, name)[:1]
             (mapping,) = ticks.mappings
             seen.append((entity, mapping.source_component))
-    # A view complains of what it never got.
+    # A view reports entities that it never got.
     sent = {
         (entity, name)
         for entity, found in shown(Scene(description).frame()).items()
@@ -105,7 +105,7 @@ def test_plots_show_a_window_up_to_the_cursor(time_series):
     assert windows_s == {2, 10, 60}
 
 
-def test_plots_of_which_nothing_comes_are_left_out(description, layout_of):
+def test_plots_without_data_are_left_out(description, layout_of):
     absent = plots.BUS_PLOT_COMPONENTS | plots.REAL_TIME_PLOT_COMPONENTS
     health = {
         view.name

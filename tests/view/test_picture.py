@@ -51,13 +51,13 @@ def blocks(samples, size=50):
 
 
 @pytest.mark.further  # charts: test_response_charts.py
-def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, shown):
+def test_final_response_is_that_of_the_analyser(path, record, shown):
     picture = Scene(description_of(record))
     for block in blocks(read_session(path).samples):
         picture.samples(block)
     drawings = picture.finish()
     found = shown(drawings)
-    # All of it lies beneath what is coherent.
+    # All of it is below the coherent values.
     (strip,) = found[f"{MAGNITUDE_ENTITY}/uncertain"].values["LineStrips2D:strips"][-1]
     points = np.array(strip)
     expected, _ = estimate(record, WelchSettings())
@@ -76,7 +76,7 @@ def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, show
     assert points[inside, 1].min() == pytest.approx(at[:, 1].min(), abs=1e-3)
 
 
-def test_everything_has_its_place(description, make_samples, make_timings, shown):
+def test_all_entities_are_in_the_layout(description, make_samples, make_timings, shown):
     picture = Scene(description)
     frame = picture.frame()
     t_s = np.arange(3000) / 1000.0
@@ -111,7 +111,7 @@ def test_everything_has_its_place(description, make_samples, make_timings, shown
     assert "3 of 136 s" in found["/summary"].last("TextDocument:text")
 
 
-def test_a_new_connection_is_shown_what_is_known_already(short_chirps, shown):
+def test_new_connection_gets_the_earlier_drawings(short_chirps, shown):
     path = short_chirps[0]
     record = load_record(path)
     picture = Scene(description_of(record))
@@ -128,7 +128,7 @@ def known(value):
     return {"value": value, "std": 1e-3, "interval_95": [value - 2e-3, value + 2e-3]}
 
 
-def test_touches_stay_on_the_antenna_for_new_connections(description, make_samples, shown):
+def test_new_connections_get_earlier_touches(description, make_samples, shown):
     picture = Scene(description)
     for block in blocks(make_samples(2000), 100):
         picture.samples(block)

@@ -1,4 +1,4 @@
-"""Units and signs of what is plotted over time, and that titles and legends state them."""
+"""Units and signs of plots over time, and their statement in titles and legends."""
 
 import re
 import subprocess
@@ -47,7 +47,7 @@ def test_ages_have_the_unit_their_name_ends_in(make_timings):
 
 @pytest.fixture
 def health_values(description, shown):
-    """Return what the plots of the health are sent of a reading, by component."""
+    """Return the data of a reading for the plots of the health, by component."""
 
     def values(health):
         found = shown(Scene(description).health(5, health))["/health"]
@@ -74,7 +74,7 @@ def test_health_has_the_unit_its_name_ends_in(health_values):
 
 
 @pytest.mark.process
-def test_what_is_not_known_is_not_drawn_as_a_number(health_values):
+def test_unknown_values_are_not_drawn(health_values):
     shown = health_values(Health(missed_ticks=0))
     assert shown["faulty_ticks"] == pytest.approx([0.0, np.nan, np.nan], nan_ok=True)
     assert np.isnan(shown["bus_load_percent"]).all()
@@ -93,7 +93,7 @@ def test_titles_and_legends_state_the_unit(plot):
 
 
 @pytest.mark.parametrize("plot", PLOTS, ids=lambda plot: plot.component)
-def test_colours_differ_and_stand_out_from_dark_and_light(plot):
+def test_colours_differ_and_contrast_with_the_background(plot):
     def luminance(color) -> float:  # relative, WCAG 2
         value = np.array(color) / 255.0
         linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

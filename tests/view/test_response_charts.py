@@ -1,4 +1,4 @@
-"""What the charts of the frequency response show: units, delays, the model, what is not known."""
+"""Charts of the frequency response: units, delays, the model, unknown values."""
 
 from dataclasses import replace
 
@@ -51,9 +51,7 @@ def values(charts: ResponseCharts, entity: str, strip: np.ndarray) -> tuple[np.n
 
 @pytest.mark.parametrize("delays_s", [(0.0, 0.0), (1e-3, 0.2e-3), (0.0, 1.5e-3)])
 @pytest.mark.parametrize("tool_inertia_kg_m2", [0.0, 1e-5])
-def test_measured_response_lies_on_the_model_it_was_made_of(
-    description, shown, delays_s, tool_inertia_kg_m2
-):
+def test_measured_response_lies_on_its_model(description, shown, delays_s, tool_inertia_kg_m2):
     description = replace(
         description,
         tool_inertia_kg_m2=tool_inertia_kg_m2,
@@ -127,7 +125,7 @@ def test_band_not_yet_excited_is_shaded_and_empty(description, shown):
     assert times_ns == [20_000_000_000]
 
 
-def test_where_the_coherence_is_low_the_response_is_grey(description, shown):
+def test_response_with_low_coherence_is_grey(description, shown):
     charts = ResponseCharts(description)
     known = estimate(description)
     coherence = np.where((GRID > 5.0) & (GRID < 8.0), 0.5, 0.9)
@@ -145,7 +143,7 @@ def test_where_the_coherence_is_low_the_response_is_grey(description, shown):
     assert values(charts, COHERENCE_ENTITY, whole)[1].min() == pytest.approx(0.5, abs=1e-3)
 
 
-def test_the_last_session_s_response_is_drawn_beneath(description, shown):
+def test_last_response_is_drawn_beneath(description, shown):
     before = ResponseCharts(replace(description, name="before", specimen="A"))
     assert before.as_last_response(description) is None
     before.update(0, estimate(description))
@@ -167,7 +165,7 @@ def packed(color) -> int:
     return int.from_bytes(bytes((*color, 255)), "big")
 
 
-def test_an_empty_coherence_chart_says_why(description, shown):
+def test_empty_coherence_chart_states_the_reason(description, shown):
     charts = ResponseCharts(description)
 
     def note() -> list[str]:
@@ -184,7 +182,7 @@ def test_an_empty_coherence_chart_says_why(description, shown):
     assert note() == []
 
 
-def test_without_a_nominal_model_none_is_drawn(description, shown):
+def test_no_curve_without_a_nominal_model(description, shown):
     charts = ResponseCharts(replace(description, damping=None))
     found = shown([charts.draw_frames])
     assert not [entity for entity in found if entity.endswith("/model")]
@@ -197,7 +195,7 @@ def test_axes_state_their_units(description, shown):
     found = shown([ResponseCharts(description).draw_frames])
     titles = {
         MAGNITUDE_ENTITY: "Magnitude (dB re 1 N·m/rad)",
-        OVERVIEW_MAGNITUDE_ENTITY: "dB re 1 N·m/rad",  # the title of its view says of what
+        OVERVIEW_MAGNITUDE_ENTITY: "dB re 1 N·m/rad",  # the title of its view states the quantity
         PHASE_ENTITY: "Phase (degrees)",
         COHERENCE_ENTITY: "Coherence (1)",
     }

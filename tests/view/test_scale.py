@@ -1,4 +1,4 @@
-"""That a plot over time has two labels beside its axis, and is no longer than that takes."""
+"""A plot over time has two labels at its axis, and is no longer than that requires."""
 
 import math
 
@@ -29,7 +29,7 @@ def labels(low: float, high: float, height: float) -> int:
 
 @pytest.mark.parametrize("height", sorted({view.height for view in TIME_VIEWS}))
 @pytest.mark.parametrize("middle", [0.0, 0.3, -1.0, 59.2481])
-def test_two_values_are_labelled_whatever_the_amplitude(middle, height):
+def test_two_values_are_labelled_at_any_amplitude(middle, height):
     fills = []
     lacking = 0
     for amplitude in np.geomspace(1e-3, 1e3, 2000):
@@ -57,7 +57,7 @@ def view_of(plot: Plot, window_s: float) -> TimeView:
     return view
 
 
-def test_axes_hold_two_labels_at_every_moment_and_forget(make_samples, shown):
+def test_axes_always_hold_two_labels(make_samples, shown):
     n = 30 * RATE_HZ
     t_s = np.arange(n) / RATE_HZ
     # Through all amplitudes in turn, as in a chirp that passes a resonance.
@@ -102,7 +102,7 @@ def test_single_steps_and_noise_do_not_fill_an_axis(view):
             assert labels(first, last, view.height) >= 2
 
 
-def test_it_makes_no_difference_how_much_comes_at_a_time(make_samples, shown):
+def test_scale_does_not_depend_on_blocks(make_samples, shown):
     samples = make_samples(5000, coupling_torque_nm=0.06 * np.sin(np.arange(5000) / 30.0))
 
     def ticks(block: int):
@@ -119,7 +119,7 @@ def test_it_makes_no_difference_how_much_comes_at_a_time(make_samples, shown):
     assert ticks(100)[1][0] == [0.1]
 
 
-def test_every_view_is_sent_its_ticks_at_once_or_it_complains(shown):
+def test_every_view_gets_its_ticks_immediately(shown):
     drawings = [d for s in (SIGNALS, READINGS, HEALTH) for d in Scale(s, TIME_VIEWS).frame()]
     found = shown(drawings)
     for view in TIME_VIEWS:
@@ -128,7 +128,7 @@ def test_every_view_is_sent_its_ticks_at_once_or_it_complains(shown):
         )
 
 
-def test_values_that_are_none_are_passed_over(make_samples):
+def test_invalid_values_are_skipped(make_samples):
     scale = Scale(SIGNALS, TIME_VIEWS)
     for value in (np.nan, np.inf, 1.7e308, -1.7e308):
         samples = make_samples(200, coupling_torque_nm=value)

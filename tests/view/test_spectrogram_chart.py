@@ -1,4 +1,4 @@
-"""A tone's colour is at its time and frequency, and means the level that the bar says."""
+"""A tone's colour is at its time and frequency, and means the level of the colour bar."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def tone(description, shown):
     return chart.chart, shown([chart.draw_frame, chart.draw])
 
 
-def test_a_tone_is_where_and_when_it_was_and_as_loud(tone):
+def test_tone_has_its_frequency_time_and_level(tone):
     chart, found = tone
     image = pixels(found[f"{SPECTROGRAM_ENTITY}/levels"])
     corner, size = placed(found[f"{SPECTROGRAM_ENTITY}/levels"])

@@ -1,4 +1,4 @@
-"""The state of a session at one look."""
+"""The state of a session at a glance."""
 
 import pytest
 
@@ -31,7 +31,7 @@ def summary(description, shown):
     return text
 
 
-def test_a_session_that_goes_well(summary):
+def test_summary_of_a_normal_session(summary):
     assert rows(summary(43_200_000_000, WELL)) == {
         "session": "43 of 136 s",
         "rate": "1000.0 Hz",
@@ -47,7 +47,7 @@ def test_a_session_that_goes_well(summary):
     }
 
 
-def test_what_is_wrong_stands_out(summary):
+def test_errors_are_highlighted(summary):
     found = rows(summary(0, Health(missed_ticks=3, lost_ticks=0, bus_errors=2, sensor_status=0x41)))
     assert {name for name, text in found.items() if "⚠" in text} == {
         "missed ticks",
@@ -58,5 +58,5 @@ def test_what_is_wrong_stands_out(summary):
     assert "3" in found["missed ticks"]
 
 
-def test_what_is_not_known_is_left_out(summary):
+def test_unknown_values_are_left_out(summary):
     assert set(rows(summary(0, Health()))) == {"session"}
