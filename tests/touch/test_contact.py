@@ -95,7 +95,7 @@ def test_two_obstacles_press_as_springs_on_what_both_forces_bend():
 def test_responses_are_convolutions():
     rng = np.random.default_rng(1)
     kernels, force = rng.normal(size=(2, 3, 100)), rng.normal(size=(3, 121))
-    told = contact_responses(tuple(kernels), force, every=4, samples=31)
+    told = contact_responses(tuple(kernels), force, steps_per_sample=4, sample_count=31)
     for channel in range(2):
         for row in range(3):
             whole = np.convolve(kernels[channel, row], force[row])[:121]

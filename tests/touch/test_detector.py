@@ -16,8 +16,8 @@ from rigd.touch import (
     InnovationFilter,
     SensorFilter,
     TouchDetector,
+    contact_templates,
     observed_beam,
-    signatures,
 )
 from rigd.touch._innovations import _fit_filter
 
@@ -89,7 +89,7 @@ def innovations(model, readings):
 
 
 def detector_of(model):
-    beam = DetectorModel(model, signatures(BEAM, DAMPING, RATE_HZ, model))
+    beam = DetectorModel(model, contact_templates(BEAM, DAMPING, RATE_HZ, model))
     return TouchDetector(beam, RATE_HZ, DetectorSettings())
 
 
@@ -168,7 +168,7 @@ def test_the_threshold_rises_with_the_noise_at_rest(model):
 
 def test_rate_of_false_alarms(model):
     # White noise straight into the comparisons.
-    known = signatures(BEAM, DAMPING, RATE_HZ, model)
+    known = contact_templates(BEAM, DAMPING, RATE_HZ, model)
     settings = DetectorSettings(false_alarms_per_hour=2e3)
     threshold = settings.threshold(RATE_HZ, len(known))
     white = np.random.default_rng(1).standard_normal((200_000, 2))
@@ -182,7 +182,7 @@ def test_rate_of_false_alarms(model):
 
 
 def test_signatures_are_unit_vectors_of_the_last_ticks(model):
-    known = signatures(BEAM, DAMPING, RATE_HZ, model)
+    known = contact_templates(BEAM, DAMPING, RATE_HZ, model)
     assert known.shape[1] == 2 * 24
     assert np.linalg.norm(known, axis=1) == pytest.approx(1.0)
     ages = {24 - int(np.flatnonzero(np.any(row, axis=1))[0]) for row in known.reshape(-1, 24, 2)}
@@ -191,7 +191,7 @@ def test_signatures_are_unit_vectors_of_the_last_ticks(model):
 
 
 def test_no_two_signatures_are_alike(model):
-    known = signatures(BEAM, DAMPING, RATE_HZ, model)
+    known = contact_templates(BEAM, DAMPING, RATE_HZ, model)
     alike = np.abs(known @ known.T) - np.eye(len(known))
     assert alike.max() < 0.9
 
@@ -215,7 +215,7 @@ def test_a_contact_makes_no_touch_after_its_end(model):
 def test_a_contact_looks_like_a_signature(name, struck):
     # Of records that another simulation has made; the innovations are large beside their noise.
     beam = observed_beam(LINK, DAMPED, RATE_HZ, NOISE)
-    known = signatures(LINK, DAMPED, RATE_HZ, beam)
+    known = contact_templates(LINK, DAMPED, RATE_HZ, beam)
     record = struck[name]
     white = innovations(beam, (record.angle_rad, record.torque_nm, record.shear_n))
     last = int(record.touch_s * RATE_HZ) + 15
@@ -242,7 +242,7 @@ def test_modes_that_are_elsewhere_make_no_touch_in_a_chirp(model, key):
         level.append(detector.level)
     # It would be one, were the innovations taken to be as small as at rest.
     white = innovations(model, readings) / detector.noise
-    known = signatures(BEAM, DAMPING, RATE_HZ, model)
+    known = contact_templates(BEAM, DAMPING, RATE_HZ, model)
     ticks = known.shape[1] // 2
     windows = np.lib.stride_tricks.sliding_window_view(white[REST:].ravel(), 2 * ticks)[::2]
     threshold = DetectorSettings().threshold(RATE_HZ, len(known))

@@ -286,9 +286,11 @@ def test_once_is_the_same_as_prepared(model, struck, told):
 def test_a_second_obstacle_is_sought_beyond_one_that_is_not_reached(estimator, struck):
     """Its parameters have no effect in the first samples."""
     search = ExplanationSearch(estimator._tables, cut(struck["middle"], 50), DETECTION_DELAYS_S[0])
-    pairing, window = search.pairing(), search.window(0.05)
-    not_reached = np.array([0.62, window.end / 1000, np.log(3000.0)])
+    pairing, window = search.two_obstacle_contact(), search.window(0.05)
+    not_reached = np.array([0.62, window.end_sample / 1000, np.log(3000.0)])
     no_effect = pairing.predict_channels(np.tile(not_reached, (1, 2)), window)
     assert not no_effect.any()
-    starts = pairing.starts(not_reached, window, pairing.space(search.space(3)), 2)
+    starts = pairing.start_pairs(
+        not_reached, window, pairing.parameter_ranges(search.parameter_ranges(3)), 2
+    )
     assert np.isfinite(starts).all()

@@ -10,11 +10,11 @@ from rigd.beam import Damping, PointForceGrid, clamped_free_eigenvalues, mode_sh
 from rigd.touch import SensorFilter
 from rigd.touch._kernels import (
     ForcePulse,
+    beam_positions,
     chebyshev_nodes,
     contact_kernels,
     cross_kernels,
     cubic_weights,
-    positions,
 )
 
 STEP_S = 1 / 8000
@@ -22,7 +22,7 @@ STEP_S = 1 / 8000
 
 @pytest.fixture(scope="module")
 def kernels():
-    return contact_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), STEP_S, 400)
+    return contact_kernels(LINK, DAMPED, beam_positions(LINK.length_m, 0.007), STEP_S, 400)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_displacement_is_the_sum_of_the_modes(at_point):
 
 def test_kernels_between_places_are_those_of_the_exact_model():
     x, other = np.array([0.1, 0.3, 0.8]), np.array([0.25, 0.62, 0.7])
-    crossing = cross_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), 2 * STEP_S, 400)
+    crossing = cross_kernels(LINK, DAMPED, beam_positions(LINK.length_m, 0.007), 2 * STEP_S, 400)
     told = crossing.between_positions(x, other, 300)
     hat = ForcePulse(2 * STEP_S, 400)
     exact = hat.kernels(PointForceGrid(hat.transform.s, LINK, DAMPED).per_force(x, other).T)
@@ -101,7 +101,7 @@ def test_cubic_interpolation_is_exact_for_cubics():
 
 def test_few_nodes_tell_a_wave_at_all_places():
     """The shortest wave of 1 kHz on this beam is six to its length."""
-    x_m = positions(LINK.length_m, 0.007)
+    x_m = beam_positions(LINK.length_m, 0.007)
     nodes, between = chebyshev_nodes(x_m, 36)
     at_positions, at_nodes = (np.exp(12j * np.pi * x / LINK.length_m) for x in (x_m, nodes))
     assert np.abs(between @ at_nodes - at_positions).max() < 1e-7

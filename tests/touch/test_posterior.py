@@ -14,10 +14,10 @@ def drawn(chi2_of, centres, width):
         np.array(centres, dtype=float),
         np.broadcast_to(width**2 * np.eye(2), (len(centres), 2, 2)),
         BOUNDS,
-        scale=1.0,
-        count=400,
-        rounds=6,
-        enough_samples=1500.0,
+        residual_variance=1.0,
+        samples_per_round=400,
+        max_rounds=6,
+        sufficient_samples=1500.0,
         smallest_std=np.array([0.01, 0.01]),
     )
 
