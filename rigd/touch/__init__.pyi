@@ -12,6 +12,6 @@ from ._model import TouchModel as TouchModel
 from ._results import TouchEstimate as TouchEstimate
 from ._results import TouchQuantity as TouchQuantity
 from ._sensor_filter import SensorFilter as SensorFilter
-from ._signatures import DetectorModel as DetectorModel
-from ._signatures import detector_model as detector_model
-from ._signatures import signatures as signatures
+from ._templates import DetectorModel as DetectorModel
+from ._templates import contact_templates as contact_templates
+from ._templates import detector_model as detector_model

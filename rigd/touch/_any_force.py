@@ -1,9 +1,9 @@
-"""Any force at one point: the likelihood of the point for any behaviour of the obstacle.
+"""Likelihood of each touch position for an arbitrary contact force over time.
 
-The force is white noise of unknown size, on steps of half a sample. Torque and shear are then
-Gaussian with a covariance that depends on the point, and the likeliest point is the one at which
-both agree with the measurement. This works for obstacles that move, yield or come from outside as
-well as for springs, with a larger uncertainty.
+The force is assumed to be white noise of unknown variance, in time steps of half a sample. Torque
+and shear are then Gaussian with a covariance that depends on the position, and the likeliest
+position is the one whose covariance fits the measurement best. No model of the obstacle is needed,
+so that the obstacle may move or yield. The position is less certain than with a model.
 """
 
 from dataclasses import dataclass
@@ -17,33 +17,33 @@ from rigd.touch._obstacle_contact import WhitenedWindow
 Real = NDArray[np.float64]
 
 _FORCE_STDS_N = np.array([0.1, 0.4, 1.6, 6.4])
-"""Standard deviations of the force in N that are compared."""
+"""Standard deviations in N of the random force, of which the likeliest is chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class AnyForceLikelihood:
-    """Likelihood of a touch at each position along the beam, whatever its force over time is."""
+    """Likelihood of a touch at each position along the beam, for an arbitrary force over time."""
 
     x_m: Real
     """Positions along the beam, shape (m,)."""
     log_likelihood: Real
-    """Logarithm of the likelihood at each position, for the likeliest size of the force; shape
-    (m,)."""
+    """Logarithm of the likelihood at each position, for the likeliest standard deviation of the
+    force; shape (m,)."""
     chi2: float
     """Sum of squared whitened residuals at the likeliest position."""
-    degrees: int
-    """Expectation of this sum."""
+    expected_chi2: int
+    """Expectation of `chi2`."""
     force_n: Real
-    """Estimated force on the beam at the likeliest position, shape (2 · samples,)."""
+    """Estimated force on the beam at the likeliest position over time, shape (2 · samples,)."""
     force_std_n: float
-    """Standard deviation of the force that is likeliest at this position."""
+    """Likeliest standard deviation of the force at the likeliest position."""
 
-    def interval(self, drop: float = 1.92) -> tuple[float, float, float, float]:
+    def interval(self, log_likelihood_drop: float = 1.92) -> tuple[float, float, float, float]:
         """Return the likeliest position, its standard deviation and the ends of its interval, in m.
 
         Parameters
         ----------
-        drop
+        log_likelihood_drop
             Difference of the log-likelihood between the likeliest position and the ends; 1.92 for
             an interval of 95 %.
         """
@@ -61,7 +61,7 @@ class AnyForceLikelihood:
                 best_m += float(
                     np.clip(0.5 * (left_value - right_value) / curvature, -1, 1) * spacing_m
                 )
-        likely_m = fine_positions_m[log_likelihood >= log_likelihood.max() - drop]
+        likely_m = fine_positions_m[log_likelihood >= log_likelihood.max() - log_likelihood_drop]
         likelihood_weights = np.exp(log_likelihood - log_likelihood.max())
         mean_m = np.sum(likelihood_weights * fine_positions_m) / np.sum(likelihood_weights)
         std_m = float(
@@ -74,24 +74,24 @@ class AnyForceLikelihood:
 
 
 class AnyForceEstimator:
-    """Estimator of the touch position without an assumption on the force over time.
+    """Estimator of the touch position for an arbitrary force over time.
 
     Parameters
     ----------
     kernels
-        Contact kernels with two time steps a sample.
+        Contact kernels with two time steps per sample.
     position_stride
-        Number of the kernels' positions from one scanned position to the next.
+        The positions that are compared are every `position_stride`-th position of the kernels.
     sample_count
-        Largest number of samples.
+        Largest number of samples that `scan` accepts.
     """
 
-    __slots__ = ("_effects", "_x_m")
+    __slots__ = ("_force_effects", "_x_m")
 
     def __init__(self, kernels: ContactKernels, position_stride: int, sample_count: int) -> None:
         self._x_m = kernels.x_m[::position_stride]
         lag_samples = 2 * np.arange(sample_count)[:, None] - np.arange(2 * sample_count)
-        self._effects = [
+        self._force_effects = [
             np.where(
                 lag_samples >= 0,
                 response_table[::position_stride][
@@ -103,19 +103,19 @@ class AnyForceEstimator:
         ]  # (positions, samples, forces)
 
     def scan(self, sample_window: WhitenedWindow) -> AnyForceLikelihood:
-        """Return the likelihood of a touch at each position along the beam, for any force.
+        """Return the likelihood of a touch at each position, for an arbitrary force over time.
 
         Parameters
         ----------
         sample_window
-            Whitened innovations of at most the prepared number of samples.
+            Whitened innovations of at most `sample_count` samples.
         """
-        sample_count = sample_window.end - sample_window.first
-        noise_stds = sample_window.motion.noise
+        sample_count = sample_window.end_sample - sample_window.first_sample
+        noise_stds = sample_window.motion.noise_stds
         force_effects = np.concatenate(
             [
                 channel_effects[:, :sample_count, : 2 * sample_count] / noise_std
-                for channel_effects, noise_std in zip(self._effects, noise_stds, strict=False)
+                for channel_effects, noise_std in zip(self._force_effects, noise_stds, strict=False)
             ],
             axis=1,
         )
@@ -129,8 +129,8 @@ class AnyForceEstimator:
         bordered_matrices = np.empty((self._x_m.size, n + 1, n + 1))
         bordered_matrices[:, n, :n] = bordered_matrices[:, :n, n] = whitened_data
         bordered_matrices[:, n, n] = bordered_corner
-        for i, std_index in enumerate(_FORCE_STDS_N):
-            bordered_matrices[:, :n, :n] = std_index**2 * force_covariance + np.eye(n)
+        for i, force_std_n in enumerate(_FORCE_STDS_N):
+            bordered_matrices[:, :n, :n] = force_std_n**2 * force_covariance + np.eye(n)
             cholesky_factors = np.linalg.cholesky(bordered_matrices)
             factor_diagonals = np.diagonal(cholesky_factors, axis1=1, axis2=2)
             quadratic_forms[i] = bordered_corner - factor_diagonals[:, n] ** 2
@@ -151,7 +151,7 @@ class AnyForceEstimator:
             x_m=self._x_m,
             log_likelihood=log_likelihoods.max(axis=0),
             chi2=float(quadratic_forms[std_index, position_index]),
-            degrees=n,
+            expected_chi2=n,
             force_n=force_n,
             force_std_n=float(_FORCE_STDS_N[std_index]),
         )

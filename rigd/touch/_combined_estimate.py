@@ -1,7 +1,7 @@
-"""Estimate of a touch: the common result of its likeliest explanations, and its kind.
+"""Estimate of a touch, combined from the explanations that are about equally likely.
 
-Standard deviations and intervals of the values include the noise, the model's uncertainty and all
-positions that are about as likely.
+Standard deviations and intervals include the noise, the model's uncertainty and all positions that
+are about as likely as the best one.
 """
 
 import numpy as np
@@ -29,18 +29,19 @@ Real = NDArray[np.float64]
 
 _NORMAL_QUANTILE_95 = 1.959964
 """Number of standard deviations of a normal distribution's two-sided 95 % interval."""
-_BOUNCE_STD_M = (3e-4, 5e-4)
-"""Additional standard deviation of the position in m, from the bounces of hard contacts: elsewhere,
-and near the tip. With this addition the errors of 130 simulated touches agree with the
+_BOUNCE_STDS_M = (3e-4, 5e-4)
+"""Additional standard deviations in m of the position because of bounces: of a touch far from the
+tip, and of one near the tip. With them the errors of 130 simulated touches agree with the
 intervals."""
 _TWO_OBSTACLES_STD_M = 2e-3
-"""Additional standard deviation in m of the position of the first of two obstacles, whose contact
-is integrated in longer time steps."""
+"""Additional standard deviation in m of the first obstacle's position if there are two, because
+their contact is integrated in longer time steps."""
 _EARLY_TIMES_S = (0.006, 0.01, 0.022)
-"""Times in s after the detection up to which an unexplained touch is evaluated in addition. Later a
-second point may be touched."""
+"""Times in s after the detection at which additional, shorter evaluations of an unexplained touch
+end. The beam may touch a second point later."""
 _WIDE_LIKELIHOOD_DROP = 8.0
-"""Drop of the log-likelihood at the ends of the position's interval for an unexplained touch."""
+"""Difference of the log-likelihood between the likeliest position of an unexplained touch and the
+ends of its interval."""
 
 
 def estimate_from_explanations(
@@ -55,7 +56,7 @@ def estimate_from_explanations(
     explained_record
         Explanations of the record.
     scan
-        Whether the estimate contains the likelihood of all positions; otherwise it is empty.
+        Whether the estimate contains the likelihood of each position; otherwise that is empty.
     """
     explanations, sample_window = explained_record.explanations, explained_record.window
     at_rest = explanations[0]
@@ -75,7 +76,7 @@ def estimate_from_explanations(
         likely_explanations += [
             explanation for explanation in explanations if explanation.kind == "two"
         ]
-    begin_s = explanation_search.begin / explanation_search.rate
+    begin_s = explanation_search.record_offset / explanation_search.rate_hz
     x_m = time_s = force_n = stiffness_n_per_m = None
     force_history_n, force_times_s = np.zeros(0), np.zeros(0)
     obstacle_kind = "unknown"
@@ -90,19 +91,19 @@ def estimate_from_explanations(
             obstacle_kind = best_explanation.kind
         x_m, time_s = (
             _position_estimate(explanation_search, likely_explanations),
-            _common_parameter(likely_explanations, 1, begin_s),
+            _parameter_estimate(likely_explanations, 1, begin_s),
         )
-        x_m = _including(x_m, explained_record.first_of_two_m)
+        x_m = _with_interval_including(x_m, explained_record.first_obstacle_positions_m)
         if is_poor_fit or explained_record.other_kinds_untried:
-            x_m = _with_wide_interval(explanation_search, x_m)
+            x_m = _with_any_force_interval(explanation_search, x_m)
         force_history_n, force_times_s, force_n = _force_estimate(
             explanation_search, best_explanation, sample_window
         )
         if obstacle_kind == "rigid":
             stiffness_n_per_m = _stiffness_estimate(at_rest.posterior)
     elif (
-        explanation_search.any_force.chi2
-        < explanation_search.max_chi2(explanation_search.any_force.degrees)
+        explanation_search.any_force_likelihood.chi2
+        < explanation_search.max_chi2(explanation_search.any_force_likelihood.expected_chi2)
         and not explanation_search.begins_before_window
     ):
         x_m = _unexplained_position(explanation_search)
@@ -113,14 +114,16 @@ def estimate_from_explanations(
         stiffness_n_per_m=stiffness_n_per_m,
         kind=obstacle_kind,
         model=explanation_search.tables.model.source,
-        channels=explanation_search.motion.noise.size,
-        samples=sample_window.end - explanation_search.detected,
+        channels=explanation_search.motion.noise_stds.size,
+        samples=sample_window.end_sample - explanation_search.detected,
         chi2_per_degree=best_explanation.chi2
         / (sample_window.data.size - best_explanation.parameters.size),
-        positions_m=explanation_search.any_force.x_m if scan else np.zeros(0),
-        log_likelihood=explanation_search.any_force.log_likelihood if scan else np.zeros(0),
+        positions_m=explanation_search.any_force_likelihood.x_m if scan else np.zeros(0),
+        log_likelihood=explanation_search.any_force_likelihood.log_likelihood
+        if scan
+        else np.zeros(0),
         innovations=explanation_search.motion.innovations
-        / explanation_search.motion.noise[:, None],
+        / explanation_search.motion.noise_stds[:, None],
         innovation_times_s=explanation_search.motion.t + begin_s,
         force_history_n=force_history_n,
         force_times_s=force_times_s + begin_s,
@@ -130,38 +133,38 @@ def estimate_from_explanations(
 def _unexplained_position(explanation_search: ExplanationSearch) -> TouchQuantity:
     """Return the position of an unexplained touch in m, with a wide interval.
 
-    The interval contains all positions at which any force could cause the first samples, or the
-    first and later samples. Later more than one point may be touched.
+    The interval contains all positions at which some force explains the samples up to one of
+    several times, because the beam may touch more than one point later.
     """
     early_likelihoods = [
-        explanation_search.tables.any_force.scan(explanation_search.window(time_s))
+        explanation_search.tables.any_force_estimator.scan(explanation_search.window(time_s))
         for time_s in _EARLY_TIMES_S
     ]
     interval_ends = np.array(
         [
             likelihood.interval(_WIDE_LIKELIHOOD_DROP)[2:]
-            for likelihood in (explanation_search.any_force, *early_likelihoods)
+            for likelihood in (explanation_search.any_force_likelihood, *early_likelihoods)
         ]
     )
     low_m, high_m = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
     return TouchQuantity(
-        explanation_search.any_force.interval(_WIDE_LIKELIHOOD_DROP)[0],
+        explanation_search.any_force_likelihood.interval(_WIDE_LIKELIHOOD_DROP)[0],
         (high_m - low_m) / 4,
         (low_m, high_m),
     )
 
 
-def _with_wide_interval(
+def _with_any_force_interval(
     explanation_search: ExplanationSearch, estimate: TouchQuantity
 ) -> TouchQuantity:
-    """Return a touch position in m, with an interval that includes that for any force over time."""
-    *_, low_m, high_m = explanation_search.any_force.interval()
+    """Return a touch position in m, whose interval includes the interval for an arbitrary force."""
+    *_, low_m, high_m = explanation_search.any_force_likelihood.interval()
     low_m, high_m = min(low_m, estimate.interval_95[0]), max(high_m, estimate.interval_95[1])
     return TouchQuantity(estimate.value, max(estimate.std, (high_m - low_m) / 4), (low_m, high_m))
 
 
-def _including(estimate: TouchQuantity, positions_m: Real) -> TouchQuantity:
-    """Return a touch position in m, with an interval that includes other possible positions."""
+def _with_interval_including(estimate: TouchQuantity, positions_m: Real) -> TouchQuantity:
+    """Return a touch position in m, whose interval is extended to include `positions_m`."""
     low_m, high_m = (
         float(limit([*estimate.interval_95, *positions_m])) for limit in (np.min, np.max)
     )
@@ -176,15 +179,15 @@ def _including(estimate: TouchQuantity, positions_m: Real) -> TouchQuantity:
 def _position_estimate(
     explanation_search: ExplanationSearch, likely_explanations: list[Explanation]
 ) -> TouchQuantity:
-    """Return the position of the touch in m, with the additional uncertainty from bounces."""
-    position = _common_parameter(likely_explanations, 0)
+    """Return the touch position in m, less certain because of bounces or a second obstacle."""
+    position = _parameter_estimate(likely_explanations, 0)
     is_near_tip = (
         position.value > NEAR_TIP_FRACTION * explanation_search.tables.model.plant.beam.length_m
     )
     additional_std_m = (
         _TWO_OBSTACLES_STD_M
         if likely_explanations[0].kind == "two"
-        else _BOUNCE_STD_M[int(is_near_tip)]
+        else _BOUNCE_STDS_M[int(is_near_tip)]
     )
     low_m, high_m = (
         position.value
@@ -206,16 +209,16 @@ def _force_estimate(
     best_explanation: Explanation,
     sample_window: WhitenedWindow,
 ) -> tuple[Real, Real, TouchQuantity]:
-    """Return the contact force over time, its instants, and its peak with an interval.
+    """Return the contact force in N at each time step, the instants in s, and the peak force.
 
-    Force and instants are those of the likeliest parameters. The interval of the peak contains the
-    spread over the posterior distribution.
+    Forces and instants are computed from the likeliest parameters, the peak and its interval from
+    samples of the posterior distribution.
     """
     rng = np.random.default_rng(2)
     posterior = best_explanation.posterior
     drawn_indices = rng.choice(posterior.weights.size, 48, p=posterior.weights)
     candidates = np.vstack([best_explanation.parameters, posterior.samples[drawn_indices]])
-    step_s = explanation_search.tables.middle.step_s
+    step_s = explanation_search.tables.middle_kernels.step_s
     if best_explanation.kind == "knock":
         peak_forces_n = np.abs(candidates[:, 3])
         pulse_phase = np.arange(0.0, np.exp(candidates[0, 2]) + step_s, step_s) / np.exp(
@@ -223,22 +226,24 @@ def _force_estimate(
         )
         force_history_n = peak_forces_n[:1, None] * np.sin(np.pi * np.minimum(pulse_phase, 1.0))
     elif best_explanation.kind == "two":
-        step_s = explanation_search.tables.coarse.step_s
-        force_history_n = np.abs(explanation_search.pairing().predict(candidates, sample_window)[1])
+        step_s = explanation_search.tables.coarse_kernels.step_s
+        force_history_n = np.abs(
+            explanation_search.two_obstacle_contact().predict(candidates, sample_window)[1]
+        )
         peak_forces_n = force_history_n.max(axis=1)
     else:
         obstacle_contact = ObstacleContact(
-            explanation_search.tables.middle,
+            explanation_search.tables.middle_kernels,
             explanation_search.tables.x_m,
             explanation_search.motion,
         )
-        pressing_side = (
-            None if best_explanation.kind == "rigid" else explanation_search.pressing_direction()
+        pressing_sign = (
+            None if best_explanation.kind == "rigid" else explanation_search.pressing_sign()
         )
         if best_explanation.kind == "yielding":
             candidates = np.insert(candidates, 3, 0.0, axis=1)
         force_history_n = np.abs(
-            obstacle_contact.predict(candidates, sample_window, pressing_side)[1]
+            obstacle_contact.predict(candidates, sample_window, pressing_sign)[1]
         )
         peak_forces_n = force_history_n.max(axis=1)
     low_n, high_n = np.quantile(peak_forces_n[1:], (0.025, 0.975))
@@ -257,7 +262,7 @@ def _force_estimate(
 def _is_about_as_likely(best_explanation: Explanation, other_explanation: Explanation) -> bool:
     """Return whether another explanation of a touch is about as likely as the best one.
 
-    An explanation with more parameters must be clearly better.
+    An explanation with more parameters must have clearly smaller residuals.
     """
     if best_explanation.kind == "rigid" and other_explanation.kind in ("moving", "yielding"):
         return other_explanation.chi2 < best_explanation.chi2 - CHANCE_CHI2_REDUCTION
@@ -269,13 +274,13 @@ def _is_about_as_likely(best_explanation: Explanation, other_explanation: Explan
     )
 
 
-def _common_parameter(
+def _parameter_estimate(
     likely_explanations: list[Explanation], parameter_column: int, value_shift: float = 0.0
 ) -> TouchQuantity:
-    """Return the estimate of a parameter that all likely explanations of a touch have.
+    """Return the estimate of one parameter, with an interval that contains all explanations'.
 
-    `parameter_column` is the column of the parameter in the posterior's samples, and `value_shift`
-    is added to its value. The interval contains the intervals of all explanations.
+    `parameter_column` is the column of the parameter in the posterior's samples. `value_shift` is
+    added to the value and to the ends of the interval.
     """
     interval_ends = np.array(
         [
@@ -302,7 +307,7 @@ def _common_parameter(
 def _stiffness_estimate(posterior: Posterior) -> TouchQuantity | None:
     """Return the obstacle's estimated stiffness in N/m, or None if the data do not bound it.
 
-    The value is the exponential of the logarithm's median.
+    The estimate is the exponential of the median of the logarithm.
     """
     low_ln_stiffness, median_ln_stiffness, high_ln_stiffness = posterior.quantiles(
         2, (0.025, 0.5, 0.975)

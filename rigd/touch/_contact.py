@@ -1,9 +1,9 @@
 """Contact with a springy obstacle, integrated in time for many candidates at once.
 
-The obstacle presses with the force ``N = max(0, k · penetration)``, and the beam yields by its
-displacement kernel, its response to a triangular pulse ("hat") of force. Steps begin at the instant
-of touch, so that the prediction depends smoothly on it. The force of a step is implicit, so that
-the integration is as stable with a stiff obstacle as with a soft one.
+The obstacle presses with the force ``N = max(0, k · penetration)``. The displacement of the beam is
+the convolution of this force with a kernel: the response to a triangular pulse ("hat") of force.
+Time steps begin at the instant of touch, so that the prediction depends smoothly on it. The force
+of each step is computed implicitly, so that the integration is stable with stiff obstacles too.
 """
 
 from typing import TypeVar
@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 Real = NDArray[np.float64]
 _Precision = TypeVar("_Precision", np.float32, np.float64)
 
-_BLOCK, _SHORT_BLOCK = 16, 6
-"""Numbers of steps in a block, for which the effects of all earlier forces are summed at once.
-Within a block a step takes three operations on the remaining steps, so that shorter blocks are
-faster with many candidates."""
-_MANY = 1000
-"""Number of candidates from which shorter blocks are used."""
-_SAMPLES = 16
-"""Number of samples that are convolved at once, all with the history of the last of them."""
+_BLOCK_STEPS, _SHORT_BLOCK_STEPS = 16, 6
+"""Numbers of time steps in a block: usual, and with many candidates. The effects of forces before
+the block are summed for all its steps at once; within it, each step updates all later ones, so that
+shorter blocks are faster with many candidates."""
+_MANY_CANDIDATES = 1000
+"""Number of candidates above which shorter blocks are used."""
+_SAMPLES_AT_ONCE = 16
+"""Number of samples whose convolution is computed at once, with as many earlier forces as the last
+sample needs."""
 
 
 def integrate_contact(
@@ -37,18 +38,18 @@ def integrate_contact(
     Parameters
     ----------
     kernel
-        Displacement in the direction of the force per hat of force, shape (k, n).
+        Displacement in the direction of the force per hat of force, in m/N, shape (k, n).
     approach
-        Distance by which the beam would be beyond the point of touch without the force, shape
-        (k, n), or (k, g, n) for g candidates of each kernel. It is 0 at the first step.
+        Distance in m by which the beam would be beyond the point of touch if there were no force,
+        shape (k, n), or (k, g, n) for g candidates of each kernel. It is 0 at the first step.
     stiffness_n_per_m
         Stiffness of the obstacle, shape (k,) or (k, g).
     step_s
         Time between two steps.
     rate_m_per_s
-        Speed of the obstacle away from the beam, shape (k,) or a number.
+        Speed at which the obstacle moves away from the beam, shape (k,) or a number.
     mobility_m_per_n_s
-        Speed at which the obstacle yields per force, shape (k,) or a number.
+        Speed at which the obstacle yields, divided by the force, shape (k,) or a number.
 
     Returns
     -------
@@ -57,7 +58,7 @@ def integrate_contact(
     """
     result_shape = approach.shape
     kernel_count, step_count = kernel.shape
-    # An obstacle that moves away is a shorter approach; one that yields is a softer beam.
+    # An obstacle that moves away shortens the approach; one that yields acts as a softer beam.
     if np.any(rate_m_per_s):
         obstacle_motion_m = np.multiply.outer(
             np.asarray(rate_m_per_s) * step_s, np.arange(step_count)
@@ -78,7 +79,9 @@ def integrate_contact(
     reversed_kernel = np.ascontiguousarray(kernel[:, ::-1])
     row_stride, column_stride = reversed_kernel.strides
     # Within a block each force is subtracted from the later steps. All views are made once.
-    block_steps = _BLOCK if kernel_count * group_size < _MANY else _SHORT_BLOCK
+    block_steps = (
+        _BLOCK_STEPS if kernel_count * group_size < _MANY_CANDIDATES else _SHORT_BLOCK_STEPS
+    )
     block_forces, block_reductions = np.zeros(
         (2, block_steps, kernel_count * group_size), free_force_n.dtype
     )
@@ -100,7 +103,7 @@ def integrate_contact(
         end = min(block_begin + block_steps, step_count)
         block_force_n = free_force_n[block_begin:end]
         if first_contact_step < block_begin:
-            # Element (k, i, j): effect of the force touched + j at step begin + i.
+            # Element (k, i, j): effect of force first_contact_step + j at step block_begin + i.
             earlier_block_effect = np.ndarray(
                 (kernel_count, end - block_begin, block_begin - first_contact_step),
                 reversed_kernel.dtype,
@@ -120,9 +123,9 @@ def integrate_contact(
             continue  # no candidate is in contact
         first_contact_step = min(first_contact_step, block_begin)
         block_forces[: end - block_begin] = block_force_n.reshape(end - block_begin, -1)
-        for now, lag, lag_product, later_reductions in block_views:
-            np.maximum(now, zero_forces, out=now)
-            np.multiply(lag, now, out=lag_product)
+        for step_forces_n, lag, lag_product, later_reductions in block_views:
+            np.maximum(step_forces_n, zero_forces, out=step_forces_n)
+            np.multiply(lag, step_forces_n, out=lag_product)
             np.subtract(later_reductions, lag_product, out=later_reductions)
         block_slice = block_forces[: end - block_begin].reshape(-1, kernel_count, group_size)
         forces_n[:, block_begin:end] = block_slice.transpose(1, 0, 2)
@@ -140,13 +143,14 @@ def integrate_two_contacts(
     Parameters
     ----------
     own_kernels
-        Displacement at each obstacle's position per hat of force there, shape (k, n).
+        Displacement at each obstacle's position per hat of force at that position, in m/N, shape
+        (k, n).
     cross_kernel
-        Displacement at one position per hat of force at the other, in the directions of the forces;
-        shape (k, n).
+        Displacement at one position per hat of force at the other, in m/N, shape (k, n); positive
+        in the directions of the two forces.
     approach
-        Distance by which the beam would be beyond each obstacle without any force, shape (k, n).
-        It is not positive at the first step.
+        Distance in m by which the beam would be beyond each obstacle if there were no force, shape
+        (k, n). It is not positive at the first step.
     stiffness_n_per_m
         Stiffness of each obstacle, shape (k,).
 
@@ -178,10 +182,10 @@ def integrate_two_contacts(
     reversed_kernel = np.ascontiguousarray(kernel[::-1].transpose(3, 1, 2, 0))
     *outer_strides, column_stride = reversed_kernel.strides
     forces_n = np.zeros((pair_count, 2, step_count))
-    block_forces = np.empty((_BLOCK, 2, pair_count))
-    product = np.empty((_BLOCK, 2, 2, pair_count))
-    for block_begin in range(1, step_count, _BLOCK):
-        end = min(block_begin + _BLOCK, step_count)
+    block_forces = np.empty((_BLOCK_STEPS, 2, pair_count))
+    product = np.empty((_BLOCK_STEPS, 2, 2, pair_count))
+    for block_begin in range(1, step_count, _BLOCK_STEPS):
+        end = min(block_begin + _BLOCK_STEPS, step_count)
         block_force_n = block_forces[: end - block_begin]
         block_force_n[:] = free_force_n[block_begin:end]
         if block_begin > 1:
@@ -196,8 +200,8 @@ def integrate_two_contacts(
                 axis=2
             )
             block_force_n -= earlier_effect.transpose(2, 1, 0)
-        for i, now in enumerate(block_force_n):
-            first_force_n, second_force_n = now
+        for i, step_forces_n in enumerate(block_force_n):
+            first_force_n, second_force_n = step_forces_n
             # The second force if both press; then the first one, which is right in any case.
             pressing_forces = np.maximum(
                 (second_force_n - effect_of_first * first_force_n) * coupling_factor, 0.0
@@ -207,7 +211,7 @@ def integrate_two_contacts(
             later_reductions = block_force_n[i + 1 :]
             reductions = np.multiply(
                 kernel[1 : len(later_reductions) + 1],
-                now[None, None],
+                step_forces_n[None, None],
                 out=product[: len(later_reductions)],
             )
             later_reductions -= reductions[:, :, 0]
@@ -217,10 +221,10 @@ def integrate_two_contacts(
 
 
 def shift_rows(value_table: Real, begin_columns: Real, column_count: int) -> Real:
-    """Shift each row of a table by a fraction of columns, by cubic interpolation.
+    """Return each row of a table from a fractional column on, by cubic interpolation.
 
-    The result has the shape (k, column_count). Before the first column the values are 0,
-    and after the last column they are constant.
+    The result has the shape (k, column_count). Before the first column of the table, values are 0;
+    after the last column, they equal those of the last column.
 
     Parameters
     ----------
@@ -245,7 +249,7 @@ def shift_rows(value_table: Real, begin_columns: Real, column_count: int) -> Rea
         value_table,
     )
     padded_table[:, padding_before + columns :] = value_table[:, -1:]
-    # Row k of the result: held[k, begin : begin + count + 3], copied as one block.
+    # Row k: padded_table[k, begin : begin + column_count + 3], copied as one block.
     column_stride, row_stride = padded_table.strides[1], padded_table.strides[0]
     column_blocks = np.ndarray(
         (rows, padded_table.shape[1] - column_count - 2, column_count + 3),
@@ -260,27 +264,29 @@ def shift_rows(value_table: Real, begin_columns: Real, column_count: int) -> Rea
     return shifted_rows
 
 
-def contact_responses(kernels: tuple[Real, ...], forces_n: Real, every: int, samples: int) -> Real:
-    """Return the responses to a force at some of its time steps, shape (k, kernels, samples).
+def contact_responses(
+    kernels: tuple[Real, ...], forces_n: Real, steps_per_sample: int, sample_count: int
+) -> Real:
+    """Return the convolution of forces with kernels, shape (k, kernels, sample_count).
 
-    They are the convolution of the force with the kernels.
+    Only the values at the samples are computed, one every `steps_per_sample` time steps.
 
     Parameters
     ----------
     kernels
-        Responses to a hat of force, each of shape (k, n) or (1, n), which are 0 from column n on.
+        Responses to a hat of force, each of shape (k, n) or (1, n); they are 0 from column n on.
     forces_n
-        Force at each step, shape (k, (samples - 1) · every + 1).
-    every
-        Number of steps from one sample to the next; the first sample is at the first step.
-    samples
+        Force at each time step, shape (k, (sample_count - 1) · steps_per_sample + 1).
+    steps_per_sample
+        Number of time steps from one sample to the next; the first sample is at the first step.
+    sample_count
         Number of samples.
     """
     candidate_count, step_count = forces_n.shape
     kernel_tables = np.stack(kernels, axis=1)
     kernel_steps = min(kernel_tables.shape[2], step_count)
-    if len(kernel_tables) == 1 and candidate_count > _SAMPLES:  # one matrix for all
-        lag_steps = every * np.arange(samples) - np.arange(step_count)[:, None]
+    if len(kernel_tables) == 1 and candidate_count > _SAMPLES_AT_ONCE:  # one matrix for all
+        lag_steps = steps_per_sample * np.arange(sample_count) - np.arange(step_count)[:, None]
         lag_table = np.where(
             (lag_steps >= 0) & (lag_steps < kernel_steps),
             kernel_tables[0][:, np.clip(lag_steps, 0, kernel_steps - 1)],
@@ -291,15 +297,15 @@ def contact_responses(kernels: tuple[Real, ...], forces_n: Real, every: int, sam
     reversed_force = np.zeros((candidate_count, step_count + kernel_steps))
     reversed_force[:, :step_count] = forces_n[:, ::-1]
     row_stride, column_stride = reversed_force.strides
-    summed_responses = np.empty((candidate_count, len(kernels), samples))
-    for first_index in range(0, samples, _SAMPLES):
-        end = min(first_index + _SAMPLES, samples)
-        history_steps = min(kernel_steps, (end - 1) * every + 1)
+    summed_responses = np.empty((candidate_count, len(kernels), sample_count))
+    for first_index in range(0, sample_count, _SAMPLES_AT_ONCE):
+        end = min(first_index + _SAMPLES_AT_ONCE, sample_count)
+        history_steps = min(kernel_steps, (end - 1) * steps_per_sample + 1)
         history_view = np.ndarray(
             (candidate_count, 1, end - first_index, history_steps),
             buffer=reversed_force,
-            offset=(step_count - 1 - first_index * every) * column_stride,
-            strides=(row_stride, 0, -every * column_stride, column_stride),
+            offset=(step_count - 1 - first_index * steps_per_sample) * column_stride,
+            strides=(row_stride, 0, -steps_per_sample * column_stride, column_stride),
         )
         summed_responses[:, :, first_index:end] = np.vecdot(
             kernel_tables[:, :, None, :history_steps], history_view

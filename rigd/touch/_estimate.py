@@ -1,7 +1,7 @@
-"""Position, instant and force of a touch, from its record.
+"""Estimation of a touch's position, instant and force from its record.
 
-The touch began some time before its detection. The shortest possible time is assumed first. The
-samples before the touch determine the motion of the free beam.
+The time from touch to detection is unknown: the shortest assumed time is tried first, longer ones
+if it fails. The samples before the touch determine the motion of the free beam.
 """
 
 import numpy as np
@@ -14,16 +14,16 @@ from rigd.touch._results import TouchEstimate
 from rigd.touch._tables import DETECTION_DELAYS_S, TouchTables
 
 _MIN_SAMPLES_BEFORE = 100
-"""Smallest number of samples before a touch with which an estimate is possible."""
+"""Smallest number of samples before a touch that an estimate requires."""
 _POOR_MISFIT = 3.0
-"""Mean square residual of an obstacle at rest, over noise, above which the touch may have begun
-earlier."""
+"""Mean square residual of an obstacle at rest, divided by the noise variance, above which the touch
+may have begun earlier."""
 
 
 def estimate_touch(touch_record: TouchRecord, model: TouchModel) -> TouchEstimate:
     """Estimate position, instant, force and stiffness of one touch from its record.
 
-    For several touches with one model, prepare a `TouchEstimator`.
+    For several touches with the same model, create a `TouchEstimator` once.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def estimate_touch(touch_record: TouchRecord, model: TouchModel) -> TouchEstimat
 
 
 class TouchEstimator:
-    """Estimator of touches with one model of the beam; its preparation takes a second.
+    """Estimator of touches for one model of the beam; its construction takes a second.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class TouchEstimator:
         self._tables = TouchTables(model, rate_hz)
 
     def estimate(self, touch_record: TouchRecord, *, scan: bool = True) -> TouchEstimate:
-        """Return the estimate of one touch from the samples so far.
+        """Return the estimate of one touch from its record.
 
         Parameters
         ----------
@@ -61,19 +61,19 @@ class TouchEstimator:
             Samples from 0.3 s or more before the touch. More samples after the detection, up to
             0.2 s, improve the estimate.
         scan
-            Whether the estimate contains the likelihood of all positions; otherwise it is empty.
+            Whether the estimate contains the likelihood of each position; otherwise that is empty.
         """
         return self.follow().update(touch_record, scan=scan)
 
     def follow(self) -> "GrowingEstimate":
-        """Return the estimator of one touch whose record still grows."""
+        """Return an estimator of one touch for records that grow from call to call."""
         return GrowingEstimate(self._tables)
 
 
 class GrowingEstimate:
-    """Estimator of one touch from a growing record; each estimate starts from the last one.
+    """Estimator of one touch whose record grows; each estimate starts from the previous one.
 
-    All records begin with the same sample.
+    All records must begin with the same sample.
 
     Parameters
     ----------
@@ -89,12 +89,12 @@ class GrowingEstimate:
         self._explaining_delay_s: float | None = None
 
     def preview(self, touch_record: TouchRecord) -> None:
-        """Search the likely positions of the touch in advance, so that the first estimate is fast.
+        """Search the likely positions of the touch in advance, so that the first update is fast.
 
         Parameters
         ----------
         touch_record
-            Samples until `PREVIEW_S` after the detection, or some more.
+            Samples up to `PREVIEW_S` after the detection or somewhat later.
         """
         for detection_delay_s in DETECTION_DELAYS_S[
             :-1
@@ -114,14 +114,14 @@ class GrowingEstimate:
         record
             Samples from 0.3 s or more before the touch.
         scan
-            Whether the estimate contains the likelihood of all positions; otherwise it is empty.
+            Whether the estimate contains the likelihood of each position; otherwise that is empty.
         first
-            Whether this is the first estimate. It then tries one and two obstacles at rest only,
-            because other kinds take a second, and reports any other touch as of unknown kind.
+            Whether this is the first estimate. Only one and two obstacles at rest are then tried,
+            because other kinds take a second; a touch of another kind is reported as unknown.
         """
         latest_result = None
         searched_from = record.angle_rad.size
-        # The start that explained the beginning comes first.
+        # The delay with which an earlier record was explained comes first.
         for detection_delay_s in sorted(
             DETECTION_DELAYS_S, key=lambda each: each != self._explaining_delay_s
         ):
@@ -129,7 +129,7 @@ class GrowingEstimate:
                 continue
             explanation_search = self._search(record, detection_delay_s)
             if detection_delay_s != self._explaining_delay_s and (
-                # After an unexplained one, only if the touch may have begun before.
+                # A longer delay only if the touch may begin before the window of the shorter one.
                 explanation_search.likely_first_sample >= searched_from
                 or self._began_earlier(record, detection_delay_s)
             ):
@@ -143,30 +143,30 @@ class GrowingEstimate:
                 self._explaining_delay_s = detection_delay_s
             if touch_estimate.explained or first:
                 break
-            searched_from = explanation_search.first
+            searched_from = explanation_search.first_touch_sample
         return latest_result or self._empty_estimate(record)
 
     def _has_enough_samples(self, touch_record: TouchRecord, detection_delay_s: float) -> bool:
-        """Return whether at least 100 samples precede a touch this long before its detection."""
+        """Return whether 100 samples precede a touch `detection_delay_s` before its detection."""
         return (
             touch_record.detected - round(detection_delay_s * self._tables.rate_hz)
             >= _MIN_SAMPLES_BEFORE
         )
 
     def _search(self, touch_record: TouchRecord, detection_delay_s: float) -> ExplanationSearch:
-        """Return the search for explanations of a record, for one time from touch to detection.
+        """Return the search for explanations of a record, for one longest delay of the detection.
 
-        It starts from the results with the previous, shorter record.
+        A new search starts from the results of the search in the previous, shorter record.
         """
         previous_search = self._searches.get(detection_delay_s)
-        if previous_search is None or previous_search.given is not touch_record:
+        if previous_search is None or previous_search.given_record is not touch_record:
             self._searches[detection_delay_s] = ExplanationSearch(
                 self._tables, touch_record, detection_delay_s, previous_search
             )
         return self._searches[detection_delay_s]
 
     def _began_earlier(self, touch_record: TouchRecord, detection_delay_s: float) -> bool:
-        """Return whether a touch seems to begin before `detection_delay_s` ahead of detection."""
+        """Return whether a touch probably began more than `detection_delay_s` before detection."""
         if detection_delay_s == DETECTION_DELAYS_S[-1]:
             return False
         explanation_search = self._search(touch_record, detection_delay_s)
@@ -179,12 +179,12 @@ class GrowingEstimate:
             return False
         longer_search = self._search(touch_record, longer_delay_s)
         return (
-            longer_search.likely_first_sample < explanation_search.first
+            longer_search.likely_first_sample < explanation_search.first_touch_sample
             and longer_search.misfit < 0.5 * explanation_search.misfit
         )
 
     def _empty_estimate(self, touch_record: TouchRecord) -> TouchEstimate:
-        """Return the estimate without any result, for a record with too few samples."""
+        """Return an estimate of unknown kind without values, for a record with too few samples."""
         empty_array = np.zeros(0)
         channel_count = 1 if touch_record.shear_n is None else 2
         return TouchEstimate(

@@ -1,8 +1,9 @@
-"""Motion of the beam without a touch, from the measured angle: the reference for the innovations.
+"""Motion that a beam without contact has in a record, predicted from the measured angle.
 
-The measured angle drives the exact model from the record's beginning on. Earlier motion (the beam
-may be vibrating from its slew) adds free vibrations of unknown amplitude. They are fitted to the
-samples before the touch, together with an offset and a drift of torque and base shear.
+The innovations of a touch are the deviations from this prediction. The measured angle drives the
+exact model from the beginning of the record. Motion before the record adds free vibrations of
+unknown amplitudes, which are fitted to the samples before the touch, together with an offset and a
+drift of torque and base shear.
 """
 
 from copy import copy
@@ -26,21 +27,20 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 STEPS_PER_SAMPLE = 4
-"""Number of time steps of the free motion per sample, to which a spline interpolates the angle."""
+"""Number of time steps of the free motion per sample; a spline interpolates the angle to them."""
 _BAND_FRACTION = 0.5
-"""Fraction of the frequencies up to the time steps' Nyquist frequency that are used: up to twice
-the Nyquist frequency of the samples."""
+"""Highest frequency that is computed, as a fraction of the Nyquist frequency of the time steps."""
 _MAX_MODE_HZ = 330.0
-"""Highest frequency in Hz of a free vibration that is fitted."""
+"""Highest frequency in Hz of the modes whose free vibrations are fitted."""
 _SETTLING_S = 0.03
-"""Time constant in s with which the angle comes to rest after the record's end. A jump there would
-cause vibrations before it."""
+"""Time constant in s with which the angle is continued to rest after the record's end. A jump at
+the end would cause computed vibrations before it."""
 _SPEED_WINDOW_S = 0.02
-"""Time in s over which the speed at the record's beginning is measured."""
+"""Duration in s of the first samples from which the initial speed is estimated."""
 _NODE_COUNT = 36
 """Number of positions from which the displacement at all other positions is interpolated."""
 SPLINE_FADE_SAMPLES = 24
-"""Number of samples over which the effect of one sample in a spline fades."""
+"""Number of samples after which the effect of one sample on a spline has faded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +56,10 @@ class TouchRecord:
     shear_n: Real | None
     """Measured base shear, shape (n,); None if the profile does not define it."""
     detected: int
-    """Index of the sample of the detection."""
+    """Index of the sample at which the touch was detected."""
 
     def until(self, samples: int) -> "TouchRecord":
-        """Return a record that contains only the first samples.
+        """Return the record of the first samples only, with the same detection.
 
         Parameters
         ----------
@@ -73,7 +73,7 @@ class TouchRecord:
 
 
 class FreeBeam:
-    """Responses of a beam without contact to the motor's angle, for records of one length.
+    """Model of the beam without contact, which predicts its motion from the measured angle.
 
     Parameters
     ----------
@@ -88,14 +88,14 @@ class FreeBeam:
     """
 
     __slots__ = (
-        "_between",
-        "_displacement",
-        "_grid",
-        "_sample",
+        "_force_grid",
+        "_interpolation",
+        "_node_displacement",
         "_shear",
         "_torque",
+        "_unit_sample_transform",
+        "free_vibration",
         "model",
-        "modes",
         "rate_hz",
         "transform",
         "x_m",
@@ -109,22 +109,22 @@ class FreeBeam:
         step_hz = STEPS_PER_SAMPLE * rate_hz
         self.transform = CausalTransform(n, step_hz, DECAY_EXPONENT, _BAND_FRACTION * step_hz / 2)
         s = self.transform.s
-        self._grid = force_grid = PointForceGrid(s, model.plant.beam, model.plant.damping)
+        self._force_grid = force_grid = PointForceGrid(s, model.plant.beam, model.plant.damping)
         filter_response = model.sensor_filter.response(s)
         filter_response *= np.exp(-s * (model.wrench_delay_s - model.angle_delay_s))
         tool_inertia = model.plant.tool_inertia_kg_m2 * s * s
         self._torque: Complex = filter_response * (force_grid.torque_per_angle() + tool_inertia)
         self._shear: Complex = filter_response * force_grid.shear_per_angle()
-        self.modes = FreeVibration.from_model(model, np.empty(0))
+        self.free_vibration = FreeVibration.from_model(model, np.empty(0))
         self._set_positions(x_m)
         unit_sample = np.zeros(3 * SPLINE_FADE_SAMPLES)
         unit_sample[SPLINE_FADE_SAMPLES] = 1.0
-        self._sample = self.transform.forward(
+        self._unit_sample_transform = self.transform.forward(
             _interpolate_angle(unit_sample, rate_hz, self.transform)[0]
         )
 
     def at_positions(self, x_m: Real) -> "FreeBeam":
-        """Return a copy that computes the displacement at other positions along the beam.
+        """Return a copy of the model that computes displacements at other positions.
 
         Parameters
         ----------
@@ -138,32 +138,35 @@ class FreeBeam:
     def _set_positions(self, x_m: Real) -> None:
         """Set the positions at which the displacement is computed.
 
-        Many positions are interpolated from a few nodes, with an error of 1e-7 for waves of 1 kHz.
+        Displacements at many positions are interpolated from those at 36 nodes, with a relative
+        error of 1e-7 for waves of 1 kHz.
         """
         self.x_m = x_m
-        nodes_m, self._between = x_m, np.eye(x_m.size)
+        nodes_m, self._interpolation = x_m, np.eye(x_m.size)
         if x_m.size > _NODE_COUNT:
-            nodes_m, self._between = chebyshev_nodes(x_m, _NODE_COUNT)
-        self._displacement: Complex = self._grid.displacement_per_angle(nodes_m).T
-        self.modes = self.modes.at_positions(x_m / self.model.plant.beam.length_m)
+            nodes_m, self._interpolation = chebyshev_nodes(x_m, _NODE_COUNT)
+        self._node_displacement: Complex = self._force_grid.displacement_per_angle(nodes_m).T
+        self.free_vibration = self.free_vibration.at_positions(x_m / self.model.plant.beam.length_m)
 
     def displacement_per_sample(self, position_index: int, sample_count: int) -> Real:
-        """Return the displacement at a position that one sample of the angle causes, in m/rad.
+        """Return the displacement over time at one position per sample of the angle, in m/rad.
 
         Parameters
         ----------
         position_index
             Index of the position.
         sample_count
-            Number of samples after the sample of the angle.
+            Number of samples after the sample of the angle for which the displacement is returned.
 
         Returns
         -------
-        ndarray, shape (STEPS_PER_SAMPLE · (SPLINE_FADE_SAMPLES + samples),)
-            Displacement on the fine time steps, from `SPLINE_FADE_SAMPLES` samples before the
-            sample of the angle, because the spline through the samples acts ahead of each sample.
+        ndarray, shape (STEPS_PER_SAMPLE · (SPLINE_FADE_SAMPLES + sample_count),)
+            Displacement at the time steps. They begin `SPLINE_FADE_SAMPLES` samples before the
+            sample of the angle, because a sample also changes the spline before it.
         """
-        laplace_response = (self._between[position_index] @ self._displacement) * self._sample
+        laplace_response = (
+            self._interpolation[position_index] @ self._node_displacement
+        ) * self._unit_sample_transform
         return self.transform.inverse(
             laplace_response, STEPS_PER_SAMPLE * (SPLINE_FADE_SAMPLES + sample_count)
         )
@@ -175,7 +178,7 @@ class FreeBeam:
         first_sample: int,
         angle_transform: "AngleTransform | None" = None,
     ) -> "FreeMotion":
-        """Return the motion of a beam without contact, and a record's deviations from it.
+        """Return the predicted motion without contact, and the record's deviations from it.
 
         Parameters
         ----------
@@ -186,7 +189,7 @@ class FreeBeam:
         first_sample
             Index of the sample from which the displacement is computed.
         angle_transform
-            Transform of the record's angle, if it is known from another beam; None: it is computed.
+            Transform of the record's angle, if another model has computed it; None: compute it.
         """
         n = touch_record.angle_rad.size
         rate_hz = self.rate_hz
@@ -203,7 +206,7 @@ class FreeBeam:
             measured_channels.append((touch_record.shear_n, self._shear))
         t = np.arange(n) / rate_hz
         delay_s = self.model.wrench_delay_s - self.model.angle_delay_s
-        vibration_columns = self.modes.channels(t - delay_s)
+        vibration_columns = self.free_vibration.torque_and_shear(t - delay_s)
         innovations, design_matrices = [], []
         for i, (measured_samples, transfer_function) in enumerate(measured_channels):
             free_reading = self.transform.inverse(
@@ -216,22 +219,26 @@ class FreeBeam:
             design_matrices.append(np.hstack([vibration_columns[i], offset_and_drift]))
         motion_fit = _FreeMotionFit.fit(innovations, design_matrices, quiet_samples)
         step_count = STEPS_PER_SAMPLE * n
-        node_displacement_m = self.transform.inverse(self._displacement * spectrum, step_count)
-        displacement_m = self._between @ node_displacement_m[:, STEPS_PER_SAMPLE * first_sample :]
+        node_displacement_m = self.transform.inverse(self._node_displacement * spectrum, step_count)
+        displacement_m = (
+            self._interpolation @ node_displacement_m[:, STEPS_PER_SAMPLE * first_sample :]
+        )
         step_times_s = np.arange(STEPS_PER_SAMPLE * first_sample, step_count) / (
             STEPS_PER_SAMPLE * rate_hz
         )
         displacement_m += self.x_m[:, None] * (start_rad + speed_rad_s * step_times_s)
-        vibration_amplitudes = motion_fit.values[: self.modes.shapes.shape[0] * 2]
-        displacement_m += self.modes.displacement(step_times_s, vibration_amplitudes)
+        vibration_amplitudes = motion_fit.amplitudes[
+            : self.free_vibration.displacement_shapes.shape[0] * 2
+        ]
+        displacement_m += self.free_vibration.displacement(step_times_s, vibration_amplitudes)
         return FreeMotion(
             t=t - self.model.wrench_delay_s,
             innovations=np.array(motion_fit.innovations),
-            noise=np.array(motion_fit.noise),
-            design=np.array(design_matrices),
-            spread=np.linalg.cholesky(motion_fit.covariance).astype(np.float64),
+            noise_stds=np.array(motion_fit.noise_stds),
+            design_matrices=np.array(design_matrices),
+            amplitude_cholesky=np.linalg.cholesky(motion_fit.covariance).astype(np.float64),
             angle_transform=angle_transform,
-            ringing=self.modes,
+            free_vibration=self.free_vibration,
             angle_noise_rad=_angle_noise(touch_record.angle_rad[:quiet_samples]),
             displacement_m=displacement_m,
             first_s=first_sample / rate_hz - self.model.angle_delay_s,
@@ -241,47 +248,48 @@ class FreeBeam:
 
 @dataclass(frozen=True, slots=True)
 class FreeMotion:
-    """Motion that a beam without contact would have, and a record's deviations from it."""
+    """Predicted motion of the beam without contact, and the deviations of a record from it."""
 
     t: Real
     """Instants of the samples of torque and shear, corrected for their delays, shape (n,)."""
     innovations: Real
-    """Innovations of torque and, if measured, shear, shape (c, n)."""
-    noise: Real
-    """Standard deviation of the innovations of torque and shear before the touch, shape (c,)."""
-    design: Real
-    """Design matrix of the fit to the samples before the touch, shape (c, n, q): free vibrations,
-    offset and drift."""
-    spread: Real
-    """Cholesky factor of the covariance of the q fitted amplitudes, shape (q, q)."""
+    """Innovations (measured minus predicted) of torque and, if measured, base shear, shape (c,
+    n)."""
+    noise_stds: Real
+    """Standard deviation of each channel's innovations before the touch, shape (c,)."""
+    design_matrices: Real
+    """Effects of the q fitted quantities (free vibrations, offsets and drifts) on torque and shear
+    per unit amplitude, shape (c, n, q)."""
+    amplitude_cholesky: Real
+    """Lower Cholesky factor of the covariance of the q fitted amplitudes, shape (q, q)."""
     angle_transform: "AngleTransform"
-    """Transform of the angle that drives the beam."""
-    ringing: "FreeVibration"
-    """Free vibrations that were fitted."""
+    """Laplace transform of the measured angle, which drives the beam."""
+    free_vibration: "FreeVibration"
+    """Free vibrations whose amplitudes were fitted."""
     angle_noise_rad: float
     """Standard deviation of the noise in one sample of the angle."""
     displacement_m: Real
-    """Displacement of the beam at the positions on fine time steps, shape (m, k)."""
+    """Displacement of the beam in m at m positions and k time steps, shape (m, k)."""
     first_s: float
-    """Instant of the displacement's first time step."""
+    """Instant of the first time step of `displacement_m`."""
     step_s: float
-    """Time between two steps of the displacement."""
+    """Time between two time steps of `displacement_m`."""
 
 
 def _angle_noise(angle_rad: Real) -> float:
-    """Return the standard deviation of an angle's noise in rad, including encoder steps.
+    """Return the standard deviation in rad of the angle's noise, including encoder resolution.
 
-    Fourth differences of the samples remove the motion.
+    It is estimated from fourth differences of the samples, which contain hardly any motion.
     """
     return float(np.sqrt(np.mean(np.diff(angle_rad, 4) ** 2) / 70))
 
 
 @dataclass(frozen=True, slots=True)
 class AngleTransform:
-    """Laplace transform of a record's angle, after subtraction of a motion at constant speed."""
+    """Laplace transform of a record's angle, without its initial value and speed."""
 
     spectrum: Complex
-    """Transform of the angle minus the motion at constant speed."""
+    """Laplace transform of the angle minus ``start_rad + speed_rad_s · t``."""
     start_rad: float
     """Angle at the record's beginning."""
     speed_rad_s: float
@@ -291,7 +299,7 @@ class AngleTransform:
     def from_samples(
         cls, angle_rad: Real, rate_hz: float, transform: CausalTransform
     ) -> "AngleTransform":
-        """Return the transform of an angle's samples."""
+        """Return the Laplace transform of a record's angle from its samples."""
         remaining_angle, start_rad, speed_rad_s = _interpolate_angle(angle_rad, rate_hz, transform)
         return cls(transform.forward(remaining_angle), start_rad, speed_rad_s)
 
@@ -299,9 +307,9 @@ class AngleTransform:
 def _interpolate_angle(
     angle_rad: Real, rate_hz: float, transform: CausalTransform
 ) -> tuple[Real, float, float]:
-    """Interpolate an angle to the time steps of a transform, and subtract constant speed.
+    """Return the angle at the time steps of a transform, without its initial value and speed.
 
-    Return the remaining angle, and angle and speed at the record's beginning.
+    The second and third results are the initial angle in rad and the initial speed in rad/s.
     """
     from scipy.interpolate import CubicSpline
 
@@ -328,16 +336,16 @@ def _interpolate_angle(
 
 @dataclass(frozen=True, slots=True)
 class FreeVibration:
-    """Free vibrations of the beam's first modes: decaying cosines and sines to be fitted."""
+    """Free vibrations of the beam's first modes: decaying cosines and sines of unit amplitude."""
 
     poles: Complex
     """Poles of the modes in rad/s, shape (modes,)."""
-    root: Complex
-    """Torque and base shear per amplitude of each mode, shape (2, modes)."""
-    scale: Real
-    """Unit of each mode's amplitude, shape (modes,)."""
-    shapes: Real
-    """Displacement at the positions per amplitude of each mode, shape (modes, positions)."""
+    root_loads: Complex
+    """Complex torque and base shear of each mode for a unit amplitude, shape (2, modes)."""
+    amplitude_units: Real
+    """Factor of each mode's shape for a unit amplitude, chosen for similar torques; (modes,)."""
+    displacement_shapes: Real
+    """Displacement at each position for a unit amplitude of each mode, shape (modes, positions)."""
 
     @classmethod
     def from_model(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
@@ -357,18 +365,18 @@ class FreeVibration:
             [-2 * mode_signs * wave_numbers**2, -2 * mode_signs * shear_ratios * wave_numbers**3]
         )
         root_loads *= model.sensor_filter.response(mode_poles)
-        # Units of the amplitudes that give about the same torque in each mode.
-        torque_scale = 1 / np.abs(root_loads[0])
+        # With these units the same amplitude causes about the same torque in each mode.
+        amplitude_units = 1 / np.abs(root_loads[0])
         without_shapes = cls(
             mode_poles.astype(np.complex128),
-            root_loads * torque_scale,
-            torque_scale,
+            root_loads * amplitude_units,
+            amplitude_units,
             np.empty((mode_count, 0)),
         )
         return without_shapes.at_positions(x_m / beam.length_m)
 
     def at_positions(self, fractions: Real) -> "FreeVibration":
-        """Return the free vibrations with the displacement at other positions.
+        """Return the same free vibrations with displacements at other positions.
 
         Parameters
         ----------
@@ -376,31 +384,31 @@ class FreeVibration:
             Positions as fractions of the length, shape (positions,).
         """
         mode_shapes = np.stack([mode_shape(i + 1, fractions) for i in range(self.poles.size)])
-        return replace(self, shapes=mode_shapes * self.scale[:, None])
+        return replace(self, displacement_shapes=mode_shapes * self.amplitude_units[:, None])
 
-    def channels(self, t: Real) -> Real:
-        """Return torque and shear of each vibration at some times, shape (2, t, 2 · modes).
+    def torque_and_shear(self, t: Real) -> Real:
+        """Return torque and base shear of each vibration over time, shape (2, t, 2 · modes).
 
         Parameters
         ----------
         t
-            Times from the record's beginning.
+            Times in s from the record's beginning, shape (t,).
         """
         oscillation = np.exp(np.multiply.outer(t, self.poles))
-        complex_parts = [oscillation * root_load for root_load in self.root]
+        complex_parts = [oscillation * root_load for root_load in self.root_loads]
         return np.array(
             [np.hstack([complex_part.real, -complex_part.imag]) for complex_part in complex_parts]
         )
 
     def displacement(self, t: NDArray[np.floating], amplitudes: Real) -> Real:
-        """Return the beam's displacement for given amplitudes of the free vibrations.
+        """Return the beam's displacement in m for given amplitudes of the free vibrations.
 
         The shape is (positions, t, r), or (positions, t) for amplitudes without the axis r.
 
         Parameters
         ----------
         t
-            Times from the record's beginning.
+            Times in s from the record's beginning, shape (t,).
         amplitudes
             Amplitudes of cosines and sines, shape (2 · modes, r) or (2 · modes,).
         """
@@ -413,7 +421,7 @@ class FreeVibration:
         displacement_m -= np.multiply(
             oscillation.imag[:, :, None], vibration_columns[mode_count:, None]
         )
-        displacement: Real = self.shapes.T @ displacement_m.reshape(mode_count, -1)
+        displacement: Real = self.displacement_shapes.T @ displacement_m.reshape(mode_count, -1)
         return displacement.reshape(-1, t.size, *amplitudes.shape[1:])
 
 
@@ -421,26 +429,30 @@ class FreeVibration:
 class _FreeMotionFit:
     """Fit of free vibrations, offset and drift to the samples before a touch."""
 
-    values: Real
+    amplitudes: Real
     """Fitted amplitudes, shape (q,)."""
     covariance: Real
     """Covariance of the amplitudes, shape (q, q)."""
-    noise: list[float]
-    """Standard deviation of torque and shear around the fit."""
+    noise_stds: list[float]
+    """Standard deviations of the residuals of torque and shear before the touch."""
     innovations: list[Real]
-    """Torque and shear minus the fit at all samples."""
+    """Residuals of torque and shear at all samples, also after the touch."""
 
     @classmethod
-    def fit(cls, innovations: list[Real], designs: list[Real], quiet: int) -> "_FreeMotionFit":
-        """Fit the first `quiet` samples by weighted least squares.
+    def fit(
+        cls, innovations: list[Real], design_matrices: list[Real], quiet_samples: int
+    ) -> "_FreeMotionFit":
+        """Return the weighted least-squares fit to the first `quiet_samples` samples.
 
-        Repeated fits estimate the noise of torque and shear, which gives the weights.
+        Torque and shear are weighted by their noise, which repeated fits estimate.
         """
         noise_stds = [1.0] * len(innovations)
         for _ in range(3):
-            a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise_stds, strict=True)])
+            a = np.vstack(
+                [d[:quiet_samples] / s for d, s in zip(design_matrices, noise_stds, strict=True)]
+            )
             b = np.concatenate(
-                [e[:quiet] / s for e, s in zip(innovations, noise_stds, strict=True)]
+                [e[:quiet_samples] / s for e, s in zip(innovations, noise_stds, strict=True)]
             )
             normal_matrix = a.T @ a
             regularisation = 1e-9 * np.trace(normal_matrix) / normal_matrix.shape[0]
@@ -448,12 +460,19 @@ class _FreeMotionFit:
                 normal_matrix + regularisation * np.eye(normal_matrix.shape[0])
             )
             fitted_values = covariance @ (a.T @ b)
-            residuals = [e - d @ fitted_values for e, d in zip(innovations, designs, strict=True)]
-            degrees_of_freedom = max(quiet - fitted_values.size / len(residuals), quiet / 2)
-            noise_stds = [
-                float(np.sqrt(np.sum(e[:quiet] ** 2) / degrees_of_freedom)) for e in residuals
+            residuals = [
+                e - d @ fitted_values for e, d in zip(innovations, design_matrices, strict=True)
             ]
-        a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise_stds, strict=True)])
+            degrees_of_freedom = max(
+                quiet_samples - fitted_values.size / len(residuals), quiet_samples / 2
+            )
+            noise_stds = [
+                float(np.sqrt(np.sum(e[:quiet_samples] ** 2) / degrees_of_freedom))
+                for e in residuals
+            ]
+        a = np.vstack(
+            [d[:quiet_samples] / s for d, s in zip(design_matrices, noise_stds, strict=True)]
+        )
         normal_matrix = a.T @ a
         covariance = np.linalg.inv(normal_matrix + regularisation * np.eye(normal_matrix.shape[0]))
         return cls(fitted_values, covariance, noise_stds, residuals)

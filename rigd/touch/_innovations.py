@@ -1,10 +1,10 @@
-"""Innovations: the unpredicted part of a sensor's readings, tick by tick.
+"""Innovations: the part of torque and base shear that is not predicted, in each tick.
 
-The exact model of the free beam predicts torque and base shear from the angle. The difference from
-the measurement is noise, earlier vibration of the beam, the model's own error, or a touch.
-Vibration and error are slow and at the beam's own frequencies: an observer (a stationary Kalman
-filter of the first modes and of the zeros of torque and shear) follows them. The innovations are
-the part that the observer cannot predict from one tick to the next: white noise without a touch.
+The exact model of the free beam predicts torque and base shear from the angle. The measurement
+deviates because of noise, earlier vibration of the beam, errors of the model, or a touch. An
+observer (a stationary Kalman filter of the first modes and of the zeros of torque and shear)
+follows vibration and model errors, which change slowly or at the natural frequencies. The
+innovations are the remaining part, which is white noise without a touch.
 
 Filter and observer are linear, so that a tick is the product of one matrix with one vector:
 [state, angle, torque, shear] → [next state, whitened innovations, whitened prediction].
@@ -30,37 +30,38 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 _CANDIDATE_MODES = 40
-"""Number of modes of the beam from which the filter's modes are chosen."""
+"""Number of the beam's first modes, of which the filter represents those of low enough
+frequency."""
 _MAX_FREQUENCY_FRACTION = 0.42
-"""Highest frequency of a mode of the filter over the tick rate; delay taps approximate higher
-modes."""
+"""Highest frequency of the filter's modes, as a fraction of the tick rate; delay taps approximate
+higher modes."""
 _MIN_IMAGINARY_FRACTION = 0.5
-"""Smallest ratio of imaginary part to magnitude for a pole of the filter; real poles approximate
-modes that are more strongly damped."""
+"""Smallest ratio of imaginary part to magnitude of the poles of the filter's modes; real poles
+approximate modes that are more strongly damped."""
 _REAL_POLE_COUNT = 10
-"""Number of real poles that approximate the branch cut of fractional orders."""
+"""Number of real poles, which approximate the branch cut of fractional-order damping."""
 _SLOWEST_REAL_POLE_RAD_S = 0.03
-"""Slowest of these real poles in rad/s."""
+"""Magnitude of the slowest real pole in rad/s."""
 _DELAY_TAPS = 4
-"""Number of delay taps of the filter: past angles with a coefficient each."""
+"""Number of delay taps of the filter: the present and past angles, with a coefficient each."""
 _FIT_START_HZ, _FIT_END_FRACTION = 0.02, 0.45
-"""Band in which the filter is fitted: lower end in Hz, and upper end over the tick rate."""
+"""Band in which the filter is fitted: lower end in Hz, upper end as a fraction of the tick rate."""
 _FULL_WEIGHT_START_HZ, _FULL_WEIGHT_END_HZ = 0.3, 50.0
 """Lower and upper end in Hz of the band in which the relative error of the fit has full weight.
-Motors hardly move above it, where a close fit would only amplify the encoder's steps."""
+Above it motors hardly move, and a close fit would only amplify the noise of the encoder."""
 _OBSERVED_MODES = 4
 """Number of modes whose vibration the observer follows."""
 _VIBRATION_BANDWIDTH_RAD_S = 6.0
-"""Bandwidth in rad/s of the observer for vibration. It is slow compared with a touch (at 15 rad/s
-the observer absorbs a tenth of a touch within 10 ms), and fast compared with the phase drift of a
+"""Bandwidth in rad/s with which the observer follows vibration: slow compared with a touch (15
+rad/s would absorb a tenth of a touch within 10 ms), and fast compared with the phase drift of a
 model with a 1 % frequency error."""
 _ZERO_BANDWIDTH_RAD_S = 0.5
-"""Bandwidth in rad/s of the observer for the zeros of torque and shear."""
+"""Bandwidth in rad/s with which the observer follows the zeros of torque and shear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedBeam:
-    """Discrete model of the beam without contact, with an observer, for one tick rate and sensor.
+    """Discrete model of the beam without contact and its observer, as the matrix of one tick.
 
     Examples
     --------
@@ -75,11 +76,12 @@ class ObservedBeam:
 
     matrix: Real
     """Matrix of a tick from [state, angle, torque, shear] to [next state, whitened innovations,
-    whitened prediction], shape (n + 4, n + 3). Without shear its row and column are zero."""
+    whitened prediction], shape (n + 4, n + 3). Without shear, the rows and the column of shear are
+    zero."""
     gain: Real
     """Effect of each whitened innovation on the next state, shape (n, 2)."""
     whitening: Real
-    """Matrix from innovations of torque and shear to whitened innovations, shape (2, 2)."""
+    """Matrix from innovations in N·m and N to whitened innovations, shape (2, 2)."""
     states: int
     """Number n of states."""
     channels: int
@@ -88,14 +90,14 @@ class ObservedBeam:
 
 @dataclass(frozen=True, slots=True)
 class ChannelNoise:
-    """Standard deviations of the noise in one sample of torque, base shear and angle."""
+    """Standard deviation of the noise in each sample of torque, base shear and angle."""
 
     torque_nm: float
     """Standard deviation of the coupling torque."""
     shear_n: float | None
     """Standard deviation of the base shear; None: it is not measured."""
     angle_rad: float = 0.0
-    """Standard deviation of the angle; a resolution of 7e-5 rad corresponds to 2e-5 rad."""
+    """Standard deviation of the angle, such as the encoder's resolution divided by √12."""
 
 
 def observed_beam(
@@ -108,7 +110,7 @@ def observed_beam(
     torque_after_angle_s: float = 0.0,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> ObservedBeam:
-    """Design the filter and observer that compute the innovations of a beam's torque and shear.
+    """Return the model with filter and observer that computes innovations of torque and shear.
 
     Parameters
     ----------
@@ -117,7 +119,7 @@ def observed_beam(
     rate_hz
         Ticks a second.
     noise_stds
-        Noise of torque, base shear and angle.
+        Standard deviations of the noise of torque, base shear and angle.
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     torque_after_angle_s
@@ -157,9 +159,9 @@ def observed_beam(
 
 
 class InnovationFilter:
-    """Filter that computes the deviation of torque and shear from the free beam at each tick.
+    """Filter that computes the innovations of torque and base shear in each tick.
 
-    It starts with the beam at rest at the first angle.
+    The beam is assumed to be at rest at the angle of the first tick.
 
     Parameters
     ----------
@@ -169,10 +171,10 @@ class InnovationFilter:
     Attributes
     ----------
     whitened
-        Innovations of torque and shear in the last tick, whitened: uncorrelated, in units of their
-        standard deviations.
+        Two whitened innovations of the last tick: combinations of those of torque and shear that
+        are uncorrelated and, for the assumed noise, have a standard deviation of 1.
     predicted
-        Torque and shear predicted from the angle alone, in the same units.
+        Torque and shear that the angle alone predicts, transformed by the same matrix.
     """
 
     __slots__ = (
@@ -223,12 +225,12 @@ class InnovationFilter:
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> None:
-        """Compute the deviations of torque and shear of a tick from the model, from its readings.
+        """Compute the innovations of a tick from its readings.
 
         Parameters
         ----------
         angle_rad, torque_nm, shear_n
-            Readings. The shear has no effect if the model has no shear.
+            Measured angle, torque and base shear; the shear is ignored if the model has none.
         missed
             Number of ticks that were missed before this tick; their angles are interpolated.
         angle_stale
@@ -254,11 +256,11 @@ class InnovationFilter:
             self._step_with_wrench(relative_angle_rad, torque_nm, shear_n)
 
     def hold_zeros(self) -> None:
-        """Hold the zeros of torque and shear, which a contact force would shift for seconds."""
+        """Hold the zeros of torque and shear, so that a contact force does not shift them."""
         self._multiply, self._gain = self._holding_zeros
 
     def follow_zeros(self) -> None:
-        """Follow the zeros of torque and shear again."""
+        """Let the observer follow the zeros of torque and shear again."""
         self._multiply, self._gain = self._following_zeros
 
     @property
@@ -271,7 +273,7 @@ class InnovationFilter:
     def _step_with_wrench(
         self, relative_angle_rad: float, torque_nm: float, shear_n: float
     ) -> None:
-        """Process the angle relative to rest, torque and shear of one tick."""
+        """Process one tick: angle relative to the first tick, torque and base shear."""
         n = self._states
         input_vector, output_vector = self._vectors
         input_vector[n] = relative_angle_rad
@@ -289,7 +291,7 @@ class InnovationFilter:
     def _step_without_wrench(
         self, relative_angle_rad: float, torque_nm: float, shear_n: float
     ) -> None:
-        """Process one tick without a valid wrench, whose effect on the filter's state is undone."""
+        """Process one tick whose torque and shear are invalid and have no effect on the state."""
         self._step_with_wrench(relative_angle_rad, torque_nm, shear_n)
         self._vectors[0][: self._states] -= self._gain @ np.array(self.whitened)
         self.whitened = 0.0, 0.0
@@ -321,10 +323,10 @@ def _fit_filter(
     torque_after_angle_s: float,
     sensor_filter: SensorFilter,
 ) -> _AngleFilter:
-    """Return the discrete filter whose response fits that of the exact model best.
+    """Return the discrete filter that approximates the exact model's frequency response.
 
-    Its poles are those of the exact model. Some real poles and delay taps approximate the remaining
-    response.
+    Its complex poles are those of the exact model. Real poles and delay taps approximate the
+    remaining response. The coefficients are fitted by least squares.
     """
     pole_pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_CANDIDATE_MODES), beam, damping)
     upper_poles = pole_pairs[_is_represented_mode(pole_pairs[:, 0], rate_hz), 0]
@@ -375,10 +377,10 @@ def _fit_filter(
 
 
 def _is_represented_mode(upper_poles: Complex, rate_hz: float) -> NDArray[np.bool_]:
-    """Return which of the poles belong to modes that the filter represents, as a mask.
+    """Return a mask of the poles whose modes the filter represents.
 
-    Such a mode oscillates at less than `_MAX_FREQUENCY_FRACTION` of the tick rate. A pole of NaN
-    belongs to no mode.
+    These are oscillating modes below `_MAX_FREQUENCY_FRACTION` of the tick rate; poles that are NaN
+    are excluded.
     """
     is_represented: NDArray[np.bool_] = upper_poles.imag > _MIN_IMAGINARY_FRACTION * np.abs(
         upper_poles
@@ -387,10 +389,10 @@ def _is_represented_mode(upper_poles: Complex, rate_hz: float) -> NDArray[np.boo
 
 
 def _term_responses(s_ticks: Complex, complex_poles: Complex, real_poles: Real) -> Complex:
-    """Return the frequency responses of the filter's terms, whose weighted sum is the response.
+    """Return the frequency response of each term of the filter, shape (frequencies, terms).
 
     The terms are the real and the imaginary part of each complex pole, the real poles and the delay
-    taps. `s_ticks` is the Laplace variable times the period.
+    taps. `s_ticks` is the Laplace variable multiplied by the duration of a tick.
     """
     tick_delay = np.exp(-s_ticks)[:, None]
     upper_terms, lower_terms = (
@@ -412,7 +414,10 @@ def _term_responses(s_ticks: Complex, complex_poles: Complex, real_poles: Real) 
 def _state_space(
     complex_poles: Complex, real_poles: Real, coefficients: Real, noise_gain: Real
 ) -> _AngleFilter:
-    """Return the fitted filter as a state space, whose state excludes the angle of the tick."""
+    """Return the state space of the filter with the given coefficients of its terms.
+
+    The state depends on past angles only; the present one acts through ``d``.
+    """
     m, k = complex_poles.size, real_poles.size
     n = 2 * m + k + _DELAY_TAPS - 1
     a, b = np.zeros((n, n)), np.zeros(n)
@@ -447,9 +452,9 @@ def _state_space(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Observer:
-    """Observer of the motion that the angle does not explain, with the innovations e.
+    """Observer of vibrations and zeros, from the deviations y of torque and shear.
 
-    The equations are ``x' = a x + gain e`` and ``e = y - c x``.
+    The equations are ``x' = a x + gain e`` and ``e = y - c x``, with the innovations e.
     """
 
     a: Real

@@ -1,10 +1,10 @@
-"""Effect of a force on the beam in time: displacement, torque and base shear, over the length.
+"""Responses of the beam over time to a force: displacement, torque and base shear.
 
 A force that is linear between two time steps is a sum of triangular pulses, here called hats, with
-one hat per step. The response to one hat of unit height at each of the following steps is a kernel.
+one hat per step. A kernel is the response to a hat of 1 N, at the time steps from its peak on.
 Kernels are inverse Laplace transforms of the exact model (`CausalTransform`). By reciprocity,
-torque and shear per force at x are minus the displacement there per angle and per displacement of
-the root.
+torque and base shear per force at x are minus the displacement at x per angle and per displacement
+of the root.
 """
 
 from dataclasses import dataclass
@@ -26,27 +26,27 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 DECAY_EXPONENT = 14.0
-"""Exponent of the transforms' damping: what wraps round is 1e-6 of the values at the end of the
-period."""
+"""Exponent by which the transforms damp signals over their period; values that wrap round from the
+end of the period are reduced to 1e-6."""
 
 _OVERSAMPLING = 2
-"""Number of steps of the inverse transform per step of the kernels, since the spectrum of a hat is
-small above half the step's rate."""
+"""Number of steps of the inverse transform per step of the kernels. Two suffice, because the
+spectrum of a hat is small at higher frequencies."""
 
 _CROSS_MODE_COUNT = 20
-"""Number of modes that transmit a force to another position."""
+"""Number of modes whose sum is the displacement at one position by a force at another."""
 
 _FIRST_POSITION_M = 0.003
-"""Distance in m of the first position from the root; the last position is the tip."""
+"""Distance in m of the first kernel position from the root; the last position is the tip."""
 
 
 class ForcePulse:
-    """Triangular pulse of force, to compute responses over time from Laplace transforms.
+    """Triangular pulse of 1 N, whose responses over time are computed from transfer functions.
 
     Parameters
     ----------
     step_s
-        Half the width of the pulse, which is the time between two values of a kernel.
+        Half the width of the pulse, and the time between two values of a kernel.
     step_count
         Number of values of a kernel.
     """
@@ -66,12 +66,12 @@ class ForcePulse:
         self._delayed_pulse = pulse_transform * np.exp(-s * step_s)
 
     def kernels(self, laplace_response: Complex) -> Real:
-        """Return responses over time to one triangular pulse of force, shape (k, steps).
+        """Return the responses over time to the pulse, from transfer functions, shape (k, steps).
 
         Parameters
         ----------
         laplace_response
-            Transfer functions from a force at `s` of the transform, shape (k, frequencies).
+            Transfer functions from force, at the points `s` of the transform, shape (k, points).
         """
         fine_values = self.transform.inverse(
             self._delayed_pulse * laplace_response, _OVERSAMPLING * (self._steps + 1)
@@ -88,10 +88,10 @@ class ContactKernels:
     step_s: float
     """Time step of the kernels, which is half the width of the pulse."""
     displacement: Real
-    """Displacement at the force's position in m/N, shape (m, n). The first column is the instant of
-    the pulse's peak."""
+    """Displacement at the position of the force in m/N, shape (m, n), from the peak of the pulse
+    on."""
     torque: Real
-    """Torque on the motor in N·m/N, shape (m, n)."""
+    """Coupling torque in N·m/N, shape (m, n)."""
     shear: Real
     """Base shear in N/N, shape (m, n)."""
 
@@ -101,12 +101,12 @@ class ContactKernels:
         return int(self.displacement.shape[1])
 
     def at_positions(self, x_m: Real, step_count: int) -> "ContactKernels":
-        """Return the responses at other positions, by cubic interpolation of four positions.
+        """Return the responses at other positions, by cubic interpolation between positions.
 
         Parameters
         ----------
         x_m
-            Positions within the range of those of the kernels, shape (k,).
+            Positions within the range of the present positions, shape (k,).
         step_count
             Number of time steps of the result.
         """
@@ -202,31 +202,31 @@ def contact_kernels(
 
 @dataclass(frozen=True, slots=True)
 class CrossKernels:
-    """Displacement over time at one position per pulse of contact force at another position.
+    """Displacement over time at one position for a pulse of contact force at another position.
 
-    It is a sum over the modes.
+    It is computed as a sum over the modes.
     """
 
     x_m: Real
     """Positions at which the mode shapes are given, shape (m,)."""
-    shapes: Real
+    mode_shapes: Real
     """Mode shapes at the positions, shape (m, modes)."""
     kernels: Real
-    """Displacement over time of each mode for a pulse of force, where its shape is 1; shape
-    (modes, n)."""
+    """Response over time of each mode to the pulse, for mode shapes of 1 at both positions, in m/N;
+    shape (modes, n)."""
 
     def between_positions(self, x_m: Real, other_m: Real, step_count: int) -> Real:
-        """Return displacement per force pulse between pairs of positions, shape (pairs, steps).
+        """Return the displacement in m/N for each pair of positions, shape (k, step_count).
 
         Parameters
         ----------
         x_m, other_m
-            Positions of force and displacement, shape (k,); they may be exchanged.
+            Positions of force and displacement, shape (k,); exchanging them changes nothing.
         step_count
             Number of time steps of the result.
         """
         first_shapes, second_shapes = (
-            interpolate_rows(self.shapes, *cubic_weights(x, self.x_m)) for x in (x_m, other_m)
+            interpolate_rows(self.mode_shapes, *cubic_weights(x, self.x_m)) for x in (x_m, other_m)
         )
         cross_kernels_of_pairs: Real = (first_shapes * second_shapes) @ self.kernels[:, :step_count]
         return cross_kernels_of_pairs
@@ -235,7 +235,7 @@ class CrossKernels:
 def cross_kernels(
     beam: Beam, damping: Damping, x_m: Real, step_s: float, step_count: int
 ) -> CrossKernels:
-    """Return the displacements over time at one position per force pulse at another.
+    """Return the kernels from a force at one position to the displacement at another.
 
     The arguments are those of `contact_kernels`.
     """
@@ -258,7 +258,7 @@ _POSITIONS_AT_ONCE = 8
 """Number of positions that are evaluated at once, so that temporary arrays stay in the cache."""
 
 
-def positions(length_m: float, spacing_m: float) -> Real:
+def beam_positions(length_m: float, spacing_m: float) -> Real:
     """Return equally spaced positions along the beam up to its tip, in m.
 
     Parameters
@@ -273,7 +273,7 @@ def positions(length_m: float, spacing_m: float) -> Real:
 
 
 def chebyshev_nodes(x_m: Real, node_count: int) -> tuple[Real, Real]:
-    """Return Chebyshev nodes, and the matrix that interpolates from them to given positions.
+    """Return Chebyshev nodes, and the matrix that interpolates from nodes to positions.
 
     Parameters
     ----------
@@ -286,8 +286,8 @@ def chebyshev_nodes(x_m: Real, node_count: int) -> tuple[Real, Real]:
     -------
     nodes_m : ndarray, shape (node_count,)
         Positions of the nodes.
-    between : ndarray, shape (m, count)
-        Matrix that interpolates values at the nodes to the given positions.
+    interpolation_matrix : ndarray, shape (m, node_count)
+        Matrix that multiplies values at the nodes, and gives interpolated values at `x_m`.
     """
     from numpy.polynomial import chebyshev
 
@@ -301,24 +301,24 @@ def chebyshev_nodes(x_m: Real, node_count: int) -> tuple[Real, Real]:
     return x_m[0] + (x_m[-1] - x_m[0]) * (unit_nodes + 1) / 2, interpolation_matrix
 
 
-def cubic_weights(positions_at: Real, grid_points: Real) -> tuple[NDArray[np.intp], Real]:
+def cubic_weights(points: Real, grid_points: Real) -> tuple[NDArray[np.intp], Real]:
     """Return the indices and weights of a cubic interpolation on an equally spaced grid.
 
     Parameters
     ----------
-    positions_at
-        Points to which is interpolated, shape (k,).
+    points
+        Points at which interpolated values are wanted, shape (k,).
     grid_points
         At least four equally spaced, increasing points.
 
     Returns
     -------
-    first : ndarray of int, shape (k,)
-        Index of the first of four grid points for each point.
+    first_indices : ndarray of int, shape (k,)
+        Index of the first of the four grid points for each point.
     weights : ndarray, shape (k, 4)
         Weights of these four grid points.
     """
-    grid_positions = (np.asarray(positions_at) - grid_points[0]) / (grid_points[1] - grid_points[0])
+    grid_positions = (np.asarray(points) - grid_points[0]) / (grid_points[1] - grid_points[0])
     first_indices = np.clip(np.floor(grid_positions).astype(np.intp) - 1, 0, grid_points.size - 4)
     u = grid_positions - first_indices
     weights = np.stack(
@@ -334,7 +334,7 @@ def cubic_weights(positions_at: Real, grid_points: Real) -> tuple[NDArray[np.int
 
 
 def interpolate_rows(value_table: Real, first_rows: NDArray[np.intp], weights: Real) -> Real:
-    """Interpolate between the rows of a table (m, n) by `cubic_weights`; shape (k, n)."""
+    """Return interpolated rows (k, n) of a table (m, n), with the results of `cubic_weights`."""
     weighted_sum = weights[:, 0, None] * value_table[first_rows]
     for i in range(1, 4):
         weighted_sum += weights[:, i, None] * value_table[first_rows + i]

@@ -1,4 +1,4 @@
-"""Model of the beam for the estimation of touches, with its uncertainty."""
+"""Beam model for the estimation of touches, with the uncertainty of its parameters."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -15,12 +15,12 @@ _ASSUMED_RELATIVE_STD: Final = {
     "zeta": 0.2,
     "gamma": 0.2,
 }
-"""Relative standard deviations that are assumed for the parameters of a beam that was not
+"""Relative standard deviation that is assumed for each parameter of a beam that was not
 identified."""
 
 
 _LARGEST_ORDER: Final = 1.99
-"""Largest order of damping in a changed model."""
+"""Largest fractional order of damping in a model with a changed parameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,32 +28,32 @@ class TouchModel:
     """Exact beam model for the estimation of touches, with its parameters' uncertainty."""
 
     plant: Plant
-    """Beam, damping and torque channel. Its delay includes that of the weighted mean of records,
-    but not that of the low-pass filter. Ends of the beam and filters are not used."""
+    """Beam, damping and torque channel. The channel's delay includes the averaging of the sensor's
+    records, but not the low-pass filter. The plant's beam ends and filters are not used."""
     angle_delay_s: float = 0.0
-    """Age of the angle at the time of its sample."""
+    """Time in s from the measurement of the angle to its sample."""
     sensor_filter: SensorFilter = NO_FILTER
     """Filters of torque and shear."""
     source: str = "profile"
-    """Source of the model, for the operator."""
+    """Origin of the model, as shown to the operator: ``profile`` or the path of a document."""
     std: Mapping[str, float] = field(default_factory=dict)
     """Standard deviation of each uncertain parameter in its unit, by name. The mass per length is
-    the product of bending stiffness and density over stiffness."""
+    no parameter, but the product of bending stiffness and density over stiffness."""
 
     @property
     def wrench_delay_s(self) -> float:
-        """Age of torque and shear in s, without the delay of averaging the sensor's records."""
+        """Delay of torque and shear in s, without that of averaging the sensor's records."""
         return self.angle_delay_s + self.plant.delay_s - self.sensor_filter.weights_delay_s
 
     def with_changed_parameter(self, name: str, parameter_change: float) -> "TouchModel":
-        """Return the model with one parameter changed by a given difference.
+        """Return the model with a difference added to one parameter, limited to valid values.
 
         Parameters
         ----------
         name
             Name of the parameter, such as ``zeta``.
         parameter_change
-            Difference in the unit of the parameter.
+            Difference that is added, in the unit of the parameter.
 
         Raises
         ------
@@ -73,14 +73,14 @@ class TouchModel:
     ) -> "TouchModel":
         """Return the model of a beam that was not identified, with assumed uncertainties.
 
-        They are 1 % for stiffness and density, and 20 % for the damping.
+        The standard deviations are 1 % for stiffness and density and 20 % for the damping.
 
         Parameters
         ----------
         plant
             Beam, damping and torque channel.
         angle_delay_s
-            Age of the angle at the time of its sample.
+            Time in s from the measurement of the angle to its sample.
         sensor_filter
             Filters of torque and shear.
         """
@@ -99,7 +99,7 @@ class TouchModel:
     def from_analysis(
         cls,
         path: str | Path,
-        stated: Plant,
+        stated_plant: Plant,
         angle_delay_s: float = 0.0,
         sensor_filter: SensorFilter = NO_FILTER,
     ) -> "TouchModel":
@@ -109,9 +109,9 @@ class TouchModel:
         ----------
         path
             Path of the JSON document.
-        stated
-            Stated plant: its length, which cannot be identified from a session, its tool inertia
-            and delay apply if the document has none.
+        stated_plant
+            Plant of the profile. It supplies the length, which a session cannot identify, and tool
+            inertia and delay if the document does not have them.
         angle_delay_s, sensor_filter
             Values of the profile.
 
@@ -121,7 +121,7 @@ class TouchModel:
             If the file cannot be read, lacks the beam's stiffness or density, has an effect that a
             uniform beam on a rigid clamp does not have, or flags a required number.
         """
-        identified = read_identified_beam(path, stated, TOUCH)
+        identified = read_identified_beam(path, stated_plant, TOUCH)
         return cls(
             identified.plant,
             angle_delay_s,

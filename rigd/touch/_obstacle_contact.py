@@ -1,9 +1,9 @@
-"""Springy obstacle at rest: point, instant and stiffness from the integration of the contact.
+"""Contact with one obstacle: predicted effects, and fit of position, instant and stiffness.
 
-A candidate is a set of values for the three parameters. A grid of candidates is integrated for the
-first samples, and the best candidates of each position for more samples. The best of these are
-refined by least squares (Levenberg and Marquardt, derivatives by differences, all candidates in one
-batch). A bouncing contact has many local minima, which is why there are so many candidates.
+A candidate is a set of parameter values. The contact of each candidate of a grid is integrated for
+the first samples, that of the best candidates at each position for more samples. The best of these
+are refined by least squares (Levenberg and Marquardt, numerical derivatives, all candidates in one
+batch). There are many candidates because a bouncing contact has many local minima.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from rigd.touch._kernels import ContactKernels, cubic_weights, interpolate_rows
 Real = NDArray[np.float64]
 
 OBSTACLE_PARAMETERS = ("x_m", "time_s", "ln_stiffness", "rate_m_per_s", "mobility_m_per_n_s")
-"""Names of the parameters of an obstacle, in the order of a candidate's columns; the last two are
+"""Names of an obstacle's parameters, in the order of a candidate's columns; the last two are
 omitted for an obstacle at rest."""
 
 MAX_LN_STIFFNESS = log(1e6)
@@ -30,8 +30,8 @@ MIN_LN_STIFFNESS = log(10.0)
 """Logarithm of the smallest stiffness of an obstacle in N/m."""
 
 Prediction = Callable[[Real, "WhitenedWindow"], Real]
-"""Function that predicts the effect of candidates, shape (k, p), on torque and base shear in a
-window of samples, shape (k, c, samples)."""
+"""Function that predicts the effects (k, c, samples) of candidates (k, p) on torque and base shear
+in a window of samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,74 +42,82 @@ class ParameterRanges:
     """Smallest value of each parameter."""
     high: Real
     """Largest value of each parameter."""
-    difference: Real
+    derivative_step: Real
     """Change of each parameter for a numerical derivative."""
-    scale: Real
+    significant_change: Real
     """Significant change of each parameter; an iteration changes it by at most eight times this."""
     smallest_std: Real
-    """Smallest standard deviation of each parameter for drawing samples."""
+    """Lower limit of the standard deviation with which values of each parameter are drawn."""
     largest_std: Real
-    """Largest standard deviation of each parameter for drawing samples."""
+    """Upper limit of the standard deviation with which values of each parameter are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class WhitenedWindow:
-    """Whitened innovations in a range of samples, with which predictions are compared."""
+    """Whitened innovations of successive samples, with which predicted effects are compared."""
 
     motion: FreeMotion
     """Motion of the beam without a touch in the record."""
-    first: int
+    first_sample: int
     """Index of the first sample."""
-    end: int
+    end_sample: int
     """Index of the sample after the last."""
     whitening: Real
-    """Inverse Cholesky factor of the covariance of noise and uncertainties of the free motion."""
+    """Inverse Cholesky factor of the covariance that noise and uncertainties cause, shape (n,
+    n)."""
     data: Real
     """Whitened innovations of torque and base shear, shape (n,)."""
 
     @classmethod
     def from_motion(
-        cls, free_motion: FreeMotion, first: int, end: int, deviations: Real | None = None
+        cls,
+        free_motion: FreeMotion,
+        first_sample: int,
+        end_sample: int,
+        effects_per_std: Real | None = None,
     ) -> "WhitenedWindow":
-        """Return the whitened innovations of the samples from `first` to `end`.
+        """Return the whitened innovations of the samples from `first_sample` to `end_sample`.
 
         Parameters
         ----------
         free_motion
             Motion of the beam without a touch in the record.
-        first, end
+        first_sample, end_sample
             Index of the first sample, and of the sample after the last.
-        deviations
-            Effects of all uncertainties on torque and shear, for one standard deviation each, shape
-            (c, n, r) from sample `first`. None: the effects of the free motion's uncertainty are
-            used, without those that the touch transmits.
+        effects_per_std
+            Effect of one standard deviation of each of r uncertainties on torque and shear, shape
+            (c, n, r) from `first_sample` on. None: only the uncertainty of the free motion is used,
+            without its effect on the contact.
         """
-        if deviations is None:
-            deviations = free_motion.design[:, first:end] @ free_motion.spread
-        noise_stds = free_motion.noise[:, None, None]
-        scaled_deviations = (deviations[:, : end - first] / noise_stds).reshape(
-            -1, deviations.shape[2]
+        if effects_per_std is None:
+            effects_per_std = (
+                free_motion.design_matrices[:, first_sample:end_sample]
+                @ free_motion.amplitude_cholesky
+            )
+        noise_stds = free_motion.noise_stds[:, None, None]
+        scaled_effects = (effects_per_std[:, : end_sample - first_sample] / noise_stds).reshape(
+            -1, effects_per_std.shape[2]
         )
-        covariance = np.eye(scaled_deviations.shape[0]) + scaled_deviations @ scaled_deviations.T
+        covariance = np.eye(scaled_effects.shape[0]) + scaled_effects @ scaled_effects.T
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
         scaled_innovations = (
-            free_motion.innovations[:, first:end] / free_motion.noise[:, None]
+            free_motion.innovations[:, first_sample:end_sample] / free_motion.noise_stds[:, None]
         ).ravel()
-        return cls(free_motion, first, end, whitening, whitening @ scaled_innovations)
+        return cls(free_motion, first_sample, end_sample, whitening, whitening @ scaled_innovations)
 
     def residuals(self, predicted_effects: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-        """Return the whitened innovations minus predicted effects of touches, shape (k, n).
+        """Return the whitened innovations minus the whitened predicted effects, shape (k, n).
 
         The result has the floating-point precision of the prediction.
 
         Parameters
         ----------
         predicted_effects
-            Effect of each touch on torque and base shear, shape (k, c, samples).
+            Predicted effect of each touch on torque and base shear, shape (k, c, samples).
         """
         noise_stds, whitening, whitened_data = (
             float_array.astype(predicted_effects.dtype, copy=False)
-            for float_array in (self.motion.noise, self.whitening, self.data)
+            for float_array in (self.motion.noise_stds, self.whitening, self.data)
         )
         scaled_predictions = (predicted_effects / noise_stds[:, None]).reshape(
             predicted_effects.shape[0], -1
@@ -125,7 +133,7 @@ class ObstacleContact:
     kernels
         Contact kernels at some positions, on the time steps of the integration.
     x_m
-        Positions at which the displacement of the free motion is given.
+        Positions of the displacements in `free_motion`.
     free_motion
         Motion of the beam without a touch in the record.
     """
@@ -139,7 +147,7 @@ class ObstacleContact:
         self,
         parameters: Real,
         sample_window: WhitenedWindow,
-        pressing_side: float | None = None,
+        pressing_sign: float | None = None,
         kernels: ContactKernels | None = None,
     ) -> tuple[Real, Real]:
         """Return the effect of obstacles on torque and shear, and the contact forces in N.
@@ -151,25 +159,25 @@ class ObstacleContact:
             (k, p).
         sample_window
             Samples for which the effect is predicted.
-        pressing_side
-            Direction in which the beam presses, 1 or -1; None: the direction of its motion.
+        pressing_sign
+            Direction in which the beam presses, 1 or -1; None: that of its motion at the touch.
         kernels
-            Kernels with one row for the only position; None: they are interpolated.
+            Kernels at the position of the only candidate; None: interpolated kernels.
 
         Returns
         -------
         channels : ndarray, shape (k, c, samples)
             Effect on torque and base shear.
         force : ndarray, shape (k, n)
-            Force on the beam in N, at the steps from the touch on.
+            Force on the beam in N, at the time steps from the touch on.
         """
         free_motion = self._motion
         x, instants_s = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
         time_steps = self.step_count(instants_s, sample_window)
         local_kernels = self._kernels.at_positions(x, time_steps) if kernels is None else kernels
-        approaches_m, pressing_sides = self.motion_beyond_obstacle(
-            x, instants_s, time_steps, pressing_side
+        approaches_m, pressing_signs = self.motion_beyond_obstacle(
+            x, instants_s, time_steps, pressing_sign
         )
         motion_parameters = parameters[:, 3:].T
         pressing_force_n = integrate_contact(
@@ -177,22 +185,22 @@ class ObstacleContact:
             approaches_m,
             np.exp(parameters[:, 2]),
             step_s,
-            *(pressing_sides * motion_parameters[0],) if len(motion_parameters) else (),
+            *(pressing_signs * motion_parameters[0],) if len(motion_parameters) else (),
             *motion_parameters[1:2],
         )
-        forces_n = -pressing_sides[:, None] * pressing_force_n
+        forces_n = -pressing_signs[:, None] * pressing_force_n
         kernel_tables = (local_kernels.torque, local_kernels.shear)[
             : free_motion.innovations.shape[0]
         ]
-        return self.effects(kernel_tables, forces_n, instants_s, sample_window), forces_n
+        return self.force_effects(kernel_tables, forces_n, instants_s, sample_window), forces_n
 
     def effect_of_changed_motion(
         self, parameters: Real, sample_window: WhitenedWindow, displacement_changes_m: Real
     ) -> Real:
-        """Return how changes of the free motion act on torque and shear through the contact.
+        """Return the effects of changed free motions on torque and shear through the contact.
 
-        Another free motion meets the obstacle at another instant, which changes the contact force.
-        The shape is (r, c, samples).
+        A change of the free motion changes the instant of touch, and thereby the contact force. The
+        shape is (r, c, samples).
 
         Parameters
         ----------
@@ -201,15 +209,15 @@ class ObstacleContact:
         sample_window
             Samples for which the effect is predicted.
         displacement_changes_m
-            Changes of the displacement at the obstacle's position, on the free motion's steps from
-            its first step on, shape (r, columns).
+            Changes of the displacement at the obstacle's position, at the time steps of the free
+            motion, shape (r, steps).
         """
         x, instant_s = parameters[:1], parameters[1:2]
         time_steps = self.step_count(instant_s, sample_window)
         local_kernels = self._kernels.at_positions(x, time_steps)
-        approach_m, pressing_side = self.motion_beyond_obstacle(x, instant_s, time_steps)
+        approach_m, pressing_sign = self.motion_beyond_obstacle(x, instant_s, time_steps)
         repeated_instants_s = np.repeat(instant_s, len(displacement_changes_m))
-        added_approach_m = pressing_side * self._on_kernel_steps(
+        added_approach_m = pressing_sign * self._interpolate_to_steps(
             displacement_changes_m, repeated_instants_s, time_steps
         )
         all_approaches = np.vstack(
@@ -225,9 +233,9 @@ class ObstacleContact:
         kernel_tables = (local_kernels.torque, local_kernels.shear)[
             : self._motion.innovations.shape[0]
         ]
-        return self.effects(
+        return self.force_effects(
             kernel_tables,
-            -pressing_side * (pressing_force_n[1:] - pressing_force_n[0]),
+            -pressing_sign * (pressing_force_n[1:] - pressing_force_n[0]),
             repeated_instants_s,
             sample_window,
         )
@@ -240,16 +248,17 @@ class ObstacleContact:
         instants_s
             Instants of touch, shape (k,).
         sample_window
-            Samples at whose end the integration ends.
+            Samples; the integration ends with the last one.
         """
         step_s = self._kernels.step_s
         needed_steps = (
-            int(np.ceil((self._motion.t[sample_window.end - 1] - instants_s.min()) / step_s)) + 3
+            int(np.ceil((self._motion.t[sample_window.end_sample - 1] - instants_s.min()) / step_s))
+            + 3
         )
         return min(max(needed_steps, 4), self._kernels.steps)
 
-    def pressing_direction(self, parameters: Real) -> float:
-        """Return the direction of the beam's motion at a touch, 1 or -1.
+    def pressing_sign(self, parameters: Real) -> float:
+        """Return the direction of the free beam's motion at a touch, 1 or -1.
 
         Parameters
         ----------
@@ -258,9 +267,9 @@ class ObstacleContact:
         """
         return float(self.motion_beyond_obstacle(parameters[:1], parameters[1:2], 1)[1][0])
 
-    def effects(
+    def force_effects(
         self,
-        tables: tuple[Real, ...],
+        kernel_tables: tuple[Real, ...],
         forces_n: Real,
         instants_s: Real,
         sample_window: WhitenedWindow,
@@ -269,10 +278,10 @@ class ObstacleContact:
 
         Parameters
         ----------
-        tables
+        kernel_tables
             Kernel of torque, and of shear if measured, with as many rows as `forces_n` or one.
         forces_n
-            Forces on the beam at the steps of the kernels, shape (k, n).
+            Forces on the beam at the time steps of the kernels, shape (k, n).
         instants_s
             Instant of each force's first step, shape (k,).
         sample_window
@@ -281,18 +290,18 @@ class ObstacleContact:
         free_motion = self._motion
         step_s = self._kernels.step_s
         steps_per_sample = round((free_motion.t[1] - free_motion.t[0]) / step_s)
-        sample_count = sample_window.end - sample_window.first
-        begin_steps = (free_motion.t[sample_window.first] - instants_s) / step_s
+        sample_count = sample_window.end_sample - sample_window.first_sample
+        begin_steps = (free_motion.t[sample_window.first_sample] - instants_s) / step_s
         # Convolution and shift commute: shifting first puts the steps of all at the samples.
         aligned_forces = shift_rows(
             forces_n, begin_steps, (sample_count - 1) * steps_per_sample + 1
         )
-        return contact_responses(tables, aligned_forces, steps_per_sample, sample_count)
+        return contact_responses(kernel_tables, aligned_forces, steps_per_sample, sample_count)
 
     def motion_beyond_obstacle(
-        self, positions_m: Real, instants_s: Real, steps: int, given_direction: float | None = None
+        self, positions_m: Real, instants_s: Real, steps: int, given_sign: float | None = None
     ) -> tuple[Real, Real]:
-        """Return how far the free beam would move beyond the obstacle, and in which direction.
+        """Return the free beam's distance beyond each obstacle over time, and its direction.
 
         Parameters
         ----------
@@ -300,32 +309,32 @@ class ObstacleContact:
             Positions and instants of touches, shape (k,).
         steps
             Number of time steps from the instants on.
-        given_direction
+        given_sign
             Direction of the motion, 1 or -1; None: the direction at the instant of touch.
 
         Returns
         -------
-        beyond : ndarray, shape (k, steps)
-            Displacement of the free beam from its displacement at the touch, in m, positive in the
-            direction of the motion.
-        side : ndarray, shape (k,)
+        distance : ndarray, shape (k, steps)
+            Displacement of the free beam in m since the instant of touch, positive in the direction
+            of the motion.
+        sign : ndarray, shape (k,)
             Direction of the motion, 1 or -1.
         """
         free_motion = self._motion
         first_rows, weights = cubic_weights(positions_m, self._x_m)
         displacement_m = interpolate_rows(free_motion.displacement_m, first_rows, weights)
-        free_motion_m = self._on_kernel_steps(displacement_m, instants_s, steps)
-        if given_direction is None:
+        free_motion_m = self._interpolate_to_steps(displacement_m, instants_s, steps)
+        if given_sign is None:
             position_before_m = shift_rows(
                 displacement_m, (instants_s - free_motion.first_s) / free_motion.step_s - 1.0, 1
             )
-            pressing_sides = np.where(free_motion_m[:, 0] >= position_before_m[:, 0], 1.0, -1.0)
+            pressing_signs = np.where(free_motion_m[:, 0] >= position_before_m[:, 0], 1.0, -1.0)
         else:
-            pressing_sides = np.full(positions_m.size, given_direction)
-        return pressing_sides[:, None] * (free_motion_m - free_motion_m[:, :1]), pressing_sides
+            pressing_signs = np.full(positions_m.size, given_sign)
+        return pressing_signs[:, None] * (free_motion_m - free_motion_m[:, :1]), pressing_signs
 
-    def _on_kernel_steps(self, displacement_m: Real, instants_s: Real, steps: int) -> Real:
-        """Interpolate displacements to the time steps of the contact, each row from its instant."""
+    def _interpolate_to_steps(self, displacement_m: Real, instants_s: Real, steps: int) -> Real:
+        """Return displacements at the time steps of the contact, each row from its instant on."""
         free_motion = self._motion
         begin_steps = (instants_s - free_motion.first_s) / free_motion.step_s
         substeps = max(1, round(free_motion.step_s / self._kernels.step_s))
@@ -337,20 +346,20 @@ class ObstacleContact:
 
 
 @dataclass(frozen=True, slots=True)
-class Minima:
-    """Local minima of the sum of squared residuals that least squares found."""
+class LocalMinima:
+    """Local minima of the sum of squared residuals, found by least squares."""
 
     parameters: Real
     """Parameters of each minimum, with the columns of `OBSTACLE_PARAMETERS`; shape (k, p)."""
     chi2: Real
     """Sum of squared residuals at each minimum, shape (k,)."""
     jacobian: Real
-    """Derivatives of the residuals by the parameters, shape (k, n, p)."""
+    """Derivatives of the residuals with respect to the parameters, shape (k, n, p)."""
 
 
 _MIN_CHI2_REDUCTION = 0.1
-"""Reduction of the sum of squared residuals below which a step of least squares is the last. For a
-step that fails, the predicted reduction counts."""
+"""Reduction of the sum of squared residuals below which an iteration is the last one. If the sum
+increases, the reduction predicted by the linearised model is compared."""
 
 
 def find_minima(
@@ -358,10 +367,10 @@ def find_minima(
     sample_window: WhitenedWindow,
     start_candidates: Real,
     parameter_ranges: ParameterRanges,
-    rounds: int = 12,
-    free: NDArray[np.bool_] | None = None,
-) -> Minima:
-    """Minimise the sum of squared residuals from each start by least squares; return the minima.
+    max_iterations: int = 12,
+    free_parameters: NDArray[np.bool_] | None = None,
+) -> LocalMinima:
+    """Return the local minima of the sum of squared residuals that are reached from given starts.
 
     Parameters
     ----------
@@ -373,10 +382,10 @@ def find_minima(
         Candidates from which the iterations start, shape (k, p).
     parameter_ranges
         Ranges of the parameters.
-    rounds
+    max_iterations
         Largest number of iterations.
-    free
-        Whether each parameter of each start is free, shape (k, p); None: all are free.
+    free_parameters
+        Whether each parameter of each start is varied, shape (k, p); None: all are varied.
     """
     best_parameters = np.clip(start_candidates, parameter_ranges.low, parameter_ranges.high)
     damping_factors = np.full(len(best_parameters), 1e-2)
@@ -385,12 +394,12 @@ def find_minima(
     )
     chi2 = np.einsum("kn,kn->k", current_residuals, current_residuals)
     is_active = np.ones(len(best_parameters), dtype=bool)
-    regularisation = 1e-6 / parameter_ranges.scale**2
-    for _ in range(rounds):
+    regularisation = 1e-6 / parameter_ranges.significant_change**2
+    for _ in range(max_iterations):
         active_rows = np.flatnonzero(is_active)
         j, r = jacobians[active_rows], current_residuals[active_rows]
-        if free is not None:
-            j = j * free[active_rows, None]
+        if free_parameters is not None:
+            j = j * free_parameters[active_rows, None]
         normal_matrices = np.einsum("knp,knq->kpq", j, j)
         gradients = np.einsum("knp,kn->kp", j, r)
         normal_diagonals = (
@@ -400,7 +409,9 @@ def find_minima(
         normal_matrices += normal_diagonals[:, :, None] * np.eye(best_parameters.shape[1])
         parameter_steps = -np.linalg.solve(normal_matrices, gradients[:, :, None])[:, :, 0]
         parameter_steps = np.clip(
-            parameter_steps, -8 * parameter_ranges.scale, 8 * parameter_ranges.scale
+            parameter_steps,
+            -8 * parameter_ranges.significant_change,
+            8 * parameter_ranges.significant_change,
         )
         trial_parameters = np.clip(
             best_parameters[active_rows] + parameter_steps,
@@ -410,15 +421,15 @@ def find_minima(
         predicted_residual = r + np.einsum(
             "knp,kp->kn", j, trial_parameters - best_parameters[active_rows]
         )
-        predicted_gain = chi2[active_rows] - np.einsum(
+        predicted_reduction = chi2[active_rows] - np.einsum(
             "kn,kn->k", predicted_residual, predicted_residual
         )
         new_residuals, new_jacobian = _linearise(
             predict_effect, sample_window, trial_parameters, parameter_ranges
         )
         new_chi2 = np.einsum("kn,kn->k", new_residuals, new_residuals)
-        chi2_gain = chi2[active_rows] - new_chi2
-        is_improved = chi2_gain > 0
+        chi2_reduction = chi2[active_rows] - new_chi2
+        is_improved = chi2_reduction > 0
         accepted_rows = active_rows[is_improved]
         best_parameters[accepted_rows], chi2[accepted_rows] = (
             trial_parameters[is_improved],
@@ -433,11 +444,13 @@ def find_minima(
         )
         # Residuals have kinks where contacts begin and end: short steps may fail to reduce them.
         is_active[
-            active_rows[np.where(is_improved, chi2_gain, predicted_gain) < _MIN_CHI2_REDUCTION]
+            active_rows[
+                np.where(is_improved, chi2_reduction, predicted_reduction) < _MIN_CHI2_REDUCTION
+            ]
         ] = False
         if not is_active.any():
             break
-    return Minima(best_parameters, chi2, jacobians)
+    return LocalMinima(best_parameters, chi2, jacobians)
 
 
 def _linearise(
@@ -446,12 +459,12 @@ def _linearise(
     current_candidates: Real,
     parameter_ranges: ParameterRanges,
 ) -> tuple[Real, Real]:
-    """Return candidates' residuals (k, n), and their derivatives by the parameters (k, n, p)."""
+    """Return the candidates' residuals (k, n) and the derivatives by their parameters (k, n, p)."""
     parameter_count = current_candidates.shape[1]
     parameter_shifts = np.where(
-        current_candidates + parameter_ranges.difference > parameter_ranges.high,
-        -parameter_ranges.difference,
-        parameter_ranges.difference,
+        current_candidates + parameter_ranges.derivative_step > parameter_ranges.high,
+        -parameter_ranges.derivative_step,
+        parameter_ranges.derivative_step,
     )
     shifted_candidates = np.concatenate(
         [
@@ -470,35 +483,51 @@ def _linearise(
 
 
 class CandidateGrid:
-    """Grid of candidate obstacles over position, instant and stiffness, to start a search.
+    """Grid of candidate obstacles at rest: positions, instants and stiffnesses to start a search.
 
-    All candidates are integrated together in coarse time steps.
+    The contacts of all candidates are integrated together, in coarse time steps.
 
     Parameters
     ----------
     kernels
-        Contact kernels whose step divides the sampling period.
+        Contact kernels whose time step is an integer fraction of the sampling period.
     position_stride
-        Number of the kernels' positions from one position of the grid to the next.
+        The grid has every `position_stride`-th position of the kernels.
     rate_hz
         Samples a second.
     sample_count
-        Number of samples that are compared.
+        Number of samples with which the candidates are compared.
     """
 
-    __slots__ = ("_channels", "_kernel", "_ratio", "_samples", "_step_s", "_stride", "_x_m")
+    __slots__ = (
+        "_displacement_kernels",
+        "_lag_kernels",
+        "_position_stride",
+        "_sample_count",
+        "_step_s",
+        "_steps_per_sample",
+        "_x_m",
+    )
 
     def __init__(
         self, kernels: ContactKernels, position_stride: int, rate_hz: float, sample_count: int
     ) -> None:
-        self._ratio = round(1 / (rate_hz * kernels.step_s))
-        self._samples, self._stride, self._step_s = sample_count, position_stride, kernels.step_s
-        time_steps = self._ratio * sample_count
+        self._steps_per_sample = round(1 / (rate_hz * kernels.step_s))
+        self._sample_count, self._position_stride, self._step_s = (
+            sample_count,
+            position_stride,
+            kernels.step_s,
+        )
+        time_steps = self._steps_per_sample * sample_count
         self._x_m = kernels.x_m[::position_stride]
         # Single precision suffices for choosing starts, and is twice as fast.
-        self._kernel = kernels.displacement[::position_stride, :time_steps].astype(np.float32)
-        lag_steps = self._ratio * np.arange(sample_count)[:, None] - np.arange(time_steps)
-        self._channels = [
+        self._displacement_kernels = kernels.displacement[::position_stride, :time_steps].astype(
+            np.float32
+        )
+        lag_steps = self._steps_per_sample * np.arange(sample_count)[:, None] - np.arange(
+            time_steps
+        )
+        self._lag_kernels = [
             np.where(
                 lag_steps >= 0, kernel_table[::position_stride][:, np.maximum(lag_steps, 0)], 0.0
             )
@@ -510,7 +539,7 @@ class CandidateGrid:
     def integrate(
         self, free_motion: FreeMotion, sample_window: WhitenedWindow, latest_sample: int
     ) -> tuple[Real, Real]:
-        """Return all candidate obstacles of the grid, and their sums of squared residuals.
+        """Return all candidates of the grid (k, 3), and their sums of squared residuals (k,).
 
         Parameters
         ----------
@@ -519,13 +548,12 @@ class CandidateGrid:
         sample_window
             Whitened innovations with which the candidates are compared.
         latest_sample
-            Index of the last sample at which the touch may begin. The earliest is the first sample
-            of the window.
+            Index of the last sample at which the touch may begin.
         """
-        touch_samples = np.arange(sample_window.first + 1, latest_sample + 1)
+        touch_samples = np.arange(sample_window.first_sample + 1, latest_sample + 1)
         sample_batches = np.array_split(touch_samples, -(-touch_samples.size // _INSTANTS_AT_ONCE))
         chi2 = [
-            self._sums_of_squares(free_motion, sample_window, sample_batch)
+            self._sums_of_squared_residuals(free_motion, sample_window, sample_batch)
             for sample_batch in sample_batches
         ]
         grid_axes = np.meshgrid(
@@ -533,55 +561,57 @@ class CandidateGrid:
         )
         return np.stack(grid_axes, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
-    def _sums_of_squares(
+    def _sums_of_squared_residuals(
         self, free_motion: FreeMotion, sample_window: WhitenedWindow, samples: NDArray[np.intp]
     ) -> Real:
-        """Return the grid candidates' sums of squared residuals for touches at some samples.
+        """Return the sums of squared residuals of the candidates whose touch begins at `samples`.
 
-        The shape is (positions, instants, stiffnesses).
+        The shape is (positions, samples, stiffnesses).
         """
         position_count, stiffness_count = self._x_m.size, GRID_STIFFNESSES_N_PER_M.size
-        sample_count = sample_window.end - int(samples[0])
-        time_steps = self._ratio * sample_count
+        sample_count = sample_window.end_sample - int(samples[0])
+        time_steps = self._steps_per_sample * sample_count
         begin_steps = np.round(
             (free_motion.t[samples] - free_motion.first_s) / free_motion.step_s
         ).astype(np.intp)
         step_columns = begin_steps[:, None] + np.arange(-1, time_steps)
         last_column = free_motion.displacement_m.shape[1] - 1
-        displacement_m = free_motion.displacement_m[:: self._stride][
+        displacement_m = free_motion.displacement_m[:: self._position_stride][
             :, np.minimum(step_columns, last_column)
         ]
         # Axes: position, instant, step.
-        pressing_sides = np.where(displacement_m[:, :, 1] >= displacement_m[:, :, 0], 1, -1)[
+        pressing_signs = np.where(displacement_m[:, :, 1] >= displacement_m[:, :, 0], 1, -1)[
             :, :, None
         ].astype(np.float32)
         approaches_m = (
-            pressing_sides * (displacement_m[:, :, 1:] - displacement_m[:, :, 1:2])
+            pressing_signs * (displacement_m[:, :, 1:] - displacement_m[:, :, 1:2])
         ).astype(np.float32)
         pressing_force_n = integrate_contact(
-            self._kernel[:, :time_steps],
+            self._displacement_kernels[:, :time_steps],
             np.repeat(approaches_m, stiffness_count, axis=1),
             np.tile(GRID_STIFFNESSES_N_PER_M.astype(np.float32), (position_count, samples.size)),
             self._step_s,
         )
-        forces_n = -np.repeat(pressing_sides, stiffness_count, axis=1) * pressing_force_n
+        forces_n = -np.repeat(pressing_signs, stiffness_count, axis=1) * pressing_force_n
         predicted_effects = np.zeros(
             (
                 position_count,
                 samples.size,
                 stiffness_count,
-                free_motion.noise.size,
-                sample_window.end - sample_window.first,
+                free_motion.noise_stds.size,
+                sample_window.end_sample - sample_window.first_sample,
             ),
             dtype=np.float32,
         )
-        for channel_index in range(free_motion.noise.size):
-            channel_effect = forces_n @ self._channels[channel_index][:, :time_steps, :sample_count]
+        for channel_index in range(free_motion.noise_stds.size):
+            channel_effect = (
+                forces_n @ self._lag_kernels[channel_index][:, :time_steps, :sample_count]
+            )
             channel_effect = channel_effect.reshape(
                 position_count, samples.size, stiffness_count, sample_count
             )
             for i, touch_sample in enumerate(samples):
-                later_samples = sample_window.end - touch_sample
+                later_samples = sample_window.end_sample - touch_sample
                 predicted_effects[:, i, :, channel_index, -later_samples:] = channel_effect[
                     :, i, :, :later_samples
                 ]
@@ -593,7 +623,7 @@ class CandidateGrid:
 
 
 _INSTANTS_AT_ONCE = 16
-"""Number of instants of touch in the grid that are integrated at once."""
+"""Number of instants of touch whose candidates are integrated at once."""
 GRID_STIFFNESSES_N_PER_M = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 100000.0])
 """Stiffnesses of the grid's candidates in N/m."""
 

@@ -1,8 +1,8 @@
-"""Two obstacles at rest, the second touched with or after the first.
+"""Contact with two obstacles at rest, of which the second is touched with or after the first.
 
-Each force bends the beam also at the other position, so both contacts are integrated together. Two
-soft obstacles that are touched at about the same time have a similar effect as one obstacle between
-them. Every touch that one obstacle explains is therefore tested for a second obstacle.
+Each force also bends the beam at the other position, so that both contacts are integrated together.
+Two soft obstacles that are touched at about the same time have a similar effect to one obstacle
+between them. Every touch that one obstacle explains is therefore tested for a second obstacle.
 """
 
 import numpy as np
@@ -20,26 +20,26 @@ from rigd.touch._obstacle_contact import (
 Real = NDArray[np.float64]
 
 _SECOND_TOUCH_DELAYS_S = np.array([0.0, 0.008, 0.025, 0.06])
-"""Times in s from the first touch to that of the second obstacle by a free beam, with which the
-search starts."""
+"""Times in s from the first to the second touch from which the search starts, if the first obstacle
+did not slow the beam."""
 _POSITION_COUNT = 12
-"""Number of positions of the second obstacle with which the search starts."""
+"""Number of positions of the second obstacle among which the search chooses its starts."""
 _TRIAL_STIFFNESS_N_PER_M = 100.0
-"""Stiffness of the second obstacle whose effect is computed; the effect of other soft obstacles is
-proportional to their stiffness."""
-_EQUIVALENT_POSITIONS = np.array([[0.6, 1.6], [0.8, 1.3], [0.6, 2.5]])
-"""Positions of two obstacles that are equivalent to one obstacle, over its position. Each of the
-two has half of the moment."""
+"""Stiffness of the second obstacle for which first-order effects are computed; they are scaled in
+proportion to the stiffness."""
+_RELATIVE_EQUIVALENT_POSITIONS = np.array([[0.6, 1.6], [0.8, 1.3], [0.6, 2.5]])
+"""Positions of two obstacles with about the effect of one, divided by the position of the one. Each
+of the two exerts half of its moment."""
 _MAX_DISTANCE_M = 0.3
-"""Largest distance in m of the free beam from the second obstacle at the first touch."""
+"""Largest distance in m from the free beam to the second obstacle at the first touch."""
 
 
 class TwoObstacleContact:
     """Model of the beam's contact with two obstacles, for the record of one touch.
 
-    Candidates have six columns: position, instant and logarithm of the stiffness of the first
-    obstacle, then the position of the second obstacle, the free beam's distance from it at that
-    instant in m, and the logarithm of its stiffness.
+    Candidates have six columns. The first three are position, instant and logarithm of stiffness
+    of the first obstacle. The others are the position of the second obstacle, its distance in m
+    from the free beam at the instant of the first touch, and the logarithm of its stiffness.
 
     Parameters
     ----------
@@ -47,16 +47,19 @@ class TwoObstacleContact:
         Integration of the contact with one obstacle.
     kernels
         Contact kernels on the time steps of the integration.
-    pair_kernels
+    cross_kernels
         Kernels from a force at one position to the displacement at another, on the same steps.
     """
 
-    __slots__ = ("_contact", "_crossing", "_kernels")
+    __slots__ = ("_contact", "_cross_kernels", "_kernels")
 
     def __init__(
-        self, obstacle_contact: ObstacleContact, kernels: ContactKernels, pair_kernels: CrossKernels
+        self,
+        obstacle_contact: ObstacleContact,
+        kernels: ContactKernels,
+        cross_kernels: CrossKernels,
     ) -> None:
-        self._contact, self._kernels, self._crossing = obstacle_contact, kernels, pair_kernels
+        self._contact, self._kernels, self._cross_kernels = obstacle_contact, kernels, cross_kernels
 
     def predict(self, parameters: Real, sample_window: WhitenedWindow) -> tuple[Real, Real]:
         """Return the effect of two obstacles on torque and shear, and the force of the first.
@@ -73,18 +76,18 @@ class TwoObstacleContact:
         channels : ndarray, shape (k, c, samples)
             Effect on torque and base shear.
         force : ndarray, shape (k, n)
-            Force of the first obstacle on the beam in N, at the steps from the touch on.
+            Force of the first obstacle on the beam in N, at the time steps from the touch on.
         """
         obstacle_contact, instants_s = self._contact, parameters[:, 1]
         step_count = obstacle_contact.step_count(instants_s, sample_window)
         positions_m = parameters[:, 0], parameters[:, 3]
         local_kernels = [self._kernels.at_positions(x, step_count) for x in positions_m]
-        (beyond_first_m, first_side), (beyond_second_m, second_side) = (
+        (beyond_first_m, first_sign), (beyond_second_m, second_sign) = (
             obstacle_contact.motion_beyond_obstacle(x, instants_s, step_count) for x in positions_m
         )
         local_cross_kernels = (
-            self._crossing.between_positions(*positions_m, step_count)
-            * (first_side * second_side)[:, None]
+            self._cross_kernels.between_positions(*positions_m, step_count)
+            * (first_sign * second_sign)[:, None]
         )
         pressing_forces_n = integrate_two_contacts(
             (local_kernels[0].displacement, local_kernels[1].displacement),
@@ -93,12 +96,12 @@ class TwoObstacleContact:
             (np.exp(parameters[:, 2]), np.exp(parameters[:, 5])),
         )
         forces_n = (
-            -first_side[:, None] * pressing_forces_n[0],
-            -second_side[:, None] * pressing_forces_n[1],
+            -first_sign[:, None] * pressing_forces_n[0],
+            -second_sign[:, None] * pressing_forces_n[1],
         )
-        channel_count = sample_window.motion.noise.size
+        channel_count = sample_window.motion.noise_stds.size
         first_effect, second_effect = (
-            obstacle_contact.effects(
+            obstacle_contact.force_effects(
                 (position_kernels.torque, position_kernels.shear)[:channel_count],
                 force_n,
                 instants_s,
@@ -115,7 +118,7 @@ class TwoObstacleContact:
         """
         return self.predict(parameters, sample_window)[0]
 
-    def starts(
+    def start_pairs(
         self,
         single_obstacle: Real,
         sample_window: WhitenedWindow,
@@ -124,7 +127,8 @@ class TwoObstacleContact:
     ) -> Real:
         """Return pairs of obstacles from which the search starts, shape (k, 6).
 
-        Some have a similar effect as one obstacle, others have a second obstacle in addition to it.
+        Some pairs have about the effect of the single obstacle; in the others, a second obstacle is
+        added to it.
 
         Parameters
         ----------
@@ -136,12 +140,12 @@ class TwoObstacleContact:
         parameter_ranges
             Ranges of the parameters.
         pair_count
-            Number of positions of a second obstacle: those with the largest reduction of the
-            residuals, by first-order effects.
+            Number of pairs with an added second obstacle. Its positions are those for which first-
+            order effects predict the largest reduction of the residuals.
         """
         return np.vstack(
             [
-                self.equivalent_pairs(single_obstacle, _EQUIVALENT_POSITIONS),
+                self.equivalent_pairs(single_obstacle, _RELATIVE_EQUIVALENT_POSITIONS),
                 self._with_second_obstacle(
                     single_obstacle, sample_window, parameter_ranges, pair_count
                 ),
@@ -150,14 +154,14 @@ class TwoObstacleContact:
 
     @staticmethod
     def equivalent_pairs(single_obstacle: Real, relative_positions: Real) -> Real:
-        """Return pairs of obstacles with about the effect of a single one, shape (k, 6).
+        """Return pairs of obstacles that have about the effect of a single one, shape (k, 6).
 
         Parameters
         ----------
         single_obstacle
             Position, instant and logarithm of the stiffness of the single obstacle.
         relative_positions
-            Positions of the two obstacles over that of the single one, shape (k, 2).
+            Positions of the two obstacles, divided by that of the single one, shape (k, 2).
         """
         pairs: Real = np.tile(
             np.concatenate([single_obstacle, single_obstacle]), (len(relative_positions), 1)
@@ -174,9 +178,9 @@ class TwoObstacleContact:
         parameter_ranges: ParameterRanges,
         pair_count: int,
     ) -> Real:
-        """Return pairs of one obstacle and a likely second obstacle, shape (pair_count, 6).
+        """Return pairs of the single obstacle and a likely second obstacle, shape (pair_count, 6).
 
-        Their likelihood is computed from the first-order effect of the second obstacle.
+        The likeliest ones are selected by the first-order effect of the second obstacle.
         """
         x_m = np.linspace(parameter_ranges.low[3], parameter_ranges.high[3], _POSITION_COUNT)
         instants_s = np.full(_POSITION_COUNT, single_obstacle[1])
@@ -190,40 +194,45 @@ class TwoObstacleContact:
         without_second = np.concatenate(
             [single_obstacle, [x_m[-1], parameter_ranges.high[4], MIN_LN_STIFFNESS]]
         )
-        changed_first = without_second + np.diag(parameter_ranges.difference)[:3]
+        changed_first = without_second + np.diag(parameter_ranges.derivative_step)[:3]
         candidate_rows = np.vstack([without_second, changed_first, with_second])
         residuals = sample_window.residuals(self.predict_channels(candidate_rows, sample_window))
         residual_without_second, second_effects = residuals[0], residuals[4:] - residuals[0]
-        # Effects that changes of the first could have are projected out of both.
+        # Effects that changes of the first obstacle can have are removed by projection.
         q, triangle = np.linalg.qr(
-            ((residuals[1:4] - residual_without_second) / parameter_ranges.difference[:3, None]).T
+            (
+                (residuals[1:4] - residual_without_second)
+                / parameter_ranges.derivative_step[:3, None]
+            ).T
         )
         projected_effect = second_effects - (second_effects @ q) @ q.T
         effect_power = np.einsum("kn,kn->k", projected_effect, projected_effect) + 1e-300
         effect_factors = np.maximum(
             -(projected_effect @ residual_without_second) / effect_power, 0.0
         )
-        chi2_gain = (effect_factors**2 * effect_power).reshape(_POSITION_COUNT, -1)
-        likeliest_positions = np.argsort(-chi2_gain.max(axis=1))[:pair_count]
-        chosen_rows = likeliest_positions * delay_steps.size + chi2_gain[
+        chi2_reduction = (effect_factors**2 * effect_power).reshape(_POSITION_COUNT, -1)
+        likeliest_positions = np.argsort(-chi2_reduction.max(axis=1))[:pair_count]
+        chosen_rows = likeliest_positions * delay_steps.size + chi2_reduction[
             likeliest_positions
         ].argmax(axis=1)
-        starts: Real = with_second[chosen_rows]
-        starts[:, 5] += np.log(np.clip(effect_factors[chosen_rows], 0.1, 100.0))
+        chosen_pairs: Real = with_second[chosen_rows]
+        chosen_pairs[:, 5] += np.log(np.clip(effect_factors[chosen_rows], 0.1, 100.0))
         first_obstacle_residuals = (
             residual_without_second
             + effect_factors[chosen_rows, None] * second_effects[chosen_rows]
         ) @ q
         # Singular if a parameter has no effect: the first obstacle may not be reached by then.
         first_obstacle_changes = -first_obstacle_residuals @ np.linalg.pinv(triangle).T
-        starts[:, :3] += np.clip(
-            first_obstacle_changes, -4 * parameter_ranges.scale[:3], 4 * parameter_ranges.scale[:3]
+        chosen_pairs[:, :3] += np.clip(
+            first_obstacle_changes,
+            -4 * parameter_ranges.significant_change[:3],
+            4 * parameter_ranges.significant_change[:3],
         )
-        return starts
+        return chosen_pairs
 
     @staticmethod
     def in_reverse_order(parameters: Real) -> Real:
-        """Return pairs in which the second obstacle is touched first, the other right after it.
+        """Return pairs with exchanged obstacles that are touched at the same instant, shape (k, 6).
 
         Parameters
         ----------
@@ -235,13 +244,13 @@ class TwoObstacleContact:
         return reversed_pairs
 
     @staticmethod
-    def space(single_obstacle: ParameterRanges) -> ParameterRanges:
-        """Return the allowed ranges of the six parameters of two obstacles.
+    def parameter_ranges(single_obstacle: ParameterRanges) -> ParameterRanges:
+        """Return bounds and step sizes of the six parameters of two obstacles.
 
         Parameters
         ----------
         single_obstacle
-            Ranges of the parameters of one obstacle at rest.
+            Bounds and step sizes of the parameters of one obstacle at rest.
         """
         return ParameterRanges(
             low=np.concatenate(
@@ -253,8 +262,8 @@ class TwoObstacleContact:
                     [single_obstacle.high[0], _MAX_DISTANCE_M, single_obstacle.high[2]],
                 ]
             ),
-            difference=np.concatenate([single_obstacle.difference, [2e-4, 2e-5, 2e-2]]),
-            scale=np.array([6e-3, 1e-3, 1.0, 6e-3, 1e-3, 1.0]),
+            derivative_step=np.concatenate([single_obstacle.derivative_step, [2e-4, 2e-5, 2e-2]]),
+            significant_change=np.array([6e-3, 1e-3, 1.0, 6e-3, 1e-3, 1.0]),
             smallest_std=np.concatenate([single_obstacle.smallest_std, [1e-3, 2e-5, 2e-2]]),
             largest_std=np.array([0.05, 5e-3, 1.0, 0.2, 0.05, 2.0]),
         )

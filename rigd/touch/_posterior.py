@@ -1,8 +1,8 @@
-"""Posterior of candidates: population Monte Carlo over position, instant and stiffness.
+"""Posterior distribution of an obstacle's parameters, sampled by population Monte Carlo.
 
-The likelihood of a bouncing contact is rough, so the curvatures at its minima do not describe it.
-Samples are drawn around the minima, weighted by their likelihood, and drawn again around the best
-of them (adaptive importance sampling with the weights of the deterministic mixture).
+The likelihood of a bouncing contact is rough, so that curvatures at its maxima do not describe it.
+Samples are drawn around these maxima, weighted by their likelihood, and drawn again around the best
+samples (adaptive importance sampling with deterministic-mixture weights).
 
 References
 ----------
@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 Real = NDArray[np.float64]
 
 _STUDENT_DEGREES = 4.0
-"""Degrees of freedom of the Student distributions from which samples are drawn; they have heavy
-tails."""
+"""Degrees of freedom of the Student distributions from which samples are drawn; few degrees give
+heavy tails."""
 _MAX_CENTRES = 16
-"""Largest number of Student distributions in a round, centred at the best samples."""
+"""Largest number of samples around which Student distributions are centred in the next round."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +38,11 @@ class Posterior:
 
     @property
     def effective_samples(self) -> float:
-        """Effective number of samples: number of equal weights with the same precision."""
+        """Effective sample size: the number of equally weighted samples of the same precision."""
         return float(1 / np.sum(self.weights**2))
 
     def quantiles(self, parameter_column: int, quantile_levels: tuple[float, ...]) -> Real:
-        """Return quantiles of the posterior distribution of one obstacle parameter.
+        """Return quantiles of one parameter's posterior distribution, in the parameter's unit.
 
         Parameters
         ----------
@@ -84,34 +84,34 @@ def sample_posterior(
     covariances: Real,
     bounds: tuple[Real, Real],
     *,
-    scale: float,
-    count: int,
-    rounds: int,
-    enough_samples: float,
+    residual_variance: float,
+    samples_per_round: int,
+    max_rounds: int,
+    sufficient_samples: float,
     smallest_std: Real,
 ) -> Posterior:
-    """Draw weighted samples of obstacle parameters from the posterior, uniform prior in bounds.
+    """Return weighted samples of the posterior distribution, for a uniform prior within bounds.
 
     Parameters
     ----------
     chi2_of
-        Function that returns the sum of squared residuals of rows of parameters.
+        Function that returns the sum of squared residuals of each row of parameters.
     centres
-        Minima of the sum of squared residuals, around which samples are drawn, shape (k, p).
+        Minima of the sum of squared residuals, around which the first samples are drawn, (k, p).
     covariances
-        Covariance of the parameters at each minimum, shape (k, p, p).
+        Covariance with which samples are drawn around each minimum, shape (k, p, p).
     bounds
-        Lower and upper ends of the parameters' ranges.
-    scale
-        Variance of a residual.
-    count
-        Number of samples in a round.
-    rounds
+        Smallest and largest value of each parameter, each of shape (p,).
+    residual_variance
+        Assumed variance of a residual.
+    samples_per_round
+        Number of samples that are drawn in a round.
+    max_rounds
         Largest number of rounds.
-    enough_samples
-        Effective number of samples that ends the rounds.
+    sufficient_samples
+        Effective sample size above which no further round follows.
     smallest_std
-        Smallest standard deviation for drawing samples, shape (p,).
+        Lower limit of the standard deviation with which each parameter is drawn, shape (p,).
     """
     rng = np.random.default_rng(0)  # the same record gives the same answer
     parameter_count = centres.shape[1]
@@ -122,18 +122,20 @@ def sample_posterior(
     proposal_density = np.empty(0)
     proposals: list[tuple[Real, Real, Real]] = []
     posterior = None
-    for _ in range(rounds):
-        chosen_centres = rng.choice(len(centres), count, p=mixture)
+    for _ in range(max_rounds):
+        chosen_centres = rng.choice(len(centres), samples_per_round, p=mixture)
         centre_factors = np.linalg.cholesky(covariances)
-        normal_numbers = rng.standard_normal((count, parameter_count))
-        student_scale = np.sqrt(_STUDENT_DEGREES / rng.chisquare(_STUDENT_DEGREES, count))
+        normal_numbers = rng.standard_normal((samples_per_round, parameter_count))
+        student_scale = np.sqrt(
+            _STUDENT_DEGREES / rng.chisquare(_STUDENT_DEGREES, samples_per_round)
+        )
         drawn_samples = centres[chosen_centres] + student_scale[:, None] * np.einsum(
             "kpq,kq->kp", centre_factors[chosen_centres], normal_numbers
         )
         is_in_bounds = np.all(
             (drawn_samples >= lower_bounds) & (drawn_samples <= upper_bounds), axis=1
         )
-        drawn_chi2 = np.full(count, np.inf)
+        drawn_chi2 = np.full(samples_per_round, np.inf)
         if is_in_bounds.any():
             drawn_chi2[is_in_bounds] = chi2_of(drawn_samples[is_in_bounds])
         proposals.append((centres, covariances, mixture))
@@ -146,11 +148,11 @@ def sample_posterior(
         samples = np.concatenate([samples, drawn_samples])
         chi2 = np.concatenate([chi2, drawn_chi2])
         proposal_density = np.concatenate([proposal_density, own_density])
-        log_weights = -0.5 * (chi2 - chi2.min()) / scale - np.log(proposal_density)
+        log_weights = -0.5 * (chi2 - chi2.min()) / residual_variance - np.log(proposal_density)
         weights = np.exp(log_weights - log_weights.max())
         weights /= weights.sum()
         posterior = Posterior(samples, weights, chi2)
-        if posterior.effective_samples > enough_samples and len(proposals) > 1:
+        if posterior.effective_samples > sufficient_samples and len(proposals) > 1:
             break
         # Tempered weights choose the next centres, so that one lucky sample does not dominate.
         tempered_weights = weights**0.5
@@ -177,7 +179,7 @@ def sample_posterior(
 
 
 def _density(samples: Real, centres: Real, covariances: Real, mixture_weights: Real) -> Real:
-    """Return the density of a mixture of Student distributions at samples, shape (n,).
+    """Return the density of a mixture of Student distributions at each sample, shape (n,).
 
     A constant factor is omitted.
     """

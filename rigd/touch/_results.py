@@ -1,4 +1,4 @@
-"""Results of the estimation of a touch."""
+"""Data classes of an estimated touch."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,7 +11,7 @@ Real = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class TouchQuantity:
-    """Estimated number, with its standard deviation and its 95 % interval."""
+    """Estimated quantity of a touch, with standard deviation and 95 % interval."""
 
     value: float
     """Estimated value."""
@@ -27,7 +27,7 @@ class TouchQuantity:
 
 @dataclass(frozen=True, slots=True)
 class TouchEstimate:
-    """Estimate of one touch: point, instant, force and stiffness, and the kind of obstacle.
+    """Estimate of one touch: position, instant, force and stiffness, and the kind of obstacle.
 
     A quantity is None if the record does not determine it.
     """
@@ -41,22 +41,25 @@ class TouchEstimate:
     stiffness_n_per_m: TouchQuantity | None
     """Stiffness of the obstacle."""
     kind: str
-    """Kind of obstacle: rigid (at rest, springy or not) | yielding | moving | knock | unknown."""
+    """Kind of obstacle: rigid (one at rest, also if springy), yielding, moving, knock (an impact)
+    or unknown."""
     model: str
-    """Source of the beam's model."""
+    """Origin of the beam's model: ``profile`` or the path of a document."""
     channels: int
     """Number of measured quantities: 1 for torque alone, 2 with base shear."""
     samples: int
     """Number of samples after the detection that were used."""
     chi2_per_degree: float
-    """Sum of squared residuals over its expectation from noise: about 1 if the touch is
+    """Sum of squared residuals, divided by its expectation for noise alone: about 1 if the touch is
     explained."""
     positions_m: Real
-    """Positions at which the likelihood is given, shape (m,); empty if it was not requested."""
+    """Positions of `log_likelihood` in m, shape (m,); empty if no likelihood was requested."""
     log_likelihood: Real
-    """Logarithm of the likelihood of a touch at each position by any force, shape (m,)."""
+    """Logarithm of the likelihood of a touch at each position for an arbitrary force, shape
+    (m,)."""
     innovations: Real
-    """Innovations of torque and shear in standard deviations, shape (channels, n)."""
+    """Innovations of torque and shear, divided by their standard deviations, shape (channels,
+    n)."""
     innovation_times_s: Real
     """Instants of the innovations, from the record's first sample; shape (n,)."""
     force_history_n: Real
@@ -66,7 +69,7 @@ class TouchEstimate:
 
     @property
     def explained(self) -> bool:
-        """Whether an obstacle or a knock explains the record except for noise."""
+        """Whether an obstacle or an impact explains the record up to noise."""
         return self.time_s is not None
 
     def as_dict(self, start_s: float = 0.0) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Filters between the beam and the samples of its torque and shear, and their effect on a touch."""
+"""Filters between the torque and shear of the beam and the samples of the force sensor."""
 
 from dataclasses import dataclass
 from math import pi, sqrt
@@ -12,7 +12,7 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class SensorFilter:
-    """Low-pass filter and averaging of torque and shear by the force sensor.
+    """Low-pass filter and averaging that the samples of torque and shear have passed.
 
     Examples
     --------
@@ -29,7 +29,8 @@ class SensorFilter:
     order: int = 1
     """Order of the low-pass filter: 1, or 2 (Butterworth)."""
     weights: tuple[float, ...] = (1.0,)
-    """Weight of each of the sensor's records in a sample, oldest first, with the sum 1."""
+    """Weights of the sensor's records whose weighted mean is a sample, oldest first, with the sum
+    1."""
     spacing_s: float = 0.0
     """Time between two of the sensor's records."""
 
@@ -37,17 +38,17 @@ class SensorFilter:
     def for_records(
         cls, corner_hz: float, order: int, kind: str, record_count: int, spacing_s: float
     ) -> "SensorFilter":
-        """Return the filter of a sensor that sends several readings per tick, which are averaged.
+        """Return the filter of a sensor that sends several records per tick, which are averaged.
 
         Parameters
         ----------
         corner_hz, order
             Corner frequency and order of the sensor's low-pass filter.
         kind
-            How the records form a sample: "mean" of those in one tick, or weighted by a "triangle"
-            over two ticks.
+            How the records form a sample: "mean" of the records of one tick, or "triangle", their
+            mean over two ticks with triangular weights.
         record_count
-            Number of records a tick.
+            Number of records per tick.
         spacing_s
             Time between two records.
         """
@@ -58,16 +59,16 @@ class SensorFilter:
 
     @property
     def weights_delay_s(self) -> float:
-        """Group delay in s of the weighted mean of the sensor's readings of one tick."""
+        """Group delay in s of the weighted mean of the sensor's records."""
         return 0.5 * (len(self.weights) - 1) * self.spacing_s
 
     def response(self, s: ArrayLike) -> Complex:
-        """Return the frequency response of the sensor's filters, delays included.
+        """Return the transfer function of low-pass filter and weighted mean, delay included.
 
         Parameters
         ----------
         s
-            Laplace variable in rad/s, of any shape.
+            Laplace variable in rad/s, of any shape, which the result has too.
         """
         laplace_points = np.asarray(s, dtype=np.complex128)
         record_ages_s = self.spacing_s * np.arange(len(self.weights))[::-1]
@@ -81,4 +82,4 @@ class SensorFilter:
 
 
 NO_FILTER: Final = SensorFilter()
-"""Sensor without filters."""
+"""Filter of a sensor that neither filters nor averages."""

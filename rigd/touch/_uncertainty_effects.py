@@ -1,7 +1,7 @@
-"""Effects of uncertainties on the innovations of a touch.
+"""Effects of uncertainties on the innovations of a touch, for the covariance of the residuals.
 
-The uncertainties are those of the model's parameters, the time steps of the integration, the free
-motion and the encoder's steps, with their effects on the instant of touch.
+The sources are the model's parameters, the time steps of the integration, the fitted free motion
+and the encoder's noise. Each effect includes that of another instant of touch.
 """
 
 import numpy as np
@@ -21,9 +21,9 @@ def uncertainty_effects(
     likely_obstacle: Real,
     sample_window: WhitenedWindow,
 ) -> Real:
-    """Return the effects of r uncertainties on the innovations, for one standard deviation each.
+    """Return the effect of each uncertainty (one standard deviation) on innovations, (c, n, r).
 
-    The shape is (c, n, r), with c = 1 for torque alone and 2 for torque and base shear.
+    c is 1 for torque alone and 2 for torque and base shear, r the number of uncertainties.
 
     Parameters
     ----------
@@ -34,24 +34,24 @@ def uncertainty_effects(
     likely_obstacle
         Position, instant and logarithm of the stiffness of the likeliest obstacle, shape (1, 3).
     sample_window
-        Innovations from a sample that is certainly before the touch to the end.
+        Innovations from a sample that is certainly before the touch on.
     """
-    free_motion, quiet_samples = sample_window.motion, sample_window.first
-    finest_effect = ObstacleContact(touch_tables.finest, touch_tables.x_m, free_motion).predict(
-        likely_obstacle, sample_window
-    )[0][0]
-    obstacle_contact = ObstacleContact(touch_tables.middle, touch_tables.x_m, free_motion)
+    free_motion, quiet_samples = sample_window.motion, sample_window.first_sample
+    finest_effect = ObstacleContact(
+        touch_tables.fine_kernels, touch_tables.x_m, free_motion
+    ).predict(likely_obstacle, sample_window)[0][0]
+    obstacle_contact = ObstacleContact(touch_tables.middle_kernels, touch_tables.x_m, free_motion)
     middle_effect = obstacle_contact.predict(likely_obstacle, sample_window)[0][0]
     effect_list = [
         finest_effect - middle_effect,
         *_free_motion_effects(touch_tables, obstacle_contact, likely_obstacle[0], sample_window),
         *_encoder_noise_effects(touch_tables, obstacle_contact, likely_obstacle[0], sample_window),
     ]
-    window_slice = slice(sample_window.first, sample_window.end)
+    window_slice = slice(sample_window.first_sample, sample_window.end_sample)
     residuals = free_motion.innovations[:, window_slice] - middle_effect
     x = float(likely_obstacle[0, 0])
     nearby_m = min(x, touch_tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
-    for nearby_beam in touch_tables.changed:
+    for nearby_beam in touch_tables.changed_beams:
         changed_beam = nearby_beam.at_positions(nearby_m).motion(
             touch_record, quiet_samples, quiet_samples - 4, free_motion.angle_transform
         )
@@ -59,8 +59,9 @@ def uncertainty_effects(
             nearby_beam.model.plant.beam,
             nearby_beam.model.plant.damping,
             np.array([x]),
-            touch_tables.middle.step_s,
-            round((free_motion.t[-1] - likely_obstacle[0, 1]) / touch_tables.middle.step_s) + 4,
+            touch_tables.middle_kernels.step_s,
+            round((free_motion.t[-1] - likely_obstacle[0, 1]) / touch_tables.middle_kernels.step_s)
+            + 4,
             nearby_beam.model.sensor_filter,
         )
         position_effect, _ = ObstacleContact(nearby_kernels, nearby_m, changed_beam).predict(
@@ -78,13 +79,13 @@ def _free_motion_effects(
     likely_obstacle: Real,
     sample_window: WhitenedWindow,
 ) -> Real:
-    """Return the effects of the free motion's uncertainty on the innovations, (q, c, n).
+    """Return the effects of the free motion's uncertainty on the innovations, shape (q, c, n).
 
-    They include the effects through the contact, such as another instant of touch.
+    Each is the sum of the direct effect and the effect through the changed contact force.
     """
     free_motion = sample_window.motion
-    spread = free_motion.spread
-    amplitude_count = free_motion.ringing.poles.size * 2
+    amplitude_cholesky = free_motion.amplitude_cholesky
+    amplitude_count = free_motion.free_vibration.poles.size * 2
     position_fraction = likely_obstacle[:1] / touch_tables.model.plant.beam.length_m
     step_count = free_motion.displacement_m.shape[1]
     # Times from the record's beginning, as for the amplitudes.
@@ -93,10 +94,13 @@ def _free_motion_effects(
         + touch_tables.model.angle_delay_s
         + free_motion.step_s * np.arange(step_count)
     )
-    displacement_m = free_motion.ringing.at_positions(position_fraction).displacement(
-        t, spread[:amplitude_count]
+    displacement_m = free_motion.free_vibration.at_positions(position_fraction).displacement(
+        t, amplitude_cholesky[:amplitude_count]
     )[0]
-    direct_effects = free_motion.design[:, sample_window.first : sample_window.end] @ spread
+    direct_effects = (
+        free_motion.design_matrices[:, sample_window.first_sample : sample_window.end_sample]
+        @ amplitude_cholesky
+    )
     return direct_effects.transpose(2, 0, 1) + obstacle_contact.effect_of_changed_motion(
         likely_obstacle, sample_window, displacement_m.T
     )
@@ -108,21 +112,22 @@ def _encoder_noise_effects(
     likely_obstacle: Real,
     sample_window: WhitenedWindow,
 ) -> Real:
-    """Return the effects of the encoder's noise through the contact on the innovations.
+    """Return the effects of the encoder's noise on the innovations, shape (samples, c, n).
 
-    There is one for each sample of the angle; the shape is (samples, c, n).
+    Each is the effect of the noise in one sample of the angle through the contact force.
     """
     free_motion = sample_window.motion
-    sample_indices = np.arange(sample_window.first, sample_window.end)
+    sample_indices = np.arange(sample_window.first_sample, sample_window.end_sample)
     nearest_position = int(np.argmin(np.abs(touch_tables.x_m - likely_obstacle[0])))
-    sample_displacement = touch_tables.free.displacement_per_sample(
+    sample_displacement = touch_tables.free_beam.displacement_per_sample(
         nearest_position, sample_indices.size + 8
     )
     # Columns begin four samples before the window.
     window_steps = np.arange(free_motion.displacement_m.shape[1]) - 4 * STEPS_PER_SAMPLE
     response_index = (
         window_steps[None, :]
-        - STEPS_PER_SAMPLE * (sample_indices - sample_window.first - SPLINE_FADE_SAMPLES)[:, None]
+        - STEPS_PER_SAMPLE
+        * (sample_indices - sample_window.first_sample - SPLINE_FADE_SAMPLES)[:, None]
     )
     displacement_m = np.where(
         (response_index >= 0) & (response_index < sample_displacement.size),

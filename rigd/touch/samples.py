@@ -1,4 +1,4 @@
-"""Conversion of a session's samples to the record of one touch for the estimator."""
+"""Selection and conversion of a session's samples to the record of one touch."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -10,15 +10,15 @@ from rigd.session.layout import WRENCH_FIELDS
 from rigd.touch._free_motion import TouchRecord
 
 HISTORY_S: Final = 1.5
-"""Time in s before a detection whose samples an estimate uses."""
+"""Time in s before a detection from which on samples are used for an estimate."""
 CONTACT_S: Final = 0.8
-"""Time in s after a detection for which the beam may still touch the obstacle."""
+"""Longest assumed duration in s of the contact after a detection."""
 PREVIEW_S: Final = 0.025
-"""Time in s after a detection whose samples the preliminary search of the position uses."""
+"""Time in s after a detection up to which the preliminary search of the position uses samples."""
 FIRST_S: Final = 0.05
-"""Time in s after a detection whose samples the first estimate uses."""
+"""Time in s after a detection up to which the first estimate uses samples."""
 FINAL_S: Final = 0.2
-"""Time in s after a detection whose samples the last estimate uses."""
+"""Time in s after a detection up to which the last estimate uses samples."""
 
 
 def around_touch(
@@ -35,7 +35,7 @@ def around_touch(
     rate_hz
         Ticks a second.
     free_from
-        Tick before which the beam was in contact, so that earlier samples are not used.
+        Earliest tick whose sample may be used, because the beam was in contact before it.
     """
     sample_ticks = samples["tick"].astype(np.int64)
     first_tick = max(tick - round(HISTORY_S * rate_hz), free_from)
@@ -49,7 +49,7 @@ def touch_record(
     rate_hz: float,
     shear_projection: Sequence[float] | None,
 ) -> TouchRecord:
-    """Return angle, torque and shear around a touch, with missed ticks interpolated.
+    """Return the record of angle, torque and shear around a touch, with missed ticks interpolated.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def touch_record(
 def base_shear_n(
     samples: NDArray[np.void], shear_projection: Sequence[float]
 ) -> NDArray[np.float64]:
-    """Return the base shear force of samples in N, shape (n,).
+    """Return the base shear in N of each sample, shape (n,).
 
     Parameters
     ----------

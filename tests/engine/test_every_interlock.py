@@ -334,7 +334,7 @@ def test_the_tare_of_a_frozen_sensor_is_refused(make_session):
     session = make_session()
     sensor(session, wrong_from=0, stuck=StuckReadings())
     session.obey(TareOrder())
-    (refused,) = session.parent.said(MeasurementRefused)
+    (refused,) = session.parent.messages_of(MeasurementRefused)
     assert refused.reason.startswith("Run of identical readings of all sensor channels")
     session.assert_safe()
 

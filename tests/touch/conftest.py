@@ -1,4 +1,4 @@
-"""Records of touches, simulated once."""
+"""Simulated records of touches, and an estimator for them, shared by the tests."""
 
 import pytest
 from struck_beam import ALIKE, MISTAKEN, OBSTACLES
@@ -9,36 +9,38 @@ from rigd.touch import TouchEstimator, TouchModel
 
 
 @pytest.fixture(scope="session")
-def simulated(computed_once):
-    """Simulate records of obstacles by name, once for all workers."""
+def simulated_records(computed_once):
+    """Function that simulates a record per obstacle, by name, once for all workers."""
 
     def records(name, obstacles, slews, duration_s):
-        def march():
+        def simulate_all():
             return simulate(
                 obstacles.values(), slews, duration_s=duration_s, steps=20, modes=20, seed=4
             )
 
-        return dict(zip(obstacles, computed_once(f"touch_{name}", march), strict=True))
+        return dict(zip(obstacles, computed_once(f"touch_{name}", simulate_all), strict=True))
 
     return records
 
 
 @pytest.fixture(scope="session")
-def struck(simulated):
-    """Name → record of one second or so, and the truth."""
-    return simulated("struck", OBSTACLES, [Slew(1.0)] * len(OBSTACLES), 0.8)
+def records_by_name(simulated_records):
+    """Records of 0.8 s with the true touch, by the name of the obstacle."""
+    return simulated_records("struck", OBSTACLES, [Slew(1.0)] * len(OBSTACLES), 0.8)
 
 
 @pytest.fixture(scope="session")
-def mistaken(simulated):
-    """Name → record of what could be taken for an obstacle at rest, or elsewhere."""
-    met, slews = zip(*(MISTAKEN | ALIKE).values(), strict=True)
-    return simulated("mistaken", dict(zip(MISTAKEN | ALIKE, met, strict=True)), slews, 0.85)
+def ambiguous_records(simulated_records):
+    """Records of obstacles that resemble one at rest or at another position, by name."""
+    obstacles, slews = zip(*(MISTAKEN | ALIKE).values(), strict=True)
+    return simulated_records(
+        "mistaken", dict(zip(MISTAKEN | ALIKE, obstacles, strict=True)), slews, 0.85
+    )
 
 
 @pytest.fixture(scope="session")
 def model():
-    """The beam of the records, known well but not exactly."""
+    """Model of the simulated beam, with small uncertainties of its parameters."""
     return TouchModel(
         Plant(LINK, DAMPED),
         std={
@@ -51,5 +53,5 @@ def model():
 
 @pytest.fixture(scope="session")
 def estimator(model):
-    """Return an estimator for all records."""
+    """Estimator that all tests share."""
     return TouchEstimator(model, 1000.0)

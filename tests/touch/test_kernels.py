@@ -1,4 +1,4 @@
-"""Contact kernels against closed forms and sums of modes, and as a sensor's filter shows them."""
+"""Contact kernels compared with closed forms and modal sums, with and without sensor filters."""
 
 from math import pi, sqrt
 
@@ -10,11 +10,11 @@ from rigd.beam import Damping, PointForceGrid, clamped_free_eigenvalues, mode_sh
 from rigd.touch import SensorFilter
 from rigd.touch._kernels import (
     ForcePulse,
+    beam_positions,
     chebyshev_nodes,
     contact_kernels,
     cross_kernels,
     cubic_weights,
-    positions,
 )
 
 STEP_S = 1 / 8000
@@ -22,7 +22,7 @@ STEP_S = 1 / 8000
 
 @pytest.fixture(scope="module")
 def kernels():
-    return contact_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), STEP_S, 400)
+    return contact_kernels(LINK, DAMPED, beam_positions(LINK.length_m, 0.007), STEP_S, 400)
 
 
 @pytest.fixture(scope="module")
@@ -56,19 +56,19 @@ def test_displacement_is_the_sum_of_the_modes(at_point):
     assert np.abs(total - at_point.displacement[0]).max() < 3e-4 * np.abs(total).max()
 
 
-def test_kernels_between_places_are_those_of_the_exact_model():
+def test_cross_kernels_match_exact_model():
     x, other = np.array([0.1, 0.3, 0.8]), np.array([0.25, 0.62, 0.7])
-    crossing = cross_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), 2 * STEP_S, 400)
-    told = crossing.between_positions(x, other, 300)
+    crossing = cross_kernels(LINK, DAMPED, beam_positions(LINK.length_m, 0.007), 2 * STEP_S, 400)
+    computed = crossing.between_positions(x, other, 300)
     hat = ForcePulse(2 * STEP_S, 400)
     exact = hat.kernels(
         PointForceGrid(hat.transform.s, LINK, DAMPED).displacement_per_force(x, other).T
     )
-    assert told == pytest.approx(exact[:, :300], abs=1e-3 * np.abs(exact).max())
-    assert crossing.between_positions(other, x, 300) == pytest.approx(told)
+    assert computed == pytest.approx(exact[:, :300], abs=1e-3 * np.abs(exact).max())
+    assert crossing.between_positions(other, x, 300) == pytest.approx(computed)
 
 
-def test_a_force_that_stays_is_carried_by_the_root_at_last():
+def test_constant_force_has_static_response():
     damped = Damping(zeta=0.02, alpha=1.0)
     kernels = contact_kernels(LINK, damped, np.array([0.4]), 2.5e-4, 16000)
     static = {name: getattr(kernels, name)[0].sum() for name in ("torque", "shear", "displacement")}
@@ -78,7 +78,7 @@ def test_a_force_that_stays_is_carried_by_the_root_at_last():
     assert static["displacement"] == pytest.approx(compliance, rel=5e-3)
 
 
-def test_between_places_kernels_are_interpolated(kernels, at_point):
+def test_interpolated_kernels_match_exact_ones(kernels, at_point):
     between = kernels.at_positions(np.array([0.62]), 400)
     for name in ("displacement", "torque", "shear"):
         exact = getattr(at_point, name)
@@ -101,41 +101,41 @@ def test_cubic_interpolation_is_exact_for_cubics():
     assert values == pytest.approx(at**3 - at)
 
 
-def test_few_nodes_tell_a_wave_at_all_places():
-    """The shortest wave of 1 kHz on this beam is six to its length."""
-    x_m = positions(LINK.length_m, 0.007)
+def test_chebyshev_interpolation_of_a_wave():
+    """At 1 kHz this beam has at most six waves along its length."""
+    x_m = beam_positions(LINK.length_m, 0.007)
     nodes, between = chebyshev_nodes(x_m, 36)
     at_positions, at_nodes = (np.exp(12j * np.pi * x / LINK.length_m) for x in (x_m, nodes))
     assert np.abs(between @ at_nodes - at_positions).max() < 1e-7
     assert x_m[0] < nodes.min() < nodes.max() < x_m[-1]
 
 
-# What a filter of the sensor makes of them
+# With filters of the sensor
 
 
-def test_a_mean_of_records_is_the_mean_of_late_kernels(at_point):
+def test_averaged_kernels_are_means_of_delayed_ones(at_point):
     mean = SensorFilter(weights=(0.25,) * 4, spacing_s=2 * STEP_S)
-    seen = contact_kernels(LINK, DAMPED, np.array([0.62]), STEP_S, 400, mean)
+    filtered = contact_kernels(LINK, DAMPED, np.array([0.62]), STEP_S, 400, mean)
     for name in ("torque", "shear"):
-        plain = getattr(at_point, name)[0]
-        late = [np.concatenate([np.zeros(2 * i), plain[: 400 - 2 * i]]) for i in range(4)]
-        assert getattr(seen, name)[0] == pytest.approx(
-            np.mean(late, axis=0), abs=2e-3 * np.abs(plain).max()
+        unfiltered = getattr(at_point, name)[0]
+        delayed = [np.concatenate([np.zeros(2 * i), unfiltered[: 400 - 2 * i]]) for i in range(4)]
+        assert getattr(filtered, name)[0] == pytest.approx(
+            np.mean(delayed, axis=0), abs=2e-3 * np.abs(unfiltered).max()
         )
-    # The obstacle feels the beam, not the sensor.
-    assert np.array_equal(seen.displacement, at_point.displacement)
+    # The filter does not act on the displacement.
+    assert np.array_equal(filtered.displacement, at_point.displacement)
     assert mean.weights_delay_s == 3 * STEP_S
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_a_low_pass_filter_is_the_one_of_the_books(at_point, order):
+def test_low_pass_filter_matches_scipy(at_point, order):
     corner = 2 * pi * 150.0
     low_pass = SensorFilter(corner_hz=150.0, order=order)
-    seen = contact_kernels(LINK, DAMPED, np.array([0.62]), STEP_S, 400, low_pass)
+    filtered = contact_kernels(LINK, DAMPED, np.array([0.62]), STEP_S, 400, low_pass)
     u = np.array([1 / corner, 1.0])
     from scipy.signal import TransferFunction, lsim  # half a second for every worker
 
     system = TransferFunction([1.0], u if order == 1 else [u[0] ** 2, sqrt(2) * u[0], 1.0])
-    _, told, _ = lsim(system, at_point.shear[0], np.arange(400) * STEP_S)
-    assert seen.shear[0] == pytest.approx(told, abs=1e-2 * np.abs(told).max())
+    _, computed, _ = lsim(system, at_point.shear[0], np.arange(400) * STEP_S)
+    assert filtered.shear[0] == pytest.approx(computed, abs=1e-2 * np.abs(computed).max())
     assert abs(low_pass.response(1j * corner)) == pytest.approx(sqrt(0.5))

@@ -1,4 +1,4 @@
-"""Models of the beam: from an analysis, from a profile, and changed in one parameter."""
+"""Beam models from an analysis, from a profile, and with one changed parameter."""
 
 import json
 from dataclasses import replace
@@ -29,8 +29,8 @@ PARAMETERS = {
 
 
 @pytest.fixture
-def written(tmp_path):
-    """Write a document with these headlines."""
+def write_document(tmp_path):
+    """Function that writes a document with given headlines and returns its path."""
 
     def write(*headlines):
         path = tmp_path / "model.json"
@@ -40,8 +40,8 @@ def written(tmp_path):
     return write
 
 
-def test_an_analysis_is_read(written):
-    path = written({"file": "a.mcap", "parameters": PARAMETERS})
+def test_model_from_analysis(write_document):
+    path = write_document({"file": "a.mcap", "parameters": PARAMETERS})
     model = TouchModel.from_analysis(path, STATED, angle_delay_s=1e-4)
     assert model.plant.beam == Beam(LENGTH_M, 0.052 * 0.09, 0.09)
     assert model.plant.damping == Damping(zeta=7e-5, alpha=0.99, gamma=0.05, lambda_=0.6)
@@ -54,17 +54,19 @@ def test_an_analysis_is_read(written):
     assert "tool_inertia_kg_m2" not in model.std
 
 
-def test_what_a_structure_does_not_have_is_absent(written):
-    few = {name: PARAMETERS[name] for name in ("density_over_stiffness", "bending_stiffness_n_m2")}
+def test_defaults_for_missing_parameters(write_document):
+    few_parameters = {
+        name: PARAMETERS[name] for name in ("density_over_stiffness", "bending_stiffness_n_m2")
+    }
     model = TouchModel.from_analysis(
-        written({"file": "a.mcap", "parameters": few}),
+        write_document({"file": "a.mcap", "parameters": few_parameters}),
         replace(STATED, delay_s=5e-4, tool_inertia_kg_m2=2e-5),
     )
     assert model.plant.damping == Damping()
     assert (model.wrench_delay_s, model.plant.tool_inertia_kg_m2) == (5e-4, 2e-5)
 
 
-def test_changes_leave_the_rest():
+def test_only_one_parameter_changes():
     model = TouchModel.assumed(STATED)
     stiffer = model.with_changed_parameter("bending_stiffness_n_m2", 0.009)
     assert stiffer.plant.beam.bending_stiffness_n_m2 == pytest.approx(0.099)

@@ -8,22 +8,22 @@ from rigd.touch._posterior import sample_posterior
 BOUNDS = (np.array([-20.0, -20.0]), np.array([20.0, 20.0]))
 
 
-def drawn(chi2_of, centres, width):
+def draw_posterior(chi2_of, centres, width):
     return sample_posterior(
         chi2_of,
         np.array(centres, dtype=float),
         np.broadcast_to(width**2 * np.eye(2), (len(centres), 2, 2)),
         BOUNDS,
-        scale=1.0,
-        count=400,
-        rounds=6,
-        enough_samples=1500.0,
+        residual_variance=1.0,
+        samples_per_round=400,
+        max_rounds=6,
+        sufficient_samples=1500.0,
         smallest_std=np.array([0.01, 0.01]),
     )
 
 
 def test_a_normal_distribution_has_its_moments_and_quantiles():
-    posterior = drawn(
+    posterior = draw_posterior(
         lambda x: ((x - [1.0, -2.0]) ** 2 / [0.25, 4.0]).sum(axis=1), [[0.5, -1.0]], 1.0
     )
     assert posterior.mean(0) == pytest.approx(1.0, abs=0.06)
@@ -33,19 +33,21 @@ def test_a_normal_distribution_has_its_moments_and_quantiles():
     assert posterior.effective_samples > 300
 
 
-def test_two_minima_share_the_weight_by_their_depth():
+def test_weights_of_two_minima():
     def chi2_of(x):
-        near = ((x - [-3.0, 0.0]) ** 2 / 0.04).sum(axis=1)
-        far = ((x - [3.0, 0.0]) ** 2 / 0.04).sum(axis=1) + 2 * np.log(3)
-        return -2 * np.logaddexp(-near / 2, -far / 2)
+        deeper = ((x - [-3.0, 0.0]) ** 2 / 0.04).sum(axis=1)
+        shallower = ((x - [3.0, 0.0]) ** 2 / 0.04).sum(axis=1) + 2 * np.log(3)
+        return -2 * np.logaddexp(-deeper / 2, -shallower / 2)
 
-    posterior = drawn(chi2_of, [[-3.0, 0.0], [3.0, 0.0]], 0.3)
-    share = posterior.weights[posterior.samples[:, 0] < 0].sum()
-    assert share == pytest.approx(0.75, abs=0.06)
+    posterior = draw_posterior(chi2_of, [[-3.0, 0.0], [3.0, 0.0]], 0.3)
+    weight_fraction = posterior.weights[posterior.samples[:, 0] < 0].sum()
+    assert weight_fraction == pytest.approx(0.75, abs=0.06)
 
 
-def test_nothing_lies_outside_the_bounds():
-    posterior = drawn(lambda x: (x - [20.0, 0.0])[:, 0] ** 2 + x[:, 1] ** 2, [[19.0, 0.0]], 1.0)
+def test_samples_are_within_bounds():
+    posterior = draw_posterior(
+        lambda x: (x - [20.0, 0.0])[:, 0] ** 2 + x[:, 1] ** 2, [[19.0, 0.0]], 1.0
+    )
     likely = posterior.samples[posterior.weights > 0]
     assert likely[:, 0].max() <= 20.0
     assert posterior.mean(0) == pytest.approx(20 - np.sqrt(2 / np.pi), abs=0.1)

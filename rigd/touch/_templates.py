@@ -1,11 +1,11 @@
-"""Signatures of touches: the innovations in the first ticks after a contact.
+"""Templates of contacts: the innovations that a contact causes in the ticks after it begins.
 
-A touch far from the root appears late and with many sign changes. The torque of a soft obstacle
-rises slowly, and a hard obstacle releases the beam at once. The contact is linear except for the
-release, so that its time course does not depend on the speed. With the motor held, the contact is
-computed for obstacles of a grid of positions and stiffnesses. The filter of the innovations turns
-torque and base shear into the signatures for the detector. Of several similar signatures one is
-enough.
+The detector correlates innovations with these templates (matched filters). A touch far from the
+root appears late and with many sign changes. The torque of a soft obstacle rises slowly, and a hard
+obstacle releases the beam at once. The contact is linear except for the release, so that its time
+course does not depend on the speed. Contacts at several positions with several stiffnesses are
+computed for a motor at rest. The innovation filter turns their torque and base shear into
+templates. Of several similar templates one is stored.
 """
 
 from dataclasses import dataclass
@@ -26,33 +26,33 @@ if TYPE_CHECKING:  # the control loop does not import models
 Real = NDArray[np.float64]
 
 _POSITION_FRACTIONS = np.linspace(0.04, 1.0, 33)
-"""Positions of the signatures' obstacles, as fractions of the beam's length."""
+"""Positions of the templates' obstacles, as fractions of the beam's length."""
 _STIFFNESSES_N_PER_M = np.array([1e2, 2e2, 4e2, 1e3, 3e3, 1e4, 3e4, 1e5])
-"""Stiffnesses of the signatures' obstacles."""
+"""Stiffnesses of the templates' obstacles."""
 _CONTACT_AGES_S = np.array([2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20, 24]) * 1e-3
-"""Times in s from the contact to the tick at which a signature is compared."""
+"""Times in s from the beginning of a contact to the tick in which its template is compared."""
 _CONTACT_PHASES = 2
-"""Number of instants of the contact within a tick, since bending waves change their sign from tick
-to tick."""
+"""Number of instants within a tick at which contacts begin; one is too few, because bending waves
+change their sign from tick to tick."""
 _STEPS_PER_TICK = 16
-"""Number of time steps of the calculation in a tick."""
+"""Number of time steps of the integration in a tick."""
 _REDUNDANT_CORRELATION = 0.9
-"""Correlation of two signatures above which one of them is redundant: of 6864 signatures 500
+"""Correlation of two templates above which one of them is redundant: of 6864 templates 500
 remain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectorModel:
-    """Beam model and effects of touches on it, with which a `TouchDetector` compares readings."""
+    """Beam model and templates of contacts for a `TouchDetector`."""
 
     observed: ObservedBeam
-    """Model of the free beam, with the noise of its readings."""
-    signatures: Real
-    """Signatures of touches from the function `signatures`, shape (signatures, 2 · ticks)."""
+    """Model of the free beam that computes the innovations."""
+    templates: Real
+    """Templates from the function `contact_templates`, shape (templates, 2 · ticks)."""
 
 
 def detector_model(model: "TouchModel", rate_hz: float, noise_stds: ChannelNoise) -> DetectorModel:
-    """Return the model and the signatures of a beam, with which touches are detected.
+    """Return the model and the templates with which a `TouchDetector` detects touches.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def detector_model(model: "TouchModel", rate_hz: float, noise_stds: ChannelNoise
     rate_hz
         Ticks a second.
     noise_stds
-        Noise of torque, base shear and angle.
+        Standard deviations of the noise of torque, base shear and angle.
     """
     observed_model = observed_beam(
         model.plant.beam,
@@ -72,22 +72,22 @@ def detector_model(model: "TouchModel", rate_hz: float, noise_stds: ChannelNoise
         torque_after_angle_s=model.wrench_delay_s - model.angle_delay_s,
         sensor_filter=model.sensor_filter,
     )
-    unit_signatures = signatures(
+    templates = contact_templates(
         model.plant.beam, model.plant.damping, rate_hz, observed_model, model.sensor_filter
     )
-    return DetectorModel(observed_model, unit_signatures)
+    return DetectorModel(observed_model, templates)
 
 
-def signatures(
+def contact_templates(
     beam: Beam,
     damping: Damping,
     rate_hz: float,
     model: ObservedBeam,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> Real:
-    """Return the signatures of touches: the innovations in the last ticks after a contact.
+    """Return templates of contacts: unit vectors of the innovations that a contact causes.
 
-    They are unit vectors for contacts of several positions, stiffnesses and ages.
+    The contacts have several positions, stiffnesses and times since their beginning.
 
     Parameters
     ----------
@@ -96,14 +96,14 @@ def signatures(
     rate_hz
         Ticks a second.
     model
-        Filter of the innovations.
+        Model from `observed_beam`, whose innovations are computed.
     sensor_filter
         Filters of the wrench.
 
     Returns
     -------
-    ndarray of shape (signatures, 2 · ticks)
-        Innovations of torque and shear for each tick, the oldest tick first.
+    ndarray of shape (templates, 2 · ticks)
+        Innovations of torque and shear in turn for the last ticks, the oldest tick first.
     """
     ages_ticks = np.maximum(1, np.round(_CONTACT_AGES_S * rate_hz)).astype(int)
     tick_count = int(ages_ticks.max())
@@ -115,7 +115,7 @@ def signatures(
     approaches_m = positions_m[:, None] * step_s * np.arange(kernels.steps)
     impulse_responses = _impulse_responses(model, tick_count)
 
-    signature_blocks = []
+    template_blocks = []
     for stiffness_n_per_m in _STIFFNESSES_N_PER_M:
         forces_n = integrate_contact(
             kernels.displacement, approaches_m, np.full(positions_m.size, stiffness_n_per_m), step_s
@@ -134,18 +134,18 @@ def signatures(
             )
             innovations = tick_forces @ impulse_responses
             for age in ages_ticks:
-                age_rows = np.zeros_like(innovations)
-                age_rows[:, 2 * (tick_count - age) :] = innovations[:, : 2 * age]
-                signature_blocks.append(age_rows)
-    all_signatures = np.concatenate(signature_blocks)
-    norms = np.linalg.norm(all_signatures, axis=1)
-    return _select_dissimilar(all_signatures[norms > 0] / norms[norms > 0, None])
+                aged_templates = np.zeros_like(innovations)
+                aged_templates[:, 2 * (tick_count - age) :] = innovations[:, : 2 * age]
+                template_blocks.append(aged_templates)
+    all_templates = np.concatenate(template_blocks)
+    norms = np.linalg.norm(all_templates, axis=1)
+    return _select_dissimilar(all_templates[norms > 0] / norms[norms > 0, None])
 
 
 def _impulse_responses(model: ObservedBeam, ticks: int) -> Real:
-    """Return the matrix from torque and shear of each tick to the innovations of each tick.
+    """Return the matrix M with ``innovations = readings @ M``, shape (2 · ticks, 2 · ticks).
 
-    The shape is (2 · ticks, 2 · ticks).
+    Both row vectors have torque and shear in turn for each tick.
     """
     response_matrix = np.zeros((2 * ticks, 2 * ticks))
     for channel_index, unit_impulse in enumerate(((1.0, 0.0), (0.0, 1.0))):
@@ -153,17 +153,17 @@ def _impulse_responses(model: ObservedBeam, ticks: int) -> Real:
         for tick in range(ticks):
             innovation_filter.step(0.0, *(unit_impulse if tick == 0 else (0.0, 0.0)))
             for row_begin in range(ticks - tick):
-                at = 2 * (row_begin + tick)
-                response_matrix[2 * row_begin + channel_index, at : at + 2] = (
+                first_column = 2 * (row_begin + tick)
+                response_matrix[2 * row_begin + channel_index, first_column : first_column + 2] = (
                     innovation_filter.whitened
                 )
     return response_matrix
 
 
 def _select_dissimilar(unit_vectors: Real) -> Real:
-    """Return a selection of unit vectors such that every other vector is similar to one of them.
+    """Return a subset of unit vectors such that every other vector is similar to one of the subset.
 
-    Each selected vector is the one that is least similar to those selected before.
+    Each vector that is added is the least similar to those selected before.
     """
     selected_rows = [0]
     similarities = np.abs(unit_vectors @ unit_vectors[0])
