@@ -292,19 +292,19 @@ def test_text_suits_a_terminal(chirps):
 
 def test_quick_look_is_complete_and_replaces_older_ones_only(tmp_path):
     path = tmp_path / "a.mcap"
-    place = quick_look_path(path)
+    quick_look_file = quick_look_path(path)
     write_quick_look(document_with(2.5, made_utc_ns=6), path)
     write_quick_look(document_with(2.6, made_utc_ns=7), path)
-    assert json.loads(place.read_text())["made_utc_ns"] == 7
+    assert json.loads(quick_look_file.read_text())["made_utc_ns"] == 7
     write_quick_look(document_with(2.7, made_utc_ns=5), path)
-    assert json.loads(place.read_text())["made_utc_ns"] == 7
-    place.write_text("somebody else's")
+    assert json.loads(quick_look_file.read_text())["made_utc_ns"] == 7
+    quick_look_file.write_text("somebody else's")
     with pytest.raises(QuickLookError, match="move it away"):
         write_quick_look(document_with(2.5), path)
-    assert place.read_text() == "somebody else's"
+    assert quick_look_file.read_text() == "somebody else's"
     with pytest.raises(QuickLookError, match="cannot be written"):
         write_quick_look(document_with(2.5), tmp_path / "missing" / "a.mcap")
-    assert [each.name for each in tmp_path.iterdir()] == [place.name]
+    assert [each.name for each in tmp_path.iterdir()] == [quick_look_file.name]
 
 
 def run_quick_look(*arguments):

@@ -37,7 +37,7 @@ def test_arrays_units_and_segments_are_read(tmp_path, write_session, short_signa
     assert record.flags == {}
 
 
-def test_without_segments_the_whole_record_is_the_sweep(tmp_path, write_session, short_signals):
+def test_record_without_segments_is_all_sweep(tmp_path, write_session, short_signals):
     record = load_record(write_session(tmp_path / "a.mcap", short_signals, segments={}))
     assert record.sweep == slice(0, 5000)
     assert record.rest_angle_rad is None
@@ -94,7 +94,7 @@ def test_flags_in_the_sweep_are_counted_and_warned_of(tmp_path, write_session, s
     assert np.flatnonzero(~record.torque_known).tolist() == [600, 601, 602]
 
 
-def test_a_stopped_sweep_is_cut_to_what_was_recorded(tmp_path, write_session, short_signals):
+def test_stopped_sweep_is_cut_to_its_recorded_part(tmp_path, write_session, short_signals):
     present = np.arange(5000) < 3000
     path = write_session(tmp_path / "a.mcap", short_signals.part(present), outcome="stopped")
     record = load_record(path)

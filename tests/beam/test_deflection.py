@@ -215,7 +215,7 @@ def test_the_steps_of_the_encoder_are_not_magnified():
     assert np.std(errors_m) < 1.5 * resolution_rad / np.sqrt(12) * LENGTH_M
 
 
-def test_the_clamp_stays_where_it_is():
+def test_clamp_does_not_move():
     bends = DeflectionFilter(BEAM, DAMPINGS["VI omega"], RATE_HZ, points=11)
     np.testing.assert_allclose(bends.x_m, x_m(11))
     deflection_m = bends.feed(0.1 * np.sin(np.arange(2000) / 9))

@@ -41,16 +41,16 @@ def solved(s, damping, tip_mass_kg, compliance):
     c = 1 + damping.zeta * s**damping.alpha
     p = BEAM.density_over_stiffness * s**2 + damping.gamma * s**damping.lambda_
     found, slopes = [], []
-    for place in range(s.size):
-        stiffness = BEAM.bending_stiffness_n_m2 * c[place]
-        roots = (-p[place] / c[place] + 0j) ** 0.25 * np.array([1, 1j, -1, -1j])
+    for index in range(s.size):
+        stiffness = BEAM.bending_stiffness_n_m2 * c[index]
+        roots = (-p[index] / c[index] + 0j) ** 0.25 * np.array([1, 1j, -1, -1j])
         waves = np.exp(roots * BEAM.length_m)
         matrix = np.array(
             [
                 np.ones(4),
                 roots,
                 roots**2 * waves,
-                (stiffness * roots**3 - tip_mass_kg * s[place] ** 2) * waves,
+                (stiffness * roots**3 - tip_mass_kg * s[index] ** 2) * waves,
             ]
         )
         amplitudes = np.linalg.solve(matrix, np.array([0, 1, 0, 0]))

@@ -31,7 +31,7 @@ def held(cell: str, seed: int) -> Scored:
 
 
 @pytest.fixture
-def judge(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+def scored_requests(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     """Score nothing, but record the requests."""
     requested = []
 
@@ -95,7 +95,7 @@ def test_kinds_of_cells():
 
 
 def test_benchmark_resumes_where_it_ended(
-    judge: list[tuple[str, int]],
+    scored_requests: list[tuple[str, int]],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -103,20 +103,20 @@ def test_benchmark_resumes_where_it_ended(
     file = tmp_path / "scores.jsonl"
     options = ("--cells", f"ringing, {NAME}", "--file", file, "--first", 5)
     assert run(monkeypatch, *options, "--count", 2) == 0
-    assert judge == [(f"ringing, {NAME}", 5), (f"ringing, {NAME}", 6)]
+    assert scored_requests == [(f"ringing, {NAME}", 5), (f"ringing, {NAME}", 6)]
     run(monkeypatch, *options, "--count", 4)
-    assert [seed for _, seed in judge] == [5, 6, 7, 8]
+    assert [seed for _, seed in scored_requests] == [5, 6, 7, 8]
     assert [json.loads(line)["seed"] for line in file.read_text().splitlines()] == [5, 6, 7, 8]
     capsys.readouterr()
     run(monkeypatch, *options, "--count", 9, "--print")
-    assert len(judge) == 4
+    assert len(scored_requests) == 4
     assert "4 sessions" in capsys.readouterr().out
     run(monkeypatch, *options, "--count", 9, "--seconds", -1)
-    assert len(judge) == 4
+    assert len(scored_requests) == 4
 
 
 def test_failed_record_is_reported_without_stopping(
-    judge: list[tuple[str, int]],
+    scored_requests: list[tuple[str, int]],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -124,7 +124,7 @@ def test_failed_record_is_reported_without_stopping(
     file = tmp_path / "scores.jsonl"
     options = ("--cells", f"one mode, {NAME}", "--file", file, "--first", 13, "--count", 2)
     assert run(monkeypatch, *options) == 1
-    assert len(judge) == 2
+    assert len(scored_requests) == 2
     assert len(file.read_text().splitlines()) == 1
     printed = capsys.readouterr()
     assert "cannot be judged" in printed.err

@@ -264,9 +264,7 @@ def test_present_effect_is_no_false_fact(truth: dict[str, Any], headline: dict[s
     assert not score_document(truth, headline, 1.0).false_facts
 
 
-def test_beam_data_are_compared_with_what_the_file_states(
-    truth: dict[str, Any], headline: dict[str, Any]
-):
+def test_beam_data_are_compared_with_the_file(truth: dict[str, Any], headline: dict[str, Any]):
     truth["ranges"]["density_over_stiffness"] = [0.97 * OVER, 1.01 * OVER]
     for sentence, value, false in (
         ("Mass per length over bending stiffness (rho/EI) is 2 % lower.", -0.02, False),

@@ -107,7 +107,7 @@ def test_modes_match_the_closed_form_with_delay(plain: DefectRecord):
 def marched(step_at_s: float = np.inf, stiffness: float = 1.0, drag_m: float = 0.0) -> Real:
     """Torque of the first modes by the method of Runge and Kutta, from rest."""
     beam = RIG.beam
-    frequencies, shares = (each[:3] for each in beam.shares())
+    frequencies, participations = (each[:3] for each in beam.shares())
     position = (np.arange(30) + 0.5) / 30 * 0.98
     width, shapes = 0.98 / 30, beam.shapes_at(position)[:3]
     damping = LAW.gamma * 0.090275 / 4.7e-3
@@ -142,7 +142,7 @@ def marched(step_at_s: float = np.inf, stiffness: float = 1.0, drag_m: float = 0
         speed = v @ shapes + position * hub[j, 1]
         drag = per_speed * np.abs(speed) * speed
         elastic = stiffer * frequencies**2 * (q + LAW.zeta * v)
-        drive = shares * (hub[j, 2] + damping * hub[j, 1])
+        drive = participations * (hub[j, 2] + damping * hub[j, 1])
         return -drive - damping * v - elastic - shapes @ drag * width, drag
 
     torque, q, v = np.zeros(count), np.zeros(3), np.zeros(3)
@@ -152,7 +152,7 @@ def marched(step_at_s: float = np.inf, stiffness: float = 1.0, drag_m: float = 0
         a1, drag = rates(j, q, v, stiffer)
         torque[i] = (
             rest * (hub[j, 2] + damping * hub[j, 1])
-            + shares @ (a1 + damping * v)
+            + participations @ (a1 + damping * v)
             + drag @ position * width
         )
         a2, _ = rates(j + 1, q + step / 2 * v, v + step / 2 * a1, stiffer)

@@ -200,11 +200,11 @@ def verdict_of(make_estimate, campaign_of):
     values = {name: PLANT.parameters[name] for name in names}
     estimate = make_estimate("VI", values, np.diag([1e-6] * 4), names)
 
-    def judge(sessions):
+    def campaign_verdict(sessions):
         every = [replace(each, record_estimates=(estimate,), verdict=VERDICT) for each in sessions]
         return campaign_of(every).verdict
 
-    return judge
+    return campaign_verdict
 
 
 def test_order_is_the_slope_of_a_loss(sessions_of, verdict_of):
@@ -240,7 +240,7 @@ def test_numbers_of_strongly_nonuniform_beam_follow_its_losses(sessions_of, verd
     assert "each mode lies where" not in text
 
 
-def test_with_a_uniformity_of_0_the_numbers_are_the_narrow_ones(sessions_of, verdict_of):
+def test_numbers_are_narrow_for_uniformity_0(sessions_of, verdict_of):
     found = verdict_of(sessions_of(8, uniformity=0.0))
     assert found.lambda_.exact is None
     assert found.lambda_.status == "fractional"

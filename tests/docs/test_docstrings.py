@@ -76,7 +76,7 @@ def with_string(cls):
     ]
 
 
-def complaints_on_function(function, text, *, may_be_in_summary=True):
+def errors_of_function(function, text, *, may_be_in_summary=True):
     arguments = [each for each in inspect.signature(function).parameters if each != "self"]
     found = described(text, "Parameters")
     if found or not may_be_in_summary or len(arguments) > 1:
@@ -84,7 +84,7 @@ def complaints_on_function(function, text, *, may_be_in_summary=True):
         yield from (f"there is no {each}" for each in found if each not in arguments)
 
 
-def complaints_on_class(cls):
+def errors_of_class(cls):
     text = inspect.cleandoc(vars(cls)["__doc__"])
     if dataclasses.is_dataclass(cls):
         found = described(text, "Attributes")
@@ -96,12 +96,12 @@ def complaints_on_class(cls):
         existing = {*fields, *dir(cls)}
         yield from (f"there is no {each}" for each in found if each not in existing)
     elif "__init__" in vars(cls) and not getattr(cls, "_is_protocol", False):
-        yield from complaints_on_function(cls.__init__, text, may_be_in_summary=False)
+        yield from errors_of_function(cls.__init__, text, may_be_in_summary=False)
     for name in vars(cls):
         method = getattr(cls, name)
         takes_arguments = inspect.isroutine(method) and not isinstance(method, cached_property)
         if not name.startswith("_") and takes_arguments:
-            for each in complaints_on_function(method, inspect.getdoc(method)):
+            for each in errors_of_function(method, inspect.getdoc(method)):
                 yield f"{name}: {each}"
 
 
@@ -111,16 +111,16 @@ def test_every_argument_and_field_is_described_by_its_name(path):
         f"{thing.__module__}.{thing.__name__}: {complaint}"
         for thing in offered(path)
         for complaint in (
-            complaints_on_class(thing)
+            errors_of_class(thing)
             if inspect.isclass(thing)
-            else complaints_on_function(thing, inspect.getdoc(thing))
+            else errors_of_function(thing, inspect.getdoc(thing))
         )
     ]
     assert not found
 
 
 @pytest.mark.parametrize(
-    ("text", "complaints"),
+    ("text", "errors"),
     [
         ("Sum.\n\nParameters\n----------\na, b : int\n    Numbers.", []),
         (
@@ -131,8 +131,8 @@ def test_every_argument_and_field_is_described_by_its_name(path):
         ("Sum of `a` and `b`.", ["a is not described", "b is not described"]),
     ],
 )
-def test_check_finds_missing_descriptions(text, complaints):
-    assert list(complaints_on_function(lambda a, b: a + b, text)) == complaints
+def test_check_finds_missing_descriptions(text, errors):
+    assert list(errors_of_function(lambda a, b: a + b, text)) == errors
 
 
 def test_descriptions_begin_with_a_noun():

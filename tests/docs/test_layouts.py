@@ -290,7 +290,7 @@ def test_session_file_opened_directly_shows_only_events(views_in_viewer):
 
 
 @pytest.mark.further  # parsed in test_documents.py
-def test_other_commands_of_the_page(session):
+def test_other_commands_of_the_page_run(session):
     (replay,) = (b.strip() for b in blocks("sh") if b.startswith("rigd replay"))
     command = ["bash", "-ec", f"{replay} --save seen.rrd"]
     subprocess.run(command, cwd=session, env=environment(), capture_output=True, check=True)

@@ -28,14 +28,16 @@ def wrong_values(made, session):
     found = samples["tick"].astype(int)
     stale = samples["status"] & (Status.ANGLE_STALE | Status.WRENCH_STALE)
     for skip in range(40):  # samples before the channels' common beginning
-        places = found + skip
-        if places[-1] > ticks[-1] or not np.isin(places, ticks).all():
+        expected_ticks = found + skip
+        if expected_ticks[-1] > ticks[-1] or not np.isin(expected_ticks, ticks).all():
             continue
         good = stale == 0
-        angle_error = np.abs(samples["angle_rad"] - made.angle_rad[places])[good].max()
-        torque_error = np.abs(samples["coupling_torque_nm"] - made.torque_nm[places])[good].max()
+        angle_error = np.abs(samples["angle_rad"] - made.angle_rad[expected_ticks])[good].max()
+        torque_error = np.abs(samples["coupling_torque_nm"] - made.torque_nm[expected_ticks])[
+            good
+        ].max()
         if angle_error <= made.digits and torque_error <= made.digits:
-            missing = len(ticks) - len(places) - skip
+            missing = len(ticks) - len(expected_ticks) - skip
             allowed = 2 + np.ceil(made.torque_later)
             if skip > allowed or missing > allowed:
                 return f"{skip} samples at the beginning and {missing} at the end are missing"

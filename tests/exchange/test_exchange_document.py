@@ -29,14 +29,14 @@ def third_party_files(simulated, tmp_path):
     nptdms = pytest.importorskip("nptdms", reason="the document imports a TDMS file")
     pyuff = pytest.importorskip("pyuff", reason="the document imports a universal file")
     samples = read_session(simulated).samples
-    place = np.clip(np.arange(-500, 21_500), 0, None)
-    angle, torque = samples["angle_rad"][place], samples["coupling_torque_nm"][place]
-    time_s = np.arange(len(place)) * 1e-3
+    indices = np.clip(np.arange(-500, 21_500), 0, None)
+    angle, torque = samples["angle_rad"][indices], samples["coupling_torque_nm"][indices]
+    time_s = np.arange(len(indices)) * 1e-3
     np.savetxt(
         tmp_path / "log.csv", np.column_stack([1e3 * time_s, np.degrees(angle), 1e3 * torque]),
         "%.17g", ";", header="t;Shaft [deg];Tz", comments="",
     )  # fmt: skip
-    wrench = np.column_stack([samples[name][place] for name in ("fx_n", "fy_n", "fz_n")] * 2)
+    wrench = np.column_stack([samples[name][indices] for name in ("fx_n", "fy_n", "fz_n")] * 2)
     wrench[:, 5] = torque
     log = {"t": time_s, "angle": angle, "wrench": wrench}
     scipy.io.savemat(tmp_path / "log.mat", {"log": log}, oned_as="column")

@@ -445,8 +445,8 @@ def test_damaged_matlab_file_gives_no_traceback(tmp_path):
     refusals = 0
     for _ in range(200):
         damaged = bytearray(whole)
-        for place in rng.integers(0, len(whole), 3):
-            damaged[place] = rng.integers(256)
+        for offset in rng.integers(0, len(whole), 3):
+            damaged[offset] = rng.integers(256)
         path.write_bytes(damaged[: rng.integers(len(whole) // 2, len(whole) + 1)])
         try:
             read_source(path, ["a", "s.b"])

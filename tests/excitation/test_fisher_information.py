@@ -100,8 +100,8 @@ def test_predicted_uncertainty_is_that_of_a_fit():
     fit = fit_record(measurement, [STRUCTURES["VI"]]).fits[0]
     predicted = covariance_of(information(angle, ESTIMATE, RATE_HZ))
     for name, spread in zip(fit.determined, np.sqrt(np.diag(fit.covariance)), strict=True):
-        place = UNIFORM.index(name)
-        assert spread == pytest.approx(np.sqrt(predicted[place, place]), rel=0.25), name
+        index = UNIFORM.index(name)
+        assert spread == pytest.approx(np.sqrt(predicted[index, index]), rel=0.25), name
 
 
 def test_twice_the_noise_gives_a_quarter_of_information():

@@ -148,8 +148,8 @@ def test_split_of_the_time_is_optimal(rig):
         FoundMode(44.8, 0.0099, 0.0),
     ]
     bands = [Band.around_mode(mode, 1.0) for mode in modes]
-    shares = time_fractions(bands, [0.025] * 3, rig)
-    assert shares.sum() == pytest.approx(1.0)
+    fractions = time_fractions(bands, [0.025] * 3, rig)
+    assert fractions.sum() == pytest.approx(1.0)
     damping = first_order_damping(modes, LINK)
     rates = []
     for band in bands:
@@ -176,8 +176,8 @@ def test_split_of_the_time_is_optimal(rig):
         (a, b, 1 - a - b) for a in np.arange(0.02, 1, 0.02) for b in np.arange(0.02, 0.99 - a, 0.02)
     ]
     best = min(map(spread, grid))
-    assert spread(shares) < best + 0.02
-    assert spread(shares) < spread([1 / 3] * 3) - 0.3
+    assert spread(fractions) < best + 0.02
+    assert spread(fractions) < spread([1 / 3] * 3) - 0.3
 
 
 def test_damping_reproduces_the_ratios_of_modes():

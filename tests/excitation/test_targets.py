@@ -64,7 +64,7 @@ def test_invalid_text_is_refused_with_a_remedy(quantity, text, message):
 )
 def test_derivatives_of_modes_match_the_model(name, step):
     """Derivatives of damping ratio and frequency, against differences of the model's own modes."""
-    place, value = UNIFORM.index(name), ESTIMATE.values[name]
+    index, value = UNIFORM.index(name), ESTIMATE.values[name]
 
     def moved(by):
         moved_value = value * (1 + by) if name in LOGARITHMIC_PARAMETERS else value + by
@@ -75,8 +75,8 @@ def test_derivatives_of_modes_match_the_model(name, step):
     for mode, after, before in zip(ESTIMATE.modes(), up, down, strict=True):
         ratio = (after.damping_ratio - before.damping_ratio) / (2 * step)
         hz = (after.frequency_hz - before.frequency_hz) / (2 * step)
-        assert mode.damping_ratio_derivative[place] == pytest.approx(ratio, rel=1e-4, abs=1e-7)
-        assert mode.frequency_derivative_hz[place] == pytest.approx(hz, rel=1e-4, abs=1e-6)
+        assert mode.damping_ratio_derivative[index] == pytest.approx(ratio, rel=1e-4, abs=1e-7)
+        assert mode.frequency_derivative_hz[index] == pytest.approx(hz, rel=1e-4, abs=1e-6)
 
 
 def test_target_holds_for_all_modes_by_default():

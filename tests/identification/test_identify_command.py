@@ -23,8 +23,10 @@ def pasted(text, toml):
         elif line:
             key = line.split(" = ")[0]
             start = lines.index(section)
-            place = next(i for i in range(start, len(lines)) if lines[i].startswith(key + " = "))
-            lines[place] = line
+            line_number = next(
+                i for i in range(start, len(lines)) if lines[i].startswith(key + " = ")
+            )
+            lines[line_number] = line
     return "\n".join(lines)
 
 

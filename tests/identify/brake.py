@@ -52,8 +52,8 @@ def drag_torque(angle_rad, rate_hz, beam, damping, constant_m, slowing=0.0, mode
     driven = driven_speed(angle_rad, rate_hz, beam, damping, x)
     z = clamped_free_eigenvalues(modes)
     shapes = np.array([mode_shape(i + 1, x / beam.length_m) for i in range(modes)])
-    shares = (shapes * dx / beam.length_m).T
-    leverage = shares.T @ x
+    mode_weights = (shapes * dx / beam.length_m).T
+    leverage = mode_weights.T @ x
     elastic = beam.bending_stiffness_n_m2 * (z / beam.length_m) ** 4
     density = beam.density_kg_per_m
     external = damping.gamma * beam.bending_stiffness_n_m2
@@ -67,7 +67,7 @@ def drag_torque(angle_rad, rate_hz, beam, damping, constant_m, slowing=0.0, mode
         size = np.abs(speed)
         drag = constant_m * size + slowing * np.cbrt(size) if slowing else constant_m * size
         force = -HALF_AIR_DENSITY_KG_PER_M3 * drag * speed
-        modal = force @ shares
+        modal = force @ mode_weights
         return (modal - viscous * v - elastic * q) / density, force, modal
 
     for i in range(angle_rad.size - 1):

@@ -79,10 +79,10 @@ def beyond_uniform(s, beam, damping, offsets):
     p = beam.density_kg_per_m * s**2
     p = p + damping.gamma * beam.bending_stiffness_n_m2 * s**damping.lambda_
     q = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
-    shares = participation(beam, 1 + len(offsets))[1:]
+    participations = participation(beam, 1 + len(offsets))[1:]
     of_modes = (clamped_free_eigenvalues(1 + len(offsets))[1:] / beam.length_m) ** 4
     more = 0
-    for fraction, k, offset in zip(shares, of_modes, offsets, strict=True):
+    for fraction, k, offset in zip(participations, of_modes, offsets, strict=True):
         loose = k * (1 + offset)
         more = more + fraction * p * q * (loose / (q * loose + p) - k / (q * k + p))
     return more

@@ -54,7 +54,7 @@ def counts_used(counts, reference_rad):
     return Measurement.from_record(SimpleNamespace(**vars(RECORD) | record)).angle_rad / COUNT_RAD
 
 
-def test_an_encoder_between_two_counts_at_rest_is_at_the_edge():
+def test_resting_encoder_between_two_counts_is_at_the_edge():
     counts = np.repeat([0, 5, 5, 6, 5, 6, 5, 6, 6, 6], 30)
     expected = counts.astype(float)
     expected[90:210] = 5.5
@@ -70,7 +70,7 @@ def test_an_encoder_between_two_counts_at_rest_is_at_the_edge():
         ([0, 5, 5, 6, 5, 6, 6, 6, 6, 6], np.zeros(300)),  # returns twice only
     ],
 )
-def test_an_encoder_that_shows_motion_is_read_as_it_is(pattern, reference_rad):
+def test_moving_encoder_is_read_unchanged(pattern, reference_rad):
     counts = np.repeat(pattern, 30)
     assert counts_used(counts, reference_rad) == pytest.approx(counts)
 

@@ -91,14 +91,14 @@ def plant(zeta=5.4e-5, gamma=0.02, density=4.7e-3, delay_s=0.0, lambda_=1.0):
 LAW = DragLaw(2e-3, 5e-4)
 
 
-@pytest.mark.parametrize("place", [0, 1])
-def test_derivatives_by_the_law(short, place):
+@pytest.mark.parametrize("index", [0, 1])
+def test_derivatives_by_the_law(short, index):
     numbers = np.array([LAW.constant_m, LAW.decreasing_part])
-    step = 1e-3 * numbers * np.eye(2)[place]
+    step = 1e-3 * numbers * np.eye(2)[index]
     beam = response(short, plant())
     above, below = (beam.torque(DragLaw(*(numbers + sign * step))).torque_nm for sign in (1, -1))
-    exact = beam.torque(LAW).law_derivatives[place]
-    assert deviation((above - below) / (2 * step[place]), exact) < 1e-4
+    exact = beam.torque(LAW).law_derivatives[index]
+    assert deviation((above - below) / (2 * step[index]), exact) < 1e-4
 
 
 @pytest.mark.parametrize(

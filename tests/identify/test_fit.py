@@ -210,7 +210,7 @@ def test_hum_near_the_second_mode(sessions, seed):
 
 
 @pytest.mark.parametrize("seed", [0, 1, *map(further, range(2, 10))])
-def test_no_hum_is_found_without_one(sessions, seed):
+def test_no_false_hum_is_found(sessions, seed):
     """The residual of a rough start at a sharp mode once passed for a hum, and stayed unfitted."""
     session = sessions("IV", shaken=True).cut(5000)
     analysis = fit_record(session.measured(noise_nm=1e-2, seed=seed), [STRUCTURES["IV"]])

@@ -100,7 +100,7 @@ def test_spectra_of_decays_that_begin_within_a_filtered_record(decimation):
     assert_gradient(spectra, some)
 
 
-def test_no_mode_no_column():
+def test_no_column_without_a_mode():
     spectra = DecaySpectra(100, 125.0, np.array([1.0, 2.0]))
     assert spectra.spectra(()).shape == (0, 2)
     assert Plant(BEAM, FRACTIONAL).mode_poles(0, NAMES) == ()

@@ -60,9 +60,7 @@ def test_damping_ratios_are_those_without_air(bursts_of_modes, brake, plants, li
 
 
 @pytest.mark.further  # that no drag is found is in test_drag.py
-def test_without_air_the_damping_ratios_are_as_uncertain_as_drag_makes_them(
-    bursts_of_modes, plants, link
-):
+def test_damping_ratios_without_air_include_drag_uncertainty(bursts_of_modes, plants, link):
     selection = judged(bursts_of_modes, 8)
     assert np.abs(deviations(selection, plants, link)).max() < 3.5
     assert {"air drag"} >= {each.kind for each in selection.verdict.findings}

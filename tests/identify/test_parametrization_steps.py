@@ -113,13 +113,13 @@ def test_steps_without_a_free_order_are_straight():
 def test_tiny_loss_grows_by_the_requested_step(structure):
     unknowns = Unknowns.for_structure(STRUCTURES[structure], NOMINAL, SETTINGS)
     steps = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
-    place = unknowns.names.index("zeta")
+    index = unknowns.names.index("zeta")
     x, step = unknowns.vector(NOMINAL), np.zeros(len(unknowns.names))
     # A loss of 1e-8 is to become 1e-5: a step of its logarithm by 999 would end at the upper bound.
-    x[place], step[place] = math.log(1e-8), 999.0
-    assert math.exp(steps.end(x, step)[place]) == pytest.approx(1e-5, rel=1e-3)
-    assert StepRule.for_unknowns(unknowns).end(x, step)[place] == steps.upper[place]
-    x[place], step[place] = math.log(1e-2), 0.5
+    x[index], step[index] = math.log(1e-8), 999.0
+    assert math.exp(steps.end(x, step)[index]) == pytest.approx(1e-5, rel=1e-3)
+    assert StepRule.for_unknowns(unknowns).end(x, step)[index] == steps.upper[index]
+    x[index], step[index] = math.log(1e-2), 0.5
     assert steps.end(x, step) == pytest.approx(
         StepRule.for_unknowns(unknowns).end(x, step), abs=1e-12
     )

@@ -84,9 +84,9 @@ def test_subsamples_agree_with_a_higher_rate(plant, factor):
 
     fine = TorquePredictor(angle(factor * 125.0), factor * 125.0, slice(0, factor * 400))
     torque, gradient = fine.torque(plant, WRT)
-    places = np.arange(1, torque.size, 5)
+    indices = np.arange(1, torque.size, 5)
     coarse = TorquePredictor(angle(125.0), 125.0, slice(0, 400))
-    at, gradient_at = coarse.torque_at_fine_samples(plant, factor, places, WRT)
-    assert np.abs(at - torque[places]).max() < 1e-6 * torque.std()
-    difference = np.abs(gradient_at - gradient[:, places]).max(axis=1)
+    at, gradient_at = coarse.torque_at_fine_samples(plant, factor, indices, WRT)
+    assert np.abs(at - torque[indices]).max() < 1e-6 * torque.std()
+    difference = np.abs(gradient_at - gradient[:, indices]).max(axis=1)
     assert (difference < 1e-6 * gradient.std(axis=1)).all()

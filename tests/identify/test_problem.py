@@ -46,9 +46,9 @@ def test_continued_descent_saves_one_evaluation(objective, monkeypatch):
     on = first.continue_descent(4)
     going_on = len(evaluated)
     evaluated.clear()
-    anew = Refit.descend(comparison, unknowns, first.x, noise, max_evaluations=4)
-    assert (on.x == anew.x).all()
-    assert on.cost == anew.cost < first.cost
+    restarted = Refit.descend(comparison, unknowns, first.x, noise, max_evaluations=4)
+    assert (on.x == restarted.x).all()
+    assert on.cost == restarted.cost < first.cost
     assert going_on == len(evaluated) - 1 == 3
 
 
@@ -59,9 +59,9 @@ def test_final_cost_is_that_of_its_noise(objective):
     )
     x = objective.unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8]))
     end = Descent(objective, x).descend_to_minimum(noise, 1e-2)
-    anew = Descent(end.objective, end.x)
-    assert end.cost(noise) == anew.cost(noise)
-    assert end.cost(louder) == anew.cost(louder) == pytest.approx(end.cost(noise) / 4)
+    restarted = Descent(end.objective, end.x)
+    assert end.cost(noise) == restarted.cost(noise)
+    assert end.cost(louder) == restarted.cost(louder) == pytest.approx(end.cost(noise) / 4)
 
 
 @pytest.mark.parametrize(

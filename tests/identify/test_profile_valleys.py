@@ -73,9 +73,9 @@ def test_the_crossing_of_a_parabola_is_exact():
 
 
 def test_proposed_points_lie_outside_known_ones():
-    places = values_outside_known([0.5, 0.9], (0.0, 2.0), 0.2)
-    assert all(place < 0.5 or place > 0.9 for place in places)
-    assert (min(places), max(places)) == pytest.approx((0.1, 1.9))
+    proposed = values_outside_known([0.5, 0.9], (0.0, 2.0), 0.2)
+    assert all(value < 0.5 or value > 0.9 for value in proposed)
+    assert (min(proposed), max(proposed)) == pytest.approx((0.1, 1.9))
 
 
 def test_dips_of_a_coarse_curve():

@@ -57,13 +57,13 @@ class Verdict:
     """Step to "ok" or to its error; a text that begins with "(" states why it was left out."""
 
     @property
-    def complaints(self) -> list[str]:
+    def errors(self) -> list[str]:
         return [f"{k}: {v}" for k, v in self.steps.items() if not v.startswith(("ok", "("))]
 
     @property
     def outcome(self) -> str:
         """Category in the summary."""
-        if self.complaints:
+        if self.errors:
             return "with complaints"
         if any(result.startswith("(") for result in self.steps.values()):
             return "not put to the test"

@@ -56,7 +56,7 @@ def test_session_fault_reset_session(trial, eds_file):
     verdict = trial.play("drive", eds_file(**RESTRICTED), left_on=(), ignore_timing=True)
     assert verdict.paper.usable, verdict.paper.why
     assert verdict.paper.accept == []
-    assert not verdict.complaints
+    assert not verdict.errors
     assert verdict.steps["chirp again"] == "ok"
 
 

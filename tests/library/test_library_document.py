@@ -36,7 +36,7 @@ def test_the_queries_read_the_index(
     assert capsys.readouterr().out == "2023-11-14T22:13:20.000+00:00 antenna 3 complete\n"
 
 
-def test_its_sections_are_understood(tmp_path):
+def test_toml_blocks_are_valid(tmp_path):
     required, specimen = blocks("toml")
     path = tmp_path / "lab.toml"
     path.write_text((PROJECT / "hw_profiles" / "sim.toml").read_text("utf-8") + required)

@@ -23,14 +23,14 @@ def eds_text(table: str, device: str = "VendorName=A vendor\nBaudRate_1000=1") -
     parts = [f"[DeviceInfo]\n{device}"]
     seen = set()
     for line in filter(None, map(str.strip, table.splitlines())):
-        place, kind, access, default, *mappable = line.split()
-        index, colon, sub = place.partition(":")
+        address, kind, access, default, *mappable = line.split()
+        index, colon, sub = address.partition(":")
         title = f"{index}sub{sub}" if colon else index
         if colon and index not in seen:
             parts.append(f"[{index}]\nParameterName=Object {index}\nObjectType=0x9")
         seen.add(index)
         lines = [
-            f"[{title}]\nParameterName=Object {place}\nObjectType=0x7",
+            f"[{title}]\nParameterName=Object {address}\nObjectType=0x7",
             f"DataType=0x{TYPES[kind]:04X}\nAccessType={access}\nPDOMapping={len(mappable)}",
         ]
         if default != "-":
@@ -88,16 +88,16 @@ COMPLETE = """
 """A drive that has all that rigd works with."""
 
 
-def without(*places: str) -> str:
+def without(*addresses: str) -> str:
     """The complete table without some objects, given as in the table."""
     lines = COMPLETE.splitlines()
     remaining = [
-        line for line in lines if not line.strip().startswith(tuple(p + " " for p in places))
+        line for line in lines if not line.strip().startswith(tuple(p + " " for p in addresses))
     ]
-    assert len(remaining) == len(lines) - len(places)
+    assert len(remaining) == len(lines) - len(addresses)
     return "\n".join(remaining)
 
 
-def changed(place: str, line: str) -> str:
+def changed(address: str, line: str) -> str:
     """The complete table with another line for an object: type, access, default and *."""
-    return f"{without(place)}\n{place} {line}"
+    return f"{without(address)}\n{address} {line}"

@@ -829,8 +829,8 @@ def _mat(made: EverydayFile, folder: Path, rng: np.random.Generator) -> None:
     elif mistake in ("struct array", "struct array unnamed"):
         newer = False
         runs = np.empty((1, 3), dtype=[("t", "O"), ("angle", "O"), ("torque", "O")])
-        for place in range(3):
-            runs[0, place] = (time_s, angle * (1 + place), torque * (2 - place) + place)
+        for index in range(3):
+            runs[0, index] = (time_s, angle * (1 + index), torque * (2 - index) + index)
         made.angle_rad, made.torque_nm = 2 * angle, torque + 1
         contents = {"log": runs}
         first = "log(2)" if mistake == "struct array" else "log"

@@ -185,7 +185,7 @@ def test_figure_is_written_in_the_requested_formats(tmp_path):
         (("svg",), 2_000_000, "png;base64,cG5n"),
     ],
 )
-def test_a_page_shows_a_format_that_is_written_and_no_huge_svg(
+def test_page_shows_a_written_format_and_no_huge_svg(
     monkeypatch, tmp_path, formats, svg_bytes, shown
 ):
     drawn = []
@@ -329,7 +329,7 @@ def test_each_mode_has_an_enlargement_at_its_passage(paper_analysis):
 
 @pytest.mark.fit
 @pytest.mark.parametrize("draw", [further(paper_signals_figure), torque_figure])
-def test_marks_have_the_numbers_and_the_extent_of_the_enlargements(paper_analysis, draw):
+def test_marks_match_the_enlargements(paper_analysis, draw):
     with style.figure_style():
         figure = draw(paper_analysis)
     whole = figure.axes[0]

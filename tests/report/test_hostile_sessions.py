@@ -149,7 +149,7 @@ def test_nonnumeric_values_are_refused(tmp_path, write_session, short_signals):
 
 
 @pytest.mark.parametrize(
-    ("place", "t_ns", "message_"),
+    ("indices", "t_ns", "message_"),
     [
         (2000, 1_990_000_000, "from 1999000000 ns at tick 1999 to 1990000000 ns at tick 2000"),
         (2000, 1_999_000_000, "to 1999000000 ns at tick 2000, but time must go forward"),
@@ -157,9 +157,9 @@ def test_nonnumeric_values_are_refused(tmp_path, write_session, short_signals):
         (4999, 2**63 - 1, "rate_hz is 1000 Hz, but the time stamps t_ns advance at"),
     ],
 )
-def test_invalid_times_are_refused(tmp_path, write_session, short_signals, place, t_ns, message_):
+def test_invalid_times_are_refused(tmp_path, write_session, short_signals, indices, t_ns, message_):
     times_ns = np.arange(5000) * 1_000_000
-    times_ns[place] = t_ns
+    times_ns[indices] = t_ns
     path = write_session(tmp_path / "a.mcap", short_signals, t_ns=times_ns)
     with pytest.raises(RecordError) as error:
         load_record(path)

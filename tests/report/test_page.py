@@ -164,9 +164,11 @@ def test_verdict_with_intervals_comes_first(read_page, record_result):
     text = " ".join("".join(read_page.text).split())
     first_mode = record_result.whole.fit.modes[0]
     assert f"The antenna's damping ratio is {100 * first_mode.damping_ratio:.2f}"[:-1] in text
-    places = [text.index(word) for word in ("Both orders", "Sweep round mode 1 & 2", "Parameters,")]
-    assert places == sorted(places)
-    assert text.index("damping ratio is") < places[0]
+    positions = [
+        text.index(word) for word in ("Both orders", "Sweep round mode 1 & 2", "Parameters,")
+    ]
+    assert positions == sorted(positions)
+    assert text.index("damping ratio is") < positions[0]
     assert "Only 3 Welch segment(s)" in text  # the warning
     for fact in ("SHA-256", "report made", "output error", "numpy"):
         assert fact in text

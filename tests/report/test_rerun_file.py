@@ -61,12 +61,12 @@ class Canvas:
 
     def __init__(self, chunks, entity):
         labels = [str(text) for text in value(chunks[f"{entity}/labels"], "Points2D:labels")]
-        places = np.array(value(chunks[f"{entity}/labels"], "Points2D:positions"))
+        positions = np.array(value(chunks[f"{entity}/labels"], "Points2D:positions"))
         frame = np.array(value(chunks[f"{entity}/frame"], "LineStrips2D:strips")[0])
         (self.left, self.top), (self.right, self.bottom) = frame.min(axis=0), frame.max(axis=0)
         numbers = {
-            text: place
-            for text, place in zip(labels, places, strict=True)
+            text: position
+            for text, position in zip(labels, positions, strict=True)
             if text.replace("−", "").replace(".", "").isdigit()
         }
         # Next to the frame are the ticks of the vertical axis, below it those of the other.
@@ -95,10 +95,10 @@ def assert_on_curve(chunks, entity, name, grid_hz, expected, tolerance, *, compo
     strips = [strips] if component.startswith("Points2D") else strips
     frequency_hz, values = Canvas(chunks, entity).points(strips)
     assert len(values) > 300
-    place = np.abs(grid_hz[:, None] - frequency_hz).argmin(axis=0)
-    assert frequency_hz == pytest.approx(grid_hz[place], rel=2e-3)
+    index = np.abs(grid_hz[:, None] - frequency_hz).argmin(axis=0)
+    assert frequency_hz == pytest.approx(grid_hz[index], rel=2e-3)
     # On steep flanks the neighbouring bin may be as near.
-    near = np.stack([expected[np.clip(place + k, 0, grid_hz.size - 1)] for k in range(-4, 5)])
+    near = np.stack([expected[np.clip(index + k, 0, grid_hz.size - 1)] for k in range(-4, 5)])
     assert np.abs(near - values).min(axis=0).max() < tolerance
     return frequency_hz
 
@@ -112,7 +112,7 @@ def degrees(values):
 
 
 @pytest.mark.parametrize("kind", [further("I"), further("III"), "VI"])
-def test_each_model_and_its_residual_lie_over_the_measured_response(paper_analysis, written, kind):
+def test_models_and_residuals_lie_over_the_response(paper_analysis, written, kind):
     chunks, _ = written
     grid_hz, measured = paper_analysis.response.frequency_hz, paper_analysis.response.response
     entity = f"/fits/type_{kind}"
@@ -191,9 +191,7 @@ def from_record(record_result, tmp_path_factory, brief_sessions):
     return batches(path), path
 
 
-def test_the_whole_record_s_model_and_residual_lie_over_the_measured_response(
-    record_result, from_record
-):
+def test_model_of_the_whole_record_lies_over_the_response(record_result, from_record):
     chunks, _ = from_record
     whole = record_result.whole
     angle = whole.record.angle_rad - (whole.record.rest_angle_rad or 0.0)

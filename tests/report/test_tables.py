@@ -149,7 +149,7 @@ def test_shifted_modes_are_marked(paper_analysis, tables_text):
     assert "‡ more than 10 % off" in " ".join(text.split())
 
 
-def test_one_table_is_shown_in_its_units_and_written_in_full(as_text):
+def test_table_is_shown_in_its_units_and_written_in_full(as_text):
     """A file's name may look like markup, a value may be missing, unknown or for programs only."""
     columns = (
         Column("file", "file", TEXT_FORMAT), Column("ζ (1e-5)", "zeta", ".2f", 1e5),

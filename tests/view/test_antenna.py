@@ -246,11 +246,11 @@ def test_touch_is_drawn_at_the_beam_against_its_motion(description, samples, dra
     # The exact shape of that very tick.
     filter_ = DeflectionFilter(description.beam, description.damping, description.rate_hz)
     deflection_m = filter_.feed(samples["angle_rad"][:2013])
-    place = 0.49 / description.beam.length_m
+    position = 0.49 / description.beam.length_m
     across = np.interp(0.49, filter_.x_m, deflection_m) / description.beam.length_m
-    y = ENLARGEMENT * (samples["angle_rad"][2012] * place + across)
+    y = ENLARGEMENT * (samples["angle_rad"][2012] * position + across)
     # Between two drawn shapes, at 50 ms, it is interpolated.
-    assert point == pytest.approx([place, y, 0.0], abs=4e-3)
+    assert point == pytest.approx([position, y, 0.0], abs=4e-3)
     _, (interval,) = values_of(sent[f"{TOUCH}/3/interval"], STRIPS)
     assert interval[:, 0] * description.beam.length_m == pytest.approx([0.47, 0.51], abs=1e-6)
     _, (force,) = values_of(sent[f"{TOUCH}/3/force"], "Arrows3D:vectors")
@@ -258,7 +258,7 @@ def test_touch_is_drawn_at_the_beam_against_its_motion(description, samples, dra
     before = DeflectionFilter(description.beam, description.damping, description.rate_hz)
     then = np.interp(0.49, before.x_m, before.feed(samples["angle_rad"][:1970]))
     forward = y - ENLARGEMENT * (
-        samples["angle_rad"][1969] * place + then / description.beam.length_m
+        samples["angle_rad"][1969] * position + then / description.beam.length_m
     )
     assert force[1] * forward < 0
     assert origin + force == pytest.approx(point, abs=1e-6)

@@ -136,8 +136,8 @@ def test_new_connections_get_earlier_touches(description, make_samples, shown):
     picture.touches([touch])
     picture.touches([touch | {"x_m": known(0.5)}])  # with more data
     found = shown(picture.frame())["/antenna/touch/1/point"]
-    ((place,),) = found.values["Points3D:positions"]
-    assert place[0] == pytest.approx(0.5 / description.beam.length_m)
+    ((position,),) = found.values["Points3D:positions"]
+    assert position[0] == pytest.approx(0.5 / description.beam.length_m)
 
 
 def test_a_recorded_session_shows_its_touches(touch_file, drawn, make_timings):

@@ -21,7 +21,7 @@ def pixels(shown) -> np.ndarray:
     return np.array(buffer, np.uint8).reshape(form["height"], form["width"])
 
 
-def placed(shown) -> tuple[np.ndarray, np.ndarray]:
+def corner_and_size(shown) -> tuple[np.ndarray, np.ndarray]:
     """Top left corner and size of a pixel, on the canvas."""
     corner, size = (shown.last(f"Transform3D:{name}") for name in ("translation", "scale"))
     return np.array(corner[:2]), np.array(size[:2])
@@ -41,7 +41,7 @@ def tone(description, shown):
 def test_tone_has_its_frequency_time_and_level(tone):
     chart, found = tone
     image = pixels(found[f"{SPECTROGRAM_ENTITY}/levels"])
-    corner, size = placed(found[f"{SPECTROGRAM_ENTITY}/levels"])
+    corner, size = corner_and_size(found[f"{SPECTROGRAM_ENTITY}/levels"])
     rows, columns = np.nonzero(image > 128)
     at = corner + size * np.column_stack([columns + 0.5, rows + 0.5])
     assert at[:, 1] == pytest.approx(chart.to_canvas(0.0, 25.0)[1], abs=45.0)
@@ -68,7 +68,7 @@ def test_the_bar_has_the_colours_of_the_levels(tone):
     for name in ("colormap", "depth_range"):
         assert levels.last(f"DepthImage:{name}") == bar.last(f"DepthImage:{name}")
     assert pixels(bar)[:, 0].tolist() == list(range(255, -1, -1))
-    _, size = placed(bar)
+    _, size = corner_and_size(bar)
     (labels,) = found[f"{SPECTROGRAM_ENTITY}/bar/labels"].values["Points2D:labels"]
     (points,) = found[f"{SPECTROGRAM_ENTITY}/bar/labels"].values["Points2D:positions"]
     heights = {text: y for text, (_, y) in zip(labels, points, strict=True)}
