@@ -438,7 +438,7 @@ class ExplanationSearch:
     def _first_samples(self) -> WhitenedWindow:
         """Whitened innovations of the first samples, with which the best of the grid are compared.
 
-        Of the uncertainties, only that of the free motion is included.
+        Only the uncertainty of the free motion is included, not its effect on the contact.
         """
         return WhitenedWindow.from_motion(
             self.motion, self.quiet_samples, self.sample_after_detection(FIRST_S)

@@ -5,7 +5,7 @@ root appears late and with many sign changes. The torque of a soft obstacle rise
 obstacle releases the beam at once. The contact is linear except for the release, so that its time
 course does not depend on the speed. Contacts at several positions with several stiffnesses are
 computed for a motor at rest. The innovation filter turns their torque and base shear into
-templates. Of several similar templates one is stored.
+templates. Only one of several similar templates is stored.
 """
 
 from dataclasses import dataclass
