@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from rigd.estimates import EstimatedMode
     from rigd.spectral import RunningEstimate, Segmentation
 
-    Real = NDArray[np.float64]
+    RealArray = NDArray[np.float64]
 
 _LONGEST_FULL_ANALYSIS_S: Final = 300.0
 """Longest record to which every structure is fitted, in seconds. Per second of record at 1 kHz, all
@@ -298,7 +298,7 @@ def _estimate_response(
 
 def _estimate_coherence(
     record: Record, estimate: RunningEstimate, segments: Segmentation, last_hz: float
-) -> tuple[Real | None, Segmentation]:
+) -> tuple[RealArray | None, Segmentation]:
     """Return the coherence of a record, and the segments by which it is estimated.
 
     If `segments` give only one segment, which has no coherence, shorter ones are used. The
@@ -317,7 +317,7 @@ def _estimate_coherence(
 
 
 def _join_bins(
-    frequency_hz: Real, is_selected: NDArray[np.bool_], resolution_hz: float
+    frequency_hz: RealArray, is_selected: NDArray[np.bool_], resolution_hz: float
 ) -> Iterator[tuple[float, float]]:
     """Yield the frequency bands, as first and last frequency in Hz, that the selected bins form.
 
@@ -472,7 +472,7 @@ def _text_lines(document: Mapping[str, Any]) -> Iterator[str]:
         yield f"  {document['against_last']['sentence']}"
 
 
-def _round_digits(numbers: Real) -> list[float]:
+def _round_digits(numbers: RealArray) -> list[float]:
     """Return values rounded to six digits, which is finer than the accuracy of an estimate."""
     return [float(f"{number:.6g}") for number in numbers]
 

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
     from rigd.touch import TouchEstimate
 
-    Real = NDArray[np.float64]
+    RealArray = NDArray[np.float64]
 
 _MIN_BEFORE_S: Final = 0.3
 """Least duration that must be recorded before a detection for an estimate of the touch."""
@@ -119,9 +119,9 @@ class Touch:
     angle_rad: float
     start_s: float
     estimate: TouchEstimate | None = None
-    antenna_m: Real | None = None
-    point_m: Real | None = None
-    interval_ends_m: Real | None = None
+    antenna_m: RealArray | None = None
+    point_m: RealArray | None = None
+    interval_ends_m: RealArray | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the touch and its estimate as a JSON document."""
@@ -484,7 +484,7 @@ def _detect_touches(
     return detections
 
 
-def _white_noise_std(signal_values: Real) -> float:
+def _white_noise_std(signal_values: RealArray) -> float:
     """Return the standard deviation of the white noise in a slowly changing signal."""
     value_steps = np.diff(signal_values)
     return (
@@ -494,7 +494,7 @@ def _white_noise_std(signal_values: Real) -> float:
     )
 
 
-def _angle_noise_std(angle_rad: Real, is_at_rest: NDArray[np.bool_]) -> float:
+def _angle_noise_std(angle_rad: RealArray, is_at_rest: NDArray[np.bool_]) -> float:
     """Return the standard deviation of the angle's noise, from rest or from its resolution."""
     angle_increments_rad = np.abs(np.diff(angle_rad))
     angle_increments_rad = angle_increments_rad[angle_increments_rad > _MIN_NOISE_STD]
@@ -536,7 +536,7 @@ def _number_list(numbers: Sequence[int]) -> str:
 # Seen from above
 
 
-def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, time_s: float) -> Real:
+def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, time_s: float) -> RealArray:
     """Return the deflection in metres of a beam that moves freely, relative to its undeformed line.
 
     `free_beam` computes the motion at points along the beam, the first at the motor's axis. Its
@@ -545,14 +545,14 @@ def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, time_s: float) 
     fit_samples = min(max(int(time_s * record.rate_hz) - 1, _MIN_FIT_SAMPLES), record.detected)
     free_motion = free_beam.motion(record, fit_samples, fit_samples - 4)
     step_index = round((time_s - free_motion.first_s) / free_motion.step_s)
-    displacement_m: Real = free_motion.displacement_m[
+    displacement_m: RealArray = free_motion.displacement_m[
         :, min(max(step_index, 0), free_motion.displacement_m.shape[1] - 1)
     ]
     times_s = np.arange(record.angle_rad.size) / record.rate_hz
     return displacement_m - float(np.interp(time_s, times_s, record.angle_rad)) * free_beam.x_m
 
 
-def _top_view(angle_rad: float, along_m: Real, across_m: Real) -> Real:
+def _top_view(angle_rad: float, along_m: RealArray, across_m: RealArray) -> RealArray:
     """Return points of the bent beam seen from above, shape (points, 2); angle 0 is along x."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     return np.column_stack([cos * along_m - sin * across_m, sin * along_m + cos * across_m])

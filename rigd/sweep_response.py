@@ -16,9 +16,9 @@ from rigd.session.layout import Status
 from rigd.spectral import CurveDecimation, RunningEstimate, RunningResponse, segmentation_of
 from rigd.text_table import decode_text
 
-Real = npt.NDArray[np.float64]
+RealArray = npt.NDArray[np.float64]
 """Array of real numbers."""
-Complex = npt.NDArray[np.complex128]
+ComplexArray = npt.NDArray[np.complex128]
 """Array of complex numbers."""
 
 FIRST_HZ: Final = 0.5
@@ -128,7 +128,7 @@ class SweepResponse:
 
 def nominal_response(
     beam: Beam, damping: Damping, tool_inertia_kg_m2: float
-) -> tuple[Real, Complex]:
+) -> tuple[RealArray, ComplexArray]:
     """Return the nominal frequency response from motor angle to the sensor's torque.
 
     Parameters
@@ -148,7 +148,7 @@ def nominal_response(
     return frequency_hz, transfer(s, beam, damping) + tool_inertia_kg_m2 * s * s
 
 
-def response_decimation(frequency_hz: Real) -> CurveDecimation:
+def response_decimation(frequency_hz: RealArray) -> CurveDecimation:
     """Return the object that decimates curves over frequency for the charts.
 
     Parameters

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from analysis.identify.drag_torque import DragLaw, DragResponse
     from rigd.beam import Plant, Pole
 
-    Real = NDArray[np.float64]
-    Complex = NDArray[np.complex128]
+    RealArray = NDArray[np.float64]
+    ComplexArray = NDArray[np.complex128]
 
 _EXTERNAL_PARAMETERS: Final = ("gamma", "lambda")
 """Parameters of the external damping."""
@@ -73,12 +73,12 @@ class DragExpansion:
     plant: Plant
     law: DragLaw
     response: DragResponse
-    band: Callable[[Real], Complex]
-    pole_derivatives: dict[int, Complex]
-    external_derivatives: Complex
-    ln_density_derivative: Complex
-    delay_derivative: Complex
-    law_derivatives: Complex
+    band: Callable[[RealArray], ComplexArray]
+    pole_derivatives: dict[int, ComplexArray]
+    external_derivatives: ComplexArray
+    ln_density_derivative: ComplexArray
+    delay_derivative: ComplexArray
+    law_derivatives: ComplexArray
     speed_m_s: float
     top_speed_m_s: float
 
@@ -87,8 +87,8 @@ class DragExpansion:
         plant: Plant,
         poles: Sequence[Pole],
         parameter_names: Sequence[str],
-        parameter_slopes: Real,
-    ) -> tuple[Complex, Complex]:
+        parameter_slopes: RealArray,
+    ) -> tuple[ComplexArray, ComplexArray]:
         """Return the change of the drag torque if another beam replaces this one.
 
         The spectrum of the change in the band, shape (K,), is returned with its derivatives by the
@@ -118,12 +118,14 @@ class DragExpansion:
         step_slopes += list(_parameter_rows(parameter_slopes, parameter_names, ("delay_s",)))
         # A real view suffices, since the spectra are multiplied by real numbers only.
         real_spectra = np.array(derivative_spectra).view(np.float64)
-        torque_change: Complex = (np.array(parameter_steps) @ real_spectra).view(np.complex128)
-        torque_jacobian: Complex = (np.array(step_slopes).T @ real_spectra).view(np.complex128)
+        torque_change: ComplexArray = (np.array(parameter_steps) @ real_spectra).view(np.complex128)
+        torque_jacobian: ComplexArray = (np.array(step_slopes).T @ real_spectra).view(np.complex128)
         change_by_poles, jacobian_by_poles = self.change_by_poles(poles, parameter_slopes.shape[1])
         return torque_change + change_by_poles, torque_jacobian + jacobian_by_poles
 
-    def change_by_poles(self, poles: Sequence[Pole], unknown_count: int) -> tuple[Complex, Complex]:
+    def change_by_poles(
+        self, poles: Sequence[Pole], unknown_count: int
+    ) -> tuple[ComplexArray, ComplexArray]:
         """Return the change of the drag torque due to the poles of another beam.
 
         The spectrum of the change, shape (K,), is returned with its derivatives by the unknowns,
@@ -148,7 +150,7 @@ class DragExpansion:
             jacobian += np.outer(pole.derivative.imag, by_imaginary_at_pole)
         return change, jacobian
 
-    def _external_damping_change(self, plant: Plant) -> list[Real]:
+    def _external_damping_change(self, plant: Plant) -> list[RealArray]:
         """Return the external damping of another beam minus that of this beam, for two modes.
 
         The difference is taken at the pole of each mode, without an expansion in the order:
@@ -179,7 +181,7 @@ class DragExpansion:
 
     def _torque_beyond_first_order(
         self, mode_number: int, own_pole: complex, other_pole: complex
-    ) -> tuple[Complex, Complex]:
+    ) -> tuple[ComplexArray, ComplexArray]:
         """Return the change of one mode's torque with its pole, without the first-order part.
 
         The spectrum has the shape (K,). It is returned with its derivatives by the real and the
@@ -206,8 +208,8 @@ class DragExpansion:
 
 
 def _parameter_rows(
-    derivatives: Real, derivative_names: Sequence[str], wanted_names: Sequence[str]
-) -> Real:
+    derivatives: RealArray, derivative_names: Sequence[str], wanted_names: Sequence[str]
+) -> RealArray:
     """Return the rows of `derivatives` for the wanted parameters, shape (n, k).
 
     `derivative_names` are the parameters of all rows. A parameter that is not among them gets

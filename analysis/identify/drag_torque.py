@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from analysis.identify._modal_model import ModalEstimate
     from rigd.beam import Plant
 
-    Real = NDArray[np.float64]
-    Complex = NDArray[np.complex128]
+    RealArray = NDArray[np.float64]
+    ComplexArray = NDArray[np.complex128]
 
 DRAG_MODES: Final = 5
 """Number of beam modes that the drag force can excite in the computation."""
@@ -146,22 +146,22 @@ class DragTorque:
     """
 
     law: DragLaw
-    torque_nm: Real
-    pole_derivatives: dict[int, Real]
-    external_derivatives: Real
-    law_derivatives: Real
-    delay_derivative: Real
+    torque_nm: RealArray
+    pole_derivatives: dict[int, RealArray]
+    external_derivatives: RealArray
+    law_derivatives: RealArray
+    delay_derivative: RealArray
     speed_m_s: float
     top_speed_m_s: float
 
     @property
-    def ln_density_derivative(self) -> Real:
+    def ln_density_derivative(self) -> RealArray:
         """Return the derivative of the drag torque by ln(mass per length), in N·m, shape (m,).
 
         Poles and drag law are held constant.
         """
         law_coefficients = np.array([self.law.constant_m, self.law.decreasing_part])
-        torque_derivative: Real = self.torque_nm - law_coefficients @ self.law_derivatives
+        torque_derivative: RealArray = self.torque_nm - law_coefficients @ self.law_derivatives
         return torque_derivative
 
 
@@ -188,7 +188,7 @@ class DragResponse:
 
     def __init__(
         self,
-        angle_rad: Real,
+        angle_rad: RealArray,
         rate_hz: float,
         plant: Plant,
         measured_modes: ModalEstimate | None = None,
@@ -205,7 +205,7 @@ class DragResponse:
         self._pole_pairs = _pole_pairs(k * beam.length_m**4, plant)
         self._impedance_slopes = _impedance_slopes(self._pole_pairs, plant)
         self._inertia_terms = [p] * DRAG_MODES
-        self._phase_factors: list[Complex | float] = [1.0] * DRAG_MODES
+        self._phase_factors: list[ComplexArray | float] = [1.0] * DRAG_MODES
         measured_poles = measured_modes.poles_rad_s if measured_modes else {}
         for mode_index in range(DRAG_MODES):
             pole = measured_poles.get(mode_index + 1)
@@ -232,7 +232,7 @@ class DragResponse:
         )
         self._speed_transform = s * angle_transform
 
-    def first_order_torque(self) -> Real:
+    def first_order_torque(self) -> RealArray:
         """Return the drag torque divided by C_D d in the limit of small drag, in N, shape (m,).
 
         C_D d is drag coefficient times diameter.
@@ -276,7 +276,7 @@ class DragResponse:
         ]
         force_spectra = self._transform_forces(modal_forces)
         modal_speeds = self._modal_speed_by_angle + self._speed_per_force * force_spectra[:-1]
-        speed_sources: list[tuple[int, Real]] = []
+        speed_sources: list[tuple[int, RealArray]] = []
         direct_torques = []
         modal_torques = self._modal_torques(force_spectra)
         for mode_number in mode_numbers:
@@ -335,17 +335,17 @@ class DragResponse:
         )
 
     @property
-    def poles(self) -> Complex:
+    def poles(self) -> ComplexArray:
         """Return the pole with positive imaginary part of each mode, in rad/s, shape (modes,)."""
-        upper_poles: Complex = self._pole_pairs[:, 0]
+        upper_poles: ComplexArray = self._pole_pairs[:, 0]
         return upper_poles
 
     @property
-    def _leverage(self) -> Real:
+    def _leverage(self) -> RealArray:
         """Return ``L b_i`` in m², the first moment of the shape of each mode i about the root."""
         return self.plant.beam.length_m * self._grid.leverage_m
 
-    def _mean_speed(self, speed_m_s: Real) -> float:
+    def _mean_speed(self, speed_m_s: RealArray) -> float:
         """Return the mean speed of the beam in m/s, weighted with the power dissipated by drag."""
         speed_cubed = np.abs(speed_m_s) ** 3
         total_power = float(speed_cubed.sum(axis=0) @ self._grid.weight_m)
@@ -354,11 +354,11 @@ class DragResponse:
         )
         return speed_times_power / total_power if total_power > 0 else 0.0
 
-    def _linear_speed(self) -> Real:
+    def _linear_speed(self) -> RealArray:
         """Return the speeds of the beam points without drag in m/s, shape (3 m, points)."""
         return self._point_speed(self._oversampled_modal_speeds())
 
-    def _oversampled_modal_speeds(self) -> Real:
+    def _oversampled_modal_speeds(self) -> RealArray:
         """Return the speeds of rotation and of each mode without drag, shape (1 + modes, 3 m)."""
         modal_speeds = np.empty((1 + DRAG_MODES, _OVERSAMPLING * self._samples))
         speed_transforms = (self._speed_transform, *self._modal_speed_by_angle)
@@ -366,17 +366,17 @@ class DragResponse:
             modal_speed[:] = self._oversampled_values(speed_transform)
         return modal_speeds
 
-    def _point_speed(self, modal_speeds: Real) -> Real:
+    def _point_speed(self, modal_speeds: RealArray) -> RealArray:
         """Return the speeds of the beam points in m/s, shape (n, points).
 
         `modal_speeds`, shape (1 + modes, n), are the speeds of rotation and of each mode.
         """
-        point_speed_m_s: Real = np.outer(modal_speeds[0], self._grid.x_m)
+        point_speed_m_s: RealArray = np.outer(modal_speeds[0], self._grid.x_m)
         for mode_shape, modal_speed in zip(self._grid.shapes, modal_speeds[1:], strict=True):
             point_speed_m_s += np.outer(modal_speed, mode_shape)
         return point_speed_m_s
 
-    def _add_drag_to_speeds(self, speed_m_s: Real, law: DragLaw) -> None:
+    def _add_drag_to_speeds(self, speed_m_s: RealArray, law: DragLaw) -> None:
         """Add the effect of drag to the speeds of the beam points in m/s, shape (3 m, points).
 
         The array is changed in place.
@@ -412,8 +412,8 @@ class DragResponse:
             add(modal_state, free_state, modal_state)
 
     def _modal_force_changes(
-        self, speed_m_s: Real, law: DragLaw, speed_sources: list[tuple[int, Real]]
-    ) -> list[Real]:
+        self, speed_m_s: RealArray, law: DragLaw, speed_sources: list[tuple[int, RealArray]]
+    ) -> list[RealArray]:
         """Return the first-order changes of the modal forces, each of shape (modes + 1, 3 m).
 
         First come the changes due to each of `speed_sources`: the index of a mode, and a speed,
@@ -469,7 +469,7 @@ class DragResponse:
                 add(modal_state, free_state, modal_state)
         return list(np.ascontiguousarray(force_changes.transpose(2, 1, 0)))
 
-    def _time_step_matrices(self) -> tuple[Real, Real, Real]:
+    def _time_step_matrices(self) -> tuple[RealArray, RealArray, RealArray]:
         """Return the matrices of one time step of the modes under drag.
 
         They multiply the state to give the modal speeds, the state to give its part of the next
@@ -522,22 +522,22 @@ class DragResponse:
         )
 
     @property
-    def _point_to_modal_forces(self) -> Real:
+    def _point_to_modal_forces(self) -> RealArray:
         """Return the matrix that converts forces at the beam points to modal forces.
 
         Its last row gives the moment about the root.
         """
         return np.vstack([self._grid.to_modes, self._grid.to_moment])
 
-    def _modal_forces(self, point_force: Real) -> Real:
+    def _modal_forces(self, point_force: RealArray) -> RealArray:
         """Convert forces at the beam points to modal forces and, last, the moment about the root.
 
         The result has the shape (modes + 1, 3 m).
         """
-        modal_forces: Real = self._point_to_modal_forces @ point_force.T
+        modal_forces: RealArray = self._point_to_modal_forces @ point_force.T
         return modal_forces
 
-    def _transform_forces(self, modal_forces: Real) -> Complex:
+    def _transform_forces(self, modal_forces: RealArray) -> ComplexArray:
         """Return the Laplace transform of modal forces and root moment at the points `s`.
 
         Its shape is (modes + 1, bins).
@@ -550,7 +550,7 @@ class DragResponse:
             ]
         )
 
-    def _modal_torques(self, force_spectra: Complex) -> Complex:
+    def _modal_torques(self, force_spectra: ComplexArray) -> ComplexArray:
         """Return the transforms of the torque that each modal force causes, shape (modes, bins)."""
         return np.array(
             [
@@ -565,12 +565,12 @@ class DragResponse:
             ]
         )
 
-    def _torque_over_time(self, modal_forces: Real) -> Real:
+    def _torque_over_time(self, modal_forces: RealArray) -> RealArray:
         """Return the torque in N·m, shape (m,), that modal forces and root moment cause."""
         force_spectra = self._transform_forces(modal_forces)
         return self.in_time(self._modal_torques(force_spectra).sum(axis=0) - force_spectra[-1])
 
-    def in_time(self, torque_transform: Complex) -> Real:
+    def in_time(self, torque_transform: ComplexArray) -> RealArray:
         """Convert the Laplace transform of a torque to samples in N·m, shape (..., m).
 
         The samples include delay and filters of the torque channel.
@@ -582,14 +582,14 @@ class DragResponse:
         """
         return self._transform.inverse(torque_transform * self._torque_channel, self._samples)
 
-    def modal_torque(self, mode_number: int) -> Complex:
+    def modal_torque(self, mode_number: int) -> ComplexArray:
         """Return the transform of the linear torque by one mode, without the delay, shape (bins,).
 
         Modes are numbered from 1. This part of the linear torque contains its whole dependence on
         the poles of the mode.
         """
         torque_factor = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode_number - 1]
-        torque_spectrum: Complex = (
+        torque_spectrum: ComplexArray = (
             torque_factor
             * self._inertia_terms[mode_number - 1]
             * self._modal_speed_by_angle[mode_number - 1]
@@ -598,7 +598,7 @@ class DragResponse:
         )
         return torque_spectrum
 
-    def _phase_factor(self, pole: complex, residue: complex) -> Complex:
+    def _phase_factor(self, pole: complex, residue: complex) -> ComplexArray:
         """Return the factor that gives the torque of a mode its measured phase, shape (bins,).
 
         Drag adds damping to a mode, whatever changes the phase of its residue: external damping,
@@ -607,10 +607,10 @@ class DragResponse:
         # The residue of -s⁴ / Z, through the torque channel, is j times a multiple of this.
         phasor = residue / (1j * pole**4 * self.plant.channel_response(pole))
         phasor /= abs(phasor)
-        factor: Complex = phasor.real + phasor.imag * (self.s - pole.real) / pole.imag
+        factor: ComplexArray = phasor.real + phasor.imag * (self.s - pole.real) / pole.imag
         return factor
 
-    def _oversampled_values(self, laplace_transform: Complex) -> Real:
+    def _oversampled_values(self, laplace_transform: ComplexArray) -> RealArray:
         """Convert a Laplace transform to a time series at three times the sampling rate.
 
         The shape is (..., 3 m).
@@ -620,23 +620,23 @@ class DragResponse:
         )
 
 
-def _drag_force(speed_m_s: Real, law: DragLaw) -> Real:
+def _drag_force(speed_m_s: RealArray, law: DragLaw) -> RealArray:
     """Return the drag force per length of the beam in N/m, of the shape of the speeds in m/s."""
     speed_magnitude = np.abs(speed_m_s)
     force_per_speed = law.constant_m * speed_magnitude
     if law.decreasing_part:
         force_per_speed += law.decreasing_part * np.cbrt(speed_magnitude)
-    force_n_per_m: Real = -HALF_AIR_DENSITY_KG_PER_M3 * force_per_speed * speed_m_s
+    force_n_per_m: RealArray = -HALF_AIR_DENSITY_KG_PER_M3 * force_per_speed * speed_m_s
     return force_n_per_m
 
 
-def _pole_pairs(k_of_length: Real, plant: Plant) -> Complex:
+def _pole_pairs(k_of_length: RealArray, plant: Plant) -> ComplexArray:
     """Return both poles of each mode in rad/s, shape (modes, 2), from its ``(k L)^4``."""
     pole_pairs = poles_for_eigenvalues(k_of_length**0.25, plant.beam, plant.damping)
     return pole_pairs.astype(np.complex128)
 
 
-def _impedance_slopes(pole_pairs: Complex, plant: Plant) -> Complex:
+def _impedance_slopes(pole_pairs: ComplexArray, plant: Plant) -> ComplexArray:
     """Return the derivative of the modal impedance Z_i by s at both poles, shape (modes, 2)."""
     s, damping = pole_pairs, plant.damping
     density_over_stiffness = plant.beam.density_over_stiffness
@@ -646,14 +646,14 @@ def _impedance_slopes(pole_pairs: Complex, plant: Plant) -> Complex:
     k = -(density_over_stiffness * s * s + external_damping) / (
         1 + internal_damping
     )  # since Z = 0 at the poles
-    impedance_slopes: Complex = (
+    impedance_slopes: ComplexArray = (
         2 * density_over_stiffness * s
         + (damping.lambda_ * external_damping + damping.alpha * k * internal_damping) / s
     )
     return impedance_slopes
 
 
-def _force_weights_of_step(poles_per_s: Complex, step_s: float) -> Complex:
+def _force_weights_of_step(poles_per_s: ComplexArray, step_s: float) -> ComplexArray:
     """Return the weights of the last forces F in one time step of the equation ``z' = p z + F``.
 
     p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCES`), with that of the
@@ -676,7 +676,7 @@ def _force_weights_of_step(poles_per_s: Complex, step_s: float) -> Complex:
         ]
     )
     remaining_decay = np.exp(poles_per_s[:, None] * (step_s * (1 - step_fraction)))
-    weights_of_forces: Complex = (
+    weights_of_forces: ComplexArray = (
         remaining_decay * (0.5 * step_s * quadrature_weight) @ lagrange_values.T
     )
     return weights_of_forces

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from analysis.linear_model._dynamics import Dynamics
 
-    Real = NDArray[np.float64]
+    RealArray = NDArray[np.float64]
 
 InputKind = Literal["acceleration", "angle"]
 """Input of an exported model."""
@@ -291,7 +291,7 @@ class PoleFit:
 
     def _dense_frequencies(
         self, band_hz: tuple[float, float], point_counts: tuple[int, int]
-    ) -> Real:
+    ) -> RealArray:
         """Return frequencies in a band, in hertz, that are dense near the poles and zeros.
 
         `point_counts` are their numbers over the band and within 3 half widths of a pole or zero.
@@ -309,7 +309,7 @@ class PoleFit:
             frequencies_hz[(frequencies_hz >= band_hz[0]) & (frequencies_hz <= band_hz[1])]
         )
 
-    def _is_apart_from_poles_and_zeros(self, frequency_hz: Real) -> NDArray[np.bool_]:
+    def _is_apart_from_poles_and_zeros(self, frequency_hz: RealArray) -> NDArray[np.bool_]:
         """Return a mask of the frequencies that are far enough from every pole and zero.
 
         Nearer ones are not used, because a relative error means nothing at a zero.
@@ -358,7 +358,7 @@ class PoleFit:
         return s
 
 
-def imaginary_axis(frequency_hz: Real) -> NDArray[np.complex128]:
+def imaginary_axis(frequency_hz: RealArray) -> NDArray[np.complex128]:
     """Return s = j omega in rad/s for each frequency."""
     return np.asarray(2j * np.pi * frequency_hz, dtype=np.complex128)
 

@@ -50,9 +50,9 @@ if TYPE_CHECKING:
     from rigd.view.chart import Axis
 
     # Array of real numbers.
-    Real = NDArray[np.float64]
+    RealArray = NDArray[np.float64]
     # Array of complex numbers.
-    Complex = NDArray[np.complex128]
+    ComplexArray = NDArray[np.complex128]
 
 RECORD_ENTITY: Final = "/whole_record"
 """Entity path in Rerun of the whole record's results."""
@@ -120,7 +120,7 @@ class ChartCurve:
 
     name: str
     key: LegendEntry
-    values: Real
+    values: RealArray
     dotted: bool = False
 
 
@@ -151,7 +151,7 @@ class ChartPage:
 
     title: str
     graphs: tuple[Graph, Graph, Graph]
-    frequency_hz: Real
+    frequency_hz: RealArray
     band_hz: tuple[float, float]
 
 
@@ -307,7 +307,7 @@ def _type_page(
     measured_frf, band_hz = analysis.response.response, analysis.settings.band_hz
     page_entity = f"{FITS_ENTITY}/type_{type_name}"
 
-    def model_curves(values_of_model: Callable[[FittedModel], Real]) -> list[ChartCurve]:
+    def model_curves(values_of_model: Callable[[FittedModel], RealArray]) -> list[ChartCurve]:
         return [
             ChartCurve(_entity_name(model.fit.weighting), key, values_of_model(model))
             for key, model in zip(legend_entries, models, strict=True)
@@ -382,7 +382,7 @@ def _magnitude_axis(analysis: WelchAnalysis) -> Axis:
     )
 
 
-def _axis_of_responses(measured_frf: Complex, modelled_frf: Sequence[Complex]) -> Axis:
+def _axis_of_responses(measured_frf: ComplexArray, modelled_frf: Sequence[ComplexArray]) -> Axis:
     """Return a magnitude axis for measured and modelled responses, and for their residuals."""
     responses = [measured_frf, *modelled_frf]
     measured_and_residuals = [measured_frf, *(measured_frf - model for model in modelled_frf)]
@@ -427,7 +427,7 @@ class PlotOverTime:
     names: tuple[str, ...]
     colors: tuple[Color, ...]
     widths: tuple[float, ...]
-    compute_values: Callable[[TorqueInBand], Real]
+    compute_values: Callable[[TorqueInBand], RealArray]
 
 
 _PLOTS_OVER_TIME: Final = (

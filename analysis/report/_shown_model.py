@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rigd.beam import Plant
 
     # Array of real numbers.
-    Real = NDArray[np.float64]
+    RealArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ class ShownModel:
         """
         return self.beam.parameters["delay_s"] if self.modal is None else self.stated_delay_s
 
-    def band(self, frequency_hz: Real) -> ResponseBand:
+    def band(self, frequency_hz: RealArray) -> ResponseBand:
         """Return the model's response without the delay, with its 95 % band.
 
         Parameters

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     Band = tuple[float, float]
 
     # Array of real numbers.
-    Real = NDArray[np.float64]
+    RealArray = NDArray[np.float64]
 
 _BLOCK_BINS: Final = 24
 """Number of frequency bins in a block, whose mean power decides whether the block was excited."""
@@ -122,7 +122,7 @@ class FittedPlant(Protocol):
         """Names of the parameters that the data determine, in the order of `covariance`."""
 
     @property
-    def covariance(self) -> Real:
+    def covariance(self) -> RealArray:
         """Covariance of the determined parameters, or of the logarithms of positive ones."""
 
 
@@ -148,7 +148,7 @@ class NearlyUniformBeam:
     plant: Plant
     parameters: Mapping[str, float]
     determined: tuple[str, ...]
-    covariance: Real
+    covariance: RealArray
 
     @classmethod
     def from_estimate(cls, tolerant_estimate: TolerantEstimate) -> NearlyUniformBeam:
@@ -179,7 +179,7 @@ _GRID_POINTS: Final = 900
 """Number of frequencies of a grid over a band, in addition to those near the peaks."""
 
 
-def dense_grid(first_hz: float, last_hz: float, peaks_hz: Sequence[float]) -> Real:
+def dense_grid(first_hz: float, last_hz: float, peaks_hz: Sequence[float]) -> RealArray:
     """Return frequencies on which curves over a band are drawn, denser near narrow peaks.
 
     Parameters
@@ -223,17 +223,17 @@ class ResponseBand:
         Standard deviation of the phase.
     """
 
-    frequency_hz: Real
+    frequency_hz: RealArray
     response: NDArray[np.complex128]
-    log_magnitude_std: Real
-    phase_std_rad: Real
+    log_magnitude_std: RealArray
+    phase_std_rad: RealArray
 
-    def magnitude_limits(self) -> tuple[Real, Real]:
+    def magnitude_limits(self) -> tuple[RealArray, RealArray]:
         """Return lower and upper limits of the magnitude's 95 % band in N·m/rad, (n,) each."""
         return _logarithmic_limits(np.abs(self.response), self.log_magnitude_std)
 
 
-def response_band(fit: FittedPlant, frequency_hz: Real) -> ResponseBand:
+def response_band(fit: FittedPlant, frequency_hz: RealArray) -> ResponseBand:
     """Return a fit's frequency response with the uncertainty that follows from its covariance.
 
     Parameters
@@ -281,7 +281,9 @@ def response_band(fit: FittedPlant, frequency_hz: Real) -> ResponseBand:
     )
 
 
-def modal_response_band(fit: ModalFit, frequency_hz: Real, delay_s: float = 0.0) -> ResponseBand:
+def modal_response_band(
+    fit: ModalFit, frequency_hz: RealArray, delay_s: float = 0.0
+) -> ResponseBand:
     """Return a modal model's frequency response with the uncertainty from its covariance.
 
     Parameters
@@ -339,10 +341,10 @@ class LossFactor:
         Standard deviation of the loss factor's logarithm.
     """
 
-    value: Real
-    log_std: Real
+    value: RealArray
+    log_std: RealArray
 
-    def limits(self) -> tuple[Real, Real]:
+    def limits(self) -> tuple[RealArray, RealArray]:
         """Return the lower and upper limit of the loss factor's 95 % band, shape (n,) each."""
         return _logarithmic_limits(self.value, self.log_std)
 
@@ -362,13 +364,13 @@ class LossFactors:
         Sum of both. At a mode it is twice the damping ratio, to first order of the damping.
     """
 
-    frequency_hz: Real
+    frequency_hz: RealArray
     internal: LossFactor | None
     external: LossFactor | None
     total: LossFactor
 
 
-def loss_factors(fit: FittedPlant, frequency_hz: Real) -> LossFactors:
+def loss_factors(fit: FittedPlant, frequency_hz: RealArray) -> LossFactors:
     """Return internal, external and total loss factor of a fit, with their uncertainties.
 
     Parameters
@@ -437,8 +439,11 @@ def loss_factors(fit: FittedPlant, frequency_hz: Real) -> LossFactors:
 
 
 def _loss_with_slopes(
-    omega_rad_s: Real, damping_coefficient: Real | float, damping_order: float, term_sign: float
-) -> tuple[Real, tuple[Real, Real]]:
+    omega_rad_s: RealArray,
+    damping_coefficient: RealArray | float,
+    damping_order: float,
+    term_sign: float,
+) -> tuple[RealArray, tuple[RealArray, RealArray]]:
     """Return a damping term's loss factor, and the derivatives of the loss factor's logarithm.
 
     The derivatives are with respect to the logarithm of the coefficient, and to the order.
@@ -459,7 +464,9 @@ def _loss_with_slopes(
     return quadrature_part / real_part, (1 / real_part, slope_by_order)
 
 
-def _rows_by_parameter(fit: FittedPlant, slopes_by_name: dict[str, Real], point_count: int) -> Real:
+def _rows_by_parameter(
+    fit: FittedPlant, slopes_by_name: dict[str, RealArray], point_count: int
+) -> RealArray:
     """Return derivatives by parameters as rows (k, n), in the order of the fit's covariance.
 
     A parameter that is not in `slopes_by_name` has a row of zeros.
@@ -472,7 +479,7 @@ def _rows_by_parameter(fit: FittedPlant, slopes_by_name: dict[str, Real], point_
     ).reshape(len(fit.determined), point_count)
 
 
-def _standard_deviations(gradient: Real, covariance: Real) -> Real:
+def _standard_deviations(gradient: RealArray, covariance: RealArray) -> RealArray:
     """Return the standard deviations (n,) of a function of the parameters.
 
     `gradient` contains the function's derivatives, (k, n); `covariance` is the parameters', (k, k).
@@ -481,7 +488,9 @@ def _standard_deviations(gradient: Real, covariance: Real) -> Real:
     return np.asarray(np.sqrt(np.maximum(log_variance, 0.0)))
 
 
-def _logarithmic_limits(central_value: Real, log_std: Real) -> tuple[Real, Real]:
+def _logarithmic_limits(
+    central_value: RealArray, log_std: RealArray
+) -> tuple[RealArray, RealArray]:
     """Return lower and upper limits of 95 % intervals that are symmetric in the logarithm."""
     # An undetermined value may overflow. Its band then includes everything.
     limit_factor = np.exp(np.minimum(NORMAL_95 * log_std, 300.0))

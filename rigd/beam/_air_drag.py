@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rigd.beam._model import Beam
 from rigd.beam._modes import clamped_free_eigenvalues, mode_shape
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 AIR_DENSITY_KG_PER_M3 = 1.2
 """Density of air that the drag coefficients refer to.
@@ -34,13 +34,13 @@ by a few per cent, with the same relative error of C_D d."""
 class DragGrid:
     """Quadrature points along the beam for the air's drag, with the mode shapes at the points."""
 
-    x_m: Real
+    x_m: RealArray
     """Distance of each point from the motor's axis, shape (g,)."""
-    weight_m: Real
+    weight_m: RealArray
     """Quadrature weight of each point, a length of beam, shape (g,)."""
-    shapes: Real
+    shapes: RealArray
     """Mode shapes at the points, shape (n, g), each of mean square 1 over the beam."""
-    leverage_m: Real
+    leverage_m: RealArray
     """First moment ``b_i = ∫ x phi_i dx / L`` of each mode shape phi_i, shape (n,)."""
 
     @classmethod
@@ -69,17 +69,17 @@ class DragGrid:
         )
 
     @property
-    def to_modes(self) -> Real:
+    def to_modes(self) -> RealArray:
         """Matrix that converts force per metre at the points into modal forces, shape (n, g)."""
         length_m = self.weight_m.sum()
-        modal_projection: Real = self.shapes * self.weight_m / length_m
+        modal_projection: RealArray = self.shapes * self.weight_m / length_m
         return modal_projection
 
     @property
-    def to_moment(self) -> Real:
+    def to_moment(self) -> RealArray:
         """Weights in m², shape (g,), that turn the force per metre at the points into a moment.
 
         The moment is about the motor's axis.
         """
-        moment_row: Real = self.x_m * self.weight_m
+        moment_row: RealArray = self.x_m * self.weight_m
         return moment_row

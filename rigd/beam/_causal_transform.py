@@ -17,8 +17,8 @@ from math import ceil, inf
 import numpy as np
 from numpy.typing import NDArray
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 def fast_transform_length(min_length: int) -> int:
@@ -82,7 +82,7 @@ class CausalTransform:
         bin_count = int(min(length // 2, highest_hz * length / rate_hz)) + 1
         omega_per_bin = 2j * np.pi * rate_hz / length
         self.s = np.asarray(self.sigma_per_s + omega_per_bin * np.arange(bin_count), np.complex128)
-        self._weights: dict[tuple[int, int], Real] = {}
+        self._weights: dict[tuple[int, int], RealArray] = {}
 
     @classmethod
     def for_record(
@@ -113,7 +113,9 @@ class CausalTransform:
 
         return cls(next_fast_len(ceil(padding_ratio * sample_count)), rate_hz, decay_exponent)
 
-    def forward(self, values: Real, *, oversampling: int = 1, hold: bool = False) -> Complex:
+    def forward(
+        self, values: RealArray, *, oversampling: int = 1, hold: bool = False
+    ) -> ComplexArray:
         """Return the Laplace transform of signals, divided by the sampling period, shape (…, bins).
 
         Parameters
@@ -130,12 +132,12 @@ class CausalTransform:
             missing_count = padded_length - values.shape[-1]
             values = np.concatenate([values, np.repeat(values[..., -1:], missing_count, -1)], -1)
         damped_values = values * self._weight(-1, values.shape[-1], oversampling)
-        transform: Complex = np.fft.rfft(damped_values, padded_length)[..., : self.s.size]
+        transform: ComplexArray = np.fft.rfft(damped_values, padded_length)[..., : self.s.size]
         return transform if oversampling == 1 else transform / oversampling
 
     def inverse(
         self, transform: NDArray[np.complexfloating], samples: slice | int, *, oversampling: int = 1
-    ) -> Real:
+    ) -> RealArray:
         """Return signals from their Laplace transforms, shape (…, m).
 
         Parameters
@@ -152,12 +154,12 @@ class CausalTransform:
         if oversampling != 1:
             transform = oversampling * transform
         damped_values = np.fft.irfft(transform, oversampling * self.length)[..., samples]
-        signals: Real = damped_values * self._weight(1, samples.stop, oversampling)[samples]
+        signals: RealArray = damped_values * self._weight(1, samples.stop, oversampling)[samples]
         return signals
 
     def inverse_at(
-        self, transform: Complex, fine_indices: NDArray[np.intp], oversampling: int
-    ) -> Real:
+        self, transform: ComplexArray, fine_indices: NDArray[np.intp], oversampling: int
+    ) -> RealArray:
         """Return single values of signals from their Laplace transforms, shape (k, p).
 
         Parameters
@@ -185,7 +187,7 @@ class CausalTransform:
         signals *= np.exp(self.sigma_per_s * fine_indices / (oversampling * self.rate_hz))
         return signals
 
-    def convolve(self, values: Real, response: Complex) -> Real:
+    def convolve(self, values: RealArray, response: ComplexArray) -> RealArray:
         """Return the response of a linear system to signals, in the shape of the signals.
 
         Parameters
@@ -197,7 +199,7 @@ class CausalTransform:
         """
         return self.inverse(self.forward(values) * response, values.shape[-1])
 
-    def _weight(self, sign: int, count: int, oversampling: int) -> Real:
+    def _weight(self, sign: int, count: int, oversampling: int) -> RealArray:
         """Return ``exp(sign sigma t)`` at the first `count` values, from a cache if possible."""
         weight = self._weights.get((sign, oversampling))
         if weight is None or weight.size < count:

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from rigd.beam._model import Beam, Damping
 from rigd.beam._modes import clamped_free_eigenvalues, mode_shape, poles_for_eigenvalues
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
 
 _CHUNK_SAMPLES = 256
 """Number of samples processed at once; a table of as many powers of each pole is stored."""
@@ -83,14 +83,16 @@ class DeflectionFilter:
         modes: int = 4,
         points: int = 41,
     ) -> None:
-        self.x_m: Real = np.linspace(0.0, beam.length_m, points)
+        self.x_m: RealArray = np.linspace(0.0, beam.length_m, points)
         z = clamped_free_eigenvalues(modes + 1)
         pole_pairs = poles_for_eigenvalues(z, beam, damping)
         mode_count = _usable_mode_count(pole_pairs, rate_hz)
         pole_pairs, z = pole_pairs[:mode_count], z[:mode_count]
 
         real_poles = _branch_cut_poles(damping, rate_hz)
-        pole_factors: Complex = np.exp(np.concatenate([pole_pairs.ravel(), real_poles]) / rate_hz)
+        pole_factors: ComplexArray = np.exp(
+            np.concatenate([pole_pairs.ravel(), real_poles]) / rate_hz
+        )
         # Row per mode, column per pole: weight of the pole in the mode.
         pole_weights = np.zeros((z.size, pole_factors.size), dtype=np.complex128)
         for i, residues in enumerate(_mode_residues(z, pole_pairs, beam, damping)):
@@ -101,15 +103,15 @@ class DeflectionFilter:
             )
 
         # Powers of the poles, the highest first: effect of each sample of a chunk at its end.
-        self._powers: Complex = pole_factors[:, None] ** np.arange(_CHUNK_SAMPLES, -1, -1)
-        self._scaled_shapes: Complex = (
+        self._powers: ComplexArray = pole_factors[:, None] ** np.arange(_CHUNK_SAMPLES, -1, -1)
+        self._scaled_shapes: ComplexArray = (
             -_scaled_shapes(beam, self.x_m / beam.length_m, z) @ pole_weights
         )
-        self._direct: Real = -(self._scaled_shapes @ _steady_states(pole_factors)).real
-        self._state: Complex = np.zeros(pole_factors.size, dtype=np.complex128)
+        self._direct: RealArray = -(self._scaled_shapes @ _steady_states(pole_factors)).real
+        self._state: ComplexArray = np.zeros(pole_factors.size, dtype=np.complex128)
         self._start_rad: float | None = None
 
-    def feed(self, angle_rad: Real) -> Real:
+    def feed(self, angle_rad: RealArray) -> RealArray:
         """Process samples of the motor's angle and return the deflection at the last one.
 
         Successive calls continue the samples at the sampling rate, without gaps. The beam is
@@ -133,18 +135,20 @@ class DeflectionFilter:
             chunk_rad = turned_rad[chunk_start : chunk_start + _CHUNK_SAMPLES]
             chunk_powers = self._powers[:, _CHUNK_SAMPLES - chunk_rad.size :]
             self._state = chunk_powers[:, 0] * self._state + chunk_powers[:, 1:] @ chunk_rad
-        deflection: Real = (self._scaled_shapes @ self._state).real + self._direct * turned_rad[-1]
+        deflection: RealArray = (
+            self._scaled_shapes @ self._state
+        ).real + self._direct * turned_rad[-1]
         return deflection
 
 
-def _usable_mode_count(pole_pairs: Complex, rate_hz: float) -> int:
+def _usable_mode_count(pole_pairs: ComplexArray, rate_hz: float) -> int:
     """Return the number of modes, from the first on, slow enough for the sampling rate."""
     below_limit = np.abs(pole_pairs[:, 0].imag) < 2 * np.pi * _MAX_FREQUENCY_FRACTION * rate_hz
     is_usable = below_limit & ~np.isnan(pole_pairs[:, 0])
     return is_usable.size if is_usable.all() else int(np.argmin(is_usable))
 
 
-def _branch_cut_poles(damping: Damping, rate_hz: float) -> Real:
+def _branch_cut_poles(damping: Damping, rate_hz: float) -> RealArray:
     """Return the real poles in rad/s that approximate the branch cut of fractional damping orders.
 
     The array is empty if the damping is of integer order, which has no branch cut.
@@ -153,19 +157,19 @@ def _branch_cut_poles(damping: Damping, rate_hz: float) -> Real:
     external_is_integer = damping.gamma == 0 or damping.lambda_ in (0, 1)
     if internal_is_integer and external_is_integer:
         return np.zeros(0)
-    poles: Real = -np.geomspace(_SLOWEST_POLE_RAD_S, rate_hz, _REAL_POLE_COUNT)
+    poles: RealArray = -np.geomspace(_SLOWEST_POLE_RAD_S, rate_hz, _REAL_POLE_COUNT)
     return poles
 
 
-def _steady_states(pole_factors: Complex) -> Complex:
+def _steady_states(pole_factors: ComplexArray) -> ComplexArray:
     """Return the final state of each discrete pole of `pole_factors` for a constant angle of 1."""
-    steady_states: Complex = 1 / (1 - pole_factors)
+    steady_states: ComplexArray = 1 / (1 - pole_factors)
     return steady_states
 
 
 def _modal_stiffness_terms(
-    s: Complex, z: Real, beam: Beam, damping: Damping
-) -> tuple[Complex, Complex, Complex]:
+    s: ComplexArray, z: RealArray, beam: Beam, damping: Damping
+) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return ``P / EI``, ``Q k⁴ / EI`` and ``s d/ds`` of their sum for each mode at `s` (rad/s)."""
     inertial_term = beam.density_over_stiffness * s * s
     external_term = damping.gamma * s**damping.lambda_
@@ -179,21 +183,23 @@ def _modal_stiffness_terms(
     return inertial_term + external_term, (1 + internal_term) * k_fourth, log_slope
 
 
-def _mode_residues(z: Real, pole_pairs: Complex, beam: Beam, damping: Damping) -> Complex:
+def _mode_residues(
+    z: RealArray, pole_pairs: ComplexArray, beam: Beam, damping: Damping
+) -> ComplexArray:
     """Return the residues in rad/s of each mode's response at its two poles, shape (modes, 2)."""
     inertial_load, _, log_slope = _modal_stiffness_terms(pole_pairs, z[:, None], beam, damping)
-    residues: Complex = inertial_load * pole_pairs / log_slope
+    residues: ComplexArray = inertial_load * pole_pairs / log_slope
     return residues
 
 
 def _branch_cut_weights(
-    z: Real,
+    z: RealArray,
     beam: Beam,
     damping: Damping,
     rate_hz: float,
-    pole_factors: Complex,
-    pair_weights: Complex,
-) -> Real:
+    pole_factors: ComplexArray,
+    pair_weights: ComplexArray,
+) -> RealArray:
     """Return the weight of each real pole in each mode, shape (modes, real poles).
 
     They are fitted to the difference between each mode's exact response H_i and that of the pole
@@ -221,7 +227,7 @@ def _branch_cut_weights(
     return cut_weights
 
 
-def _scaled_shapes(beam: Beam, x: Real, z: Real) -> Real:
+def _scaled_shapes(beam: Beam, x: RealArray, z: RealArray) -> RealArray:
     """Return ``b_i phi_i`` in m of the used modes at x = 0…1, shape (x.size, z.size).
 
     The last mode includes all higher ones in the low-frequency limit, in which the sum of
@@ -235,5 +241,5 @@ def _scaled_shapes(beam: Beam, x: Real, z: Real) -> Real:
     if z.size:
         under_load = x**2 * (x**3 - 10 * x + 20) / 120
         shapes[:, -1] = z[-1] ** 4 * (under_load - shapes[:, :-1] @ z[:-1] ** -4.0)
-    scaled_shapes: Real = beam.length_m * shapes
+    scaled_shapes: RealArray = beam.length_m * shapes
     return scaled_shapes

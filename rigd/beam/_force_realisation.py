@@ -17,8 +17,8 @@ from rigd.beam._modes import clamped_free_eigenvalues, mode_mean, mode_shape, po
 from rigd.beam._point_force import PointForceGrid
 from rigd.beam.realisation import RealisationError
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
 
 _MAX_MODES = 80
 """Largest number of modes in a realisation."""
@@ -65,26 +65,26 @@ class ForceRealisation:
     A force at another point of the beam has the same `a` and `b`, but other output rows.
     """
 
-    a: Real
+    a: RealArray
     """State matrix, shape (n, n), in 1/s: 2 × 2 blocks of the modes, then the real poles.
 
     A realisation of the same beam up to a higher frequency has all these poles and additional modal
     and real ones."""
     modes: int
     """Number of modes in the state space."""
-    b: Real
+    b: RealArray
     """Input vector of the force, shape (n,)."""
-    rows: Real
+    rows: RealArray
     """Output matrix, shape (outputs, n).
 
     The outputs are the displacement at each output point (m), then the torque (N·m) and the shear
     force (N) of the motor on the beam."""
-    direct: Real
+    direct: RealArray
     """Direct term: immediate change of each output per N of the force, shape (outputs,)."""
 
 
 def realise_force(
-    beam: Beam, damping: Damping, force_at_m: float, output_at_m: Real, highest_rad_s: float
+    beam: Beam, damping: Damping, force_at_m: float, output_at_m: RealArray, highest_rad_s: float
 ) -> ForceRealisation:
     """Return a state-space realisation of the beam's response to a point force.
 
@@ -217,8 +217,8 @@ def check_force_damping_order(damping: Damping) -> None:
 
 
 def _modal_poles_and_residues(
-    beam: Beam, damping: Damping, x: Real, highest_rad_s: float
-) -> tuple[Complex, Complex]:
+    beam: Beam, damping: Damping, x: RealArray, highest_rad_s: float
+) -> tuple[ComplexArray, ComplexArray]:
     """Return the oscillating modes' poles in rad/s and the outputs' residues (outputs, modes).
 
     `x` contains the output points, then the point of the force, as fractions of the length.
@@ -247,7 +247,7 @@ def _modal_poles_and_residues(
     shape_at_force = mode_shapes[:, -1] / equation_slope
     per_length = beam.length_m * beam.bending_stiffness_n_m2
     root_residue = shape_at_force * (inertial_term + external_term)
-    residues: Complex = np.vstack(
+    residues: ComplexArray = np.vstack(
         [
             mode_shapes[:, :-1].T * shape_at_force / per_length,
             leverage_m * root_residue,
@@ -257,20 +257,20 @@ def _modal_poles_and_residues(
     return poles, residues
 
 
-def _modal_response(s: Complex, poles: Complex, residues: Complex) -> Complex:
+def _modal_response(s: ComplexArray, poles: ComplexArray, residues: ComplexArray) -> ComplexArray:
     """Return the modes' part of each output at `s`: the sum over conjugate pole pairs.
 
     The shape is (number of s, outputs).
     """
     upper_terms, lower_terms = 1 / (s[:, None] - poles), 1 / (s[:, None] - poles.conj())
-    modal_outputs: Complex = upper_terms @ residues.T + lower_terms @ residues.conj().T
+    modal_outputs: ComplexArray = upper_terms @ residues.T + lower_terms @ residues.conj().T
     return modal_outputs
 
 
-def _infinite_beam_response(s: Complex, beam: Beam, damping: Damping) -> Real:
+def _infinite_beam_response(s: ComplexArray, beam: Beam, damping: Damping) -> RealArray:
     """Return the magnitude in m/N of an infinitely long beam's displacement under the force."""
     stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
     inertial_load = beam.density_over_stiffness * s**2 + damping.gamma * s**damping.lambda_
     inertial_load = inertial_load * beam.bending_stiffness_n_m2
-    response_m_per_n: Real = np.sqrt(0.125) / np.abs(inertial_load**0.75 * stiffness**0.25)
+    response_m_per_n: RealArray = np.sqrt(0.125) / np.abs(inertial_load**0.75 * stiffness**0.25)
     return response_m_per_n

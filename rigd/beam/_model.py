@@ -27,8 +27,8 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 from numpy.typing import ArrayLike, NDArray
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ class TransferGrid:
             slice(i, i + _BLOCK_POINTS) for i in range(0, s_points.size, _BLOCK_POINTS)
         ]
 
-    def evaluate(self, beam: Beam, damping: Damping) -> Complex:
+    def evaluate(self, beam: Beam, damping: Damping) -> ComplexArray:
         """Return the coupling torque per motor angle in N·m/rad at all s of the grid.
 
         Parameters
@@ -164,7 +164,7 @@ class TransferGrid:
 
     def evaluate_with_gradient(
         self, beam: Beam, damping: Damping, wrt: Sequence[str] = GRADIENT_NAMES[:4]
-    ) -> tuple[Complex, Complex]:
+    ) -> tuple[ComplexArray, ComplexArray]:
         """Return the coupling torque per motor angle and its derivatives for the parameters `wrt`.
 
         Parameters
@@ -223,7 +223,7 @@ class TransferGrid:
                         row[:] = g[grid_slice]
         return g.reshape(self.shape), gradient.reshape(len(wrt), *self.shape)
 
-    def _power_of_s(self, order: float, grid_slice: slice) -> Complex:
+    def _power_of_s(self, order: float, grid_slice: slice) -> ComplexArray:
         """Return ``s^order`` at the points of s in a slice of the grid."""
         if self._log_magnitude is None:
             power = np.exp(order * self._log_s[grid_slice])
@@ -234,16 +234,21 @@ class TransferGrid:
         return power
 
     def _fourth_power_of_z(
-        self, beam: Beam, damping: Damping, c: Complex, s_lambda: Complex, grid_slice: slice
-    ) -> Complex:
+        self,
+        beam: Beam,
+        damping: Damping,
+        c: ComplexArray,
+        s_lambda: ComplexArray,
+        grid_slice: slice,
+    ) -> ComplexArray:
         """Return ``q = z⁴``, with z the wave number times L, in a slice of the grid."""
         inertial_term = beam.density_over_stiffness * self._s_squared[grid_slice]
-        q: Complex = (inertial_term + damping.gamma * s_lambda) / c
+        q: ComplexArray = (inertial_term + damping.gamma * s_lambda) / c
         q *= -(beam.length_m**4)
         return q
 
 
-def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
+def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> ComplexArray:
     """Return the transfer function from motor angle to coupling torque (Eq. 25 of the paper).
 
     Parameters
@@ -278,7 +283,7 @@ def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
 
 def transfer_and_gradient(
     s: ArrayLike, beam: Beam, damping: Damping, wrt: Sequence[str] = GRADIENT_NAMES[:4]
-) -> tuple[Complex, Complex]:
+) -> tuple[ComplexArray, ComplexArray]:
     """Return the coupling torque per motor angle at `s` and its derivatives for parameters `wrt`.
 
     Parameters
@@ -315,7 +320,7 @@ def transfer_and_gradient(
     return TransferGrid(s).evaluate_with_gradient(beam, damping, wrt)
 
 
-def _polynomials(coefficients: Real, x: Complex) -> Complex:
+def _polynomials(coefficients: RealArray, x: ComplexArray) -> ComplexArray:
     """Return the values of k polynomials at n points, shape (k, n).
 
     `coefficients` have the shape (k, degree + 1), the lowest power first.
@@ -327,7 +332,7 @@ def _polynomials(coefficients: Real, x: Complex) -> Complex:
     return polynomial_sums
 
 
-def _scaled_form(q: Complex) -> tuple[Complex, Complex]:
+def _scaled_form(q: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Return F(q) and ``2 z² sin z sinh z / (1 + cos z cosh z)`` at large ``q = z⁴``.
 
     Only decaying exponentials are used, so nothing overflows.
@@ -355,7 +360,7 @@ def _scaled_form(q: Complex) -> tuple[Complex, Complex]:
     return f, s
 
 
-def _root_in_first_quadrant(real: Real, imag: Real) -> Complex:
+def _root_in_first_quadrant(real: RealArray, imag: RealArray) -> ComplexArray:
     """Return the square root of ``real + 1j imag`` for ``imag >= 0``.
 
     It is as accurate as numpy's and three times as fast.
@@ -370,7 +375,7 @@ def _root_in_first_quadrant(real: Real, imag: Real) -> Complex:
     return complex_root
 
 
-def _evaluate_f(q: Complex) -> Complex:
+def _evaluate_f(q: ComplexArray) -> ComplexArray:
     """Return the beam's dimensionless response function F(q) at ``q = z⁴``."""
     f = np.empty_like(q)
     is_small = np.abs(q) < _SERIES_LIMIT
@@ -383,7 +388,7 @@ def _evaluate_f(q: Complex) -> Complex:
     return f
 
 
-def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
+def _f_with_slope(q: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return the beam's response function F(q), dF/dq and ``F - q dF/dq``, without cancellation."""
     f, f_slope, remainder = np.empty((3, q.size), dtype=np.complex128)
     is_small = np.abs(q) < _SERIES_LIMIT

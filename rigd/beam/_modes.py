@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigd.beam._model import Beam, Damping
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
 
 _HOMOTOPY_STEP_COUNTS = (8, 64)
 """Numbers of steps in which damping grows from zero while poles are followed.
@@ -52,7 +52,7 @@ class Mode:
     """Damping ratio of the mode, ``-(p_1 + p_2) / (2 sqrt(p_1 p_2))``; above 1 if over-damped."""
 
 
-def clamped_free_eigenvalues(n: int) -> Real:
+def clamped_free_eigenvalues(n: int) -> RealArray:
     """Return the first `n` positive roots z_i of ``1 + cos z cosh z = 0``, shape (n,).
 
     References
@@ -69,7 +69,7 @@ def clamped_free_eigenvalues(n: int) -> Real:
 
 
 @cache
-def _cached_eigenvalues(n: int) -> Real:
+def _cached_eigenvalues(n: int) -> RealArray:
     """Return the first `n` clamped–free eigenvalues as a cached array that must not be changed."""
     i = np.arange(1, n + 1)
     asymptotic_root = (i - 0.5) * np.pi
@@ -84,7 +84,7 @@ def _cached_eigenvalues(n: int) -> Real:
     return asymptotic_root + d
 
 
-def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
+def undamped_frequencies_rad_s(beam: Beam, n: int) -> RealArray:
     """Return the first `n` natural frequencies of the undamped beam, shape (n,), in rad/s.
 
     Parameters
@@ -103,11 +103,11 @@ def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
     [ 2.554 16.005 44.816]
     """
     z = clamped_free_eigenvalues(n)
-    frequencies_rad_s: Real = z * z / (beam.length_m**2 * np.sqrt(beam.density_over_stiffness))
+    frequencies_rad_s: RealArray = z * z / (beam.length_m**2 * np.sqrt(beam.density_over_stiffness))
     return frequencies_rad_s
 
 
-def mode_shape(mode_number: int, x_over_length: ArrayLike) -> Real:
+def mode_shape(mode_number: int, x_over_length: ArrayLike) -> RealArray:
     """Return a mode shape of the clamped–free beam, normalised to the mean square 1.
 
     Its value at the tip is 2. It is computed without growing exponentials, so high modes are as
@@ -137,13 +137,13 @@ def mode_shape(mode_number: int, x_over_length: ArrayLike) -> Real:
     one_minus_sigma = 2 * decay * (sine - cosine - decay) / sum_
     growing_part = (np.exp(x - z) - np.exp(-x - z)) * (sine - cosine - decay) / sum_
     shape_sign = 1.0 if mode_number % 2 == 1 else -1.0
-    mode_values: Real = shape_sign * (
+    mode_values: RealArray = shape_sign * (
         np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + growing_part
     )
     return mode_values
 
 
-def mode_mean(n: int) -> Real:
+def mode_mean(n: int) -> RealArray:
     """Return the mean of each of the first `n` mode shapes over the beam, shape (n,).
 
     Parameters
@@ -157,13 +157,13 @@ def mode_mean(n: int) -> Real:
     >>> print(mode_mean(3).round(4))
     [ 0.783  -0.4339  0.2544]
     """
-    shape_means: Real = (
+    shape_means: RealArray = (
         2 * (-1.0) ** np.arange(n) * root_shear_ratio(n) / clamped_free_eigenvalues(n)
     )
     return shape_means
 
 
-def root_shear_ratio(n: int) -> Real:
+def root_shear_ratio(n: int) -> RealArray:
     """Return ``-phi'''(0) / (k phi''(0))`` of the first `n` mode shapes phi, shape (n,).
 
     It relates the shear force at the motor's axis to the bending moment there. A mode of mean
@@ -183,11 +183,11 @@ def root_shear_ratio(n: int) -> Real:
     z = clamped_free_eigenvalues(n)
     decay = np.exp(-z)
     sum_ = 1 - decay * decay + 2 * decay * np.sin(z)  # (sinh z + sin z) 2 exp(-z)
-    shear_ratios: Real = (1 + decay * decay + 2 * decay * np.cos(z)) / sum_
+    shear_ratios: RealArray = (1 + decay * decay + 2 * decay * np.cos(z)) / sum_
     return shear_ratios
 
 
-def participation(beam: Beam, n: int) -> Real:
+def participation(beam: Beam, n: int) -> RealArray:
     """Return the participation factors of the first `n` modes in m³, shape (n,).
 
     The factor ``a_i² = 4 L³ / z_i⁴`` times rho is the mode's part of the rigid beam's moment of
@@ -208,11 +208,11 @@ def participation(beam: Beam, n: int) -> Real:
     >>> print(fraction.round(4))
     [0.9707 0.0247 0.0032]
     """
-    factors_m3: Real = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
+    factors_m3: RealArray = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
     return factors_m3
 
 
-def poles(beam: Beam, damping: Damping, n: int) -> Complex:
+def poles(beam: Beam, damping: Damping, n: int) -> ComplexArray:
     """Return the poles of the first `n` modes, shape (n, 2), in rad/s.
 
     A row has a conjugate pair (positive frequency first), or two real poles (slow one first) where
@@ -249,8 +249,8 @@ def poles(beam: Beam, damping: Damping, n: int) -> Complex:
 
 
 def poles_for_eigenvalues(
-    z: Real, beam: Beam, damping: Damping, near_rad_s: Complex | None = None
-) -> Complex:
+    z: RealArray, beam: Beam, damping: Damping, near_rad_s: ComplexArray | None = None
+) -> ComplexArray:
     """Return the pole pair of each mode from its eigenvalue z, shape (len(z), 2), in rad/s.
 
     The poles are the roots of ``Q (z/L)⁴ + P = 0``, ordered as in `poles`. If z are the roots of
@@ -298,7 +298,7 @@ def poles_for_eigenvalues(
 
 def pole_gradient(
     pole_rad_s: complex, k4_per_m4: float, beam: Beam, damping: Damping, wrt: Sequence[str]
-) -> Complex:
+) -> ComplexArray:
     """Return the derivatives of a mode's pole with respect to parameters, shape (len(wrt),).
 
     The derivatives follow by implicit differentiation of the mode's characteristic equation
@@ -367,7 +367,7 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
     return tuple(mode_list)
 
 
-def _second_order_poles(omega_squared: Real, damping_rate: Real) -> Complex:
+def _second_order_poles(omega_squared: RealArray, damping_rate: RealArray) -> ComplexArray:
     """Return the two roots in rad/s of ``s² + damping_rate s + omega_squared``, shape (n, 2)."""
     minus_half_rate = -0.5 * damping_rate
     first_roots = minus_half_rate + np.sqrt(
@@ -386,23 +386,25 @@ def _second_order_poles(omega_squared: Real, damping_rate: Real) -> Complex:
 
 
 def _poles_by_continuation(
-    omega_squared: Real, external_coefficient: float, damping: Damping, steps: int
-) -> Complex:
+    omega_squared: RealArray, external_coefficient: float, damping: Damping, steps: int
+) -> ComplexArray:
     """Return the modes' poles in the upper half plane, followed from the undamped ones.
 
     Damping grows from zero in `steps` steps. A pole is NaN where the path was lost or has left the
     principal sheet.
     """
-    log_s: Complex = 0.5 * np.log(omega_squared) + 0.5j * np.pi
+    log_s: ComplexArray = 0.5 * np.log(omega_squared) + 0.5j * np.pi
     for fraction in (np.arange(1, steps + 1) / steps) ** 2:
         log_s = _newton_roots(
             log_s, omega_squared, fraction * external_coefficient, fraction * damping.zeta, damping
         )
-    poles: Complex = np.exp(log_s)
+    poles: ComplexArray = np.exp(log_s)
     return poles
 
 
-def _poles_by_search(omega_squared: Real, external_coefficient: float, damping: Damping) -> Complex:
+def _poles_by_search(
+    omega_squared: RealArray, external_coefficient: float, damping: Damping
+) -> ComplexArray:
     """Search for the modes' poles in the upper half plane by Newton's method from many starts.
 
     Most starts are near the branch cut: near critical damping of almost first order a pole turns
@@ -410,24 +412,26 @@ def _poles_by_search(omega_squared: Real, external_coefficient: float, damping: 
     leads to a pole on the principal sheet.
     """
     start_angles_rad = np.pi * np.array([0.7, 0.9, 0.98, 0.999])
-    start_offsets: Complex = np.add.outer(1j * start_angles_rad, np.linspace(-6, 6, 49)).ravel()
-    log_s: Complex = 0.5 * np.log(omega_squared)[:, None] + start_offsets
+    start_offsets: ComplexArray = np.add.outer(
+        1j * start_angles_rad, np.linspace(-6, 6, 49)
+    ).ravel()
+    log_s: ComplexArray = 0.5 * np.log(omega_squared)[:, None] + start_offsets
     log_s = _newton_roots(
         log_s, omega_squared[:, None], external_coefficient, damping.zeta, damping
     )
     has_converged = ~np.isnan(log_s)
     first_converged = np.argmax(has_converged, axis=1)[:, None]
-    poles: Complex = np.exp(np.take_along_axis(log_s, first_converged, axis=1)[:, 0])
+    poles: ComplexArray = np.exp(np.take_along_axis(log_s, first_converged, axis=1)[:, 0])
     return poles
 
 
 def _newton_roots(
-    log_s: Complex,
-    omega_squared: Real,
+    log_s: ComplexArray,
+    omega_squared: RealArray,
     external_coefficient: float,
     zeta: float,
     damping: Damping,
-) -> Complex:
+) -> ComplexArray:
     """Return ln s of the roots s of the characteristic equation, found by Newton's method.
 
     The unknown is ln s: in ln s a pole moves almost linearly, and a pole off the principal sheet

@@ -35,8 +35,8 @@ from rigd.beam._tip_mass import (
     uniform_tip_response,
 )
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 _BUTTERWORTH_LOSS: Final = 2**0.5
@@ -271,7 +271,7 @@ class Plant:
             )
         return offset_plant
 
-    def transfer(self, s: ArrayLike) -> Complex:
+    def transfer(self, s: ArrayLike) -> ComplexArray:
         """Return the torque on the beam per motor angle in N·m/rad, in the shape of `s` (not 0)."""
         s = np.asarray(s, dtype=np.complex128)
         if self.is_uniform_cantilever:
@@ -279,7 +279,9 @@ class Plant:
         response = self.rigid_clamp_response(s).response
         return response / (1 + self.root_compliance_rad_per_nm * response)
 
-    def transfer_and_gradient(self, s: ArrayLike, wrt: Sequence[str]) -> tuple[Complex, Complex]:
+    def transfer_and_gradient(
+        self, s: ArrayLike, wrt: Sequence[str]
+    ) -> tuple[ComplexArray, ComplexArray]:
         """Return the coupling torque per motor angle and its derivatives for the parameters `wrt`.
 
         Parameters
@@ -306,7 +308,7 @@ class Plant:
         )
         return clamped_response.response * clamp_factor, gradient * clamp_factor * clamp_factor
 
-    def channel_response(self, s: ArrayLike) -> Complex:
+    def channel_response(self, s: ArrayLike) -> ComplexArray:
         """Return the dimensionless transfer function of the torque channel's delay and filters.
 
         Parameters
@@ -315,7 +317,7 @@ class Plant:
             Laplace variable in rad/s.
         """
         s = np.asarray(s, dtype=np.complex128)
-        response: Complex = np.exp(-self.delay_s * s)
+        response: ComplexArray = np.exp(-self.delay_s * s)
         for linear_coefficient, quadratic_coefficient in self.lags:
             response /= 1 + s * (linear_coefficient + s * quadratic_coefficient)
         return response
@@ -327,7 +329,7 @@ class Plant:
         lags = ((first_s, 0.0), (_BUTTERWORTH_LOSS * second_s, second_s * second_s))
         return tuple(lag for lag in lags if any(lag))
 
-    def pole_gradients(self, poles_rad_s: Complex, wrt: Sequence[str]) -> Complex:
+    def pole_gradients(self, poles_rad_s: ComplexArray, wrt: Sequence[str]) -> ComplexArray:
         """Return the derivatives of poles with respect to parameters, shape (n, len(wrt)).
 
         The poles are treated as roots of ``1/G + kappa``. At the pole of a beam on a rigid clamp G
@@ -356,7 +358,7 @@ class Plant:
         if any(self.stiffness_offsets):
             raise ValueError("Of modes of their own stiffness the shear is not known.")
 
-    def _response_and_slopes(self, s: Complex) -> tuple[LoadedResponse, Slopes]:
+    def _response_and_slopes(self, s: ComplexArray) -> tuple[LoadedResponse, Slopes]:
         """Return the coupling torque per angle on a rigid clamp, and functions for its derivatives.
 
         The derivative with respect to the clamp's compliance is that at a compliance of 0.
@@ -375,11 +377,11 @@ class Plant:
             )
         }
 
-    def tip_slope(self, s: ArrayLike) -> Complex:
+    def tip_slope(self, s: ArrayLike) -> ComplexArray:
         """Return the slope of the tip relative to the root per motor angle, in the shape of `s`."""
         return self.tip_response(s)[1]
 
-    def tip_response(self, s: ArrayLike) -> tuple[Complex, Complex]:
+    def tip_response(self, s: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
         """Return the tip's displacement (m/rad) and slope per motor angle, relative to the root.
 
         Parameters
@@ -427,17 +429,17 @@ class Plant:
         )
         return displacement * clamp_factor, slope_per_angle * clamp_factor
 
-    def _tip_force_per_angle(self, s: Complex, force_grid: PointForceGrid) -> Complex:
+    def _tip_force_per_angle(self, s: ComplexArray, force_grid: PointForceGrid) -> ComplexArray:
         """Return the force in N/rad that the tip mass exerts on the beam per angle of the root."""
         tip_m, inertial_load = self.beam.length_m, self.tip_mass_kg * s * s
-        tip_force: Complex = (
+        tip_force: ComplexArray = (
             -inertial_load
             * force_grid.displacement_per_angle(tip_m)
             / (1 + inertial_load * force_grid.displacement_per_force(tip_m, tip_m))
         )
         return tip_force
 
-    def shear(self, s: Complex) -> Complex:
+    def shear(self, s: ComplexArray) -> ComplexArray:
         """Return the motor's transverse force on the beam per motor angle in N/rad at `s`."""
         self._require_uniform()
         force_grid = PointForceGrid(s, self.beam, self.damping)
@@ -452,7 +454,7 @@ class Plant:
             )
         return shear_per_angle
 
-    def rigid_clamp_response(self, s: Complex) -> LoadedResponse:
+    def rigid_clamp_response(self, s: ComplexArray) -> LoadedResponse:
         """Return the torque per angle at `s` (rad/s) that the beam would have on a rigid clamp."""
         elastic_factor, inertial_factor = self.elastic_and_inertial_factors(s)
         response = loaded_response(
@@ -464,7 +466,7 @@ class Plant:
             response, elastic_factor, inertial_factor, self.beam, self.stiffness_offsets
         )
 
-    def residues(self, poles_rad_s: Complex) -> Complex:
+    def residues(self, poles_rad_s: ComplexArray) -> ComplexArray:
         """Return the residues of the coupling torque per angular acceleration at poles.
 
         The torque per angular acceleration is ``G(s) / s²``. A mode with the pole p, its conjugate
@@ -485,19 +487,19 @@ class Plant:
         pole_distance = 0.0 if self.root_compliance_rad_per_nm else _POLE_DISTANCE
         s = poles_rad_s * (1 - pole_distance)
         clamped_response = self.rigid_clamp_response(s)
-        residues: Complex = (
+        residues: ComplexArray = (
             -(clamped_response.response**2) / self.derivative_by_s(s, clamped_response) / s**2
         )
         return residues
 
-    def elastic_and_inertial_factors(self, s: Complex) -> tuple[Complex, Complex]:
+    def elastic_and_inertial_factors(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Return the elastic factor c and the inertial factor p at `s` (rad/s)."""
         log_s, damping = np.log(s), self.damping
         elastic_factor = 1 + damping.zeta * np.exp(damping.alpha * log_s).astype(np.complex128)
         external_term = damping.gamma * np.exp(damping.lambda_ * log_s).astype(np.complex128)
         return elastic_factor, self.beam.density_over_stiffness * s * s + external_term
 
-    def derivative_by_s(self, s: Complex, clamped_response: LoadedResponse) -> Complex:
+    def derivative_by_s(self, s: ComplexArray, clamped_response: LoadedResponse) -> ComplexArray:
         """Return dG/ds, with G the coupling torque per motor angle of the beam on a rigid clamp.
 
         Parameters
@@ -511,14 +513,14 @@ class Plant:
         internal_term = damping.zeta * damping.alpha * np.exp(damping.alpha * log_s)
         external_term = damping.gamma * damping.lambda_ * np.exp(damping.lambda_ * log_s)
         inertial_factor = 2 * self.beam.density_over_stiffness * s * s + external_term
-        by_log_s: Complex = (
+        by_log_s: ComplexArray = (
             clamped_response.by_elastic * internal_term
             + clamped_response.by_inertial * inertial_factor
             + 2 * self.tip_mass_kg * clamped_response.by_mass
         )
         return by_log_s / s
 
-    def poles(self, z: Real, near_rad_s: Complex | None = None) -> Complex:
+    def poles(self, z: RealArray, near_rad_s: ComplexArray | None = None) -> ComplexArray:
         """Return both poles of each mode with locked hub, shape (len(z), 2), in rad/s.
 
         The poles are followed from those of the beam on a rigid clamp without a tip mass while mass
@@ -544,7 +546,7 @@ class Plant:
                 return np.column_stack([upper_poles, upper_poles.conj()])
         return self._followed_roots(z, zeros=False)
 
-    def zeros(self, z: Real) -> Complex:
+    def zeros(self, z: RealArray) -> ComplexArray:
         """Return the zeros of the coupling torque per angle in rad/s, in pairs as in `poles`.
 
         Parameters
@@ -554,7 +556,7 @@ class Plant:
         """
         return self._followed_roots(z, zeros=True)
 
-    def _followed_roots(self, z: Real, *, zeros: bool) -> Complex:
+    def _followed_roots(self, z: RealArray, *, zeros: bool) -> ComplexArray:
         """Return poles or zeros, followed from those of the uniform beam with eigenvalues `z`."""
         offsets = np.array(self.stiffness_offsets)
         if not zeros and offsets.size:
@@ -573,7 +575,9 @@ class Plant:
         if zeros:
             relative_change = max(relative_change, float(np.abs(offsets).max(initial=0.0)))
 
-        def roots_near(fraction: float, start_roots: Complex, step_tolerance: float) -> Complex:
+        def roots_near(
+            fraction: float, start_roots: ComplexArray, step_tolerance: float
+        ) -> ComplexArray:
             partial_plant = replace(
                 self,
                 tip_mass_kg=fraction * self.tip_mass_kg,
@@ -584,15 +588,15 @@ class Plant:
 
         return followed_roots(roots, relative_change, roots_near)
 
-    def _newton_roots(self, s: Complex, step_tolerance: float, *, zeros: bool) -> Complex:
+    def _newton_roots(self, s: ComplexArray, step_tolerance: float, *, zeros: bool) -> ComplexArray:
         """Return the roots near `s` of ``1/G + kappa``, or of G if `zeros` is true."""
 
-        def newton_step(s: Complex) -> Complex:
+        def newton_step(s: ComplexArray) -> ComplexArray:
             clamped_response = self.rigid_clamp_response(s)
             factor = (
                 -1 if zeros else 1 + self.root_compliance_rad_per_nm * clamped_response.response
             )
-            step: Complex = (
+            step: ComplexArray = (
                 clamped_response.response / self.derivative_by_s(s, clamped_response) * factor
             )
             return step

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 _MAX_HOMOTOPY_STEPS = 12
 """Largest number of steps in which the tip mass and the clamp's compliance grow from zero."""
@@ -40,7 +40,7 @@ class Pole:
     """Number of the mode, from 1."""
     at_rad_s: complex
     """Pole in the complex plane."""
-    derivative: Complex
+    derivative: ComplexArray
     """Derivatives of the pole with respect to the k requested parameters, shape (k,)."""
 
     @property
@@ -59,12 +59,12 @@ class Pole:
         return -self.at_rad_s.real / abs(self.at_rad_s)
 
     @property
-    def frequency_derivative_hz(self) -> Real:
+    def frequency_derivative_hz(self) -> RealArray:
         """Derivatives of the frequency in Hz with respect to the parameters, shape (k,)."""
         return np.asarray(self.derivative.imag / (2 * math.pi), dtype=np.float64)
 
     @property
-    def damping_ratio_derivative(self) -> Real:
+    def damping_ratio_derivative(self) -> RealArray:
         """Derivatives of the damping ratio with respect to the parameters, shape (k,)."""
         p, pole_magnitude = self.at_rad_s, abs(self.at_rad_s)
         magnitude_derivative = (p.conjugate() * self.derivative).real / pole_magnitude
@@ -76,10 +76,10 @@ class Pole:
 
 
 def followed_roots(
-    uniform_roots: Complex,
+    uniform_roots: ComplexArray,
     relative_change: float,
-    roots_near: Callable[[float, Complex, float], Complex],
-) -> Complex:
+    roots_near: Callable[[float, ComplexArray, float], ComplexArray],
+) -> ComplexArray:
     """Return poles or zeros, followed from those of the uniform beam on a rigid clamp.
 
     `relative_change` is the difference of the plant's tip mass and compliance from that beam,
@@ -115,8 +115,8 @@ def followed_roots(
 
 
 def newton_roots(
-    newton_step: Callable[[Complex], Complex], s: Complex, step_tolerance: float
-) -> Complex:
+    newton_step: Callable[[ComplexArray], ComplexArray], s: ComplexArray, step_tolerance: float
+) -> ComplexArray:
     """Return the roots that Newton's method finds from the start values `s`.
 
     `step_tolerance` is the relative length of the last step. The result is NaN where no root is

@@ -31,8 +31,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigd.beam._model import Beam, Damping
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 _SERIES_LIMIT = 40.0
 """Magnitude of q at which the power series are replaced by exponentials."""
@@ -78,8 +78,8 @@ class PointForceGrid:
         inertial_term = beam.density_over_stiffness * s_points * s_points
         internal_factor = 1 + damping.zeta * s_points**damping.alpha
         self._length_m = beam.length_m
-        self._q_stiffness: Complex = beam.bending_stiffness_n_m2 * internal_factor
-        self._b4: Complex = (
+        self._q_stiffness: ComplexArray = beam.bending_stiffness_n_m2 * internal_factor
+        self._b4: ComplexArray = (
             -(inertial_term + damping.gamma * s_points**damping.lambda_) / internal_factor
         )
         is_small = np.abs(self._b4) * beam.length_m**4 < _SERIES_LIMIT
@@ -89,7 +89,7 @@ class PointForceGrid:
         )
         self._exponentials = _ExponentialSolution(self._b4[self._large_q_indices], beam.length_m)
 
-    def displacement_per_angle(self, x_m: ArrayLike, derivative_order: int = 0) -> Complex:
+    def displacement_per_angle(self, x_m: ArrayLike, derivative_order: int = 0) -> ComplexArray:
         """Return the displacement of the beam per angle of its root, or its derivative by x.
 
         Parameters
@@ -122,7 +122,7 @@ class PointForceGrid:
 
     def displacement_per_force(
         self, x_m: ArrayLike, force_at_m: ArrayLike, derivative_order: int = 0
-    ) -> Complex:
+    ) -> ComplexArray:
         """Return the displacement of the beam per point force, or its derivative by x.
 
         The motor holds the root at angle zero.
@@ -169,18 +169,18 @@ class PointForceGrid:
         )
         return out.reshape((*self._shape, *shape))
 
-    def torque_per_angle(self) -> Complex:
+    def torque_per_angle(self) -> ComplexArray:
         """Return the motor's torque on the beam per angle (Eq. 25) in N·m/rad.
 
         The shape is that of the grid.
         """
         return -self._bending_stiffness() * self.displacement_per_angle(0.0, 2)
 
-    def shear_per_angle(self) -> Complex:
+    def shear_per_angle(self) -> ComplexArray:
         """Return the shear force at the root per angle in N/rad, in the shape of the grid."""
         return self._bending_stiffness() * self.displacement_per_angle(0.0, 3)
 
-    def torque_per_force(self, force_at_m: ArrayLike) -> Complex:
+    def torque_per_force(self, force_at_m: ArrayLike) -> ComplexArray:
         """Return the motor's torque on the beam per point force on it, in N·m/N.
 
         The shape is that of s, then of `force_at_m`.
@@ -195,7 +195,7 @@ class PointForceGrid:
             np.zeros_like(force_x), force_x, 2
         )
 
-    def shear_per_force(self, force_at_m: ArrayLike) -> Complex:
+    def shear_per_force(self, force_at_m: ArrayLike) -> ComplexArray:
         """Return the shear force at the root per point force on the beam, dimensionless.
 
         The shape is that of s, then of `force_at_m`.
@@ -210,17 +210,17 @@ class PointForceGrid:
             np.zeros_like(force_x), force_x, 3
         )
 
-    def _bending_stiffness(self, axes: int = 0) -> Complex:
+    def _bending_stiffness(self, axes: int = 0) -> ComplexArray:
         """Return the complex bending stiffness Q in N·m²; `axes` axes of length 1 are appended."""
         return self._q_stiffness.reshape(self._shape + (1,) * axes)
 
-    def _series_at_tip(self, n: int) -> Complex:
+    def _series_at_tip(self, n: int) -> ComplexArray:
         """Return the power series ``K_n`` at the tip at the s with small q, shape (low, 1)."""
         return _power_series(self._b4[self._small_q_indices, None], np.array([self._length_m]), n)
 
     def _root_derivatives(
-        self, b4: Complex, tip_moment: Complex, tip_shear: Complex
-    ) -> tuple[Complex, Complex]:
+        self, b4: ComplexArray, tip_moment: ComplexArray, tip_shear: ComplexArray
+    ) -> tuple[ComplexArray, ComplexArray]:
         """Return y''(0) and y'''(0) of the beam whose moment and shear force at the tip are zero.
 
         `tip_moment` and `tip_shear` are y''(L) and y'''(L) of the solution without the terms in K_2
@@ -228,12 +228,14 @@ class PointForceGrid:
         """
         k0, k1, k3 = self._series_at_tip(0), self._series_at_tip(1), self._series_at_tip(3)
         determinant = k0 * k0 - b4 * k1 * k3
-        moment: Complex = (k1 * tip_shear - k0 * tip_moment) / determinant
-        shear: Complex = (b4 * k3 * tip_moment - k0 * tip_shear) / determinant
+        moment: ComplexArray = (k1 * tip_shear - k0 * tip_moment) / determinant
+        shear: ComplexArray = (b4 * k3 * tip_moment - k0 * tip_shear) / determinant
         return moment, shear
 
 
-def _power_series(b4: Complex, x: Real, n: int, derivative_order: int = 0) -> Complex:
+def _power_series(
+    b4: ComplexArray, x: RealArray, n: int, derivative_order: int = 0
+) -> ComplexArray:
     """Return the power series ``K_n``, or a derivative of it, at the points x, shape (s, m).
 
     `b4` is ``-P/Q``, shape (s, 1); x has the shape (m,).
@@ -253,12 +255,12 @@ def _power_series(b4: Complex, x: Real, n: int, derivative_order: int = 0) -> Co
 class _ExponentialSolution:
     """Beam responses at large |q|, written as sums of exponentials that never grow."""
 
-    _b: Complex  # (s, 1)
-    _kappa: Complex  # (s, 1): c / b, which is j or -j
+    _b: ComplexArray  # (s, 1)
+    _kappa: ComplexArray  # (s, 1): c / b, which is j or -j
     _length_m: float
-    _inverse: Complex  # (s, 4, 4)
+    _inverse: ComplexArray  # (s, 4, 4)
 
-    def __init__(self, b4: Complex, length_m: float) -> None:
+    def __init__(self, b4: ComplexArray, length_m: float) -> None:
         wave_number = b4**0.25
         self._length_m = length_m
         self._b = wave_number[:, None]
@@ -277,15 +279,15 @@ class _ExponentialSolution:
             np.complex128
         )
 
-    def response_per_angle(self, x: Real, derivative_order: int) -> Complex:
+    def response_per_angle(self, x: RealArray, derivative_order: int) -> ComplexArray:
         """Return the displacement per root angle at x, or its derivative by x; shape (s, m)."""
         return self._weighted_sum(
             self._inverse[:, :, 1, None] / self._b[:, :, None], x, derivative_order
         )
 
     def response_per_force_over_stiffness(
-        self, x: Real, force_x: Real, derivative_order: int
-    ) -> Complex:
+        self, x: RealArray, force_x: RealArray, derivative_order: int
+    ) -> ComplexArray:
         """Return displacement times bending stiffness per point force, or its derivative by x.
 
         Point i of x, shape (m,), is displaced by the force at point i of `force_x`. The result has
@@ -318,7 +320,9 @@ class _ExponentialSolution:
         coefficients = -self._inverse @ at_ends
         return direct_response + self._weighted_sum(coefficients, x, derivative_order)
 
-    def _weighted_sum(self, coefficients: Complex, x: Real, derivative_order: int) -> Complex:
+    def _weighted_sum(
+        self, coefficients: ComplexArray, x: RealArray, derivative_order: int
+    ) -> ComplexArray:
         """Return the four exponential solutions' weighted sum; weights of shape (s, 4, m or 1)."""
         b, c = self._b, self._kappa * self._b
         from_tip = self._length_m - x
@@ -328,7 +332,7 @@ class _ExponentialSolution:
             (-c) ** derivative_order * np.exp(-c * x),
             c**derivative_order * np.exp(-c * from_tip),
         )
-        weighted_sum: Complex = sum(
+        weighted_sum: ComplexArray = sum(
             (coefficients[:, i] * exponential for i, exponential in enumerate(exponentials)),
             start=np.zeros((b.shape[0], x.size), dtype=np.complex128),
         )

@@ -32,8 +32,8 @@ from rigd.beam._modes import (
     clamped_free_eigenvalues,
 )
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 _SERIES_LIMIT = 40.0
 """Magnitude of q below which power series replace the closed form, which cancels there."""
@@ -58,20 +58,20 @@ class LoadedResponse:
     constant, and the bending stiffness and length as well.
     """
 
-    response: Complex
+    response: ComplexArray
     """Coupling torque per motor angle in N·m/rad."""
-    by_elastic: Complex
+    by_elastic: ComplexArray
     """Derivative of the response with respect to the elastic factor c."""
-    by_inertial: Complex
+    by_inertial: ComplexArray
     """Derivative of the response with respect to the inertial factor p."""
-    by_mass: Complex
+    by_mass: ComplexArray
     """Derivative of the response with respect to the tip mass, in N·m/(rad kg)."""
 
 
 def loaded_response(
-    s_squared: Complex,
-    elastic_factor: Complex,
-    inertial_factor: Complex,
+    s_squared: ComplexArray,
+    elastic_factor: ComplexArray,
+    inertial_factor: ComplexArray,
     beam: Beam,
     tip_mass_kg: float,
 ) -> LoadedResponse:
@@ -112,8 +112,8 @@ def loaded_response(
 
 def add_stiffness_offsets(
     uniform_response: LoadedResponse,
-    elastic_factor: Complex,
-    inertial_factor: Complex,
+    elastic_factor: ComplexArray,
+    inertial_factor: ComplexArray,
     beam: Beam,
     stiffness_offsets: tuple[float, ...],
 ) -> LoadedResponse:
@@ -160,13 +160,13 @@ def add_stiffness_offsets(
     )
 
 
-Slopes = dict[str, Callable[[], Complex]]
+Slopes = dict[str, Callable[[], ComplexArray]]
 """Map from a parameter's name to a function that computes the derivative of the response."""
 
 
 def differentiated_response(
-    log_s: Complex,
-    s_squared: Complex,
+    log_s: ComplexArray,
+    s_squared: ComplexArray,
     beam: Beam,
     damping: Damping,
     tip_mass_kg: float,
@@ -216,7 +216,9 @@ def differentiated_response(
     }
 
 
-def uniform_tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Complex]:
+def uniform_tip_response(
+    beam: Beam, damping: Damping, s: ComplexArray
+) -> tuple[ComplexArray, ComplexArray]:
     """Return the tip's displacement and slope per motor angle.
 
     Parameters
@@ -244,12 +246,14 @@ def uniform_tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Comp
     reciprocal = 1 / (4 * rotation * decay + (1 + b) * (1 + a))
     sines = 2 * rotation * (1 - a) + 2j * imaginary_sign * decay * (1 - b)
     cosines = 2 * rotation * (1 + a) + 2 * decay * (1 + b)
-    displacement: Complex = beam.length_m * sines * reciprocal / z
-    tip_slope: Complex = cosines * reciprocal
+    displacement: ComplexArray = beam.length_m * sines * reciprocal / z
+    tip_slope: ComplexArray = cosines * reciprocal
     return displacement, tip_slope
 
 
-def _response_functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]:
+def _response_functions(
+    q: ComplexArray,
+) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
     """Return the loaded beam's dimensionless functions F and U at `q`, and q F' and q U'."""
     q = np.asarray(q, dtype=np.complex128)
     f, u, b = np.empty((3, *q.shape), dtype=np.complex128)
@@ -267,7 +271,7 @@ def _response_functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]
     return f, u, 0.25 * (f + u + f * f), 0.5 * (u + b) + 0.25 * u * f
 
 
-def _scaled_functions(q: Complex) -> tuple[Complex, Complex, Complex]:
+def _scaled_functions(q: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return F, U and z² B at large `q`, computed from decaying exponentials only."""
     # F, U and B are real functions of q: values below the real axis mirror those above it.
     lower_half_plane = q.imag < 0

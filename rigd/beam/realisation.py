@@ -65,8 +65,8 @@ Such combinations would gain the last digit in the band with huge residues that 
 nowhere else."""
 
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
 
 
 class RealisationError(UserError, ValueError):
@@ -82,11 +82,11 @@ class Realisation:
     `a` is block diagonal: 2 × 2 blocks for the complex pairs, then the real poles.
     """
 
-    a: Real
+    a: RealArray
     """State matrix, shape (n, n), in 1/s."""
-    b: Real
+    b: RealArray
     """Input vector of the angular acceleration, shape (n,), dimensionless."""
-    c: Real
+    c: RealArray
     """Output vector of the torque, shape (n,), in N·m."""
     direct_inertia_kg_m2: float
     """Torque per angular acceleration that bypasses the states (D), not negative."""
@@ -96,13 +96,13 @@ class Realisation:
     """Torque per angle that bypasses the states (K), not negative."""
     relative_error: float
     """Largest ``|realised - exact| / |exact|`` of the transfer function from 0.05 to 100 Hz."""
-    poles_rad_s: Complex
+    poles_rad_s: ComplexArray
     """Poles, shape (m,): of each conjugate pair the one with positive imaginary part, then the
     real poles."""
     modes: NDArray[np.intp]
     """Index of each pole's mode, shape (m,), from 0; -1 for a pole of the branch cut."""
 
-    def transfer(self, s: ArrayLike) -> Complex:
+    def transfer(self, s: ArrayLike) -> ComplexArray:
         """Return the realisation's coupling torque per motor angle at `s` (rad/s), in N·m/rad."""
         s_points = np.asarray(s, dtype=np.complex128)
         basis_columns = _basis_functions(s_points.ravel(), self.poles_rad_s)
@@ -111,7 +111,7 @@ class Realisation:
             self.direct_viscosity_nm_s_per_rad,
             self.direct_stiffness_nm_per_rad,
         )
-        g: Complex = basis_columns @ np.concatenate([self.c, direct_terms])
+        g: ComplexArray = basis_columns @ np.concatenate([self.c, direct_terms])
         return g.reshape(s_points.shape)
 
 
@@ -122,7 +122,7 @@ class StateOutput:
     The output is ``c x + D θ'' + V θ' + K θ``, with the states x of a `Realisation`.
     """
 
-    c: Real
+    c: RealArray
     """Output vector, shape (n,), in the response's unit."""
     output_per_acceleration: float
     """Output per angular acceleration that bypasses the states (D)."""
@@ -134,7 +134,7 @@ class StateOutput:
 
 def state_output(
     realisation: Realisation,
-    response: Callable[[NDArray[np.complex128]], Complex],
+    response: Callable[[NDArray[np.complex128]], ComplexArray],
     *,
     inertial: bool,
     small: float = 0.0,
@@ -199,7 +199,7 @@ def state_output(
     return StateOutput(output_coefficients[:-3], inertia, viscosity, stiffness)
 
 
-def _basis_functions(s: Complex, poles: Complex) -> Complex:
+def _basis_functions(s: ComplexArray, poles: ComplexArray) -> ComplexArray:
     """Return the functions of s whose sum, weighted by ``c, D, V, K``, is the torque per angle.
 
     The shape is (len(s), n + 3), for n states.
@@ -304,7 +304,7 @@ def _check_passive(damping: Damping) -> None:
         )
 
 
-def _realised_poles(plant: Plant, modes_of: Beam) -> tuple[Complex, NDArray[np.intp]]:
+def _realised_poles(plant: Plant, modes_of: Beam) -> tuple[ComplexArray, NDArray[np.intp]]:
     """Return the realisation's poles in rad/s and the index of each pole's mode.
 
     The poles up to 1.2 kHz are ordered as in `Realisation.poles_rad_s`; `modes_of` is the beam
@@ -345,7 +345,7 @@ def _realised_poles(plant: Plant, modes_of: Beam) -> tuple[Complex, NDArray[np.i
     )
 
 
-def _select_poles(pole_pairs: Complex) -> NDArray[np.bool_]:
+def _select_poles(pole_pairs: ComplexArray) -> NDArray[np.bool_]:
     """Return a mask of the modal poles in the state space, in the shape of `pole_pairs`."""
     is_oscillating = pole_pairs[:, 0].imag > 0
     mode_indices = np.flatnonzero(is_oscillating)
@@ -360,18 +360,18 @@ def _select_poles(pole_pairs: Complex) -> NDArray[np.bool_]:
     return is_selected
 
 
-def _zeros_in_band(plant: Plant) -> Complex:
+def _zeros_in_band(plant: Plant) -> ComplexArray:
     """Return the zeros of G in rad/s up to 500 Hz, which are poles of the pinned–free beam."""
     beam = plant.beam
     highest_k_fourth = (2 * np.pi * _FIT_BAND_HZ[1]) ** 2 * beam.density_over_stiffness
     zero_count = int(highest_k_fourth**0.25 * beam.length_m / np.pi) + 1
     z = np.pi * np.arange(1.25, zero_count + 1)  # of tan z = tanh z, within 4e-4
     zeros = plant.zeros(z)[:, 0]
-    upper_zeros: Complex = zeros[zeros.imag > 0]
+    upper_zeros: ComplexArray = zeros[zeros.imag > 0]
     return upper_zeros
 
 
-def _fit_grid(poles_and_zeros: Complex) -> tuple[Real, Real]:
+def _fit_grid(poles_and_zeros: ComplexArray) -> tuple[RealArray, RealArray]:
     """Return the angular frequencies (rad/s) of the fit, and the weight of each in the fit.
 
     The grid covers the fit's band, where it is dense near `poles_and_zeros`, and both tails.
@@ -392,17 +392,17 @@ def _fit_grid(poles_and_zeros: Complex) -> tuple[Real, Real]:
     return 2 * np.pi * frequency_hz, point_weights
 
 
-def _grid_around(poles_and_zeros: Complex, points: int) -> Real:
+def _grid_around(poles_and_zeros: ComplexArray, points: int) -> RealArray:
     """Return a grid of frequencies (Hz) within three half-widths of each pole or zero."""
     half_width = np.maximum(-poles_and_zeros.real, 1e-4 * poles_and_zeros.imag)
     width_offsets = np.linspace(-3, 3, points)
-    frequency_hz: Real = (
+    frequency_hz: RealArray = (
         poles_and_zeros.imag[:, None] + half_width[:, None] * width_offsets
     ).ravel() / (2 * np.pi)
     return frequency_hz
 
 
-def _fit_coefficients(equation_columns: Complex, equation_target: Complex) -> Real:
+def _fit_coefficients(equation_columns: ComplexArray, equation_target: ComplexArray) -> RealArray:
     """Return the real least-squares solution whose last three unknowns (D, V, K) are not negative.
 
     The equations ``columns @ solution = target`` are complex.
@@ -419,14 +419,16 @@ def _fit_coefficients(equation_columns: Complex, equation_target: Complex) -> Re
         )[0]
         direct_terms = scaled_solution[-3:]
         if (direct_terms >= 0).all():
-            scaled: Real = scaled_solution / column_scale
+            scaled: RealArray = scaled_solution / column_scale
             return scaled
         free_columns = free_columns[
             free_columns != real_columns.shape[1] - 3 + np.argmin(direct_terms)
         ]
 
 
-def _relative_error(plant: Plant, poles: Complex, zeros: Complex, coefficients: Real) -> float:
+def _relative_error(
+    plant: Plant, poles: ComplexArray, zeros: ComplexArray, coefficients: RealArray
+) -> float:
     """Return the realisation's largest relative error on a grid denser than that of the fit."""
     lowest_hz, highest_hz = ERROR_BAND_HZ
     poles_and_zeros = np.concatenate([poles[poles.imag > 0], zeros])
@@ -439,7 +441,9 @@ def _relative_error(plant: Plant, poles: Complex, zeros: Complex, coefficients: 
     return float(np.max(np.abs(_basis_functions(s, poles) @ coefficients / exact_response - 1)))
 
 
-def _far_from_poles_and_zeros(omega: Real, poles: Complex, zeros: Complex) -> NDArray[np.bool_]:
+def _far_from_poles_and_zeros(
+    omega: RealArray, poles: ComplexArray, zeros: ComplexArray
+) -> NDArray[np.bool_]:
     """Return a mask of the frequencies at which a relative error of the response is meaningful.
 
     At a pole or zero, where the exact response is infinite or zero, it is not.
@@ -451,7 +455,7 @@ def _far_from_poles_and_zeros(omega: Real, poles: Complex, zeros: Complex) -> ND
 
 
 def _build_realisation(
-    poles: Complex, modes: NDArray[np.intp], coefficients: Real, relative_error: float
+    poles: ComplexArray, modes: NDArray[np.intp], coefficients: RealArray, relative_error: float
 ) -> Realisation:
     """Build the realisation from its poles and the fitted coefficients ``c, D, V, K``."""
     upper_poles, real_poles = poles[poles.imag > 0], poles[poles.imag == 0].real
@@ -493,42 +497,42 @@ class CoupledModel:
     output is its output row times the state, plus its factor times τ if the model has one.
     """
 
-    a: Real
+    a: RealArray
     """State matrix, shape (n, n)."""
-    b: Real
+    b: RealArray
     """Input vector of the torque on the shaft, shape (n,)."""
-    angle: Real
+    angle: RealArray
     """Output row of the angle in rad, shape (n,)."""
-    velocity: Real
+    velocity: RealArray
     """Output row of the angular velocity in rad/s, shape (n,)."""
-    acceleration: Real
+    acceleration: RealArray
     """Output row of the angular acceleration in rad/s², shape (n,).
 
     The torque on the shaft adds `acceleration_per_torque` times τ."""
     acceleration_per_torque: float
     """Angular acceleration per torque on the shaft, in rad/(s² N·m)."""
-    beam_torque: Real
+    beam_torque: RealArray
     """Output row of the torque Γ on the beam in N·m, shape (n,).
 
     The torque on the shaft adds `beam_torque_per_torque` times τ."""
     beam_torque_per_torque: float
     """Fraction of the shaft's torque that acts on the beam without delay."""
-    sensor_torque: Real
+    sensor_torque: RealArray
     """Output row of the torque at a sensor between motor and clamp in N·m, shape (n,).
 
     It is ``Γ + J_tool θ''``; the torque on the shaft adds `sensor_torque_per_torque` times τ."""
     sensor_torque_per_torque: float
     """Fraction of the shaft's torque that acts on the sensor without delay."""
-    sensed_torque: Real | None = None
+    sensed_torque: RealArray | None = None
     """Output row of the torque after the sensor's filter in N·m, shape (n,); None without filter.
     """
-    shear: Real = field(default_factory=lambda: np.zeros(0))
+    shear: RealArray = field(default_factory=lambda: np.zeros(0))
     """Output row of the motor's force on the beam in N, shape (n,).
 
     The torque on the shaft adds `shear_per_torque` times τ."""
     shear_per_torque: float = 0.0
     """Force on the beam per torque on the shaft that acts without delay, in 1/m."""
-    sensed_shear: Real | None = None
+    sensed_shear: RealArray | None = None
     """Output row of the shear force after the sensor's filter in N, shape (n,); None without
     filter."""
 
@@ -647,7 +651,7 @@ def couple(
     )
 
 
-def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
+def propagator(model: CoupledModel, duration_s: float) -> tuple[RealArray, RealArray]:
     """Return the matrices of the exact discrete-time model for a constant torque.
 
     ``x(t + duration_s) = phi x(t) + gamma τ`` for a torque τ that is constant during that time.
@@ -681,7 +685,9 @@ def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
     return matrix_exponential[:n, :n], matrix_exponential[:n, n]
 
 
-def states_after_constant_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
+def states_after_constant_inputs(
+    model: CoupledModel, inputs: RealArray, duration_s: float
+) -> RealArray:
     """Return the state that each constant unit input causes after a duration, shape (n, inputs).
 
     Parameters
@@ -700,7 +706,7 @@ def states_after_constant_inputs(model: CoupledModel, inputs: Real, duration_s: 
     return _matrix_exponential(extended_matrix)[:n, n:]
 
 
-def _matrix_exponential(square_matrix: Real) -> Real:
+def _matrix_exponential(square_matrix: RealArray) -> RealArray:
     """Return the matrix exponential by scaling and squaring with the [13/13] Padé approximant.
 
     Algorithm 2.3 of N. J. Higham, SIAM J. Matrix Anal. Appl. 26 (2005) 1179, without its low-order
@@ -719,7 +725,7 @@ def _matrix_exponential(square_matrix: Real) -> Real:
         for parity in (0, 1)
     )
     odd_part = x @ odd_part
-    matrix_exponential: Real = np.linalg.solve(even_part - odd_part, even_part + odd_part)
+    matrix_exponential: RealArray = np.linalg.solve(even_part - odd_part, even_part + odd_part)
     for _ in range(squarings):
         matrix_exponential = matrix_exponential @ matrix_exponential
     return matrix_exponential

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from rigd.beam._causal_transform import CausalTransform, fast_transform_length
 from rigd.beam._plant import Plant
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
 
 SMALL_SLOPE_RAD = 0.14
 """Largest slope of the tip relative to the root, in rad, for which the linear model holds.
@@ -79,7 +79,7 @@ class TipMotion:
     """Largest speed of the tip in still air, including the rotation of the root."""
 
 
-def tip_motion(plant: Plant, angle_rad: Real, rate_hz: float) -> TipMotion:
+def tip_motion(plant: Plant, angle_rad: RealArray, rate_hz: float) -> TipMotion:
     """Predict the tip's largest deflection, slope and speed from a record of the motor angle.
 
     Parameters
@@ -127,7 +127,7 @@ def _memory_samples(plant: Plant, rate_hz: float) -> int:
 
 
 def _tip_motion_from_rest(
-    plant: Plant, angle_rad: Real, rate_hz: float, first_sample: int = 0
+    plant: Plant, angle_rad: RealArray, rate_hz: float, first_sample: int = 0
 ) -> TipMotion:
     """Return the tip's largest motion from `first_sample` on, for an angle from rest at 0."""
     n = angle_rad.size
@@ -142,7 +142,9 @@ def _tip_motion_from_rest(
     for block_start in range(0, s.size, _BLOCK_POINTS):
         block_slice = slice(block_start, block_start + _BLOCK_POINTS)
         angle_spectrum = deflection_spectrum[block_slice].copy()
-        root_angle: Complex = angle_spectrum  # turns like the motor, except for a compliant clamp
+        root_angle: ComplexArray = (
+            angle_spectrum  # turns like the motor, except for a compliant clamp
+        )
         tip_displacement, slope_per_angle = plant.tip_response(s[block_slice])
         if plant.root_compliance_rad_per_nm:
             root_angle = angle_spectrum * (
@@ -154,7 +156,7 @@ def _tip_motion_from_rest(
             deflection_spectrum[block_slice] + plant.beam.length_m * root_angle
         )
 
-    def largest(spectrum: Complex) -> float:
+    def largest(spectrum: ComplexArray) -> float:
         motion = transform.inverse(spectrum, slice(first_sample, n))
         return float(max(motion.max(), -motion.min()))  # NaN stays NaN
 

@@ -22,8 +22,8 @@ from rigd.control._discrete_plant import DiscretePlant
 from rigd.control._loop_model import LoopModel
 from rigd.control._pid import ControlDesignError
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 MAX_GROWTH_PER_S = 0.02
 """Largest growth rate of an oscillation of the loop in 1/s that is accepted, with a warning.
@@ -60,13 +60,13 @@ _OUTPUT_ROWS = 5  # angle, velocity, torque without friction, reference speed, s
 class LoopResponse:
     """Response of the closed loop to a reference, with a value for each tick; arrays (n,)."""
 
-    angle_rad: Real
+    angle_rad: RealArray
     """Angle of the output shaft in rad."""
-    velocity_rad_s: Real
+    velocity_rad_s: RealArray
     """Speed of the output shaft in rad/s."""
-    torque_nm: Real
+    torque_nm: RealArray
     """Torque command in N·m with friction compensation, without the limit of the motor."""
-    coupling_torque_nm: Real
+    coupling_torque_nm: RealArray
     """Coupling torque in N·m (beam and tool inertia), without the sensor's delay."""
 
 
@@ -80,9 +80,9 @@ class LoopOpening:
 
     name: str
     """Name of the signal."""
-    action: Real
+    action: RealArray
     """Effect of one unit of the signal on the next state, shape (n,)."""
-    reading: Real
+    reading: RealArray
     """Row vector that gives the signal from the state x, ``reading · x``; shape (n,)."""
 
 
@@ -95,21 +95,21 @@ class ClosedLoop:
     that compensation (rad/s), and the sensor's torque (N·m).
     """
 
-    a: Real
+    a: RealArray
     """State matrix, shape (n, n)."""
-    b: Real
+    b: RealArray
     """Input vector of the reference, shape (n,)."""
-    c: Real
+    c: RealArray
     """Output matrix, shape (5, n)."""
-    d: Real
+    d: RealArray
     """Direct effect of the reference on the outputs, shape (5,)."""
     model: LoopModel
     """Model from which the loop was computed."""
     openings: tuple[LoopOpening, ...]
     """Signals at which the loop can be opened: torque command, angle reading, torque reading."""
-    poles_rad_s: Complex
+    poles_rad_s: ComplexArray
     """Poles of the loop in continuous time, the fastest growing (or slowest decaying) first."""
-    shaft_torque: Real
+    shaft_torque: RealArray
     """Effect on the next state of 1 N·m on the shaft for one period, shape (n,)."""
     realisation: Realisation | None
     """State space of the beam, whose states follow angle and velocity in x; None: no beam."""
@@ -128,7 +128,7 @@ class ClosedLoop:
         """Return the pole of the closed loop with the lowest damping ratio, in rad/s."""
         return complex(min(self.poles_rad_s, key=_damping_ratio))
 
-    def simulate(self, reference_rad: Real) -> LoopResponse:
+    def simulate(self, reference_rad: RealArray) -> LoopResponse:
         """Return the closed loop's response to a reference from rest, exact at the ticks.
 
         The record is divided into blocks of ticks. The response within a block is the sum of two
@@ -155,7 +155,7 @@ class ClosedLoop:
                 )
         return response
 
-    def simulate_in_chunks(self, reference_rad: Real) -> Iterator[LoopResponse]:
+    def simulate_in_chunks(self, reference_rad: RealArray) -> Iterator[LoopResponse]:
         """Yield the response that `simulate` returns in consecutive chunks, which take less memory.
 
         Parameters
@@ -201,7 +201,7 @@ class ClosedLoop:
             torque_nm += friction_speed_rad_s
             yield LoopResponse(angle_rad, velocity_rad_s, torque_nm, coupling_torque_nm)
 
-    def response(self, frequency_hz: Real) -> Complex:
+    def response(self, frequency_hz: RealArray) -> ComplexArray:
         """Return the complex frequency response from reference to angle at given frequencies.
 
         The result has the shape of the frequencies.
@@ -215,7 +215,7 @@ class ClosedLoop:
         ]
         return np.array(response_values).reshape(np.shape(frequency_hz))
 
-    def _block_matrices(self) -> tuple[Real, Real, Real, Real]:
+    def _block_matrices(self) -> tuple[RealArray, RealArray, RealArray, RealArray]:
         """Return the matrices that compute the response of a block of L ticks.
 
         They are the free response (5, n, L) to the state at the start of the block, the forced
@@ -336,7 +336,7 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     )
 
 
-def continuous_poles(a: Real, rate_hz: float) -> Complex:
+def continuous_poles(a: RealArray, rate_hz: float) -> ComplexArray:
     """Return the poles in continuous time, in rad/s, of the system ``x[k+1] = a x[k]``.
 
     Parameters
@@ -348,7 +348,7 @@ def continuous_poles(a: Real, rate_hz: float) -> Complex:
     """
     eigenvalues = np.linalg.eigvals(a).astype(complex)
     # Delays have eigenvalues at zero, which decay within a few ticks.
-    poles: Complex = np.log(eigenvalues[np.abs(eigenvalues) > _MAX_DELAY_EIGENVALUE]) * rate_hz
+    poles: ComplexArray = np.log(eigenvalues[np.abs(eigenvalues) > _MAX_DELAY_EIGENVALUE]) * rate_hz
     return poles
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from rigd.control._loop_model import LinearController, LoopModel
 from rigd.control._pid import derivative_coefficients, design_pid, lowpass_coefficients
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,13 +20,13 @@ class ControlLaw:
     compensation (N·m) and the speed that the compensation uses (rad/s).
     """
 
-    a: Real
+    a: RealArray
     """State matrix, shape (n, n)."""
-    b: Real
+    b: RealArray
     """Input matrix, shape (n, 3)."""
-    c: Real
+    c: RealArray
     """Output matrix, shape (2, n)."""
-    d: Real
+    d: RealArray
     """Direct effect of the inputs on the outputs, shape (2, 3)."""
 
 

@@ -9,7 +9,7 @@ from rigd.beam.realisation import Realisation, couple, propagator
 from rigd.control._loop_model import LoopModel
 from rigd.control._pid import ControlDesignError
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 MAX_DELAY_PERIODS = 50
 """Longest delay in the model in periods: every period of delay adds one state."""
@@ -65,7 +65,7 @@ class DiscretePlant:
         switch_s = period_fraction * period_s
         extended_matrix = np.zeros((state_size, state_size + 1))
 
-        def state_map_after(duration_s: float) -> tuple[Real, int]:
+        def state_map_after(duration_s: float) -> tuple[RealArray, int]:
             """Return the linear map to the state at a time after a tick, shape (n, state_size + 1).
 
             The second result is the column of the torque that acts at that time.
@@ -82,10 +82,12 @@ class DiscretePlant:
                     torque_column = acting_column
             return state_map, torque_column
 
-        def reading_row(quantity_row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
+        def reading_row(
+            quantity_row: RealArray, per_torque: float, since_tick_s: float = 0.0
+        ) -> RealArray:
             """Return the row vector of a reading at a time after a tick, (state_size + 1,)."""
             state_map, torque_column = state_map_after(since_tick_s)
-            chain_reading: Real = quantity_row @ state_map
+            chain_reading: RealArray = quantity_row @ state_map
             chain_reading[torque_column] += per_torque
             return chain_reading
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rigd.control._closed_loop import ClosedLoop
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,16 +34,16 @@ class DisturbedResponse:
     There is one response for each of several random draws of the noise.
     """
 
-    angle_rad: Real
+    angle_rad: RealArray
     """Angle of the output shaft in rad, shape (n, draws)."""
-    mode_torque_nm: Real
+    mode_torque_nm: RealArray
     """Amplitude of the coupling torque in N·m of each of the lowest m modes, shape
     (n, m, draws)."""
 
 
 def simulate_disturbed(
     closed_loop: ClosedLoop,
-    reference_rad: Real,
+    reference_rad: RealArray,
     disturbances: Disturbances,
     *,
     modes: int,

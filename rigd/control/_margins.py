@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from rigd.control._closed_loop import ClosedLoop, LoopOpening
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 _LOWEST_FREQUENCY = 1e-6
 """Lowest examined frequency, as a fraction of the sampling rate."""
@@ -116,7 +116,9 @@ def loop_margins(closed_loop: ClosedLoop) -> tuple[Margins, ...]:
     return tuple(_margins_at_opening(closed_loop, opening) for opening in closed_loop.openings)
 
 
-def open_loop_gain(closed_loop: ClosedLoop, opening: LoopOpening, phase_rad: Real) -> Complex:
+def open_loop_gain(
+    closed_loop: ClosedLoop, opening: LoopOpening, phase_rad: RealArray
+) -> ComplexArray:
     """Return the complex gain L of the loop opened at one signal, at some frequencies.
 
     The sensitivity of the closed loop is ``1/(1 + L)``.
@@ -151,7 +153,7 @@ def open_loop_gain(closed_loop: ClosedLoop, opening: LoopOpening, phase_rad: Rea
 def _margins_at_opening(closed_loop: ClosedLoop, opening: LoopOpening) -> Margins:
     """Return the stability margins of a closed loop opened at one signal."""
 
-    def curve(phase_rad: Real) -> Complex:
+    def curve(phase_rad: RealArray) -> ComplexArray:
         return open_loop_gain(closed_loop, opening, phase_rad)
 
     rate_hz = closed_loop.model.rate_hz
@@ -199,11 +201,11 @@ def _margins_at_opening(closed_loop: ClosedLoop, opening: LoopOpening) -> Margin
     )
 
 
-Curve = Callable[[Real], Complex]
+Curve = Callable[[RealArray], ComplexArray]
 """Function that returns the open loop's gain at angular frequencies times the period."""
 
 
-def _examined_frequencies(closed_loop: ClosedLoop, opening: LoopOpening) -> Real:
+def _examined_frequencies(closed_loop: ClosedLoop, opening: LoopOpening) -> RealArray:
     """Return the frequencies at which margins are searched, in rad per tick, increasing.
 
     They are dense around the resonances of the open and the closed loop.
@@ -233,8 +235,8 @@ def _examined_frequencies(closed_loop: ClosedLoop, opening: LoopOpening) -> Real
 
 
 def _negative_real_crossings(
-    gain_curve: Curve, phase_per_tick_rad: Real, curve_gain: Complex
-) -> tuple[Real, Real]:
+    gain_curve: Curve, phase_per_tick_rad: RealArray, curve_gain: ComplexArray
+) -> tuple[RealArray, RealArray]:
     """Return the frequencies at which the open loop's gain is real and negative, and the gains."""
     crossings = _sign_changes(np.imag, gain_curve, phase_per_tick_rad, curve_gain)
     # The curve ends at frequency 0 and half the sampling rate, where the gain is always real.
@@ -249,11 +251,11 @@ def _negative_real_crossings(
 
 
 def _sign_changes(
-    real_function: Callable[[Complex], Real],
+    real_function: Callable[[ComplexArray], RealArray],
     gain_curve: Curve,
-    phase_per_tick_rad: Real,
-    curve_gain: Complex,
-) -> Real:
+    phase_per_tick_rad: RealArray,
+    curve_gain: ComplexArray,
+) -> RealArray:
     """Return the frequencies at which a real function of the open loop's gain changes its sign."""
     is_negative = np.signbit(real_function(curve_gain))
     interval_indices = np.flatnonzero(is_negative[:-1] != is_negative[1:])
@@ -271,12 +273,12 @@ def _sign_changes(
             np.where(is_before_zero, middle_frequencies, lower_frequencies),
             np.where(is_before_zero, upper_frequencies, middle_frequencies),
         )
-    zero_frequencies: Real = 0.5 * (lower_frequencies + upper_frequencies)
+    zero_frequencies: RealArray = 0.5 * (lower_frequencies + upper_frequencies)
     return zero_frequencies
 
 
 def _smallest_with_frequency(
-    value_frequencies: Real, candidate_values: Real
+    value_frequencies: RealArray, candidate_values: RealArray
 ) -> tuple[float, float]:
     """Return the frequency of the smallest value, and the value; NaN and infinity if all are inf.
 
@@ -289,7 +291,7 @@ def _smallest_with_frequency(
 
 
 def _distance_to_critical_point(
-    gain_curve: Curve, phase_per_tick_rad: Real, curve_gain: Complex
+    gain_curve: Curve, phase_per_tick_rad: RealArray, curve_gain: ComplexArray
 ) -> tuple[float, float]:
     """Return the frequency at which the open loop's gain is closest to -1, and the distance."""
     for _ in range(_REFINEMENTS):

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from rigd.control._closed_loop import ClosedLoop
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 _DAMPING_STRENGTH = 0.25
 """Speed of the reference per torque, times the beam's inertia and the frequency of its first mode.
@@ -79,7 +79,7 @@ class VibrationDamper:
         return displacement_rad
 
 
-_Signal = TypeVar("_Signal", float, Real)
+_Signal = TypeVar("_Signal", float, RealArray)
 
 
 class _DampingLaw:
@@ -169,7 +169,7 @@ def design_damper(closed_loop: "ClosedLoop") -> DamperSettings | None:
     return None
 
 
-def damped_poles(closed_loop: "ClosedLoop", settings: DamperSettings) -> Complex:
+def damped_poles(closed_loop: "ClosedLoop", settings: DamperSettings) -> ComplexArray:
     """Return the poles of a closed loop with active damping, in rad/s.
 
     Parameters

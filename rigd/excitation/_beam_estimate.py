@@ -19,8 +19,8 @@ from rigd.beam import (
 )
 from rigd.excitation._signals import ExcitationError
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating[Any, Any]]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 BAND_HZ: Final = 50.0
 """Upper end in Hz of the band that the whole-record fit uses."""
@@ -57,9 +57,9 @@ class BeamEstimate:
     means that the structure has no such damping."""
     names: tuple[str, ...]
     """Names of the fit's free parameters: some of `PARAMETERS`, and deviations of modes."""
-    noise_frequency_hz: Real
+    noise_frequency_hz: RealArray
     """Frequencies of the noise spectrum in increasing order, shape (m,)."""
-    noise_nm2_per_hz: Real
+    noise_nm2_per_hz: RealArray
     """One-sided power spectral density of the torque's noise, shape (m,)."""
     uniformity: float = 0.0
     """Relative standard deviation of each mode's frequency from that of the uniform beam."""
@@ -257,7 +257,7 @@ POLE_AND_RESIDUE_DERIVATIVES: Final[
 derivatives of both with respect to the constant."""
 
 
-def parameter_scales(estimate: BeamEstimate) -> Real:
+def parameter_scales(estimate: BeamEstimate) -> RealArray:
     """Return the factors that convert derivatives for model parameters to those for fit parameters.
 
     The fit uses the logarithms of zeta and gamma, so their factors are zeta and gamma. The other

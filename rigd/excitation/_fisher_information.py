@@ -31,8 +31,8 @@ from rigd.excitation._beam_estimate import (
     POLE_AND_RESIDUE_DERIVATIVES,
     TOLERATED_DEVIATIONS,
     BeamEstimate,
-    Complex,
-    Real,
+    ComplexArray,
+    RealArray,
     parameter_scales,
 )
 
@@ -76,10 +76,10 @@ class TorqueModel:
     """Number of ticks from one sample of the model to the next."""
     transform: CausalTransform
     """Laplace transform of records, at the rate of the samples."""
-    kernels: Complex
+    kernels: ComplexArray
     """Whitened derivatives of the response from angle to torque with respect to the free
     parameters, shape (k, K)."""
-    channels: Complex
+    channels: ComplexArray
     """Responses from angle to torque in N·m/rad and to the slope of the tip, shape (2, K)."""
 
     @classmethod
@@ -119,14 +119,14 @@ class TorqueModel:
         """Rate of the samples in Hz, at which derivatives of the torque are computed."""
         return self.rate_hz / self.sample_ticks
 
-    def spectrum(self, angle_rad: Real) -> Complex:
+    def spectrum(self, angle_rad: RealArray) -> ComplexArray:
         """Return the Laplace transform of a motor angle at the frequencies of the band.
 
         The angle in rad begins at rest and has the shape (n,), with n at most `ticks`.
         """
         return self.transform.forward(angle_rad, oversampling=self.sample_ticks)
 
-    def whitened_derivatives(self, angle_transform: Complex) -> Real:
+    def whitened_derivatives(self, angle_transform: ComplexArray) -> RealArray:
         """Return the whitened derivatives of the torque for the k free parameters, at each sample.
 
         `angle_transform` is the transform of the angle. The shape is (k, ticks / sample_ticks).
@@ -135,7 +135,7 @@ class TorqueModel:
             self.kernels * angle_transform, self.ticks // self.sample_ticks
         )
 
-    def torque_and_slope(self, angle_transform: Complex) -> Real:
+    def torque_and_slope(self, angle_transform: ComplexArray) -> RealArray:
         """Return torque in N·m and slope of the tip in rad at every tick, shape (2, ticks).
 
         `angle_transform` is the transform of the angle.
@@ -145,7 +145,9 @@ class TorqueModel:
         )
 
 
-def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Complex]:
+def responses(
+    estimate: BeamEstimate, s: ComplexArray
+) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return the transfer functions from the motor's angle to torques and to the slope of the tip.
 
     Parameters
@@ -167,7 +169,7 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
     return g, measured_response, slope_response
 
 
-def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Complex:
+def whitened_kernels(estimate: BeamEstimate, s: ComplexArray, sample_hz: float) -> ComplexArray:
     """Return whitened derivatives of the response from angle to torque for each parameter.
 
     They are divided by the noise spectrum so that the noise of a sample has variance 1. The shape
@@ -193,7 +195,7 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     if parameter_names:
         g, beam_gradient = plant.transfer_and_gradient(s, derivative_names)
     channel_response = plant.channel_response(s)
-    kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
+    kernels: ComplexArray = np.empty((len(estimate.names), s.size), dtype=np.complex128)
     kernels[len(parameter_names) :] = _modal_derivatives(estimate, s) * channel_response
     gradient_rows = iter(beam_gradient)
     for out, parameter_name, parameter_scale in zip(
@@ -209,7 +211,7 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     return kernels
 
 
-def _modal_derivatives(estimate: BeamEstimate, s: Complex) -> Complex:
+def _modal_derivatives(estimate: BeamEstimate, s: ComplexArray) -> ComplexArray:
     """Return the response's derivatives for the constants of free modes and of the background.
 
     The shape is (number of constants, K).
@@ -244,7 +246,7 @@ def ticks_per_sample(rate_hz: float) -> int:
 
 def _whitening_weights(
     estimate: BeamEstimate, frequency_hz: NDArray[np.floating[Any]], sample_hz: float
-) -> Real:
+) -> RealArray:
     """Return the weights of frequencies that whiten the torque noise: a sample has variance 1.
 
     They fade to 0 above the end of the band.
@@ -253,7 +255,7 @@ def _whitening_weights(
         frequency_hz, estimate.noise_frequency_hz, np.log(estimate.noise_nm2_per_hz)
     )
     fade_factors = np.clip((frequency_hz / BAND_HZ - 1.0) / (_FADE_END_RATIO - 1.0), 0.0, 1.0)
-    whitening_weights: Real = np.exp(-0.5 * log_noise_density) * np.sqrt(2.0 / sample_hz)
+    whitening_weights: RealArray = np.exp(-0.5 * log_noise_density) * np.sqrt(2.0 / sample_hz)
     whitening_weights *= 0.5 + 0.5 * np.cos(pi * fade_factors)
     return whitening_weights
 
@@ -267,18 +269,18 @@ class RecordSoFar:
 
     estimate: BeamEstimate
     """Estimate of the beam from which the information is computed."""
-    past_gram: Real
+    past_gram: RealArray
     """Gram matrix of the record's k torque derivatives and m nuisance terms, shape
     (k + m, k + m)."""
-    future_rows: Real
+    future_rows: RealArray
     """Derivatives and nuisance terms from now on if the motor is held, shape (k + m, samples)."""
-    ringing_motion: Real
+    ringing_motion: RealArray
     """Torque in N·m and slope of the tip in rad from now on if the motor is held, shape
     (2, ticks)."""
 
     @classmethod
     def from_angle(
-        cls, angle_rad: Real, estimate: BeamEstimate, rate_hz: float, future_s: float = 0.0
+        cls, angle_rad: RealArray, estimate: BeamEstimate, rate_hz: float, future_s: float = 0.0
     ) -> "RecordSoFar":
         """Return a record's derivatives and continuing vibration, predicted from the motor's angle.
 
@@ -326,12 +328,12 @@ class RecordSoFar:
         )
 
     @property
-    def nuisance_projection(self) -> Real:
+    def nuisance_projection(self) -> RealArray:
         """Matrix that projects the nuisance terms out of the derivatives, shape (k, k + m)."""
         k = len(self.estimate.names)
         return np.concatenate([np.eye(k), -_regression_coefficients(self.past_gram, k)], axis=1)
 
-    def information_after(self, added_rows: Real | None, sample_count: int) -> Real:
+    def information_after(self, added_rows: RealArray | None, sample_count: int) -> RealArray:
         """Return the Fisher information on the parameters after further samples, shape (k, k).
 
         Parameters
@@ -351,7 +353,7 @@ class RecordSoFar:
         )
 
 
-def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real:
+def information(angle_rad: RealArray, estimate: BeamEstimate, rate_hz: float) -> RealArray:
     """Return a record's Fisher information on the free parameters of the beam, shape (k, k).
 
     Free decay from before the record, and offset and drift of the torque, are unknown as well and
@@ -388,7 +390,7 @@ def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real
     return RecordSoFar.from_angle(angle_rad, estimate, rate_hz).information_after(None, 0)
 
 
-def projected_information(gram: Real, k: int) -> Real:
+def projected_information(gram: RealArray, k: int) -> RealArray:
     """Return the Fisher information on k parameters if all others are unknown, shape (k, k).
 
     Parameters
@@ -398,11 +400,11 @@ def projected_information(gram: Real, k: int) -> Real:
     k
         Number of parameters of interest.
     """
-    information: Real = gram[:k, :k] - _regression_coefficients(gram, k) @ gram[k:, :k]
+    information: RealArray = gram[:k, :k] - _regression_coefficients(gram, k) @ gram[k:, :k]
     return 0.5 * (information + information.T)
 
 
-def _regression_coefficients(gram: Real, k: int) -> Real:
+def _regression_coefficients(gram: RealArray, k: int) -> RealArray:
     """Return the coefficients of the regression of the first k derivatives on the m others.
 
     The shape is (k, m), and `gram` is the Gram matrix of all derivatives.
@@ -411,14 +413,14 @@ def _regression_coefficients(gram: Real, k: int) -> Real:
     normalized_gram = gram[k:, k:] / np.outer(derivative_norms, derivative_norms) + 1e-12 * np.eye(
         derivative_norms.size
     )
-    coefficients: Real = (
+    coefficients: RealArray = (
         np.linalg.solve(normalized_gram, gram[k:, :k] / derivative_norms[:, None]).T
         / derivative_norms
     )
     return coefficients
 
 
-def covariance_of(fisher_information: Real, estimate: BeamEstimate) -> Real:
+def covariance_of(fisher_information: RealArray, estimate: BeamEstimate) -> RealArray:
     """Return the parameters' covariance from a Fisher information and prior knowledge."""
     prior_stds = np.array(
         [_prior_std(parameter_name, estimate) for parameter_name in estimate.names]
@@ -428,7 +430,7 @@ def covariance_of(fisher_information: Real, estimate: BeamEstimate) -> Real:
         len(prior_stds)
     )
     diagonal_roots = np.sqrt(np.diag(scaled_information))
-    inverse_matrix: Real = np.linalg.inv(
+    inverse_matrix: RealArray = np.linalg.inv(
         scaled_information / np.outer(diagonal_roots, diagonal_roots)
     )
     return inverse_matrix * np.outer(prior_stds / diagonal_roots, prior_stds / diagonal_roots)
@@ -451,7 +453,7 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
     return _PRIOR_STD[name]
 
 
-def _nuisance_terms(estimate: BeamEstimate, sample_count: int, sample_hz: float) -> Real:
+def _nuisance_terms(estimate: BeamEstimate, sample_count: int, sample_hz: float) -> RealArray:
     """Return the nuisance terms of a record's torque: free decays, offset and drift.
 
     The shape is (m, samples).

@@ -43,8 +43,8 @@ from rigd.excitation._signals import (
     require_within_turn,
 )
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 _MAX_REDUCTIONS: Final = 8
 """Largest number of times that the amplitude of a sweep is reduced to stay within the limits."""
@@ -282,13 +282,13 @@ class SweepRig(Protocol):
     def beam(self) -> Beam:
         """Beam of the rig's profile."""
 
-    def tracking(self, frequency_hz: Real) -> Complex:
+    def tracking(self, frequency_hz: RealArray) -> ComplexArray:
         """Return the frequency response from reference to angle at some frequencies in Hz."""
 
-    def fraction_of_limits(self, reference_rad: Real) -> float:
+    def fraction_of_limits(self, reference_rad: RealArray) -> float:
         """Return the largest fraction of a limit that a reference in rad is predicted to use."""
 
-    def tip_slope_rad(self, reference_rad: Real) -> float:
+    def tip_slope_rad(self, reference_rad: RealArray) -> float:
         """Return the largest predicted slope in rad of the beam's free end for a reference."""
 
 
@@ -328,7 +328,7 @@ class Band:
 
 def time_fractions(
     sweep_bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig
-) -> Real:
+) -> RealArray:
     """Return the fraction of the sweep's time for each band that measures damping most precisely.
 
     The geometric mean of the standard deviations of the damping's parameters is minimised, with
@@ -390,7 +390,7 @@ def first_order_damping(modes: Sequence[FoundMode], beam: Beam) -> Damping:
 
 def _information_rates(
     sweep_bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig, damping: Damping
-) -> tuple[Real, int]:
+) -> tuple[RealArray, int]:
     """Return the Fisher information per second of each band, and the number of damping parameters.
 
     The information has the shape (bands, k, k), with the damping's parameters first. That on
@@ -572,7 +572,7 @@ def _read_bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> li
 
 
 def _admissible_amplitudes(
-    unit_sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: SweepRig
+    unit_sweeps: Sequence[RealArray], amplitude_rad: float, tip_slope_rad: float, rig: SweepRig
 ) -> list[float]:
     """Return the amplitude of each sweep in rad, reduced where the rig's limits require it.
 
@@ -597,13 +597,13 @@ def _admissible_amplitudes(
     return amplitudes_rad
 
 
-def _divide_ticks(band_fractions: Real, tick_count: int) -> list[int]:
+def _divide_ticks(band_fractions: RealArray, tick_count: int) -> list[int]:
     """Divide `tick_count` ticks in proportion to `band_fractions`; the sum is exact."""
     end_ticks = np.round(np.cumsum(band_fractions) * tick_count).astype(int)
     return [int(part_ticks) for part_ticks in np.diff(end_ticks, prepend=0)]
 
 
-def _raise_to_least(band_fractions: Real) -> Real:
+def _raise_to_least(band_fractions: RealArray) -> RealArray:
     """Return the bands' fractions of the time, each raised to the least that is allowed.
 
     The other fractions are reduced in proportion, so that the sum remains 1.
@@ -619,7 +619,7 @@ def _raise_to_least(band_fractions: Real) -> Real:
     return raised_fractions
 
 
-def _unit_sweep(band: Band, tick_count: int, fade_ticks: int, rate_hz: float) -> Real:
+def _unit_sweep(band: Band, tick_count: int, fade_ticks: int, rate_hz: float) -> RealArray:
     """Return a sweep of amplitude 1 through a band, shape (tick_count,).
 
     A raised-cosine fade at either end takes half of `fade_ticks`.

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from rigd.excitation.moves import ROBUST_BELOW_HZ
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
 
 ARRIVAL_TOLERANCE_RAD: Final = 1e-3
 """Distance in rad from the end of a move within which the angle counts as arrived."""
@@ -32,7 +32,7 @@ class DisturbedRig(Protocol):
         """Ticks a second."""
 
     @property
-    def disturbed(self) -> Callable[[Real, int], tuple[Real, Real]]:
+    def disturbed(self) -> Callable[[RealArray, int], tuple[RealArray, RealArray]]:
         """Function that simulates the rig, of a reference, shape (n,), and a number of modes.
 
         It returns the angle in rad, shape (n, draws), and the amplitude of each mode's coupling
@@ -40,7 +40,7 @@ class DisturbedRig(Protocol):
         """
 
     @property
-    def poles_rad_s(self) -> Complex:
+    def poles_rad_s(self) -> ComplexArray:
         """Poles of the modes in rad/s, shape (m,)."""
 
     @property
@@ -72,7 +72,7 @@ class MoveEnd:
     ring-downs. A smaller vibration cannot be detected."""
 
 
-def predict_move_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
+def predict_move_end(rig: DisturbedRig, reference_rad: RealArray, ring_down_s: float) -> MoveEnd:
     """Predict when the motor arrives at the end of a move, and the vibration after it.
 
     Parameters

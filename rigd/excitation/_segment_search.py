@@ -35,7 +35,7 @@ from rigd.excitation._sweeps import (
 from rigd.excitation.moves import quintic
 from rigd.excitation.targets import Precision, Quantities
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 DURATIONS_S: Final = (1.0, 1.5, 2.0, 3.0)
 """Durations in s of the candidate segments."""
@@ -90,13 +90,13 @@ class Segment:
 
     name: str
     """Modes, frequencies, duration and amplitudes, as text for the operator."""
-    reference_rad: Real
+    reference_rad: RealArray
     """Reference angle at each tick, relative to the start angle; shape (n,)."""
-    angle_rad: Real
+    angle_rad: RealArray
     """Predicted angle of the motor at each tick; shape (n,)."""
     names: tuple[str, ...]
     """Names of the free parameters, in the order of the covariance."""
-    covariance: Real
+    covariance: RealArray
     """Covariance of the free parameters that is expected at the end of the segment, shape (k, k);
     see `information` for their units."""
     now: tuple[Precision, ...]
@@ -347,7 +347,7 @@ class SegmentSearch:
             fade_window * np.cos(phase_rad)
         )
 
-    def unit_sweep(self, reference_rad: Real) -> UnitSweep:
+    def unit_sweep(self, reference_rad: RealArray) -> UnitSweep:
         """Return the predicted response to a reference of amplitude 1 rad from rest, shape (n,)."""
         n = reference_rad.size
         extended_reference_rad = np.concatenate(
@@ -445,8 +445,8 @@ class SegmentSearch:
     def information_to_horizon(
         self,
         sweep_band: SweepBand,
-        weighted_rows: Real,
-        tip_slope_fractions: Real,
+        weighted_rows: RealArray,
+        tip_slope_fractions: RealArray,
         duration_s: float,
     ) -> float:
         """Return the information up to the planning horizon from a segment and the time after it.
@@ -471,7 +471,7 @@ class SegmentSearch:
         return float(np.vdot(rows_before, rows_before) + np.vdot(rows_after, rows_after))
 
     @cached_property
-    def amplitude_matrix(self) -> Real:
+    def amplitude_matrix(self) -> RealArray:
         """Matrix that maps one second of the tip's slope to the modes' complex amplitudes.
 
         The shape is (2 m, n), with a row each for real and imaginary part of the m amplitudes.

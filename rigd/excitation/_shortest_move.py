@@ -27,8 +27,8 @@ from rigd.excitation.moves import (
 )
 from rigd.identified_beam import IdentifiedBeam
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
 
 LONGEST_MOVE_S: Final = 60.0
 """Longest duration of a move in s; a longer one is an error."""
@@ -57,19 +57,19 @@ class Response(Protocol):
     """Interface to the closed loop's response to a reference: arrays (n,), one value a tick."""
 
     @property
-    def angle_rad(self) -> Real:
+    def angle_rad(self) -> RealArray:
         """Angle of the output shaft in rad."""
 
     @property
-    def velocity_rad_s(self) -> Real:
+    def velocity_rad_s(self) -> RealArray:
         """Speed of the output shaft in rad/s."""
 
     @property
-    def torque_nm(self) -> Real:
+    def torque_nm(self) -> RealArray:
         """Torque command in N·m without the limit of the motor."""
 
     @property
-    def coupling_torque_nm(self) -> Real:
+    def coupling_torque_nm(self) -> RealArray:
         """Coupling torque in N·m that the sensor measures."""
 
 
@@ -79,19 +79,19 @@ class MovePlant:
 
     rate_hz: float
     """Ticks a second."""
-    respond: Callable[[Real], Response]
+    respond: Callable[[RealArray], Response]
     """Function that returns the response of the closed loop to a reference in rad, shape (n,), from
     rest and without friction."""
-    disturbed: Callable[[Real, int], tuple[Real, Real]]
+    disturbed: Callable[[RealArray, int], tuple[RealArray, RealArray]]
     """Function that returns the response to a reference in rad, shape (n,), from rest with
     friction, encoder steps and noise, in several random draws. The second argument is the number of
     lowest modes. The result is the angle in rad, shape (n, draws), and the amplitude of each mode's
     coupling torque in N·m, shape (n, modes, draws)."""
-    poles_rad_s: Complex
+    poles_rad_s: ComplexArray
     """Poles of the closed loop at the modes of the beam, one of each pair; shape (m,)."""
-    torque_per_state_nm_s: Real
+    torque_per_state_nm_s: RealArray
     """Amplitude of the coupling torque per `modal_state` of a mode, in N·m·s; shape (m,)."""
-    frequency_uncertainty: Real
+    frequency_uncertainty: RealArray
     """Relative standard uncertainty of the modes' frequencies, shape (m,)."""
     torque_noise_nm: float
     """Standard deviation in N·m of the noise of one reading of the coupling torque."""
@@ -119,7 +119,7 @@ class MovePlant:
 class Move:
     """Planned move of the motor to another angle, with its predicted residual vibration."""
 
-    reference_rad: Real
+    reference_rad: RealArray
     """Reference angle at the ticks after the start, relative to the start angle; shape (n,). The
     last angle is that of the end of the move."""
     duration_s: float
@@ -139,7 +139,7 @@ def shortest_move(
     *,
     start_rad: float = 0.0,
     robust: bool = False,
-    ringing: Complex | None = None,
+    ringing: ComplexArray | None = None,
 ) -> Move:
     """Plan the shortest move within a rig's limits that leaves no vibration.
 
@@ -184,7 +184,7 @@ def shortest_move(
 
 
 def _residual_torque_nm(
-    plant: MovePlant, reference_rad: Real, initial_states: Complex | None
+    plant: MovePlant, reference_rad: RealArray, initial_states: ComplexArray | None
 ) -> float:
     """Return the largest coupling torque in N·m of the beam's vibration after a move.
 
@@ -213,7 +213,7 @@ class _MoveSearch:
         distance_rad: float,
         start_rad: float,
         zero_order: int,
-        initial_states: Complex | None,
+        initial_states: ComplexArray | None,
     ) -> None:
         self._plant = plant
         self._distance_rad = distance_rad
@@ -237,7 +237,7 @@ class _MoveSearch:
                 "sensor.range for a move; wait until the beam is at rest."
             )
 
-    def shortest_accelerations(self) -> Real:
+    def shortest_accelerations(self) -> RealArray:
         """Return the accelerations of the shortest move in rad/s², shape (n,).
 
         Raise `ExcitationError` if the move would take more than `LONGEST_MOVE_S`.
@@ -252,7 +252,7 @@ class _MoveSearch:
             inf,
             0.0,
         )
-        best_accelerations: Real | None = None
+        best_accelerations: RealArray | None = None
         for _ in range(_MAX_ROUNDS):
             used_fraction, accelerations = self._least_limit_fraction(n)
             if used_fraction <= 1.0:
@@ -287,7 +287,7 @@ class _MoveSearch:
             )
         return best_accelerations
 
-    def _least_limit_fraction(self, n: int) -> tuple[float, Real | None]:
+    def _least_limit_fraction(self, n: int) -> tuple[float, RealArray | None]:
         """Solve the linear programme for a move of n ticks.
 
         Return the smallest fraction of the limits that such a move uses, and its accelerations in
@@ -373,7 +373,7 @@ class _MoveSearch:
 
     def _inequalities(
         self, n: int, edge_ticks: NDArray[np.intp], acceleration_scale: float
-    ) -> tuple[Real, Real, Real]:
+    ) -> tuple[RealArray, RealArray, RealArray]:
         """Return the inequalities of the linear programme for a move of n ticks.
 
         They are linear maps from the acceleration in each interval: to fractions of the limits,
@@ -429,7 +429,7 @@ class _MoveSearch:
             np.repeat(free_angles_rad, len(every_second_tick)),
         )
 
-    def limit_fraction(self, reference_rad: Real) -> float:
+    def limit_fraction(self, reference_rad: RealArray) -> float:
         """Return the largest fraction of a rig's limit that the response to a reference reaches."""
         plant = self._plant
         held_ticks = round(plant.settling_s * plant.rate_hz)
@@ -484,10 +484,10 @@ class _UnitResponse:
 
     def __init__(self, plant: MovePlant) -> None:
         self._plant = plant
-        self._rows: dict[str, Real] = {}
+        self._rows: dict[str, RealArray] = {}
         self._ticks = 0
 
-    def for_ticks(self, tick_count: int) -> dict[str, Real]:
+    def for_ticks(self, tick_count: int) -> dict[str, RealArray]:
         """Return the response of each quantity by name, for at least the given number of ticks."""
         if tick_count > self._ticks:
             self._ticks = max(2 * tick_count, 1024)
@@ -505,15 +505,15 @@ class _UnitResponse:
 
 
 def _interval_responses(
-    unit_responses: Real, edge_ticks: NDArray[np.intp], response_ticks: NDArray[np.intp]
-) -> Real:
+    unit_responses: RealArray, edge_ticks: NDArray[np.intp], response_ticks: NDArray[np.intp]
+) -> RealArray:
     """Return the response at some ticks to an acceleration of 1 rad/s² in one interval only.
 
     The shape is (ticks, intervals). `unit_responses` is the response to a constant acceleration of
     1, and `edge_ticks` are the ticks at which the intervals begin and end.
     """
     ticks_since_edge = response_ticks[:, None] - edge_ticks
-    step_response: Real = np.where(
+    step_response: RealArray = np.where(
         ticks_since_edge >= 0, unit_responses[np.maximum(ticks_since_edge, 0)], 0.0
     )
     return step_response[:, :-1] - step_response[:, 1:]
@@ -522,7 +522,7 @@ def _interval_responses(
 # Braking
 
 
-def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
+def shortest_braking(plant: MovePlant, reference_rad: RealArray) -> Braking:
     """Return the shortest braking path that needs no more than the motor's peak torque.
 
     Parameters

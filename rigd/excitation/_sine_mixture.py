@@ -16,7 +16,7 @@ from rigd.excitation._sweeps import SIDE_OFFSET
 from rigd.excitation.moves import quintic
 from rigd.excitation.targets import Quantities
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _SINE_OFFSETS: Final = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
 """Distances of the forecast's steady sines from a mode, in half-power half-widths of the mode."""
@@ -29,8 +29,8 @@ UNREACHABLE_S: Final = 1e5
 
 
 def steady_sines(
-    estimate: BeamEstimate, modes: Sequence[Pole], plant: MovePlant, limits: Real
-) -> tuple[Real, Real]:
+    estimate: BeamEstimate, modes: Sequence[Pole], plant: MovePlant, limits: RealArray
+) -> tuple[RealArray, RealArray]:
     """Return frequencies and largest allowed amplitudes of the forecast's steady sines.
 
     The results are frequencies in Hz and amplitudes of the angle in rad, each of shape (m,).
@@ -84,19 +84,19 @@ def steady_sines(
 class SineMixture:
     """Durations of steady sines that reach all target precisions soonest, ring-up neglected."""
 
-    times_s: Real
+    times_s: RealArray
     """Time in s for which each sine lasts; shape (m,)."""
-    weights: Real
+    weights: RealArray
     """Weights of q combinations of the k derivatives of the torque, whose sum of squares is the
     information that brings the targets closer; shape (q, k)."""
 
 
 def best_mixture(
-    fisher_information: Real,
+    fisher_information: RealArray,
     estimate: BeamEstimate,
     quantities: Quantities,
-    frequency_hz: Real,
-    angle_rad: Real,
+    frequency_hz: RealArray,
+    angle_rad: RealArray,
     target_relaxation: float = 1.0,
 ) -> SineMixture:
     """Return durations of steady sines that together reach all target precisions soonest.
@@ -152,21 +152,23 @@ def best_mixture(
     return SineMixture(times_s, multiplier_scales[:, None] * gain_directions)
 
 
-def _information_rates(estimate: BeamEstimate, frequency_hz: Real, angle_rad: Real) -> Real:
+def _information_rates(
+    estimate: BeamEstimate, frequency_hz: RealArray, angle_rad: RealArray
+) -> RealArray:
     """Return the Fisher information per second of each steady sine, shape (m, k, k)."""
     kernels = whitened_kernels(estimate, 2j * pi * frequency_hz, 1.0) * (angle_rad / 2.0**0.5)
-    information_rates: Real = np.einsum("if,jf->fij", kernels, kernels.conj()).real
+    information_rates: RealArray = np.einsum("if,jf->fij", kernels, kernels.conj()).real
     return information_rates
 
 
 def least_deviations(
-    fisher_information: Real,
+    fisher_information: RealArray,
     estimate: BeamEstimate,
     quantities: Quantities,
-    frequency_hz: Real,
-    angle_rad: Real,
+    frequency_hz: RealArray,
+    angle_rad: RealArray,
     duration_s: float,
-) -> Real:
+) -> RealArray:
     """Return the smallest standard deviation that each quantity can have in a record.
 
     For each quantity the mixture of sines is the best for this quantity alone.
@@ -200,7 +202,7 @@ def least_deviations(
     return least_stds
 
 
-def time_with_ring_up(times_s: Real, frequency_hz: Real, modes: Sequence[Pole]) -> float:
+def time_with_ring_up(times_s: RealArray, frequency_hz: RealArray, modes: Sequence[Pole]) -> float:
     """Return the time in s of a mixture of sines, plus the time in which its modes ring up.
 
     The information on the damping grows as ``1 - exp(-t / tau)`` at a constant amplitude.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rigd.beam import Pole
 from rigd.excitation._beam_estimate import BAND_HZ
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 FADE_S: Final = 0.25
 """Shortest duration in s of a sweep's fade at either end."""
@@ -47,19 +47,19 @@ class SweepBand:
 class UnitSweep:
     """Reference angle and predicted response of a sweep of amplitude 1 rad in one phase."""
 
-    reference_rad: Real
+    reference_rad: RealArray
     """Reference angle at each tick of the segment; shape (n,)."""
-    angle_rad: Real
+    angle_rad: RealArray
     """Predicted angle of the motor at each tick of the segment; shape (n,)."""
-    rows: Real
+    rows: RealArray
     """Whitened derivatives of the torque for the free parameters, from the segment's beginning on;
     shape (k, samples)."""
-    weighted_rows: Real
+    weighted_rows: RealArray
     """Combinations of `rows` with the weights of the mixture; shape (q, samples)."""
-    channels: Real
+    channels: RealArray
     """Limited quantities, such as speed and torque, as fractions of their limits; shape
     (6, ticks)."""
-    slope: Real
+    slope: RealArray
     """Slope of the tip up to the planning horizon, as a fraction of its limit; shape (samples,)."""
 
 
@@ -73,24 +73,24 @@ class SegmentCandidate:
     """Bands of the segment, and their amplitudes in rad."""
     terms: tuple[tuple[float, UnitSweep], ...]
     """Amplitudes in rad and unit sweeps, whose sum of products is the segment."""
-    channels: Real
+    channels: RealArray
     """Limited quantities as fractions of their limits, at one tick in `_LIMIT_CHECK_TICKS`; shape
     (6, ticks)."""
-    weighted_rows: Real
+    weighted_rows: RealArray
     """Combinations of the torque's derivatives with the weights of the mixture; shape
     (q, samples)."""
-    tip_slope: Real
+    tip_slope: RealArray
     """Slope of the tip as a fraction of its limit; shape (samples,)."""
     information_s: float
     """Information up to the planning horizon if the first band is still driven after the segment,
     expressed as the time in s in which the best mixture would give it."""
 
-    def weighted_sum(self, attribute_name: str) -> Real:
+    def weighted_sum(self, attribute_name: str) -> RealArray:
         """Return the sum of an array attribute of the segment's sweeps, weighted by amplitude.
 
         `attribute_name` is an attribute of `UnitSweep`.
         """
-        summed_values: Real = sum(
+        summed_values: RealArray = sum(
             sweep_factor * getattr(candidate_sweep, attribute_name)
             for sweep_factor, candidate_sweep in self.terms
         )
@@ -101,10 +101,10 @@ class SegmentCandidate:
 class ContinuedDrive:
     """Response to exciting a mode by a sine after a segment, in two phases of the sine."""
 
-    weighted_rows: Real
+    weighted_rows: RealArray
     """Weighted derivatives of the torque for a sine of amplitude 1 rad in either phase; shape
     (2, q, samples)."""
-    drive_per_amplitude: Real
+    drive_per_amplitude: RealArray
     """Amplitudes of the two sines that hold the mode's vibration constant, per real and imaginary
     part of its amplitude; shape (2, 2)."""
 
@@ -146,7 +146,7 @@ def candidate_bands(modes: Sequence[Pole]) -> list[SweepBand]:
     return sweep_bands
 
 
-def largest_factor(existing_motion: Real, added_motion: Real) -> float:
+def largest_factor(existing_motion: RealArray, added_motion: RealArray) -> float:
     """Return the largest factor with which a motion can be added within the limits.
 
     All quantities are fractions of their limits, so the sum must be between -1 and 1. If the

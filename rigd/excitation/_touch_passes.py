@@ -32,7 +32,7 @@ from rigd.excitation._signals import (
 from rigd.excitation.moves import Braking, slew, vibration_free_path
 from rigd.identified_beam import TOUCH
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _PEAK_OVER_MEAN_SPEED = 2.0
 """Ratio of the largest speed to the mean speed on the way back: that of a minimum-jerk path, with a
@@ -61,7 +61,7 @@ class Approach:
     """Path on which the motor brakes after a touch."""
     hold_ticks: int
     """Number of ticks from a touch to the way back."""
-    back: Real
+    back: RealArray
     """Path of the way back from 0 to 1, at the ticks after its start."""
     force_limit_n: float
     """Contact force in N above which the torque is switched off."""
@@ -234,7 +234,7 @@ def reference_after_touch(
     tick: int,
     recent_rad: tuple[float, float, float],
     start_rad: float,
-) -> Real:
+) -> RealArray:
     """Return the reference for the rest of a pass after a touch: brake, hold, and return.
 
     Parameters

@@ -30,7 +30,7 @@ from rigd.excitation.moves import quintic
 from rigd.excitation.targets import QUANTITIES, Target, parse_target
 from rigd.units import with_percentage
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 PAUSE_S: Final = 0.5
 """Pause in s of the reference for a fit, such as the first. The record gains information meanwhile,
@@ -60,10 +60,10 @@ _EXAMPLE_TARGET: Final = "--damping 1%"
 class ScanRig(DesignRig, Protocol):
     """Interface to a rig for which a quick sweep through all modes is planned: predictions."""
 
-    def fraction_of_limits(self, reference_rad: Real) -> float:
+    def fraction_of_limits(self, reference_rad: RealArray) -> float:
         """Return the largest fraction of a limit that a reference in rad is predicted to use."""
 
-    def tip_slope_rad(self, reference_rad: Real) -> float:
+    def tip_slope_rad(self, reference_rad: RealArray) -> float:
         """Return the largest predicted slope in rad of the beam's free end for a reference."""
 
     @property
@@ -100,7 +100,7 @@ class PrecisionSearch:
 
     targets: tuple[Target, ...]
     planned_ticks: int
-    scan: tuple[int, Real]
+    scan: tuple[int, RealArray]
     tip_slope_rad: float
     uniformity_percent: float | None = None
 
@@ -302,7 +302,9 @@ def _require_reachable_targets(
     )
 
 
-def _unit_scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None) -> Real:
+def _unit_scan(
+    n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None
+) -> RealArray:
     """Return a quick sweep of n ticks with largest amplitude 1, at rest at both ends; shape (n,).
 
     With a beam, the amplitude depends on the frequency relative to the beam's first mode.
@@ -333,7 +335,7 @@ def _unit_scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Be
     fade_factors = quintic(_FADE_S, rate_hz)
     relative_amplitude[: fade_factors.size] *= fade_factors
     relative_amplitude[n - fade_factors.size :] *= 1.0 - fade_factors
-    unit_sweep: Real = relative_amplitude * np.sin(phase_rad)
+    unit_sweep: RealArray = relative_amplitude * np.sin(phase_rad)
     return unit_sweep
 
 

@@ -37,7 +37,7 @@ from rigd.excitation._signals import ExcitationError
 from rigd.excitation._sine_mixture import least_deviations
 from rigd.excitation.targets import MODE_QUANTITIES, Precision, Quantities, Target
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 
 _GEOMETRY_DOMINANCE_RATIO: Final = 1.5
@@ -68,13 +68,13 @@ class Design:
 
     segments: tuple[Segment, ...]
     """Segments in the order of time."""
-    reference_rad: Real
+    reference_rad: RealArray
     """Reference angle of all segments at each tick, shape (n,)."""
-    angle_rad: Real
+    angle_rad: RealArray
     """Predicted angle of the motor at each tick, shape (n,)."""
     names: tuple[str, ...]
     """Names of the free parameters, in the order of the covariance."""
-    covariance: Real
+    covariance: RealArray
     """Covariance of the parameters that is expected at the end of the session, shape (k, k)."""
     expected: tuple[Precision, ...]
     """Precision of each target that is expected at the end of the session."""
@@ -82,7 +82,7 @@ class Design:
 
 def next_segment(
     estimate: BeamEstimate,
-    angle_rad_so_far: Real,
+    angle_rad_so_far: RealArray,
     targets: Iterable[Target],
     rig: DesignRig,
     time_left_s: float,
@@ -230,7 +230,7 @@ def geometry_floors(
 
 
 def expected_precisions(
-    angle_rad: Real, estimate: BeamEstimate, targets: Iterable[Target], rate_hz: float
+    angle_rad: RealArray, estimate: BeamEstimate, targets: Iterable[Target], rate_hz: float
 ) -> tuple[Precision, ...]:
     """Return the standard deviation of each target quantity expected from a motor angle record.
 
@@ -255,7 +255,7 @@ def design_excitation(
     targets: Sequence[Target],
     duration_s: float,
     *,
-    angle_rad_so_far: Real | None = None,
+    angle_rad_so_far: RealArray | None = None,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
 ) -> Design:
     """Design segments of excitation until all target precisions are reached or time is over.

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from rigd.excitation._signals import require_positive
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
 
 ROBUST_BELOW_HZ = 60.0
 """Frequency in Hz below which a robust move has zeros of second order for the modes. Higher modes
@@ -28,7 +28,7 @@ _MAX_PEAK_ACCELERATION = 24.0
 path shorter than about half a period of a mode would exceed it, and then has fewer zeros."""
 
 
-def quintic(duration_s: float, rate_hz: float) -> Real:
+def quintic(duration_s: float, rate_hz: float) -> RealArray:
     """Return the minimum-jerk path from 0 to 1 at each tick, at rest at both ends, shape (n,).
 
     Parameters
@@ -55,11 +55,11 @@ def quintic(duration_s: float, rate_hz: float) -> Real:
     """
     n = max(1, round(duration_s * rate_hz))
     u = np.arange(1, n + 1) / n
-    unit_path: Real = u**3 * (10 - 15 * u + 6 * u**2)
+    unit_path: RealArray = u**3 * (10 - 15 * u + 6 * u**2)
     return unit_path
 
 
-def vibration_free_path(duration_s: float, rate_hz: float, poles_rad_s: Complex) -> Real:
+def vibration_free_path(duration_s: float, rate_hz: float, poles_rad_s: ComplexArray) -> RealArray:
     """Return the path from 0 to 1 of least mean-square acceleration that leaves all modes at rest.
 
     The path has zeros of second order at the poles if the time suffices, else zeros of first order.
@@ -101,8 +101,8 @@ def slew(
     speed_rad_s: float,
     acceleration_rad_s2: float,
     rate_hz: float,
-    poles_rad_s: Complex,
-) -> Real:
+    poles_rad_s: ComplexArray,
+) -> RealArray:
     """Return a reference at constant speed that excites no vibration, on the way or at the end.
 
     A pulse of acceleration that leaves all modes at rest starts the motion, and the same pulse with
@@ -155,7 +155,7 @@ def slew(
     )
 
 
-def _speed_change_pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | None:
+def _speed_change_pulse(n: int, rate_hz: float, poles_rad_s: ComplexArray) -> RealArray | None:
     """Return the accelerations (n,) of least norm that change the speed by 1 rad/s.
 
     They leave all modes at rest. Return None if `n` ticks are too few.
@@ -167,7 +167,7 @@ def _speed_change_pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | 
     return unit_pulse if is_solved else None
 
 
-def from_acceleration(acceleration_rad_s2: Real, rate_hz: float) -> Real:
+def from_acceleration(acceleration_rad_s2: RealArray, rate_hz: float) -> RealArray:
     """Integrate accelerations twice to the reference angle in rad at the ticks after the start.
 
     Parameters
@@ -177,17 +177,19 @@ def from_acceleration(acceleration_rad_s2: Real, rate_hz: float) -> Real:
     rate_hz
         Ticks a second.
     """
-    reference_rad: Real = np.cumsum(np.cumsum(acceleration_rad_s2)) / rate_hz**2
+    reference_rad: RealArray = np.cumsum(np.cumsum(acceleration_rad_s2)) / rate_hz**2
     return reference_rad
 
 
-def _motion_map(n: int, rate_hz: float) -> Real:
+def _motion_map(n: int, rate_hz: float) -> RealArray:
     """Return the linear map, shape (2, n), from n accelerations to change of speed and distance."""
     remaining_ticks = n - np.arange(n)
     return np.stack([np.full(n, 1.0 / rate_hz), remaining_ticks / rate_hz**2])
 
 
-def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, zero_order: int) -> Real:
+def residual_vibration_map(
+    n: int, rate_hz: float, poles_rad_s: ComplexArray, zero_order: int
+) -> RealArray:
     """Return the linear map from n accelerations to the modes' vibration after the last one.
 
     Its product with the accelerations is zero if the path leaves all modes at rest. Each mode has a
@@ -207,7 +209,7 @@ def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, zero_or
         Order of the zeros: 1 or 2.
     """
     remaining_s = (n - np.arange(n)) / rate_hz
-    map_rows: list[Real] = []
+    map_rows: list[RealArray] = []
     for mode_pole in poles_rad_s:
         pole_transform = np.exp(mode_pole * remaining_s) / rate_hz
         second_order = zero_order > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
@@ -222,7 +224,7 @@ def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, zero_or
     return np.array(map_rows).reshape(-1, n)
 
 
-def _least_norm_solution(linear_map: Real, wanted_values: Real) -> tuple[Real, bool]:
+def _least_norm_solution(linear_map: RealArray, wanted_values: RealArray) -> tuple[RealArray, bool]:
     """Return the least-squares solution a of ``linear_map @ a = wanted_values``, of least norm.
 
     The second result is whether a solves the equations within rounding errors.
@@ -239,7 +241,9 @@ def _least_norm_solution(linear_map: Real, wanted_values: Real) -> tuple[Real, b
     return least_norm, bool(relative_residuals.max() <= 1e-9 * np.linalg.norm(least_norm))
 
 
-def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Complex:
+def modal_state(
+    reference_rad: RealArray, rate_hz: float, poles_rad_s: ComplexArray
+) -> ComplexArray:
     """Return the complex state of each mode's vibration at the end of a reference.
 
     It is the transform of the reference's accelerations at the mode's pole.
@@ -261,7 +265,7 @@ def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Co
     accelerations_rad_s2 = np.diff(reference_rad, n=2, prepend=(reference_rad[0],) * 2) * rate_hz**2
     # r[k+1] - 2 r[k] + r[k-1] belongs to tick k: one before the sample in which it shows.
     remaining_s = np.arange(accelerations_rad_s2.size, 0, -1) / rate_hz
-    modal_states: Complex = (
+    modal_states: ComplexArray = (
         np.exp(np.outer(poles_rad_s, remaining_s)) @ accelerations_rad_s2 / rate_hz
     )
     return modal_states
@@ -346,7 +350,9 @@ def braking_path(duration_s: float, rate_hz: float) -> Braking:
     )
 
 
-def braked_reference(reference_rad: Sequence[float] | Real, tick: int, braking: Braking) -> Real:
+def braked_reference(
+    reference_rad: Sequence[float] | RealArray, tick: int, braking: Braking
+) -> RealArray:
     """Return a reference up to a tick, followed by the braking path, as in the control loop.
 
     Parameters

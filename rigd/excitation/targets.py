@@ -15,7 +15,7 @@ from rigd.excitation._beam_estimate import (
 )
 from rigd.excitation._signals import ExcitationError
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 MODE_QUANTITIES: Final = ("damping", "frequency")
 """Names of the target quantities that belong to a mode."""
@@ -169,7 +169,7 @@ class Quantities:
 
     items: tuple[Precision, ...]
     """Value and target of each quantity; the standard deviations are still unknown."""
-    gradients: Real
+    gradients: RealArray
     """Derivatives of the q quantities with respect to the k free parameters, shape (q, k)."""
 
     @classmethod
@@ -208,7 +208,7 @@ class Quantities:
             np.array(gradients).reshape(len(quantity_items), len(estimate.names)),
         )
 
-    def ratios(self, covariance: Real) -> Real:
+    def ratios(self, covariance: RealArray) -> RealArray:
         """Return the ratio of each quantity's standard deviation to its target, shape (q,).
 
         The ratio is 0 for a quantity that no record can determine.
@@ -222,10 +222,10 @@ class Quantities:
         target_std = np.array(
             [inf if precision.impossible else precision.target_std for precision in self.items]
         )
-        ratios: Real = np.sqrt(np.maximum(variances, 0.0)) / target_std
+        ratios: RealArray = np.sqrt(np.maximum(variances, 0.0)) / target_std
         return ratios
 
-    def precisions(self, covariance: Real) -> tuple[Precision, ...]:
+    def precisions(self, covariance: RealArray) -> tuple[Precision, ...]:
         """Return each quantity's standard deviation for a covariance (k, k) of the parameters."""
         return tuple(
             replace(
@@ -245,7 +245,7 @@ def _targets_of_modes(given_target: Target, modes: tuple[Pole, ...]) -> list[Tar
 
 def _linearise(
     given_target: Target, estimate: BeamEstimate, modes: tuple[Pole, ...]
-) -> tuple[float, Real, str]:
+) -> tuple[float, RealArray, str]:
     """Return the value of a quantity and its derivatives for the beam's parameters, shape (k,).
 
     The third result is the reason why no record can determine the quantity, or an empty text.

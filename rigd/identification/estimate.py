@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from rigd.errors import FailureError
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 # The motor's equation as linear rows
@@ -58,11 +58,11 @@ class Timing:
 class _MotionRepeats:
     """Readings of all repeats of the same motion, in arrays of shape (repeats, samples)."""
 
-    angle_rad: Real
+    angle_rad: RealArray
     """Measured angle."""
-    torque_command_nm: Real
+    torque_command_nm: RealArray
     """Commanded torque."""
-    coupling_torque_nm: Real
+    coupling_torque_nm: RealArray
     """Measured coupling torque."""
     direction: float
     """Sign of the speed."""
@@ -76,9 +76,9 @@ class _MotionRepeats:
 class _MotionEquations:
     """Linear equations ``y = x p`` for the unknowns p, one for each repeat and frequency."""
 
-    y: Complex
+    y: ComplexArray
     """Moments of the coupling torque, shape (repeats, frequencies)."""
-    x: Complex
+    x: ComplexArray
     """Coefficients of the unknowns, shape (repeats, frequencies, unknowns)."""
 
 
@@ -99,11 +99,11 @@ def _equations(
     length_s = n * period_s
     bin_count = int(motion_repeats.top_hz * length_s) + 1
     omega = 2.0 * pi / length_s * np.arange(bin_count)
-    tick_s: Real = np.arange(n, dtype=np.float64) * period_s
+    tick_s: RealArray = np.arange(n, dtype=np.float64) * period_s
 
-    def transform(window_weight: Real, signal: Real, shift_s: float) -> Complex:
+    def transform(window_weight: RealArray, signal: RealArray, shift_s: float) -> ComplexArray:
         spectrum = np.fft.rfft(window_weight * signal, axis=-1)[..., :bin_count]
-        shifted_spectrum: Complex = period_s * np.exp(-1j * omega * shift_s) * spectrum
+        shifted_spectrum: ComplexArray = period_s * np.exp(-1j * omega * shift_s) * spectrum
         return shifted_spectrum
 
     angle_rad = motion_repeats.angle_rad - motion_repeats.angle_rad.mean(axis=1, keepdims=True)
@@ -140,7 +140,7 @@ def _equations(
     return _MotionEquations(y, x)
 
 
-def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
+def _test_window(t: RealArray, length_s: float) -> tuple[RealArray, RealArray, RealArray]:
     """Return the window of the test functions at times `t`, and its first two derivatives.
 
     The window is smooth to its third derivative and zero outside of 0 to `length_s`.
@@ -176,10 +176,10 @@ _SMOOTHED_BINS = 9
 class _MotorFit:
     """Estimated unknowns of the motor's equation, with standard deviations and diagnostics."""
 
-    values: Real
+    values: RealArray
     """Estimates: torque scale, inertia, viscous and Coulomb friction, delay from command to angle,
     and the sessions' zeros of the torque."""
-    stds: Real
+    stds: RealArray
     """Standard deviations of `values`; 0 for a scale that is not estimated."""
     misfit: float
     """Ratio of the residual's mean square to that expected from the scatter of the repeats."""
@@ -202,7 +202,7 @@ def _fit_equation(
         else np.full(unknown_count, fill_value=True)
     )
     delay_s, torque_scale = timing.actuation_delay_s + timing.angle_delay_s, 1.0
-    bin_weights: list[Real] = []
+    bin_weights: list[RealArray] = []
     for _ in range(_MAX_ITERATIONS):
         stack_equations = [
             _equations(motion_repeats, timing, delay_s, torque_scale, unknown_count)
@@ -229,8 +229,10 @@ def _fit_equation(
 
 
 def _solve_mean_equations(
-    stack_equations: Sequence[_MotionEquations], weights: Sequence[Real], is_free: NDArray[np.bool_]
-) -> Real:
+    stack_equations: Sequence[_MotionEquations],
+    weights: Sequence[RealArray],
+    is_free: NDArray[np.bool_],
+) -> RealArray:
     """Return the least-squares solution of the equations, averaged over the repeats of each motion.
 
     `is_free` is a mask of the unknowns to solve for; the torque scale is 1 if not among them.
@@ -260,15 +262,15 @@ def _solve_mean_equations(
 
 
 def _inverse_variances(
-    residuals: Sequence[Complex], stacks: Sequence[_MotionRepeats]
-) -> list[Real]:
+    residuals: Sequence[ComplexArray], stacks: Sequence[_MotionRepeats]
+) -> list[RealArray]:
     """Return the weight of each motion's mean equation at each frequency.
 
     A weight is the inverse variance of the mean of the repeats. The variance of single repeats is
     pooled over the stacks of a session, which have the same noise, and over neighbouring
     frequencies.
     """
-    variances: dict[int, Real] = {}
+    variances: dict[int, RealArray] = {}
     for session_number in {motion_repeats.session for motion_repeats in stacks}:
         session_residuals = [
             r for r, s in zip(residuals, stacks, strict=True) if s.session == session_number
@@ -291,10 +293,10 @@ def _inverse_variances(
 
 def _finish_fit(
     stack_equations: Sequence[_MotionEquations],
-    weights: Sequence[Real],
-    residuals: Sequence[Complex],
+    weights: Sequence[RealArray],
+    residuals: Sequence[ComplexArray],
     is_free: NDArray[np.bool_],
-    solution: Real,
+    solution: RealArray,
     delay_s: float,
 ) -> _MotorFit:
     """Remove the bias that the noise causes from the solution, and estimate its uncertainty."""
@@ -354,7 +356,7 @@ def _finish_fit(
     return _MotorFit(unbiased_values, stds, misfit, friction_departure_nm)
 
 
-def _student_factor(degrees_of_freedom: Real) -> Real:
+def _student_factor(degrees_of_freedom: RealArray) -> RealArray:
     """Return the ratio of Student's t to 3 at the probability of three standard deviations.
 
     It is exact to second order in the inverse degrees of freedom.
@@ -387,11 +389,11 @@ class MotorEstimateError(FailureError, ValueError):
 class PassReadings:
     """Readings in the evaluated window of a pass at constant nominal speed, n samples of each."""
 
-    angle_rad: Real
+    angle_rad: RealArray
     """Measured angle of the shaft."""
-    torque_command_nm: Real
+    torque_command_nm: RealArray
     """Commanded torque."""
-    coupling_torque_nm: Real
+    coupling_torque_nm: RealArray
     """Measured torque between motor and beam."""
     speed_rad_s: float
     """Nominal speed of the pass, with its sign."""

@@ -19,7 +19,7 @@ from rigd.control import ClosedLoop, close_loop
 from rigd.excitation import Excitation, ExcitationError
 from rigd.profile import Profile
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 TRIAL = "motor-trial"
 """Name of the excitation of the short session that precedes the other sessions."""
@@ -301,14 +301,14 @@ def _fit_schedule(
     )
 
 
-def _passes_path(schedule: PassSchedule, rate_hz: float) -> Real:
+def _passes_path(schedule: PassSchedule, rate_hz: float) -> RealArray:
     """Return the angle in rad at each tick of all passes, relative to the end of the approach."""
     turn_ticks, settle_ticks, window_ticks = (
         round(time_s * rate_hz)
         for time_s in (schedule.turn_s, schedule.settle_s, schedule.window_s)
     )
     speed_rise = _smooth_rise(np.arange(turn_ticks) / turn_ticks)
-    speed_segments: list[Real] = []
+    speed_segments: list[RealArray] = []
     previous_speed = 0.0
     for pass_speed in [s for v in schedule.speeds_rad_s for s in (v, -v)] * schedule.cycles:
         speed_segments.append(previous_speed + (pass_speed - previous_speed) * speed_rise)
@@ -316,13 +316,13 @@ def _passes_path(schedule: PassSchedule, rate_hz: float) -> Real:
         previous_speed = pass_speed
     speed_segments.append(previous_speed * (1.0 - speed_rise))
     speed_samples = np.concatenate(speed_segments)
-    path_rad: Real = (
+    path_rad: RealArray = (
         np.concatenate([[0.0], np.cumsum(0.5 * (speed_samples[1:] + speed_samples[:-1]))]) / rate_hz
     )
     return path_rad
 
 
-def _passes_reference(schedule: PassSchedule, profile: Profile) -> Real:
+def _passes_reference(schedule: PassSchedule, profile: Profile) -> RealArray:
     """Return the reference angle in rad without a multisine: rest, approach, passes, end."""
     rate_hz = profile.rig.rate_hz
     path_rad = _passes_path(schedule, rate_hz)
@@ -338,7 +338,7 @@ def _passes_reference(schedule: PassSchedule, profile: Profile) -> Real:
     return reference_rad
 
 
-def _add_offsets(reference_rad: Real, schedule: PassSchedule, profile: Profile) -> None:
+def _add_offsets(reference_rad: RealArray, schedule: PassSchedule, profile: Profile) -> None:
     """Add a different offset of some encoder steps to each cycle of a reference angle, in place.
 
     The offset changes in the turn before the cycle.
@@ -369,7 +369,7 @@ def _add_offsets(reference_rad: Real, schedule: PassSchedule, profile: Profile) 
 
 def _multisine_reference(
     schedule: PassSchedule, closed_loop: ClosedLoop, modulation: float
-) -> Real:
+) -> RealArray:
     """Return the reference angle in rad of the multisine alone.
 
     In response to it, the loop changes the speed of the passes by at most the fraction
@@ -419,7 +419,7 @@ def _multisine_reference(
     return reference_rad
 
 
-def _smooth_rise(x: Real) -> Real:
+def _smooth_rise(x: RealArray) -> RealArray:
     """Return a polynomial that rises from 0 to 1 for x from 0 to 1.
 
     Its slope and curvature are zero at both ends.
@@ -427,7 +427,7 @@ def _smooth_rise(x: Real) -> Real:
     return x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
 
 
-def _peak_torque(closed_loop: ClosedLoop, reference_rad: Real) -> float:
+def _peak_torque(closed_loop: ClosedLoop, reference_rad: RealArray) -> float:
     """Return the motor's largest predicted torque in N·m for a reference angle in rad."""
     return float(np.max(np.abs(closed_loop.simulate(reference_rad).torque_nm)))
 
@@ -437,7 +437,7 @@ def _checked_excitation(
     schedule: PassSchedule,
     profile: Profile,
     closed_loop: ClosedLoop,
-    reference_rad: Real,
+    reference_rad: RealArray,
     torque_percent: float,
     stroke_rad: float,
 ) -> Excitation:

@@ -19,8 +19,8 @@ from rigd.excitation import MovePlant
 from rigd.identified_beam import IdentifiedBeam
 from rigd.profile import Profile
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 _MAX_MODES = 6
 """Maximum number of modes whose vibration a move suppresses; higher modes are negligible."""
@@ -83,7 +83,7 @@ def move_plant_of(
     )
     compensated_loop = replace(uncompensated_loop, model=model)
 
-    def respond_disturbed(reference_rad: Real, modes: int) -> tuple[Real, Real]:
+    def respond_disturbed(reference_rad: RealArray, modes: int) -> tuple[RealArray, RealArray]:
         disturbed_response = simulate_disturbed(
             compensated_loop, reference_rad, disturbances, modes=modes, draws=_NOISE_REALISATIONS
         )
@@ -124,7 +124,7 @@ def torque_noise_nm(profile: Profile) -> float:
     return float(np.linalg.norm(np.array(rig.sensor.projection) * axis_noise))
 
 
-def mode_poles(loop: ClosedLoop) -> tuple[Complex, Complex]:
+def mode_poles(loop: ClosedLoop) -> tuple[ComplexArray, ComplexArray]:
     """Return the poles of the beam with locked hub, and the closed loop's poles, in rad/s.
 
     The arrays (m,) contain one pole of each conjugate pair, for the lowest modes that oscillate

@@ -26,7 +26,7 @@ from rigd.runner.planning import RigPreview
 from rigd.session import Validity
 from rigd.units import with_half_width, with_percentage
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _SUFFICIENT_RATIO: Final = 0.98
 """Maximum ratio of expected to requested standard deviation at which a pause is appended."""
@@ -186,7 +186,7 @@ class _PlannedInterval:
     """
 
     name: str
-    reference_rad: Real
+    reference_rad: RealArray
     reference_tick: int
     """First tick of the segment in the reference."""
     record_tick: int
@@ -410,7 +410,7 @@ class ExcitationPlanner:
         return 1.0 if has_full_amplitude else _REDUCED_AMPLITUDE
 
     def _corrected_targets(
-        self, estimate: BeamEstimate, angle_rad: Real, estimates: Sequence[TargetEstimate]
+        self, estimate: BeamEstimate, angle_rad: RealArray, estimates: Sequence[TargetEstimate]
     ) -> list[Target]:
         """Return the corrected standard deviations that the next segment is designed to reach.
 
@@ -488,13 +488,13 @@ class ExcitationPlanner:
         self._append("pause", np.zeros(round(duration_s * self._rate_hz)))
         self.due_tick, self.may_be_last = self._writer.ticks, True
 
-    def _append(self, name: str, reference_rad: Real) -> None:
+    def _append(self, name: str, reference_rad: RealArray) -> None:
         """Append a named segment to the reference that the control loop reads."""
         first_tick = self._writer.ticks
         self._intervals.append(_PlannedInterval(name, reference_rad, first_tick, first_tick))
         self._writer.append(reference_rad)
 
-    def _reference_rad(self, held_ticks: int) -> Real:
+    def _reference_rad(self, held_ticks: int) -> RealArray:
         """Return the reference angle (n,) at each tick of the record up to the last segment."""
         reference_rad = np.zeros(self._writer.ticks + held_ticks)
         for interval in self._intervals:

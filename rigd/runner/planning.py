@@ -36,8 +36,8 @@ from rigd.runner._tip_slope import (
     tip_in_words,
 )
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 _MAX_AMPLITUDE_RAD = 2.0 * math.pi
@@ -132,14 +132,14 @@ class RigPreview:
         """Stable closed loop with the beam of the profile."""
         return stable_loop(self._profile.loop_model())[0]
 
-    def tracking(self, frequency_hz: Real) -> Complex:
+    def tracking(self, frequency_hz: RealArray) -> ComplexArray:
         """Return the closed loop's frequency response from reference angle to motor angle.
 
         The result has the shape of `frequency_hz`.
         """
         return self._closed_loop.response(frequency_hz)
 
-    def fraction_of_limits(self, reference_rad: Real) -> float:
+    def fraction_of_limits(self, reference_rad: RealArray) -> float:
         """Return the largest ratio of a peak to its limit that a reference angle (n,) would cause.
 
         Raises
@@ -177,7 +177,7 @@ class RigPreview:
             self._profile, loop_model, _sensor_limit_nm(self._profile), identified_beam
         )
 
-    def tip_slope_rad(self, reference_rad: Real) -> float:
+    def tip_slope_rad(self, reference_rad: RealArray) -> float:
         """Return the predicted peak slope of the beam's free end for a reference angle (n,)."""
         angle_rad = self._closed_loop.simulate(reference_rad).angle_rad
         return tip_motion(self._profile.plant, angle_rad, self._profile.rig.rate_hz).slope_rad
@@ -498,8 +498,8 @@ def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPredictio
 
 
 def _peaks_and_angle(
-    closed_loop: ClosedLoop, reference_rad: Real
-) -> tuple[SessionPrediction, Real]:
+    closed_loop: ClosedLoop, reference_rad: RealArray
+) -> tuple[SessionPrediction, RealArray]:
     """Return the peak magnitudes in the response to a reference (n,), and the angle (n,) in rad.
 
     The response is computed in chunks, because the response of an hour would take 150 MB.
@@ -662,6 +662,6 @@ def _sensor_limit_nm(profile: Profile) -> float:
     )
 
 
-def _peak(signal: Real) -> float:
+def _peak(signal: RealArray) -> float:
     """Return the largest magnitude in an array."""
     return float(np.max(np.abs(signal)))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rigd.beam import CausalTransform, transfer
 from rigd.safety.probing_move import ProbedRig, ProbeEnd, ProbingMove
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 RATIO_BAND = (0.7, 1.42)
 """Smallest and largest accepted ratio of a measured scale or inertia to the profile's value.
@@ -101,7 +101,7 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
     if angle_rad.size < smoothing_window.size + _MIN_SAMPLES:
         return ProbeEstimate(*(None,) * 8, travel_rad=float(np.ptp(angle_rad)), speed_rad_s=0.0)
 
-    def smooth(signal: Real) -> Real:
+    def smooth(signal: RealArray) -> RealArray:
         return np.convolve(signal, smoothing_window, "valid")
 
     speed_rad_s = np.gradient(smooth(angle_rad)) * rig.rate_hz
@@ -136,11 +136,11 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
     )
 
 
-def _smoothing_window(rate_hz: float) -> Real:
+def _smoothing_window(rate_hz: float) -> RealArray:
     """Return the Gaussian smoothing window, of unit sum, odd length and at least three ticks."""
     spread_ticks = max(1.0, _WINDOW_STD_S * rate_hz)
     half_width = int(3.0 * spread_ticks)
-    window_weights: Real = np.exp(
+    window_weights: RealArray = np.exp(
         -0.5 * (np.arange(-half_width, half_width + 1) / spread_ticks) ** 2
     )
     window_weights /= window_weights.sum()
@@ -148,14 +148,14 @@ def _smoothing_window(rate_hz: float) -> Real:
 
 
 def _coupling_ratio(
-    rig: ProbedRig, angle_rad: Real, measured_nm: Real, smoothing_window: Real
-) -> tuple[float | None, float | None, Real]:
+    rig: ProbedRig, angle_rad: RealArray, measured_nm: RealArray, smoothing_window: RealArray
+) -> tuple[float | None, float | None, RealArray]:
     """Fit the measured coupling torque by the torque of the profile's beam at the measured angle.
 
     Returns the ratio of measured to expected torque, its standard deviation, and the fitted
     coupling torque in N·m without noise.
     """
-    best_fit: tuple[float, float, float, Real] | None = None
+    best_fit: tuple[float, float, float, RealArray] | None = None
     for beam_nm in _beam_torques(rig, angle_rad):
         expected_nm = np.convolve(beam_nm, smoothing_window, "valid")
         torque_squares = float(expected_nm @ expected_nm)
@@ -180,12 +180,12 @@ def _coupling_ratio(
     return (None, None, np.zeros_like(measured_nm)) if best_fit is None else best_fit[1:]
 
 
-def _samples_per_independent_sample(smoothing_window: Real) -> float:
+def _samples_per_independent_sample(smoothing_window: RealArray) -> float:
     """Return the number of smoothed samples with the information of one independent sample."""
     return 1.0 / float(smoothing_window @ smoothing_window)
 
 
-def _beam_torques(rig: ProbedRig, angle_rad: Real) -> Real:
+def _beam_torques(rig: ProbedRig, angle_rad: RealArray) -> RealArray:
     """Return the exact beam's torque in N·m at the measured angle, shape (factors, n).
 
     There is a row for each candidate factor of the beam's frequencies.
@@ -206,10 +206,10 @@ def _beam_torques(rig: ProbedRig, angle_rad: Real) -> Real:
 
 
 def _fit_motor_equation(
-    command_nm: Real,
-    acceleration: Real,
-    speed_rad_s: Real,
-    beam_nm: Real,
+    command_nm: RealArray,
+    acceleration: RealArray,
+    speed_rad_s: RealArray,
+    beam_nm: RealArray,
     is_moving: NDArray[np.bool_],
     window_ticks: float,
 ) -> tuple[float | None, ...]:

@@ -21,9 +21,9 @@ from rigd.beam import (
 )
 from rigd.beam.realisation import CoupledModel, Realisation
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 """Array of real numbers."""
-Complex = NDArray[np.complex128]
+ComplexArray = NDArray[np.complex128]
 """Array of complex numbers."""
 
 _DRAG_MODES = 5
@@ -92,7 +92,7 @@ class AirBrake:
         self._shear_per_force_m = mean_deflections_m @ drag_grid.to_modes - drag_grid.weight_m
 
         coupled_state_count = 2 + realisation.b.size
-        self.speed_rows: Real = np.zeros((_DRAG_POINTS, coupled_state_count + 2 * mode_count))
+        self.speed_rows: RealArray = np.zeros((_DRAG_POINTS, coupled_state_count + 2 * mode_count))
         self.speed_rows[:, 1] = drag_grid.x_m
         modal_rows = _real_part_rows(-drag_grid.leverage_m * load_terms / pole_slopes / poles)
         self.speed_rows[:, 2 : 2 + 2 * mode_count] = drag_grid.shapes.T @ modal_rows
@@ -109,7 +109,7 @@ class AirBrake:
         ]
         self._force_per_square_speed = -0.5 * AIR_DENSITY_KG_PER_M3 * drag_m
 
-    def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
+    def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, RealArray]:
         """Return the model of motor and beam, extended by the effect of the drag on the modes.
 
         The model has two more states per mode, whose torque acts on the shaft. Return also the
@@ -128,7 +128,9 @@ class AirBrake:
         force_input[:n] = -np.outer(model.b, self._torque_per_force_m2)
         force_input[first_states] = self._grid.to_modes
 
-        def row(model_row: Real, per_torque: float = 0.0, direct_effect: float = 0.0) -> Real:
+        def row(
+            model_row: RealArray, per_torque: float = 0.0, direct_effect: float = 0.0
+        ) -> RealArray:
             return np.concatenate([model_row, (direct_effect - per_torque) * self._torque_of_mode])
 
         extended_coupled = replace(
@@ -147,7 +149,7 @@ class AirBrake:
         )
         return extended_coupled, force_input
 
-    def update_force(self, speed_m_s: Real) -> tuple[float, float]:
+    def update_force(self, speed_m_s: RealArray) -> tuple[float, float]:
         """Compute and store the drag force for given speeds in m/s; return its immediate effect.
 
         The effect is the change of the beam's torque in N·m and shear in N by the force before it
@@ -162,12 +164,12 @@ class AirBrake:
             self._shear_per_force_m.dot(force_n_per_m)
         )
 
-    def write_held_force(self, force_output: Real) -> None:
+    def write_held_force(self, force_output: RealArray) -> None:
         """Write the drag force of the coming period, in N/m, into the array `force_output`."""
         self._weights[self._newest].dot(self._forces, force_output)
 
 
-def _real_part_rows(gains: Complex) -> Real:
+def _real_part_rows(gains: ComplexArray) -> RealArray:
     """Return rows that compute ``2 Re(gain z)`` for the complex state z of each pole, (m, 2 m).
 
     The model stores z as two real states: its real part, and minus its imaginary part.

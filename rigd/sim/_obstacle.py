@@ -32,9 +32,9 @@ from rigd.beam.realisation import (
 )
 from rigd.devices.obstacles import Disturbance, ImpactSpecification, Obstacle
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 """Array of real numbers."""
-Complex = NDArray[np.complexfloating]
+ComplexArray = NDArray[np.complexfloating]
 """Array of complex numbers."""
 
 _RIGID_STIFFNESS_N_PER_M = 1e9
@@ -129,22 +129,22 @@ class AttachedObstacles:
             for i, attached_body in enumerate(bodies)
             if isinstance(attached_body, ImpactSpecification)
         ]
-        self._zero_forces: Real = np.zeros((self.substeps, len(bodies)))
+        self._zero_forces: RealArray = np.zeros((self.substeps, len(bodies)))
         self.forces_n = self._zero_forces
         # Displacement at each body at the end of the last period, and at its start.
-        self._displacement_m: Real = np.zeros(len(bodies))
+        self._displacement_m: RealArray = np.zeros(len(bodies))
         self._start_displacement_m = self._displacement_m
         self._penetration_m = self._end_penetrations_m = dict.fromkeys(range(len(bodies)), -inf)
 
     @property
-    def displacement_rows(self) -> Real:
+    def displacement_rows(self) -> RealArray:
         """Matrix that gives the beam's displacement in m at each obstacle or impact from the state.
 
         The state is that of the model that `extended_model` returns.
         """
         return np.column_stack([self._rigid_rows, self._force_state_rows[:-2]])
 
-    def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
+    def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, RealArray]:
         """Return the model of motor and beam, extended by the effect of forces on the beam.
 
         The model has additional states for each force, whose torque acts on the shaft. Return also
@@ -184,12 +184,12 @@ class AttachedObstacles:
     def substep_matrices(
         self,
         model: CoupledModel,
-        force_input: Real,
-        holding_torque: Real,
+        force_input: RealArray,
+        holding_torque: RealArray,
         switch_s: float,
         angle_instant_s: float,
         torque_instant_s: float,
-        friction_effect: Real,
+        friction_effect: RealArray,
     ) -> "SubstepMatrices":
         """Compute the matrices for the substeps of a period, for a free or a locked motor.
 
@@ -238,7 +238,7 @@ class AttachedObstacles:
         force_kernel = displacement_rows @ decayed_states
         force_kernel[0] += self._direct_rows[:-2]
 
-        def effect_on(row: Real, direct_effect: Real, instant_s: float) -> Real:
+        def effect_on(row: RealArray, direct_effect: RealArray, instant_s: float) -> RealArray:
             """Return the effect of each substep's force on an output at an instant."""
             substeps_before = instant_s / substep_s
             substep_index = min(int(substeps_before), substep_count - 1)
@@ -279,7 +279,7 @@ class AttachedObstacles:
             velocity_row=n + 1,
         )
 
-    def cannot_touch(self, displacement_m: Real, time_s: float) -> bool:
+    def cannot_touch(self, displacement_m: RealArray, time_s: float) -> bool:
         """Return whether no obstacle and no impact can act on the beam during a period.
 
         `displacement_m`, shape (bodies,), is the beam's displacement at each body at the end of the
@@ -315,8 +315,8 @@ class AttachedObstacles:
         return True
 
     def forces(
-        self, substep_matrices: "SubstepMatrices", free_displacement_m: Real, time_s: float
-    ) -> Real:
+        self, substep_matrices: "SubstepMatrices", free_displacement_m: RealArray, time_s: float
+    ) -> RealArray:
         """Return the forces in N of obstacles and impacts on the beam in each substep of a period.
 
         The forces have the shape (substeps, bodies) and are positive in the direction of increasing
@@ -444,7 +444,9 @@ class AttachedObstacles:
                 obstacle.start_penetration_m = obstacle.end_penetration_m
             j += 1
 
-    def adopt_states(self, old_state: Real, old_obstacles: "AttachedObstacles | None") -> Real:
+    def adopt_states(
+        self, old_state: RealArray, old_obstacles: "AttachedObstacles | None"
+    ) -> RealArray:
         """Take over the state of a plant with fewer obstacles; return the state with all of them.
 
         The obstacles that have acted so far come first among these obstacles. `old_state` is the
@@ -492,7 +494,10 @@ class AttachedObstacles:
         ]
 
     def store_forces(
-        self, substep_matrices: "SubstepMatrices", forces_n: Real, free_displacement_m: Real
+        self,
+        substep_matrices: "SubstepMatrices",
+        forces_n: RealArray,
+        free_displacement_m: RealArray,
     ) -> None:
         """Store the forces of a period, and the displacements and penetrations at its end."""
         self.forces_n = forces_n
@@ -511,9 +516,9 @@ class _ActiveObstacle:
     stiffness_n_per_m: float
     damping_n_per_m: float  # damping coefficient divided by the length of a substep
     compliance_m_per_n: float  # displacement of the beam by 1 N within a substep
-    free_penetration_m: Real  # penetration at the end of each substep if no force acts
+    free_penetration_m: RealArray  # penetration at the end of each substep if no force acts
     start_penetration_m: float  # penetration at the start of the present substep
-    force_n: Real  # forces of the substeps computed so far, else 0; positive on either side
+    force_n: RealArray  # forces of the substeps computed so far, else 0; positive on either side
     end_penetration_m: float = -inf  # penetration at the end of the present substep
 
     def force_and_penetration(self, p: float) -> tuple[float, float]:
@@ -578,24 +583,24 @@ class SubstepMatrices:
     One instance is for a free motor, another for a locked motor.
     """
 
-    free_displacement: Callable[[Real], Real]
+    free_displacement: Callable[[RealArray], RealArray]
     """Function that returns the displacement at the end of each substep if no force acts, body by
     body, from [state, torque before and after the switch, friction of the previous period]."""
-    displacement_per_friction: Real
+    displacement_per_friction: RealArray
     """Displacement at the end of each substep per friction, m per N·m, shape (substeps, bodies)."""
-    displacement_kernel: Real
+    displacement_kernel: RealArray
     """Displacement in m per N at the end of the substep in which a force acts, and of each later
     substep, shape (substeps, bodies, bodies)."""
-    displacement_history: Real
+    displacement_history: RealArray
     """Displacement in m per N at the end of each substep by a force in each substep (last axis),
     shape (bodies, bodies, substeps, substeps)."""
-    force_effect: Callable[[Real], Real]
+    force_effect: Callable[[RealArray], RealArray]
     """Function that returns the effect of the forces of all substeps on [next state, outputs]."""
     velocity_row: int
     """Index of the velocity in [next state, outputs]."""
 
 
-def _history_matrices(kernel: Real) -> Real:
+def _history_matrices(kernel: RealArray) -> RealArray:
     """Return the displacement in m per N at the end of each substep by a force in each substep.
 
     A `kernel` of shape (substeps, m, m) gives lower triangular matrices of shape (m, m, substeps,
@@ -603,7 +608,7 @@ def _history_matrices(kernel: Real) -> Real:
     """
     substep_count = len(kernel)
     lag = np.subtract.outer(np.arange(substep_count), np.arange(substep_count))
-    history_matrices: Real = np.where(
+    history_matrices: RealArray = np.where(
         lag >= 0, kernel.transpose(1, 2, 0)[:, :, np.maximum(lag, 0)], 0.0
     )
     return history_matrices
@@ -633,6 +638,8 @@ def _substeps_per_period(beam: Beam, bodies: tuple[Disturbance, ...], period_s: 
     return max(_MIN_SUBSTEPS, ceil(max(required_rates_per_s) * period_s))
 
 
-def _displacement_per_angle(beam: Beam, damping: Damping, x_m: float, s: Complex) -> Complex:
+def _displacement_per_angle(
+    beam: Beam, damping: Damping, x_m: float, s: ComplexArray
+) -> ComplexArray:
     """Return the transfer function in m/rad from motor angle to beam displacement at `x_m`."""
     return PointForceGrid(s, beam, damping).displacement_per_angle(x_m)

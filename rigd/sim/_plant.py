@@ -31,7 +31,7 @@ from rigd.sim._step import (
 )
 from rigd.sim._stiffness_drift import StiffnessDrift
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 """Array of real numbers."""
 
 _OBSTACLE_ATTRIBUTES = (
@@ -301,7 +301,7 @@ class SimulatedPlant:
         self._torques.extend([0.0] * len(self._torques))
 
     @property
-    def contact_forces_n(self) -> Real:
+    def contact_forces_n(self) -> RealArray:
         """Force in N on the beam in each substep of the last period, shape (substeps, obstacles).
 
         It is positive in the direction of increasing angles. Without obstacles the shape is (0, 0).
@@ -490,7 +490,12 @@ class SimulatedPlant:
         self._set_jump_gains(*drift.arrays[3].tolist())
 
     def _add_contact_effect(
-        self, substep_matrices: SubstepMatrices, input_: Real, output: Real, *, is_turning: bool
+        self,
+        substep_matrices: SubstepMatrices,
+        input_: RealArray,
+        output: RealArray,
+        *,
+        is_turning: bool,
     ) -> None:
         """Add the effect of the obstacles to the state and outputs of a step computed without them.
 
@@ -530,7 +535,7 @@ class SimulatedPlant:
 
     def _with_drag_effect(
         self,
-        output: Real,
+        output: RealArray,
         is_shaft_free: bool,
         torque_nm: float,
         holding_torque_nm: float,
@@ -588,7 +593,7 @@ def _attached_obstacles(
 
 def _step_vectors(
     state_count: int, point_count: int, *, drag_points: int
-) -> tuple[tuple[Real, Real, Real], ...]:
+) -> tuple[tuple[RealArray, RealArray, RealArray], ...]:
     """Return the two vectors that alternate in steps, each with views of its input and outputs.
 
     The input contains `drag_points` drag forces.

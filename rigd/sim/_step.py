@@ -26,7 +26,7 @@ from rigd.beam.realisation import (
 from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._stiffness_drift import with_modal_displacements
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 """Array of real numbers."""
 
 OUTPUT_COUNT = 8
@@ -79,7 +79,7 @@ def free_and_locked_steps(
     locked_model: CoupledModel,
     period_s: float,
     instants: tuple[float, float, float],
-) -> tuple[Real, Real, Real]:
+) -> tuple[RealArray, RealArray, RealArray]:
     """Return the step matrices for a free and a locked shaft, and the effect of 1 N·m of friction.
 
     The matrices have the shape (n + 8, n + 3), and the effect has the shape (n + 8,). `instants`
@@ -105,7 +105,7 @@ def drifted_step_arrays(
     initial_realisation: Realisation,
     period_s: float,
     instants: tuple[float, float, float],
-) -> tuple[Real, Real, Real, Real]:
+) -> tuple[RealArray, RealArray, RealArray, RealArray]:
     """Return matrices and effects of a step for a beam whose bending stiffness has drifted.
 
     Return the matrices for a free and a locked shaft, shape (n + 8, n + 3), the effect of 1 N·m of
@@ -155,12 +155,12 @@ def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
 
 def _step_matrix(
     model: CoupledModel,
-    holding_torque: Real,
+    holding_torque: RealArray,
     period_s: float,
     switch_s: float,
     angle_instant_s: float,
     torque_instant_s: float,
-) -> Real:
+) -> RealArray:
     """Return the matrix of a step of the plant, which lasts one period.
 
     The matrix, shape (n + 8, n + 2), maps [state, motor torque before and after its change] to
@@ -171,22 +171,24 @@ def _step_matrix(
     """
 
     @cache
-    def state_at(instant_s: float) -> Real:
+    def state_at(instant_s: float) -> RealArray:
         phi, step_response = propagator(model, instant_s)
         response_after = propagator(model, max(instant_s - switch_s, 0.0))[1]
         return np.column_stack([phi, step_response - response_after, response_after])
 
-    def torque_at(instant_s: float) -> Real:
+    def torque_at(instant_s: float) -> RealArray:
         return row_with_immediate_effect(
             model.sensor_torque, model.sensor_torque_per_torque, instant_s
         )
 
-    def shear_at(instant_s: float) -> Real:
+    def shear_at(instant_s: float) -> RealArray:
         return row_with_immediate_effect(model.shear, model.shear_per_torque, instant_s)
 
-    def row_with_immediate_effect(state_row: Real, per_torque: float, instant_s: float) -> Real:
+    def row_with_immediate_effect(
+        state_row: RealArray, per_torque: float, instant_s: float
+    ) -> RealArray:
         """Return the row of an output on which the motor torque acts at once."""
-        row: Real = state_row @ state_at(instant_s)
+        row: RealArray = state_row @ state_at(instant_s)
         after_switch_s = instant_s - switch_s
         if abs(after_switch_s) <= _SAME_INSTANT_PERIODS * period_s:
             fraction_after = 0.5
@@ -212,8 +214,8 @@ def _step_matrix(
 
 
 def _output_rows(
-    model: CoupledModel, end_rows: Real, torque_row: Real, holding_torque: Real
-) -> tuple[Real, ...]:
+    model: CoupledModel, end_rows: RealArray, torque_row: RealArray, holding_torque: RealArray
+) -> tuple[RealArray, ...]:
     """Return the step matrix's first rows: state after a period, angle, speed and both torques."""
     return (
         end_rows,
@@ -226,12 +228,12 @@ def _output_rows(
 
 def constant_force_effect(
     model: CoupledModel,
-    force_input: Real,
-    holding_torque: Real,
+    force_input: RealArray,
+    holding_torque: RealArray,
     period_s: float,
     angle_instant_s: float,
     torque_instant_s: float,
-) -> Real:
+) -> RealArray:
     """Return the effect of a drag force, constant over a period, on the next state and outputs.
 
     The effect has the shape (n + 8, points). `force_input`, shape (n, points), is the derivative of
@@ -239,7 +241,7 @@ def constant_force_effect(
     `_step_matrix`.
     """
 
-    def state_at(instant_s: float) -> Real:
+    def state_at(instant_s: float) -> RealArray:
         return states_after_constant_inputs(model, force_input, instant_s)
 
     end_states = state_at(period_s)

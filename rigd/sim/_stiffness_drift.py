@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rigd.beam.realisation import CoupledModel, Realisation
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 """Array of real numbers."""
 
 LARGEST_DRIFT = 0.05
@@ -54,7 +54,7 @@ class StiffnessDrift:
         rate_per_s: float,
         period_s: float,
         highest_mode_rad_s: float,
-        arrays_at: Callable[[float], Sequence[Real]],
+        arrays_at: Callable[[float], Sequence[RealArray]],
     ) -> None:
         # The phase of the fastest mode in a step, from the middle of the drift to its ends.
         half_angle_rad = 0.25 * LARGEST_DRIFT * highest_mode_rad_s * period_s
@@ -124,8 +124,8 @@ def with_modal_displacements(
     )
     to_displacements = np.linalg.inv(from_displacements)
 
-    def row(old_row: Real) -> Real:
-        new_row: Real = old_row @ from_displacements
+    def row(old_row: RealArray) -> RealArray:
+        new_row: RealArray = old_row @ from_displacements
         return new_row
 
     return replace(
@@ -145,7 +145,7 @@ def with_modal_displacements(
 
 def _states_from_displacements(
     beam_realisation: Realisation, initial_realisation: Realisation
-) -> Real:
+) -> RealArray:
     """Return the matrix that computes the realisation's states from modal displacements and speeds.
 
     States that belong to no mode are unchanged.

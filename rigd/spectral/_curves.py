@@ -6,23 +6,23 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-Real = npt.NDArray[np.float64]
+RealArray = npt.NDArray[np.float64]
 """Array of real numbers."""
-Complex = npt.NDArray[np.complex128]
+ComplexArray = npt.NDArray[np.complex128]
 """Array of complex numbers."""
 
 PHASE_START_DEG: Final = -90.0
 """Smallest phase in degrees, chosen so that phases near 0 and 180 degrees do not wrap."""
 
 
-def magnitude_db(response: Complex) -> Real:
+def magnitude_db(response: ComplexArray) -> RealArray:
     """Return the magnitude of complex responses, in dB re 1 N·m/rad."""
     with np.errstate(divide="ignore"):
-        level_db: Real = 20.0 * np.log10(np.abs(response))
+        level_db: RealArray = 20.0 * np.log10(np.abs(response))
     return level_db
 
 
-def phase_deg(response: Complex) -> Real:
+def phase_deg(response: ComplexArray) -> RealArray:
     """Return the phase of complex responses in degrees, from −90 to below 270.
 
     Examples
@@ -32,7 +32,7 @@ def phase_deg(response: Complex) -> Real:
     >>> print(phase_deg(np.array([1.0, 1j, -1.0, -1j])))
     [  0.  90. 180. -90.]
     """
-    phase_from_start: Real = np.mod(np.degrees(np.angle(response)) - PHASE_START_DEG, 360.0)
+    phase_from_start: RealArray = np.mod(np.degrees(np.angle(response)) - PHASE_START_DEG, 360.0)
     return phase_from_start + PHASE_START_DEG
 
 
@@ -49,12 +49,12 @@ class CurveDecimation:
         first index.
     """
 
-    grid: Real
+    grid: RealArray
     groups: npt.NDArray[np.intp]
 
     @classmethod
     def logarithmic(
-        cls, grid: Real, first_hz: float, last_hz: float, max_groups: int
+        cls, grid: RealArray, first_hz: float, last_hz: float, max_groups: int
     ) -> "CurveDecimation":
         """Return the decimation of a curve over frequency, in groups of equal frequency ratio.
 
@@ -81,7 +81,7 @@ class CurveDecimation:
             + np.where(index_offsets < group_sizes[:, None], index_offsets, 0),
         )
 
-    def strips(self, curve_values: Real) -> list[Real]:
+    def strips(self, curve_values: RealArray) -> list[RealArray]:
         """Return the decimated curve as strips (p, 2) of grid value and curve value.
 
         Each strip contains the least and the greatest value of every group. A new strip begins
@@ -101,7 +101,7 @@ class CurveDecimation:
             for strip_indices in map(np.unique, np.split(extreme_indices, strip_starts))
         ]
 
-    def extremes(self, curve_values: Real) -> npt.NDArray[np.intp]:
+    def extremes(self, curve_values: RealArray) -> npt.NDArray[np.intp]:
         """Return the increasing grid indices of the least and greatest value of every group.
 
         Parameters
@@ -111,7 +111,7 @@ class CurveDecimation:
         """
         return np.unique(self._extremes(curve_values)[1])
 
-    def gaps(self, curve_values: Real) -> npt.NDArray[np.intp]:
+    def gaps(self, curve_values: RealArray) -> npt.NDArray[np.intp]:
         """Return the increasing grid indices of the known values on both sides of each gap.
 
         Parameters
@@ -125,7 +125,9 @@ class CurveDecimation:
         last_indices = self.groups[group_indices[before_gaps + 1] - 1].max(axis=1)
         return np.unique(np.concatenate([first_indices, last_indices]))
 
-    def _extremes(self, curve_values: Real) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    def _extremes(
+        self, curve_values: RealArray
+    ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
         """Return the indices of groups with known values, and the grid indices of their extremes.
 
         The extremes are the least and the greatest value, shape (groups, 2).

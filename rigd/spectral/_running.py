@@ -29,7 +29,7 @@ from rigd.spectral._frf import (
 )
 from rigd.spectral._window import WINDOW
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 """Array of real numbers."""
 
 MIN_SEGMENT_FRACTION: Final = 0.25
@@ -218,7 +218,7 @@ class Segments:
         self._available = 0
         self._next = 0
 
-    def feed(self, ticks: ArrayLike, channel_values: ArrayLike) -> Iterator[tuple[int, Real]]:
+    def feed(self, ticks: ArrayLike, channel_values: ArrayLike) -> Iterator[tuple[int, RealArray]]:
         """Add samples and yield the first tick and the values of each segment that they complete.
 
         The samples have increasing numbers, also from call to call, and values of the shape
@@ -238,14 +238,16 @@ class Segments:
                     block_start, sample_block[:, block_start - first_tick : end_tick - first_tick]
                 )
 
-    def newest(self, max_samples: int) -> Real:
+    def newest(self, max_samples: int) -> RealArray:
         """Return the newest samples without a gap, shape (channels, n), at most `max_samples`.
 
         The array is a view of the internal array.
         """
         return self._buffer[:, self._used - min(max_samples, self._available) : self._used]
 
-    def _add_block(self, first_tick: int, sample_block: Real) -> Iterator[tuple[int, Real]]:
+    def _add_block(
+        self, first_tick: int, sample_block: RealArray
+    ) -> Iterator[tuple[int, RealArray]]:
         """Add samples without gaps; yield the first tick and the data of each complete segment."""
         if first_tick != self.end:
             self.end = first_tick
@@ -263,7 +265,7 @@ class Segments:
                 yield self._next, self.newest(self._length)
                 self._next += self._hop
 
-    def _append(self, new_samples: Real) -> None:
+    def _append(self, new_samples: RealArray) -> None:
         """Append samples to the internal array, which stores at least the newest segment."""
         new_count = new_samples.shape[1]
         if self._used + new_count > self._buffer.shape[1]:
@@ -281,9 +283,9 @@ class _GapFiller:
 
     def __init__(self, longest_gap: int) -> None:
         self._longest = longest_gap
-        self._last: tuple[NDArray[np.int64], Real] | None = None
+        self._last: tuple[NDArray[np.int64], RealArray] | None = None
 
-    def fill(self, ticks: ArrayLike, channel_values: ArrayLike) -> Iterator[tuple[int, Real]]:
+    def fill(self, ticks: ArrayLike, channel_values: ArrayLike) -> Iterator[tuple[int, RealArray]]:
         """Yield blocks without gaps: their first tick and their values (channels, n)."""
         known_ticks = np.asarray(ticks, dtype=np.int64)
         known_values = np.asarray(channel_values, dtype=np.float64)
@@ -312,7 +314,9 @@ class _GapFiller:
                 yield first_tick, sample_block
 
 
-def _interpolate_to_ticks(known_ticks: NDArray[np.int64], known_values: Real) -> tuple[int, Real]:
+def _interpolate_to_ticks(
+    known_ticks: NDArray[np.int64], known_values: RealArray
+) -> tuple[int, RealArray]:
     """Return the first tick, and interpolated values at every tick from the first to the last."""
     first_tick, last_tick = int(known_ticks[0]), int(known_ticks[-1])
     if last_tick - first_tick + 1 == known_ticks.size:

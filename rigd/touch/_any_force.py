@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rigd.touch._kernels import ContactKernels
 from rigd.touch._obstacle_contact import WhitenedWindow
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _FORCE_STDS_N = np.array([0.1, 0.4, 1.6, 6.4])
 """Standard deviations in N of the random force, of which the likeliest is chosen."""
@@ -24,16 +24,16 @@ _FORCE_STDS_N = np.array([0.1, 0.4, 1.6, 6.4])
 class AnyForceLikelihood:
     """Likelihood of a touch at each position along the beam, for an arbitrary force over time."""
 
-    x_m: Real
+    x_m: RealArray
     """Positions along the beam, shape (m,)."""
-    log_likelihood: Real
+    log_likelihood: RealArray
     """Logarithm of the likelihood at each position, for the likeliest standard deviation of the
     force; shape (m,)."""
     chi2: float
     """Sum of squared whitened residuals at the likeliest position."""
     expected_chi2: int
     """Expectation of `chi2`."""
-    force_n: Real
+    force_n: RealArray
     """Estimated force on the beam at the likeliest position over time, shape (2 · samples,)."""
     force_std_n: float
     """Likeliest standard deviation of the force at the likeliest position."""

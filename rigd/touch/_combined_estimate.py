@@ -25,7 +25,7 @@ from rigd.touch._obstacle_contact import (
 from rigd.touch._posterior import Posterior
 from rigd.touch._results import TouchEstimate, TouchQuantity
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _NORMAL_QUANTILE_95 = 1.959964
 """Number of standard deviations of a normal distribution's two-sided 95 % interval."""
@@ -163,7 +163,7 @@ def _with_any_force_interval(
     return TouchQuantity(estimate.value, max(estimate.std, (high_m - low_m) / 4), (low_m, high_m))
 
 
-def _with_interval_including(estimate: TouchQuantity, positions_m: Real) -> TouchQuantity:
+def _with_interval_including(estimate: TouchQuantity, positions_m: RealArray) -> TouchQuantity:
     """Return a touch position in m, whose interval is extended to include `positions_m`."""
     low_m, high_m = (
         float(limit([*estimate.interval_95, *positions_m])) for limit in (np.min, np.max)
@@ -208,7 +208,7 @@ def _force_estimate(
     explanation_search: ExplanationSearch,
     best_explanation: Explanation,
     sample_window: WhitenedWindow,
-) -> tuple[Real, Real, TouchQuantity]:
+) -> tuple[RealArray, RealArray, TouchQuantity]:
     """Return the contact force in N at each time step, the instants in s, and the peak force.
 
     Forces and instants are computed from the likeliest parameters, the peak and its interval from

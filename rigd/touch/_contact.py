@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 _Precision = TypeVar("_Precision", np.float32, np.float64)
 
 _BLOCK_STEPS, _SHORT_BLOCK_STEPS = 16, 6
@@ -30,8 +30,8 @@ def integrate_contact(
     approach: NDArray[_Precision],
     stiffness_n_per_m: NDArray[_Precision],
     step_s: float,
-    rate_m_per_s: Real | float = 0.0,
-    mobility_m_per_n_s: Real | float = 0.0,
+    rate_m_per_s: RealArray | float = 0.0,
+    mobility_m_per_n_s: RealArray | float = 0.0,
 ) -> NDArray[_Precision]:
     """Return the force with which the beam presses on an obstacle, at each step since the touch.
 
@@ -133,11 +133,11 @@ def integrate_contact(
 
 
 def integrate_two_contacts(
-    own_kernels: tuple[Real, Real],
-    cross_kernel: Real,
-    approach: tuple[Real, Real],
-    stiffness_n_per_m: tuple[Real, Real],
-) -> tuple[Real, Real]:
+    own_kernels: tuple[RealArray, RealArray],
+    cross_kernel: RealArray,
+    approach: tuple[RealArray, RealArray],
+    stiffness_n_per_m: tuple[RealArray, RealArray],
+) -> tuple[RealArray, RealArray]:
     """Return the forces with which the beam presses on two obstacles at rest, at each step.
 
     Parameters
@@ -220,7 +220,7 @@ def integrate_two_contacts(
     return forces_n[:, 0], forces_n[:, 1]
 
 
-def shift_rows(value_table: Real, begin_columns: Real, column_count: int) -> Real:
+def shift_rows(value_table: RealArray, begin_columns: RealArray, column_count: int) -> RealArray:
     """Return each row of a table from a fractional column on, by cubic interpolation.
 
     The result has the shape (k, column_count). Before the first column of the table, values are 0;
@@ -265,8 +265,8 @@ def shift_rows(value_table: Real, begin_columns: Real, column_count: int) -> Rea
 
 
 def contact_responses(
-    kernels: tuple[Real, ...], forces_n: Real, steps_per_sample: int, sample_count: int
-) -> Real:
+    kernels: tuple[RealArray, ...], forces_n: RealArray, steps_per_sample: int, sample_count: int
+) -> RealArray:
     """Return the convolution of forces with kernels, shape (k, kernels, sample_count).
 
     Only the values at the samples are computed, one every `steps_per_sample` time steps.

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rigd.touch._innovations import InnovationFilter
 from rigd.touch._templates import DetectorModel
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _INDEPENDENT_FRACTION: Final = 0.5
 """Number of independent tests per template and tick, because templates overlap; measured at

@@ -33,7 +33,7 @@ from rigd.touch._tables import GRID_COMPARISON_S, TouchTables
 from rigd.touch._uncertainty_effects import uncertainty_effects
 from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _STAGE_ENDS_S = (FIRST_S, 0.1, FINAL_S)
 """Times in s after the detection at which the stages of the explanation end; each stage explains a
@@ -111,7 +111,7 @@ class Explanation:
     impact)."""
     posterior: Posterior
     """Posterior distribution of the obstacle's parameters."""
-    parameters: Real
+    parameters: RealArray
     """Likeliest parameters of the obstacle, shape (p,)."""
     chi2: float
     """Sum of squared whitened residuals for the likeliest parameters."""
@@ -129,7 +129,7 @@ class ExplainedRecord:
     """Whether the samples after `window` contradict an obstacle at rest."""
     other_kinds_untried: bool
     """Whether a kind of obstacle that was not tried may be likelier."""
-    first_obstacle_positions_m: Real
+    first_obstacle_positions_m: RealArray
     """Positions in m of the first of two obstacles, for pairs that explain the record as well as
     one obstacle does."""
 
@@ -179,13 +179,13 @@ class ExplanationSearch:
         )
         self.samples_after_detection = self.record.angle_rad.size - self.detected
         self.position_range_m = (float(touch_tables.x_m[0]) + 0.002, float(touch_tables.x_m[-1]))
-        self.effects_per_std: Real | None = None
+        self.effects_per_std: RealArray | None = None
         self._uncertainties_end_s = 0.0
         covers_grid = (
             previous_search is not None
             and previous_search.samples_after_detection >= round(GRID_COMPARISON_S * rate_hz)
         )
-        self._grid_candidates: Real = (
+        self._grid_candidates: RealArray = (
             previous_search._grid_candidates
             if previous_search and covers_grid
             else self._best_of_grid()
@@ -224,7 +224,7 @@ class ExplanationSearch:
         )
         explanations = [resting_explanation]
         other_kinds_untried = False
-        first_obstacle_positions_m: Real = np.zeros(0)
+        first_obstacle_positions_m: RealArray = np.zeros(0)
         if two_obstacles is None:
             needs_other_kinds = not self.fits(
                 resting_explanation, sample_window, POOR_FIT_STDS
@@ -331,7 +331,7 @@ class ExplanationSearch:
             is_precise or not self.fits(resting_explanation, sample_window)
         )
 
-    def _include_uncertainties(self, likely_obstacle: Real, after_detection_s: float) -> None:
+    def _include_uncertainties(self, likely_obstacle: RealArray, after_detection_s: float) -> None:
         """Compute the effects of uncertainties on the samples up to a time after the detection.
 
         Only the first candidate of `likely_obstacle` is used. Effects that were computed before, up
@@ -351,7 +351,7 @@ class ExplanationSearch:
                 self.tables, self.record, likely_obstacle[:1], whole_window
             )
 
-    def _next_candidates(self, resting_explanation: Explanation) -> Real:
+    def _next_candidates(self, resting_explanation: Explanation) -> RealArray:
         """Return candidate obstacles for the next stage, from the last stage's explanation."""
         return np.vstack(
             [resting_explanation.parameters, self._draw_candidates(resting_explanation.posterior)]
@@ -398,7 +398,7 @@ class ExplanationSearch:
             largest_std=np.array([0.02, 2e-3, 1.0, 0.3, 0.3])[:parameter_count],
         )
 
-    def predictor(self, near_candidates: Real, *, coarse: bool = False) -> Prediction:
+    def predictor(self, near_candidates: RealArray, *, coarse: bool = False) -> Prediction:
         """Return the function that predicts the effects of obstacles near `near_candidates`.
 
         The function integrates with fine time steps if the candidates are near the tip. Otherwise
@@ -420,7 +420,7 @@ class ExplanationSearch:
 
     # Springy obstacle at rest
 
-    def _best_of_grid(self) -> Real:
+    def _best_of_grid(self) -> RealArray:
         """Return the four likeliest candidates of the grid at each position, shape (k, 3)."""
         grid_window = self.window(GRID_COMPARISON_S)
         candidate_grid = self.tables.candidate_grid(
@@ -429,7 +429,7 @@ class ExplanationSearch:
         grid_candidates, chi2 = candidate_grid.integrate(self.motion, grid_window, self.detected)
         grid_candidates = grid_candidates[np.lexsort((chi2, grid_candidates[:, 0]))]
         candidates_per_position = grid_candidates.shape[0] // np.unique(grid_candidates[:, 0]).size
-        best_candidates: Real = grid_candidates.reshape(-1, candidates_per_position, 3)[
+        best_candidates: RealArray = grid_candidates.reshape(-1, candidates_per_position, 3)[
             :, :4
         ].reshape(-1, 3)
         return best_candidates
@@ -445,7 +445,7 @@ class ExplanationSearch:
         )
 
     @cached_property
-    def grid_starts(self) -> Real:
+    def grid_starts(self) -> RealArray:
         """The 12 candidates of the grid that explain the first samples best, shape (12, 3)."""
         coarse_contact = ObstacleContact(self.tables.coarse_kernels, self.tables.x_m, self.motion)
         chi2 = chi2_of(
@@ -467,7 +467,7 @@ class ExplanationSearch:
             max_iterations=7,
         )
 
-    def _add_neighbours(self, candidates: Real) -> Real:
+    def _add_neighbours(self, candidates: RealArray) -> RealArray:
         """Return candidate obstacles; near the tip, add neighbours of the two best.
 
         Minima are close together near the tip.
@@ -480,7 +480,7 @@ class ExplanationSearch:
         )
         return np.vstack([candidates, nearby_candidates.reshape(-1, candidates.shape[1])])
 
-    def _draw_candidates(self, posterior: Posterior) -> Real:
+    def _draw_candidates(self, posterior: Posterior) -> RealArray:
         """Return random candidates near samples of a posterior distribution, shape (k, p)."""
         rng = np.random.default_rng(1)
         drawn_candidates = posterior.samples[
@@ -505,7 +505,7 @@ class ExplanationSearch:
         kind: str,
         predict_effect: Prediction,
         sample_window: WhitenedWindow,
-        start_candidates: Real,
+        start_candidates: RealArray,
         parameter_ranges: ParameterRanges,
     ) -> Explanation:
         """Return the explanation by one kind of obstacle, searched from `start_candidates`."""
@@ -696,7 +696,7 @@ class ExplanationSearch:
 
     def _explain_by_two(
         self, resting_explanation: Explanation, sample_window: WhitenedWindow
-    ) -> tuple[Explanation | None, Real]:
+    ) -> tuple[Explanation | None, RealArray]:
         """Return the explanation by two obstacles, and possible positions in m of the first one.
 
         The explanation is None if one obstacle explains the record about as well. With the first of
@@ -761,7 +761,7 @@ class ExplanationSearch:
         resting_explanation: Explanation,
         sample_window: WhitenedWindow,
         single_chi2: float,
-    ) -> tuple[Real, Real]:
+    ) -> tuple[RealArray, RealArray]:
         """Return pairs of obstacles with the effect of one, and their sums of squared residuals.
 
         The shapes are (k, 6) and (k,); k = 0 if no pair has an effect similar to one obstacle.
@@ -806,7 +806,7 @@ class ExplanationSearch:
         """
         obstacle_contact = ObstacleContact(kernels, self.tables.x_m, self.motion)
 
-        def predict(candidates: Real, sample_window: WhitenedWindow) -> Real:
+        def predict(candidates: RealArray, sample_window: WhitenedWindow) -> RealArray:
             if kind == "yielding":
                 candidates = np.insert(candidates, 3, 0.0, axis=1)
             return obstacle_contact.predict(candidates, sample_window, pressing_sign)[0]
@@ -827,10 +827,10 @@ class ExplanationSearch:
         )
 
 
-def _distinct_minima(local_minima: LocalMinima) -> Real:
+def _distinct_minima(local_minima: LocalMinima) -> RealArray:
     """Return the parameters of minima that are not close to a better one, best first, (k, 3)."""
     minimum_order = np.argsort(local_minima.chi2)
-    distinct_minima: list[Real] = []
+    distinct_minima: list[RealArray] = []
     for row in local_minima.parameters[
         minimum_order[local_minima.chi2[minimum_order] < 2 * local_minima.chi2.min() + 60]
     ]:

@@ -23,8 +23,8 @@ from rigd.beam import (
 from rigd.touch._kernels import DECAY_EXPONENT, chebyshev_nodes
 from rigd.touch._model import TouchModel
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 STEPS_PER_SAMPLE = 4
 """Number of time steps of the free motion per sample; a spline interpolates the angle to them."""
@@ -49,11 +49,11 @@ class TouchRecord:
 
     rate_hz: float
     """Samples a second."""
-    angle_rad: Real
+    angle_rad: RealArray
     """Measured angle, shape (n,)."""
-    torque_nm: Real
+    torque_nm: RealArray
     """Measured coupling torque, shape (n,)."""
-    shear_n: Real | None
+    shear_n: RealArray | None
     """Measured base shear, shape (n,); None if the profile does not define it."""
     detected: int
     """Index of the sample at which the touch was detected."""
@@ -101,7 +101,9 @@ class FreeBeam:
         "x_m",
     )
 
-    def __init__(self, model: TouchModel, x_m: Real, rate_hz: float, sample_count: int) -> None:
+    def __init__(
+        self, model: TouchModel, x_m: RealArray, rate_hz: float, sample_count: int
+    ) -> None:
         from scipy.fft import next_fast_len
 
         self.model, self.x_m, self.rate_hz = model, x_m, rate_hz
@@ -113,8 +115,10 @@ class FreeBeam:
         filter_response = model.sensor_filter.response(s)
         filter_response *= np.exp(-s * (model.wrench_delay_s - model.angle_delay_s))
         tool_inertia = model.plant.tool_inertia_kg_m2 * s * s
-        self._torque: Complex = filter_response * (force_grid.torque_per_angle() + tool_inertia)
-        self._shear: Complex = filter_response * force_grid.shear_per_angle()
+        self._torque: ComplexArray = filter_response * (
+            force_grid.torque_per_angle() + tool_inertia
+        )
+        self._shear: ComplexArray = filter_response * force_grid.shear_per_angle()
         self.free_vibration = FreeVibration.from_model(model, np.empty(0))
         self._set_positions(x_m)
         unit_sample = np.zeros(3 * SPLINE_FADE_SAMPLES)
@@ -123,7 +127,7 @@ class FreeBeam:
             _interpolate_angle(unit_sample, rate_hz, self.transform)[0]
         )
 
-    def at_positions(self, x_m: Real) -> "FreeBeam":
+    def at_positions(self, x_m: RealArray) -> "FreeBeam":
         """Return a copy of the model that computes displacements at other positions.
 
         Parameters
@@ -135,7 +139,7 @@ class FreeBeam:
         moved_beam._set_positions(x_m)
         return moved_beam
 
-    def _set_positions(self, x_m: Real) -> None:
+    def _set_positions(self, x_m: RealArray) -> None:
         """Set the positions at which the displacement is computed.
 
         Displacements at many positions are interpolated from those at 36 nodes, with a relative
@@ -145,10 +149,10 @@ class FreeBeam:
         nodes_m, self._interpolation = x_m, np.eye(x_m.size)
         if x_m.size > _NODE_COUNT:
             nodes_m, self._interpolation = chebyshev_nodes(x_m, _NODE_COUNT)
-        self._node_displacement: Complex = self._force_grid.displacement_per_angle(nodes_m).T
+        self._node_displacement: ComplexArray = self._force_grid.displacement_per_angle(nodes_m).T
         self.free_vibration = self.free_vibration.at_positions(x_m / self.model.plant.beam.length_m)
 
-    def displacement_per_sample(self, position_index: int, sample_count: int) -> Real:
+    def displacement_per_sample(self, position_index: int, sample_count: int) -> RealArray:
         """Return the displacement over time at one position per sample of the angle, in m/rad.
 
         Parameters
@@ -250,17 +254,17 @@ class FreeBeam:
 class FreeMotion:
     """Predicted motion of the beam without contact, and the deviations of a record from it."""
 
-    t: Real
+    t: RealArray
     """Instants of the samples of torque and shear, corrected for their delays, shape (n,)."""
-    innovations: Real
+    innovations: RealArray
     """Innovations (measured minus predicted) of torque and, if measured, base shear, shape (c,
     n)."""
-    noise_stds: Real
+    noise_stds: RealArray
     """Standard deviation of each channel's innovations before the touch, shape (c,)."""
-    design_matrices: Real
+    design_matrices: RealArray
     """Effects of the q fitted quantities (free vibrations, offsets and drifts) on torque and shear
     per unit amplitude, shape (c, n, q)."""
-    amplitude_cholesky: Real
+    amplitude_cholesky: RealArray
     """Lower Cholesky factor of the covariance of the q fitted amplitudes, shape (q, q)."""
     angle_transform: "AngleTransform"
     """Laplace transform of the measured angle, which drives the beam."""
@@ -268,7 +272,7 @@ class FreeMotion:
     """Free vibrations whose amplitudes were fitted."""
     angle_noise_rad: float
     """Standard deviation of the noise in one sample of the angle."""
-    displacement_m: Real
+    displacement_m: RealArray
     """Displacement of the beam in m at m positions and k time steps, shape (m, k)."""
     first_s: float
     """Instant of the first time step of `displacement_m`."""
@@ -276,7 +280,7 @@ class FreeMotion:
     """Time between two time steps of `displacement_m`."""
 
 
-def _angle_noise(angle_rad: Real) -> float:
+def _angle_noise(angle_rad: RealArray) -> float:
     """Return the standard deviation in rad of the angle's noise, including encoder resolution.
 
     It is estimated from fourth differences of the samples, which contain hardly any motion.
@@ -288,7 +292,7 @@ def _angle_noise(angle_rad: Real) -> float:
 class AngleTransform:
     """Laplace transform of a record's angle, without its initial value and speed."""
 
-    spectrum: Complex
+    spectrum: ComplexArray
     """Laplace transform of the angle minus ``start_rad + speed_rad_s · t``."""
     start_rad: float
     """Angle at the record's beginning."""
@@ -297,7 +301,7 @@ class AngleTransform:
 
     @classmethod
     def from_samples(
-        cls, angle_rad: Real, rate_hz: float, transform: CausalTransform
+        cls, angle_rad: RealArray, rate_hz: float, transform: CausalTransform
     ) -> "AngleTransform":
         """Return the Laplace transform of a record's angle from its samples."""
         remaining_angle, start_rad, speed_rad_s = _interpolate_angle(angle_rad, rate_hz, transform)
@@ -305,8 +309,8 @@ class AngleTransform:
 
 
 def _interpolate_angle(
-    angle_rad: Real, rate_hz: float, transform: CausalTransform
-) -> tuple[Real, float, float]:
+    angle_rad: RealArray, rate_hz: float, transform: CausalTransform
+) -> tuple[RealArray, float, float]:
     """Return the angle at the time steps of a transform, without its initial value and speed.
 
     The second and third results are the initial angle in rad and the initial speed in rad/s.
@@ -338,17 +342,17 @@ def _interpolate_angle(
 class FreeVibration:
     """Free vibrations of the beam's first modes: decaying cosines and sines of unit amplitude."""
 
-    poles: Complex
+    poles: ComplexArray
     """Poles of the modes in rad/s, shape (modes,)."""
-    root_loads: Complex
+    root_loads: ComplexArray
     """Complex torque and base shear of each mode for a unit amplitude, shape (2, modes)."""
-    amplitude_units: Real
+    amplitude_units: RealArray
     """Factor of each mode's shape for a unit amplitude, chosen for similar torques; (modes,)."""
-    displacement_shapes: Real
+    displacement_shapes: RealArray
     """Displacement at each position for a unit amplitude of each mode, shape (modes, positions)."""
 
     @classmethod
-    def from_model(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
+    def from_model(cls, model: TouchModel, x_m: RealArray) -> "FreeVibration":
         """Return the free vibrations of a model, with the displacement at positions `x_m`."""
         beam, damping = model.plant.beam, model.plant.damping
         candidate_modes = 12
@@ -375,7 +379,7 @@ class FreeVibration:
         )
         return without_shapes.at_positions(x_m / beam.length_m)
 
-    def at_positions(self, fractions: Real) -> "FreeVibration":
+    def at_positions(self, fractions: RealArray) -> "FreeVibration":
         """Return the same free vibrations with displacements at other positions.
 
         Parameters
@@ -386,7 +390,7 @@ class FreeVibration:
         mode_shapes = np.stack([mode_shape(i + 1, fractions) for i in range(self.poles.size)])
         return replace(self, displacement_shapes=mode_shapes * self.amplitude_units[:, None])
 
-    def torque_and_shear(self, t: Real) -> Real:
+    def torque_and_shear(self, t: RealArray) -> RealArray:
         """Return torque and base shear of each vibration over time, shape (2, t, 2 · modes).
 
         Parameters
@@ -400,7 +404,7 @@ class FreeVibration:
             [np.hstack([complex_part.real, -complex_part.imag]) for complex_part in complex_parts]
         )
 
-    def displacement(self, t: NDArray[np.floating], amplitudes: Real) -> Real:
+    def displacement(self, t: NDArray[np.floating], amplitudes: RealArray) -> RealArray:
         """Return the beam's displacement in m for given amplitudes of the free vibrations.
 
         The shape is (positions, t, r), or (positions, t) for amplitudes without the axis r.
@@ -421,7 +425,9 @@ class FreeVibration:
         displacement_m -= np.multiply(
             oscillation.imag[:, :, None], vibration_columns[mode_count:, None]
         )
-        displacement: Real = self.displacement_shapes.T @ displacement_m.reshape(mode_count, -1)
+        displacement: RealArray = self.displacement_shapes.T @ displacement_m.reshape(
+            mode_count, -1
+        )
         return displacement.reshape(-1, t.size, *amplitudes.shape[1:])
 
 
@@ -429,18 +435,18 @@ class FreeVibration:
 class _FreeMotionFit:
     """Fit of free vibrations, offset and drift to the samples before a touch."""
 
-    amplitudes: Real
+    amplitudes: RealArray
     """Fitted amplitudes, shape (q,)."""
-    covariance: Real
+    covariance: RealArray
     """Covariance of the amplitudes, shape (q, q)."""
     noise_stds: list[float]
     """Standard deviations of the residuals of torque and shear before the touch."""
-    innovations: list[Real]
+    innovations: list[RealArray]
     """Residuals of torque and shear at all samples, also after the touch."""
 
     @classmethod
     def fit(
-        cls, innovations: list[Real], design_matrices: list[Real], quiet_samples: int
+        cls, innovations: list[RealArray], design_matrices: list[RealArray], quiet_samples: int
     ) -> "_FreeMotionFit":
         """Return the weighted least-squares fit to the first `quiet_samples` samples.
 

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from rigd.touch._kernels import ContactKernels
 from rigd.touch._obstacle_contact import ObstacleContact, ParameterRanges, WhitenedWindow
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _DURATIONS_S = np.array([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
 """Durations of the pulse in s from which the search starts."""
@@ -39,7 +39,7 @@ class ImpactResponse:
             position_stride,
         )
 
-    def predict(self, parameters: Real, sample_window: WhitenedWindow) -> Real:
+    def predict(self, parameters: RealArray, sample_window: WhitenedWindow) -> RealArray:
         """Return the effect of impacts on torque and base shear, shape (k, c, samples).
 
         Parameters
@@ -61,7 +61,7 @@ class ImpactResponse:
 
     def start_candidates(
         self, sample_window: WhitenedWindow, latest_sample: int, impact_count: int
-    ) -> Real:
+    ) -> RealArray:
         """Return the likeliest candidates of a grid of impacts, shape (impact_count, 4).
 
         The grid has positions, instants and durations; the peak is fitted by least squares.

@@ -26,8 +26,8 @@ from rigd.beam import (
 )
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
 
 _CANDIDATE_MODES = 40
 """Number of the beam's first modes, of which the filter represents those of low enough
@@ -74,13 +74,13 @@ class ObservedBeam:
     (39, (43, 42))
     """
 
-    matrix: Real
+    matrix: RealArray
     """Matrix of a tick from [state, angle, torque, shear] to [next state, whitened innovations,
     whitened prediction], shape (n + 4, n + 3). Without shear, the rows and the column of shear are
     zero."""
-    gain: Real
+    gain: RealArray
     """Effect of each whitened innovation on the next state, shape (n, 2)."""
-    whitening: Real
+    whitening: RealArray
     """Matrix from innovations in N·m and N to whitened innovations, shape (2, 2)."""
     states: int
     """Number n of states."""
@@ -307,11 +307,11 @@ class _AngleFilter:
     The equations are ``x' = a x + b θ`` and ``[torque, shear] = c x + d θ``.
     """
 
-    a: Real
-    b: Real
-    c: Real
-    d: Real
-    noise_gain: Real
+    a: RealArray
+    b: RealArray
+    c: RealArray
+    d: RealArray
+    noise_gain: RealArray
     """Standard deviations of torque and shear per white noise of 1 rad in the angle, shape (2,)."""
 
 
@@ -330,8 +330,8 @@ def _fit_filter(
     """
     pole_pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_CANDIDATE_MODES), beam, damping)
     upper_poles = pole_pairs[_is_represented_mode(pole_pairs[:, 0], rate_hz), 0]
-    complex_poles: Complex = np.exp(upper_poles / rate_hz)
-    real_poles: Real = np.exp(
+    complex_poles: ComplexArray = np.exp(upper_poles / rate_hz)
+    real_poles: RealArray = np.exp(
         -np.geomspace(_SLOWEST_REAL_POLE_RAD_S, rate_hz, _REAL_POLE_COUNT) / rate_hz
     )
 
@@ -376,7 +376,7 @@ def _fit_filter(
     return _state_space(complex_poles, real_poles, coefficients, noise_gain)
 
 
-def _is_represented_mode(upper_poles: Complex, rate_hz: float) -> NDArray[np.bool_]:
+def _is_represented_mode(upper_poles: ComplexArray, rate_hz: float) -> NDArray[np.bool_]:
     """Return a mask of the poles whose modes the filter represents.
 
     These are oscillating modes below `_MAX_FREQUENCY_FRACTION` of the tick rate; poles that are NaN
@@ -388,7 +388,9 @@ def _is_represented_mode(upper_poles: Complex, rate_hz: float) -> NDArray[np.boo
     return is_represented & (upper_poles.imag < 2 * pi * _MAX_FREQUENCY_FRACTION * rate_hz)
 
 
-def _term_responses(s_ticks: Complex, complex_poles: Complex, real_poles: Real) -> Complex:
+def _term_responses(
+    s_ticks: ComplexArray, complex_poles: ComplexArray, real_poles: RealArray
+) -> ComplexArray:
     """Return the frequency response of each term of the filter, shape (frequencies, terms).
 
     The terms are the real and the imaginary part of each complex pole, the real poles and the delay
@@ -412,7 +414,10 @@ def _term_responses(s_ticks: Complex, complex_poles: Complex, real_poles: Real) 
 
 
 def _state_space(
-    complex_poles: Complex, real_poles: Real, coefficients: Real, noise_gain: Real
+    complex_poles: ComplexArray,
+    real_poles: RealArray,
+    coefficients: RealArray,
+    noise_gain: RealArray,
 ) -> _AngleFilter:
     """Return the state space of the filter with the given coefficients of its terms.
 
@@ -457,15 +462,15 @@ class _Observer:
     The equations are ``x' = a x + gain e`` and ``e = y - c x``, with the innovations e.
     """
 
-    a: Real
-    c: Real
-    gain: Real
-    whitening: Real
+    a: RealArray
+    c: RealArray
+    gain: RealArray
+    whitening: RealArray
     """Matrix from innovations to whitened innovations, shape (2, 2)."""
 
 
 def _design_observer(
-    beam: Beam, damping: Damping, rate_hz: float, noise: ChannelNoise, noise_gain: Real
+    beam: Beam, damping: Damping, rate_hz: float, noise: ChannelNoise, noise_gain: RealArray
 ) -> _Observer:
     """Return the stationary Kalman filter that follows vibrating modes and drifting zeros."""
     from scipy.linalg import solve_discrete_are

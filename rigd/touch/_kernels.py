@@ -22,8 +22,8 @@ from rigd.beam import (
 )
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+RealArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 DECAY_EXPONENT = 14.0
 """Exponent by which the transforms damp signals over their period; values that wrap round from the
@@ -65,7 +65,7 @@ class ForcePulse:
         # Two steps later than the force, so that the hat begins within the period.
         self._delayed_pulse = pulse_transform * np.exp(-s * step_s)
 
-    def kernels(self, laplace_response: Complex) -> Real:
+    def kernels(self, laplace_response: ComplexArray) -> RealArray:
         """Return the responses over time to the pulse, from transfer functions, shape (k, steps).
 
         Parameters
@@ -83,16 +83,16 @@ class ForcePulse:
 class ContactKernels:
     """Responses over time to a triangular pulse of contact force, at positions along the beam."""
 
-    x_m: Real
+    x_m: RealArray
     """Positions of the force along the beam, shape (m,)."""
     step_s: float
     """Time step of the kernels, which is half the width of the pulse."""
-    displacement: Real
+    displacement: RealArray
     """Displacement at the position of the force in m/N, shape (m, n), from the peak of the pulse
     on."""
-    torque: Real
+    torque: RealArray
     """Coupling torque in N·m/N, shape (m, n)."""
-    shear: Real
+    shear: RealArray
     """Base shear in N/N, shape (m, n)."""
 
     @property
@@ -100,7 +100,7 @@ class ContactKernels:
         """Number of time steps of the responses."""
         return int(self.displacement.shape[1])
 
-    def at_positions(self, x_m: Real, step_count: int) -> "ContactKernels":
+    def at_positions(self, x_m: RealArray, step_count: int) -> "ContactKernels":
         """Return the responses at other positions, by cubic interpolation between positions.
 
         Parameters
@@ -160,7 +160,7 @@ class ContactKernels:
 def contact_kernels(
     beam: Beam,
     damping: Damping,
-    x_m: Real,
+    x_m: RealArray,
     step_s: float,
     step_count: int,
     sensor_filter: SensorFilter = NO_FILTER,
@@ -207,15 +207,15 @@ class CrossKernels:
     It is computed as a sum over the modes.
     """
 
-    x_m: Real
+    x_m: RealArray
     """Positions at which the mode shapes are given, shape (m,)."""
-    mode_shapes: Real
+    mode_shapes: RealArray
     """Mode shapes at the positions, shape (m, modes)."""
-    kernels: Real
+    kernels: RealArray
     """Response over time of each mode to the pulse, for mode shapes of 1 at both positions, in m/N;
     shape (modes, n)."""
 
-    def between_positions(self, x_m: Real, other_m: Real, step_count: int) -> Real:
+    def between_positions(self, x_m: RealArray, other_m: RealArray, step_count: int) -> RealArray:
         """Return the displacement in m/N for each pair of positions, shape (k, step_count).
 
         Parameters
@@ -228,12 +228,14 @@ class CrossKernels:
         first_shapes, second_shapes = (
             interpolate_rows(self.mode_shapes, *cubic_weights(x, self.x_m)) for x in (x_m, other_m)
         )
-        cross_kernels_of_pairs: Real = (first_shapes * second_shapes) @ self.kernels[:, :step_count]
+        cross_kernels_of_pairs: RealArray = (first_shapes * second_shapes) @ self.kernels[
+            :, :step_count
+        ]
         return cross_kernels_of_pairs
 
 
 def cross_kernels(
-    beam: Beam, damping: Damping, x_m: Real, step_s: float, step_count: int
+    beam: Beam, damping: Damping, x_m: RealArray, step_s: float, step_count: int
 ) -> CrossKernels:
     """Return the kernels from a force at one position to the displacement at another.
 
@@ -258,7 +260,7 @@ _POSITIONS_AT_ONCE = 8
 """Number of positions that are evaluated at once, so that temporary arrays stay in the cache."""
 
 
-def beam_positions(length_m: float, spacing_m: float) -> Real:
+def beam_positions(length_m: float, spacing_m: float) -> RealArray:
     """Return equally spaced positions along the beam up to its tip, in m.
 
     Parameters
@@ -272,7 +274,7 @@ def beam_positions(length_m: float, spacing_m: float) -> Real:
     return np.linspace(_FIRST_POSITION_M, length_m, n)
 
 
-def chebyshev_nodes(x_m: Real, node_count: int) -> tuple[Real, Real]:
+def chebyshev_nodes(x_m: RealArray, node_count: int) -> tuple[RealArray, RealArray]:
     """Return Chebyshev nodes, and the matrix that interpolates from nodes to positions.
 
     Parameters
@@ -297,11 +299,11 @@ def chebyshev_nodes(x_m: Real, node_count: int) -> tuple[Real, Real]:
         chebyshev.chebvander(unit_points, node_count - 1)
         for unit_points in (unit_nodes, unit_positions)
     )
-    interpolation_matrix: Real = at_positions @ np.linalg.inv(at_nodes)
+    interpolation_matrix: RealArray = at_positions @ np.linalg.inv(at_nodes)
     return x_m[0] + (x_m[-1] - x_m[0]) * (unit_nodes + 1) / 2, interpolation_matrix
 
 
-def cubic_weights(points: Real, grid_points: Real) -> tuple[NDArray[np.intp], Real]:
+def cubic_weights(points: RealArray, grid_points: RealArray) -> tuple[NDArray[np.intp], RealArray]:
     """Return the indices and weights of a cubic interpolation on an equally spaced grid.
 
     Parameters
@@ -333,7 +335,9 @@ def cubic_weights(points: Real, grid_points: Real) -> tuple[NDArray[np.intp], Re
     return first_indices, weights
 
 
-def interpolate_rows(value_table: Real, first_rows: NDArray[np.intp], weights: Real) -> Real:
+def interpolate_rows(
+    value_table: RealArray, first_rows: NDArray[np.intp], weights: RealArray
+) -> RealArray:
     """Return interpolated rows (k, n) of a table (m, n), with the results of `cubic_weights`."""
     weighted_sum = weights[:, 0, None] * value_table[first_rows]
     for i in range(1, 4):

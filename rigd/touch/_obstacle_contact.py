@@ -18,7 +18,7 @@ from rigd.touch._contact import contact_responses, integrate_contact, shift_rows
 from rigd.touch._free_motion import FreeMotion
 from rigd.touch._kernels import ContactKernels, cubic_weights, interpolate_rows
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 OBSTACLE_PARAMETERS = ("x_m", "time_s", "ln_stiffness", "rate_m_per_s", "mobility_m_per_n_s")
 """Names of an obstacle's parameters, in the order of a candidate's columns; the last two are
@@ -29,7 +29,7 @@ MAX_LN_STIFFNESS = log(1e6)
 MIN_LN_STIFFNESS = log(10.0)
 """Logarithm of the smallest stiffness of an obstacle in N/m."""
 
-Prediction = Callable[[Real, "WhitenedWindow"], Real]
+Prediction = Callable[[RealArray, "WhitenedWindow"], RealArray]
 """Function that predicts the effects (k, c, samples) of candidates (k, p) on torque and base shear
 in a window of samples."""
 
@@ -38,17 +38,17 @@ in a window of samples."""
 class ParameterRanges:
     """Bounds and step sizes of the p parameters of one kind of obstacle; arrays of shape (p,)."""
 
-    low: Real
+    low: RealArray
     """Smallest value of each parameter."""
-    high: Real
+    high: RealArray
     """Largest value of each parameter."""
-    derivative_step: Real
+    derivative_step: RealArray
     """Change of each parameter for a numerical derivative."""
-    significant_change: Real
+    significant_change: RealArray
     """Significant change of each parameter; an iteration changes it by at most eight times this."""
-    smallest_std: Real
+    smallest_std: RealArray
     """Lower limit of the standard deviation with which values of each parameter are drawn."""
-    largest_std: Real
+    largest_std: RealArray
     """Upper limit of the standard deviation with which values of each parameter are drawn."""
 
 
@@ -62,10 +62,10 @@ class WhitenedWindow:
     """Index of the first sample."""
     end_sample: int
     """Index of the sample after the last."""
-    whitening: Real
+    whitening: RealArray
     """Inverse Cholesky factor of the covariance that noise and uncertainties cause, shape (n,
     n)."""
-    data: Real
+    data: RealArray
     """Whitened innovations of torque and base shear, shape (n,)."""
 
     @classmethod
@@ -74,7 +74,7 @@ class WhitenedWindow:
         free_motion: FreeMotion,
         first_sample: int,
         end_sample: int,
-        effects_per_std: Real | None = None,
+        effects_per_std: RealArray | None = None,
     ) -> "WhitenedWindow":
         """Return the whitened innovations of the samples from `first_sample` to `end_sample`.
 
@@ -140,16 +140,16 @@ class ObstacleContact:
 
     __slots__ = ("_kernels", "_motion", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, x_m: Real, free_motion: FreeMotion) -> None:
+    def __init__(self, kernels: ContactKernels, x_m: RealArray, free_motion: FreeMotion) -> None:
         self._kernels, self._x_m, self._motion = kernels, x_m, free_motion
 
     def predict(
         self,
-        parameters: Real,
+        parameters: RealArray,
         sample_window: WhitenedWindow,
         pressing_sign: float | None = None,
         kernels: ContactKernels | None = None,
-    ) -> tuple[Real, Real]:
+    ) -> tuple[RealArray, RealArray]:
         """Return the effect of obstacles on torque and shear, and the contact forces in N.
 
         Parameters
@@ -195,8 +195,11 @@ class ObstacleContact:
         return self.force_effects(kernel_tables, forces_n, instants_s, sample_window), forces_n
 
     def effect_of_changed_motion(
-        self, parameters: Real, sample_window: WhitenedWindow, displacement_changes_m: Real
-    ) -> Real:
+        self,
+        parameters: RealArray,
+        sample_window: WhitenedWindow,
+        displacement_changes_m: RealArray,
+    ) -> RealArray:
         """Return the effects of changed free motions on torque and shear through the contact.
 
         A change of the free motion changes the instant of touch, and thereby the contact force. The
@@ -240,7 +243,7 @@ class ObstacleContact:
             sample_window,
         )
 
-    def step_count(self, instants_s: Real, sample_window: WhitenedWindow) -> int:
+    def step_count(self, instants_s: RealArray, sample_window: WhitenedWindow) -> int:
         """Return the number of time steps from the earliest touch to the end of the window.
 
         Parameters
@@ -257,7 +260,7 @@ class ObstacleContact:
         )
         return min(max(needed_steps, 4), self._kernels.steps)
 
-    def pressing_sign(self, parameters: Real) -> float:
+    def pressing_sign(self, parameters: RealArray) -> float:
         """Return the direction of the free beam's motion at a touch, 1 or -1.
 
         Parameters
@@ -269,11 +272,11 @@ class ObstacleContact:
 
     def force_effects(
         self,
-        kernel_tables: tuple[Real, ...],
-        forces_n: Real,
-        instants_s: Real,
+        kernel_tables: tuple[RealArray, ...],
+        forces_n: RealArray,
+        instants_s: RealArray,
         sample_window: WhitenedWindow,
-    ) -> Real:
+    ) -> RealArray:
         """Return the effect of contact forces on torque and base shear, shape (k, c, samples).
 
         Parameters
@@ -299,8 +302,12 @@ class ObstacleContact:
         return contact_responses(kernel_tables, aligned_forces, steps_per_sample, sample_count)
 
     def motion_beyond_obstacle(
-        self, positions_m: Real, instants_s: Real, steps: int, given_sign: float | None = None
-    ) -> tuple[Real, Real]:
+        self,
+        positions_m: RealArray,
+        instants_s: RealArray,
+        steps: int,
+        given_sign: float | None = None,
+    ) -> tuple[RealArray, RealArray]:
         """Return the free beam's distance beyond each obstacle over time, and its direction.
 
         Parameters
@@ -333,7 +340,9 @@ class ObstacleContact:
             pressing_signs = np.full(positions_m.size, given_sign)
         return pressing_signs[:, None] * (free_motion_m - free_motion_m[:, :1]), pressing_signs
 
-    def _interpolate_to_steps(self, displacement_m: Real, instants_s: Real, steps: int) -> Real:
+    def _interpolate_to_steps(
+        self, displacement_m: RealArray, instants_s: RealArray, steps: int
+    ) -> RealArray:
         """Return displacements at the time steps of the contact, each row from its instant on."""
         free_motion = self._motion
         begin_steps = (instants_s - free_motion.first_s) / free_motion.step_s
@@ -349,11 +358,11 @@ class ObstacleContact:
 class LocalMinima:
     """Local minima of the sum of squared residuals, found by least squares."""
 
-    parameters: Real
+    parameters: RealArray
     """Parameters of each minimum, with the columns of `OBSTACLE_PARAMETERS`; shape (k, p)."""
-    chi2: Real
+    chi2: RealArray
     """Sum of squared residuals at each minimum, shape (k,)."""
-    jacobian: Real
+    jacobian: RealArray
     """Derivatives of the residuals with respect to the parameters, shape (k, n, p)."""
 
 
@@ -365,7 +374,7 @@ increases, the reduction predicted by the linearised model is compared."""
 def find_minima(
     predict_effect: Prediction,
     sample_window: WhitenedWindow,
-    start_candidates: Real,
+    start_candidates: RealArray,
     parameter_ranges: ParameterRanges,
     max_iterations: int = 12,
     free_parameters: NDArray[np.bool_] | None = None,
@@ -456,9 +465,9 @@ def find_minima(
 def _linearise(
     predict_effect: Prediction,
     sample_window: WhitenedWindow,
-    current_candidates: Real,
+    current_candidates: RealArray,
     parameter_ranges: ParameterRanges,
-) -> tuple[Real, Real]:
+) -> tuple[RealArray, RealArray]:
     """Return the candidates' residuals (k, n) and the derivatives by their parameters (k, n, p)."""
     parameter_count = current_candidates.shape[1]
     parameter_shifts = np.where(
@@ -538,7 +547,7 @@ class CandidateGrid:
 
     def integrate(
         self, free_motion: FreeMotion, sample_window: WhitenedWindow, latest_sample: int
-    ) -> tuple[Real, Real]:
+    ) -> tuple[RealArray, RealArray]:
         """Return all candidates of the grid (k, 3), and their sums of squared residuals (k,).
 
         Parameters
@@ -563,7 +572,7 @@ class CandidateGrid:
 
     def _sums_of_squared_residuals(
         self, free_motion: FreeMotion, sample_window: WhitenedWindow, samples: NDArray[np.intp]
-    ) -> Real:
+    ) -> RealArray:
         """Return the sums of squared residuals of the candidates whose touch begins at `samples`.
 
         The shape is (positions, samples, stiffnesses).
@@ -618,7 +627,7 @@ class CandidateGrid:
         sample_residuals = sample_window.residuals(
             predicted_effects.reshape(-1, *predicted_effects.shape[3:])
         )
-        chi2: Real = np.einsum("kn,kn->k", sample_residuals, sample_residuals)
+        chi2: RealArray = np.einsum("kn,kn->k", sample_residuals, sample_residuals)
         return chi2.reshape(position_count, samples.size, stiffness_count)
 
 
@@ -628,7 +637,9 @@ GRID_STIFFNESSES_N_PER_M = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 10000
 """Stiffnesses of the grid's candidates in N/m."""
 
 
-def chi2_of(predict_effect: Prediction, sample_window: WhitenedWindow, candidates: Real) -> Real:
+def chi2_of(
+    predict_effect: Prediction, sample_window: WhitenedWindow, candidates: RealArray
+) -> RealArray:
     """Return the sum of squared residuals of each candidate obstacle, shape (k,).
 
     Parameters
@@ -641,5 +652,5 @@ def chi2_of(predict_effect: Prediction, sample_window: WhitenedWindow, candidate
         Parameters of the candidates, shape (k, p).
     """
     candidate_residuals = sample_window.residuals(predict_effect(candidates, sample_window))
-    chi2: Real = np.einsum("kn,kn->k", candidate_residuals, candidate_residuals)
+    chi2: RealArray = np.einsum("kn,kn->k", candidate_residuals, candidate_residuals)
     return chi2

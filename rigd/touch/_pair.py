@@ -17,7 +17,7 @@ from rigd.touch._obstacle_contact import (
     WhitenedWindow,
 )
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _SECOND_TOUCH_DELAYS_S = np.array([0.0, 0.008, 0.025, 0.06])
 """Times in s from the first to the second touch from which the search starts, if the first obstacle
@@ -61,7 +61,9 @@ class TwoObstacleContact:
     ) -> None:
         self._contact, self._kernels, self._cross_kernels = obstacle_contact, kernels, cross_kernels
 
-    def predict(self, parameters: Real, sample_window: WhitenedWindow) -> tuple[Real, Real]:
+    def predict(
+        self, parameters: RealArray, sample_window: WhitenedWindow
+    ) -> tuple[RealArray, RealArray]:
         """Return the effect of two obstacles on torque and shear, and the force of the first.
 
         Parameters
@@ -111,7 +113,7 @@ class TwoObstacleContact:
         )
         return first_effect + second_effect, forces_n[0]
 
-    def predict_channels(self, parameters: Real, sample_window: WhitenedWindow) -> Real:
+    def predict_channels(self, parameters: RealArray, sample_window: WhitenedWindow) -> RealArray:
         """Return the effect of two obstacles on torque and shear, shape (k, c, samples).
 
         The arguments are those of `predict`.
@@ -120,11 +122,11 @@ class TwoObstacleContact:
 
     def start_pairs(
         self,
-        single_obstacle: Real,
+        single_obstacle: RealArray,
         sample_window: WhitenedWindow,
         parameter_ranges: ParameterRanges,
         pair_count: int,
-    ) -> Real:
+    ) -> RealArray:
         """Return pairs of obstacles from which the search starts, shape (k, 6).
 
         Some pairs have about the effect of the single obstacle; in the others, a second obstacle is
@@ -153,7 +155,7 @@ class TwoObstacleContact:
         )
 
     @staticmethod
-    def equivalent_pairs(single_obstacle: Real, relative_positions: Real) -> Real:
+    def equivalent_pairs(single_obstacle: RealArray, relative_positions: RealArray) -> RealArray:
         """Return pairs of obstacles that have about the effect of a single one, shape (k, 6).
 
         Parameters
@@ -163,7 +165,7 @@ class TwoObstacleContact:
         relative_positions
             Positions of the two obstacles, divided by that of the single one, shape (k, 2).
         """
-        pairs: Real = np.tile(
+        pairs: RealArray = np.tile(
             np.concatenate([single_obstacle, single_obstacle]), (len(relative_positions), 1)
         )
         pairs[:, [0, 3]] *= relative_positions
@@ -173,11 +175,11 @@ class TwoObstacleContact:
 
     def _with_second_obstacle(
         self,
-        single_obstacle: Real,
+        single_obstacle: RealArray,
         sample_window: WhitenedWindow,
         parameter_ranges: ParameterRanges,
         pair_count: int,
-    ) -> Real:
+    ) -> RealArray:
         """Return pairs of the single obstacle and a likely second obstacle, shape (pair_count, 6).
 
         The likeliest ones are selected by the first-order effect of the second obstacle.
@@ -215,7 +217,7 @@ class TwoObstacleContact:
         chosen_rows = likeliest_positions * delay_steps.size + chi2_reduction[
             likeliest_positions
         ].argmax(axis=1)
-        chosen_pairs: Real = with_second[chosen_rows]
+        chosen_pairs: RealArray = with_second[chosen_rows]
         chosen_pairs[:, 5] += np.log(np.clip(effect_factors[chosen_rows], 0.1, 100.0))
         first_obstacle_residuals = (
             residual_without_second
@@ -231,7 +233,7 @@ class TwoObstacleContact:
         return chosen_pairs
 
     @staticmethod
-    def in_reverse_order(parameters: Real) -> Real:
+    def in_reverse_order(parameters: RealArray) -> RealArray:
         """Return pairs with exchanged obstacles that are touched at the same instant, shape (k, 6).
 
         Parameters
@@ -239,7 +241,7 @@ class TwoObstacleContact:
         parameters
             Candidates, shape (k, 6).
         """
-        reversed_pairs: Real = parameters[:, [3, 1, 5, 0, 4, 2]]
+        reversed_pairs: RealArray = parameters[:, [3, 1, 5, 0, 4, 2]]
         reversed_pairs[:, 4] = 0.0
         return reversed_pairs
 

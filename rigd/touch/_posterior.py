@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _STUDENT_DEGREES = 4.0
 """Degrees of freedom of the Student distributions from which samples are drawn; few degrees give
@@ -29,11 +29,11 @@ _MAX_CENTRES = 16
 class Posterior:
     """Posterior distribution of an obstacle's parameters, such as position, as weighted samples."""
 
-    samples: Real
+    samples: RealArray
     """Parameters of each sample, shape (n, p)."""
-    weights: Real
+    weights: RealArray
     """Weight of each sample, with the sum 1; shape (n,)."""
-    chi2: Real
+    chi2: RealArray
     """Sum of squared residuals of each sample, shape (n,)."""
 
     @property
@@ -41,7 +41,7 @@ class Posterior:
         """Effective sample size: the number of equally weighted samples of the same precision."""
         return float(1 / np.sum(self.weights**2))
 
-    def quantiles(self, parameter_column: int, quantile_levels: tuple[float, ...]) -> Real:
+    def quantiles(self, parameter_column: int, quantile_levels: tuple[float, ...]) -> RealArray:
         """Return quantiles of one parameter's posterior distribution, in the parameter's unit.
 
         Parameters
@@ -79,16 +79,16 @@ class Posterior:
 
 
 def sample_posterior(
-    chi2_of: Callable[[Real], Real],
-    centres: Real,
-    covariances: Real,
-    bounds: tuple[Real, Real],
+    chi2_of: Callable[[RealArray], RealArray],
+    centres: RealArray,
+    covariances: RealArray,
+    bounds: tuple[RealArray, RealArray],
     *,
     residual_variance: float,
     samples_per_round: int,
     max_rounds: int,
     sufficient_samples: float,
-    smallest_std: Real,
+    smallest_std: RealArray,
 ) -> Posterior:
     """Return weighted samples of the posterior distribution, for a uniform prior within bounds.
 
@@ -120,7 +120,7 @@ def sample_posterior(
     samples = np.empty((0, parameter_count))
     chi2 = np.empty(0)
     proposal_density = np.empty(0)
-    proposals: list[tuple[Real, Real, Real]] = []
+    proposals: list[tuple[RealArray, RealArray, RealArray]] = []
     posterior = None
     for _ in range(max_rounds):
         chosen_centres = rng.choice(len(centres), samples_per_round, p=mixture)
@@ -178,7 +178,9 @@ def sample_posterior(
     return posterior
 
 
-def _density(samples: Real, centres: Real, covariances: Real, mixture_weights: Real) -> Real:
+def _density(
+    samples: RealArray, centres: RealArray, covariances: RealArray, mixture_weights: RealArray
+) -> RealArray:
     """Return the density of a mixture of Student distributions at each sample, shape (n,).
 
     A constant factor is omitted.

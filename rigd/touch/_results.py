@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,19 +52,19 @@ class TouchEstimate:
     chi2_per_degree: float
     """Sum of squared residuals, divided by its expectation for noise alone: about 1 if the touch is
     explained."""
-    positions_m: Real
+    positions_m: RealArray
     """Positions of `log_likelihood` in m, shape (m,); empty if no likelihood was requested."""
-    log_likelihood: Real
+    log_likelihood: RealArray
     """Logarithm of the likelihood of a touch at each position for an arbitrary force, shape
     (m,)."""
-    innovations: Real
+    innovations: RealArray
     """Innovations of torque and shear, divided by their standard deviations, shape (channels,
     n)."""
-    innovation_times_s: Real
+    innovation_times_s: RealArray
     """Instants of the innovations, from the record's first sample; shape (n,)."""
-    force_history_n: Real
+    force_history_n: RealArray
     """Magnitude of the contact force over time, shape (k,)."""
-    force_times_s: Real
+    force_times_s: RealArray
     """Instants of the contact force, from the record's first sample; shape (k,)."""
 
     @property

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Complex = NDArray[np.complex128]
+ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class SensorFilter:
         """Group delay in s of the weighted mean of the sensor's records."""
         return 0.5 * (len(self.weights) - 1) * self.spacing_s
 
-    def response(self, s: ArrayLike) -> Complex:
+    def response(self, s: ArrayLike) -> ComplexArray:
         """Return the transfer function of low-pass filter and weighted mean, delay included.
 
         Parameters
@@ -72,7 +72,7 @@ class SensorFilter:
         """
         laplace_points = np.asarray(s, dtype=np.complex128)
         record_ages_s = self.spacing_s * np.arange(len(self.weights))[::-1]
-        filter_response: Complex = np.exp(
+        filter_response: ComplexArray = np.exp(
             np.multiply.outer(laplace_points, -record_ages_s)
         ) @ np.array(self.weights)
         if self.corner_hz > 0:

@@ -23,7 +23,7 @@ from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 if TYPE_CHECKING:  # the control loop does not import models
     from rigd.touch._model import TouchModel
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 _POSITION_FRACTIONS = np.linspace(0.04, 1.0, 33)
 """Positions of the templates' obstacles, as fractions of the beam's length."""
@@ -47,7 +47,7 @@ class DetectorModel:
 
     observed: ObservedBeam
     """Model of the free beam that computes the innovations."""
-    templates: Real
+    templates: RealArray
     """Templates from the function `contact_templates`, shape (templates, 2 · ticks)."""
 
 
@@ -84,7 +84,7 @@ def contact_templates(
     rate_hz: float,
     model: ObservedBeam,
     sensor_filter: SensorFilter = NO_FILTER,
-) -> Real:
+) -> RealArray:
     """Return templates of contacts: unit vectors of the innovations that a contact causes.
 
     The contacts have several positions, stiffnesses and times since their beginning.
@@ -142,7 +142,7 @@ def contact_templates(
     return _select_dissimilar(all_templates[norms > 0] / norms[norms > 0, None])
 
 
-def _impulse_responses(model: ObservedBeam, ticks: int) -> Real:
+def _impulse_responses(model: ObservedBeam, ticks: int) -> RealArray:
     """Return the matrix M with ``innovations = readings @ M``, shape (2 · ticks, 2 · ticks).
 
     Both row vectors have torque and shear in turn for each tick.
@@ -160,7 +160,7 @@ def _impulse_responses(model: ObservedBeam, ticks: int) -> Real:
     return response_matrix
 
 
-def _select_dissimilar(unit_vectors: Real) -> Real:
+def _select_dissimilar(unit_vectors: RealArray) -> RealArray:
     """Return a subset of unit vectors such that every other vector is similar to one of the subset.
 
     Each vector that is added is the least similar to those selected before.

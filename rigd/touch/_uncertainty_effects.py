@@ -12,15 +12,15 @@ from rigd.touch._kernels import contact_kernels
 from rigd.touch._obstacle_contact import ObstacleContact, WhitenedWindow
 from rigd.touch._tables import TouchTables
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 
 def uncertainty_effects(
     touch_tables: TouchTables,
     touch_record: TouchRecord,
-    likely_obstacle: Real,
+    likely_obstacle: RealArray,
     sample_window: WhitenedWindow,
-) -> Real:
+) -> RealArray:
     """Return the effect of each uncertainty (one standard deviation) on innovations, (c, n, r).
 
     c is 1 for torque alone and 2 for torque and base shear, r the number of uncertainties.
@@ -76,9 +76,9 @@ def uncertainty_effects(
 def _free_motion_effects(
     touch_tables: TouchTables,
     obstacle_contact: ObstacleContact,
-    likely_obstacle: Real,
+    likely_obstacle: RealArray,
     sample_window: WhitenedWindow,
-) -> Real:
+) -> RealArray:
     """Return the effects of the free motion's uncertainty on the innovations, shape (q, c, n).
 
     Each is the sum of the direct effect and the effect through the changed contact force.
@@ -109,9 +109,9 @@ def _free_motion_effects(
 def _encoder_noise_effects(
     touch_tables: TouchTables,
     obstacle_contact: ObstacleContact,
-    likely_obstacle: Real,
+    likely_obstacle: RealArray,
     sample_window: WhitenedWindow,
-) -> Real:
+) -> RealArray:
     """Return the effects of the encoder's noise on the innovations, shape (samples, c, n).
 
     Each is the effect of the noise in one sample of the angle through the contact force.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Records = npt.NDArray[Any]
 """Structured array of samples, shape (n,)."""
-Real = npt.NDArray[np.float64]
+RealArray = npt.NDArray[np.float64]
 """Array of real numbers."""
 _TimedLines = tuple[int, npt.NDArray[np.float32]]
 """Time since the start of the session in ns, and the drawn lines at that time, (n, points, 3)."""
@@ -112,8 +112,10 @@ class Antenna:
         trail_shapes = max(1, round(shape_hz * TRAIL_S))
         self._tips_m: collections.deque[float] = collections.deque(maxlen=trail_shapes)
         self._to_scale = session.excitation in _UNSCALED_EXCITATIONS
-        self._newest: tuple[int, Real] | None = None  # tick, time and angle of the newest sample
-        self._waiting: Real = np.zeros((0, 2))  # times and angles since the last shape
+        self._newest: tuple[int, RealArray] | None = (
+            None  # tick, time and angle of the newest sample
+        )
+        self._waiting: RealArray = np.zeros((0, 2))  # times and angles since the last shape
         self._trail: list[_TimedLines] = []  # lines that are not sent yet
         self._shapes: collections.deque[_TimedLines] = collections.deque(
             maxlen=round(_STORED_LINES_S * DRAWN_HZ)
@@ -226,7 +228,7 @@ class Antenna:
             )
         ]
 
-    def _interpolate_to_ticks(self, samples: Records) -> Real:
+    def _interpolate_to_ticks(self, samples: Records) -> RealArray:
         """Return time (ns) and motor angle (rad) of all new ticks, shape (n, 2).
 
         The new ticks are those after the last sample of the previous call, to the last sample.
@@ -281,7 +283,7 @@ def static_drawings() -> list[Drawing]:
     return [_draw_motor, _draw_direction, _draw_styles]
 
 
-def enlarged_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray[np.float32]:
+def enlarged_lines(angle_rad: float, deflection_per_length: RealArray) -> npt.NDArray[np.float32]:
     """Return the coordinates of the undeformed and of the bent beam, enlarged by `ENLARGEMENT`.
 
     Parameters
@@ -306,7 +308,7 @@ def enlarged_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray
     return line_coordinates
 
 
-def unscaled_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray[np.float32]:
+def unscaled_lines(angle_rad: float, deflection_per_length: RealArray) -> npt.NDArray[np.float32]:
     """Return the coordinates of the undeformed and of the bent beam, true to scale.
 
     Arguments and result are those of `enlarged_lines`.
@@ -468,8 +470,8 @@ def _draw_touch(
     stream: "RecordingStream",
     touch_number: int,
     t_ns: int,
-    touch_points: Real,
-    force_arrow: Real,
+    touch_points: RealArray,
+    force_arrow: RealArray,
     label_text: str,
 ) -> None:
     """Draw a touch from its time on: contact point, its uncertainty along the beam, and force."""

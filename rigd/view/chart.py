@@ -17,7 +17,7 @@ from rigd.view.plots import GREY, Color
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
-Real = npt.NDArray[np.float64]
+RealArray = npt.NDArray[np.float64]
 """Array of real numbers."""
 
 
@@ -67,7 +67,7 @@ class Axis:
     lines: tuple[float, ...] = ()
     logarithmic: bool = False
 
-    def fraction(self, axis_values: npt.ArrayLike) -> Real:
+    def fraction(self, axis_values: npt.ArrayLike) -> RealArray:
         """Return the positions of values on the axis, from 0 (first) to 1 (last), clipped."""
         axis_positions, axis_start, axis_end = (
             np.asarray(axis_values, dtype=np.float64),
@@ -138,7 +138,7 @@ class Chart:
         """
         return self.left, _TOP_MARGIN, self.width - self.right, self.height - _BOTTOM_MARGIN
 
-    def to_canvas(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Real:
+    def to_canvas(self, x: npt.ArrayLike, y: npt.ArrayLike) -> RealArray:
         """Return the canvas coordinates (n, 2) of points with given values on the axes.
 
         Values beyond an axis are clipped to its ends.
@@ -204,7 +204,7 @@ class Chart:
         self,
         stream: "RecordingStream",
         name: str,
-        strips: Sequence[Real],
+        strips: Sequence[RealArray],
         key: LegendEntry,
         *,
         static: bool = False,

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from rigd.view._session_info import SessionDescription
 
 
-Real = npt.NDArray[np.float64]
+RealArray = npt.NDArray[np.float64]
 """Array of real numbers."""
-Complex = npt.NDArray[np.complex128]
+ComplexArray = npt.NDArray[np.complex128]
 """Array of complex numbers."""
 
 
@@ -105,8 +105,8 @@ class LastResponse:
 
     session: str
     specimen: str
-    frequency_hz: Real
-    response: Complex
+    frequency_hz: RealArray
+    response: ComplexArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +117,9 @@ class _ResponseCurve:
     """Chart that contains the curve."""
     key: LegendEntry
     """Label and style of the curve."""
-    values: Callable[["FrequencyResponse"], Real]
+    values: Callable[["FrequencyResponse"], RealArray]
     """Function that returns the curve's values for an estimated response."""
-    from_complex: Callable[[Complex], Real] | None = None
+    from_complex: Callable[[ComplexArray], RealArray] | None = None
     """Function that returns the curve's values for a complex response; None for the coherence."""
 
 
@@ -197,9 +197,9 @@ class ResponseCharts:
         )
         self._thinning: CurveDecimation | None = None
         self._t_ns = 0
-        self._last_update: tuple[Real, Complex] | None = None
-        self._curves: dict[str, Sequence[Real]] = {}
-        self._uncertain: dict[str, Sequence[Real]] = {}
+        self._last_update: tuple[RealArray, ComplexArray] | None = None
+        self._curves: dict[str, Sequence[RealArray]] = {}
+        self._uncertain: dict[str, Sequence[RealArray]] = {}
         self._excited_hz = (LAST_HZ, LAST_HZ)
         self._note = NO_COHERENCE_YET
 
@@ -313,7 +313,7 @@ class ResponseCharts:
 
 def _last_response_curves(
     last_response: LastResponse, response_curves: "Sequence[_ResponseCurve]"
-) -> dict[str, Sequence[Real]]:
+) -> dict[str, Sequence[RealArray]]:
     """Return the curves of an earlier session's response: entity path of the chart → strips."""
     decimation = response_decimation(last_response.frequency_hz)
     return {
@@ -325,17 +325,17 @@ def _last_response_curves(
     }
 
 
-def _magnitude_db(response: "FrequencyResponse") -> Real:
+def _magnitude_db(response: "FrequencyResponse") -> RealArray:
     """Return the magnitude of an estimated response, in dB re 1 N·m/rad."""
     return magnitude_db(response.response)
 
 
-def _phase_deg(response: "FrequencyResponse") -> Real:
+def _phase_deg(response: "FrequencyResponse") -> RealArray:
     """Return the phase of an estimated response, in degrees."""
     return phase_deg(response.response)
 
 
-def _coherence(response: "FrequencyResponse") -> Real:
+def _coherence(response: "FrequencyResponse") -> RealArray:
     """Return the coherence of an estimated response; NaN if it comes from a single segment."""
     if response.coherence is None:
         return np.full(response.frequency_hz.shape, np.nan)
@@ -443,7 +443,9 @@ class SpectrogramChart:
         Axes of the spectrogram.
     """
 
-    def __init__(self, session: "SessionDescription", frequency_hz: Real, step_s: float) -> None:
+    def __init__(
+        self, session: "SessionDescription", frequency_hz: RealArray, step_s: float
+    ) -> None:
         duration_s = max(session.ticks / session.rate_hz, step_s)
         self._column_s = max(step_s, duration_s / MAX_COLUMNS)
         column_count = int(np.ceil(duration_s / self._column_s))
@@ -494,7 +496,7 @@ class SpectrogramChart:
         self.chart.draw_frame(stream)
         self._bar.draw_frame(stream)
 
-    def update(self, t_ns: int, level_columns: Sequence[tuple[float, Real]]) -> None:
+    def update(self, t_ns: int, level_columns: Sequence[tuple[float, RealArray]]) -> None:
         """Add columns to the spectrogram, which `draw` then sends.
 
         Parameters
@@ -521,7 +523,10 @@ class SpectrogramChart:
 
 
 def _position_image(
-    stream: "RecordingStream", entity_path: str, image_corners: Real, image_shape: tuple[int, ...]
+    stream: "RecordingStream",
+    entity_path: str,
+    image_corners: RealArray,
+    image_shape: tuple[int, ...],
 ) -> None:
     """Send the position and the colour map of an image to Rerun.
 

@@ -17,7 +17,7 @@ from rigd.spectral import CurveDecimation
 from rigd.sweep_response import LAST_HZ, SweepResponse, nominal_response, response_decimation
 
 Document = dict[str, Any]
-Real = npt.NDArray[np.float64]
+RealArray = npt.NDArray[np.float64]
 
 ENVELOPE_POINT_S: Final = 0.05
 """Duration in seconds of each point of an envelope."""
@@ -52,7 +52,7 @@ class PageSignalBlock:
     """Number of the block's first tick."""
     rate_hz: float
     """Loop rate in ticks per second."""
-    values: Real
+    values: RealArray
     """Angle (rad), its reference (rad) and coupling torque (N·m), shape (3, n); NaN if unknown."""
 
     @classmethod
@@ -84,7 +84,7 @@ class SignalEnvelopes:
         )
         self._next_point = 0
         """Index of the next point since the start of the session."""
-        self._incomplete_point: list[Real] = []
+        self._incomplete_point: list[RealArray] = []
         """Values of the next point so far."""
         self._next_tick = 0
         """Tick that is expected next."""
@@ -147,7 +147,7 @@ def _envelope_message(first_index: int, points: list[tuple[float | None, ...]]) 
     }
 
 
-def _without_nan(numbers: Real) -> list[float | None]:
+def _without_nan(numbers: RealArray) -> list[float | None]:
     """Return an array's numbers as a list, with None instead of NaN."""
     return [None if number != number else number for number in numbers.tolist()]
 
@@ -261,7 +261,7 @@ def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) ->
     }
 
 
-def _response_document(frequency_hz: Real, response: npt.NDArray[np.complex128]) -> Document:
+def _response_document(frequency_hz: RealArray, response: npt.NDArray[np.complex128]) -> Document:
     """Return frequencies, magnitudes and phases of a response as JSON lists."""
     return {
         "frequency_hz": np.round(frequency_hz, 4).tolist(),
