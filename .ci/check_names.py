@@ -4,8 +4,9 @@
 
 Prints file and line of each offence and exits with 1 if there are any:
 
-* a word of `WORDS` in an identifier or a docstring of `rigd` or `analysis`, apart from the
-  identifiers in `ALLOWED_NAMES` and the terms in `ALLOWED_TERMS`;
+* a word of `WORDS` in an identifier or a docstring of `rigd`, `analysis` or `tests`, apart from
+  the identifiers in `ALLOWED_NAMES` and the terms in `ALLOWED_TERMS`; tests of benchmarks have
+  the names of these;
 * a class name that is defined twice in `rigd` and `analysis`, apart from `ALLOWED_TWICE`;
 * more imports of private modules and names in `tests` than `MOST_PRIVATE_IMPORTS`.
 
@@ -130,11 +131,13 @@ def offences(root: Path) -> Iterator[str]:
                 if isinstance(node, ast.ClassDef):
                     classes[node.name].append(f"{shown}:{node.lineno}")
     yield from class_offences(classes)
-    private = [
-        line
-        for path in sorted((root / "tests").rglob("*.py"))
-        for line in private_imports(path.relative_to(root), ast.parse(path.read_text("utf-8")))
-    ]
+    private: list[str] = []
+    for path in sorted((root / "tests").rglob("*.py")):
+        source, shown = path.read_text("utf-8"), path.relative_to(root)
+        tree = ast.parse(source)
+        private += private_imports(shown, tree)
+        if "benchmarks" not in shown.parts:
+            yield from word_offences(shown, source, tree)
     if len(private) > MOST_PRIVATE_IMPORTS:
         yield from private
         yield f"tests: {len(private)} private imports, at most {MOST_PRIVATE_IMPORTS} are allowed"

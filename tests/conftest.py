@@ -139,7 +139,7 @@ def runtime_folder(monkeypatch):
     shutil.rmtree(folder, ignore_errors=True)
 
 
-BRIEF_LOOK = """
+BRIEF_QUICK_LOOK = """
 import json, pathlib, sys
 
 session = pathlib.Path(sys.argv[1])
@@ -155,7 +155,7 @@ def brief_quick_looks(tmp_path_factory, monkeypatch):
     folder = tmp_path_factory.mktemp("brief") / "analysis"
     folder.mkdir()
     (folder / "__init__.py").touch()
-    (folder / "quick_look.py").write_text(BRIEF_LOOK)
+    (folder / "quick_look.py").write_text(BRIEF_QUICK_LOOK)
     monkeypatch.setenv("PYTHONPATH", str(folder.parent))
     monkeypatch.delenv("RIGD_NO_LOOK")
     return folder / "quick_look.py"

@@ -19,7 +19,7 @@ DAMPINGS = {
     "above one": Damping(7.1e-5, 1.3, 0.055, 0.594),
 }
 MOST = (1e-3, 1e-3, 1e-3, 0.01, 0.03)
-TOLD_M = np.array([0.1, 0.5, 0.97])
+OUTPUT_POSITIONS_M = np.array([0.1, 0.5, 0.97])
 
 
 def response(realised, s):
@@ -37,12 +37,12 @@ def test_response_to_a_force_is_the_exact_one(damping, at_m, highest_rad_s):
     grid = PointForceGrid(s, BEAM, damping)
     exact = np.column_stack(
         [
-            grid.displacement_per_force(TOLD_M, np.full(3, at_m)),
+            grid.displacement_per_force(OUTPUT_POSITIONS_M, np.full(3, at_m)),
             grid.torque_per_force(at_m),
             grid.shear_per_force(at_m),
         ]
     )
-    realised = response(realise_force(BEAM, damping, at_m, TOLD_M, highest_rad_s), s)
+    realised = response(realise_force(BEAM, damping, at_m, OUTPUT_POSITIONS_M, highest_rad_s), s)
     # Displacement of a beam without ends: its size at a node.
     stiffness = 0.090275 * (1 + damping.zeta * s**damping.alpha)
     load = 4.7e-3 * s**2 + 0.090275 * damping.gamma * s**damping.lambda_
@@ -56,10 +56,10 @@ def test_response_to_a_force_is_the_exact_one(damping, at_m, highest_rad_s):
 
 def test_static_force_bends_the_beam_as_in_textbooks():
     at_m = 0.7
-    realised = realise_force(BEAM, DAMPINGS["paper"], at_m, TOLD_M, 1e4)
+    realised = realise_force(BEAM, DAMPINGS["paper"], at_m, OUTPUT_POSITIONS_M, 1e4)
     static = realised.direct - realised.rows @ np.linalg.solve(realised.a, realised.b)
     ei = BEAM.bending_stiffness_n_m2
-    short, long = np.minimum(TOLD_M, at_m), np.maximum(TOLD_M, at_m)
+    short, long = np.minimum(OUTPUT_POSITIONS_M, at_m), np.maximum(OUTPUT_POSITIONS_M, at_m)
     assert static[:3] == pytest.approx(short**2 * (3 * long - short) / (6 * ei), rel=2e-3)
     assert static[3:] == pytest.approx([-at_m, -1.0], rel=2e-3)
 

@@ -10,7 +10,7 @@ from rigd.beam import Beam, Damping, PointForceGrid, transfer
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 FRACTIONAL = Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
 HALF = Damping(zeta=1e-3, alpha=0.5, gamma=0.1, lambda_=0.3)
-PLACES_M = np.array([0.05, 0.3, 0.62, 0.98])
+POSITIONS_M = np.array([0.05, 0.3, 0.62, 0.98])
 
 S = {
     "axis": 2j * pi * np.geomspace(1e-3, 3e3, 801),
@@ -37,13 +37,13 @@ def test_torque_without_force_is_that_of_eq_25(line, damping):
 @pytest.mark.parametrize("damping", [FRACTIONAL, HALF])
 def test_torque_of_a_force_is_the_displacement_of_an_angle(line, damping):
     grid = PointForceGrid(S[line], BEAM, damping)
-    displacement = grid.displacement_per_angle(PLACES_M)
-    assert np.abs(grid.torque_per_force(PLACES_M) / displacement + 1).max() < 1e-12
+    displacement = grid.displacement_per_angle(POSITIONS_M)
+    assert np.abs(grid.torque_per_force(POSITIONS_M) / displacement + 1).max() < 1e-12
 
 
 def test_forces_and_displacements_are_reciprocal():
     grid = PointForceGrid(S["axis"], BEAM, FRACTIONAL)
-    there = grid.displacement_per_force(PLACES_M[:, None], PLACES_M)
+    there = grid.displacement_per_force(POSITIONS_M[:, None], POSITIONS_M)
     assert there.shape == (801, 4, 4)
     size = np.sqrt(np.abs(np.einsum("sii,sjj->sij", there, there)))
     assert (np.abs(there - there.swapaxes(1, 2)) / size).max() < 1e-10
@@ -91,8 +91,8 @@ def test_series_and_waves_meet():
     s = 1j * np.sqrt(q / (BEAM.density_over_stiffness * BEAM.length_m**4))
     grid = PointForceGrid(s, BEAM, Damping())
     for curve in (
-        grid.displacement_per_angle(PLACES_M),
-        grid.displacement_per_force(PLACES_M, 0.5),
+        grid.displacement_per_angle(POSITIONS_M),
+        grid.displacement_per_force(POSITIONS_M, 0.5),
     ):
         assert curve[0] == pytest.approx(curve[1], rel=1e-6)
 
@@ -100,12 +100,12 @@ def test_series_and_waves_meet():
 def test_static_deflection():
     grid = PointForceGrid([0.0], BEAM, FRACTIONAL)
     ei = BEAM.bending_stiffness_n_m2
-    assert grid.displacement_per_force(PLACES_M, PLACES_M)[0] == pytest.approx(
-        PLACES_M**3 / (3 * ei)
+    assert grid.displacement_per_force(POSITIONS_M, POSITIONS_M)[0] == pytest.approx(
+        POSITIONS_M**3 / (3 * ei)
     )
-    assert grid.displacement_per_angle(PLACES_M)[0] == pytest.approx(PLACES_M)
-    assert grid.torque_per_force(PLACES_M)[0] == pytest.approx(-PLACES_M)
-    assert grid.shear_per_force(PLACES_M)[0] == pytest.approx(-1.0)
+    assert grid.displacement_per_angle(POSITIONS_M)[0] == pytest.approx(POSITIONS_M)
+    assert grid.torque_per_force(POSITIONS_M)[0] == pytest.approx(-POSITIONS_M)
+    assert grid.shear_per_force(POSITIONS_M)[0] == pytest.approx(-1.0)
 
 
 def test_rigid_obstacle_at_tip_gives_pinned_frequencies():
@@ -121,9 +121,9 @@ def test_rigid_obstacle_at_tip_gives_pinned_frequencies():
 def test_shapes():
     grid = PointForceGrid(np.full((2, 3), 5j), BEAM, FRACTIONAL)
     assert grid.torque_per_angle().shape == (2, 3)
-    assert grid.displacement_per_angle(PLACES_M).shape == (2, 3, 4)
+    assert grid.displacement_per_angle(POSITIONS_M).shape == (2, 3, 4)
     assert grid.displacement_per_force(0.2, 0.5).shape == (2, 3)
-    assert grid.displacement_per_force(PLACES_M, PLACES_M).shape == (2, 3, 4)
+    assert grid.displacement_per_force(POSITIONS_M, POSITIONS_M).shape == (2, 3, 4)
 
 
 def test_single_point():

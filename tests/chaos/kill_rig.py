@@ -78,7 +78,7 @@ MODES = ("direct", "wire", "lock-step", "daemon")
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM, signal.SIGINT)
 _ASKING = (signal.SIGTERM, signal.SIGINT)
 
-KEPT_S = 0.3
+STORED_S = 0.3
 """No sample older than this at the moment of the kill may be lost."""
 _TRANSPORT_S = 5e-3
 """The drive's log has a torque one tick after its sample, on a grid half a tick off."""
@@ -740,7 +740,7 @@ def _check_file(verdict: Verdict, scene: Scene, hit_ns: int, wall_ns: int) -> No
     ticks = samples["tick"].astype(np.int64)
     if due_s[0] < hit_s < due_s[0] + REST_S + verdict.case.sweep_s + RING_DOWN_S:
         verdict.behind_s = float(hit_s - due_s[-1])
-        stored_before_s = KEPT_S + verdict.case.grace_s
+        stored_before_s = STORED_S + verdict.case.grace_s
         gone = [
             e["t_s"]
             for e in ([] if scene.log is None else scene.log.torques)

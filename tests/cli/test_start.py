@@ -29,7 +29,7 @@ def process_at(link):
 
 
 class Client:
-    """Returns events; a number among them stands for so many presses of Ctrl-C."""
+    """Client that returns events; a number among them is a number of presses of Ctrl-C."""
 
     def __init__(self, interrupts, *events):
         self.interrupts = interrupts

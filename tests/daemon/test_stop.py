@@ -31,7 +31,7 @@ def control_of(pid):
     return None
 
 
-def test_without_a_session_the_searched_places_are_named(stop_here, runtime_folder):
+def test_searched_folders_are_named_without_a_session(stop_here, runtime_folder):
     code, out, err = stop_here()
     assert (code, err) == (0, "")
     assert out.startswith("No session is running. Searched: the process table")

@@ -102,7 +102,7 @@ def test_damping_grows_with_the_amplitude(refitted, link):
 
 @pytest.mark.further  # with external damping it is above
 def test_size_of_drag_without_external_damping_is_right():
-    """Where that vanishes, with an order at its edge, each step promises more than it saves."""
+    """With an order at the end of its range, each step reduces the cost by less than predicted."""
     wire = Drag(replace(RIGS["III"], gamma=0.0), 2e-3, 0.0125, cylinder=True)
     (made,) = drags([wire], [9523])
     headline = select(made.measurement()).headline

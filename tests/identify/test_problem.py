@@ -31,7 +31,7 @@ def test_gradient_is_that_of_the_cost(objective):
         assert 2 * here.gradient[k] == pytest.approx((after - before) / 2e-6, rel=2e-4)
 
 
-def test_continued_descent_saves_one_evaluation(objective, monkeypatch):
+def test_continued_descent_needs_one_evaluation_less(objective, monkeypatch):
     comparison, unknowns = objective.comparison, objective.unknowns
     bins = comparison.frequency_hz.size
     noise = NoiseSpectrum(np.full(bins, 1e-2), np.ones(bins, dtype=bool), ())

@@ -53,12 +53,12 @@ class Producer(threading.Thread):
         super().__init__(daemon=True)
         self.speed = speed
         self.fds = descriptors()
-        *for_rings, for_board, _ = self.fds
+        *for_rings, for_shared_state, _ = self.fds
         rings = [
             Ring.create(topic.record_size, capacity if topic.tick_interval else 256, fd)
             for topic, fd in zip(TOPICS, for_rings, strict=True)
         ]
-        self.channels = Channels(*rings, SharedState.create(for_board))
+        self.channels = Channels(*rings, SharedState.create(for_shared_state))
         self.channels.shared_state[StateField.GO] = 1
         self.written = [0] * len(rings)
         self.tick = 0

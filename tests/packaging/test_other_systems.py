@@ -178,7 +178,7 @@ def test_the_simulation_refuses_what_windows_does_not_have(variables, tmp_path, 
 
 def test_every_module_can_be_imported_and_the_commands_run(run_commands, sessions, tmp_path):
     (tmp_path / "report").mkdir()  # an empty folder is taken
-    said = run_commands(
+    printed = run_commands(
         ("rigd", "list", sessions),
         ("rigd", "info", sessions / "0.mcap"),
         ("analysis", sessions / "0.mcap", "--method", "welch", "--types", "I", "--weights", "const",
@@ -189,8 +189,8 @@ def test_every_module_can_be_imported_and_the_commands_run(run_commands, session
          "--angle", "angle_rad:rad", "--torque", "coupling_torque_nm:N.m", "--sweep", "1,31"),
         ("analysis", "export", "frf", "imported.mcap", "frf.mat"),
     )  # fmt: skip
-    assert "2.mcap" in said
-    assert "rate" in said
+    assert "2.mcap" in printed
+    assert "rate" in printed
     assert (tmp_path / "report" / "figures" / "welch_frf.svg").stat().st_size > 10_000
     assert json.loads((tmp_path / "fits.json").read_text("utf-8"))["fits"]
     assert not list(tmp_path.glob(".*"))  # nothing temporary remains

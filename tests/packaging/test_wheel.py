@@ -166,13 +166,13 @@ def test_an_extra_that_is_not_installed_is_named(bare, tmp_path, command, subjec
 
 def test_it_holds_all_modules_and_profiles_and_nothing_else(wheel):
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    kept = {
+    retained = {
         str(path.relative_to(PROJECT))
         for room in ("rigd", "analysis")
         for path in (PROJECT / room).rglob("*")
         if path.is_file() and path.suffix != ".pyc"
     }
-    assert held == kept | {f"rigd/profile/shipped/{name}" for name in SHIPPED}
+    assert held == retained | {f"rigd/profile/shipped/{name}" for name in SHIPPED}
 
 
 @pytest.mark.slow  # .ci/run does it too, with dependencies as declared
@@ -185,10 +185,10 @@ def test_from_an_empty_folder_it_runs_a_session_and_analyses_it(installed, tmp_p
         return run(installed / "bin" / program, *options, folder=work, **variables)
 
     # What runs below is what is installed: the checkout is nowhere to be imported from.
-    asked = (
+    requested = (
         "import analysis, rigd, sys; print(analysis.__file__, rigd.__file__, *sys.path, sep='|')"
     )
-    analyser, rig, *path = here("python", "-c", asked).strip().split("|")
+    analyser, rig, *path = here("python", "-c", requested).strip().split("|")
     for module in (analyser, rig):
         assert Path(module).is_relative_to(installed)
     assert str(PROJECT) not in path

@@ -27,7 +27,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def desktop(browser):
-    """A window as wide as a laptop's; its pages share no tab, and so no token."""
+    """Window as wide as a laptop's; each page has a tab, and so a token, of its own."""
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     context.set_default_timeout(PATIENCE_MS)
     return context

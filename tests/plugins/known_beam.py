@@ -10,7 +10,7 @@ from rigd.beam import modes
 from rigd.profile import load_profile
 
 ON_THE_WAY, CERTAIN = 0.03, 0.001
-"""Relative standard deviations of the damping: a few pieces away from 1 %, and below it."""
+"""Relative standard deviations of the damping: a few segments away from 1 %, and below it."""
 _NAMES = ("zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "bending_stiffness_n_m2")
 
 
@@ -63,7 +63,7 @@ def answer(profile, tick, relative_std, flag=None, with_air_drag=False):
 
 
 class KnownBeamEstimator:
-    """Estimator of a fit process: on the way after the scan, certain after the first piece."""
+    """Estimator of a fit process: imprecise after the scan, precise after the first segment."""
 
     def __init__(self, metadata, segments):
         self._rate_hz = float(metadata["rate_hz"])
@@ -82,7 +82,7 @@ class KnownBeamEstimator:
 
 
 class KilledEstimator(KnownBeamEstimator):
-    """One whose process is killed when the second estimate is asked for."""
+    """Estimator whose process is killed when the second estimate is requested."""
 
     def estimate(self, tick, **options):
         if self._estimates:

@@ -150,7 +150,7 @@ def test_shifted_modes_are_marked(paper_analysis, tables_text):
 
 
 def test_table_is_shown_in_its_units_and_written_in_full(as_text):
-    """A file's name may look like markup, a value may be missing, unknown or for programs only."""
+    """A file's name may resemble markup, a value may be missing, unknown or for programs only."""
     columns = (
         Column("file", "file", TEXT_FORMAT), Column("ζ (1e-5)", "zeta", ".2f", 1e5),
         Column("std", "zeta_std", ".2f", 1e5, std_of_previous=True),

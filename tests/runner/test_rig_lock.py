@@ -19,7 +19,7 @@ def test_error_names_the_holder_of_the_rig(runtime_folder):
         pass
 
 
-def test_simulated_rigs_share_a_lock_except_with_a_daemon(runtime_folder):
+def test_simulated_rigs_have_one_lock_except_with_a_daemon(runtime_folder):
     with (
         RigLock("sim", "rigd run", hardware=False, exclusive=False),
         RigLock("sim", "rigd run", hardware=False, exclusive=False),

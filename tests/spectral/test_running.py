@@ -176,11 +176,11 @@ def test_chirp_excites_up_to_its_frequency(start_hz, stop_hz, duration_s, taper_
     reference = excitation.reference_rad[slice(*excitation.segments["sweep"])]
     length = segmentation_of(reference.size, RATE_HZ).segment_length
     hz_per_s = (stop_hz - start_hz) / duration_s
-    looked = 0
+    inspected = 0
     for end, found in estimates(Sweep(reference, reference, reference), reference.size // 40):
         if found is None or found.final:
             continue
-        looked += 1
+        inspected += 1
         now_hz = start_hz + hz_per_s * end / RATE_HZ
         frequency_hz = found.response.frequency_hz
         first_hz, last_hz = frequency_hz[found.excited][[0, -1]]
@@ -197,7 +197,7 @@ def test_chirp_excites_up_to_its_frequency(start_hz, stop_hz, duration_s, taper_
         # One band, except perhaps for frequencies passed quickly at its lower end.
         within = (frequency_hz > max(first_hz, 0.5)) & (frequency_hz < last_hz)
         assert found.excited[within].all(), end
-    assert looked >= 20
+    assert inspected >= 20
 
 
 def test_a_multisine_has_excited_its_band_from_the_beginning():

@@ -43,7 +43,7 @@ def test_it_needs_no_test_framework():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_a_profile_differs_where_it_is_asked_to(tmp_path):
+def test_profile_has_only_the_requested_differences(tmp_path):
     values = {
         "name": "other",
         "limits.angle_rad": 0.5,

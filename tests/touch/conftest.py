@@ -53,5 +53,5 @@ def model():
 
 @pytest.fixture(scope="session")
 def estimator(model):
-    """Estimator that all tests share."""
+    """Estimator for all tests."""
     return TouchEstimator(model, 1000.0)

@@ -92,7 +92,7 @@ def shown(drawn):
     return draw
 
 
-class _LayoutTaker:
+class _LayoutReader:
     """A stream that stores the layout sent to it and drops everything else."""
 
     layout = None
@@ -109,7 +109,7 @@ def layout_of(description):
     """Return the root of the layout that a scene sends to a new connection."""
 
     def taken(of=description):
-        stream = _LayoutTaker()
+        stream = _LayoutReader()
         for drawing in Scene(of).frame():
             drawing(stream)
         return stream.layout.root_container

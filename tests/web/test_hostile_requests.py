@@ -30,11 +30,11 @@ def without(*names):
 def secret_file(served, tmp_path_factory):
     """A file that must not be read, and paths to it."""
     secret = tmp_path_factory.mktemp("elsewhere") / "secret.mcap"
-    place_secret_files(served.folder, secret)
+    write_secret_files(served.folder, secret)
     return secret
 
 
-def place_secret_files(folder, secret):
+def write_secret_files(folder, secret):
     """Put files next to the folder of the sessions, and links to them into it."""
     secret.write_bytes(SECRET)
     (folder / "link.mcap").symlink_to(secret)
@@ -335,7 +335,7 @@ def rig(tmp_path, tmp_path_factory, write_profile_in):
     """The real daemon with its page, time skipped, and a file that must not be read."""
     with rig_with_page(write_profile_in, tmp_path, "--fast") as rig:
         rig.folder.mkdir(exist_ok=True)
-        place_secret_files(rig.folder, tmp_path_factory.mktemp("elsewhere") / "secret.mcap")
+        write_secret_files(rig.folder, tmp_path_factory.mktemp("elsewhere") / "secret.mcap")
         yield rig
 
 
