@@ -189,8 +189,8 @@ def recommend_sweeps(
     if sweeps is not None and sweeps.changed:
         modes_text = listed([str(mode_change.mode) for mode_change in sweeps.changed])
         return [
-            "To tell a change in time from one with amplitude, repeat both sweeps with half the "
-            f"amplitude: a difference in mode {modes_text} that stays is a change in time. "
+            "To distinguish a change in time from one with amplitude, repeat both sweeps with half "
+            f"the amplitude: a difference in mode {modes_text} that stays is a change in time. "
             "Then check clamp and temperature."
         ]
     sweep_directions = {session.experiment.rising for session in sessions}

@@ -375,7 +375,7 @@ def experiments(
         not has_unexplained_residual and any(o.status == "open" for o in order_verdicts)
     ):
         advice_sentences.append(
-            "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
+            "To distinguish the structures, excite one more mode (a wider sweep), or sweep longer."
         )
     return advice_sentences
 
