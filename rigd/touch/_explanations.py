@@ -723,7 +723,7 @@ class ExplanationSearch:
         single_obstacle = resting_explanation.parameters[None]
         [single_chi2] = chi2_of(self.predictor(single_obstacle), early_window, single_obstacle)
         equivalent_pairs, equivalent_chi2 = self._equivalent_pairs(
-            two_contacts, resting_explanation, early_window, single_chi2
+            two_contacts, resting_explanation, early_window, parameter_ranges, single_chi2
         )
         first_obstacle_positions_m = equivalent_pairs[equivalent_chi2 <= single_chi2, 0]
         start_candidates = np.vstack([minima.parameters, equivalent_pairs])
@@ -760,13 +760,13 @@ class ExplanationSearch:
         two_contacts: TwoObstacleContact,
         resting_explanation: Explanation,
         sample_window: WhitenedWindow,
+        parameter_ranges: ParameterRanges,
         single_chi2: float,
     ) -> tuple[RealArray, RealArray]:
         """Return pairs of obstacles with the effect of one, and their sums of squared residuals.
 
         The shapes are (k, 6) and (k,); k = 0 if no pair has an effect similar to one obstacle.
         """
-        parameter_ranges = two_contacts.parameter_ranges(self.parameter_ranges(3))
         pairs = two_contacts.equivalent_pairs(
             resting_explanation.parameters, _RELATIVE_PAIR_POSITIONS
         )
