@@ -63,7 +63,7 @@ class OnlineEstimate:
         Reason why there is no fit; empty with a fit.
     validity : Validity
         Validity of the linear model for the record.
-    fit_in_air : RecordFit or None
+    linear_fit : RecordFit or None
         Linear fit, from which the next excitation is planned, if the reported fit includes air
         drag. Its damping is valid at the amplitude of the record. None without air drag.
     """
@@ -79,7 +79,7 @@ class OnlineEstimate:
     warnings: tuple[str, ...] = ()
     problem: str = ""
     validity: Validity = field(default_factory=Validity)
-    fit_in_air: RecordFit | None = None
+    linear_fit: RecordFit | None = None
 
     @property
     def doubt(self) -> str | None:
@@ -114,8 +114,8 @@ class OnlineEstimate:
         headline, analysis = self.headline, self.analysis
         if headline is None or analysis is None:
             return None
-        if self.fit_in_air is not None:
-            return self.fit_in_air
+        if self.linear_fit is not None:
+            return self.linear_fit
         fit = headline.with_both
         flagged_orders = {
             order_name for order_name in COEFFICIENT_OF if order_name in headline.flags
@@ -324,7 +324,7 @@ class OnlineEstimator:
             duration_s = record.time_s.size / record.rate_hz
             measurement, band_hz = Measurement.from_record(record), record_band_hz(record)
             order_verdicts: tuple[OrderVerdict, ...] = ()
-            fit_in_air = None
+            linear_fit = None
             if whole:
                 last_selection = self._last_selection if from_last else None
                 selection = select(measurement, band_hz=band_hz, earlier=last_selection)
@@ -333,7 +333,7 @@ class OnlineEstimator:
                 findings = selection.verdict.findings
                 order_verdicts = (selection.verdict.alpha, selection.verdict.lambda_)
                 if any(finding.kind == "air drag" for finding in findings):
-                    fit_in_air = next(
+                    linear_fit = next(
                         candidate.fit
                         for candidate in selection.linear_candidates
                         if candidate.structure is ORDER_ONE_STRUCTURE
@@ -364,6 +364,6 @@ class OnlineEstimator:
             analysis=analysis if has_modes else None,
             warnings=record.warnings,
             problem="" if has_modes else "No mode has been excited enough yet.",
-            fit_in_air=fit_in_air if has_modes else None,
+            linear_fit=linear_fit if has_modes else None,
             validity=record_validity(record.metadata, record.angle_rad, record.rate_hz, plant),
         )

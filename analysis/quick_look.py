@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from analysis.identify import Finding
     from analysis.identify.headline import Headline
     from analysis.record import Record
-    from rigd.estimates import EstimatedMode
+    from rigd.estimates import ReportedMode
     from rigd.spectral import RunningEstimate, Segmentation
 
     RealArray = NDArray[np.float64]
@@ -87,7 +87,7 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
     from analysis.results import finite
 
     started_s = time.monotonic()
-    modes: list[EstimatedMode] = []
+    modes: list[ReportedMode] = []
     response_document, coherence_document, model_document = None, _empty_coherence(), None
     specimen, start_utc_ns, session_id, excitation = "", 0, path.stem, ""
     quality_flags: list[str] = []
@@ -372,7 +372,7 @@ def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str,
     return None if path_and_document is None else path_and_document[1]
 
 
-def _compare_modes(modes: list[EstimatedMode], other_document: Mapping[str, Any]) -> dict[str, Any]:
+def _compare_modes(modes: list[ReportedMode], other_document: Mapping[str, Any]) -> dict[str, Any]:
     """Compare the modes that are visible both in a session and in an earlier one.
 
     Return the comparison as a section of the JSON document.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from rigd.estimates import EstimatedMode
+    from rigd.estimates import ReportedMode
     from rigd.spectral import FrequencyResponse
 
     Parameters = dict[tuple[str, str], dict[str, NDArray[np.float64]]]
@@ -123,7 +123,7 @@ def first_peak(folder: Path, peaks: list[FirstPeak]) -> None:
 
 
 def order(
-    folder: Path, found: Parameters, uniform: NDArray[np.float64], modes: tuple[EstimatedMode, ...]
+    folder: Path, found: Parameters, uniform: NDArray[np.float64], modes: tuple[ReportedMode, ...]
 ) -> None:
     """Draw loss factors that follow from what is found, and alpha session by session."""
     hz = np.geomspace(1.0, 50.0, 300)

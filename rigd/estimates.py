@@ -161,8 +161,8 @@ def change_between(earlier: Estimate, later: Estimate) -> Change:
 
 
 @dataclass(frozen=True, slots=True)
-class EstimatedMode:
-    """Estimated mode of the beam with locked hub."""
+class ReportedMode:
+    """Mode of the beam with locked hub, as reported: with intervals and flags."""
 
     number: int
     """Number of the mode, from 1."""
@@ -194,7 +194,7 @@ class EstimatedMode:
         }
 
     @classmethod
-    def from_json(cls, document: object, number: int) -> "EstimatedMode | None":
+    def from_json(cls, document: object, number: int) -> "ReportedMode | None":
         """Return the mode that a JSON value describes, or None if it describes no mode.
 
         A mode has a positive frequency and a damping ratio.
@@ -224,7 +224,7 @@ class EstimatedMode:
             participation=participation,
         )
 
-    def frequency_change_text(self, earlier: "EstimatedMode") -> str:
+    def frequency_change_text(self, earlier: "ReportedMode") -> str:
         """Return the change of the frequency since an earlier estimate, in Hz with its sign."""
         change_hz = self.frequency_hz.value - earlier.frequency_hz.value
         decimal_digits = decimals(self.frequency_hz.std) if self.frequency_hz.std else 4
@@ -235,9 +235,9 @@ class EstimatedMode:
 
         Examples
         --------
-        >>> from rigd.estimates import Estimate, EstimatedMode
+        >>> from rigd.estimates import Estimate, ReportedMode
         >>> frequency_hz = Estimate(2.5699, 6e-4, (2.5687, 2.5711))
-        >>> print(EstimatedMode(1, frequency_hz, Estimate(0.00909, None, None)).line())
+        >>> print(ReportedMode(1, frequency_hz, Estimate(0.00909, None, None)).line())
         mode 1: 2.5699 ± 0.0012 Hz, damping 0.909 %
         """
         text = (
@@ -249,7 +249,7 @@ class EstimatedMode:
         return f"{text}, inertia {self.participation.text(_KG_MM2_PER_KG_M2)} kg·mm²"
 
 
-def modes_from_json(documents: object) -> list[EstimatedMode]:
+def modes_from_json(documents: object) -> list[ReportedMode]:
     """Return the modes that a JSON list describes; entries that are no modes are left out.
 
     Parameters
@@ -260,7 +260,7 @@ def modes_from_json(documents: object) -> list[EstimatedMode]:
     return list(_modes(documents)) if isinstance(documents, list) else []
 
 
-def unseen_modes(modes: Iterable[EstimatedMode]) -> str:
+def unseen_modes(modes: Iterable[ReportedMode]) -> str:
     """Return text that names the modes that are not visible in a record; empty if all are.
 
     Parameters
@@ -270,17 +270,17 @@ def unseen_modes(modes: Iterable[EstimatedMode]) -> str:
 
     Examples
     --------
-    >>> from rigd.estimates import Estimate, EstimatedMode, unseen_modes
+    >>> from rigd.estimates import Estimate, ReportedMode, unseen_modes
     >>> one = Estimate(1.0, None, None)
-    >>> unseen_modes(EstimatedMode(n, one, one, shown=n == 1) for n in (1, 2, 3))
+    >>> unseen_modes(ReportedMode(n, one, one, shown=n == 1) for n in (1, 2, 3))
     'modes 2 and 3'
     """
     numbers = [str(mode.number) for mode in modes if not mode.shown]
     return f"mode{'s' if len(numbers) > 1 else ''} {listed(numbers)}" if numbers else ""
 
 
-def _modes(documents: list[object]) -> Iterator[EstimatedMode]:
+def _modes(documents: list[object]) -> Iterator[ReportedMode]:
     """Yield the entries of a JSON list that are modes."""
     for number, document in enumerate(documents[:_MAX_MODES], start=1):
-        if (mode := EstimatedMode.from_json(document, number)) is not None:
+        if (mode := ReportedMode.from_json(document, number)) is not None:
             yield mode

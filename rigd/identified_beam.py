@@ -23,7 +23,7 @@ from rigd.beam import (
 )
 from rigd.documents import DocumentError, read_json
 from rigd.errors import UserError
-from rigd.estimates import Estimate, EstimatedMode
+from rigd.estimates import Estimate, ReportedMode
 from rigd.session import BeamUniformity
 from rigd.units import is_usable_size
 
@@ -227,9 +227,9 @@ def _with_observed_modes(
     Stiffness offsets give it the observed frequencies, and its inertia follows from the first
     mode's participation. `refusal` is the reason why no uniform beam can be used.
     """
-    modes: list[EstimatedMode] = []
+    modes: list[ReportedMode] = []
     for number, document in enumerate(documents if isinstance(documents, list) else [], start=1):
-        mode = EstimatedMode.from_json(document, number)
+        mode = ReportedMode.from_json(document, number)
         if mode is None or not mode.shown or not mode.damping_ratio.value or mode.flag:
             break
         if mode.participation is not None and mode.participation.flag:
@@ -521,7 +521,7 @@ def _check_offset_modes(label: str, values_by_name: Mapping[str, float]) -> None
 def _mode_uncertainties(label: str, documents: object) -> Iterator[float]:
     """Yield the relative standard uncertainty of the pole of each mode in the document."""
     for number, document in enumerate(documents if isinstance(documents, list) else [], start=1):
-        mode = EstimatedMode.from_json(document, 0)
+        mode = ReportedMode.from_json(document, 0)
         if mode is None or mode.number != number:
             raise IdentifiedBeamError(
                 f"{label}.modes[{number - 1}] is not mode {number} with frequency_hz and "

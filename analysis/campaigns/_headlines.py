@@ -11,7 +11,7 @@ from analysis.identify.modal_headline import replace_by_modal_model
 from analysis.models import STRUCTURES
 from analysis.statistics import BIC_DECISIVE, student_t_quantile
 from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
-from rigd.estimates import Estimate, EstimatedMode
+from rigd.estimates import Estimate, ReportedMode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -219,7 +219,7 @@ def _reported_loss_factors(
 
 def _reported_modes(
     campaign: CampaignResult, pooled_estimate: PooledEstimate, common_flag: str | None
-) -> tuple[EstimatedMode, ...]:
+) -> tuple[ReportedMode, ...]:
     """Return frequency and damping ratio of each pooled mode, with their flags."""
     t, is_mixed = (
         student_t_quantile(0.95, pooled_estimate.sessions - 1),
@@ -232,7 +232,7 @@ def _reported_modes(
         return Estimate(value, std, (value - t * std, value + t * std), value_flag)
 
     return tuple(
-        EstimatedMode(
+        ReportedMode(
             mode.number,
             reported_value(mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"),
             reported_value(

@@ -21,7 +21,7 @@ from analysis.identify.verdict import (
 )
 from analysis.statistics import BIC_DECISIVE, NORMAL_95
 from rigd.beam import BEAM_PARAMETERS, COEFFICIENT_OF
-from rigd.estimates import Estimate, EstimatedMode
+from rigd.estimates import Estimate, ReportedMode
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
@@ -150,7 +150,7 @@ class Estimates:
         Parameters of the structure, by the names of `RecordFit`.
     sizes : tuple of ReportedLossFactor
         Loss factors of the dampings, the internal one first.
-    modes : tuple of EstimatedMode
+    modes : tuple of ReportedMode
         Modes of the beam with locked hub.
     structures : tuple of (str, str)
         Name of every fitted structure in tables, and its status: "selected" for the reported one,
@@ -173,7 +173,7 @@ class Estimates:
     name: str
     parameters: Mapping[str, Estimate]
     sizes: tuple[ReportedLossFactor, ...]
-    modes: tuple[EstimatedMode, ...]
+    modes: tuple[ReportedMode, ...]
     structures: tuple[tuple[str, StructureStatus], ...]
     simpler: ConditionalEstimate | None
     drag_speed_m_s: float | None
@@ -571,12 +571,12 @@ def _modes_with_wider_uncertainty(fit: RecordFit, with_both: RecordFit) -> Itera
 
 def _reported_mode(
     mode_estimate: ModeEstimate, visible_numbers: Collection[int], invalid_reason: str | None
-) -> EstimatedMode:
+) -> ReportedMode:
     """Return the reported frequency and damping ratio of a mode, flagged if it is not visible."""
     is_visible_mode = mode_estimate.number in visible_numbers
     if invalid_reason is None and not is_visible_mode:
         invalid_reason = "computed from the model: the record does not show this mode"
-    return EstimatedMode(
+    return ReportedMode(
         mode_estimate.number,
         symmetric_value(mode_estimate.frequency_hz, mode_estimate.frequency_std_hz, invalid_reason),
         symmetric_value(

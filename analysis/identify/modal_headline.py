@@ -29,7 +29,7 @@ from analysis.identify.verdict import (
 from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
 from rigd.beam import BEAM_PARAMETERS, COEFFICIENT_OF
-from rigd.estimates import Estimate, EstimatedMode
+from rigd.estimates import Estimate, ReportedMode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -216,19 +216,19 @@ def _reported_modes(
     half_width: float,
     *,
     from_beam: bool,
-) -> tuple[EstimatedMode, ...]:
+) -> tuple[ReportedMode, ...]:
     """Return the visible modes from the modal model, and the other modes from the beam.
 
     With `from_beam`, frequency and damping ratio of visible modes are also those of the beam.
     """
     visible = modal.visible
-    modes_by_number: dict[int, EstimatedMode] = {
+    modes_by_number: dict[int, ReportedMode] = {
         mode_estimate.number: mode_estimate for mode_estimate in estimates.modes
     }
     for mode_number in visible:
         modal_mode = modal.mode(mode_number)
         inertia_kg_m2, relative_std = modal.inertia(mode_number)
-        mode_estimate = EstimatedMode(
+        mode_estimate = ReportedMode(
             mode_number,
             symmetric_value(
                 modal_mode.frequency_hz, modal_mode.frequency_std_hz, doubt, half_width

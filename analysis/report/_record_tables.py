@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from analysis.identify.headline import Estimates, Headline, ReportedLossFactor
     from analysis.results import WholeRecord
-    from rigd.estimates import Estimate, EstimatedMode
+    from rigd.estimates import Estimate, ReportedMode
 
 _SCALE_NAMES: Final = {"torque_scale": "torque scale", "length": "length"}
 """Names of the scales in notes, by key."""
@@ -112,7 +112,7 @@ _MODE_COLUMNS: Final = (
 """Columns of a mode's frequency and damping ratio with their uncertainties."""
 
 
-def _mode_cells(mode: EstimatedMode) -> tuple[Cell, ...]:
+def _mode_cells(mode: ReportedMode) -> tuple[Cell, ...]:
     """Return the cells of a mode's frequency and damping ratio, without the mode's number."""
     return *_quantity_cells(mode.frequency_hz)[:2], *_quantity_cells(mode.damping_ratio, 100.0)
 

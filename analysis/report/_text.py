@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from analysis.identify.headline import Headline, ReportedLossFactor
     from analysis.report.table import Table
     from analysis.results import RecordResult, WholeRecord
-    from rigd.estimates import Estimate, EstimatedMode
+    from rigd.estimates import Estimate, ReportedMode
 
 _WIDTH_CHARACTERS: Final = 120
 """Width of plain text in characters."""
@@ -276,7 +276,7 @@ def damping_sentences(headline: Headline) -> tuple[str, ...]:
     return tuple(damping_texts)
 
 
-def _mode_text(mode: EstimatedMode) -> str:
+def _mode_text(mode: ReportedMode) -> str:
     """Return a mode's damping ratio and frequency as text."""
     damping_ratio = mode.damping_ratio
     return f"{_percent_text(damping_ratio)} at {mode.frequency_hz.value:.4g} Hz"

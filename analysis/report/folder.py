@@ -184,7 +184,7 @@ def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
             ) from error
         yield temporary_folder
         checksums = {
-            path.relative_to(temporary_folder).as_posix(): {_sha256(path)}
+            path.relative_to(temporary_folder).as_posix(): {sha256(path)}
             for path in sorted(temporary_folder.rglob("*"))
             if path.is_file()
         }
@@ -306,7 +306,7 @@ def _is_unchanged_report_file(
     return (
         is_inside
         and file_path.is_file()
-        and _sha256(file_path) in listed_checksums.get(file_name, ())
+        and sha256(file_path) in listed_checksums.get(file_name, ())
     )
 
 
@@ -334,7 +334,7 @@ def _list_text(checksums: Mapping[str, set[str]]) -> str:
     )
 
 
-def _sha256(path: Path) -> str:
+def sha256(path: Path) -> str:
     """Return the SHA-256 checksum of a file, in hexadecimal."""
     with path.open("rb") as file_stream:
         return hashlib.file_digest(file_stream, "sha256").hexdigest()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -14,7 +14,7 @@ from analysis.report._document import document, document_text
 from analysis.report._equation import definitions, equations, latex, mathml, types_table
 from analysis.report._text import damping_sentences, tables_text
 from analysis.report._uniformity import UNIFORMITY_FIGURE, uniformity_table
-from analysis.report.folder import write_new
+from analysis.report.folder import sha256, write_new
 from analysis.report.table import Table, csv_text, latex_table, with_validity
 from analysis.results import DEFAULT_FORMATS
 from rigd.spectral import WINDOW
@@ -155,21 +155,11 @@ def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[Fact
     ]
 
 
-def sha256(path: Path) -> str | None:
-    """Return the SHA-256 checksum of a file in hexadecimal; None if the file cannot be read."""
-    try:
-        with path.open("rb") as file_stream:
-            return hashlib.file_digest(file_stream, "sha256").hexdigest()
-    except OSError:
-        return None
-
-
 def _file_facts(path: Path) -> list[tuple[str, str]]:
     """Return facts (name, text) on a file: path, size and checksum."""
-    checksum = sha256(path)
     file_facts = [("path", str(path))]
-    if checksum is not None:
-        file_facts += [("size", f"{path.stat().st_size} bytes"), ("SHA-256", checksum)]
+    with suppress(OSError):  # the file may have been removed since it was analysed
+        file_facts += [("size", f"{path.stat().st_size} bytes"), ("SHA-256", sha256(path))]
     return file_facts
 
 

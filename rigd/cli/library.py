@@ -20,7 +20,7 @@ from rigd.cli.options import (
 from rigd.printable import printable, readable_message
 
 if TYPE_CHECKING:
-    from rigd.estimates import Change, Estimate, EstimatedMode
+    from rigd.estimates import Change, Estimate, ReportedMode
     from rigd.library import SessionRow
     from rigd.library.trend import ModeTrend, TrendPoint
 
@@ -206,7 +206,7 @@ def _session_lines(session_rows: "list[SessionRow]") -> Iterator[str]:
             yield f"{printable(row.path.name)}: {row.problem}"
 
 
-def _mode_text(mode: "EstimatedMode") -> str:
+def _mode_text(mode: "ReportedMode") -> str:
     """Format a mode's frequency and damping ratio; a "?" marks values that an analysis doubts."""
     flag_mark = "?" if mode.flag else ""
     return f"{mode.frequency_hz.value:.4g} Hz {100 * mode.damping_ratio.value:.3g} %{flag_mark}"

@@ -8,7 +8,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.estimates import EstimatedMode, modes_from_json
+from rigd.estimates import ReportedMode, modes_from_json
 from rigd.printable import printable
 from rigd.runtime import read_plain_file
 from rigd.session import Validity
@@ -82,7 +82,7 @@ class SessionRow:
     """Number of ticks with a late wake-up."""
     lost: int | None = None
     """Number of samples that were measured but not recorded."""
-    modes: tuple[EstimatedMode, ...] = ()
+    modes: tuple[ReportedMode, ...] = ()
     """Modes of the last report or, if there is no report, of the quick look."""
     validity: Document | None = None
     """Validity of the linear model for the modes, as `rigd.session.Validity.as_json`; None if there
@@ -241,7 +241,7 @@ def _modes_of_results(quick_look: Path | None, report_folder: Path | None) -> Do
     )
 
 
-def _with_validity(modes: tuple[EstimatedMode, ...], document: object) -> Document:
+def _with_validity(modes: tuple[ReportedMode, ...], document: object) -> Document:
     """Return the fields `modes` and `validity` of a row from modes and a document of results.
 
     The dictionary is empty if there are no modes.
@@ -266,7 +266,7 @@ def _list_in_document(document: object, key: str) -> list[object]:
     return listed_value if isinstance(listed_value, list) else []
 
 
-def usable_modes(mode_list: object) -> tuple[EstimatedMode, ...]:
+def usable_modes(mode_list: object) -> tuple[ReportedMode, ...]:
     """Return the modes of a JSON list that the record shows; invalid entries are left out."""
     return tuple(mode for mode in modes_from_json(mode_list) if mode.shown)
 

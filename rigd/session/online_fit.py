@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from math import isnan
 from typing import Any
 
-from rigd.estimates import EstimatedMode, modes_from_json, unseen_modes
+from rigd.estimates import ReportedMode, modes_from_json, unseen_modes
 from rigd.session._validity import Validity
 
 
@@ -45,7 +45,7 @@ def estimate_lines(
     return [*report_lines, *findings]
 
 
-def _change_text(earlier_mode: EstimatedMode, mode: EstimatedMode) -> str:
+def _change_text(earlier_mode: ReportedMode, mode: ReportedMode) -> str:
     """Return text with the changes of a mode's frequency in Hz and of its damping in percent."""
     change_percent = mode.damping_ratio.percent_above(earlier_mode.damping_ratio)
     percent_text = "" if isnan(change_percent) else f", {change_percent:+.2g} %"

@@ -7,20 +7,22 @@ are about as likely as the best one.
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.touch._explanations import (
-    CHANCE_CHI2_REDUCTION,
-    DECISIVE_CHI2_DIFFERENCE,
-    NEAR_TIP_FRACTION,
-    POOR_FIT_STDS,
-    ExplainedRecord,
-    Explanation,
-    ExplanationSearch,
-)
+from rigd.touch._explanations import ExplainedRecord, ExplanationSearch
 from rigd.touch._obstacle_contact import (
     MAX_LN_STIFFNESS,
     MIN_LN_STIFFNESS,
     ObstacleContact,
     WhitenedWindow,
+)
+from rigd.touch._obstacle_fit import (
+    NEAR_TIP_FRACTION,
+    POOR_FIT_STDS,
+    Explanation,
+    ObstacleFit,
+)
+from rigd.touch._other_kinds import (
+    CHANCE_CHI2_REDUCTION,
+    DECISIVE_CHI2_DIFFERENCE,
 )
 from rigd.touch._posterior import Posterior
 from rigd.touch._results import TouchEstimate, TouchQuantity
@@ -58,6 +60,7 @@ def estimate_from_explanations(
     scan
         Whether the estimate contains the likelihood of each position; otherwise that is empty.
     """
+    obstacle_fit = explanation_search.fit
     explanations, sample_window = explained_record.explanations, explained_record.window
     at_rest = explanations[0]
     best_explanation = min(explanations, key=lambda explanation: explanation.chi2)
@@ -76,12 +79,12 @@ def estimate_from_explanations(
         likely_explanations += [
             explanation for explanation in explanations if explanation.kind == "two"
         ]
-    begin_s = explanation_search.record_offset / explanation_search.rate_hz
+    begin_s = obstacle_fit.record_offset / obstacle_fit.rate_hz
     x_m = time_s = force_n = stiffness_n_per_m = None
     force_history_n, force_times_s = np.zeros(0), np.zeros(0)
     obstacle_kind = "unknown"
-    if explanation_search.fits(best_explanation, sample_window):
-        is_poor_fit = not explanation_search.fits(best_explanation, sample_window, POOR_FIT_STDS)
+    if obstacle_fit.fits(best_explanation, sample_window):
+        is_poor_fit = not obstacle_fit.fits(best_explanation, sample_window, POOR_FIT_STDS)
         is_doubtful = (
             explained_record.later_samples_contradict or explained_record.other_kinds_untried
             if best_explanation is at_rest
@@ -90,75 +93,70 @@ def estimate_from_explanations(
         if is_unambiguous and not is_doubtful:
             obstacle_kind = best_explanation.kind
         x_m, time_s = (
-            _position_estimate(explanation_search, likely_explanations),
+            _position_estimate(obstacle_fit, likely_explanations),
             _parameter_estimate(likely_explanations, 1, begin_s),
         )
         x_m = _with_interval_including(x_m, explained_record.first_obstacle_positions_m)
         if is_poor_fit or explained_record.other_kinds_untried:
-            x_m = _with_any_force_interval(explanation_search, x_m)
+            x_m = _with_any_force_interval(obstacle_fit, x_m)
         force_history_n, force_times_s, force_n = _force_estimate(
-            explanation_search, best_explanation, sample_window
+            obstacle_fit, best_explanation, sample_window
         )
         if obstacle_kind == "rigid":
             stiffness_n_per_m = _stiffness_estimate(at_rest.posterior)
     elif (
-        explanation_search.any_force_likelihood.chi2
-        < explanation_search.max_chi2(explanation_search.any_force_likelihood.expected_chi2)
+        obstacle_fit.any_force_likelihood.chi2
+        < obstacle_fit.max_chi2(obstacle_fit.any_force_likelihood.expected_chi2)
         and not explanation_search.begins_before_window
     ):
-        x_m = _unexplained_position(explanation_search)
+        x_m = _unexplained_position(obstacle_fit)
     return TouchEstimate(
         x_m=x_m,
         time_s=time_s,
         force_n=force_n,
         stiffness_n_per_m=stiffness_n_per_m,
         kind=obstacle_kind,
-        model=explanation_search.tables.model.source,
-        channels=explanation_search.motion.noise_stds.size,
-        samples=sample_window.end_sample - explanation_search.detected,
+        model=obstacle_fit.tables.model.source,
+        channels=obstacle_fit.motion.noise_stds.size,
+        samples=sample_window.end_sample - obstacle_fit.detected,
         chi2_per_degree=best_explanation.chi2
         / (sample_window.data.size - best_explanation.parameters.size),
-        positions_m=explanation_search.any_force_likelihood.x_m if scan else np.zeros(0),
-        log_likelihood=explanation_search.any_force_likelihood.log_likelihood
-        if scan
-        else np.zeros(0),
-        innovations=explanation_search.motion.innovations
-        / explanation_search.motion.noise_stds[:, None],
-        innovation_times_s=explanation_search.motion.t + begin_s,
+        positions_m=obstacle_fit.any_force_likelihood.x_m if scan else np.zeros(0),
+        log_likelihood=obstacle_fit.any_force_likelihood.log_likelihood if scan else np.zeros(0),
+        innovations=obstacle_fit.motion.innovations / obstacle_fit.motion.noise_stds[:, None],
+        innovation_times_s=obstacle_fit.motion.t + begin_s,
         force_history_n=force_history_n,
         force_times_s=force_times_s + begin_s,
     )
 
 
-def _unexplained_position(explanation_search: ExplanationSearch) -> TouchQuantity:
+def _unexplained_position(obstacle_fit: ObstacleFit) -> TouchQuantity:
     """Return the position of an unexplained touch in m, with a wide interval.
 
     The interval contains all positions at which some force explains the samples up to one of
     several times, because the beam may touch more than one point later.
     """
     early_likelihoods = [
-        explanation_search.tables.any_force_estimator.scan(explanation_search.window(time_s))
+        obstacle_fit.tables.any_force_estimator.scan(obstacle_fit.window(time_s))
         for time_s in _EARLY_TIMES_S
     ]
     interval_ends = np.array(
         [
             likelihood.interval(_WIDE_LIKELIHOOD_DROP)[2:]
-            for likelihood in (explanation_search.any_force_likelihood, *early_likelihoods)
+            for likelihood in (obstacle_fit.any_force_likelihood, *early_likelihoods)
         ]
     )
     low_m, high_m = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
     return TouchQuantity(
-        explanation_search.any_force_likelihood.interval(_WIDE_LIKELIHOOD_DROP)[0],
+        obstacle_fit.any_force_likelihood.interval(_WIDE_LIKELIHOOD_DROP)[0],
         (high_m - low_m) / 4,
         (low_m, high_m),
     )
 
 
-def _with_any_force_interval(
-    explanation_search: ExplanationSearch, estimate: TouchQuantity
-) -> TouchQuantity:
+def _with_any_force_interval(obstacle_fit: ObstacleFit, estimate: TouchQuantity) -> TouchQuantity:
     """Return a touch position in m, whose interval includes the interval for an arbitrary force."""
-    *_, low_m, high_m = explanation_search.any_force_likelihood.interval()
+    *_, low_m, high_m = obstacle_fit.any_force_likelihood.interval()
     low_m, high_m = min(low_m, estimate.interval_95[0]), max(high_m, estimate.interval_95[1])
     return TouchQuantity(estimate.value, max(estimate.std, (high_m - low_m) / 4), (low_m, high_m))
 
@@ -177,13 +175,11 @@ def _with_interval_including(estimate: TouchQuantity, positions_m: RealArray) ->
 
 
 def _position_estimate(
-    explanation_search: ExplanationSearch, likely_explanations: list[Explanation]
+    obstacle_fit: ObstacleFit, likely_explanations: list[Explanation]
 ) -> TouchQuantity:
     """Return the touch position in m, less certain because of bounces or a second obstacle."""
     position = _parameter_estimate(likely_explanations, 0)
-    is_near_tip = (
-        position.value > NEAR_TIP_FRACTION * explanation_search.tables.model.plant.beam.length_m
-    )
+    is_near_tip = position.value > NEAR_TIP_FRACTION * obstacle_fit.tables.model.plant.beam.length_m
     additional_std_m = (
         _TWO_OBSTACLES_STD_M
         if likely_explanations[0].kind == "two"
@@ -196,7 +192,7 @@ def _position_estimate(
         )
         for end, interval_sign in zip(position.interval_95, (-1.0, 1.0), strict=True)
     )
-    length_m = explanation_search.tables.model.plant.beam.length_m
+    length_m = obstacle_fit.tables.model.plant.beam.length_m
     return TouchQuantity(
         position.value,
         float(np.hypot(position.std, additional_std_m)),
@@ -205,7 +201,7 @@ def _position_estimate(
 
 
 def _force_estimate(
-    explanation_search: ExplanationSearch,
+    obstacle_fit: ObstacleFit,
     best_explanation: Explanation,
     sample_window: WhitenedWindow,
 ) -> tuple[RealArray, RealArray, TouchQuantity]:
@@ -218,7 +214,7 @@ def _force_estimate(
     posterior = best_explanation.posterior
     drawn_indices = rng.choice(posterior.weights.size, 48, p=posterior.weights)
     candidates = np.vstack([best_explanation.parameters, posterior.samples[drawn_indices]])
-    step_s = explanation_search.tables.middle_kernels.step_s
+    step_s = obstacle_fit.tables.middle_kernels.step_s
     if best_explanation.kind == "knock":
         peak_forces_n = np.abs(candidates[:, 3])
         pulse_phase = np.arange(0.0, np.exp(candidates[0, 2]) + step_s, step_s) / np.exp(
@@ -226,20 +222,18 @@ def _force_estimate(
         )
         force_history_n = peak_forces_n[:1, None] * np.sin(np.pi * np.minimum(pulse_phase, 1.0))
     elif best_explanation.kind == "two":
-        step_s = explanation_search.tables.coarse_kernels.step_s
+        step_s = obstacle_fit.tables.coarse_kernels.step_s
         force_history_n = np.abs(
-            explanation_search.two_obstacle_contact().predict(candidates, sample_window)[1]
+            obstacle_fit.two_obstacle_contact().predict(candidates, sample_window)[1]
         )
         peak_forces_n = force_history_n.max(axis=1)
     else:
         obstacle_contact = ObstacleContact(
-            explanation_search.tables.middle_kernels,
-            explanation_search.tables.x_m,
-            explanation_search.motion,
+            obstacle_fit.tables.middle_kernels,
+            obstacle_fit.tables.x_m,
+            obstacle_fit.motion,
         )
-        pressing_sign = (
-            None if best_explanation.kind == "rigid" else explanation_search.pressing_sign()
-        )
+        pressing_sign = None if best_explanation.kind == "rigid" else obstacle_fit.pressing_sign()
         if best_explanation.kind == "yielding":
             candidates = np.insert(candidates, 3, 0.0, axis=1)
         force_history_n = np.abs(

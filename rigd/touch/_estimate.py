@@ -143,7 +143,7 @@ class GrowingEstimate:
                 self._explaining_delay_s = detection_delay_s
             if touch_estimate.explained or first:
                 break
-            searched_from = explanation_search.first_touch_sample
+            searched_from = explanation_search.fit.first_touch_sample
         return latest_result or self._empty_estimate(record)
 
     def _has_enough_samples(self, touch_record: TouchRecord, detection_delay_s: float) -> bool:
@@ -179,7 +179,7 @@ class GrowingEstimate:
             return False
         longer_search = self._search(touch_record, longer_delay_s)
         return (
-            longer_search.likely_first_sample < explanation_search.first_touch_sample
+            longer_search.likely_first_sample < explanation_search.fit.first_touch_sample
             and longer_search.misfit < 0.5 * explanation_search.misfit
         )
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.estimates import Estimate, EstimatedMode, modes_from_json, unseen_modes
+from rigd.estimates import Estimate, ReportedMode, modes_from_json, unseen_modes
 from rigd.session import Validity
 from rigd.units import suffix_of, unit_of, with_percentage
 from rigd.view._session_info import escape_markdown
@@ -40,7 +40,7 @@ class _Quantity:
     name: str
     """Name of the quantity in a fit's list of target precisions."""
     attribute_name: str
-    """Name of the quantity among the attributes of an `EstimatedMode`."""
+    """Name of the quantity among the attributes of an `ReportedMode`."""
     suffix: str
     """Unit as the suffix of the plot's component name in Rerun."""
     title: str
@@ -262,7 +262,7 @@ def _target_row(target_precision: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _mode_row(mode: EstimatedMode) -> tuple[str, ...]:
+def _mode_row(mode: ReportedMode) -> tuple[str, ...]:
     """Return the table row of a mode: its number, frequency and damping ratio with intervals."""
     return (
         str(mode.number),

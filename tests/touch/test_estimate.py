@@ -11,7 +11,7 @@ from struck_beam import ALIKE, MISTAKEN, NOTICED, OBSTACLES, begin_s, cut
 from touch_records import Obstacle, Slew, simulate
 
 from rigd.touch import TouchRecord, estimate_touch
-from rigd.touch._explanations import ExplanationSearch
+from rigd.touch._obstacle_fit import ObstacleFit
 from rigd.touch._tables import DETECTION_DELAYS_S
 
 AT_REST = [further("soft"), "middle", further("hard")]
@@ -296,14 +296,14 @@ def test_estimate_touch_equals_prepared_estimator(model, records_by_name, estima
 
 def test_start_pairs_are_finite_without_contact(estimator, records_by_name):
     """The first obstacle is not reached, so that its parameters have no effect."""
-    search = ExplanationSearch(
+    obstacle_fit = ObstacleFit(
         estimator._tables, cut(records_by_name["middle"], 50), DETECTION_DELAYS_S[0]
     )
-    pair_contact, window = search.two_obstacle_contact(), search.window(0.05)
+    pair_contact, window = obstacle_fit.two_obstacle_contact(), obstacle_fit.window(0.05)
     not_reached = np.array([0.62, window.end_sample / 1000, np.log(3000.0)])
     no_effect = pair_contact.predict_channels(np.tile(not_reached, (1, 2)), window)
     assert not no_effect.any()
     starts = pair_contact.start_pairs(
-        not_reached, window, pair_contact.parameter_ranges(search.parameter_ranges(3)), 2
+        not_reached, window, pair_contact.parameter_ranges(obstacle_fit.parameter_ranges(3)), 2
     )
     assert np.isfinite(starts).all()
