@@ -100,7 +100,7 @@ PAPER_BEST_MODELS: Final = (("III", "omega"), ("VI", "omega"))
 
 @dataclass(frozen=True, slots=True)
 class MeanPeakDeviation:
-    """Mean absolute deviation of a model's resonant peak from the sessions' (Eqs. 31 and 32).
+    """Mean absolute deviation of a model's resonant peak from the sessions' (paper, Eqs. 31 and 32).
 
     Attributes
     ----------
@@ -189,7 +189,7 @@ def best_models(models: Sequence[NominalModel]) -> tuple[NominalModel, ...]:
 def mean_deviations(
     measured_peaks: Sequence[Sequence[Peak | None]], model_peaks: Sequence[Peak | None]
 ) -> tuple[MeanPeakDeviation, ...]:
-    """Return the deviation of each resonant peak, averaged over the sessions (Eqs. 31 and 32).
+    """Return the deviation of each resonant peak, averaged over the sessions (paper, Eqs. 31, 32).
 
     The model and each session have one peak, or None, for each mode.
     """

@@ -83,7 +83,7 @@ class ModelCheck:
 
     @property
     def contradicts_file(self) -> bool:
-        """Return whether sign, unit or size of a channel contradict the file."""
+        """Return whether a recorded signal has another sign, unit or scale than the file states."""
         return not _CONTRADICTING_KINDS.isdisjoint(self.finding_kinds)
 
     @property

@@ -135,12 +135,12 @@ class Refit:
 
     @property
     def predicted_cost(self) -> float:
-        """Return the sum of squares that the Gauss-Newton step predicts at the true minimum."""
+        """Return the sum of squares at the minimum that the Gauss-Newton step predicts."""
         return max(self.cost + float(self.equations.gradient @ self.predicted_step), 0.0)
 
     @property
     def predicted_step(self) -> NDArray[np.float64]:
-        """Return the Gauss-Newton step of the unknowns to the true minimum, shape (k,)."""
+        """Return the Gauss-Newton step of the unknowns to the predicted minimum, shape (k,)."""
         normal_equations = self.equations
         is_at_bound = normal_equations.held(self.x, *self.objective.unknowns.bounds)
         is_free = ~is_at_bound & (np.diag(normal_equations.hessian) > 0)

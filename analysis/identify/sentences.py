@@ -219,7 +219,7 @@ def _exact_order_sentences(headline: Headline) -> list[str]:
 
 
 def order_sentence(order_verdict: OrderVerdict) -> str:
-    """Return the sentence on one order, estimated on an exactly uniform beam."""
+    """Return the sentence on one order of damping, estimated for an exactly uniform beam."""
     order_profile = order_verdict.profile
     lower_end, upper_end = order_profile.interval
     order_name, damping_name = order_verdict.order, _DAMPING_OF_ORDER[order_verdict.order]

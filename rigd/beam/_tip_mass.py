@@ -138,19 +138,26 @@ def add_stiffness_offsets(
     for k4, offset in zip((z / length_m) ** 4, stiffness_offsets, strict=True):
         # a² EI k⁴, with the participation a² = 4 L³ / z⁴
         mode_weight, stiffer_mode = 4 * stiffness_n_m2 / length_m, 1 + offset
-        uniform_mode = 1 / (elastic_factor * k4 + inertial_factor)
-        offset_mode = 1 / (elastic_factor * k4 * stiffer_mode + inertial_factor)
+        uniform_mode_response = 1 / (elastic_factor * k4 + inertial_factor)
+        offset_mode_response = 1 / (elastic_factor * k4 * stiffer_mode + inertial_factor)
         total_response += (
-            mode_weight * inertial_factor**2 * elastic_factor * offset * uniform_mode * offset_mode
+            mode_weight
+            * inertial_factor**2
+            * elastic_factor
+            * offset
+            * uniform_mode_response
+            * offset_mode_response
         )
         by_elastic += (
-            mode_weight * inertial_factor**2 * (stiffer_mode * offset_mode**2 - uniform_mode**2)
+            mode_weight
+            * inertial_factor**2
+            * (stiffer_mode * offset_mode_response**2 - uniform_mode_response**2)
         )
         by_inertial += (
             mode_weight
             * elastic_factor**2
             * k4
-            * ((stiffer_mode * offset_mode) ** 2 - uniform_mode**2)
+            * ((stiffer_mode * offset_mode_response) ** 2 - uniform_mode_response**2)
         )
     return replace(
         uniform_response,

@@ -70,7 +70,7 @@ class InspectedDrive(Protocol):
 def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRow]:
     """Yield check results on the drive's identity, rated torque and safeguards.
 
-    They are never failed: a drive that contradicts the profile cannot be connected.
+    None of these checks fails: a drive that contradicts the profile was refused when connecting.
     """
     drive_settings = rig.cia402
     wanted_texts = {

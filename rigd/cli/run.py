@@ -57,7 +57,7 @@ class _AddedExcitations(TyperGroup):
 
     # Typer's click is its own in some versions and the package of that name in others.
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ANN401
-        """Return a subcommand by its name, also one for an excitation of an installed package."""
+        """Return a subcommand by its name; excitations of installed packages are included."""
         command = super().get_command(ctx, cmd_name)
         return command or _added_command(self.name or "run", cmd_name)
 

@@ -1,4 +1,4 @@
-"""Excitation that moves the motor to another angle, where it stays, without a vibration."""
+"""Excitation that moves the motor to another angle without leaving the antenna vibrating."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -480,10 +480,10 @@ class SegmentSearch:
         free_oscillations = np.exp(
             np.outer([beam_mode.at_rad_s for beam_mode in self.modes], time_s)
         )
-        decay_columns = np.stack([free_oscillations.real, -free_oscillations.imag], axis=1).reshape(
+        decay_rows = np.stack([free_oscillations.real, -free_oscillations.imag], axis=1).reshape(
             -1, time_s.size
         )
-        return np.linalg.pinv(decay_columns.T)
+        return np.linalg.pinv(decay_rows.T)
 
     def continued_drive(self, sweep_band: SweepBand) -> ContinuedDrive:
         """Return the response to exciting a band's mode by a sine up to the planning horizon."""

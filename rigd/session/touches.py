@@ -52,7 +52,7 @@ def touches_of(outcome: Mapping[str, str] | None) -> list[dict[str, Any]]:
 
 
 def _checked_touch(touch_document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the touch that a JSON object states; an invalid quantity is None."""
+    """Return the touch that a JSON object states, with None for each invalid quantity."""
     touch_number, touch_kind = touch_document.get("number"), touch_document.get("kind")
     touch: dict[str, Any] = {
         "number": touch_number if isinstance(touch_number, int) and 0 < touch_number < 10**9 else 0,

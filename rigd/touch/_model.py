@@ -119,7 +119,7 @@ class TouchModel:
         ------
         IdentifiedBeamError
             If the file cannot be read, lacks the beam's stiffness or density, has an effect that a
-            uniform beam on a rigid clamp does not have, or flags a required number.
+            uniform beam on a rigid clamp does not have, or marks a required number as doubtful.
         """
         identified = read_identified_beam(path, stated_plant, TOUCH)
         return cls(

@@ -212,10 +212,10 @@ class _AttributeOverride:
 class BusSimulation:
     """Simulated rig with its lines, which transfers frames between host and nodes.
 
-    In lock-step each SYNC advances the rig by one period, instead of wall time. `now_ns` is the
-    present time on a monotonic clock. `send` sends a frame to the hosts on the CAN bus; its second
-    argument is the host that sent the frame, or None for a node. `write` sends bytes to the host on
-    the serial line. `cut` and `mend` interrupt and reconnect the "bus" or the line of the "sensor".
+    In lock-step, each SYNC advances the rig by one period; otherwise, wall time advances it.
+    `now_ns` is the present time on a monotonic clock. `send` sends a frame to the hosts on the CAN
+    bus; its second argument is the host that sent the frame, or None for a node. `write` sends
+    bytes to the host on the serial line. `cut` and `mend` interrupt and reconnect the "bus" or the line of the "sensor".
     This class sets the time of `log`.
 
     Attributes
