@@ -100,7 +100,7 @@ PAPER_BEST_MODELS: Final = (("III", "omega"), ("VI", "omega"))
 
 @dataclass(frozen=True, slots=True)
 class MeanPeakDeviation:
-    """Mean absolute deviation of a model's resonant peak from the sessions' (paper, Eqs. 31 and 32).
+    """Mean absolute deviation of a model's resonant peak from the sessions' (paper, Eqs. 31, 32).
 
     Attributes
     ----------

@@ -215,8 +215,8 @@ class BusSimulation:
     In lock-step, each SYNC advances the rig by one period; otherwise, wall time advances it.
     `now_ns` is the present time on a monotonic clock. `send` sends a frame to the hosts on the CAN
     bus; its second argument is the host that sent the frame, or None for a node. `write` sends
-    bytes to the host on the serial line. `cut` and `mend` interrupt and reconnect the "bus" or the line of the "sensor".
-    This class sets the time of `log`.
+    bytes to the host on the serial line. `cut` and `mend` interrupt and reconnect the "bus" or the
+    line of the "sensor". This class sets the time of `log`.
 
     Attributes
     ----------
