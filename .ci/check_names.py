@@ -1,12 +1,11 @@
-"""Check names in `rigd`, `analysis` and `tests`: plain words, unique classes, public imports.
+"""Check names of code, tests and benchmarks: plain words, unique classes, public imports.
 
     python .ci/check_names.py [ROOT]
 
 Prints file and line of each offence and exits with 1 if there are any:
 
-* a word of `WORDS` in an identifier or a docstring of `rigd`, `analysis` or `tests`, apart from
-  the identifiers in `ALLOWED_NAMES` and the terms in `ALLOWED_TERMS`; tests of benchmarks have
-  the names of these;
+* a word of `WORDS` in an identifier or a docstring, apart from the identifiers in `ALLOWED_NAMES`
+  and the terms in `ALLOWED_TERMS`;
 * a class name that is defined twice in `rigd` and `analysis`, apart from `ALLOWED_TWICE`;
 * more imports of private modules and names in `tests` than `MOST_PRIVATE_IMPORTS`.
 
@@ -132,12 +131,13 @@ def offences(root: Path) -> Iterator[str]:
                     classes[node.name].append(f"{shown}:{node.lineno}")
     yield from class_offences(classes)
     private: list[str] = []
-    for path in sorted((root / "tests").rglob("*.py")):
-        source, shown = path.read_text("utf-8"), path.relative_to(root)
-        tree = ast.parse(source)
-        private += private_imports(shown, tree)
-        if "benchmarks" not in shown.parts:
+    for folder in ("benchmarks", "tests"):
+        for path in sorted((root / folder).rglob("*.py")):
+            source, shown = path.read_text("utf-8"), path.relative_to(root)
+            tree = ast.parse(source)
             yield from word_offences(shown, source, tree)
+            if folder == "tests":
+                private += private_imports(shown, tree)
     if len(private) > MOST_PRIVATE_IMPORTS:
         yield from private
         yield f"tests: {len(private)} private imports, at most {MOST_PRIVATE_IMPORTS} are allowed"

@@ -1,12 +1,12 @@
-"""What `analyze SESSION` with its full report costs: processor and wall time, and memory.
+"""Cost of `analyze SESSION` with its full report: processor time, wall time and memory.
 
 Usage: python benchmarks/bench_analyze.py [SESSION.mcap]
 
-Without a file a full session is recorded on the simulated rig first, and a record of 30 minutes in
-any case (``--minutes``). The peers are processes that only start the interpreter, or only import
-what figures cannot do without: the floor for `--help` and for a report. Processor time is judged,
-which is the one to compare on a computer that does other things as well; the best of several runs
-counts, the long record is analysed once. The limit of a campaign is in `bench_campaign.py`.
+Without a file, a full session is first recorded on the simulated rig. A record of 30 minutes is
+always made (``--minutes``). The peers are processes that only start the interpreter, or only import
+the packages that figures need: the least possible time for `--help` and for a report. The limits
+are on processor time, which other programs on the computer hardly change. The best of several runs
+counts; the long record is analysed once. The limit of a campaign is in `bench_campaign.py`.
 """
 
 import argparse
@@ -28,8 +28,8 @@ RUNS = 3
 REST_S = 16
 """Rest and ring-down of a record."""
 ROWS = (
-    # Limits of wall time on an idle computer, where a report takes 4 s; beside other programs its
-    # processor time was 6 s. "whole record" is one session's full judgement, with all rivals.
+    # Limits of wall time on an idle computer, where a report takes 4 s; with other programs its
+    # processor time was 6 s. "whole record" is the full verdict of one session, with all rivals.
     Row("quick look", most=10, unit="s of processor"),
     Row("analyze, full report", most=8, unit="s of processor"),
     Row("analyze, long record", most=40, unit="s of processor"),
@@ -77,7 +77,7 @@ class Cost:
 
 
 def cost(command: list[str]) -> Cost:
-    """Run a process to its end."""
+    """Run a process, wait for its end and return its cost."""
     start = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
@@ -89,7 +89,7 @@ def cost(command: list[str]) -> Cost:
 
 
 def best_of(runs: Iterable[Cost]) -> Cost:
-    """Least processor and wall time of several runs, most memory."""
+    """Return the least processor and wall time of several runs and their largest memory."""
     found = list(runs)
     return Cost(
         min(each.processor_s for each in found),
@@ -99,7 +99,7 @@ def best_of(runs: Iterable[Cost]) -> Cost:
 
 
 def best(command: list[str]) -> Cost:
-    """Run a process a few times."""
+    """Return the best cost of a few runs of a process."""
     return best_of(cost(command) for _ in range(RUNS))
 
 
@@ -118,7 +118,7 @@ def recorded_session(folder: Path, sweep_s: float = 120) -> Path:
 
 
 def steps(session: Path, folder: Path) -> dict[str, float]:
-    """Processor time of each step in one process, imports where they first occur."""
+    """Return the processor time of each step in one process; a step includes its first imports."""
     command = [sys.executable, "-c", STEPS, str(session), str(folder)]
     output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return {
@@ -127,7 +127,7 @@ def steps(session: Path, folder: Path) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print costs, their ratios to the peers, and the steps, and judge them."""
+    """Print costs, their ratios to the peers and the steps, and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("session", type=Path, nargs="?")
     parser.add_argument("--minutes", type=float, default=30, help="of the long record")
@@ -135,7 +135,7 @@ def main() -> None:
     use_one_thread()  # as the command does
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        if gate.given.session:  # a copy: the quick look is written beside it
+        if gate.given.session:  # a copy: the quick look is written next to it
             session = Path(shutil.copy(gate.given.session, folder))
         else:
             session = recorded_session(folder)
@@ -147,7 +147,7 @@ def main() -> None:
             cost([*ANALYZE, str(session), "--report", str(folder / f"report{run}")])
             for run in range(RUNS)
         )
-        look = best([sys.executable, "-m", "analysis.quick_look", str(session)])
+        quick_look = best([sys.executable, "-m", "analysis.quick_look", str(session)])
         longest = cost([*ANALYZE, str(long), "--report", str(folder / "report of long")])
         print(f"best of {RUNS} processes, {session.name}, load {os.getloadavg()[0]:.1f}")
         print(f"  {'':28}  processor      wall   memory")
@@ -155,7 +155,7 @@ def main() -> None:
             ("interpreter alone", interpreter),
             ("analyze --help", usage),
             ("import numpy and matplotlib", floor),
-            ("quick look", look),
+            ("quick look", quick_look),
             ("analyze, full report", whole),
             ("analyze, long record", longest),
         ):
@@ -164,12 +164,12 @@ def main() -> None:
                 f"{found.megabytes:5.0f} MB"
             )
         for what, found in (
-            ("quick look", look),
+            ("quick look", quick_look),
             ("analyze, full report", whole),
             ("analyze, long record", longest),
         ):
             gate.measured(what, found.processor_s)
-        gate.measured("memory", max(each.megabytes for each in (look, whole, longest)))
+        gate.measured("memory", max(each.megabytes for each in (quick_look, whole, longest)))
         gate.measured("analyze --help", usage.processor_s / interpreter.processor_s)
         gate.measured("full report", whole.processor_s / floor.processor_s)
         print("steps of one process, processor time, best of each")

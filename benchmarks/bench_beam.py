@@ -1,4 +1,4 @@
-"""Time of the exact model, against Eq. 25 typed in as it stands with differences for derivatives.
+"""Time of the exact model, against Eq. 25 as printed, with finite differences as derivatives.
 
 Best of ten in turn, on the 7907 points of the paper's fit band.
 """
@@ -25,7 +25,7 @@ ROWS = (
     Row("G", most=0.5, unit="times the textbook form"),
     Row("G and 4 derivatives", most=0.07, unit="times differences"),
     Row("G and 4 derivatives, new grid", most=0.12, unit="times differences"),
-    # Measured 8e-4, what differences of 1e-7 come to.
+    # Measured 8e-4: the error of finite differences of 1e-7.
     Row("derivatives against the differences", most=2e-3, unit="relative deviation"),
     # Measured 3.4e-5.
     Row("error of the realisation", most=1e-4, unit="of the largest response"),
@@ -36,7 +36,7 @@ ROWS = (
 
 
 def textbook(s: np.ndarray, zeta: float, alpha: float, gamma: float, lambda_: float) -> np.ndarray:
-    """Eq. 25 as printed."""
+    """Return Eq. 25 as printed."""
     stiffness, length = BEAM.bending_stiffness_n_m2, BEAM.length_m
     c = 1 + zeta * s**alpha
     beta = (-(BEAM.density_over_stiffness * s**2 + gamma * s**lambda_) / c) ** 0.25
@@ -46,7 +46,7 @@ def textbook(s: np.ndarray, zeta: float, alpha: float, gamma: float, lambda_: fl
 
 
 def textbook_with_differences(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Add the four derivatives by forward differences."""
+    """Return Eq. 25 and its four derivatives by forward differences."""
     at = np.array([DAMPING.zeta, DAMPING.alpha, DAMPING.gamma, DAMPING.lambda_])
     g = textbook(s, *at)
     steps = 1e-7 * at
@@ -55,14 +55,14 @@ def textbook_with_differences(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tick_by_tick(plant: SimulatedPlant, torques: list[float]) -> None:
-    """Drive the plant as a session does."""
+    """Advance the plant tick by tick, as a session does."""
     for torque in torques:
         plant.command(torque)
         plant.advance()
 
 
 def main() -> None:
-    """Measure, print and judge."""
+    """Measure and print the ratios, and check the limits."""
     gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     s = 2j * np.pi * np.arange(94, 8001) / 160
     grid = TransferGrid(s)

@@ -1,17 +1,17 @@
-"""Time and memory of a campaign on 2 cores, and what its Welch fits cost.
+"""Time and memory of a campaign on 2 cores, and processor time of its Welch fits.
 
 Usage: python benchmarks/bench_campaign.py [FOLDER] [--sessions 6]
 
-FOLDER holds the sessions, or takes them: without one they go to a temporary folder. They come from
-the simulated rig under its virtual clock; making twenty, of which the published figures are, takes
-minutes.
+FOLDER contains the sessions; if it is empty, they are recorded into it, without FOLDER into a
+temporary folder. They come from the simulated rig under its virtual clock. The published figures
+are of twenty sessions, which take minutes to record.
 
-Wall time is what other programs leave of the machine; CPU time, of this process and its workers, is
-what the work costs. Half of it is the least wall time on two cores that are otherwise idle.
+Wall time depends on the other programs on the computer. CPU time, of this process and its workers,
+does not; half of it is the least wall time on two otherwise idle cores.
 
-Peers: the same Welch fits one after the other in this process, and for the minima that they find
-Nelder-Mead from random starts on all points of the same cost (scipy), each fit's CPU time beside
-it. All fits are cold: the global search is repeated for every session.
+Peers: the same Welch fits one after the other in this process; and, for the minima found,
+Nelder-Mead from random starts on all points of the same cost (scipy), compared in CPU time too.
+The global search is repeated for every session.
 """
 
 import argparse
@@ -45,7 +45,7 @@ from rigd.beam import Damping, Plant, ResponseGrid
 JOBS = 2
 STARTS = 4
 ROWS = (
-    # Of twenty sessions a minute on two idle cores; the validation is a part that does not grow.
+    # For twenty sessions, a minute on two idle cores; the time of the validation is constant.
     Row("campaign, CPU time a session", most=6, unit="s"),
     Row("memory of a worker", most=1000, unit="MB"),
     # Measured 8e-14 and 0.075.
@@ -55,7 +55,7 @@ ROWS = (
 
 
 def recorded(folder: Path, sessions: int) -> list[Path]:
-    """Sessions of a folder, made if it has none."""
+    """Return the sessions of a folder; record them if it has none."""
     if not any(folder.glob("*.mcap")):
         rigd = Path(sys.executable).with_name("rigd")
         command = [
@@ -74,7 +74,7 @@ def recorded(folder: Path, sessions: int) -> list[Path]:
 
 
 def welch_only(paths: list[Path]) -> int:
-    """Fit by the Welch method alone, on two workers, these started included."""
+    """Fit by the Welch method alone, on two workers; their start is part of the time."""
     task = SessionTask(WelchSettings(), (), (), BAND_HZ)
     with process_pool(JOBS) as pool:
         results = pool.run(analyse_session, [(path, task) for path in paths])
@@ -89,15 +89,15 @@ def _cost(
     weight: NDArray[np.float64],
     x: NDArray[np.float64],
 ) -> float:
-    """Eq. (26)."""
+    """Return the cost of Eq. (26)."""
     (response,) = response_grid.evaluate(replace(plant, damping=unknowns.damping(x)))
     return float(weight @ np.abs(response - measured) ** 2)
 
 
 def searched(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
-    """Cost of each fit of a session over the lowest of Nelder-Mead from random starts, less 1.
+    """Return the excess cost of each fit over the best of Nelder-Mead, and the ratio of CPU times.
 
-    That is on all points; with it how many times as long the search takes, in CPU time.
+    Nelder-Mead starts at random points and uses all points of the response. The excess is relative.
     """
     from scipy.optimize import minimize
 
@@ -134,19 +134,19 @@ def searched(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
 
 
 class Watch:
-    """Wall and CPU time since it was made."""
+    """Stopwatch of wall and CPU time."""
 
     def __init__(self) -> None:
         self.wall, self.cpu = time.perf_counter(), spent_cpu_s()
 
     def __str__(self) -> str:
-        """Both; half of the CPU time is what two free cores would take."""
+        """Return both times; half of the CPU time is the wall time on two idle cores."""
         wall, cpu = time.perf_counter() - self.wall, spent_cpu_s() - self.cpu
         return f"{wall:.1f} s, {cpu:.1f} s of CPU time"
 
 
 def main() -> None:
-    """Print the times and their ratios to the peers, and judge them."""
+    """Print the times and their ratios to the peers, and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--sessions", type=int, default=6, help="that are made")

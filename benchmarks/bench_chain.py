@@ -1,19 +1,19 @@
-"""The whole chain: sessions run by `rigd run --fast`, analysed, against what the rig was given.
+"""The whole chain: sessions of `rigd run --fast`, analysed and compared with the true parameters.
 
 ``bench_chain.py --sessions N [--plant NAME ...] [--folder DIR]`` runs N sessions of the paper's
 chirp on each plant from the command line, on profiles that are `sim` with the plant's damping and
 torque noise of 1e-2 N·m. Every session is fitted by the record method with rho/EI, EI, delay and
-tool inertia free. Printed are, parameter by parameter, the mean error, the scatter and the coverage
-of the 95 % intervals, the error of the mean over all sessions in deviations of that mean, and which
-structures were selected. A fit biased by less than a tenth of a deviation looks right in one
-session and is wrong in the mean of many: the last figure is the sharper one.
+tool inertia free. For each parameter the program prints the mean error, the scatter, the coverage
+of the 95 % intervals, and the error of the mean over all sessions in standard deviations of that
+mean; then the selected structures. A bias of less than a tenth of a standard deviation cannot be
+seen in one session but is seen in the mean of many.
 
-Last comes what the command `analyze` says of the first session. ``--sharp`` runs `multisine` and
-`modes` once each instead, with the errors of the fit and what `analyze` says; the modes are those
-that it found in the first chirp.
+Last, the program prints the verdict of `analyze` on the first session. ``--sharp`` instead runs
+`multisine` and `modes` once each and prints the errors of the fit and the verdict; the modes are
+those found in the first chirp.
 
-With ``--folder`` sessions are kept there and not run again: a benchmark that was broken off goes on
-where it was.
+With ``--folder`` sessions are stored there and not run again: an interrupted benchmark resumes
+where it ended.
 """
 
 import argparse
@@ -36,10 +36,10 @@ from rigd.beam import Damping, Plant
 
 SIM = Path(__file__).parent.parent / "hw_profiles" / "sim.toml"
 AT_ZERO = 1 / math.sqrt(2 * math.pi)
-"""Mean, in deviations, of an estimate that is normal about 0 and cannot be negative."""
+"""Mean of the positive part of a standard normal variable: bias of an estimate bounded at 0."""
 
 ROWS = (
-    # Measured 0.43 standard deviations with 20 sessions, 0.47 of what is allowed.
+    # Measured 0.43 standard deviations with 20 sessions, 0.47 of the allowed value.
     Row("largest mean error", most=1, unit="of what bias and chance allow"),
     # Measured 60 of 60.
     Row("structures right", least=85, unit="%"),
@@ -47,11 +47,11 @@ ROWS = (
     Row("95 % intervals that hold the truth", least=80, unit="%"),
 )
 RIGHT = {"VI": {"VI", "VII"}, "III": {"III"}, "IV": {"IV"}}
-"""Type VI of Table 5 has alpha = 0.996, which one session does not tell from type VII's 1."""
+"""Type VI of Table 5 has alpha = 0.996, which one session cannot distinguish from 1 (type VII)."""
 
 
 def write_profile(path: Path, damping: Damping) -> None:
-    """Write the profile `sim` with a plant's damping and the noise of the evidence."""
+    """Write the profile `sim` with the damping of a plant and the noise of the benchmark."""
     text = SIM.read_text(encoding="utf-8")
     values = {
         "alpha": damping.alpha,
@@ -68,20 +68,20 @@ def write_profile(path: Path, damping: Damping) -> None:
 
 
 def run(folder: Path, profile: Path, kind: list[str], seed: int) -> Path:
-    """Run a session from the command line unless it is there, and say where it is."""
-    kept = folder / f"{profile.stem}-{kind[0]}-{seed:03d}.mcap"
-    if not kept.exists():
+    """Run a session from the command line unless its file exists, and return its path."""
+    session_file = folder / f"{profile.stem}-{kind[0]}-{seed:03d}.mcap"
+    if not session_file.exists():
         command = [sys.executable, "-m", "rigd", "run", *kind, "--fast", "--no-look", "--json"]
         command += ["--profile", str(profile), "--seed", str(seed), "--output", str(folder)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             sys.exit(done.stderr)
-        Path(json.loads(done.stdout)["sessions"][0]["path"]).rename(kept)
-    return kept
+        Path(json.loads(done.stdout)["sessions"][0]["path"]).rename(session_file)
+    return session_file
 
 
 def analyze(path: Path, document: Path) -> str:
-    """Analyse a session from the command line; return its verdict, the document is written."""
+    """Analyse a session from the command line, write the document and return the verdict."""
     document.unlink(missing_ok=True)
     command = [str(Path(sys.executable).with_name("analyze")), str(path), "--json", str(document)]
     with tempfile.TemporaryDirectory() as report:
@@ -94,22 +94,22 @@ def analyze(path: Path, document: Path) -> str:
 
 
 def profile_of(folder: Path, name: str) -> Path:
-    """Profile of a plant, written into the folder."""
+    """Write the profile of a plant into a folder and return its path."""
     path = folder / f"{name}.toml"
     write_profile(path, PLANTS[name])
     return path
 
 
 def fitted(path: Path, name: str) -> RecordFit:
-    """Fit of one structure, everything that can be free."""
+    """Fit one structure with all parameters free."""
     return fit(load(path), [name]).fits[0]
 
 
 def many(folder: Path, name: str, count: int) -> tuple[float, int, int, int]:
     """Print the errors over many sessions of a plant.
 
-    Return the largest mean over what is allowed, the structures that are right, and how many
-    intervals hold the truth, of how many.
+    Return the largest mean error over its limit, the number of correct structures, the number of
+    intervals that contain the true value, and the number of intervals.
     """
     profile = profile_of(folder, name)
     paths = [run(folder, profile, ["chirp"], seed) for seed in range(1, count + 1)]
@@ -136,7 +136,7 @@ def many(folder: Path, name: str, count: int) -> tuple[float, int, int, int]:
         ends = [each.interval[parameter] for each in fits]
         covered = [end[0] <= truth <= end[1] for end in ends if end is not None]
         low, high = wilson(sum(covered), len(covered))
-        # Few sessions do not know their scatter: that of a standard deviation is expected.
+        # The scatter of few sessions is uncertain: it is taken to be one standard deviation.
         errors.append(abs(excess) / (0.25 + 3 / math.sqrt(count)))
         held, known = held + sum(covered), known + len(covered)
         print(
@@ -152,7 +152,7 @@ def many(folder: Path, name: str, count: int) -> tuple[float, int, int, int]:
 
 
 def sharp(folder: Path, name: str) -> None:
-    """Print what is found in records of sharp excitation."""
+    """Print the results from records of `multisine` and `modes`."""
     profile = profile_of(folder, name)
     found = folder / f"{name}.json"
     analyze(run(folder, profile, ["chirp"], 1), found)
@@ -169,12 +169,12 @@ def sharp(folder: Path, name: str) -> None:
 
 
 def main() -> None:
-    """Run the plants asked for."""
+    """Run the requested plants."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=3, help="how many of each plant")
     parser.add_argument("--plant", choices=PLANTS, action="append", help="only this one")
     parser.add_argument("--sharp", action="store_true", help="multisine and modes, once each")
-    parser.add_argument("--folder", type=Path, help="where sessions are kept for the next time")
+    parser.add_argument("--folder", type=Path, help="where sessions are stored for the next run")
     gate = Gate(ROWS, parser)
     given = gate.given
     with tempfile.TemporaryDirectory() as made:

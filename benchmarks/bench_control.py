@@ -1,4 +1,4 @@
-"""One PID step, one limit check, and the prediction of a session against a loop over its ticks."""
+"""Time of a PID step, of a limit check, and of predicting a session, against a loop over ticks."""
 
 import argparse
 
@@ -26,7 +26,7 @@ ROWS = (
 
 
 def tick_by_tick(loop: ClosedLoop, reference_rad: np.ndarray) -> np.ndarray:
-    """Run the same state space one tick after the other."""
+    """Simulate the same state space tick by tick."""
     x, out = np.zeros(loop.b.size), np.empty((reference_rad.size, 5))
     for tick, value in enumerate(reference_rad.tolist()):
         out[tick] = loop.c @ x + loop.d * value
@@ -35,7 +35,7 @@ def tick_by_tick(loop: ClosedLoop, reference_rad: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    """Measure, print and judge."""
+    """Measure and print the ratios, and check the limits."""
     gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     profile = load_profile("sim")
     model, motor = profile.loop_model(), profile.rig.motor

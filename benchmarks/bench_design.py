@@ -1,13 +1,15 @@
 """Designed excitation against the paper's chirp: precision against time.
 
-By the Fisher information: the standard deviations of a whole-record fit for the paper's chirp while
-it runs, for a scan of 5 s followed by designed pieces, and for the best steady sines, which nobody
-can play since a mode has to ring up (``--picture FILE`` draws them). The beam is that of the
-profile ``sim`` (type VI), the noise of the torque 5e-3 N·m a sample. The chirp swings the tip to a
-slope of 0.5 rad, beyond the range of small slopes; the pieces keep to it, or to ``--tip-slope``.
+The Fisher information predicts the standard deviations of a whole-record fit: for the paper's chirp
+while it runs, for a scan of 5 s followed by designed segments, and for the best steady sines, a
+bound that no session can reach because a mode needs time to build up (``--picture FILE`` draws
+them). The beam is that of the profile ``sim`` (type VI), the torque noise 5e-3 N·m per sample. The
+slope of the tip reaches 0.5 rad in the chirp, beyond the range of small slopes; the segments stay
+within that range, or within ``--tip-slope``.
 
-With ``--check``: records of scan and pieces by exact synthesis, with noise, fitted by `analysis`:
-the deviation that a fit states over the one predicted, and the scatter over the one stated.
+``--check`` makes records of scan and segments by exact synthesis, with noise, and fits them with
+`analysis`. It prints the standard deviation stated by a fit over the predicted one, and the scatter
+over the stated one.
 """
 
 import argparse
@@ -62,7 +64,7 @@ CHIRP_S = 136.0
 
 
 def precisions(angle_rad: Real, targets: list[Target]) -> tuple[Precision, ...]:
-    """Return what is expected after a record."""
+    """Return the precisions expected after a record."""
     covariance = covariance_of(information(angle_rad, ESTIMATE, RATE_HZ), ESTIMATE)
     return Quantities.linearised(targets, ESTIMATE).precisions(covariance)
 
@@ -70,26 +72,31 @@ def precisions(angle_rad: Real, targets: list[Target]) -> tuple[Precision, ...]:
 def designed(
     rig: RigPreview, targets: list[Target], longest_s: float, tip_slope_rad: float
 ) -> tuple[Real, Real, list[Segment], float]:
-    """Scan and pieces until everything is reached: reference, angle, pieces, slowest decision."""
+    """Scan, then add segments until all targets are reached.
+
+    Return reference, angle, segments, and the processor time in s of the slowest decision.
+    """
     reference_rad = SCAN.reference_rad
     angle_rad = rig.plant_with(Plant(LINK, DAMPING)).respond(reference_rad).angle_rad
-    pieces: list[Segment] = []
+    segments: list[Segment] = []
     slowest_s, left_s = 0.0, longest_s
     while left_s > 1.0:
         started_s = time.process_time()
-        piece = next_segment(ESTIMATE, angle_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad)
+        segment = next_segment(
+            ESTIMATE, angle_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad
+        )
         slowest_s = max(slowest_s, time.process_time() - started_s)
-        pieces.append(piece)
-        reference_rad = np.concatenate([reference_rad, piece.reference_rad])
-        angle_rad = np.concatenate([angle_rad, piece.angle_rad])
-        left_s -= piece.reference_rad.size / RATE_HZ
-        if all(each.reached for each in piece.expected):
+        segments.append(segment)
+        reference_rad = np.concatenate([reference_rad, segment.reference_rad])
+        angle_rad = np.concatenate([angle_rad, segment.angle_rad])
+        left_s -= segment.reference_rad.size / RATE_HZ
+        if all(each.reached for each in segment.expected):
             break
-    return reference_rad, angle_rad, pieces, slowest_s
+    return reference_rad, angle_rad, segments, slowest_s
 
 
 def steady_s(rig: RigPreview, targets: list[Target], tip_slope_rad: float) -> float:
-    """Time of the best steady sines from nothing: below it no session can be."""
+    """Return the time of the best steady sines alone, a lower bound for any session, in s."""
     record = RecordSoFar.from_angle(np.zeros(8), ESTIMATE, RATE_HZ, 8.0)
     plant = rig.plant_with(Plant(LINK, DAMPING))
     quantities = Quantities.linearised(targets, ESTIMATE)
@@ -99,8 +106,8 @@ def steady_s(rig: RigPreview, targets: list[Target], tip_slope_rad: float) -> fl
 
 
 def table(rig: RigPreview, slopes_rad: list[float], gate: Gate) -> None:
-    """Print times to what is asked."""
-    asked = {
+    """Print the times needed to reach the targets."""
+    goals = {
         "damping 1 %": [parse_target("damping", "1%")],
         "damping 0.5 %": [parse_target("damping", "0.5%")],
         "damping 0.2 %": [parse_target("damping", "0.2%")],
@@ -110,16 +117,16 @@ def table(rig: RigPreview, slopes_rad: list[float], gate: Gate) -> None:
         ],
     }
     print(
-        "asked                  slope/rad  rig time/s  pieces  steady sines/s  slowest decision/s"
+        "target                 slope/rad  rig time/s  segments  steady sines/s  slowest decision/s"
     )
-    for name, targets in asked.items():
+    for name, targets in goals.items():
         for slope_rad in slopes_rad:
-            reference, angle, pieces, slowest_s = designed(rig, targets, 120.0, slope_rad)
+            reference, angle, segments, slowest_s = designed(rig, targets, 120.0, slope_rad)
             motion = tip_motion(Plant(LINK, DAMPING), angle, RATE_HZ)
-            done = all(each.reached for each in pieces[-1].expected)
+            done = all(each.reached for each in segments[-1].expected)
             print(
                 f"{name:22} {motion.slope_rad:9.3f} {'' if done else '>'}"
-                f"{reference.size / RATE_HZ:10.1f} {len(pieces):7} "
+                f"{reference.size / RATE_HZ:10.1f} {len(segments):9} "
                 f"{steady_s(rig, targets, slope_rad):15.1f} {slowest_s:19.2f}",
                 flush=True,
             )
@@ -130,13 +137,13 @@ def table(rig: RigPreview, slopes_rad: list[float], gate: Gate) -> None:
 
 
 def worst_percent(angle_rad: Real) -> float:
-    """Largest relative deviation of a mode's damping after a record, in %."""
+    """Return the largest relative standard deviation of a damping ratio after a record, in %."""
     targets = [parse_target("damping", "1%")]
     return max(100 * each.std / each.value for each in precisions(angle_rad, targets))
 
 
 def curves(rig: RigPreview, slope_rad: float) -> dict[str, tuple[Real, Real]]:
-    """Largest relative deviation of a mode's damping in %, against the time of the record."""
+    """Return by name the times in s, and the result of `worst_percent` after each."""
     chirped = (
         rig.plant_with(Plant(LINK, DAMPING)).respond(chirp(rate_hz=RATE_HZ).reference_rad).angle_rad
     )
@@ -150,17 +157,17 @@ def curves(rig: RigPreview, slope_rad: float) -> dict[str, tuple[Real, Real]]:
         np.array([angle.size / RATE_HZ for angle in swept]),
         np.array([worst_percent(angle) for angle in swept]),
     )
-    # More is asked than any of them reaches: each does the best with its time.
+    # No session reaches this target: each is as precise as its time allows.
     targets = [parse_target("damping", "0.01%")]
     for limit_rad in (slope_rad, 0.5):
         angles = [designed(rig, targets, time_s, limit_rad)[1] for time_s in (2, 5, 10, 20, 40, 80)]
-        found[f"scan and designed pieces, slope to {limit_rad:g} rad"] = (
+        found[f"scan and designed segments, slope to {limit_rad:g} rad"] = (
             np.array([angle.size / RATE_HZ for angle in angles]),
             np.array([worst_percent(angle) for angle in angles]),
         )
-    asked = [parse_target("damping", "0.1%")]
+    bound_targets = [parse_target("damping", "0.1%")]
     for limit_rad in (slope_rad, 0.5):
-        best_s = steady_s(rig, asked, limit_rad)
+        best_s = steady_s(rig, bound_targets, limit_rad)
         times_s = np.geomspace(5.0, 136.0, 24)
         found[f"steady sines, slope to {limit_rad:g} rad (bound)"] = (
             times_s,
@@ -170,7 +177,7 @@ def curves(rig: RigPreview, slope_rad: float) -> dict[str, tuple[Real, Real]]:
 
 
 def swept_rad(rig: RigPreview, duration_s: float) -> Real:
-    """Angle of the scan, followed by narrow sweeps over the modes as it has found them."""
+    """Return the angle of the scan and of narrow sweeps over the modes that it found."""
     found = [
         {"frequency_hz": mode.frequency_hz, "damping_ratio": mode.damping_ratio}
         for mode in ESTIMATE.modes()
@@ -188,7 +195,7 @@ def swept_rad(rig: RigPreview, duration_s: float) -> Real:
 
 
 def draw(rig: RigPreview, path: Path, slope_rad: float) -> None:
-    """Draw them."""
+    """Draw the curves of precision against time."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -215,12 +222,12 @@ def draw(rig: RigPreview, path: Path, slope_rad: float) -> None:
 
 
 def check(rig: RigPreview, sessions: int, slope_rad: float) -> None:
-    """Print what fits state over what was predicted, and their scatter."""
+    """Print stated over predicted standard deviations, and the scatter of the fits."""
     targets = [parse_target("damping", "1%")]
     reference, angle, _, _ = designed(rig, targets, 30.0, slope_rad)
     names = ("zeta", "alpha", "gamma", "lambda")
-    asked = [*(Target(name, 1.0, relative=False) for name in names), *targets]
-    predicted = [each.std for each in precisions(angle, asked)]
+    requested = [*(Target(name, 1.0, relative=False) for name in names), *targets]
+    predicted = [each.std for each in precisions(angle, requested)]
     made = response(Plant(LINK, DAMPING), reference)
     everywhere = np.ones(made.angle_rad.size, dtype=bool)
     found, stated = [], []
@@ -256,7 +263,7 @@ def check(rig: RigPreview, sessions: int, slope_rad: float) -> None:
 
 
 def main() -> None:
-    """Run what is asked for, and judge the times."""
+    """Run the requested parts, and check the limits of the times."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tip-slope", type=float, action="append", help="rad (0.14 and 0.5)")
     parser.add_argument("--check", type=int, metavar="N", help="fit so many records")

@@ -1,12 +1,12 @@
-"""Drag of the air: whether it is named, how well C_D d is known, and what else is made up.
+"""Air drag: whether it is identified, the precision of C_D d, and false findings.
 
-``bench_drag.py [--every K] [--count N] [--first SEED] [--none N] [--processes P]`` judges N records
-of every K-th cell (0.5, 1 and 2 mm wires, chirps of 0.025, 0.0125 and 0.00625 rad, C_D constant or
-White's, with external damping or alone), made by equations of motion of their own
-(`wrong_models.py`), and N records of the beam without air, by turns of integer and fractional
-orders. A line for each: C_D d over the truth at the speed where it is told, its standard deviation,
-its error in those, what else is named, and the worst error of what is told without a flag. Then the
-counts.
+``bench_drag.py [--every K] [--count N] [--first SEED] [--none N] [--processes P]`` evaluates N
+records of every K-th cell (wires of 0.5, 1 and 2 mm, chirps of 0.025, 0.0125 and 0.00625 rad, C_D
+constant or White's, with external damping or without), made with independent equations of motion
+(`wrong_models.py`), and N records of the beam without air, alternately of integer and fractional
+orders. A line for each record: C_D d over the true value at the speed for which it is reported, its
+standard deviation, its error in standard deviations, other findings, and the worst error of a
+number reported without a flag. Then the counts.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from analysis.identify import select
 AMPLITUDES_RAD = (0.025, 0.0125, 0.00625)
 DIAMETERS_M = (0.5e-3, 1e-3, 2e-3)
 FALSE = ("delay", "beam data", "tool inertia", "rival explanations")
-"""Kinds of findings that drag passed for."""
+"""Kinds of findings for which drag was mistaken."""
 ROWS = (
     # Measured 72 of 72, 67 of 72, 3.9, 0 and 0: docs/validation/structure_selection.md.
     Row("drag named", least=100, unit="% of the records with air"),
@@ -39,31 +39,31 @@ ROWS = (
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """What was made of one record."""
+    """Result of one record."""
 
     wire: Drag | None
     drag: tuple[float, float, float] | None
-    """C_D d, its standard deviation, and the speed at which it is told."""
+    """C_D d, its standard deviation, and the speed for which it is reported."""
     kinds: tuple[str, ...]
     worst: tuple[float, str]
     cpu_s: float
 
     @property
     def error(self) -> float:
-        """C_D d less the truth, in standard deviations."""
+        """Error of C_D d, in standard deviations."""
         assert self.drag is not None and self.wire is not None
         value, std, speed = self.drag
         return (value - self.wire.true_m(speed)) / std
 
     @property
     def known_to(self) -> float:
-        """Standard deviation of C_D d over the truth."""
+        """Standard deviation of C_D d over the true value."""
         assert self.drag is not None and self.wire is not None
         _, std, speed = self.drag
         return std / self.wire.true_m(speed)
 
     def text(self) -> str:
-        """Give a row of the table."""
+        """Return a row of the table."""
         where = "none" if self.wire is None else (
             f"{1e3 * self.wire.diameter_m:3g} mm, {self.wire.amplitude_rad:7g} rad, "
             f"{'White' if self.wire.cylinder else 'const'}, gamma {self.wire.rig.gamma:5g}"
@@ -78,8 +78,8 @@ class Line:
         return f"{where:44} {found:44} {self.cpu_s:5.1f} s  {', '.join(self.kinds)}  {self.worst}"
 
 
-def judged(wire: Drag | None, made: Record) -> Line:
-    """Judge one record."""
+def evaluate(wire: Drag | None, made: Record) -> Line:
+    """Evaluate one record."""
     start = time.process_time()
     selection = select(made.measurement())
     cpu_s = time.process_time() - start
@@ -96,7 +96,7 @@ def judged(wire: Drag | None, made: Record) -> Line:
 
 
 def main() -> None:
-    """Judge the records asked for."""
+    """Evaluate the requested records."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--every", type=int, default=7, help="which of the 36 cells")
     parser.add_argument("--count", type=int, default=1, help="records of each of these")
@@ -119,7 +119,7 @@ def main() -> None:
     jobs += [(None, record(next(rigs), given.first + seed)) for seed in range(given.none)]
     lines = []
     with ProcessPoolExecutor(given.processes) as pool:
-        for line in pool.map(judged, *zip(*jobs, strict=True)):
+        for line in pool.map(evaluate, *zip(*jobs, strict=True)):
             lines.append(line)
             print(line.text(), flush=True)
     there = [line for line in lines if line.wire is not None]

@@ -1,15 +1,15 @@
-"""What a controller that feeds the sensor's noise back does to frequency responses and fits.
+"""Bias of frequency responses and fits by a controller that feeds the sensor noise back.
 
-The controller feeds the measured torque forward, so the motor moves with the sensor's noise. N
-sessions (``--sessions``) of one plant (``--plant``) are made exactly, with a chirp as the paper's
-or a multisine (``--multisine``); each twice with the same noise, once as the controller lets it
-move the motor and once in the torque alone. For every estimator and parameter are printed
+The controller feeds the measured torque forward, so the sensor noise moves the motor. N sessions
+(``--sessions``) of one plant (``--plant``) are computed exactly, with the paper's chirp or a
+multisine (``--multisine``), each twice with the same noise: with the noise moving the motor, and
+with the noise in the torque alone. The program prints for every estimator and parameter
 
-* loop: mean difference of the two, which is what the feedback did, nothing else being different;
-* mean error, of the session under the controller;
+* loop: the mean difference of the two, which only the feedback can cause;
+* mean error: that of the sessions with feedback;
 
-both in standard deviations between sessions. The fits are those of the paper with 1/omega weights,
-beam and clamp being known. The motor (2e-3 kg m², a loop of 80 rad/s, one tick late) is that of
+both in standard deviations between sessions. The fits are those of the paper with 1/omega weights;
+beam and clamp are known. The motor (2e-3 kg m², a loop of 80 rad/s, one tick late) is that of
 tests/identify.
 """
 
@@ -33,7 +33,7 @@ DECAY = np.exp(-5.0 * np.arange(SAMPLES) / SAMPLES)
 S = 5.0 * RATE_HZ / SAMPLES + 2j * np.pi * np.fft.rfftfreq(4 * SAMPLES, 1 / RATE_HZ)
 Real = NDArray[np.float64]
 ROWS = tuple(
-    # Measured 0.12, 0.59, 0.22 and 0.04 with 40 sessions, each with 0.07 to 0.2 of chance
+    # Measured 0.12, 0.59, 0.22 and 0.04 with 40 sessions, standard errors 0.07 to 0.2
     # (docs/validation/paper_method.md), and 0.13, 1.9, 0.87 and 0.32 with four.
     Row(f"{estimator}: largest effect of the feedback", most=most, unit="standard deviations")
     for estimator, most in (("h1", 0.6), ("h2", 2.5), ("hv", 1.2), ("iv", 0.6))
@@ -55,21 +55,21 @@ def reference_rad(*, multisine: bool) -> Real:
 
 
 def answer(spectrum: NDArray[np.complex128]) -> Real:
-    """Back to samples."""
+    """Return the signal of a spectrum."""
     samples: Real = np.fft.irfft(spectrum, 4 * SAMPLES)[:SAMPLES] / DECAY
     return samples
 
 
 @dataclass(frozen=True, slots=True)
 class Records:
-    """What one session's instruments give."""
+    """Measured signals of one session."""
 
     reference_rad: Real
     angle_rad: Real
     torque_nm: Real
 
     def response(self, estimator: str) -> FrequencyResponse:
-        """Take one of Welch's estimates, in the paper's band."""
+        """Return one of Welch's estimates, in the paper's band."""
         angle, torque = self.angle_rad[SWEEP], self.torque_nm[SWEEP]
         if estimator == "iv":
             found = instrumental_response(self.reference_rad[SWEEP], angle, torque, RATE_HZ)
@@ -94,7 +94,7 @@ class Rig:
         self.answered = self.grid.evaluate(self.plant, angle_transform=self.turned)[0]
 
     def session(self, seed: int, *, fed_back: bool) -> Records:
-        """Measure with noise that does or does not move the motor."""
+        """Return a session with noise that moves the motor (`fed_back`) or does not."""
         noise = np.random.default_rng(seed).normal(scale=NOISE_NM, size=SAMPLES)
         angle, torque = self.angle, self.torque + noise
         if fed_back:
@@ -111,7 +111,7 @@ class Found:
     values: dict[tuple[str, str], list[float]] = field(default_factory=dict)
 
     def add(self, estimator: str, parameters: dict[str, float], names: tuple[str, ...]) -> None:
-        """Keep one session's."""
+        """Add the values of one session."""
         for name in names:
             self.values.setdefault((estimator, name), []).append(parameters[name])
 
@@ -129,11 +129,11 @@ def fit_all(records: Records, name: str, found: Found) -> None:
 
 
 def main() -> None:
-    """Print the errors of one plant, and judge what the feedback did."""
+    """Print the errors of one plant, and check the limits of the effect of the feedback."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=10)
     parser.add_argument("--plant", choices=PLANTS, default="VI")
-    parser.add_argument("--multisine", action="store_true", help="in place of the chirp")
+    parser.add_argument("--multisine", action="store_true", help="instead of the chirp")
     gate = Gate(ROWS, parser)
     given = gate.given
     rig = Rig(given.plant, multisine=given.multisine)

@@ -1,9 +1,9 @@
-"""All fits of one session: times, and minima against other searches on the same cost.
+"""All fits of one session: their times, and their minima against other searches on the same cost.
 
-Peers, on every point: random starts of scipy.optimize.least_squares with analytic derivatives (12,
-``--starts N``), and a fine grid around the minimum. With ``--peer TYPE`` (several times, if wanted)
-only scipy.optimize.differential_evolution, on the same cost in the same bounds: processor time of
-one run of it, and the least of five of ours.
+Peers, on all points: scipy.optimize.least_squares with analytic derivatives from random starts (12,
+``--starts N``), and a fine grid around the minimum. With ``--peer TYPE`` (repeatable) the only peer
+is scipy.optimize.differential_evolution, on the same cost and bounds: processor time of one run of
+it, and the least of five of ours.
 """
 
 import argparse
@@ -36,14 +36,14 @@ ROWS = (
     # Beyond 1e-9 a minimum would be missed.
     Row("cost over the lowest of the random starts, - 1", most=1e-9),
     Row("cost over the lowest of the grid, - 1", most=1e-9),
-    # Measured 1.3 to 1.5: the twelve share what they have in common.
+    # Measured 1.3 to 1.5: the twelve fits compute common terms once.
     Row("twelve fits", most=3, unit="times the slowest fit"),
 )
 GRID_STEPS = {1: 201, 2: 41, 3: 13, 4: 7}  # points an axis, by the number of unknowns
 
 
 def session() -> FrequencyResponse:
-    """Welch's estimate of a session that the rig records with the simulation as shipped."""
+    """Return Welch's estimate of a session of the shipped simulated rig."""
     with tempfile.TemporaryDirectory() as folder:
         rigd = Path(sys.executable).with_name("rigd")
         command = [rigd, "run", "chirp", "--fast", "--no-look", "--seed", "1", "--output", folder]
@@ -69,24 +69,24 @@ class Peer:
         self.high = np.array([1.999 if name in ORDERS else 4.0 for name in structure.free])
 
     def damping(self, x: np.ndarray) -> Damping:
-        """Damping at `x`."""
+        """Return the damping at `x`."""
         free = zip(self.structure.free, map(float, x), strict=True)
         return self.structure.damping(
             {name: v if name in ORDERS else math.exp(v) for name, v in free}
         )
 
     def cost(self, x: np.ndarray) -> float:
-        """Eq. (26) on all points."""
+        """Return the cost of Eq. (26) on all points."""
         deviation = self.grid.evaluate(LINK, self.damping(x)) - self.measured
         return float(self.weights @ np.abs(deviation) ** 2)
 
     def residual(self, x: np.ndarray) -> np.ndarray:
-        """Weighted deviations, real parts before imaginary ones."""
+        """Return weighted residuals, real parts before imaginary ones."""
         r = np.sqrt(self.weights) * (self.grid.evaluate(LINK, self.damping(x)) - self.measured)
         return np.concatenate((r.real, r.imag))
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Differentiate `residual` by `x`."""
+        """Return the derivative of `residual` with respect to `x`."""
         _, gradient = self.grid.evaluate_with_gradient(LINK, self.damping(x), self.structure.free)
         named = zip(self.structure.free, x, strict=True)
         chain = np.array([1.0 if name in ORDERS else math.exp(v) for name, v in named])
@@ -94,7 +94,7 @@ class Peer:
         return np.concatenate((j.real, j.imag))
 
     def random_starts(self, rng: np.random.Generator, starts: int) -> list[float]:
-        """Costs where descents from random starts end."""
+        """Return the costs at which descents from random starts end."""
         return [
             2
             * least_squares(
@@ -108,7 +108,7 @@ class Peer:
         ]
 
     def local_grid(self, parameters: Mapping[str, float]) -> float:
-        """Lowest cost on a grid of ±5 % in size at the modes, and ±0.05 in the orders."""
+        """Return the lowest cost on a grid: damping at the modes ±5 %, orders ±0.05."""
         names = self.structure.free
         centre = [parameters[n] if n in ORDERS else math.log(parameters[n]) for n in names]
         axis = np.linspace(-0.05, 0.05, GRID_STEPS[len(names)])
@@ -123,7 +123,7 @@ class Peer:
 
 
 def main() -> None:
-    """Print one line a fit, and judge the worst."""
+    """Print one line per fit, and check the limits of the worst."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--peer", choices=STRUCTURES, action="append", help="for this structure")
     parser.add_argument("--starts", type=int, default=12, help="of each fit's peer")
@@ -173,7 +173,7 @@ def main() -> None:
 
 
 def against_evolution(frf: FrequencyResponse, structure: Structure) -> None:
-    """Print cost and processor time beside those of a global search on the same cost."""
+    """Print cost and processor time of ours and of a global search on the same cost."""
     for weighting in ("const", "omega"):
         peer = Peer(frf, structure, weighting)
         spent = math.inf

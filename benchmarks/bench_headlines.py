@@ -1,26 +1,26 @@
-"""Headlines as printed, against truths that are known: coverage, widths and statements by cell.
+"""Printed headlines against known true values: coverage, widths and statements by cell.
 
-``bench_headlines.py [--cells TEXT ...] [--count N] [--first SEED]`` judges N records of each cell
-whose name is or holds one of the texts (one record of every fourth cell, if none is given), and
-prints of every number of `headlines` in the analyzer's document: how many 95 % intervals without a
-flag hold the truth, with Wilson's interval (marked ``<`` or ``>`` where 90 to 99 % is missed beyond
-chance); ``x``, the median width over that of the true structure's own fit; the mean error in
-standard deviations; and the same coverage of what has a flag. Then what is missed of all that is
-asked for.
+``bench_headlines.py [--cells TEXT ...] [--count N] [--first SEED]`` evaluates N records of each
+cell whose name equals or contains one of the texts (without texts, one record of every fourth
+cell). For each number of `headlines` in the analyzer's document it prints: the number of 95 %
+intervals without a flag that contain the true value, with Wilson's interval (marked ``<`` or ``>``
+if the coverage is significantly outside 90 to 99 %); ``x``, the median width over that of a fit
+with the true structure; the mean error in standard deviations; and the coverage of intervals with a
+flag. Then it lists the requirements that are not met.
 
-With ``--file FILE`` a line is appended for each record, and records that stand there already are
-not judged again; ``--seconds S`` stops in time, and the next call goes on. ``--print`` only counts.
-``--processes P`` judges on P cores. ``--table`` adds a table in Markdown, by noise and by what is
-the matter. All cells with 50 records each take some hours.
+``--file FILE`` appends a line for each record, and records already in the file are not evaluated
+again; ``--seconds S`` ends after this time, and the next call resumes. ``--print`` only counts.
+``--processes P`` uses P cores. ``--table`` adds a table in Markdown, by noise and by kind of
+deviation. All cells with 50 records each take some hours.
 
-``--rig`` judges sessions of the simulated rig that is shipped, in its own closed loop and through
-the command line: ``rigd run chirp --fast`` and ``analyze --json``, seed by seed.
+``--rig`` evaluates sessions of the shipped simulated rig, in its closed loop and through the
+command line: ``rigd run chirp --fast`` and ``analyze --json``, one seed after the other.
 
-The records are made apart from what is judged (`independent_records.py`). Cells: alpha and lambda
-of the damping, whose sizes at 20 Hz and 2.55 Hz are those of the paper's type VI, by the noise;
-"ringing", the beam swings when the record begins; "undeclared", rho/EI is off by 1 % and EI by 2 %
-in the file, and 0.3 ms of delay and a clamp of 1e-5 kg m² are not in it; "not uniform", modes 2
-and 3 are stiffer by 0.6 and -1.3 %; "one mode", the sweep ends at 10 Hz.
+The records are made by independent code (`independent_records.py`). Cells: alpha and lambda of the
+damping, whose sizes at 20 Hz and 2.55 Hz are those of the paper's type VI, by noise; "ringing", the
+beam swings when the record begins; "undeclared", rho/EI is off by 1 % and EI by 2 % in the file,
+which also omits a delay of 0.3 ms and a clamp of 1e-5 kg m²; "not uniform", modes 2 and 3 are
+stiffer by 0.6 and -1.3 %; "one mode", the sweep ends at 10 Hz.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ from zlib import crc32
 import numpy as np
 from gate import Gate, Row, percent
 from headline_scores import (
+    ReportedNumber,
     Scored,
-    Told,
     complaints,
     containing,
+    headline_numbers,
+    interval_coverage,
+    loss_factor_numbers,
     loss_frequencies_hz,
-    loss_told,
     names_of,
-    share_held,
     shown,
     table,
-    told,
     typical_width,
 )
 from independent_records import (
@@ -86,7 +86,7 @@ ALPHAS = (0.8, 0.98, 0.99, 0.995, 0.996, 1.0, 1.005)
 LAMBDAS = (0.5, 0.594, 1.0)
 NOISE_MNM = (3, 10, 30)
 SPECIAL = ((0.996, 0.594), (0.8, 0.594), (1.0, 1.0))
-"""Orders of the damping in the cells where something else is the matter."""
+"""Orders of the damping in the cells with another deviation."""
 
 _INTERNAL_RAD_S, _EXTERNAL_RAD_S = 2 * math.pi * 20.0, 2 * math.pi * 2.55
 _INTERNAL = 7.1e-5 * _INTERNAL_RAD_S**0.996
@@ -99,7 +99,7 @@ _UNDECLARED = {
     "tool_inertia_kg_m2": 1e-5,
 }
 _BLOCK = 10
-"""Records of one cell in a row: a run that is stopped has some of every cell."""
+"""Consecutive records of one cell, so that an interrupted run has some of every cell."""
 
 _RIG = "shipped rig"
 _STATED = {
@@ -110,7 +110,7 @@ _STATED = {
     "beam_density_kg_per_m": repr(DENSITY_KG_PER_M),
     "beam_bending_stiffness_n_m2": repr(STIFFNESS_N_M2),
 }
-"""What the file says of rig and specimen, whatever is true."""
+"""Metadata of rig and specimen in the file, the same for all true values."""
 
 _PROFILE = Path(__file__).parents[1] / "hw_profiles" / "sim.toml"
 ROWS = (
@@ -121,13 +121,13 @@ ROWS = (
     Row("records without a result", most=0),
 )
 DEFAULT_STEP = 4
-"""Every fourth cell is judged if none is named."""
+"""Without names of cells, every fourth cell is evaluated."""
 _NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """What records of one kind have in common.
+    """Properties common to the records of a cell.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class Cell:
     noise_nm : float
     ringing : bool
     last_hz : float
-        Where the sweep ends.
+        Last frequency of the sweep.
     """
 
     truth: Truth
@@ -144,14 +144,14 @@ class Cell:
     last_hz: float = 50.0
 
     def record(self, seed: int, folder: Path) -> Record:
-        """Make one record, write it as a session and read that as ``analyze`` does.
+        """Make one record, write it as a session and load it as ``analyze`` does.
 
         Parameters
         ----------
         seed : int
             Seed of the noise.
         folder : Path
-            Where the session stands meanwhile.
+            Folder of the session file.
         """
         made = _exact(self.truth, self.last_hz, self.ringing)
         angle_rad, torque_nm = made.noisy(self.noise_nm, seed)
@@ -180,7 +180,7 @@ def _exact(truth: Truth, last_hz: float, ringing: bool) -> Exact:
 
 
 def damped(alpha: float, lambda_: float, **other: Any) -> Truth:  # noqa: ANN401 - fields of Truth
-    """Truth of some orders, with the paper's damping at 20 Hz and 2.55 Hz."""
+    """Return a truth with given orders and the paper's damping at 20 Hz and 2.55 Hz."""
     return Truth(
         zeta=_INTERNAL / _INTERNAL_RAD_S**alpha,
         alpha=alpha,
@@ -191,7 +191,7 @@ def damped(alpha: float, lambda_: float, **other: Any) -> Truth:  # noqa: ANN401
 
 
 def cells() -> Iterator[tuple[str, Cell]]:
-    """Every cell with its name; those of one beam follow each other."""
+    """Yield name and cell; cells of the same beam are consecutive."""
     for lambda_, alpha, noise in itertools.product(LAMBDAS, ALPHAS, NOISE_MNM):
         name = f"alpha {alpha:g}, lambda {lambda_:g}, {noise} mN·m"
         yield name, Cell(damped(alpha, lambda_), 1e-3 * noise)
@@ -214,12 +214,12 @@ def cells() -> Iterator[tuple[str, Cell]]:
 CELLS = dict(cells())
 
 
-def judged(name: str, seed: int) -> Scored:
-    """Make one record of a cell and judge it as ``analyze`` does, within this process."""
+def evaluate(name: str, seed: int) -> Scored:
+    """Make one record of a cell, analyse it in this process and score the result."""
     if name == _RIG:
-        return _judged_rig(seed)
+        return _evaluate_rig(seed)
     cell = CELLS[name]
-    # Other noise in every cell: what chance does to one says nothing of the next.
+    # Independent noise in every cell: errors of cells do not correlate.
     with tempfile.TemporaryDirectory() as folder:
         record = cell.record(crc32(f"{name} {seed}".encode()), Path(folder))
     start = time.process_time()
@@ -230,8 +230,8 @@ def judged(name: str, seed: int) -> Scored:
     return scored(name, seed, spent_s, results, record, cell.truth)
 
 
-def _judged_rig(seed: int) -> Scored:
-    """Run and analyse one session of the shipped rig through the command line."""
+def _evaluate_rig(seed: int) -> Scored:
+    """Run, analyse and score one session of the shipped rig through the command line."""
     with tempfile.TemporaryDirectory() as folder:
         run = (
             "rigd",
@@ -263,7 +263,7 @@ def _output(command: tuple[str, ...]) -> str:
 
 
 def rig_truth() -> Truth:
-    """Take the simulated beam from the profile that is shipped."""
+    """Return the true values of the simulated beam in the shipped profile."""
     profile = tomllib.loads(_PROFILE.read_text())
     beam, sensor = profile["beam"], profile["sensor"]
     damping = {name: entry["value"] for name, entry in beam["damping"].items()}
@@ -285,7 +285,7 @@ def rig_truth() -> Truth:
 def scored(
     name: str, seed: int, spent_s: float, results: dict[str, Any], record: Record, truth: Truth
 ) -> Scored:
-    """Set a document of one record beside the truth."""
+    """Compare the document of one record with the truth."""
     (headline,), (entry,) = results["headlines"], results["records"]
     contains = containing(truth)
     curves = entry["curves"]
@@ -296,9 +296,9 @@ def scored(
         seed=seed,
         cpu_s=round(spent_s, 3),
         type=headline["type"],
-        told=(*told(headline, truth), *loss_told(curves, truth)),
+        numbers=(*headline_numbers(headline, truth), *loss_factor_numbers(curves, truth)),
         own={name: typical_width(its) for name, its in of_name.items()},
-        own_holds={name: share_held(its) for name, its in of_name.items()},
+        own_holds={name: interval_coverage(its) for name, its in of_name.items()},
         contains=contains,
         structures={its["type"]: its["status"] for its in headline["structures"]},
         orders={
@@ -309,11 +309,13 @@ def scored(
     )
 
 
-def _own(record: Record, truth: Truth, name: str, loss_hz: NDArray[np.float64]) -> list[Told]:
-    """Fit the true structure, and nothing else."""
+def _own(
+    record: Record, truth: Truth, name: str, loss_hz: NDArray[np.float64]
+) -> list[ReportedNumber]:
+    """Return the numbers of a fit with the true structure."""
     (fit,) = fit_record(Measurement.from_record(record), [STRUCTURES[name]]).fits
     entries = [
-        Told(key, truth.parameters[key], fit.parameters[key], ends)
+        ReportedNumber(key, truth.parameters[key], fit.parameters[key], ends)
         for key, ends in fit.interval.items()
         if key in truth.parameters
     ]
@@ -337,28 +339,28 @@ def _own(record: Record, truth: Truth, name: str, loss_hz: NDArray[np.float64]) 
     return [
         *entries,
         *(
-            Told("loss factor", *map(float, (at, value)), (float(least), float(most)))
+            ReportedNumber("loss factor", *map(float, (at, value)), (float(least), float(most)))
             for at, value, least, most in zip(true, total.value, low, high, strict=True)
         ),
     ]
 
 
-def _symmetric(name: str, truth: float, value: float, std: float) -> Told:
+def _symmetric(name: str, truth: float, value: float, std: float) -> ReportedNumber:
     half = _NORMAL_95 * std
-    return Told(name, truth, value, (value - half, value + half))
+    return ReportedNumber(name, truth, value, (value - half, value + half))
 
 
 def run(
     tasks: list[tuple[str, int]], processes: int, until_s: float
 ) -> Iterator[tuple[tuple[str, int], Scored | BaseException]]:
-    """Judge one after the other, on several cores, as long as there is time."""
+    """Yield each task with its score or error, from several processes, until the time is over."""
     if processes == 1:
         for task in tasks:
             if time.monotonic() > until_s:
                 return
             try:
-                yield task, judged(*task)
-            except Exception as error:  # a record that cannot be judged is told, not fatal
+                yield task, evaluate(*task)
+            except Exception as error:  # reported; the next record is evaluated
                 yield task, error
         return
     waiting = iter(tasks)
@@ -368,7 +370,7 @@ def run(
             for task in itertools.islice(waiting, processes + 1 - len(running)):
                 if time.monotonic() > until_s:
                     break
-                running[pool.submit(judged, *task)] = task
+                running[pool.submit(evaluate, *task)] = task
             if not running:
                 return
             done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -376,13 +378,13 @@ def run(
                 yield running.pop(future), future.exception() or future.result()
 
 
-def asked_for(texts: list[str]) -> list[str]:
-    """Find cells by their names, or by parts of them.
+def matching_cells(texts: list[str]) -> list[str]:
+    """Return the cells whose names equal or contain one of the texts.
 
     Parameters
     ----------
     texts : list of str
-        One that is a cell's name means that cell alone.
+        A text that is the name of a cell selects only that cell.
     """
     return [
         name
@@ -392,7 +394,7 @@ def asked_for(texts: list[str]) -> list[str]:
 
 
 def by_kind(by_cell: dict[str, list[Scored]]) -> dict[str, list[Scored]]:
-    """Put cells together that have the same the matter, or the same noise if nothing is.
+    """Group cells by their kind of deviation, those without one by their noise.
 
     Parameters
     ----------
@@ -408,24 +410,26 @@ def by_kind(by_cell: dict[str, list[Scored]]) -> dict[str, list[Scored]]:
 
 
 def main() -> None:
-    """Judge the cells asked for, and print what came of it."""
+    """Evaluate the requested cells, print the scores and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--cells", nargs="+", help="those whose name is or holds a text; '' means all"
+        "--cells", nargs="+", help="those whose name equals or contains a text; '' means all"
     )
     parser.add_argument("--count", type=int, default=1, help="records of each cell")
     parser.add_argument("--first", type=int, default=1000, help="seed of the first")
-    parser.add_argument("--file", type=Path, help="one line a record; goes on where it ends")
+    parser.add_argument("--file", type=Path, help="one line per record; resumes where it ends")
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after these")
     parser.add_argument("--processes", type=int, default=1, help="cores")
-    parser.add_argument("--print", action="store_true", help="judge none, count those in the file")
+    parser.add_argument(
+        "--print", action="store_true", help="evaluate none, count those in the file"
+    )
     parser.add_argument("--table", action="store_true", help="also a table of kinds of cells")
     parser.add_argument("--rig", action="store_true", help="sessions of the shipped rig instead")
     gate = Gate(ROWS, parser)
     given = gate.given
     names = [_RIG] if given.rig else list(CELLS)[::DEFAULT_STEP]
     if given.cells:
-        names = asked_for(given.cells)
+        names = matching_cells(given.cells)
     lost = 0
     done: list[Scored] = []
     if given.file and given.file.exists():
@@ -452,12 +456,12 @@ def main() -> None:
     if given.table:
         print("\n" + table(by_kind(by_cell)))
     missed = complaints(by_cell)
-    print(f"\nMissed of what is asked for: {len(missed) or 'nothing'}")
+    print(f"\nRequirements not met: {len(missed) or 'none'}")
     for line in missed:
         print(f"    {line}")
     sessions = [each for of_cell in by_cell.values() for each in of_cell]
     known = [
-        its.holds for each in sessions for its in each.told
+        its.holds for each in sessions for its in each.numbers
         if its.flag is None and its.interval is not None
     ]  # fmt: skip
     print()

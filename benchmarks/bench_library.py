@@ -1,7 +1,6 @@
-"""Library of a thousand sessions: time to rebuild its index, to update it, and to list it warm.
+"""Library of a thousand sessions: time to rebuild and update its index, and to list it again.
 
-Files are as long as the paper's session, twenty of them under fifty names each; every one has a
-quick look.
+There are twenty files as long as the paper's session, each under fifty names and with a quick look.
 """
 
 import argparse
@@ -24,7 +23,7 @@ DISTINCT = 20
 TICKS = 136_000
 RIGD = Path(sys.executable).parent / "rigd"
 ROWS = (
-    # What must hold for the operator on an idle computer.
+    # Required by the operator on an idle computer.
     Row("rigd list, warm", most=1.0, unit="s of processor"),
     Row("index rebuilt", most=60.0, unit="s of processor"),
     # Measured 0.08 to 0.11.
@@ -41,7 +40,7 @@ def write(path: Path, number: int) -> None:
 
 
 def fill(folder: Path) -> None:
-    """Make the folder of sessions."""
+    """Write the sessions into a folder."""
     modes = [
         {key: {"value": 1.0 + mode, "std": 0.01, "interval_95": [0.9, 1.1]} for key in
          ("frequency_hz", "damping_ratio")} for mode in range(3)
@@ -56,12 +55,12 @@ def fill(folder: Path) -> None:
 
 
 def main() -> None:
-    """Measure, print and judge."""
+    """Measure and print the times, and check the limits."""
     gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         fill(folder)
-        anew_s = cpu_s(lambda: list_sessions(folder))
+        rebuild_s = cpu_s(lambda: list_sessions(folder))
         warm_s = cpu_s(lambda: list_sessions(folder))
         write(folder / "one-more.mcap", SESSIONS)
         one_more_s = cpu_s(lambda: list_sessions(folder))
@@ -75,8 +74,8 @@ def main() -> None:
         same = list_sessions(folder) == grown and len(grown) == SESSIONS + 1
     print(f"library of {SESSIONS} sessions, {TICKS} samples each; warm {warm_s:.3f} s")
     gate.measured("rigd list, warm", command_s)
-    gate.measured("index rebuilt", anew_s)
-    gate.measured("index with one more session", one_more_s / anew_s)
+    gate.measured("index rebuilt", rebuild_s)
+    gate.measured("index with one more session", one_more_s / rebuild_s)
     gate.measured("rebuilt index equal to the updated one", same)
     gate.finish()
 

@@ -1,10 +1,10 @@
-"""What the live view costs: processor time of its processes, and how late the loop wakes up.
+"""Cost of the live view: processor time of its processes, and wake-up latency of the loop.
 
     python benchmarks/bench_live.py [SECONDS] [ROUNDS]
 
-In each round, in turn, a chirp at 1 kHz with recorder is run without and with a live view, which
-has all its views. No viewer is connected: what it draws is its own affair. The ratio is the median
-over the rounds. With 12 s and 3 rounds it takes two minutes.
+Each round runs a chirp at 1 kHz with recorder without and with the complete live view, in turn. No
+viewer is connected, so its drawing is not measured. The ratio is the median over the rounds. With
+12 s and 3 rounds it takes two minutes.
 """
 
 import argparse
@@ -40,20 +40,20 @@ ROWS = (
 
 @dataclass
 class Meter:
-    """Processor time of a process, all its threads, over what was seen of a record."""
+    """Processor time of all threads of a process between its first and last reading."""
 
     pid: int
     first: tuple[float, float] | None = None
     last: tuple[float, float] | None = None
 
-    def look(self) -> None:
+    def take_reading(self) -> None:
         """Take a reading."""
         self.last = time.monotonic(), cpu_s(self.pid)
         self.first = self.first or self.last
 
     @property
     def percent(self) -> float:
-        """Share of one core."""
+        """Percentage of one core."""
         assert self.first is not None
         assert self.last is not None
         (begin_s, before_s), (end_s, after_s) = self.first, self.last
@@ -61,7 +61,7 @@ class Meter:
 
 
 def cpu_s(pid: int) -> float:
-    """Return what all threads of a process have computed, as the scheduler counts it."""
+    """Return the processor time of all threads of a process, as the scheduler counts it."""
     total_ns = 0
     for task in Path(f"/proc/{pid}/task").iterdir():
         total_ns += int((task / "schedstat").read_text().split()[0])
@@ -75,7 +75,7 @@ def resident_mb(pid: int) -> float:
 
 
 def child_of(pid: int) -> int:
-    """Return the one process that a process has started."""
+    """Return the only child of a process."""
     (child,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     return int(child)
 
@@ -86,7 +86,7 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
     Returns
     -------
     tuple
-        What the loop did; a text on the live view; processor time of the publisher, %.
+        Measurement of the loop; a text on the live view; processor time of the publisher, %.
     """
     profile = loops.simulated_profile(load_profile("sim"), RATE_HZ, 0.0)
     options = {"amplitude_rad": 0.005, "start_hz": 0.5, "stop_hz": 50.0, "duration_s": seconds}
@@ -106,7 +106,7 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
         def watch(progress: object, _: object) -> None:
             if progress.phase == Phase.RUNNING:
                 for meter in meters:
-                    meter.look()
+                    meter.take_reading()
 
         result = rig.run(order, stop, watch)
         if live:
@@ -132,7 +132,7 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
 
 
 def main() -> None:
-    """Print every round, then the medians, and judge them."""
+    """Print every round, then the medians, and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("seconds", type=float, nargs="?", default=12.0)
     parser.add_argument("rounds", type=int, nargs="?", default=3)

@@ -1,13 +1,14 @@
-"""How late the control loop wakes up, against cyclictest in turn with it.
+"""Wake-up latency of the control loop, against cyclictest in turn with it.
 
     python benchmarks/bench_loop.py [SECONDS] [ROUNDS]
 
-In each round, some seconds each at 1 kHz, same core and policy: cyclictest (package rt-tests), the
-loop alone, the loop with the last 100 µs of each wait busy-polled, and a whole session with
-recorder, live view and a stranger that computes on the other cores. Ratios are medians over the
-rounds. Then the highest rate that holds 99.9 % of its ticks, with the recorder: of all, and of
-those that did not pass while the computer stood still for 2 ms or more, as virtual machines do. The
-package rt-tests must be installed. With 6 s and 2 rounds it takes two minutes.
+Each round runs for some seconds each, at 1 kHz, on the same core and with the same policy:
+cyclictest (package rt-tests, which must be installed), the loop alone, the loop with the last
+100 µs of each wait busy-polled, and a whole session with recorder, live view and an unrelated
+program that computes on the other cores. Ratios are medians over the rounds. Then the program finds
+the highest rate, with the recorder, at which 99.9 % of the ticks are on time: of all ticks, and of
+those outside stalls of the computer of 2 ms or more, as virtual machines have. With 6 s and 2
+rounds it takes two minutes.
 """
 
 import argparse
@@ -50,7 +51,7 @@ def quiet() -> None:
 
 
 def one_round(seconds: float, granted: dict[str, str]) -> Round:
-    """Measure each once."""
+    """Measure each of them once."""
     profile = load_profile("sim")
     plain = loops.simulated_profile(profile, RATE_HZ, 0.0)
     spinning = loops.simulated_profile(profile, RATE_HZ, SPIN_US)
@@ -67,9 +68,9 @@ def one_round(seconds: float, granted: dict[str, str]) -> Round:
 
 
 def highest_rate(seconds: float) -> float:
-    """Print what becomes of higher and higher rates; return the highest held but for stalls.
+    """Print the results of increasing rates; return the highest one held outside stalls.
 
-    The best of some tries counts.
+    The best of several tries counts.
     """
     profile = load_profile("sim")
     rate_hz = RATE_HZ
@@ -87,8 +88,8 @@ def highest_rate(seconds: float) -> float:
             f"CPU {best.cpu_percent:.1f} %",
             flush=True,
         )
-        for what, share in (("all ticks", held), ("but for stalls", between)):
-            if share >= HELD_FRACTION:
+        for what, fraction in (("all ticks", held), ("but for stalls", between)):
+            if fraction >= HELD_FRACTION:
                 highest_hz[what] = rate_hz
         rate_hz *= 2.0
     print(f"highest rate that holds {100 * HELD_FRACTION:g} %: {highest_hz}")
@@ -96,7 +97,7 @@ def highest_rate(seconds: float) -> float:
 
 
 def main() -> None:
-    """Print every round, then the ratios, and judge them."""
+    """Print every round, then the ratios, and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("seconds", type=float, nargs="?", default=6.0)
     parser.add_argument("rounds", type=int, nargs="?", default=2)

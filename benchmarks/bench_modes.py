@@ -1,18 +1,18 @@
-"""Narrow sweeps around the modes against the chirp: deviations for the same time of 136 s.
+"""Narrow sweeps around the modes against the chirp: standard deviations after 136 s of each.
 
 The peer is the paper's chirp (0.025 rad, 0.05-50 Hz in 120 s, 1 s of rest before and 15 s of
-ring-down after). It is fitted first, as an operator would; its modes (those of the first session's
-fit) go into the JSON document that the narrow sweeps are made from. Of both, sessions with
-different noise are fitted by the whole-record estimator, all of rho/EI, EI, delay and tool inertia
-free. Printed are, parameter by parameter, the formal standard deviations (medians over the
-sessions), their ratio, and the ratio of the scatter over the sessions.
+ring-down after). It is fitted first, as an operator would; the modes of its first session's fit go
+into the JSON document from which the narrow sweeps are made. For both, sessions with different
+noise are fitted by the whole-record estimator with rho/EI, EI, delay and tool inertia free. The
+program prints for each parameter the formal standard deviations (medians over the sessions), their
+ratio, and the ratio of the scatter over the sessions.
 
 Without ``--engine`` the sessions are made in the frequency domain: the reference through the loop
 1/(1 + s/80)^2, exact torque, encoder steps of 7e-5 rad, torque noise of 1e-2 N·m and steps of
 1.25e-4 N·m. With ``--engine`` they are runs of ``rigd run --fast`` on the profile ``sim``.
-``--amplitude`` is that of the narrow sweeps, which keep the slope of the tip within
-``--tip-slope``; ``--chirp-amplitude`` is the chirp's. The paper's chirp slopes by 0.6 rad, one of
-0.0058 rad by 0.14 rad.
+``--amplitude`` is that of the narrow sweeps, in which the slope of the tip stays within
+``--tip-slope``; ``--chirp-amplitude`` is that of the chirp. In the paper's chirp the slope reaches
+0.6 rad, in one of 0.0058 rad 0.14 rad.
 """
 
 import argparse
@@ -58,7 +58,7 @@ ROWS = tuple(
 
 
 def response(plant: Plant, reference_rad: NDArray[np.float64]) -> Session:
-    """Exact response to a reference, from rest."""
+    """Return the exact response to a reference, from rest."""
     n = reference_rad.size
     padded = 4 * n
     decay = np.exp(-5.0 * np.arange(n) / n)
@@ -70,7 +70,7 @@ def response(plant: Plant, reference_rad: NDArray[np.float64]) -> Session:
 
 
 def write_modes(fit: RecordFit, path: Path) -> None:
-    """Write what the narrow sweeps need of a fit, by the keys of `analyze --json`."""
+    """Write the modes of a fit as a document with the keys of `analyze --json`."""
     found = [
         {
             "frequency_hz": mode.frequency_hz,
@@ -83,12 +83,12 @@ def write_modes(fit: RecordFit, path: Path) -> None:
 
 
 def fitted(measurements: list[Measurement], name: str) -> list[RecordFit]:
-    """Fit one structure to each."""
+    """Fit one structure to each measurement."""
     return [fit_record(m, [STRUCTURES[name]]).fits[0] for m in measurements]
 
 
 def recorded(kind: list[str], profile: Path, count: int, folder: Path) -> list[Measurement]:
-    """Run sessions in the engine and read them."""
+    """Run sessions in the engine and load them."""
     from analysis.record import load_record
 
     measurements = []
@@ -115,10 +115,10 @@ def recorded(kind: list[str], profile: Path, count: int, folder: Path) -> list[M
 def compare(
     name: str, truth: Plant, peer: list[RecordFit], narrow: list[RecordFit]
 ) -> tuple[float, float]:
-    """Print the deviations of both and their ratios.
+    """Print the standard deviations of both and their ratios.
 
-    Return the standard deviation of the damping over the chirp's, and the largest mean error of
-    the damping over what chance allows.
+    Return the standard deviation of the damping over that of the chirp, and the largest mean error
+    of the damping over its limit.
     """
     count = len(peer)
     print(f"\nType {name}, {count} sessions of each kind")
@@ -147,13 +147,13 @@ def compare(
 
 
 def profile_of(name: str) -> Profile:
-    """Take the simulated rig with the damping of a plant."""
+    """Return the profile of the simulated rig with the damping of a plant."""
     profile = load_profile("sim")
     return replace(profile, rig=replace(profile.rig, damping=PLANTS[name]))
 
 
 def main() -> None:
-    """Compare for the plants and amplitudes asked for."""
+    """Compare for the requested plants and amplitudes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=6, help="of each kind")
     parser.add_argument("--plant", choices=PLANTS, action="append", help="only this one")

@@ -1,14 +1,14 @@
-"""What moves with an identified model leave, against what their plan states.
+"""Residual vibration of moves with an identified model, against the value stated by their plan.
 
 Rigs with a tip mass, an elastic clamp, more or less friction than the controller compensates, and a
 sensor without noise are each identified from one chirp of 20 s (``--identify``). Moves are run with
-the model; a quintic of the same time is run with them. The torque of the modes left is measured as
-in ``bench_moves.py``, with the noise of the sensor and without.
+the model, and quintics of the same duration for comparison. The residual torque of the modes is
+measured as in ``bench_moves.py``, with sensor noise and without.
 
-Printed per move: the vibration in the record, the same with a sensor without noise, the same of the
-quintic, and its ratio; what the plan states and the floor below which it says that nothing is
-seen; whether the record is within a factor of 3 of what is stated, or below the floor; time in
-which the angle arrives, planned and in the record.
+Printed per move: the residual vibration in the record, that with a sensor without noise, that of
+the quintic, and their ratio; the value stated by the plan and the noise floor below which it states
+none; whether the record is within a factor of 3 of the stated value, or below the floor; the time
+of arrival of the angle, planned and in the record.
 """
 
 import argparse
@@ -50,14 +50,14 @@ RIGS: dict[str, dict[str, float]] = {
 DEFAULT_RIGS = ("uniform", "friction 0.1", "filter 100 Hz")
 _REACHED = 3.0
 ROWS = (
-    # Measured 0.63 and 5.6 % with a friction beyond what is compensated: docs/validation/moves.md.
+    # Measured 0.63 and 5.6 % with more friction than is compensated: docs/validation/moves.md.
     Row("vibration left, friction compensated", most=2, unit="% of a quintic's"),
     Row("vibration left, any friction", most=9, unit="% of a quintic's"),
     Row("moves that leave what they state, or nothing that shows", least=90, unit="%"),
     Row("rigs refused without a reason", most=0),
 )
 REFUSED = ("filter 100 Hz", "air")
-"""Rigs of which a plan from the model must be refused, or state more than another leaves."""
+"""Rigs for which a plan from the model must be refused, or state more residual vibration."""
 
 
 def run(profile: Path, *arguments: str) -> Path:
@@ -98,7 +98,7 @@ def main() -> None:
 
 
 def one_rig(name: str, folder: Path, identify_s: float) -> list[tuple[float, bool]]:
-    """Identify a rig, and move it with the model; return what `one_model` does."""
+    """Identify a rig, move it with the model, and return the result of `one_model`."""
     profiles = []
     for kind, other in (("noisy", {}), ("silent", SILENT)):
         (folder / kind).mkdir()
@@ -116,7 +116,7 @@ def one_rig(name: str, folder: Path, identify_s: float) -> list[tuple[float, boo
 def one_model(name: str, profiles: list[Path], model: Path) -> list[tuple[float, bool]]:
     """Move a rig with one model.
 
-    Return for each move what it leaves over what a quintic does, and whether that is as stated.
+    Return for each move its residual vibration over that of a quintic, and whether it is as stated.
     """
     moves: list[tuple[float, bool]] = []
     noisy, silent = (load_profile(path) for path in profiles)

@@ -1,19 +1,19 @@
-"""What moves leave: shortest moves through the real engine, beside quintics of the same time.
+"""Residual vibration: shortest moves through the real engine, and quintics of the same duration.
 
 For each of N rigs (``--rigs``, 1), whose stiffness, density and damping lie within 10 % of the
 profile's, one short session (``--identify`` s of chirp) is run and analysed, and moves of 0.1, 0.5
-and 1.2 rad are planned with the beam that was found, of both kinds. Friction, noise of the sensor
-and steps of the encoder are those of the profile ``sim``. A quintic of the same time is run beside
-each. The torque of the modes left is the root sum of squares of the amplitudes of the first three
-modes, fitted with the rig's own poles to 4 s of the ring-down, beside decaying exponentials for
-what the fractional damping remembers, which is no vibration.
+and 1.2 rad of both kinds are planned with the identified beam. Friction, sensor noise and encoder
+steps are those of the profile ``sim``. A quintic of the same duration is run for each. The residual
+torque is the root sum of squares of the amplitudes of the first three modes, fitted with the true
+poles to 4 s of the ring-down, together with decaying exponentials for the memory of fractional
+damping, which is no vibration.
 
-The noise of the sensor alone makes one read an amplitude: what a motor that only holds shows is
-measured first, and each move is run once more without that noise.
+The sensor noise alone gives an amplitude: it is first measured with the motor holding, and each
+move is also run without noise.
 
-Printed per move: time, in ms and in periods of mode 1; the torque left with the sensor's noise and
-without, and that of the quintic without it, in mN·m; the ratio of the last two; the peak torque
-over the motor's; the processor time of planning.
+Printed per move: duration, in ms and in periods of mode 1; the residual torque with sensor noise
+and without, and that of the quintic without, in mN·m; the ratio of the last two; the peak torque
+over that of the motor; the processor time of planning.
 """
 
 import argparse
@@ -40,7 +40,7 @@ from rigd.testing import write_profile
 Real = NDArray[np.float64]
 ANGLES_RAD = (0.1, 0.5, 1.2)
 WIDE = {"limits.tip_slope_rad": 1.5}
-"""Moves from half a radian on bend the beam by more than a linear model is exact for."""
+"""Moves of half a radian or more bend the beam beyond the range of a linear model."""
 ROWS = (
     # Measured 0.7 and 1.2 %, 90 % and less than a second: docs/validation/moves.md.
     Row("vibration left, shortest", most=2, unit="% of a quintic's"),
@@ -54,9 +54,9 @@ _FADING_PER_S = np.append(0.0, np.geomspace(0.25, 32.0, 8))
 
 
 def rig(folder: Path, number: int) -> tuple[Path, Path]:
-    """Write the profile of a rig whose beam is not the profile's (the first one's is).
+    """Write profiles of a rig whose beam differs from the shipped profile, except for the first.
 
-    Returns it with the noise of the sensor, and without.
+    Return the paths of the profile with sensor noise, and without.
     """
     nominal = load_profile("sim").rig
     off = np.random.default_rng(number).uniform(0.9, 1.1, 4) if number else np.ones(4)
@@ -88,7 +88,7 @@ def run(profile: Path, *arguments: str) -> Path:
 
 
 def own_poles(profile: Profile) -> NDArray[np.complex128]:
-    """Poles of the first modes of the beam that is simulated."""
+    """Return the poles of the first modes of the simulated beam."""
     rig = profile.rig
     assert rig.simulation is not None
     own = Plant(
@@ -101,7 +101,7 @@ def own_poles(profile: Profile) -> NDArray[np.complex128]:
 
 
 def left_nm(session: Path, profile: Profile) -> tuple[float, float]:
-    """Torque of the modes left after the sweep, and the peak of the motor's torque."""
+    """Return the residual torque of the modes after the sweep, and the peak torque of the motor."""
     found = read_session(session)
     end = found.segments["sweep"][1]
     rate_hz = profile.rig.rate_hz
@@ -114,7 +114,7 @@ def left_nm(session: Path, profile: Profile) -> tuple[float, float]:
     columns = np.column_stack([waves.real, waves.imag, slow])
     fitted = np.linalg.lstsq(columns, torque[first:last], rcond=None)[0]
     amplitude = np.hypot(fitted[:_MODES], fitted[_MODES : 2 * _MODES])
-    # Back to the end of the move.
+    # Amplitudes at the end of the move.
     amplitude *= np.exp(-ringing.real * _FITTED_S[0])
     peak = float(np.abs(found.samples["torque_command_nm"]).max())
     return float(np.sqrt((amplitude**2).sum())), peak
@@ -128,7 +128,7 @@ def main() -> None:
     gate = Gate(ROWS, parser)
     options = gate.given
     os.environ["RIGD_NO_LOOK"] = "1"
-    import scipy.optimize  # noqa: F401 - the time of planning is without it
+    import scipy.optimize  # noqa: F401 - not part of the time of planning
 
     print("rig    angle  kind        time  periods  noisy  silent  quintic    ratio  peak  plan")
     with tempfile.TemporaryDirectory() as name:
@@ -151,8 +151,8 @@ def one_rig(
 ) -> Iterator[tuple[str, float, float, float]]:
     """Identify a rig and move it.
 
-    Yield the kind of each move, what it leaves over what a quintic does, its peak torque over the
-    motor's, and the processor time of planning.
+    Yield the kind of each move, its residual vibration over that of a quintic, its peak torque over
+    that of the motor, and the processor time of planning.
     """
     profile = load_profile(path)
     held = [

@@ -1,14 +1,14 @@
-"""What the Net F/T box costs the control loop: lateness, work of a tick, and processor time.
+"""Cost of the Net F/T box for the control loop: lateness, work per tick, and processor time.
 
     python benchmarks/bench_netft_loop.py [SECONDS] [ROUNDS]
 
-A simulated box streams 7000 records a second from a process of its own, on the cores that are not
-the loop's. In each round, in changing order, four whole real-time sessions of the simulated rig:
-its own sensor alone; the same while the box streams to a socket that nobody reads, which is what
-the box itself disturbs; the driver of the box as the sensor; and the driver with the box that is
-simulated in its process. Ratios are of each round, and their median counts, because a computer
-with two cores and other users is never quiet. With 5 s and 4 rounds it takes two minutes;
-published figures are of 10 s and 20 rounds.
+A simulated box streams 7000 records a second from a separate process, on cores that the loop does
+not use. Each round runs four whole real-time sessions of the simulated rig, in changing order: with
+its own sensor; the same while the box streams to a socket that nobody reads, to measure the
+disturbance by the box itself; with the driver of the box as the sensor; and with the driver and the
+box that it simulates in its process. Ratios are taken within a round, and their median counts,
+because other programs disturb single rounds. With 5 s and 4 rounds it takes two minutes; published
+figures are of 10 s and 20 rounds.
 """
 
 import argparse
@@ -56,8 +56,7 @@ box = UdpBox(SimulatedBox(lambda: tuple(random.gauss(0.0, 0.005) for _ in range(
 print(box.port, flush=True)
 box.stream(lambda: False, 1 / 7000)
 """
-"""Program of the box: by its priority it streams as evenly as one that is no part of this
-computer."""
+"""Program of the box, with a priority that makes it stream as evenly as a separate device."""
 PACKAGE = """
 from dataclasses import replace
 from rigd_netft.kind import NETFT
@@ -69,11 +68,11 @@ def open_sensor(rig, opened):
 
 DEVICE = replace(NETFT, name="distant_netft", open_sensor=open_sensor, contradictions=None)
 """
-"""Package with the driver of a box in another process, although the drive is simulated."""
+"""Package with the driver of a box in another process, to be used with the simulated drive."""
 
 
 def install(folder: Path) -> None:
-    """Add the package to this process and its children."""
+    """Install the package for this process and its children."""
     metadata = folder / "distant_netft-1.dist-info"
     metadata.mkdir()
     (folder / "distant_netft.py").write_text(PACKAGE)
@@ -127,7 +126,7 @@ def measure(name: str, seconds: float, cores: set[int]) -> LoopMeasurement:
 
 
 def main() -> None:
-    """Print every round, then what the box adds, and judge it."""
+    """Print every round, then the cost of the box, and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("seconds", type=float, nargs="?", default=5.0)
     parser.add_argument("rounds", type=int, nargs="?", default=4)

@@ -1,12 +1,12 @@
-"""The oddities of the paper's results, reproduced: its route on beams whose parameters are known.
+"""Reproduction of oddities in the paper's results: its method on beams with known parameters.
 
-Prints the tables of ``docs/validation/paper_method.md``, part by part (``--part``); with
-``--figures DIR`` it also draws the page's figures there. 20 sessions of each of two beams, of which
-the tables are, take some five minutes; without ``--sessions`` there are 3.
+The program prints the tables of ``docs/validation/paper_method.md``, part by part (``--part``);
+with ``--figures DIR`` it also draws the figures of that page there. The tables are of 20 sessions
+of each of two beams, which take some five minutes; without ``--sessions`` there are 3.
 
-The beams are the paper's link with internal damping of order 1; on the second one the modes'
-stiffness is off by +0.6, +0.5 and -1.3 %, as a link's may be that is not quite uniform. The
-sessions are those of ``exact_sessions.py``.
+The beams are the paper's link with internal damping of order 1. In the second one the stiffness of
+the modes is off by +0.6, +0.5 and -1.3 %, as in a link that is not quite uniform. The sessions are
+those of ``exact_sessions.py``.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from rigd.spectral import FrequencyResponse, Segmentation, segment_count
 
 DAMPING = Damping(zeta=7.1e-5, alpha=1.0, gamma=5.5e-2, lambda_=0.594)
 NOT_UNIFORM = Plant(
-    # Mode 1 by the beam's own stiffness, the others relative to it.
+    # Mode 1 has the stiffness of the beam, the others are relative to it.
     Beam(0.98, 4.7e-3, 0.090275 * 1.006),
     DAMPING,
     stiffness_offsets=(1.005 / 1.006 - 1, 0.987 / 1.006 - 1),
@@ -48,7 +48,7 @@ ROWS = (
 )
 TYPES = ("I", "II", "III", "IV", "V", "VI")
 EXTERNAL = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
-"""External damping of the beams whose first peak is looked at, in parts of that of `DAMPING`."""
+"""External damping of the beams of `first_peaks`, relative to that of `DAMPING`."""
 
 PAPER_TABLE3 = Path(__file__).parents[1] / "analysis" / "report" / "data" / "paper_table3.csv"
 
@@ -78,7 +78,7 @@ class PaperRoute:
 
 
 def paper_means() -> dict[tuple[str, str, str], float]:
-    """Means of the paper's Table 3 by type, weighting and parameter."""
+    """Return the means of the paper's Table 3 by type, weighting and parameter."""
     with PAPER_TABLE3.open() as file:
         return {
             (row["type"], row["weighting"], row["parameter"]): float(row["mean"])
@@ -87,7 +87,7 @@ def paper_means() -> dict[tuple[str, str, str], float]:
 
 
 def table3(count: int, gate: Gate) -> dict[str, PaperRoute]:
-    """Print the paper's Table 3 beside the same route on both beams."""
+    """Print the paper's Table 3 and the results of its method on both beams."""
     routes = {name: PaperRoute.of(session(plant), count) for name, plant in PLANTS.items()}
     print(f"\nTable 3 of the paper, and its route here: mean ± std of {count} sessions")
     print(f"{'type, weights, parameter':28}{'paper':>10}" + "".join(f"{n:>24}" for n in routes))
@@ -113,7 +113,7 @@ def table3(count: int, gate: Gate) -> dict[str, PaperRoute]:
 
 
 def record_method(count: int, gate: Gate) -> list[Selection]:
-    """Print what the whole-record method says of the beam that is not uniform."""
+    """Print the results of the whole-record method for the beam that is not uniform."""
     made = session(NOT_UNIFORM)
     found = [select(made.noisy(seed).measurement()) for seed in range(count)]
     print(f"\nWhole record, not uniform, {count} sessions")
@@ -124,13 +124,13 @@ def record_method(count: int, gate: Gate) -> list[Selection]:
         print(f"  {order}: {dict(Counter(getattr(e.verdict, order).status for e in found))}")
     worst = np.nan
     print(f"  {'mode':26}{'truth':>10}  mean ± std of the sessions; typical std stated; flags")
-    for place, pole in enumerate(NOT_UNIFORM.mode_poles(3, ())):
+    for index, pole in enumerate(NOT_UNIFORM.mode_poles(3, ())):
         at = pole.at_rad_s
         for name, unit, truth, size in (
             ("frequency_hz", "Hz", at.imag / (2 * np.pi), 1.0),
             ("damping_ratio", "%", -100 * at.real / abs(at), 100.0),
         ):
-            numbers = [getattr(each.headline.modes[place], name) for each in found]
+            numbers = [getattr(each.headline.modes[index], name) for each in found]
             values = size * np.array([each.value for each in numbers])
             stated = size * np.median([each.std for each in numbers])
             flags = sum(each.flag is not None for each in numbers)
@@ -149,13 +149,13 @@ def record_method(count: int, gate: Gate) -> list[Selection]:
 
 
 def _type_vi(found: list[Selection]) -> list[RecordFit]:
-    """Fits of type VI to each session, whether a uniform beam is refused or not."""
+    """Return the fit of type VI to each session, also where a uniform beam is refused."""
     return [next(c.fit for c in each.candidates if c.structure.name == "VI") for each in found]
 
 
 @dataclass(frozen=True, slots=True)
 class FirstPeak:
-    """First resonance of one beam: what it is, and what the methods make of it."""
+    """First resonance of one beam: true values, and the results of the methods."""
 
     plant: Plant
     true_peak: tuple[float, float]
@@ -169,7 +169,7 @@ class FirstPeak:
 def peak_of(
     frequency_hz: NDArray[np.float64], response: NDArray[np.complex128]
 ) -> tuple[float, float]:
-    """Height of a peak in dB re 1 N·m/rad, and its width in Hz between the half-power points."""
+    """Return the height of a peak in dB re 1 N·m/rad, and its half-power width in Hz."""
     size = np.abs(response)
     top = int(np.argmax(size))
     level = size[top] / np.sqrt(2)
@@ -183,13 +183,13 @@ def peak_of(
 
 
 def first_peaks(gate: Gate) -> list[FirstPeak]:
-    """Print the first peak of beams of different external damping."""
+    """Print the first peak of beams with different external damping."""
     fine_hz = np.linspace(2.0, 3.2, 240_001)
     found = []
     print("\nFirst peak: dB and half-power width, true and of Welch's estimate (no noise); damping")
     print("ratio in %: true, type VI by the paper's route (const, omega), whole record")
-    for share in EXTERNAL:
-        damping = Damping(DAMPING.zeta, 1.0, DAMPING.gamma * share, DAMPING.lambda_)
+    for factor in EXTERNAL:
+        damping = Damping(DAMPING.zeta, 1.0, DAMPING.gamma * factor, DAMPING.lambda_)
         plant = Plant(LINK, damping)
         made = session(plant)
         h1, noisy = made.h1().band(2.0, 3.2), made.noisy(0)
@@ -229,7 +229,7 @@ def first_peaks(gate: Gate) -> list[FirstPeak]:
 
 
 def segment_trap(gate: Gate) -> dict[int, FrequencyResponse]:
-    """Print what one sample of overlap less does to the estimate and to type VI."""
+    """Print the effect of one sample less overlap on the estimate and on type VI."""
     made = session(PLANTS["uniform"])
     noisy, estimates, costs = made.noisy(0), {}, []
     near_hz = np.linspace(44, 46, 4001)
@@ -252,7 +252,7 @@ def segment_trap(gate: Gate) -> dict[int, FrequencyResponse]:
 
 
 def main() -> None:
-    """Print the parts asked for, and draw them."""
+    """Print the requested parts, and draw them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=3, help="of each beam")
     parser.add_argument("--part", choices=("table3", "record", "first_peak", "segments"))

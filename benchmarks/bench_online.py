@@ -1,16 +1,14 @@
-"""Sessions that end themselves: what the online fit is worth when precision decides the end.
+"""Sessions that end themselves: accuracy of the online fit if its precision decides the end.
 
 The beams are known (`independent_records`): all seven structures, damping ratios of 0.1 to 3 %,
 bending stiffness and density each up to 20 % off what the session states, torque noise of 3 to
-20 mN·m. A session is a chirp of 5 s (0.5-50 Hz), then a narrow sweep of 2 s round one mode after
-the other, until the damping ratio of every mode that shows is known to what was asked (1 or 3 %
-standard deviation), or 16 sweeps are over.
+20 mN·m. A session is a chirp of 5 s (0.5-50 Hz), then narrow sweeps of 2 s around one mode after
+the other, until the damping ratio of every visible mode has the requested standard deviation (1 or
+3 %), or after 16 sweeps.
 
-Told are: whether the first fit finds the modes (each within 5 of its standard deviations, and no
-mode that the chirp made loud is missed); coverage of the 95 % intervals and mean error, in standard
-deviations, of those first fits, at the stop, and at a length fixed in advance; and how far the
-estimate of the standard deviation at the stop is off that at the true beam. ``--times`` tells how
-long an estimate takes.
+The program reports whether the first fit finds the modes (each within 5 of its standard deviations,
+and no strongly excited mode missed); and the coverage of the 95 % intervals and the mean error, in
+standard deviations, of the first fits, at the stop, and after a fixed number of sweeps.
 """
 
 import argparse
@@ -40,10 +38,10 @@ from rigd.session.layout import SAMPLE_DTYPE
 Real = NDArray[np.float64]
 
 FINE_HZ = 4 * RATE_HZ
-REST_S, CHIRP_S, DECAY_S, PIECE_S = 0.5, 5.0, 1.0, 2.0
+REST_S, CHIRP_S, DECAY_S, NARROW_SWEEP_S = 0.5, 5.0, 1.0, 2.0
 FIRST_HZ, LAST_HZ, AMPLITUDE_RAD = 0.5, 50.0, 0.025
-MOST_PIECES = 16
-FIXED_PIECES = 6
+MOST_SWEEPS = 16
+FIXED_SWEEPS = 6
 TARGETS = (0.01, 0.03)
 BAND_HZ = 48.0
 ROWS = (
@@ -64,7 +62,7 @@ def beam_of(generator: np.random.Generator, name: str, off: float) -> Truth:
     generator : Generator
     name : str
     off : float
-        Largest deviation of stiffness and density from what the session states, relatively.
+        Largest relative deviation of stiffness and density from those stated by the session.
     """
     structure = STRUCTURES[name]
     stiffness, density = (
@@ -92,7 +90,7 @@ def beam_of(generator: np.random.Generator, name: str, off: float) -> Truth:
 
 
 def eased(seconds: float, ramp_s: float) -> Real:
-    """Window that begins and ends with zero slope and curvature."""
+    """Return a window that begins and ends with zero slope and curvature."""
     t = np.arange(round(seconds * FINE_HZ)) / FINE_HZ
     u = np.clip(np.minimum(t, seconds - t) / ramp_s, 0, 1)
     window: Real = u**3 * (10 - 15 * u + 6 * u**2)
@@ -100,7 +98,7 @@ def eased(seconds: float, ramp_s: float) -> Real:
 
 
 def sweep(first_hz: float, last_hz: float, seconds: float, ramp_s: float) -> Real:
-    """Linear sweep at the fine rate; less at high frequency, as the motor's torque allows."""
+    """Return a linear sweep at the fine rate."""
     t = np.arange(round(seconds * FINE_HZ)) / FINE_HZ
     phase = 2 * np.pi * (first_hz * t + (last_hz - first_hz) * t**2 / (2 * seconds))
     return AMPLITUDE_RAD * eased(seconds, ramp_s) * np.sin(phase)
@@ -116,14 +114,14 @@ class Case:
     reference: Real
 
     def estimate(self, *, whole: bool = False) -> OnlineEstimate:
-        """Fit the session, with the ring of the last piece."""
+        """Fit the session and the free decay of its last segment."""
         rest = np.zeros(round(DECAY_S * FINE_HZ))
         made = driven(self.truth, np.concatenate([self.reference, rest]))
         return estimate_of(made, self.noise_nm, self.seed, whole=whole)
 
-    def add(self, piece: Real) -> None:
-        """Append a piece."""
-        self.reference = np.concatenate([self.reference, piece])
+    def add(self, segment: Real) -> None:
+        """Append a segment."""
+        self.reference = np.concatenate([self.reference, segment])
 
 
 def estimate_of(made: Exact, noise_nm: float, seed: int, *, whole: bool) -> OnlineEstimate:
@@ -147,13 +145,13 @@ def estimate_of(made: Exact, noise_nm: float, seed: int, *, whole: bool) -> Onli
 
 @dataclass
 class Errors:
-    """Errors of one kind of number, in its standard deviations."""
+    """Errors of one kind of number, in standard deviations."""
 
-    told: list[float]
+    values: list[float]
 
     def line(self) -> str:
-        """Coverage, mean and scatter."""
-        z = np.array(self.told)
+        """Return coverage, mean and scatter as a line."""
+        z = np.array(self.values)
         if not z.size:
             return "none"
         inside = np.abs(z) < 1.96
@@ -166,12 +164,12 @@ class Errors:
 
 
 def deviations(estimate: OnlineEstimate, truth: Truth) -> dict[str, list[float]]:
-    """Errors of an estimate's unflagged numbers in their standard deviations, by kind."""
+    """Return the errors of unflagged numbers in their standard deviations, by kind."""
     found: dict[str, list[float]] = defaultdict(list)
-    told = estimate.headline
-    if told is None:
+    headline = estimate.headline
+    if headline is None:
         return found
-    for mode in told.modes:
+    for mode in headline.modes:
         at = {
             "frequency": (mode.frequency_hz, truth.frequency_hz(mode.number)),
             "damping": (mode.damping_ratio, truth.damping_ratio(mode.number)),
@@ -180,7 +178,7 @@ def deviations(estimate: OnlineEstimate, truth: Truth) -> dict[str, list[float]]
             if mode.shown and quantity.flag is None and quantity.std:
                 found[kind].append((quantity.value - true) / quantity.std)
     for name, true in truth.parameters.items():
-        quantity = told.parameters.get(name)
+        quantity = headline.parameters.get(name)
         if quantity is None or quantity.flag or not quantity.std or not quantity.value or not true:
             continue
         if name in ("zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"):
@@ -193,30 +191,30 @@ def deviations(estimate: OnlineEstimate, truth: Truth) -> dict[str, list[float]]
 
 
 def precise(estimate: OnlineEstimate, target: float) -> bool:
-    """Whether the damping of every mode that shows is known to a relative standard deviation."""
-    told = estimate.headline
-    if told is None:
+    """Whether the damping of every visible mode reaches a relative standard deviation."""
+    headline = estimate.headline
+    if headline is None:
         return False
-    ratios = [mode.damping_ratio for mode in told.modes if mode.shown]
+    ratios = [mode.damping_ratio for mode in headline.modes if mode.shown]
     return all(r.flag is None and r.std is not None and r.std < target * r.value for r in ratios)
 
 
 def next_sweep(estimate: OnlineEstimate) -> Real:
-    """Sweep round the mode whose damping is known least."""
-    told = estimate.headline
-    if told is None:
+    """Return a sweep around the mode with the least precise damping."""
+    headline = estimate.headline
+    if headline is None:
         return sweep(FIRST_HZ, LAST_HZ, CHIRP_S, 0.05)
     mode = max(
-        (mode for mode in told.modes if mode.shown),
+        (mode for mode in headline.modes if mode.shown),
         key=lambda m: (m.damping_ratio.std or math.inf) / abs(m.damping_ratio.value),
     )
     hz = mode.frequency_hz.value
-    reach_hz = max(2 * mode.damping_ratio.value * hz, 0.5 / PIECE_S, 0.02 * hz)
-    return sweep(max(hz - reach_hz, 0.1), hz + reach_hz, PIECE_S, min(0.25, 1 / hz))
+    reach_hz = max(2 * mode.damping_ratio.value * hz, 0.5 / NARROW_SWEEP_S, 0.02 * hz)
+    return sweep(max(hz - reach_hz, 0.1), hz + reach_hz, NARROW_SWEEP_S, min(0.25, 1 / hz))
 
 
 def main() -> None:
-    """Run the sessions, and print."""
+    """Run the sessions, print the results and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=7)
     parser.add_argument("--seed", type=int, default=1)
@@ -224,14 +222,14 @@ def main() -> None:
     parser.add_argument("--scan-only", action="store_true", help="First fits only.")
     parser.add_argument("--whole", action="store_true", help="Try every structure at the stop.")
     gate = Gate(ROWS, parser)
-    asked = gate.given
-    generator = np.random.default_rng(asked.seed)
+    given = gate.given
+    generator = np.random.default_rng(given.seed)
     kinds: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     missed, lost, out_of_reach, ends_s = [], [], 0, defaultdict(list)
     began_s = time.monotonic()
-    for number in range(asked.sessions):
+    for number in range(given.sessions):
         name = list(STRUCTURES)[number % len(STRUCTURES)]
-        truth = beam_of(generator, name, asked.off)
+        truth = beam_of(generator, name, given.off)
         noise_nm = float(np.exp(generator.uniform(*np.log([3e-3, 20e-3]))))
         rest = np.zeros(round(REST_S * FINE_HZ))
         chirp = sweep(FIRST_HZ, LAST_HZ, CHIRP_S, 0.05)
@@ -254,28 +252,28 @@ def main() -> None:
             missed.append(f"{where}: {dict(errors)}")
         if not {1, 2} <= set(shown) or first.doubt:
             lost.append(f"{where}: shows {shown} {first.problem or first.doubt or ''}")
-        if asked.scan_only:
+        if given.scan_only:
             continue
         todo, estimate = set(TARGETS), first
-        for piece in range(1, MOST_PIECES + 1):
+        for count in range(1, MOST_SWEEPS + 1):
             case.add(next_sweep(estimate))
             estimate = case.estimate()
-            if piece == FIXED_PIECES:
+            if count == FIXED_SWEEPS:
                 for kind, values in deviations(estimate, truth).items():
-                    kinds[f"after {FIXED_PIECES} sweeps"][kind] += values
+                    kinds[f"after {FIXED_SWEEPS} sweeps"][kind] += values
             for target in sorted(todo):
                 if precise(estimate, target):
                     todo.remove(target)
                     stop = f"at the stop, {100 * target:g} %"
-                    ended = case.estimate(whole=True) if asked.whole else estimate
+                    ended = case.estimate(whole=True) if given.whole else estimate
                     for kind, values in deviations(ended, truth).items():
                         kinds[stop][kind] += values
                     ends_s[stop].append(estimate.duration_s)
-            if not todo and piece >= FIXED_PIECES:
+            if not todo and count >= FIXED_SWEEPS:
                 break
         out_of_reach += bool(todo)
         print(f"{where}: {estimate.duration_s:.1f} s, left {sorted(todo)}", flush=True)
-    print(f"\n{asked.sessions} sessions in {time.monotonic() - began_s:.0f} s")
+    print(f"\n{given.sessions} sessions in {time.monotonic() - began_s:.0f} s")
     print(f"First fits with a mode more than 5 standard deviations off: {len(missed)}")
     print(*(f"  {each}" for each in missed), sep="\n")
     print(f"First fits that do not show modes 1 and 2, or doubt everything: {len(lost)}")
@@ -288,7 +286,7 @@ def main() -> None:
     print()
     gate.measured("first fits with a mode beyond 5 standard deviations", len(missed))
     gate.measured("first fits that miss mode 1 or 2", len(lost))
-    if not asked.scan_only:
+    if not given.scan_only:
         errors = [
             abs(error)
             for when, by_kind in kinds.items()
@@ -298,8 +296,8 @@ def main() -> None:
         ]
         held = percent(sum(error < 1.96 for error in errors), len(errors))
         gate.measured("95 % intervals at the stop that hold the truth", held)
-        gate.measured("sessions that do not reach all", percent(out_of_reach, asked.sessions))
-    gate.finish(part=asked.scan_only)
+        gate.measured("sessions that do not reach all", percent(out_of_reach, given.sessions))
+    gate.finish(part=given.scan_only)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Modes of published measurements: what others found, and what independent fits find.
+"""Modes of published measurements: published values, and results of independent fits.
 
 ``bench_published_modes.py [--files FOLDER]``
 
 The impact test is part of the project (tests/data/impact_test). Two more data sets may not be
 redistributed here (one has no licence, the other is under the GPL); they are read from FOLDER if
-you put them there:
+they are there:
 
 * ``SBPA_lame.mat`` of github.com/opatiny/matlab-scripts, in heig-vd/regul/labos/lame-flexible/data:
   a flexible blade with an actuator, driven by a pseudo-random binary signal at 1 kHz. Its author's
@@ -50,7 +50,7 @@ AUTHORS_BLADE_MODEL = Resonance(116 / (2 * np.pi), 0.005)
 
 
 SLOWDOWN = 10
-"""The record of the impact test is at a tenth of the speed, since the analyzer reads 1 kHz."""
+"""Slowdown of the record of the impact test, since the analyzer reads 1 kHz."""
 
 
 def line(name: str, reference: Resonance, *found: Resonance) -> str:

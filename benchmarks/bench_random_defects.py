@@ -1,14 +1,14 @@
-"""Random defects as judged by the analyzer: what is wrong without a flag, and what is flagged.
+"""Results of the analyzer on random defects: wrong numbers without a flag, and flagged ones.
 
 ``bench_random_defects.py [--records N] [--first-seed S] [--jobs J]`` draws N rigs (see
-`random_defects`), writes the record of each as a session, judges it as ``analyze --json`` does and
-compares the document with the truth (see `defect_scores`). It prints what is wrong of each record,
+`random_defects`), writes the record of each as a session, analyses it as ``analyze --json`` does
+and compares the document with the truth (see `defect_scores`). It prints the errors of each record,
 a table by kind, the coverage of the 95 % intervals, and the limits that are exceeded. Seeds below
-10000 serve development; figures that are published are of seeds from 100000 on.
+10000 serve development; published figures are of seeds from 100000 on.
 
-``--file FILE`` appends a line for each record and does not judge again those already there;
+``--file FILE`` appends a line for each record and does not evaluate again those already there;
 ``--kinds TEXT ...`` draws these kinds in turn instead of random ones; ``--command-line`` runs the
-program itself, report and all, which takes longer and prints the same document; ``--document DIR``
+program itself with its report, which takes longer and prints the same document; ``--document DIR``
 writes each document there. 400 records take about a quarter of an hour on two cores.
 """
 
@@ -64,19 +64,19 @@ _STATED = {
     "beam_density_kg_per_m": repr(DENSITY_KG_PER_M),
     "beam_bending_stiffness_n_m2": repr(STIFFNESS_N_M2),
 }
-"""What the file states of the specimen, whatever is true."""
+"""Metadata of the specimen in the file, the same for all true values."""
 ROWS = (
     Row("limits of defect_scores.complaints exceeded", most=0),
-    # 93 % is required of many records; six have some 36 such intervals. Measured 89 % of three.
+    # 93 % is required for many records; six have some 36 such intervals. Measured 89 % of three.
     Row("95 % intervals of modes that hold the truth", least=80, unit="%"),
 )
 HEADLINE_UNIFORMITY = 1e-3
-"""Tolerance of the geometry that the analyzer uses where nothing is stated."""
+"""Tolerance of the geometry that the analyzer uses by default."""
 
 
 @dataclass(frozen=True, slots=True)
 class DefectTask:
-    """A record to judge, and how."""
+    """A record to evaluate, and options."""
 
     seed: int
     kind: str | None
@@ -112,7 +112,7 @@ def write_record(made: DefectRecord, path: Path) -> None:
     )
 
 
-def judged_text(path: Path, *, command_line: bool) -> tuple[str, float]:
+def analyzer_document(path: Path, *, command_line: bool) -> tuple[str, float]:
     """Return the document that ``analyze --json -`` prints, and the processor time in seconds.
 
     Parameters
@@ -120,7 +120,7 @@ def judged_text(path: Path, *, command_line: bool) -> tuple[str, float]:
     path : Path
         Session file.
     command_line : bool
-        Run the program, which draws a report too; else what it calls, in this process.
+        Run the program, which also draws a report, instead of its functions in this process.
     """
     if command_line:
         options = ("--method", "record", "--report", str(path.with_suffix("")), "--json", "-")
@@ -137,8 +137,8 @@ def judged_text(path: Path, *, command_line: bool) -> tuple[str, float]:
     return document_text(document([result]), ascii_only=True), spent_s
 
 
-def judge(task: DefectTask) -> ScoredDefect:
-    """Draw a rig, make its record, and compare what the analyzer states with the truth."""
+def evaluate(task: DefectTask) -> ScoredDefect:
+    """Draw a rig, make and analyse its record, and compare the document with the truth."""
     use_one_thread()
     warnings.simplefilter("ignore")
     made = draw(task.seed, task.kind)
@@ -147,8 +147,8 @@ def judge(task: DefectTask) -> ScoredDefect:
         path = Path(folder) / f"defect-{task.seed}.mcap"
         write_record(made, path)
         try:
-            text, spent_s = judged_text(path, command_line=task.command_line)
-        except Exception as error:  # a record that cannot be judged counts, it ends nothing
+            text, spent_s = analyzer_document(path, command_line=task.command_line)
+        except Exception as error:  # counted; the next record is evaluated
             noise = truth["noise"]
             return ScoredDefect(
                 task.seed, truth["kind"], truth["linear_constant"],
@@ -169,33 +169,33 @@ def judge(task: DefectTask) -> ScoredDefect:
 
 
 def tasks(given: argparse.Namespace, done: set[tuple[int, str | None]]) -> list[DefectTask]:
-    """List what is not judged yet."""
+    """List the tasks that are not done yet."""
     kinds = [
         kind for kind in KINDS
         if any(kind == text if text in KINDS else text in kind for text in given.kinds)
     ]  # fmt: skip
     seeds = range(given.first_seed, given.first_seed + given.records)
     pairs = zip(seeds, itertools.cycle(kinds or [None]), strict=False)
-    judged = {seed for seed, _ in done}
+    evaluated = {seed for seed, _ in done}
     return [
         DefectTask(seed, kind, given.command_line, given.document)
         for seed, kind in pairs
-        if seed not in judged
+        if seed not in evaluated
     ]
 
 
-def judge_all(wanted: list[DefectTask], jobs: int) -> Iterator[ScoredDefect]:
-    """Judge on several cores."""
+def evaluate_all(wanted: list[DefectTask], jobs: int) -> Iterator[ScoredDefect]:
+    """Yield the scores of tasks, from several processes."""
     if jobs == 1:
-        yield from map(judge, wanted)
+        yield from map(evaluate, wanted)
         return
     with ProcessPoolExecutor(jobs) as pool:
-        for future in as_completed([pool.submit(judge, task) for task in wanted]):
+        for future in as_completed([pool.submit(evaluate, task) for task in wanted]):
             yield future.result()
 
 
 def described(record: ScoredDefect) -> str:
-    """Return one line on a record: what is wrong, false or not given."""
+    """Return one line on a record: its wrong, false and missing results."""
     parts = [f"{each.name} {each.deviation:.1f} std" for each in record.wrong]
     parts += [f"false: {fact}" for fact in record.false_facts]
     if record.not_given and record.linear_constant:
@@ -209,7 +209,7 @@ def described(record: ScoredDefect) -> str:
 
 
 def main() -> None:
-    """Judge the records, and print what came of it."""
+    """Evaluate the records, print the scores and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--records", type=int, default=6)
     parser.add_argument("--first-seed", type=int, default=100_000)
@@ -229,7 +229,7 @@ def main() -> None:
         there = (ScoredDefect.from_line(line) for line in lines)
         done = [each for each in there if given.first_seed <= each.seed < last]
     wanted = tasks(given, {(each.seed, each.kind) for each in done})
-    for found in judge_all(wanted, given.jobs):
+    for found in evaluate_all(wanted, given.jobs):
         done.append(found)
         print(described(found), flush=True)
         if given.file:

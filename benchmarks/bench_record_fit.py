@@ -1,15 +1,14 @@
-"""Fits of whole records: their time, a global search as peer, and errors over many sessions.
+"""Fits of whole records: their time, a global search as a peer, and errors over many sessions.
 
-N sessions of 136 s (8, ``--sessions N``) of each of three plants are fitted, and mean errors and
-the coverage of the 95 % intervals printed, parameter by parameter; then the CPU time of all seven
-structures over that of the plant's own alone. ``--times`` prints the CPU time of every structure on
-one session of each plant. ``--peer IV --plant VI`` compares with scipy's differential evolution on
-the same sum of squares within the same bounds (minutes per structure; one of them at a time, or
-several ``--peer``). With ``--undeclared`` rho/EI is off by 1 % and EI by 2 % in the file, and a
-delay of 0.3 ms and a clamp of 1e-5 kg m² are not in it; with ``--ringing`` the beam rings when the
-record begins. The last row is the tool inertia once more, from a descent in which it may be
-negative: the estimate itself never is, which shifts it by 0.40 standard deviations where the truth
-is 0.
+The program fits N sessions of 136 s (8, ``--sessions N``) of each of three plants and prints for
+each parameter the mean error and the coverage of the 95 % intervals; then the CPU time of fitting
+all seven structures over that of the true structure alone. ``--times`` prints the CPU time of every
+structure on one session of each plant. ``--peer IV --plant VI`` compares with scipy's differential
+evolution on the same sum of squares within the same bounds (minutes per structure; ``--peer`` is
+repeatable). With ``--undeclared`` rho/EI is off by 1 % and EI by 2 % in the file, which also omits
+a delay of 0.3 ms and a clamp of 1e-5 kg m²; with ``--ringing`` the beam rings when the record
+begins. The last row is the tool inertia from a descent in which it may be negative; the estimate
+itself cannot be, which shifts it by 0.40 standard deviations if the true value is 0.
 
 The sessions are made in the frequency domain on a separate grid: chirp 0.025 rad, 0.05-50 Hz in
 120 s behind a motor loop of 20 Hz, at 1 kHz, 1 s of rest before and 15 s after; encoder steps of
@@ -52,10 +51,10 @@ PLANTS = {
 
 
 ROWS = (
-    # Measured 1.05 of 4 sessions, whose scatter is not well known, and below 0.8 of 200
+    # Measured 1.05 with 4 sessions, whose scatter is uncertain, and below 0.8 with 200
     # (docs/validation/whole_record.md).
     Row("largest mean error", most=1.6, unit="of what bias and chance allow"),
-    # 23 parameters of 8 sessions: 90 % is beyond chance (95 % with a deviation of 1.6 %).
+    # 23 parameters of 8 sessions: 90 % is significantly low (95 % expected, standard error 1.6 %).
     Row("95 % intervals that hold the truth", least=90, unit="%"),
     # Measured 1.9.
     Row("all seven structures", most=4, unit="times the plant's own"),
@@ -64,14 +63,14 @@ ROWS = (
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Angle as measured, torque without noise."""
+    """Measured angle, and torque without noise."""
 
     plant: Plant
     angle_rad: NDArray[np.float64]
     torque_nm: NDArray[np.float64]
 
     def measured(self, seed: int) -> Measurement:
-        """With noise; the file states the nominal link and no delay."""
+        """Return the session with noise; the file states the nominal link and no delay."""
         noise = np.random.default_rng(seed).normal(scale=NOISE_NM, size=self.torque_nm.size)
         everywhere = np.ones(self.torque_nm.size, dtype=bool)
         return Measurement(
@@ -87,7 +86,10 @@ class Session:
 
 
 def session(plant: Plant, *, ringing: bool = False) -> Session:
-    """Exact response to the chirp; if it is to ring, shaken for 4 s until 1 s before the record."""
+    """Return the exact response to the chirp.
+
+    With `ringing` the beam is shaken for 4 s, until 1 s before the record.
+    """
     before_s = 5.0 if ringing else 0.0
     n = round((before_s + 136) * RATE_HZ)
     t = np.arange(n) / RATE_HZ - before_s - 1
@@ -107,7 +109,7 @@ def session(plant: Plant, *, ringing: bool = False) -> Session:
 
 
 class Peer:
-    """The same sum of squares, assembled again, for a search that knows nothing of it."""
+    """Independent computation of the same sum of squares, for a global search."""
 
     def __init__(self, measurement: Measurement, name: str, analysis: RecordAnalysis) -> None:
         self.comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
@@ -115,7 +117,7 @@ class Peer:
         self.weight = analysis.noise.weight
 
     def cost(self, x: NDArray[np.float64]) -> float:
-        """Sum of squares, free decay projected out."""
+        """Return the sum of squares, with the free decay projected out."""
         comparison, plant = self.comparison, self.unknowns.plant(x)
         torque, _ = comparison.prediction.torque(plant)
         residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
@@ -132,13 +134,13 @@ class Peer:
         return float(np.vdot(residual, residual).real - inside @ (projection / scale))
 
     def costs(self, population: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Costs of a population, shape (k, members) or (k,)."""
+        """Return the costs of a population, shape (k, members) or (k,)."""
         members = population.reshape(len(self.unknowns.names), -1).T
         return np.array([self.cost(x) for x in members])
 
 
 def cpu_s(work: Callable[[], object], repeats: int = 5) -> float:
-    """Least CPU time of several runs, in s: others' load does not count."""
+    """Return the least CPU time of several runs, in s."""
     spent = []
     for _ in range(repeats):
         start = time.process_time()
@@ -158,7 +160,7 @@ def times(plant: str) -> None:
 
 
 def compare(plant: str, name: str) -> None:
-    """Print what a global search finds for one structure, and how long it takes."""
+    """Print the minimum and the time of a global search for one structure."""
     from scipy.optimize import differential_evolution
 
     measurement = session(Plant(LINK, PLANTS[plant])).measured(1)
@@ -191,14 +193,14 @@ def compare(plant: str, name: str) -> None:
 def tool_inertia_of_either_sign(
     measurement: Measurement, analysis: RecordAnalysis, true: Damping
 ) -> float:
-    """Estimate a tool inertia that may come out negative, everything else free as well."""
+    """Estimate all parameters, with a tool inertia that may be negative, and return it."""
     comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
     unknowns = Unknowns.for_structure(analysis.fits[0].structure, Plant(LINK, Damping()), SETTINGS)
     weight = analysis.noise.weight
     objective = Objective(comparison, unknowns)
     steps = StepRule.for_unknowns(unknowns)
-    place = unknowns.names.index("tool_inertia_kg_m2")
-    steps.lower[place] = -steps.upper[place]
+    index = unknowns.names.index("tool_inertia_kg_m2")
+    steps.lower[index] = -steps.upper[index]
     first, second = unknowns.omega_rad_s
     sizes = {
         "zeta": math.log(true.zeta * second**true.alpha),
@@ -212,21 +214,22 @@ def tool_inertia_of_either_sign(
     found = descend(
         lambda x: objective.normal_equations(x, weight), start, steps, relative_tolerance=1e-9
     )
-    return float(found.x[place]) * LINK.inertia_kg_m2
+    return float(found.x[index]) * LINK.inertia_kg_m2
 
 
 def wilson(hits: int, of: int) -> tuple[float, float]:
-    """95 % interval of a share (E. B. Wilson, JASA 22 (1927) 209-212)."""
-    z, share = 1.96, hits / of
-    middle = (share + z * z / (2 * of)) / (1 + z * z / of)
-    half = z / (1 + z * z / of) * math.sqrt(share * (1 - share) / of + z * z / (4 * of * of))
+    """Return the 95 % interval of a proportion (E. B. Wilson, JASA 22 (1927) 209-212)."""
+    z, fraction = 1.96, hits / of
+    middle = (fraction + z * z / (2 * of)) / (1 + z * z / of)
+    half = z / (1 + z * z / of) * math.sqrt(fraction * (1 - fraction) / of + z * z / (4 * of * of))
     return middle - half, middle + half
 
 
 def errors(name: str, count: int, *, undeclared: bool, ringing: bool) -> tuple[float, int, int]:
     """Print the errors of one plant's sessions.
 
-    Return the largest mean over what is allowed, how many intervals hold the truth, of how many.
+    Return the largest mean error over its limit, the number of intervals that contain the true
+    value, and the number of intervals.
     """
     plant = Plant(LINK, PLANTS[name])
     if undeclared:
@@ -252,7 +255,7 @@ def errors(name: str, count: int, *, undeclared: bool, ringing: bool) -> tuple[f
         typical = float(np.nanmedian(std))
         error = np.array([fit.parameters[parameter] for fit in fits]) - truth
         shown = row(parameter, truth, error / typical)
-        # A tool inertia of 0 is estimated too large by chance: it is judged by its descent below.
+        # A tool inertia of 0 is estimated too large on average; the descent below has no such bias.
         judged = error / typical
         intervals = [fit.interval[parameter] for fit in fits]
         covered = [ends[0] <= truth <= ends[1] for ends in intervals if ends is not None]
@@ -270,12 +273,12 @@ def errors(name: str, count: int, *, undeclared: bool, ringing: bool) -> tuple[f
 
 
 def mean_and_allowed(error: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the mean of errors in standard deviations, and what it may be."""
+    """Return the mean of errors in standard deviations, and its limit."""
     return float(error.mean()), 0.25 + 3 * float(error.std()) / math.sqrt(error.size)
 
 
 def row(name: str, truth: float, error: NDArray[np.float64]) -> str:
-    """Mean and scatter of errors in standard deviations, and what the mean may be."""
+    """Return mean and scatter of errors in standard deviations, and the limit of the mean."""
     scatter = float(error.std())
     mean, allowed = mean_and_allowed(error)
     flag = " " if abs(mean) < allowed else "<"
@@ -283,7 +286,7 @@ def row(name: str, truth: float, error: NDArray[np.float64]) -> str:
 
 
 def main() -> None:
-    """Choose between times, peer and errors, and judge the errors."""
+    """Print times, comparison with the peer, or errors, and check the limits of the errors."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=8, help="how many to fit of each plant")
     parser.add_argument("--times", action="store_true", help="of every structure, instead")
@@ -307,7 +310,7 @@ def main() -> None:
         for plant in plants
     ]
     gate.measured("largest mean error", max(largest for largest, _, _ in found))
-    held, known = (sum(each[place] for each in found) for place in (1, 2))
+    held, known = (sum(each[index] for each in found) for index in (1, 2))
     gate.measured("95 % intervals that hold the truth", percent(held, known))
     measurement = session(Plant(LINK, PLANTS["VI"])).measured(1)
     own_s = cpu_s(lambda: fit_record(measurement, [STRUCTURES["VI"]]), 3)

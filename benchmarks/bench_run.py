@@ -1,8 +1,7 @@
-"""A session of the simulated rig: whole processes, and the loop's own time a tick.
+"""Time of a session of the simulated rig: whole processes, and the work of the loop per tick.
 
 Peer of the whole: an interpreter that imports numpy and pydantic, as every session must. Peer of
-the tick: the bare matrix product of the plant's step, without which nothing can be simulated.
-Best of five in turn.
+the tick: the matrix product alone of the plant's step. Best of five in turn.
 """
 
 import argparse
@@ -44,7 +43,7 @@ def session() -> None:
 
 
 def cycle() -> Callable[[], None]:
-    """Return the work of a tick on the simulated rig, recording apart."""
+    """Return a function that runs ticks on the simulated rig, without recording."""
     profile = load_profile("sim")
     rig = profile.rig
     motor = rig.motor
@@ -67,7 +66,7 @@ def cycle() -> Callable[[], None]:
 
 
 def product() -> Callable[[], None]:
-    """Return as many products of a matrix of the plant's size with a vector."""
+    """Return a function that makes as many matrix products of the plant's size."""
     matrix, vector, out = np.ones((64, 61)), np.ones(61), np.empty(64)
 
     def products() -> None:
@@ -78,7 +77,7 @@ def product() -> Callable[[], None]:
 
 
 def main() -> None:
-    """Print times and ratios, and judge them."""
+    """Print times and ratios, and check the limits."""
     gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     bare, whole, empty, shown = least_in_turn_s(
         5,

@@ -1,6 +1,6 @@
-"""What the running frequency response and spectrogram cost while a sweep of 120 s comes in.
+"""Cost of the running frequency response and spectrogram during a sweep of 120 s.
 
-Peers: Welch's estimate of all that has come, recomputed each time; scipy.signal.spectrogram.
+Peers: Welch's estimate of the record so far, recomputed each time; scipy.signal.spectrogram.
 """
 
 import argparse
@@ -17,20 +17,20 @@ from rigd.spectral import RunningResponse, RunningSpectrogram, welch_response
 RATE_HZ = 1000.0
 LAST_HZ = 60.0
 BLOCK = 50
-"""Samples at a time: 20 blocks a second."""
+"""Samples of a block: 20 blocks a second."""
 BETWEEN_ESTIMATES = 500
 REPEATS = 15
 ROWS = (
-    # Measured 0.13 to 0.17, and 4.5 to 5.6: scipy transforms all of the record at once.
-    Row("running response, an estimate", most=0.3, unit="times welch_response anew"),
+    # Measured 0.13 to 0.17, and 4.5 to 5.6: scipy transforms the whole record at once.
+    Row("running response, an estimate", most=0.3, unit="times welch_response of the whole record"),
     Row("running spectrogram, whole", most=9, unit="times scipy's, not cut at 60 Hz"),
-    # Measured 1.5 beside other programs.
+    # Measured 1.5 with other programs running.
     Row("all of it", most=3, unit="% of a core"),
 )
 
 
 def main() -> None:
-    """Print times and ratios, and judge them."""
+    """Print times and ratios, and check the limits."""
     gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     excitation = chirp(rate_hz=RATE_HZ)
     reference = excitation.reference_rad[slice(*excitation.segments["sweep"])]
@@ -57,7 +57,7 @@ def main() -> None:
     sweep_s = ticks.size / RATE_HZ
 
     estimate = np.median(estimated)
-    anew = least_s(lambda: welch_response(angle, torque, RATE_HZ), REPEATS)
+    recomputed = least_s(lambda: welch_response(angle, torque, RATE_HZ), REPEATS)
     options = {"fs": RATE_HZ, "nperseg": 1000, "noverlap": 750, "nfft": 4000, "detrend": False}
     peer = least_s(lambda: scipy.signal.spectrogram(torque, **options), 3)
     print(f"A sweep of {sweep_s:g} s in blocks of {BLOCK}, an estimate every {BETWEEN_ESTIMATES}")
@@ -66,7 +66,7 @@ def main() -> None:
         f"complete; an estimate {1e3 * estimate:.1f} ms; "
         f"spectrogram {1e6 * np.median(shown):.1f} µs"
     )
-    gate.measured("running response, an estimate", estimate / anew)
+    gate.measured("running response, an estimate", estimate / recomputed)
     gate.measured("running spectrogram, whole", sum(shown) / peer)
     gate.measured("all of it", 100 * (sum(fed) + sum(estimated) + sum(shown)) / sweep_s)
     gate.finish()

@@ -1,22 +1,23 @@
-"""Selection of structures: the share of verdicts that are right, over many simulated sessions.
+"""Selection of structures: fraction of correct verdicts over many simulated sessions.
 
-``bench_selection.py --sessions N [--case NAME ...] [--first SEED]`` judges N sessions of each case,
-which differ in their noise, and prints how many verdicts are right, with 95 % intervals (Wilson):
+``bench_selection.py --sessions N [--case NAME ...] [--first SEED]`` evaluates N sessions of each
+case, which differ in their noise, and prints the number of correct verdicts with 95 % intervals
+(Wilson):
 
-* structure: the one simulated, and a uniform beam refused where the beam is not uniform (there any
-  structure will do, for none is that of the beam). Type VI of Table 5 has alpha = 0.996 with a
-  standard deviation of 0.003, so no record tells it from type VII, which is it with alpha = 1: "VI
-  or VII" is counted beside it. "VI, alpha 0.8" shows type VI itself;
-* orders: what is said of alpha and lambda is true;
-* named: everything in the record has been named, and nothing else;
-* all: structure (VII for VI of Table 5), orders and names.
+* structure: the simulated one, with a uniform beam refused if the beam is not uniform (then any
+  structure is correct, because none includes the beam). Type VI of Table 5 has alpha = 0.996 with a
+  standard deviation of 0.003, so no record distinguishes it from type VII, for which alpha = 1: "VI
+  or VII" is counted too. "VI, alpha 0.8" tests type VI itself;
+* orders: the statements on alpha and lambda are true;
+* named: all effects in the record are named, and no others;
+* all: structure (or VII for VI of Table 5), orders and names.
 
-With ``--file FILE`` a line is appended for each session, and sessions that stand there already are
-not judged again; ``--seconds S`` stops in time, and the next call goes on. ``--print`` only counts.
+``--file FILE`` appends a line for each session, and sessions already in the file are not evaluated
+again; ``--seconds S`` ends after this time, and the next call resumes. ``--print`` only counts.
 
-The sessions are those of ``bench_record_fit.py``. The stiffness that rises with the deflection is
-simulated in time, mode 1 alone, by Runge and Kutta's method on its equation of motion; what it
-differs by from the linear mode is added to the exact torque.
+The sessions are those of ``bench_record_fit.py``. A stiffness that rises with the deflection is
+simulated in time for mode 1, by Runge and Kutta's method on its equation of motion; the difference
+from the linear mode is added to the exact torque.
 """
 
 import argparse
@@ -39,11 +40,11 @@ from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, participat
 HALF_FRACTIONAL = Damping(zeta=2.49e-4, alpha=0.8, gamma=5.5e-2, lambda_=0.594)
 HUM_NM = 0.03
 RISE = 0.01
-"""Share by which the stiffness of mode 1 is higher at its largest deflection."""
+"""Relative rise of the stiffness of mode 1 at its largest deflection."""
 
 ROWS = (
-    # Measured 80 % of 20 with seed 1000, whose noise makes the four cases of type III wrong: cases
-    # share their seeds. Of many seeds 97 to 100 % were (docs/validation/structure_selection.md).
+    # Measured 80 % of 20 with seed 1000, whose noise makes all four cases of type III wrong: the
+    # cases have equal seeds. With many seeds 97 to 100 % (docs/validation/structure_selection.md).
     Row("verdicts right in all", least=75, unit="%"),
     Row("cases judged", least=20),
 )
@@ -52,7 +53,7 @@ UNEVEN = (0.006, -0.013)
 
 
 def swept(plant: Plant, highest_hz: float, offsets: tuple[float, ...] = ()) -> Session:
-    """Sweep 0.05 Hz to `highest_hz`; modes 2, 3, … stiffer by `offsets`."""
+    """Return a sweep from 0.05 Hz to `highest_hz`, with modes 2, 3, … stiffer by `offsets`."""
     n = round(136 * RATE_HZ)
     t = np.arange(n) / RATE_HZ - 1
     chirp = 0.025 * np.sin(2 * np.pi * (0.05 * t + (highest_hz - 0.05) * t**2 / 240))
@@ -67,11 +68,11 @@ def swept(plant: Plant, highest_hz: float, offsets: tuple[float, ...] = ()) -> S
     p = p + damping.gamma * beam.bending_stiffness_n_m2 * s**damping.lambda_
     q = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
     modes = 1 + len(offsets)
-    shares = participation(beam, modes)[1:]
+    participations = participation(beam, modes)[1:]
     stiffness = (clamped_free_eigenvalues(modes)[1:] / beam.length_m) ** 4
-    for share, k, offset in zip(shares, stiffness, offsets, strict=True):
+    for factor, k, offset in zip(participations, stiffness, offsets, strict=True):
         moved = k * (1 + offset)
-        response = response + share * p * q * (moved / (q * moved + p) - k / (q * k + p))
+        response = response + factor * p * q * (moved / (q * moved + p) - k / (q * k + p))
     torque = angle * response
     return Session(plant, *(np.fft.irfft(x, 4 * n)[:n] / decay for x in (angle, torque)))
 
@@ -84,7 +85,7 @@ def stiffening(made: Session, rise: float) -> Session:
 
 
 def _mode_1(made: Session, cubic: float) -> tuple[NDArray[np.float64], float]:
-    """Torque of mode 1 with a force ``k cubic r³``, and the largest relative deflection r."""
+    """Return the torque of mode 1 with a force ``k cubic r³``, and the largest deflection r."""
     beam, damping, angle_rad = made.plant.beam, made.plant.damping, made.angle_rad
     n, step = angle_rad.size, 1 / RATE_HZ
     spectrum = np.fft.rfft(angle_rad, 2 * n)
@@ -115,20 +116,20 @@ def _mode_1(made: Session, cubic: float) -> tuple[NDArray[np.float64], float]:
         y += step / 6 * (v1 + 2 * v2 + 2 * v3 + v4)
         v += step / 6 * (d1 + 2 * d2 + 2 * d3 + d4)
     forces[-1] = forces[-2]
-    share = float(participation(beam, 1)[0]) * beam.bending_stiffness_n_m2
-    return -share * forces, largest
+    scale = float(participation(beam, 1)[0]) * beam.bending_stiffness_n_m2
+    return -scale * forces, largest
 
 
 def humming(made: Session) -> Session:
-    """Disturbance by the mains, just beyond the end of the band."""
+    """Add a disturbance by the mains, just beyond the end of the band."""
     t = np.arange(made.torque_nm.size) / RATE_HZ
     hum = HUM_NM * np.sin(2 * np.pi * 50.01 * t)
     return replace(made, torque_nm=made.torque_nm + hum)
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """What was said of one session."""
+class Verdict:
+    """Verdict of the analyzer on one session."""
 
     case: str
     seed: int
@@ -141,8 +142,8 @@ class Judged:
     cpu_s: float
 
     @classmethod
-    def of(cls, case: str, seed: int, selection: Selection, cpu_s: float) -> "Judged":
-        """Take what counts from a selection."""
+    def of(cls, case: str, seed: int, selection: Selection, cpu_s: float) -> "Verdict":
+        """Return the verdict of a selection."""
         verdict, test = selection.verdict, selection.headline.uniform_beam
         return cls(
             case,
@@ -163,7 +164,7 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is simulated, and what the verdict should be."""
+    """Simulated session and correct verdict."""
 
     make: Callable[[], Session]
     structures: frozenset[str]
@@ -172,21 +173,21 @@ class Case:
     uniform: bool = True
     named: frozenset[str] = field(default_factory=frozenset)
 
-    def structure(self, judged: Judged, also: frozenset[str] = frozenset()) -> bool:
-        """Whether the structure is right."""
-        return judged.structure in self.structures | also and judged.uniform == self.uniform
+    def structure(self, verdict: Verdict, also: frozenset[str] = frozenset()) -> bool:
+        """Whether the structure is correct."""
+        return verdict.structure in self.structures | also and verdict.uniform == self.uniform
 
-    def orders(self, judged: Judged) -> bool:
-        """Whether what is said of the orders is true."""
-        return judged.alpha in self.alpha and judged.lambda_ in self.lambda_
+    def orders(self, verdict: Verdict) -> bool:
+        """Whether the statements on the orders are true."""
+        return verdict.alpha in self.alpha and verdict.lambda_ in self.lambda_
 
-    def names(self, judged: Judged) -> bool:
-        """Whether what is in the record has been named, and nothing else."""
-        return judged.found.keys() == self.named
+    def names(self, verdict: Verdict) -> bool:
+        """Whether all effects in the record are named, and no others."""
+        return verdict.found.keys() == self.named
 
 
 def plant_of(name: str, beam: Beam = LINK, delay_s: float = 0.0, tool: float = 0.0) -> Plant:
-    """One of the three plants of the evidence."""
+    """Return one of the three plants."""
     return Plant(beam, PLANTS[name], delay_s, tool)
 
 
@@ -195,7 +196,7 @@ UNKNOWN = frozenset({"not identifiable"})
 SILENT = frozenset({"open", "not identifiable", "absent"})
 ANY = SILENT | INTEGER | FRACTIONAL
 CLOSE = INTEGER | FRACTIONAL | {"open"}
-"""What may be said of an order that differs from 1 by one standard deviation."""
+"""Allowed statuses of an order that differs from 1 by one standard deviation."""
 
 EVERY = frozenset({"I", "II", "III", "IV", "V", "VI", "VII"})
 SEVEN = frozenset({"VII"})
@@ -204,7 +205,7 @@ UNDECLARED = frozenset({"delay", "tool inertia", "beam data"})
 
 
 def expected(name: str, make: Callable[[], Session], *named: str) -> Case:
-    """Case of one of the three plants on a uniform beam."""
+    """Return the case of one of the three plants with a uniform beam."""
     return Case(make, frozenset({name}), *ORDERS[name], named=frozenset(named))
 
 
@@ -236,7 +237,7 @@ CASES: dict[str, Case] = {
         f"{n}, not uniform": Case(
             lambda n=n: swept(plant_of(n), 50.0, UNEVEN),
             EVERY,
-            *(SILENT | said for said in ORDERS[n]),
+            *(SILENT | statuses for statuses in ORDERS[n]),
             uniform=False,
             named=frozenset({"rival explanations"}),
         )
@@ -251,80 +252,85 @@ CASES: dict[str, Case] = {
 }
 
 
-def judge(name: str, seeds: Iterable[int], until_s: float) -> Iterable[Judged]:
-    """Judge sessions of a case, as long as there is time."""
+def evaluate(name: str, seeds: Iterable[int], until_s: float) -> Iterable[Verdict]:
+    """Yield the verdicts on sessions of a case, until the time is over."""
     make = cache(CASES[name].make)
     for seed in seeds:
         if time.monotonic() > until_s:
             return
-        # The orders that are scored are those of an exactly uniform beam.
+        # Orders are scored for an exactly uniform beam.
         measurement = replace(make().measured(seed), uniformity=0.0)
         start = time.process_time()
         selection = select(measurement)
-        yield Judged.of(name, seed, selection, time.process_time() - start)
+        yield Verdict.of(name, seed, selection, time.process_time() - start)
 
 
-def share(what: str, hits: int, count: int) -> str:
-    """Count with its interval."""
+def count_text(what: str, hits: int, count: int) -> str:
+    """Return a count with its interval as a text."""
     low, high = wilson(hits, count)
     return f"{what} {hits}/{count} [{low:.3f}, {high:.3f}]"
 
 
-def show(name: str, judged: list[Judged]) -> int:
-    """Print how many verdicts of a case are right, and all that are not; return how many are."""
-    case, count = CASES[name], len(judged)
+def show(name: str, verdicts: list[Verdict]) -> int:
+    """Print the score of a case and its wrong verdicts; return the number of correct ones."""
+    case, count = CASES[name], len(verdicts)
     close = SEVEN if case.alpha == CLOSE else frozenset()
-    right = [j for j in judged if case.structure(j, close) and case.orders(j) and case.names(j)]
-    print(f"{name}: seeds {min(j.seed for j in judged)}-{max(j.seed for j in judged)}")
-    print(f"    {share('structure', sum(map(case.structure, judged)), count)}", end="; ")
+    right = [j for j in verdicts if case.structure(j, close) and case.orders(j) and case.names(j)]
+    print(f"{name}: seeds {min(j.seed for j in verdicts)}-{max(j.seed for j in verdicts)}")
+    print(f"    {count_text('structure', sum(map(case.structure, verdicts)), count)}", end="; ")
     if close:
-        print(share("VI or VII", sum(case.structure(j, close) for j in judged), count), end="; ")
-    print(share("orders", sum(map(case.orders, judged)), count), end="; ")
-    print(share("named", sum(map(case.names, judged)), count))
-    chosen = Counter(f"{j.structure}{'' if j.uniform else ', no uniform beam'}" for j in judged)
-    said = Counter(f"alpha {j.alpha}, lambda {j.lambda_}" for j in judged)
-    cpu_s = sorted(j.cpu_s for j in judged)
+        print(
+            count_text("VI or VII", sum(case.structure(j, close) for j in verdicts), count),
+            end="; ",
+        )
+    print(count_text("orders", sum(map(case.orders, verdicts)), count), end="; ")
+    print(count_text("named", sum(map(case.names, verdicts)), count))
+    chosen = Counter(f"{j.structure}{'' if j.uniform else ', no uniform beam'}" for j in verdicts)
+    statuses = Counter(f"alpha {j.alpha}, lambda {j.lambda_}" for j in verdicts)
+    cpu_s = sorted(j.cpu_s for j in verdicts)
     print(
-        f"    {share('all', len(right), count)}; selected {dict(chosen)}; {dict(said)}; "
+        f"    {count_text('all', len(right), count)}; selected {dict(chosen)}; {dict(statuses)}; "
         f"CPU median {cpu_s[count // 2]:.2f} s, most {cpu_s[-1]:.2f} s"
     )
-    for kind in sorted({kind for j in judged for kind in j.found}):
-        values = [v for j in judged if (v := j.found.get(kind)) is not None]
+    for kind in sorted({kind for j in verdicts for kind in j.found}):
+        values = [v for j in verdicts if (v := j.found.get(kind)) is not None]
         if values:
             spread = f"mean {np.mean(values):.4g}, scatter {np.std(values):.2g}"
             print(f"    named {kind}: {len(values)} times, {spread}")
-    for j in judged:
+    for j in verdicts:
         if j not in right:
             print(f"    wrong, seed {j.seed}: {j}")
     return len(right)
 
 
 def main() -> None:
-    """Judge the cases asked for."""
+    """Evaluate the requested cases and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=2, help="how many of each case")
     parser.add_argument("--first", type=int, default=1000, help="seed of the first")
     parser.add_argument("--case", choices=CASES, action="append", help="only this one")
-    parser.add_argument("--file", type=Path, help="one line a session; goes on where it ends")
+    parser.add_argument("--file", type=Path, help="one line per session; resumes where it ends")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after these")
-    parser.add_argument("--print", action="store_true", help="judge none, count those in the file")
+    parser.add_argument(
+        "--print", action="store_true", help="evaluate none, count those in the file"
+    )
     gate = Gate(ROWS, parser)
     given = gate.given
-    done: list[Judged] = []
+    done: list[Verdict] = []
     if given.file and given.file.exists():
         lines = given.file.read_text().splitlines()
-        done = [Judged(**json.loads(line)) for line in lines]
+        done = [Verdict(**json.loads(line)) for line in lines]
     until_s = time.monotonic() + given.seconds
     right, counts = [], []
     for name in given.case or CASES:
-        before = {judged.seed for judged in done if judged.case == name}
+        before = {verdict.seed for verdict in done if verdict.case == name}
         seeds = range(given.first, given.first + (0 if given.print else given.sessions))
-        for judged in judge(name, [s for s in seeds if s not in before], until_s):
-            done.append(judged)
+        for verdict in evaluate(name, [s for s in seeds if s not in before], until_s):
+            done.append(verdict)
             if given.file:
                 with given.file.open("a") as file:
-                    file.write(json.dumps(asdict(judged)) + "\n")
-        if mine := [judged for judged in done if judged.case == name]:
+                    file.write(json.dumps(asdict(verdict)) + "\n")
+        if mine := [verdict for verdict in done if verdict.case == name]:
             right.append(show(name, mine))
             counts.append(len(mine))
     gate.measured("verdicts right in all", percent(sum(right), sum(counts)))

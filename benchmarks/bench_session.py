@@ -1,9 +1,9 @@
 """Session files: cost of writing a sample and of reading 120 000, against the plain packages.
 
-The peer writes and reads the same messages with the ``mcap`` package one by one, encoding and
-decoding them with ``protobuf`` objects. Both begin with the values of the samples: packing (here
-into the ring's layout, by the peer into protobuf messages) counts for both. Best of two of the
-peer, in turn with five runs each of this package.
+The peer writes and reads the same messages one by one with the ``mcap`` package, encoding and
+decoding them with ``protobuf`` objects. Both start from the values of the samples, so packing them
+(here into the ring's layout, by the peer into protobuf messages) counts for both. Best of two runs
+of the peer, in turn with five runs each of this package.
 """
 
 import argparse
@@ -61,17 +61,17 @@ def rows() -> list[tuple[float, ...]]:
 
 
 def write(path: Path, table: list[tuple[float, ...]]) -> float:
-    """Pack and record in blocks as they come from the ring; return the seconds it takes."""
+    """Pack and record in blocks, as from the ring; return the seconds it takes."""
     started = time.perf_counter()
     writer = SessionWriter(path)
     writer.begin(START_UTC_NS, {"rate_hz": "1000.0"}, {}, {})
     samples, controls = bytearray(BLOCK * SAMPLE_SIZE), bytearray(CONTROLS * CONTROL_SIZE)
     for first in range(0, SAMPLES, BLOCK):
-        for place, row in enumerate(table[first : first + BLOCK]):
-            pack_sample_into(samples, place * SAMPLE_SIZE, *row)
-        for place in range(CONTROLS):
-            tick = first + CONTROL_EVERY * place
-            pack_control_into(controls, place * CONTROL_SIZE, tick * 10**6, tick, *table[tick][2:8])
+        for index, row in enumerate(table[first : first + BLOCK]):
+            pack_sample_into(samples, index * SAMPLE_SIZE, *row)
+        for index in range(CONTROLS):
+            tick = first + CONTROL_EVERY * index
+            pack_control_into(controls, index * CONTROL_SIZE, tick * 10**6, tick, *table[tick][2:8])
         writer.write_controls(memoryview(controls))
         writer.write_samples(memoryview(samples))
     writer.close({"outcome": "complete"})
@@ -79,7 +79,7 @@ def write(path: Path, table: list[tuple[float, ...]]) -> float:
 
 
 def message_class(schema: Schema) -> type[Message]:
-    """Return protobuf's class of the messages of a schema."""
+    """Return the protobuf class of the messages of a schema."""
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(schema.data).file:
         pool.Add(file)
@@ -87,7 +87,7 @@ def message_class(schema: Schema) -> type[Message]:
 
 
 def write_plainly(path: Path, table: list[tuple[float, ...]], like: Path) -> float:
-    """Write the samples (without controls) with protobuf objects, by the schema of a session."""
+    """Write the samples (without controls) as protobuf objects with the schema of a session."""
     with like.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
@@ -126,7 +126,7 @@ def read_plainly(path: Path) -> float:
 
 
 def main() -> None:
-    """Measure, print and judge."""
+    """Measure and print the ratios, and check the limits."""
     gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     table = rows()
     writes, reads = [], []

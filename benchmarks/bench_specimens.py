@@ -1,11 +1,12 @@
-"""Whether campaigns of one beam are taken for one specimen, and those of two beams for two.
+"""Whether campaigns of one beam are taken as one specimen, and those of two beams as two.
 
-``bench_specimens.py [--times N] [--records N] [--noise-nm NM] [--apart SHARE] [--first SEED]``
-writes session files of exact records (`independent_records.py`, alpha 0.996), each with a noise of
-its own: N campaigns (1) of one beam, then one whose second half is of a beam with frequencies
-higher by a share. Each goes through `campaign`, as by `analyze FILES`. A line for each: what its
-sessions select by themselves, whether they are called a mixture, by what and in which groups, the
-least p-value, and the worst error of the pooled numbers in their own standard deviations.
+``bench_specimens.py [--times N] [--records N] [--noise-nm NM] [--apart RATIO] [--first SEED]``
+writes session files of exact records (`independent_records.py`, alpha 0.996), each with different
+noise: N campaigns (1) of one beam, then one whose second half is of a beam with frequencies higher
+by a relative difference. Each is evaluated by `campaign`, as by `analyze FILES`. A line for each
+campaign: the structures selected by its sessions, whether it is called a mixture, by which test and
+in which groups, the least p-value, and the worst error of the pooled numbers in their standard
+deviations.
 """
 
 from __future__ import annotations
@@ -46,14 +47,14 @@ BEAM = Truth(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A campaign: exact records, session by session."""
+    """A campaign: the exact record of each session."""
 
     name: str
     records: tuple[Exact, ...]
 
 
 def written(case: Case, noise_nm: float, first_seed: int, folder: Path) -> list[Path]:
-    """Write the sessions of a campaign, each with its own noise."""
+    """Write the sessions of a campaign, each with different noise."""
     rest, sweep = round(REST_S * RATE_HZ), round(SWEEP_S * RATE_HZ)
     paths = []
     for number, record in enumerate(case.records):
@@ -76,7 +77,7 @@ def written(case: Case, noise_nm: float, first_seed: int, folder: Path) -> list[
 
 
 def line(case: Case, found: CampaignResult) -> str:
-    """Say in a row what was made of a campaign."""
+    """Return the result of a campaign as a row."""
     verdict, alike = found.verdict, found.homogeneity
     if verdict is None:
         return f"| {case.name} | no verdict |"
@@ -96,7 +97,7 @@ def line(case: Case, found: CampaignResult) -> str:
 
 
 def worst_error(case: Case, found: CampaignResult) -> float:
-    """Largest error of the pooled parameters, in their standard deviations."""
+    """Return the largest error of the pooled parameters, in their standard deviations."""
     headline, truth = found.headline, case.records[0].truth.parameters
     assert headline is not None
     return max(
@@ -107,12 +108,14 @@ def worst_error(case: Case, found: CampaignResult) -> float:
 
 
 def main() -> None:
-    """Judge the campaigns asked for."""
+    """Evaluate the requested campaigns and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--times", type=int, default=1, help="campaigns of one beam")
     parser.add_argument("--records", type=int, default=8, help="of each campaign")
     parser.add_argument("--noise-nm", type=float, default=5e-3, help="of the torque")
-    parser.add_argument("--apart", type=float, default=5e-4, help="share between two beams")
+    parser.add_argument(
+        "--apart", type=float, default=5e-4, help="relative difference of two beams"
+    )
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--jobs", type=int, default=1)
     gate = Gate(ROWS, parser)

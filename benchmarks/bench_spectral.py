@@ -26,7 +26,7 @@ ROWS = (
 
 
 def main() -> None:
-    """Print times, ratios and the largest difference, and judge them."""
+    """Print times, ratios and the largest difference, and check the limits."""
     gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     rng = np.random.default_rng(1)
     x = rng.normal(size=120_000)
@@ -41,7 +41,7 @@ def main() -> None:
     }
 
     def peer() -> tuple[np.ndarray, np.ndarray]:
-        """H1 and coherence."""
+        """Return H1 and coherence by scipy."""
         sxy = scipy.signal.csd(x, y, **options)[1]
         sxx = scipy.signal.welch(x, **options)[1]
         syy = scipy.signal.welch(y, **options)[1]

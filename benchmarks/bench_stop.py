@@ -1,8 +1,7 @@
-"""`rigd stop` from wherever it may be called: from the call to the report that all has ended.
+"""Time of `rigd stop` in different situations, from the call to the report that sessions ended.
 
-Peer: `rigd --version`, the least that the command line can do. It needs root, for namespaces in
-which no session of anybody else can be stopped. ``--count 100`` repeats each situation as often as
-is asked for in the documents.
+Peer: `rigd --version`, the shortest command. It needs root, for namespaces in which no sessions of
+other users can be stopped. ``--count 100`` repeats each situation as often as the documents state.
 """
 
 import argparse
@@ -21,14 +20,14 @@ ROWS = tuple(
     for name in SITUATIONS
     for row in (
         Row(f"{name}: stopped and reported", least=100, unit="%"),
-        # Measured 0.6 to 3.3 beside other programs.
+        # Measured 0.6 to 3.3 with other programs running.
         Row(f"{name}: median", most=6, unit="times rigd --version"),
     )
 )
 
 
 def main() -> None:
-    """Print a row a situation, and fail if a stop was wrong."""
+    """Print a row for each situation, and fail if a stop was wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=10, help="Stops in each situation.")
     gate = Gate(ROWS, parser)

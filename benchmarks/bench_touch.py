@@ -1,16 +1,17 @@
-"""Touches: how far off the estimated point is, and whether its intervals and kinds hold.
+"""Touches: error of the estimated point, coverage of its intervals, and estimated kinds.
 
 ``bench_touch.py [--cases N] [--after-ms 50,100] [--noise 1] [--seed S]`` simulates N slews into an
-obstacle at rest (`touch_records.py`: modes, fine steps, nothing of the estimator) with places of
-0.05 to 0.97 m, stiffnesses of 100 to 100 000 N/m and speeds of 0.3 to 2 rad/s, and estimates each
-with a model that is off by what it states (as identified from one session). ``--torque-alone``
-leaves the base shear out, ``--exact`` takes the true model. ``--kinds moving,yielding,knock,two``
-takes obstacles that move, give way or knock, and two at once, instead; of two, the one that is met
-first counts, and pairs of which the second is not met within 100 ms are left out.
+obstacle at rest (`touch_records.py`: modes, fine steps, independent of the estimator) at positions
+of 0.05 to 0.97 m, with stiffnesses of 100 to 100 000 N/m and speeds of 0.3 to 2 rad/s. Each is
+estimated with a model whose errors have its stated standard deviations (as identified from one
+session). ``--torque-alone`` omits the base shear, ``--exact`` uses the true model. ``--kinds
+moving,yielding,knock,two`` simulates instead obstacles that move, give way or strike, and two at
+once; of two, the one that is met first counts, and pairs of which the second is not met within
+100 ms are left out.
 
-Printed: median, root mean square and 90 % of the error of the point (all cases, and those between
-0.1 and 0.95 m), the share within the 95 % interval and beyond four standard deviations, kinds, and
-processor time a fit.
+Printed: median, root mean square and 90th percentile of the error of the point (all cases, and
+those between 0.1 and 0.95 m), the percentage within the 95 % interval and beyond four standard
+deviations, kinds, and processor time per fit.
 """
 
 import argparse
@@ -34,7 +35,7 @@ RELATIVE_STD = {
     "zeta": 0.05,
     "gamma": 0.1,
 }
-"""What the model is off by, relative standard deviations."""
+"""Relative standard deviations of the errors of the model."""
 
 ROWS = tuple(
     row
@@ -49,11 +50,11 @@ ROWS = tuple(
 )
 DURATION_S = 0.85
 _TOGETHER_S = 0.1
-"""Of two obstacles the second is met so soon after the first, or the pair is left out."""
+"""Largest time between the first contacts with two obstacles; other pairs are left out."""
 
 
 def at_rest(count: int, rng: np.random.Generator) -> list[Case]:
-    """Draw springy obstacles at rest."""
+    """Draw elastic obstacles at rest."""
     cases: list[Case] = []
     for _ in range(count):
         speed = rng.uniform(0.3, 2.0)
@@ -67,7 +68,7 @@ def at_rest(count: int, rng: np.random.Generator) -> list[Case]:
 
 
 def other_kinds(count: int, kinds: list[str], rng: np.random.Generator) -> list[Case]:
-    """Draw obstacles that move, give way, knock, and two at once, `count` in all."""
+    """Draw `count` obstacles that move, give way or strike, and pairs."""
 
     def stiffness() -> float:
         return float(np.exp(rng.uniform(np.log(300), np.log(3e4))))
@@ -107,14 +108,14 @@ def other_kinds(count: int, kinds: list[str], rng: np.random.Generator) -> list[
 
 
 def first_met(obstacle: Obstacle | tuple[Obstacle, ...], struck: Struck) -> Obstacle:
-    """Return the obstacle that counts."""
+    """Return the obstacle that is met first."""
     if isinstance(obstacle, Obstacle):
         return obstacle
     return obstacle[int(np.argmin(struck.met_s))]
 
 
 def record_of(struck: Struck, after: int, noticed: int, *, shear: bool) -> TouchRecord:
-    """Cut the record `after` samples behind the detection, `noticed` samples after the touch."""
+    """Return the record until `after` samples past detection, `noticed` samples after the touch."""
     detected = int(struck.touch_s * RATE_HZ) + noticed
     end = detected + after
     return TouchRecord(
@@ -127,7 +128,7 @@ def record_of(struck: Struck, after: int, noticed: int, *, shear: bool) -> Touch
 
 
 def model_near(rng: np.random.Generator, *, exact: bool) -> TouchModel:
-    """Return the true beam, or one that is off by what it states."""
+    """Return the true beam (`exact`), or one with errors of its stated standard deviations."""
     model = TouchModel(Plant(LINK, DAMPED), source="benchmark")
     if exact:
         return model
@@ -137,7 +138,7 @@ def model_near(rng: np.random.Generator, *, exact: bool) -> TouchModel:
         "zeta": DAMPED.zeta,
         "gamma": DAMPED.gamma,
     }
-    std = {name: share * values[name] for name, share in RELATIVE_STD.items()}
+    std = {name: fraction * values[name] for name, fraction in RELATIVE_STD.items()}
     model = replace(model, std=std)
     for name, deviation in std.items():
         model = model.with_changed_parameter(name, deviation * rng.standard_normal())
@@ -145,7 +146,7 @@ def model_near(rng: np.random.Generator, *, exact: bool) -> TouchModel:
 
 
 def table(rows: NDArray[np.float64]) -> str:
-    """Statistics of rows of place, error, standard deviation, inside, seconds."""
+    """Return statistics of rows of position, error, standard deviation, inside, seconds."""
     error = np.abs(rows[:, 1]) * 1e3
     return (
         f"{len(rows):4d} cases: median {np.median(error):.2f} mm, rms "
@@ -157,7 +158,7 @@ def table(rows: NDArray[np.float64]) -> str:
 
 
 def main() -> None:
-    """Simulate, estimate, print."""
+    """Simulate, estimate, print, and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--cases", type=int, default=20)
     parser.add_argument("--after-ms", default="50,100")
@@ -195,27 +196,27 @@ def main() -> None:
                 continue
             record = record_of(struck, after, int(late), shear=not given.torque_alone)
             begin = time.process_time()
-            told = estimator.estimate(record)
+            estimate = estimator.estimate(record)
             spent = time.process_time() - begin
-            kinds[kind, told.kind] += 1
+            kinds[kind, estimate.kind] += 1
             seconds.append(spent)
             first = first_met(obstacle, struck)
             if given.verbose:
-                print(sentence(first, kind, told))
-            if told.x_m is not None:
-                low, high = told.x_m.interval_95
+                print(sentence(first, kind, estimate))
+            if estimate.x_m is not None:
+                low, high = estimate.x_m.interval_95
                 rows.append(
                     [
                         first.x_m,
-                        told.x_m.value - first.x_m,
-                        told.x_m.std,
+                        estimate.x_m.value - first.x_m,
+                        estimate.x_m.std,
                         low <= first.x_m <= high,
                         spent,
                     ]
                 )
         found = np.array(rows, dtype=np.float64)
-        print(f"{after} ms after the detection, point told in {len(found)} of {len(seconds)}")
-        print("  all places     ", table(found))
+        print(f"{after} ms after detection: position reported in {len(found)} of {len(seconds)}")
+        print("  all positions  ", table(found))
         inner = (found[:, 0] >= 0.1) & (found[:, 0] <= 0.95)
         print("  0.1 to 0.95 m  ", table(found[inner]))
         print("  kinds          ", {f"{a} -> {b}": n for (a, b), n in sorted(kinds.items())})
@@ -231,15 +232,13 @@ def main() -> None:
     gate.finish(part=not plain or given.after_ms != parser.get_default("after_ms"))
 
 
-def sentence(obstacle: Obstacle, kind: str, told: TouchEstimate) -> str:
-    """One case."""
-    x = told.x_m
-    point = (
-        "not told" if x is None else f"{(x.value - obstacle.x_m) * 1e3:+.2f} ± {x.std * 1e3:.2f}"
-    )
+def sentence(obstacle: Obstacle, kind: str, estimate: TouchEstimate) -> str:
+    """Return a line on one case."""
+    x = estimate.x_m
+    point = "unknown" if x is None else f"{(x.value - obstacle.x_m) * 1e3:+.2f} ± {x.std * 1e3:.2f}"
     return (
-        f"{kind} at {obstacle.x_m:.3f} m, {obstacle.stiffness_n_per_m:.0f} N/m: {told.kind}, "
-        f"{point} mm, chi² {told.chi2_per_degree:.2f}"
+        f"{kind} at {obstacle.x_m:.3f} m, {obstacle.stiffness_n_per_m:.0f} N/m: {estimate.kind}, "
+        f"{point} mm, chi² {estimate.chi2_per_degree:.2f}"
     )
 
 

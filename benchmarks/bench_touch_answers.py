@@ -1,13 +1,13 @@
-"""How soon after a touch its place is told, in real time on this machine.
+"""Time from a touch to the report of its position, in real time on this computer.
 
 Runs ``rigd run touch`` into obstacles at 0.05 to 0.97 m, of 100 to 100 000 N/m, at 0.3 to 2 rad/s,
-as an operator types it, with all processes of a session beside each other: loop, recorder, touch
-process, supervisor. The time from the touch (as the last answer tells it) to the line that the
-operator reads is printed for each, then how many come in time. Run it with nothing else going on.
+as an operator does, with all processes of a session: loop, recorder, touch process, supervisor. It
+prints for each touch the time from the touch (as stated by the last answer) to the line that the
+operator reads, then the number of answers in time. Run it on an idle computer.
 
     python benchmarks/bench_touch_answers.py --touches 40
 
-As it is, it takes 8 touches, in a minute.
+The default is 8 touches, in a minute.
 """
 
 import argparse
@@ -34,11 +34,11 @@ ROWS = (
     Row("touches with an answer", least=85, unit="%"),
 )
 RIG = 9000
-"""Number under which the obstacles are drawn."""
+"""Number of the rig, from which the obstacles are drawn."""
 
 
 def answers(meeting: Meeting, folder: Path) -> dict[str, Any] | None:
-    """Run one session; return when its first touch was told, or None if there was none."""
+    """Run one session; return the times of the answers to its first touch, None without one."""
     obstacle = f"x={meeting.x_m},angle={meeting.angle_rad},stiffness={meeting.stiffness_n_per_m}"
     command = [
         str(BIN / "rigd"), "run", "touch", str(round(meeting.angle_rad + 0.4, 4)),
@@ -46,7 +46,7 @@ def answers(meeting: Meeting, folder: Path) -> dict[str, Any] | None:
         "--obstacle", obstacle, "--output", "touches",
     ]  # fmt: skip
     environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
-    told_s: dict[str, float] = {}
+    answered_s: dict[str, float] = {}
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
         cwd=folder,
@@ -54,21 +54,21 @@ def answers(meeting: Meeting, folder: Path) -> dict[str, Any] | None:
         assert process.stderr is not None and process.stdout is not None
         for line in process.stderr:
             if line.startswith("Touch 1"):
-                told_s["first" if "first estimate" in line else "last"] = time.time()
+                answered_s["first" if "first estimate" in line else "last"] = time.time()
         [session] = json.loads(process.stdout.read())["sessions"]
-    if not session["touches"] or not told_s:
+    if not session["touches"] or not answered_s:
         return None
     touch = session["touches"][0]
     read = read_session(folder / session["path"])
     noticed = int(np.argmax((read.samples["status"] & Status.TOUCHED) != 0))
-    # Where the last answer does not tell the instant, it counts from when the touch was noticed.
+    # If the last answer does not state the time of the touch, the time of its detection counts.
     after_s = touch["time_s"]["value"] if touch["time_s"] else noticed / read.rate_hz
     touch_s = read.start_utc_ns * 1e-9 + after_s
-    return {name: at - touch_s for name, at in told_s.items()} | {"kind": touch["kind"]}
+    return {name: at - touch_s for name, at in answered_s.items()} | {"kind": touch["kind"]}
 
 
 def main() -> None:
-    """Run it."""
+    """Run the touches, print the times and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--touches", type=int, default=8)
     gate = Gate(ROWS, parser)
@@ -77,16 +77,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for number in range(given.touches):
             meeting = draw_meeting(RIG, number)
-            told = answers(meeting, Path(folder))
+            answer = answers(meeting, Path(folder))
             print(
                 f"{meeting.x_m:.3f} m, {meeting.stiffness_n_per_m:.0f} N/m, "
                 f"{meeting.speed_rad_s:.2f} rad/s:",
-                "not told" if told is None else told,
+                "no answer" if answer is None else answer,
                 flush=True,
             )
             for name in WANTED_S:
-                if told and name in told:
-                    seconds[name].append(told[name])
+                if answer and name in answer:
+                    seconds[name].append(answer[name])
     for name, wanted_s in WANTED_S.items():
         found = np.array(seconds[name] or [np.nan])
         print(

@@ -1,9 +1,9 @@
-"""Detection of touches: delay after contact, false touches in free motion, cost of a tick.
+"""Detection of touches: delay after contact, false detections in free motion, cost per tick.
 
 Run as ``python benchmarks/bench_touch_detection.py [TOUCHES] [HOURS]`` (40 and 0.1). Motor, beam,
 noise, friction and encoder are those of the simulated rig, in this process; the detector is the one
-of the control loop. In free motion (slews, moves and chirps) the model is 1 % wrong in two runs of
-three, and the torque has a hum of 2 mN·m.
+of the control loop. In free motion (slews, moves and chirps) the model has an error of 1 % in two
+of three runs, and the torque has a hum of 2 mN·m.
 """
 
 import argparse
@@ -97,7 +97,7 @@ def with_rig(profile: Profile, **changes: object) -> Profile:
 
 
 def detection(touches: int, gate: Gate) -> None:
-    """Slew into obstacles of any place and stiffness at any speed."""
+    """Slew into obstacles of random position and stiffness at random speed."""
     profile = load_profile("sim")
     poles = RigPreview(profile).move_plant("", TOUCH).poles_rad_s
     random = np.random.default_rng(1)
@@ -136,19 +136,20 @@ def detection(touches: int, gate: Gate) -> None:
             if delay > 10:
                 print(f"{delay} ms: x {x_m:.3f} m, {stiffness:.0f} N/m, {speed:.2f} rad/s")
         peaks.append(peak)
-    told = np.array(delays or [np.inf])
+    delays_ms = np.array(delays or [np.inf])
     print(
         f"{touches} touches, {missed} not detected or too early; delay median "
-        f"{np.median(told):.0f} ms, 95 % {np.quantile(told, 0.95):.0f} ms, longest {told.max()} ms"
+        f"{np.median(delays_ms):.0f} ms, 95 % {np.quantile(delays_ms, 0.95):.0f} ms, longest "
+        f"{delays_ms.max()} ms"
     )
     gate.measured("touches detected after contact", percent(len(delays), touches))
-    gate.measured("delay, median", np.median(told))
+    gate.measured("delay, median", np.median(delays_ms))
     for most_ms in (10, 20):
-        gate.measured(f"within {most_ms} ms", 100 * np.mean(told <= most_ms))
+        gate.measured(f"within {most_ms} ms", 100 * np.mean(delays_ms <= most_ms))
 
 
 def free_motion(hours: float, gate: Gate) -> None:
-    """Slew, move and sweep without obstacles."""
+    """Slew, move and sweep without obstacles, and count detections."""
     profile = load_profile("sim")
     poles = RigPreview(profile).move_plant("", TOUCH).poles_rad_s
     random = np.random.default_rng(2)
@@ -160,7 +161,7 @@ def free_motion(hours: float, gate: Gate) -> None:
         wrong = {}
         beam = profile.rig.beam
         if number % 3:
-            # So that in chirps, which are every fourth run, the one is wrong as often as the other.
+            # In chirps, which are every fourth run, both errors are then equally frequent.
             name = ("bending_stiffness_n_m2", "density_kg_per_m")[number // 4 % 2]
             wrong[name] = getattr(beam, name) * random.choice([0.99, 1.01])
         watched = with_rig(profile, beam=replace(beam, **wrong))
@@ -202,7 +203,7 @@ def free_motion(hours: float, gate: Gate) -> None:
 
 
 def tick_cost(gate: Gate) -> None:
-    """Time the detector's part of a tick."""
+    """Measure the time of the detector in a tick."""
     profile = load_profile("sim")
     detector = detector_of(profile)
     detector.arm()
@@ -223,7 +224,7 @@ def tick_cost(gate: Gate) -> None:
 
 
 def main() -> None:
-    """Measure, print and judge."""
+    """Measure and print the results, and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("touches", type=int, nargs="?", default=40)
     parser.add_argument("hours", type=float, nargs="?", default=0.1)

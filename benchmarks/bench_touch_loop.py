@@ -1,13 +1,13 @@
-"""What the detection of touches costs the control loop: lateness and work of a tick.
+"""Cost of touch detection for the control loop: lateness and work per tick.
 
     python benchmarks/bench_touch_loop.py [PASSES] [ROUNDS]
 
-In each round two whole real-time sessions of the simulated rig with the same reference, 4 s a pass,
-in turn the one or the other first: passes in search of an obstacle, of which there is none, and the
-same passes of which the loop is not told that they are a search. Both have the recorder; with the
-search go the detector in each tick and the waiting process of the estimates. Ratios of the
-lateness are of each round, and their median counts; the work of a tick is that of the best session
-with and without. With 3 passes and 3 rounds it takes two minutes.
+Each round runs two whole real-time sessions of the simulated rig with the same reference, 4 s per
+pass, in alternating order: passes in search of an obstacle, of which there is none, and the same
+passes without detection. Both have the recorder; the search adds the detector in each tick and the
+waiting process of the estimates. Ratios of lateness are taken within a round, and their median
+counts; the work per tick is that of the best session with and without. With 3 passes and 3 rounds
+it takes two minutes.
 """
 
 import argparse
@@ -103,7 +103,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurem
 
 
 def main() -> None:
-    """Print every session, then what the detector adds, and judge it."""
+    """Print every session, then the cost of the detector, and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("passes", type=int, nargs="?", default=3)
     parser.add_argument("rounds", type=int, nargs="?", default=3)

@@ -1,9 +1,10 @@
-"""Touches in sessions, with the model that one session of the same rig told.
+"""Touches in sessions, with a model identified from one session of the same rig.
 
 Each simulated rig has a beam whose density and stiffness differ from the profile's by up to a
-tenth. One ``rigd run until --damping 1%`` and ``analyze`` tell its model; then ``rigd run touch``
-meets obstacles at places of 0.05 to 0.97 m, of 100 to 100 000 N/m, at speeds of 0.3 to 2 rad/s, all
-as an operator types it, in fast mode. What is said of each touch is compared with the truth.
+tenth. One ``rigd run until --damping 1%`` and ``analyze`` identify its model; then ``rigd run
+touch`` meets obstacles at positions of 0.05 to 0.97 m, of 100 to 100 000 N/m, at speeds of 0.3 to
+2 rad/s, all with the commands of an operator, in fast mode. The report on each touch is compared
+with the truth.
 
     python benchmarks/bench_touch_sessions.py --touches 60 --rigs 6 --jsonl results.jsonl
     python benchmarks/bench_touch_sessions.py --table results.jsonl
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 
 BIN = Path(sys.executable).parent
 NOISE_NM = 5e-3
-"""As in the profile."""
+"""Torque noise of the profile."""
 ROWS = (
     # Measured 0 of 600, 1 and 4 of 600, 0.54 mm, 96.3 %, 0: docs/validation/touch.md.
     Row("touches that failed", most=0, unit="%"),
@@ -41,7 +42,7 @@ ROWS = (
 
 @dataclass(frozen=True, slots=True)
 class Meeting:
-    """A slew, and what it meets."""
+    """A slew and its obstacle."""
 
     x_m: float
     angle_rad: float
@@ -68,7 +69,7 @@ def draw_meeting(rig: int, number: int) -> Meeting:
     )
 
 
-def said(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def run_command(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a command in a folder, with its own runtime folder."""
     environment = os.environ | {"XDG_RUNTIME_DIR": str(folder), "RIGD_NO_LOOK": "1"}
     command = [str(BIN / arguments[0]), *arguments[1:]]
@@ -88,22 +89,22 @@ def model_of(profile: Path, folder: Path) -> Path:
         "--profile",
         str(profile),
         "--output",
-        "told",
+        "identification",
     ]
-    said(folder, "rigd", "run", "until", *until)
-    [file] = (folder / "told").glob("*.mcap")
+    run_command(folder, "rigd", "run", "until", *until)
+    [file] = (folder / "identification").glob("*.mcap")
     path = folder / "model.json"
     analysis = ["--method", "record", "--json", str(path), "--report", str(folder / "report")]
-    done = said(folder, "analyze", str(file), *analysis)
+    done = run_command(folder, "analyze", str(file), *analysis)
     assert path.exists(), done.stderr
     return path
 
 
 def meet(rig: Rig, number: int, profile: Path, model: Path, folder: Path) -> dict[str, Any]:
-    """Run one touch, and return what came of it."""
+    """Run one touch and return its result."""
     meeting = draw_meeting(rig.number, number)
     obstacle = f"x={meeting.x_m},angle={meeting.angle_rad},stiffness={meeting.stiffness_n_per_m}"
-    done = said(
+    done = run_command(
         folder, "rigd", "run", "touch", str(round(meeting.angle_rad + 0.4, 4)),
         "--speed", str(meeting.speed_rad_s), "--fast", "--json", "--model", str(model),
         "--seed", str(1000 * rig.number + number), "--profile", str(profile),
@@ -118,29 +119,29 @@ def meet(rig: Rig, number: int, profile: Path, model: Path, folder: Path) -> dic
 
 
 def points(results: list[dict[str, Any]]) -> NDArray[np.float64]:
-    """Return rows of place, error, standard deviation and whether the interval holds the place."""
+    """Return rows of position, error, standard deviation, and whether the interval contains it."""
     rows = []
     for each in results:
         if not each.get("touches"):
             continue
         first = each["touches"][0]
-        place = first.get("x_m")
-        # Of what it cannot tell, it says the neighbourhood at most.
-        if first.get("kind") == "unknown" or place is None or place["std"] is None:
+        position = first.get("x_m")
+        # A touch of unknown kind has an approximate position at most.
+        if first.get("kind") == "unknown" or position is None or position["std"] is None:
             continue
-        low, high = place["interval_95"]
-        error = place["value"] - each["x_m"]
-        rows.append((each["x_m"], error, place["std"], low <= each["x_m"] <= high))
+        low, high = position["interval_95"]
+        error = position["value"] - each["x_m"]
+        rows.append((each["x_m"], error, position["std"], low <= each["x_m"] <= high))
     return np.array(rows, dtype=np.float64).reshape(-1, 4)
 
 
 def table(results: list[dict[str, Any]]) -> Iterator[str]:
-    """Write errors, coverage and kinds, at all places and between 0.1 and 0.95 m."""
+    """Yield lines of errors, coverage and kinds, at all positions and between 0.1 and 0.95 m."""
     failed = [each for each in results if "failed" in each]
     missed = [each for each in results if "failed" not in each and not each["touches"]]
-    told = [each for each in results if each.get("touches")]
+    detected = [each for each in results if each.get("touches")]
     yield f"{len(results)} touches: {len(failed)} failed, {len(missed)} not detected"
-    kinds = Counter(each["touches"][0].get("kind", "not told") for each in told)
+    kinds = Counter(each["touches"][0].get("kind", "not estimated") for each in detected)
     found = points(results)
     inner = (found[:, 0] > 0.1) & (found[:, 0] < 0.95)
     for name, chosen in (("0.05 to 0.97 m", found), ("0.1 to 0.95 m", found[inner])):
@@ -158,7 +159,7 @@ def table(results: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Run it."""
+    """Run the touches, or read them, print the results and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--touches", type=int, default=10, help="with each rig")
     parser.add_argument("--rigs", type=int, default=1)

@@ -1,14 +1,14 @@
-"""Sessions that end themselves, on simulated rigs that are not what their profile says.
+"""Sessions that end themselves, on simulated rigs that differ from their profile.
 
 Each rig has a beam whose density and stiffness differ from the profile's by up to a fifth, one of
-the seven structures of damping with modes of 0.1 to 3 %, torque noise of 3 to 20 mN·m. Four in
-five are no uniform beam in a vacuum: a clamp that gives way, a mass at the tip, both, or drag of
-the air. With ``--uneven`` density and stiffness wander along the beam by 0.3 to 5 %, half of the
+the seven structures of damping with modes of 0.1 to 3 %, and torque noise of 3 to 20 mN·m. Four in
+five differ from a uniform beam in a vacuum: they have an elastic clamp, a mass at the tip, both, or
+air drag. With ``--uneven`` density and stiffness vary along the beam by 0.3 to 5 %, half of the
 beams are in air, and the rig is that of `finite_element_rig.py`.
 
-Each is asked for the damping of its modes as precisely as the modal model of a chirp of 136 s would
-state it within the same range of slopes, by ``rigd run until --fast`` as an operator types it, and
-every number that is stated without a flag is compared with the truth.
+The target of each session is the precision of damping that the modal model of a chirp of 136 s has
+within the same range of slopes. The command is ``rigd run until --fast``, and every number stated
+without a flag is compared with the truth.
 
     python benchmarks/bench_until.py --rigs 100 --jsonl results.jsonl
     python benchmarks/bench_until.py --rigs 20 --uneven
@@ -49,16 +49,16 @@ RATE_HZ = 1000.0
 STRUCTURES = {
     "I": "i", "II": "e", "III": "ie", "IV": "I", "V": "E", "VI": "IE", "VII": "iE",
 }  # fmt: skip
-"""Types of damping: internal and external, in capitals those of a fractional order."""
+"""Types of damping: internal and external, capitals for a fractional order."""
 EXTRAS = ("uniform", "clamp", "mass", "clamp and mass", "drag")
 BAND_HZ = 50.0
 _ABSENT = 1e-7
-"""A coefficient of damping that changes nothing."""
+"""A negligible coefficient of damping."""
 ROWS = (
-    # Measured 0, 12 of 12 and 28 of 28; of 40 rigs 90 % of the damping ratios, 94 % of the
+    # Measured 0, 12 of 12 and 28 of 28; with 40 rigs 90 % of the damping ratios, 94 % of the
     # frequencies: docs/validation/until.md.
     Row("sessions that failed", most=0, unit="%"),
-    Row("sessions that reached what was asked", least=75, unit="%"),
+    Row("sessions that reached the target", least=75, unit="%"),
     Row("95 % intervals of modes that hold the truth", least=80, unit="%"),
 )
 HIGHEST_HZ = 450.0
@@ -69,7 +69,7 @@ PROFILE = Path(__file__).parents[1] / "hw_profiles" / "sim.toml"
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """What a simulated rig is."""
+    """True properties of a simulated rig."""
 
     number: int
     structure: str
@@ -88,11 +88,11 @@ class Rig:
 
     @property
     def damping(self) -> Damping:
-        """Damping of its beam."""
+        """Damping of the beam."""
         return Damping(self.zeta, self.alpha, self.gamma, self.lambda_)
 
     def beam(self) -> Beam:
-        """Its beam, without clamp and tip mass."""
+        """Return the beam without clamp and tip mass."""
         stated = load_profile("sim").rig.beam
         return replace(
             stated,
@@ -101,7 +101,7 @@ class Rig:
         )
 
     def truth(self) -> dict[str, dict[str, float]]:
-        """Frequencies and damping ratios of the modes in the band."""
+        """Return frequencies and damping ratios of the modes in the band."""
         if self.uneven_percent:
             beam = self.modal_beam()
             pairs = zip(beam.omega_rad_s, beam.damping_ratio, strict=True)
@@ -129,9 +129,9 @@ class Rig:
         return found
 
     def modal_beam(self) -> finite_element_rig.ModalBeam:
-        """Beam of finite elements whose density and stiffness wander along it.
+        """Return a beam of finite elements whose density and stiffness vary along it.
 
-        Its modes have the damping ratios of those of a uniform beam.
+        Its modes have the damping ratios of a uniform beam.
         """
         stated, rng = self.beam(), np.random.default_rng([self.number, 1])
         waves = np.arange(1, 6, dtype=float)
@@ -142,19 +142,19 @@ class Rig:
             wandering.append(scaled_smoothly(value, waves, scale * cosines, scale * sines))
         law = DampingLaw(0.0, 1.0, 0.0, 1.0)
         beam = FiniteElementBeam(stated.length_m, *wandering, law.elastic, law.medium)
-        omega, share = beam.shares()
+        omega, participation = beam.participations()
         within = omega < 2 * np.pi * HIGHEST_HZ
         position_m = (np.arange(DRAG_POINTS) + 0.5) * stated.length_m / DRAG_POINTS
         shape = beam.shapes_at(position_m)[within]
         density = wandering[0](position_m)
-        piece_m = stated.length_m / DRAG_POINTS
+        spacing_m = stated.length_m / DRAG_POINTS
         ratios = [mode.damping_ratio for mode in modes(stated, self.damping, int(within.sum()))]
         return finite_element_rig.ModalBeam(
             omega[within],
             np.clip(ratios, 1e-4, 0.1),
-            share[within],
-            piece_m * shape @ density,
-            float(piece_m * density @ position_m**2),
+            participation[within],
+            spacing_m * shape @ density,
+            float(spacing_m * density @ position_m**2),
             beam.mass_moment_kg_m,
             position_m,
             shape,
@@ -201,11 +201,11 @@ def draw(number: int, seed: int) -> Rig:
     return rig
 
 
-def asked(rig: Rig) -> float:
-    """Relative standard deviation of the worst mode's damping that `analyze` states of the chirp.
+def chirp_precision(rig: Rig) -> float:
+    """Return the largest relative standard deviation of damping that the chirp would give.
 
     The angle is that of the closed loop, which hardly follows beyond mode 2. Its amplitude is the
-    paper's, lower where the tip's slope would leave the range that pieces keep to.
+    paper's, or less to keep the slope of the tip within the range of designed segments.
     """
     beam, damping = rig.beam(), rig.damping
     loop = RigPreview(load_profile("sim")).plant_with(Plant(beam, damping))
@@ -215,12 +215,14 @@ def asked(rig: Rig) -> float:
     present = replace(damping, zeta=rig.zeta or _ABSENT, gamma=rig.gamma or _ABSENT)
     noise = 2 * rig.noise_nm**2 / RATE_HZ
     estimate = BeamEstimate.stated(Plant(beam, present), noise).modal()
-    told = expected_precisions(angle_rad, estimate, [parse_target("damping", "100%")], RATE_HZ)
-    return max(each.std / each.value for each in told)
+    precisions = expected_precisions(
+        angle_rad, estimate, [parse_target("damping", "100%")], RATE_HZ
+    )
+    return max(each.std / each.value for each in precisions)
 
 
 def profile_of(rig: Rig, folder: Path) -> Path:
-    """Write the profile of a rig: the shipped one, with another simulation."""
+    """Write the shipped profile with the simulation of a rig, and return its path."""
     text = PROFILE.read_text("utf-8")
     for key, value in (
         ("torque_noise_nm", rig.noise_nm), ("rest_torque_nm", 2.5 * rig.noise_nm),
@@ -249,13 +251,13 @@ def profile_of(rig: Rig, folder: Path) -> Path:
 
 
 def run(rig: Rig, at_most_s: float, options: list[str]) -> dict[str, Any]:
-    """Run a session on a rig, and return what came of it."""
-    share = asked(rig)
+    """Run a session on a rig and return its result."""
+    target = chirp_precision(rig)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         command = [
             str(Path(sys.executable).with_name("rigd")), "run", "until",
-            "--damping", f"{100 * share:.4g}%", "--at-most", str(at_most_s), "--fast", "--no-look",
+            "--damping", f"{100 * target:.4g}%", "--at-most", str(at_most_s), "--fast", "--no-look",
             "--json", "--seed", str(rig.number), "--profile", str(profile_of(rig, folder)),
             "--output", name, *options,
         ]  # fmt: skip
@@ -266,11 +268,11 @@ def run(rig: Rig, at_most_s: float, options: list[str]) -> dict[str, Any]:
         try:
             [session] = json.loads(done.stdout)["sessions"]
         except (ValueError, KeyError):
-            return {"rig": asdict(rig), "asked": share, "failed": done.stderr[-2000:]}
+            return {"rig": asdict(rig), "target": target, "failed": done.stderr[-2000:]}
     fit = session["fit"]
     return {
         "rig": asdict(rig),
-        "asked": share,
+        "target": target,
         "duration_s": session["recorded"] / RATE_HZ,
         "outcome": session["outcome"],
         "reason": session["reason"],
@@ -283,7 +285,7 @@ def run(rig: Rig, at_most_s: float, options: list[str]) -> dict[str, Any]:
     }
 
 
-# What came of them
+# Evaluation of the results
 
 
 def intervals(result: dict[str, Any]) -> Iterator[tuple[str, float, float, float, float]]:
@@ -292,29 +294,34 @@ def intervals(result: dict[str, Any]) -> Iterator[tuple[str, float, float, float
     truth = rig.truth()
     for mode in result["modes"]:
         for key, name in (("frequency_hz", "frequency"), ("damping_ratio", "damping")):
-            told = mode[key]
+            estimate = mode[key]
             true = truth.get(f"{name} {mode['mode']}")
-            if mode["shown"] and true is not None and not told["flag"] and told["interval_95"]:
-                yield f"{name} {mode['mode']}", true, told["value"], *told["interval_95"]
+            if (
+                mode["shown"]
+                and true is not None
+                and not estimate["flag"]
+                and estimate["interval_95"]
+            ):
+                yield f"{name} {mode['mode']}", true, estimate["value"], *estimate["interval_95"]
     if rig.uneven_percent:
-        return  # the damping of such a rig acts on the motion relative to the hub, and has no order
+        return  # its damping acts on the motion relative to the hub and has no order
     values = {"zeta": rig.zeta, "alpha": rig.alpha, "gamma": rig.gamma, "lambda": rig.lambda_}
     there = {"zeta": rig.zeta, "alpha": rig.zeta, "gamma": rig.gamma, "lambda": rig.gamma}
-    for name, told in result["parameters"].items():
-        if there.get(name) and told["interval_95"] and not told["flag"]:
-            yield name, values[name], told["value"], *told["interval_95"]
+    for name, estimate in result["parameters"].items():
+        if there.get(name) and estimate["interval_95"] and not estimate["flag"]:
+            yield name, values[name], estimate["value"], *estimate["interval_95"]
 
 
 def table(results: list[dict[str, Any]]) -> Iterator[str]:
-    """Write times, coverage and bias."""
+    """Yield lines of times, coverage and bias."""
     failed = [each for each in results if "failed" in each]
     done = [each for each in results if "failed" not in each]
     reached = [each for each in done if each["search"]["reached"]]
     times = np.array([each["duration_s"] for each in reached])
-    yield f"{len(results)} rigs, {len(failed)} failed, {len(reached)} reached what was asked"
+    yield f"{len(results)} rigs, {len(failed)} failed, {len(reached)} reached the target"
     if times.size:
-        shares = " ".join(f"{p} %: {np.percentile(times, p):.1f} s" for p in (10, 50, 90, 100))
-        yield f"time to it: {shares}; asked {', '.join(_asked(reached))}"
+        percentiles = " ".join(f"{p} %: {np.percentile(times, p):.1f} s" for p in (10, 50, 90, 100))
+        yield f"time to the target: {percentiles}; target {', '.join(_target_range(reached))}"
     for each in done:
         if not each["search"]["reached"]:
             rig = each["rig"]
@@ -345,26 +352,26 @@ def table(results: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def predicted(results: list[dict[str, Any]]) -> Iterator[float]:
-    """Yield what fits state over what was expected of the piece before."""
+    """Yield stated over predicted standard deviations, one for each quantity and segment."""
     for each in results:
-        pieces = [piece for piece in each["search"]["pieces"] if "expected" in piece]
-        # A decision rests on the samples up to the beginning of the piece before.
-        for piece, later in zip(pieces, pieces[2:], strict=False):
-            for one in piece["expected"]:
+        segments = [segment for segment in each["search"]["pieces"] if "expected" in segment]
+        # A segment is chosen from the samples before the previous segment.
+        for segment, later in zip(segments, segments[2:], strict=False):
+            for one in segment["expected"]:
                 if later["stated"].get(one["name"]):
                     yield later["stated"][one["name"]] / one["std"]
 
 
-def _asked(results: list[dict[str, Any]]) -> Iterator[str]:
-    shares = [100 * each["asked"] for each in results]
+def _target_range(results: list[dict[str, Any]]) -> Iterator[str]:
+    targets = [100 * each["target"] for each in results]
     for name, value in zip(
-        ("least", "median", "most"), np.percentile(shares, (0, 50, 100)), strict=True
+        ("least", "median", "most"), np.percentile(targets, (0, 50, 100)), strict=True
     ):
         yield f"{name} {value:.2g} %"
 
 
 def main() -> None:
-    """Run it."""
+    """Run the sessions, or read them, print the results and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rigs", type=int, default=4)
     parser.add_argument("--first", type=int, default=0, help="number of the first rig")
@@ -387,14 +394,14 @@ def main() -> None:
             if chosen.jsonl:
                 with chosen.jsonl.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(result) + "\n")
-            said = result.get("failed") or f"{result['duration_s']:.1f} s, {result['reason']}"
-            print(f"rig {number}: asked {100 * result['asked']:.2g} %, {said}", flush=True)
+            outcome = result.get("failed") or f"{result['duration_s']:.1f} s, {result['reason']}"
+            print(f"rig {number}: target {100 * result['target']:.2g} %, {outcome}", flush=True)
     print("\n".join(table(results)))
     failed = sum("failed" in each for each in results)
     done = [each for each in results if "failed" not in each]
     reached = sum(bool(each["search"]["reached"]) for each in done)
     gate.measured("sessions that failed", percent(failed, len(results)))
-    gate.measured("sessions that reached what was asked", percent(reached, len(results)))
+    gate.measured("sessions that reached the target", percent(reached, len(results)))
     held = [
         low <= true <= high
         for each in done

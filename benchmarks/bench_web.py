@@ -1,12 +1,11 @@
-"""What the operator's page costs: processor time, memory, and how late the loop wakes up.
+"""Cost of the operator's page: processor time, memory, and wake-up latency of the loop.
 
     python benchmarks/bench_web.py [SECONDS] [ROUNDS]
 
-In each round, in turn, a daemon with its page runs a chirp at 1 kHz with no page open, with one,
-and with ten of which one is suspended. Processor time and memory (PSS) are those of the daemon's
-process and of the page's; the delay of a strip is from the last tick that a point stands for to its
-arrival. The ratio is the median over the rounds. With 10 s and 3 rounds it takes two and a half
-minutes.
+In each round a daemon with its page runs a chirp at 1 kHz with no page open, with one, and with ten
+of which one is suspended. Processor time and memory (PSS) are those of the process of the daemon
+and of the page server; the delay of a strip is the time from its last tick to its arrival. The
+ratio is the median over the rounds. With 10 s and 3 rounds it takes two and a half minutes.
 """
 
 import argparse
@@ -51,21 +50,21 @@ _SETTLED_S = 3.0
 
 @dataclass
 class Found:
-    """What one session showed."""
+    """Measurements of one session."""
 
     late_p99_us: float
     missed: int
     lost: int
     cpu_percent: tuple[float, float]
-    """Of the daemon's process and of the page's."""
+    """Of the daemon and of the page server, %."""
     pss_mb: tuple[float, float]
-    """Likewise."""
+    """Of the daemon and of the page server."""
     delays_s: list[float]
-    """Of the strips, as the first page got them."""
+    """Delays of the strips that the first page received."""
 
 
 def pss_mb(pid: int) -> float:
-    """Return the memory of a process, what it shares counted in parts."""
+    """Return the proportional set size of a process."""
     for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
         if line.startswith("Pss:"):
             return int(line.split()[1]) * 1024e-6
@@ -73,7 +72,7 @@ def pss_mb(pid: int) -> float:
 
 
 def page_process(daemon: int) -> int:
-    """Return the process of the page that a daemon has started."""
+    """Return the process of the page server of a daemon."""
     for task in Path(f"/proc/{daemon}/task").iterdir():
         for child in (task / "children").read_text().split():
             if b"rigd.web" in Path(f"/proc/{child}/cmdline").read_bytes():
@@ -81,28 +80,28 @@ def page_process(daemon: int) -> int:
     raise ValueError("no page")
 
 
-async def look_on(address: str, pages: int) -> None:
-    """Be some open pages; print when each strip came to the first one, and what it ended with."""
+async def open_pages(address: str, pages: int) -> None:
+    """Open pages; print the time of arrival and the end of each strip of the first one."""
     async with aiohttp.ClientSession() as session:
 
-        async def follow(*, told: bool) -> None:
+        async def follow(*, report: bool) -> None:
             async with session.ws_connect(f"{address}api/live") as socket:
                 async for message in socket:
                     for line in message.data.split("\n"):
-                        if told and line.startswith('{"type":"strip"'):
+                        if report and line.startswith('{"type":"strip"'):
                             strip = json.loads(line)
                             end_s = strip["t0_s"] + strip["dt_s"] * len(strip["angle_min"])
                             print(time.time(), end_s, flush=True)
 
-        await asyncio.gather(*(follow(told=number == 0) for number in range(pages)))
+        await asyncio.gather(*(follow(report=number == 0) for number in range(pages)))
 
 
 @contextmanager
-def looking_on(address: str, pages: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Have pages open, in a process of their own."""
+def opened_pages(address: str, pages: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Open pages in a separate process while this context lasts."""
     with out.open("wb") as stream:
         process = subprocess.Popen(
-            [sys.executable, __file__, "--look-on", address, str(pages)], stdout=stream
+            [sys.executable, __file__, "--open-pages", address, str(pages)], stdout=stream
         )
         try:
             yield process
@@ -112,7 +111,7 @@ def looking_on(address: str, pages: int, out: Path) -> Iterator[subprocess.Popen
 
 
 def run(seconds: float, folder: Path, pages: int) -> Found:
-    """Run one chirp with so many pages open; of more than one, another one is suspended."""
+    """Run one chirp with a number of open pages; of several, one is suspended."""
     daemon = find("sim")
     address = str(page_address("sim")).partition("#")[0]
     came = folder / "strips.txt"
@@ -121,9 +120,9 @@ def run(seconds: float, folder: Path, pages: int) -> Found:
         pid = client.ask("status")["daemon"]["pid"]
         watched = (pid, page_process(pid))
         suspended = None
-        openings = [looking_on(address, max(1, pages - 1), came)] if pages else []
+        openings = [opened_pages(address, max(1, pages - 1), came)] if pages else []
         if pages > 1:
-            openings.append(looking_on(address, 1, folder / "suspended.txt"))
+            openings.append(opened_pages(address, 1, folder / "suspended.txt"))
         entered = [opening.__enter__() for opening in openings]
         try:
             time.sleep(_SETTLED_S)
@@ -168,7 +167,7 @@ def run(seconds: float, folder: Path, pages: int) -> Found:
 
 
 async def load_s(address: str) -> float:
-    """Return the time in which the page and all that it names are loaded."""
+    """Return the time in which the page and all its files are loaded."""
     began_s = time.monotonic()
     async with aiohttp.ClientSession() as session:
         async with session.get(address) as answer:
@@ -184,7 +183,7 @@ async def load_s(address: str) -> float:
 
 @contextmanager
 def served(folder: Path) -> Iterator[None]:
-    """Have a daemon with its page, on the simulated rig."""
+    """Run a daemon with its page on the simulated rig while this context lasts."""
     with (folder / "serve.txt").open("wb") as log:
         command = [RIGD, "serve", "--profile", "sim", "--web", "--output", folder / "out"]
         daemon = subprocess.Popen([str(each) for each in command], stdout=log, stderr=log)
@@ -202,9 +201,9 @@ def served(folder: Path) -> Iterator[None]:
 
 
 def main() -> None:
-    """Print every round, then what it comes to."""
-    if sys.argv[1:2] == ["--look-on"]:
-        asyncio.run(look_on(sys.argv[2], int(sys.argv[3])))
+    """Print every round, then the medians, and check the limits."""
+    if sys.argv[1:2] == ["--open-pages"]:
+        asyncio.run(open_pages(sys.argv[2], int(sys.argv[3])))
         return
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("seconds", type=float, nargs="?", default=10.0)

@@ -1,11 +1,11 @@
-"""What the exchange with the devices costs the loop in each tick, against bare sockets.
+"""Cost of the exchange with the devices in each tick of the loop, against plain sockets.
 
-A simulated rig answers from another process. In blocks of 250 ticks at 1 kHz, in turn, our drivers
-and a bare loop of socket and struct do the same exchange with the same devices on the same sockets:
-SYNC, RPDO and TPDO with the drive, request and two replies (or seven records) with the sensor, and
-the values in N, N·m and rad. Between asking and taking the replies both sleep, so that no time is
-spent waiting for the other process: what is measured is the work before and after. The first ticks
-of a block, which find the other one's replies, do not count.
+A simulated rig answers from another process. In alternating blocks of 250 ticks at 1 kHz, our
+drivers and a plain loop of socket and struct do the same exchange with the same devices on the same
+sockets: SYNC, RPDO and TPDO with the drive, request and two replies (or seven records) with the
+sensor, and the values in N, N·m and rad. Between request and replies both sleep, so that no time is
+spent waiting for the other process: only the work before and after is measured. The first ticks of
+a block, which find replies to the other loop, do not count.
 """
 
 import argparse
@@ -37,18 +37,18 @@ BLOCKS, TICKS, SETTLING = 20, 250, 20
 PERIOD_NS = 1_000_000
 PAUSE_S = 600e-6
 TRIES = 5
-"""A pause of this computer ends the exchange: the simulated drive misses its SYNC."""
+"""A stall of this computer ends the exchange: the simulated drive misses its SYNC."""
 ROWS = (
     # Measured 1.5 to 1.8 and 1.9: docs/validation/architecture.md.
     Row("antenna_can, median", most=2.5, unit="times a bare loop"),
     Row("antenna_serial, median", most=2.5, unit="times a bare loop"),
 )
 Exchange = tuple[Callable[[int], None], Callable[[], None]]
-"""Asks, and takes what has come."""
+"""Functions that send the requests, and take the replies received."""
 
 
 class OpenLink:
-    """A link on a socket that the bare loop uses too."""
+    """A link on a socket that the plain loop uses too."""
 
     def __init__(self, link: socket.socket) -> None:
         self.exchange = CanExchange(SocketPort(link, "benchmark"))
@@ -58,11 +58,11 @@ class OpenLink:
         return self.exchange
 
     def close(self) -> None:
-        """Leave the socket to the benchmark."""
+        """Do nothing: the benchmark closes the socket."""
 
 
 def ours(drive: Cia402Drive, sensor: WrenchSensor) -> Exchange:
-    """Return a tick as the cycle does it."""
+    """Return the exchange of a tick by our drivers."""
 
     def ask(due_ns: int) -> None:
         drive.latch(due_ns)
@@ -77,7 +77,7 @@ def ours(drive: Cia402Drive, sensor: WrenchSensor) -> Exchange:
 
 
 class Bare:
-    """The least that speaks the protocols: no checks, no routing beyond the identifier."""
+    """Least implementation of the protocols: no checks, no routing beyond the identifier."""
 
     def __init__(self, link: socket.socket, calibration: dict, resolution_rad: float) -> None:
         frame = struct.Struct("=IB3x8s")
@@ -100,11 +100,11 @@ class Bare:
         self.wrench: Wrench = (0.0,) * 6
 
     def ask_drive(self, due_ns: int) -> None:  # noqa: ARG002
-        """Ask the drive; the sensor on the serial line is not asked."""
+        """Send requests to the drive; the sensor on the serial line needs none."""
         self.link.send(self.sync)
 
     def ask_both(self, due_ns: int) -> None:  # noqa: ARG002
-        """Ask the drive and the sensor on the bus."""
+        """Send requests to the drive and the sensor on the bus."""
         self.link.send(self.sync)
         self.link.send(self.request)
 
@@ -123,7 +123,7 @@ class Bare:
         return found
 
     def take_can(self) -> None:
-        """Take the replies of drive and sensor on the bus, and answer."""
+        """Take the replies of drive and sensor on the bus, and command a torque."""
         found = self._frames()
         for key, raw in found.items():
             if key == b"\x81\x01\0\0":
@@ -139,7 +139,7 @@ class Bare:
         self.link.send(self.rpdo.pack(0x201, 4, 0x0F, 0))
 
     def take_serial(self) -> None:
-        """Take the drive's reply and the records on the line `self.port`, and answer."""
+        """Take the drive's reply and the records on `self.port`, and command a torque."""
         found = self._frames()
         raw = found.get(b"\x81\x01\0\0")
         if raw:
@@ -162,7 +162,7 @@ class Bare:
 
 
 def alternate(exchanges: dict[str, Exchange]) -> dict[str, list[int]]:
-    """Run blocks in turn at 1 kHz; return each one's times per tick, in ns."""
+    """Run alternating blocks at 1 kHz; return the times per tick of each exchange, in ns."""
     times: dict[str, list[int]] = {name: [] for name in exchanges}
     due_ns = time.monotonic_ns() + 2 * PERIOD_NS
     for _ in range(BLOCKS):
@@ -185,11 +185,11 @@ def alternate(exchanges: dict[str, Exchange]) -> dict[str, list[int]]:
 
 
 def compare(profile_name: str) -> dict[str, list[int]]:
-    """Set the drivers up on a simulated rig, run, and return the times of ticks in ns."""
+    """Set up the drivers on a simulated rig, run, and return the times of ticks in ns."""
     profile = load_profile(profile_name)
     rig = replace(
         profile.rig,
-        # A pause of this machine must not end the comparison.
+        # A stall of this computer must not end the comparison.
         cia402=replace(profile.rig.cia402, heartbeat_timeout_s=5.0, drive_heartbeat_timeout_s=5.0),
     )
     command = [Path(sys.executable).parent / "rigd", "simulate", "--profile", profile_name]
@@ -244,7 +244,7 @@ def ratio(name: str, times: dict[str, list[int]]) -> float:
 
 
 def main() -> None:
-    """Compare both sensors, and judge."""
+    """Compare with both sensors, and check the limits."""
     gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     with tempfile.TemporaryDirectory(prefix="rigd-") as folder:
         os.environ["XDG_RUNTIME_DIR"] = folder

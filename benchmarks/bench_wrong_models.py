@@ -1,10 +1,10 @@
-"""What the analyzer says of records of rigs that are not as it takes them to be.
+"""Results of the analyzer on records of rigs that violate its assumptions.
 
 ``bench_wrong_models.py [--records N] [--defect TEXT ...] [--rig NAME ...]`` makes N records of each
-defect (those whose names hold one of the texts; every fourth, if none is given) by turns on its
-rigs, at least one on each, judges them, and prints a line for each defect: in how many records
-nothing but noise is said to remain, what is named, and the worst error of what is reported without
-a flag, in its own standard deviations. ``--say`` prints all that is said of each record.
+defect (those whose names contain one of the texts; without texts, every fourth) on its rigs in
+turn, at least one on each, and analyses them. It prints a line for each defect: the number of
+records whose residual is reported as noise, the named effects, and the worst error of a number
+without a flag, in its standard deviations. ``--say`` prints the verdict on each record.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ ROWS = (
 )
 SOUND = "none"
 DEFAULT_STEP = 4
-"""Every fourth defect is judged if none is named; the first is the sound rig."""
+"""Without names, every fourth defect is evaluated; the first is the sound rig."""
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """What was said of one record."""
+class Verdict:
+    """Verdict of the analyzer on one record."""
 
     selection: Selection
     errors: dict[str, float]
     cpu_s: float
 
     @classmethod
-    def of(cls, made: Record) -> Judged:
-        """Judge a record."""
+    def of(cls, made: Record) -> Verdict:
+        """Analyse a record."""
         measurement = made.measurement()
         start = time.process_time()
         selection = select(measurement)
@@ -52,24 +52,24 @@ class Judged:
 
     @property
     def worst(self) -> tuple[float, str]:
-        """Largest error of what has no flag, and of what it is."""
+        """Largest error of a number without a flag, and the name of the number."""
         return max(((abs(e), name) for name, e in self.errors.items()), default=(0.0, "nothing"))
 
 
 def errors_of(made: Record, selection: Selection) -> Iterator[tuple[str, float]]:
-    """Give by name the error of what the headline tells without a flag, in its deviations.
+    """Yield name and error of numbers without a flag, in standard deviations.
 
-    A frequency that changes during the sweep has no truth to compare with.
+    A frequency that changes during the sweep has no single true value.
     """
-    told = selection.headline
+    headline = selection.headline
     for name, true in made.rig.parameters.items():
-        if name in told.parameters:
-            yield from _error(name, told.parameters[name], true)
-    for mode, true in zip(told.modes, made.rig.damping_ratios.tolist(), strict=False):
+        if name in headline.parameters:
+            yield from _error(name, headline.parameters[name], true)
+    for mode, true in zip(headline.modes, made.rig.damping_ratios.tolist(), strict=False):
         yield from _error(f"xi{mode.number}", mode.damping_ratio, true)
     if made.frequencies_change:
         return
-    for mode, pole in zip(told.modes, made.rig.poles().tolist(), strict=False):
+    for mode, pole in zip(headline.modes, made.rig.poles().tolist(), strict=False):
         yield from _error(f"f{mode.number}", mode.frequency_hz, pole.imag / (2 * math.pi))
 
 
@@ -79,7 +79,7 @@ def _error(name: str, quantity: Estimate, true: float) -> Iterator[tuple[str, fl
 
 
 def main() -> None:
-    """Judge the records asked for."""
+    """Evaluate the requested records and check the limits."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--records", type=int, default=1, help="of each defect")
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
@@ -88,7 +88,7 @@ def main() -> None:
     parser.add_argument("--say", action="store_true", help="print every verdict")
     gate = Gate(ROWS, parser)
     given = gate.given
-    every: dict[str, list[Judged]] = {}
+    every: dict[str, list[Verdict]] = {}
     defects = list(DEFECTS)[::DEFAULT_STEP]
     if given.defect:
         defects = [name for name in DEFECTS if any(text in name for text in given.defect)]
@@ -99,26 +99,26 @@ def main() -> None:
     print("|---|---|---|---|---|")
     for defect in defects:
         rigs, make = DEFECTS[defect]
-        judged = []
+        verdicts = []
         chosen = [name for name in rigs if name in given.rig]
         for name in chosen:
-            share = math.ceil(given.records / len(chosen))
-            for seed in range(given.first, given.first + share):
-                one = Judged.of(make(RIGS[name], seed))
-                judged.append(one)
+            count = math.ceil(given.records / len(chosen))
+            for seed in range(given.first, given.first + count):
+                one = Verdict.of(make(RIGS[name], seed))
+                verdicts.append(one)
                 if given.write_message:
                     _say(f"{defect}, {name}, {seed}", one)
-        if judged:
-            every[defect] = judged
-            _show(defect, judged)
+        if verdicts:
+            every[defect] = verdicts
+            _show(defect, verdicts)
     records = [each for of_defect in every.values() for each in of_defect]
     gate.measured("worst error without a flag", max(each.worst for each in records)[0])
     seen = {
         sound: [
             bool(each.selection.verdict.findings) or not each.selection.verdict.adequate
-            for defect, judged in every.items()
+            for defect, verdicts in every.items()
             if (defect == SOUND) is sound
-            for each in judged
+            for each in verdicts
         ]
         for sound in (False, True)
     }
@@ -133,7 +133,7 @@ def main() -> None:
     gate.finish(part=bool(given.defect))
 
 
-def _say(title: str, one: Judged) -> None:
+def _say(title: str, one: Verdict) -> None:
     print(f"\n{title}: {one.selection.candidates[0].name}, {one.cpu_s:.1f} s")
     for sentence in one.selection.verdict.sentences:
         print(f"    {sentence}")
@@ -142,19 +142,19 @@ def _say(title: str, one: Judged) -> None:
         print("   ", row)
 
 
-def _show(defect: str, judged: list[Judged]) -> None:
-    white = sum(one.selection.verdict.adequate for one in judged)
+def _show(defect: str, verdicts: list[Verdict]) -> None:
+    white = sum(one.selection.verdict.adequate for one in verdicts)
     named = Counter(
         kind
-        for one in judged
+        for one in verdicts
         for kind in dict.fromkeys(f.kind for f in one.selection.verdict.findings)
     )
     names = ", ".join(f"{kind} {count}" for kind, count in named.most_common()) or "nothing"
-    sure = sum("no unmodelled effect" in " ".join(o.selection.verdict.sentences) for o in judged)
-    worst, what = max(one.worst for one in judged)
-    cpu_s = max(one.cpu_s for one in judged)
+    sure = sum("no unmodelled effect" in " ".join(o.selection.verdict.sentences) for o in verdicts)
+    worst, what = max(one.worst for one in verdicts)
+    cpu_s = max(one.cpu_s for one in verdicts)
     print(
-        f"| {defect} | {white}, {sure} of {len(judged)} | {names} | {worst:.1f} ({what}) "
+        f"| {defect} | {white}, {sure} of {len(verdicts)} | {names} | {worst:.1f} ({what}) "
         f"| {cpu_s:.1f} |",
         flush=True,
     )

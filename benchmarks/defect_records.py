@@ -1,4 +1,4 @@
-"""Records of rigs with defects: what is true of a rig, and what its instruments record.
+"""Records of rigs with defects: true properties of a rig, and the signals of its instruments.
 
 The beam is of finite elements (`finite_element_beam`); nothing is taken from `rigd` or `analysis`.
 A record is 136 s at 1 kHz: 1 s of rest, a chirp from 0.05 to 50 Hz in 120 s behind a motor loop of
@@ -7,7 +7,7 @@ and noise of 5 mN·m, white or coloured.
 
 Linear rigs are computed on a shifted line of the Laplace plane, on a grid four times as fine as
 the record's. A step in time conserves the state: the record after it is that of the changed beam
-plus the free decay of the difference of the two states. What drag changes is marched in time.
+plus the free decay of the difference of the two states. The effect of drag is integrated in time.
 Play, friction and the sensor's cubic gain act on signals.
 """
 
@@ -29,13 +29,13 @@ FIRST_HZ, LAST_HZ = 0.05, 50.0
 LENGTH_M, DENSITY_KG_PER_M, STIFFNESS_N_M2 = 0.98, 4.7e-3, 0.090275
 NOISE_NM = 5e-3
 VISIBLE_PEAK = 2.0
-"""A mode is visible if its part of the torque exceeds the noise's standard deviation so often."""
+"""Ratio of a mode's torque to the standard deviation of the noise above which it is visible."""
 
 _ENCODER_RAD, _SENSOR_NM = 7e-5, 1.25e-4
 _LOOP_RAD_S = 2 * np.pi * 20.0
 _FINER = 4
 _DECAY = 14.0
-"""What wraps around the padded grid has decayed by exp(-14) = 1e-6; rounding has grown by 1e3."""
+"""Aliases on the padded grid have decayed by exp(-14) = 1e-6; rounding has grown by 1e3."""
 _VISIBLE_HZ = (0.3, 48.0)
 _AIR_KG_M3, DRAG_COEFFICIENT = 1.2, 1.2
 _MARCHED_MODES = 8
@@ -64,7 +64,7 @@ class DampingLaw:
     relaxations: tuple[tuple[float, float], ...] = ()
 
     def elastic(self, s: Complex) -> Complex:
-        """Multiplier of the bending stiffness."""
+        """Return the factor of the bending stiffness."""
         found = np.ones_like(s)
         if self.zeta is not None and self.alpha is not None:
             found = found + self.zeta * s**self.alpha
@@ -73,20 +73,20 @@ class DampingLaw:
         return found
 
     def medium(self, s: Complex) -> Complex:
-        """Force of the medium per length and deflection."""
+        """Return the force of the medium per length and deflection."""
         force: Complex = self.gamma * STIFFNESS_N_M2 * s**self.lambda_
         return force
 
 
 def clamp_stiffness(clamp: tuple[float, float], s: Complex) -> Complex:
-    """Rotational stiffness of a clamp, given at rest, with its loss factor at 100 rad/s."""
+    """Return the stiffness of a clamp, from its value at rest and loss factor at 100 rad/s."""
     stiffness, loss = clamp
     found: Complex = stiffness * (1 + loss * (s / 100.0) ** 0.2 / np.sin(0.1 * np.pi))
     return found
 
 
 def clamp_loss_factor(clamp: tuple[float, float], omega_rad_s: Real) -> Real:
-    """Loss factor that a clamp adds to every mode: its part in the energy is 4 EI / (k L)."""
+    """Return the loss factor that a clamp adds to a mode; its energy fraction is 4 EI / (k L)."""
     stiffness = clamp_stiffness(clamp, 1j * omega_rad_s)
     found: Real = -4 * STIFFNESS_N_M2 / LENGTH_M * (1 / stiffness).imag
     return found
@@ -94,7 +94,7 @@ def clamp_loss_factor(clamp: tuple[float, float], omega_rad_s: Real) -> Real:
 
 @dataclass(frozen=True, slots=True)
 class TrueMode:
-    """A mode of a rig: of its free decay with locked hub, and its residue in N·m/s.
+    """A mode of a rig with locked hub, and its residue in N·m/s.
 
     Attributes
     ----------
@@ -104,9 +104,9 @@ class TrueMode:
     residue : complex
         Of measured torque per angle, at the pole of the upper half plane.
     peak_nm : float
-        Largest part that the mode has in the torque of this record.
+        Largest torque of the mode in this record.
     visible : bool
-        Swept, and its part exceeds `VISIBLE_PEAK` standard deviations of the noise.
+        Swept, with a torque above `VISIBLE_PEAK` standard deviations of the noise.
     later_frequency_hz, later_damping_ratio : float, optional
         After a step in time.
     """
@@ -121,7 +121,7 @@ class TrueMode:
     later_damping_ratio: float | None = None
 
     def document(self) -> dict[str, object]:
-        """As JSON."""
+        """Return the mode as a JSON document."""
         return {
             "mode": self.mode,
             "frequency_hz": self.frequency_hz,
@@ -143,9 +143,9 @@ class NoiseSpectrum:
     white_nm : float
         Standard deviation of the white part at `RATE_HZ`.
     corner_hz : float
-        Where the part that falls as 1/f is as strong as the white one; 0 without.
+        Frequency at which the 1/f part equals the white one; 0 without.
     bumps : tuple of (frequency_hz, relative_width, height)
-        Power density around a frequency, in that of the white part.
+        Power density around a frequency, relative to the white part.
     """
 
     white_nm: float = NOISE_NM
@@ -153,7 +153,7 @@ class NoiseSpectrum:
     bumps: tuple[tuple[float, float, float], ...] = ()
 
     def density(self, frequency_hz: Real) -> Real:
-        """Power density over that of the white part."""
+        """Return the power density over that of the white part."""
         found = np.ones_like(frequency_hz)
         if self.corner_hz:
             found = found + self.corner_hz / np.maximum(frequency_hz, 0.01)
@@ -172,7 +172,7 @@ class NoiseSpectrum:
 
 @dataclass(frozen=True, slots=True)
 class TorqueChannel:
-    """What is between the beam's torque and its record.
+    """Channel from the torque of the beam to its record.
 
     Attributes
     ----------
@@ -197,7 +197,7 @@ class TorqueChannel:
     play_rad: float = 0.0
 
     def response(self, s: Complex) -> Complex:
-        """Record of the torque over the torque."""
+        """Return the response from torque to recorded torque."""
         found = np.exp(-s * self.delay_s)
         if self.resonance_hz:
             turns = s / (2 * np.pi * self.resonance_hz)
@@ -213,23 +213,23 @@ class Defect:
     ----------
     kind : str
     size : mapping
-        What was drawn, for people.
+        Drawn values, for display.
     linear_constant : bool
     damping : DampingLaw
     beam : FiniteElementBeam
     channel : TorqueChannel
     alpha_range : tuple of float, optional
-        Slopes of the loss of material and clamp over frequency, where it has no single order.
+        Slopes of the loss of material and clamp over frequency, if they have no single order.
     clamp : tuple of (nm_per_rad, loss_factor), optional
-        Elastic clamp. The modes do not tell its loss from that of the material.
+        Elastic clamp. The modes cannot distinguish its loss from that of the material.
     effects : tuple of str
-        What the analyzer may state of this rig, in its words, whatever the size.
+        Effects that the analyzer may state for this rig, in its words, with any size.
     constant_nm : float
         Constant load of gravity.
     step : tuple of (at_s, relative_change), optional
         Change of the bending stiffness in time.
     drag_m : float
-        Diameter of a wire that the air brakes.
+        Diameter of a wire with air drag.
     """
 
     kind: str
@@ -246,10 +246,10 @@ class Defect:
     drag_m: float = 0.0
 
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Return the true values, lowest and highest, by the names that the analyzer gives them.
+        """Return the least and largest true values, by the names of the analyzer.
 
-        The two are equal where the rig has a single value. A property that varies along the beam,
-        or in time, has the range of its local values. What the rig does not have is left out.
+        They are equal if the rig has a single value. A property that varies along the beam or in
+        time has the range of its local values. Properties that the rig does not have are left out.
 
         A mass at the tip and an elastic clamp act on all modes alike, as density and stiffness do:
         these have the range up to the value of the uniform beam with the same modes.
@@ -300,13 +300,13 @@ class Defect:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """True values of what has a single one."""
+        """Return the properties that have a single true value."""
         return {name: low for name, (low, high) in self.ranges().items() if low == high}
 
 
 @dataclass(frozen=True, slots=True)
 class DefectRecord:
-    """A record of a rig with a defect, at `RATE_HZ`, with what is true of it."""
+    """A record of a rig with a defect, at `RATE_HZ`, with its true properties."""
 
     seed: int
     defect: Defect
@@ -319,7 +319,7 @@ class DefectRecord:
     modes: tuple[TrueMode, ...]
 
     def truth(self) -> dict[str, object]:
-        """Give what is true, as a JSON document."""
+        """Return the true properties as a JSON document."""
         law = self.defect.damping
         return {
             "seed": self.seed,
@@ -348,7 +348,7 @@ class DefectRecord:
         }
 
     def save(self, path: str) -> None:
-        """Write as a compressed .npz."""
+        """Write the record as a compressed .npz file."""
         np.savez_compressed(
             path,
             angle_rad=self.angle_rad,
@@ -361,7 +361,7 @@ class DefectRecord:
 
 @dataclass(frozen=True, slots=True)
 class _ShaftMotion:
-    """A shaft's motion on the shifted line."""
+    """Motion of a shaft on the shifted line."""
 
     s: Complex
     sigma: float
@@ -369,7 +369,7 @@ class _ShaftMotion:
     angle: Complex
 
     def at_record(self, spectrum: Complex) -> Real:
-        """Signal of a spectrum at `RATE_HZ`."""
+        """Return the signal of a spectrum at `RATE_HZ`."""
         points = 2 * (spectrum.size - 1)
         signal = np.fft.irfft(spectrum, points)[: self.count : _FINER]
         t = np.arange(signal.size) / RATE_HZ
@@ -377,7 +377,7 @@ class _ShaftMotion:
         return found
 
     def smooth_at_record(self, spectrum: Complex) -> Real:
-        """Signal at `RATE_HZ` of a spectrum without content above half of that."""
+        """Return the signal at `RATE_HZ` of a spectrum without content above half of that."""
         points = 2 * (spectrum.size - 1) // _FINER
         signal = np.fft.irfft(spectrum[: points // 2 + 1], points) / _FINER
         found: Real = signal[: self.count // _FINER]
@@ -385,21 +385,21 @@ class _ShaftMotion:
         return found
 
     def at_instant(self, spectrum: Complex, time_s: float) -> float:
-        """Value of a spectrum's signal at one time."""
+        """Return the value of a spectrum's signal at one time."""
         points = 2 * (spectrum.size - 1)
         total = 2 * np.sum((spectrum * np.exp(self.s * time_s)).real) / points
         ends = (spectrum[[0, -1]] * np.exp(self.s[[0, -1]] * time_s)).real.sum() / points
         return float(total - ends)
 
     def spectrum(self, signal: Real) -> Complex:
-        """Spectrum of a signal that is given on the fine grid."""
+        """Return the spectrum of a signal on the fine grid."""
         rate_hz = _FINER * RATE_HZ
         decay = np.exp(-self.sigma * np.arange(signal.size) / rate_hz)
         found: Complex = np.fft.rfft(signal * decay, 2 * (self.s.size - 1))
         return found
 
     def at_grid(self, spectrum: Complex) -> Real:
-        """Signal of a spectrum on the fine grid."""
+        """Return the signal of a spectrum on the fine grid."""
         points = 2 * (spectrum.size - 1)
         signal = np.fft.irfft(spectrum, points)[: self.count]
         found: Real = signal * np.exp(self.sigma * np.arange(self.count) / (_FINER * RATE_HZ))
@@ -434,7 +434,7 @@ def simulate(
     noise: NoiseSpectrum,
     seconds: float = RECORD_S,
 ) -> DefectRecord:
-    """Return the record of a rig, with the truth about its modes.
+    """Return the record of a rig, with the true constants of its modes.
 
     Parameters
     ----------
@@ -486,7 +486,7 @@ def simulate(
 def _true_modes(
     defect: Defect, modes: list[LockedHubMode], motion: _ShaftMotion, noise: NoiseSpectrum
 ) -> tuple[TrueMode, ...]:
-    """Constants of the modes that the sweep comes near, and whether each is visible."""
+    """Return the constants of the modes near the sweep, and whether each is visible."""
     later: dict[int, LockedHubMode] = {}
     if defect.step is not None:
         later = {mode.number: mode for mode in _stiffer(defect).modes()}
@@ -518,7 +518,7 @@ def _true_modes(
 
 
 def _with_play(angle_rad: Real, width_rad: float) -> Real:
-    """Let the root follow the shaft only once a gap is closed."""
+    """Return the angle of a root that follows the shaft only once a gap is closed."""
     follows, here = np.empty(angle_rad.size), 0.0
     for i, angle in enumerate(angle_rad.tolist()):
         here = min(max(here, angle - width_rad / 2), angle + width_rad / 2)
@@ -527,7 +527,7 @@ def _with_play(angle_rad: Real, width_rad: float) -> Real:
 
 
 def _stiffer(defect: Defect) -> FiniteElementBeam:
-    """Beam after the step in time."""
+    """Return the beam after the step in time."""
     assert defect.step is not None
     factor, beam = 1 + defect.step[1], defect.beam
     return FiniteElementBeam(
@@ -540,9 +540,9 @@ def _stiffer(defect: Defect) -> FiniteElementBeam:
 
 
 def _with_step(defect: Defect, motion: _ShaftMotion, before_nm: Real) -> Real:
-    """Change the stiffness at an instant, with deflection and speed of each mode conserved.
+    """Return the torque with a change of stiffness; deflection and speed of modes are conserved.
 
-    The damping orders are 1, so that these are the whole state. A mode of the uniform beam moves by
+    The damping orders are 1, so that these are the complete state. A mode of the uniform beam obeys
     ``q'' + (c/rho) q' + g w² (q + zeta q') = -m (theta'' + (c/rho) theta')``, and the hub feels
     ``-m g w² (q + zeta q')``; g is 1 before and ``1 + change`` after the step.
     """
@@ -555,10 +555,10 @@ def _with_step(defect: Defect, motion: _ShaftMotion, before_nm: Real) -> Real:
     s, first = motion.s, round(at_s * RATE_HZ)
     at_s = first / RATE_HZ
     t = np.arange(torque.size - first) / RATE_HZ
-    frequencies, shares = beam.shares()
+    frequencies, participations = beam.participations()
     per_mass = law.gamma * STIFFNESS_N_M2 / DENSITY_KG_PER_M
-    for omega, share in zip(frequencies[:_MARCHED_MODES], shares, strict=False):
-        loads = -share * motion.angle * (s**2 + per_mass * s)
+    for omega, participation in zip(frequencies[:_MARCHED_MODES], participations, strict=False):
+        loads = -participation * motion.angle * (s**2 + per_mass * s)
         state = []
         for factor in (1.0, 1 + change):
             stiffness = factor * omega**2 * (1 + law.zeta * s)
@@ -571,39 +571,39 @@ def _with_step(defect: Defect, motion: _ShaftMotion, before_nm: Real) -> Real:
         pole = -damping + 1j * turning
         constant = (speed - pole.conjugate() * deflection) / (2j * turning)
         free = 2 * (constant * (1 + law.zeta * pole) * np.exp(pole * t)).real
-        torque[first:] -= share * square * free
+        torque[first:] -= participation * square * free
     return np.concatenate([before_nm[:first], torque[first:]])
 
 
 def _drag_torque(defect: Defect, motion: _ShaftMotion) -> Real:
-    """Torque that the air's drag on a wire adds, ``rho C_D d v |v| / 2`` per length.
+    """Return the torque added by the drag of air on a wire, ``rho C_D d v |v| / 2`` per length.
 
-    The damping orders are 1. What the drag changes in the modes' motion is marched at `RATE_HZ`,
-    each mode exactly under a force that is constant over a period; the force of the middle of a
-    period is extrapolated from the two ticks before.
+    The damping orders are 1. The change of the modes' motion is integrated at `RATE_HZ`, each mode
+    exactly for a force that is constant over a period; the force in the middle of a period is
+    extrapolated from the two ticks before.
     """
     beam, law = defect.beam, defect.damping
     assert law.zeta is not None
     assert law.alpha == law.lambda_ == 1
     per_speed = 0.5 * _AIR_KG_M3 * DRAG_COEFFICIENT * defect.drag_m
-    frequencies, shares = (each[:_MARCHED_MODES] for each in beam.shares())
+    frequencies, participations = (each[:_MARCHED_MODES] for each in beam.participations())
     nodes, weights = np.polynomial.legendre.leggauss(_DRAG_POINTS)
     position, width = 0.5 * LENGTH_M * (nodes + 1), 0.5 * LENGTH_M * weights
     shapes = beam.shapes_at(position)[:_MARCHED_MODES]
     s, per_mass = motion.s, law.gamma * STIFFNESS_N_M2 / DENSITY_KG_PER_M
     stiffness, damping = frequencies**2, per_mass + law.zeta * frequencies**2
     linear = np.multiply.outer(motion.smooth_at_record(motion.angle * s), position)
-    for i, share in enumerate(shares):
-        deflection = -share * (s**2 + per_mass * s) / (s**2 + damping[i] * s + stiffness[i])
+    for i, participation in enumerate(participations):
+        deflection = -participation * (s**2 + per_mass * s) / (s**2 + damping[i] * s + stiffness[i])
         speed = motion.smooth_at_record(motion.angle * deflection * s)
         linear += np.multiply.outer(speed, shapes[i])
     modes = frequencies.size
     generator = np.zeros((3 * modes, 3 * modes))
-    place = np.arange(modes)
-    generator[place, modes + place] = 1.0
-    generator[modes + place, place] = -stiffness
-    generator[modes + place, modes + place] = -damping
-    generator[modes + place, 2 * modes + place] = 1.0
+    index = np.arange(modes)
+    generator[index, modes + index] = 1.0
+    generator[modes + index, index] = -stiffness
+    generator[modes + index, modes + index] = -damping
+    generator[modes + index, 2 * modes + index] = 1.0
     over_period = expm(generator / RATE_HZ)
     free = over_period[: 2 * modes, : 2 * modes]
     pushed = over_period[: 2 * modes, 2 * modes :] @ -(shapes * width)
@@ -615,8 +615,8 @@ def _drag_torque(defect: Defect, motion: _ShaftMotion) -> Real:
         forces[i] = force = per_speed * np.abs(total) * total
         state = free @ state + pushed @ (1.5 * force - 0.5 * before)
         before = force
-    # Moment about the hub: of the modes' inertia and medium, and of the drag itself.
+    # Moment about the hub by the inertia of the modes, by the medium, and by the drag itself.
     deflections, speeds = states[:, :modes], states[:, modes:]
     accelerations = -stiffness * deflections - damping * speeds - forces @ (shapes * width).T
-    added: Real = (accelerations + per_mass * speeds) @ shares + forces @ (position * width)
+    added: Real = (accelerations + per_mass * speeds) @ participations + forces @ (position * width)
     return added

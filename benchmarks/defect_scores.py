@@ -1,9 +1,9 @@
 """Scores of the analyzer's document against the truth about a rig with a defect.
 
-The truth is the document of `DefectRecord.truth`, the judged document is an object of `headlines`
+The truth is the document of `DefectRecord.truth`; the scored document is an object of `headlines`
 as ``analyze --json`` prints it. Nothing else of the analyzer is used. A number is compared with the
-range of true values (`Defect.ranges`): inside of it the error is 0, outside it is the distance to
-the nearer end over the standard deviation that the 95 % interval implies on that side.
+range of true values (`Defect.ranges`): inside it the error is 0, outside it the distance to the
+nearer end over the standard deviation that the 95 % interval implies on that side.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Range = tuple[float, float]
 Document = dict[str, Any]
 
 FAR = 4.0
-"""Standard deviations from which a number without a flag counts as wrong."""
+"""Error in standard deviations above which a number without a flag is wrong."""
 DECIDED_ORDERS = ("compatible", "fractional")
-"""Statuses of an order that state its interval as a fact."""
+"""Statuses of an order whose interval is stated as a fact."""
 MATCHED = 0.1
-"""Relative difference of frequency within which a mode is taken for a true one."""
+"""Largest relative difference of frequency between a mode and its true one."""
 LONGEST_S = 10.0
-"""Most processor time of a judgement."""
+"""Largest allowed processor time of an analysis."""
 
 _NORMAL_95 = 1.959963984540054
 _STATED_OVER = 4.7e-3 / 0.090275
@@ -38,7 +38,7 @@ _OF_EFFECT = {
     "tool inertia": "tool_inertia_kg_m2",
     "air drag": "drag_m",
 }
-"""True value that a named effect's size is compared with."""
+"""True value with which the size of a named effect is compared."""
 
 Group = Literal["mode", "parameter", "size", "exact geometry"]
 
@@ -72,7 +72,7 @@ class ScoredNumber:
 
     @property
     def inside(self) -> bool:
-        """Whether the interval holds a true value."""
+        """Whether the interval contains a true value."""
         return (
             self.interval is not None
             and self.interval[0] <= self.truth[1]
@@ -87,7 +87,7 @@ class ScoredNumber:
 
 @dataclass(frozen=True, slots=True)
 class ScoredDefect:
-    """Everything that one record's document stated, compared with the truth.
+    """Statements of the document of one record, compared with the truth.
 
     Attributes
     ----------
@@ -95,27 +95,27 @@ class ScoredDefect:
     kind : str
     linear_constant : bool
     coloured : bool
-        Whether the noise is.
+        Whether the noise is coloured.
     cpu_s : float
-        Processor time of the judgement.
+        Processor time of the analysis.
     type : str
-        Structure that the headline is of.
+        Structure of the headline.
     numbers : tuple of ScoredNumber
     not_given : tuple of int
-        Visible modes without an entry that has no flag.
+        Visible modes without an unflagged entry.
     visible : int
         Count of visible modes.
     false_facts : tuple of str
     gate : str or None
-        Status of the test whether a uniform beam predicts the modes; None if there is none.
+        Status of the test for a uniform beam; None without one.
     gate_p : float or None
     shift : float or None
-        By how many standard deviations the defect shifts the headline of a uniform beam, whose
-        geometry has a tolerance.
+        Shift of the headline of a uniform beam by the defect, in standard deviations that include
+        the tolerance of the geometry.
     exact_shift : float or None
-        The same for exact geometry, whose standard deviations are about a tenth of those.
+        The same for exact geometry, with standard deviations about a tenth of those.
     error : str or None
-        Why there is no document.
+        Reason if there is no document.
     """
 
     seed: int
@@ -136,7 +136,7 @@ class ScoredDefect:
 
     @classmethod
     def from_line(cls, line: str) -> ScoredDefect:
-        """Read what `line` wrote."""
+        """Read a record written by `line`."""
         fields = json.loads(line)
         numbers = tuple(
             ScoredNumber(
@@ -157,7 +157,7 @@ class ScoredDefect:
 
     @property
     def wrong(self) -> tuple[ScoredNumber, ...]:
-        """Numbers without a flag that are far from the truth."""
+        """Numbers without a flag that are wrong by `FAR` standard deviations."""
         return tuple(
             each
             for each in self.numbers
@@ -166,16 +166,16 @@ class ScoredDefect:
 
     @property
     def moved(self) -> bool:
-        """Whether the defect moves the headline of a uniform beam by more than its deviation.
+        """Whether the defect shifts the headline of a uniform beam by a standard deviation.
 
-        Without a shift (rigs that are not linear and constant): a parameter without a flag is three
-        standard deviations off, which noise alone seldom does.
+        Without a shift (rigs that are not linear and constant): whether a parameter without a flag
+        is off by three standard deviations, which is improbable by noise alone.
         """
         return self._is_moved(self.shift, "parameter")
 
     @property
     def moved_exactly(self) -> bool:
-        """Whether the defect moves what a uniform beam would give if its geometry were exact."""
+        """Whether the defect shifts the result of a uniform beam with exact geometry."""
         return self._is_moved(self.exact_shift, "exact geometry")
 
     def _is_moved(self, shift: float | None, group: Group) -> bool:
@@ -268,7 +268,7 @@ def _scored_modes(
 
 
 def _nearest(modes: Iterable[Document], number: int, frequency_hz: float) -> Document | None:
-    """Find the true mode of nearest frequency; by number where the rig has no frequency."""
+    """Return the true mode of nearest frequency; by number if the rig has no frequency."""
     best, distance = None, MATCHED
     for mode in modes:
         if mode["frequency_hz"] is None:
@@ -292,7 +292,7 @@ def _scored_parameters(
 
 
 def _scored_sizes(entries: Iterable[Document], truth: Document) -> list[ScoredNumber]:
-    """Compare losses at their pivots with those of laws that have a single coefficient."""
+    """Compare losses at their pivots with those of laws with a single coefficient."""
     law, ranges = truth["law"], truth["ranges"]
     numbers = []
     for entry in entries:
@@ -309,7 +309,7 @@ def _scored_sizes(entries: Iterable[Document], truth: Document) -> list[ScoredNu
         lost = coefficient * omega**order * math.sin(order * math.pi / 2)
         if not internal:
             lost /= _STATED_OVER * omega**2
-        # The loss of a clamp acts as one of the material does.
+        # The loss of a clamp acts like that of the material.
         more = 0.0 if clamp is None else float(clamp_loss_factor(tuple(clamp), np.array(omega)))
         numbers.append(_scored(f"{entry['damping']} size", "size", entry, (lost, lost + more)))
     return numbers
@@ -327,7 +327,7 @@ def _deviation(value: float, interval: Range | None, truth: Range) -> float:
 
 
 def _false_orders(entries: Document, truth: Document, ranges: dict[str, Range]) -> list[str]:
-    """List orders stated as facts that are not so."""
+    """List orders stated as facts that are wrong."""
     found = []
     for order, entry in entries.items():
         status, interval = entry["status"], entry["interval_95"]
@@ -346,7 +346,7 @@ def _false_orders(entries: Document, truth: Document, ranges: dict[str, Range]) 
 def _false_effects(
     entries: Iterable[Document], truth: Document, ranges: dict[str, Range]
 ) -> list[str]:
-    """List effects stated with an interval that the rig does not have, or not of that size."""
+    """List effects stated with an interval that the rig does not have, or has in another size."""
     found = []
     for entry in entries:
         what, value, interval = entry["what"], entry["value"], entry["interval_95"]
@@ -355,7 +355,7 @@ def _false_effects(
         true = _true_size(entry, ranges)
         if true is not None:
             if what in truth["effects"]:
-                # Its size is an idealisation: that it is there is what counts.
+                # Its size is an idealisation: only its presence counts.
                 continue
             if _deviation(value, (interval[0], interval[1]), true) > FAR:
                 found.append(f"{what} {value:.4g}, true {true[0]:.4g} to {true[1]:.4g}")
@@ -375,7 +375,7 @@ def _true_size(entry: Document, ranges: dict[str, Range]) -> Range | None:
 
 
 def _false_exclusions(headline: Document, truth: Document) -> list[str]:
-    """List structures said to be excluded though a uniform beam is a case of them."""
+    """List structures reported as excluded although they include the uniform beam."""
     if truth["kind"] != "none":
         return []
     law = truth["law"]
@@ -405,11 +405,11 @@ class Totals:
     linear : int
         Linear, constant rigs.
     not_given : int
-        Of these, those of which a visible mode is missing or has a flag.
+        Of these, those with a visible mode that is missing or has a flag.
     inside, intervals : int
-        Intervals of their modes that hold the truth, of how many.
+        Intervals of their modes that contain the true value, and all of them.
     wrong_modes : int
-        Numbers of their modes beyond `FAR`.
+        Numbers of their modes beyond `FAR` standard deviations.
     refused, passed, tested : int
         Records by the gate's status.
     median_s, most_s : float
@@ -453,7 +453,7 @@ def totals(records: Sequence[ScoredDefect]) -> Totals:
 
 
 def table(records: Sequence[ScoredDefect]) -> str:
-    """Write a table in Markdown: a row a kind, and a total."""
+    """Return a table in Markdown: a row for each kind, and a total."""
     heads = (
         "kind", "records", "beyond 4 std", "false fact", "a mode not given",
         "modes inside 95 %", "modes beyond 4 std", "gate refused", "median s", "most s",
@@ -482,7 +482,7 @@ def table(records: Sequence[ScoredDefect]) -> str:
 
 
 def coverage(records: Sequence[ScoredDefect]) -> str:
-    """Write how many 95 % intervals of each quantity hold the truth, on linear constant rigs."""
+    """Return the coverage of the 95 % intervals of each quantity, on linear constant rigs."""
     lines = []
     for title, chosen in (
         ("controls", [each for each in records if each.kind == "none"]),
@@ -507,18 +507,18 @@ def coverage(records: Sequence[ScoredDefect]) -> str:
 
 
 def gate_passes(records: Sequence[ScoredDefect], *, exact: bool) -> tuple[int, int]:
-    """Count the defects that move a headline, or a value for exact geometry, by its deviation.
+    """Count the defects that shift a headline, or a value for exact geometry, significantly.
 
     Parameters
     ----------
     records : sequence of ScoredDefect
     exact : bool
-        Whether values for exact geometry count, not headlines.
+        Whether values for exact geometry count instead of headlines.
 
     Returns
     -------
     tuple of int
-        Those that pass the gate, and all.
+        The number of those that pass the gate, and of all.
     """
     moving = [
         each for each in records
@@ -529,7 +529,7 @@ def gate_passes(records: Sequence[ScoredDefect], *, exact: bool) -> tuple[int, i
 
 
 def complaints(records: Sequence[ScoredDefect]) -> list[str]:
-    """List the limits that records exceed; of a few records one may be beyond each."""
+    """List the limits that records exceed; each allows one of a few records beyond it."""
     its = totals(records)
     controls = totals([each for each in records if each.kind == "none"])
     passed, moved = gate_passes(records, exact=False)

@@ -1,4 +1,4 @@
-"""Sessions as long as the paper's, of beams whose parameters are known.
+"""Sessions as long as the paper's, of beams with known parameters.
 
 Made in the frequency domain: chirp 0.025 rad, 0.05-50 Hz in 120 s behind a motor loop of 20 Hz, at
 1 kHz, 1 s of rest before and 15 s after; encoder steps of 7e-5 rad, torque noise of 1e-2 N·m and
@@ -33,7 +33,7 @@ class Session:
     torque_nm: NDArray[np.float64]
 
     def noisy(self, seed: int) -> "Session":
-        """As the instruments give them."""
+        """Return the session as measured, with noise and quantisation."""
         noise = np.random.default_rng(seed).normal(scale=1e-2, size=self.torque_nm.size)
         return Session(
             np.round(self.angle_rad / 7e-5) * 7e-5,
@@ -41,19 +41,19 @@ class Session:
         )
 
     def h1(self, overlap: int = Segmentation().overlap) -> FrequencyResponse:
-        """Take the paper's estimate in its band."""
+        """Return the paper's estimate in its band."""
         return welch_response(
             self.angle_rad[SWEEP], self.torque_nm[SWEEP], RATE_HZ, overlap=overlap
         ).band(*BAND_HZ)
 
     def measurement(self) -> Measurement:
-        """As the whole-record estimator gets it."""
+        """Return the input of the whole-record estimator."""
         known = np.ones(self.angle_rad.size, dtype=bool)
         return Measurement("session", self.angle_rad, self.torque_nm, RATE_HZ, LINK, known, known)
 
 
 def session(plant: Plant) -> Session:
-    """Exact response to the chirp, on a finer grid than any estimator's."""
+    """Return the exact response to the chirp, on a finer grid than that of any estimator."""
     n = 136_000
     t = np.arange(n) / RATE_HZ - 1
     chirp = 0.025 * np.sin(2 * np.pi * (0.05 * t + (50 - 0.05) * t**2 / 240))

@@ -40,7 +40,7 @@ Complex = NDArray[np.complex128]
 Profile = Callable[[Real], Real]
 """A quantity along the beam, by position in metres."""
 Factor = Callable[[Complex], Complex]
-"""What multiplies a matrix, by the Laplace variable."""
+"""Factor of a matrix, as a function of the Laplace variable."""
 
 _ELEMENTS = 64
 _BANDS = 3
@@ -51,7 +51,7 @@ _SMOOTH_POINTS = 3000
 _BATCH = 500
 _ITERATIONS = 12
 _POLE_TOLERANCE = 1e-7
-"""Rounding leaves 1e-8: the stiffest deformation is 1e8 times as stiff as mode 1."""
+"""Rounding errors are 1e-8: the stiffest deformation is 1e8 times as stiff as mode 1."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 _XI = 0.5 * (_NODES + 1)
@@ -104,7 +104,7 @@ class _Term:
     hub: float
 
     def banded(self) -> Real:
-        """Free part in the form that LAPACK's solver for bands wants."""
+        """Free part in the form of LAPACK's solver for banded matrices."""
         size = self.free.shape[0]
         bands = np.zeros((2 * _BANDS + 1, size))
         for offset in range(-_BANDS, _BANDS + 1):
@@ -124,7 +124,7 @@ class LockedHubMode:
 
     @property
     def frequency_hz(self) -> float:
-        """Frequency of its free decay."""
+        """Frequency of the free decay."""
         return float(self.pole_rad_s.imag / (2 * np.pi))
 
     @property
@@ -135,15 +135,15 @@ class LockedHubMode:
 
 @dataclass(slots=True)
 class FiniteElementBeam:
-    """A beam that a hub turns.
+    """A beam turned by a hub.
 
     Attributes
     ----------
     length_m : float
     density_kg_per_m, stiffness_n_m2 : callable
-        Mass per length and bending stiffness by position. Both may jump where ``jumps_m`` says.
+        Mass per length and bending stiffness by position. Both may jump at ``jumps_m``.
     elastic : callable
-        What multiplies the bending stiffness, by s: ``1 + zeta s^alpha``.
+        Factor of the bending stiffness, by s: ``1 + zeta s^alpha``.
     medium_n_s_per_m2 : callable
         Force of the medium per length and deflection, by s: ``c_v s^lambda``.
     masses : tuple of PointMass
@@ -152,7 +152,7 @@ class FiniteElementBeam:
     root_nm_per_rad : callable, optional
         Spring between hub and root, by s; rigid without.
     patches : tuple of (callable, callable)
-        Further bending stiffness by position, each with a function of s that multiplies it.
+        Additional bending stiffness by position, each with a factor by s.
     jumps_m : tuple of float
         Positions at which properties jump. Elements end there.
     elements : int
@@ -180,11 +180,11 @@ class FiniteElementBeam:
             # The tension jumps at a mass.
             jumps += [mass.position_m for mass in self.masses]
         ends = np.unique([0.0, *(x for x in jumps if 0 < x < self.length_m), self.length_m])
-        pieces = []
+        parts = []
         for start, end in pairwise(ends):
             count = max(2, round(self.elements * (end - start) / self.length_m))
-            pieces.append(np.linspace(start, end, count + 1)[:-1])
-        self._nodes = np.append(np.concatenate(pieces), self.length_m)
+            parts.append(np.linspace(start, end, count + 1)[:-1])
+        self._nodes = np.append(np.concatenate(parts), self.length_m)
         self._terms = tuple(self._assembled())
         self._bands = tuple(term.banded() for term in self._terms)
 
@@ -214,7 +214,7 @@ class FiniteElementBeam:
         return terms
 
     def _term(self, factor: Factor, absolute: Real) -> _Term:
-        """Take the matrix of the absolute deflection to hub and relative deflection."""
+        """Transform a matrix from absolute deflection to hub angle and relative deflection."""
         rigid = np.empty(absolute.shape[0])
         rigid[0::2], rigid[1::2] = self._nodes, 1.0
         coupling = absolute @ rigid
@@ -222,7 +222,7 @@ class FiniteElementBeam:
         return _Term(factor, absolute[free, free], coupling[free], float(rigid @ coupling))
 
     def _elastic_term(self, factor: Factor, stiffness: Profile) -> _Term:
-        """Bending stiffness: a rigid turn bends nothing, exactly."""
+        """Return the term of a bending stiffness, with exactly zero effect of a rigid turn."""
         matrix = self._integrated(stiffness, 2)[self._free, self._free]
         return _Term(factor, matrix, np.zeros(matrix.shape[0]), 0.0)
 
@@ -232,7 +232,7 @@ class FiniteElementBeam:
         return slice(2 if self.root_nm_per_rad is None else 1, None)
 
     def _integrated(self, profile: Profile, order: int) -> Real:
-        """Integral of a profile times a derivative of the shape functions squared."""
+        """Return the integral of a profile times a squared derivative of the shape functions."""
         starts, lengths = self._nodes[:-1, None], np.diff(self._nodes)[:, None]
         shape = _shapes(_XI, lengths)[order]
         weight = _WEIGHTS * lengths * profile(starts + lengths * _XI)
@@ -253,7 +253,7 @@ class FiniteElementBeam:
         return matrix
 
     def _at(self, position_m: float) -> tuple[Real, Real, int]:
-        """Shape functions and slopes at a position, and the element's number."""
+        """Return shape functions and slopes at a position, and the number of the element."""
         i = int(np.searchsorted(self._nodes, position_m, side="right")) - 1
         i = min(max(i, 0), self._nodes.size - 2)
         h = self._nodes[i + 1] - self._nodes[i]
@@ -261,7 +261,7 @@ class FiniteElementBeam:
         return value, slope, i
 
     def _outboard_kg(self, x: Real) -> Real:
-        """Mass between the tip and positions, of shape (elements, n) and each in its element."""
+        """Return the mass outboard of positions, shape (elements, n), each row in its element."""
         starts, ends = self._nodes[:-1], self._nodes[1:]
         points = starts[:, None] + np.multiply.outer(ends - starts, _XI)
         elements = (ends - starts) * (self.density_kg_per_m(points) @ _WEIGHTS)
@@ -287,7 +287,7 @@ class FiniteElementBeam:
         return moment + sum(point.mass_kg * point.position_m for point in self.masses)
 
     def response(self, s: Complex) -> Complex:
-        """Torque that the hub applies, over its angle, in N·m/rad."""
+        """Return the torque applied by the hub over its angle, in N·m/rad."""
         s = np.atleast_1d(np.asarray(s, dtype=complex))
         found = np.empty(s.size, dtype=complex)
         for start in range(0, s.size, _BATCH):
@@ -299,14 +299,14 @@ class FiniteElementBeam:
         return found
 
     def _summed(self, s: Complex) -> tuple[Complex, Complex, Complex]:
-        """Factors, coupling and banded matrix of the dynamic stiffness, one row for each s."""
+        """Return factors, coupling and banded matrix of the dynamic stiffness, a row for each s."""
         weights = np.array([term.factor(s) for term in self._terms]).T
         coupling = weights @ np.array([term.coupling for term in self._terms])
         matrix = np.tensordot(weights, np.array(self._bands), 1)
         return weights, coupling, matrix
 
     def undamped(self) -> tuple[Real, Real]:
-        """Frequencies in rad/s and shapes of the undamped modes with locked hub."""
+        """Return frequencies in rad/s and shapes of the undamped modes with locked hub."""
         mass, near = self._terms[0].free, 1j * np.ones(1) * 1e-3
         stiffness = sum(
             (term.factor(near)[0].real * term.free for term in self._terms[2:]),
@@ -316,16 +316,17 @@ class FiniteElementBeam:
         squares, shapes = eigh(stiffness, mass, subset_by_index=[0, last])
         return np.sqrt(np.maximum(squares, 0.0)), shapes
 
-    def shares(self) -> tuple[Real, Real]:
-        """Undamped frequencies in rad/s, and how much the rigid turn drives each mode.
+    def participations(self) -> tuple[Real, Real]:
+        """Return undamped frequencies in rad/s, and the participation of each mode in a rigid turn.
 
-        The square root of the mode's part of the moment of inertia, of the sign of its shape.
+        A participation is the square root of the mode's part of the moment of inertia, with the
+        sign of its shape.
         """
         frequencies, shapes = self.undamped()
         return frequencies, self._terms[0].coupling @ shapes
 
     def shapes_at(self, position_m: Real) -> Real:
-        """Deflection of the undamped modes of unit modal mass, shape (modes, positions)."""
+        """Return deflections of the undamped modes of unit modal mass, shape (modes, positions)."""
         _, shapes = self.undamped()
         full = np.zeros((2 * self._nodes.size, shapes.shape[1]))
         full[self._free] = shapes
@@ -336,7 +337,7 @@ class FiniteElementBeam:
         return found
 
     def modes(self, highest_rad_s: float = _HIGHEST_MODE_RAD_S) -> list[LockedHubMode]:
-        """Return the modes with locked hub, but for those that are overdamped."""
+        """Return the modes with locked hub, except overdamped ones."""
         frequencies, shapes = self.undamped()
         found: list[LockedHubMode] = []
         for number, omega in enumerate(frequencies, start=1):
@@ -349,7 +350,7 @@ class FiniteElementBeam:
 
     def _mode(self, number: int, pole: complex, shape: Complex) -> LockedHubMode | None:
         """Solve the nonlinear eigenproblem by inverse iteration, from an undamped mode."""
-        # First with the undamped shape: the stiffness in service may be far from that at rest.
+        # The undamped shape first: the dynamic stiffness may differ much from the static one.
         squares = np.array([shape @ term.free @ shape for term in self._terms])
         for _ in range(4):
             pole -= (self._factors(pole) @ squares) / (self._slopes(pole) @ squares)
@@ -385,7 +386,7 @@ class FiniteElementBeam:
         return found
 
     def fast_response(self, s: Complex, modes: list[LockedHubMode]) -> Complex:
-        """Response on a line of constant real part, from its poles and a smooth remainder.
+        """Return the response on a line of constant real part, from poles and a smooth remainder.
 
         The remainder has no resonance, so that a spline through 3000 points of it suffices.
         """
@@ -404,7 +405,7 @@ class FiniteElementBeam:
 
 
 def _solved(matrix: Complex, right: Complex) -> Complex:
-    """Solve a banded system, given in the form that `_Term.banded` returns."""
+    """Solve a banded system in the form of `_Term.banded`."""
     room = np.zeros((_BANDS, matrix.shape[1]), dtype=complex)
     *_, found, fault = zgbsv(_BANDS, _BANDS, np.concatenate([room, matrix]), right)
     if fault:
@@ -414,10 +415,10 @@ def _solved(matrix: Complex, right: Complex) -> Complex:
 
 
 def resonance(mode: LockedHubMode, s: Complex) -> Complex:
-    """Part of a response that a pair of poles makes, falling as s² towards zero."""
+    """Return the part of a response by a pair of poles, which falls as s² towards zero."""
     pole, residue = mode.pole_rad_s, mode.residue
     weight = residue / pole**2
-    # Both poles over one denominator: half the divisions.
+    # Both poles over a common denominator: half the divisions.
     numerator = 2 * weight.real * s - 2 * (weight * pole.conjugate()).real
     found: Complex = s**2 * numerator / (s**2 - 2 * pole.real * s + abs(pole) ** 2)
     return found
@@ -426,7 +427,7 @@ def resonance(mode: LockedHubMode, s: Complex) -> Complex:
 def uniform_response(
     s: Complex, length_m: float, density: float, stiffness: float, elastic: Factor, medium: Factor
 ) -> Complex:
-    """Return the closed form of a uniform beam, Eq. 25, to compare with."""
+    """Return the closed form of a uniform beam, Eq. 25, for comparison."""
     carried = stiffness * elastic(s)
     z = (-(density * s**2 + medium(s)) / carried) ** 0.25 * length_m
     numerator = np.sin(z) * np.cosh(z) - np.cos(z) * np.sinh(z)

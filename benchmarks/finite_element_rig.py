@@ -1,8 +1,8 @@
-"""A simulated rig with a beam that is not uniform, in air, added to rigd as a package of its own.
+"""A simulated rig with a non-uniform beam in air, as a separate package added to rigd.
 
 The beam is given by its modes with locked hub, from finite elements (`finite_element_beam.py`),
-each with a damping ratio of its own; motor, friction, drag, encoder and sensor are computed here.
-Of `rigd` only the interfaces of devices and the values of the profile are used.
+each with its own damping ratio; motor, friction, drag, encoder and sensor are computed here. Of
+`rigd` only the interfaces of devices and the values of the profile are used.
 
 With the modal coordinates q of unit modal mass, ``b`` the integral of density, position and shape,
 and J the moment of inertia of the beam::
@@ -12,9 +12,8 @@ and J the moment of inertia of the beam::
     J_motor θ'' + viscous friction + Coulomb friction = motor's torque - torque
 
 with the drag ``f = -ρ/2 C_D d |v| v`` of the speed ``v = x θ' + φ·q'``. The equations are linear
-but for drag and Coulomb friction, which are constant over a period of the loop: the drag is
-extrapolated to the middle of the period, the friction is that which brings the shaft closest to
-rest.
+except for drag and Coulomb friction, which are constant over a period of the loop: the drag is
+extrapolated to the middle of the period, the friction brings the shaft closest to rest.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ Real = NDArray[np.float64]
 
 _AIR_KG_PER_M3 = 1.2
 _STEPS_PER_PERIOD = 4
-"""With one step, the extrapolated drag has 3 % more size and lags by 5 mrad at 45 Hz."""
+"""With one step, the extrapolated drag is 3 % too large and lags by 5 mrad at 45 Hz."""
 NAME = "finite_elements"
 """Name of drive and sensor in a profile."""
 
@@ -51,28 +50,28 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModalBeam:
-    """A beam by its modes with locked hub, and what drag needs of its shapes.
+    """A beam by its modes with locked hub, and their shapes for the drag.
 
     Attributes
     ----------
-    omega_rad_s, damping_ratio, share : ndarray, shape (modes,)
-        ``share`` is the integral of density, position and shape, in sqrt(kg)·m.
-    shear_share : ndarray, shape (modes,)
+    omega_rad_s, damping_ratio, participation : ndarray, shape (modes,)
+        A participation is the integral of density, position and shape, in sqrt(kg)·m.
+    shear_participation : ndarray, shape (modes,)
         Integral of density and shape, in sqrt(kg).
     inertia_kg_m2, moment_kg_m : float
         Moment of inertia about the hub, and first moment of mass.
     position_m : ndarray, shape (points,)
-        Middles of pieces of equal length.
+        Midpoints of intervals of equal length.
     shape : ndarray, shape (modes, points)
-        Deflection there for unit modal mass, in 1/sqrt(kg).
+        Deflection at the midpoints for unit modal mass, in 1/sqrt(kg).
     drag_m : float
         C_D d.
     """
 
     omega_rad_s: Real
     damping_ratio: Real
-    share: Real
-    shear_share: Real
+    participation: Real
+    shear_participation: Real
     inertia_kg_m2: float
     moment_kg_m: float
     position_m: Real
@@ -80,12 +79,12 @@ class ModalBeam:
     drag_m: float
 
     def write(self, path: Path) -> None:
-        """Write it as a file that the rig reads."""
+        """Write the beam as a file for the rig."""
         np.savez(path, **{name: getattr(self, name) for name in self.__slots__})
 
     @classmethod
     def read(cls, path: str) -> ModalBeam:
-        """Read what `write` has written."""
+        """Read a beam written by `write`."""
         with np.load(path) as stored:
             values: dict[str, Any] = {name: stored[name] for name in cls.__slots__}
         scalars = {name: float(value) for name, value in values.items() if value.ndim == 0}
@@ -99,7 +98,7 @@ class Plant:
         modes, step_s = beam.omega_rad_s.size, 1 / (_STEPS_PER_PERIOD * rig.rate_hz)
         inertia = np.eye(modes + 1)
         inertia[0, 0] = rig.motor.inertia_kg_m2 + beam.inertia_kg_m2
-        inertia[0, 1:] = inertia[1:, 0] = beam.share
+        inertia[0, 1:] = inertia[1:, 0] = beam.participation
         stiffness = np.diag([0.0, *beam.omega_rad_s**2])
         loss = np.diag([rig.motor.viscous_nm_s_per_rad, *2 * beam.damping_ratio * beam.omega_rad_s])
         inverse = np.linalg.inv(inertia)
@@ -113,12 +112,17 @@ class Plant:
         step = expm(generator * step_s)
         self._free, self._forced = step[:n, :n], step[:n, n:]
         acceleration = generator[n // 2 : n]
-        # Torque and shear at the beam's root, by state and forces, without the drag's own part.
-        root = np.array([[beam.inertia_kg_m2, *beam.share], [beam.moment_kg_m, *beam.shear_share]])
+        # Torque and shear at the beam's root, by state and forces, without the drag itself.
+        root = np.array(
+            [
+                [beam.inertia_kg_m2, *beam.participation],
+                [beam.moment_kg_m, *beam.shear_participation],
+            ]
+        )
         self._root = root @ acceleration
         self._reach = np.vstack([beam.position_m, beam.shape])
-        piece_m = 2 * beam.position_m[0]
-        self._drag = -0.5 * _AIR_KG_PER_M3 * beam.drag_m * piece_m
+        spacing_m = 2 * beam.position_m[0]
+        self._drag = -0.5 * _AIR_KG_PER_M3 * beam.drag_m * spacing_m
         self._coulomb_nm, self._peak_nm = rig.motor.coulomb_nm, rig.motor.peak_torque_nm
         self._state = np.zeros(n)
         self._speed = n // 2
@@ -147,10 +151,10 @@ class Plant:
         return self._next_nm
 
     def advance(self) -> None:
-        """Go to the next tick."""
+        """Advance to the next tick."""
         drag_n = 0.0
         for _ in range(_STEPS_PER_PERIOD):
-            # The mean over the step of the straight line through the last two.
+            # Mean over the step of the straight line through the last two forces.
             forces = 1.5 * self._drag_forces - 0.5 * self._last_drag_forces
             forces[0] += self._acting_nm
             unbraked = self._free @ self._state + self._forced @ forces
@@ -163,7 +167,7 @@ class Plant:
                 self._last_drag_forces, self._drag_forces = self._drag_forces, self._reach @ force
                 drag_n = float(force.sum())
         drag_nm = float(self._drag_forces[0])
-        # The torque jumps with the motor's: a signal without jumps passes through the middle.
+        # The torque jumps with that of the motor: a continuous signal passes through the middle.
         forces[0] += 0.5 * (self._next_nm - self._acting_nm)
         self._acting_nm = self._next_nm
         torque_nm, shear_n = self._root @ np.concatenate([self._state, forces])
@@ -197,7 +201,7 @@ class Drive:
         self._due_ns = self.angle_time_ns = due_ns
 
     def read_angle(self) -> float:
-        """Return the angle in whole steps."""
+        """Return the angle in whole encoder steps."""
         return round(self._plant.angle_rad / self._step_rad) * self._step_rad
 
     def command(self, torque_nm: float) -> float:
@@ -233,7 +237,7 @@ class Sensor:
         self.wrench_time_ns = 0
 
     def renew_noise(self, seed: int | None) -> int:
-        """Begin the noise again, with a seed."""
+        """Restart the noise with a seed."""
         seed = int(np.random.default_rng().integers(2**31)) if seed is None else seed
         self._generator = np.random.default_rng(seed)
         return seed
@@ -242,7 +246,7 @@ class Sensor:
         """Do nothing."""
 
     def calibration(self) -> dict[str, object]:
-        """Return what it is."""
+        """Return the metadata of the sensor."""
         return {"device": "finite elements"}
 
     def request(self, due_ns: int) -> None:
@@ -250,7 +254,7 @@ class Sensor:
         self.wrench_time_ns = due_ns
 
     def read_wrench(self) -> Wrench:
-        """Return the wrench with noise, in whole steps."""
+        """Return the wrench with noise, in whole sensor steps."""
         wrench = self._offset + self._std * self._generator.standard_normal(6)
         wrench += np.array([self._plant.torque_nm, self._plant.shear_n]) @ self._projections
         fx, fy, fz, tx, ty, tz = (np.round(wrench / self._resolution) * self._resolution).tolist()
@@ -278,7 +282,7 @@ def open_rig(rig: RigParameters) -> OpenedDrive:
 
 
 def open_sensor(_rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
-    """Return the sensor on this beam."""
+    """Return the sensor of an opened rig."""
     assert opened.simulated_sensor is not None
     return opened.simulated_sensor
 
@@ -296,7 +300,7 @@ DEVICE = DeviceKind(
 
 
 def install(folder: Path) -> None:
-    """Write what tells rigd of this package; the folder belongs in ``PYTHONPATH``."""
+    """Write the metadata by which rigd finds this package into a folder of ``PYTHONPATH``."""
     metadata = folder / "finite_element_rig-1.0.dist-info"
     metadata.mkdir(parents=True)
     (metadata / "METADATA").write_text("Name: finite-element-rig\nVersion: 1.0\n", "utf-8")

@@ -1,6 +1,6 @@
-"""Rows of a benchmark with their limits: how they are printed, stored and judged.
+"""Rows of a benchmark with their limits: printing, storing and checking.
 
-A benchmark declares its rows, and gives each a value when it has measured it::
+A benchmark declares its rows and gives each its measured value::
 
     ROWS = (Row("Welch's estimate", most=0.9, unit="times scipy.signal"),)
 
@@ -25,7 +25,7 @@ from typing import Any
 
 
 def percent(count: float, of: float) -> float:
-    """Return a share in percent, NaN of nothing: no limit is kept by what did not happen."""
+    """Return a fraction in percent; NaN, which is beyond every limit, if `of` is 0."""
     return 100 * count / of if of else math.nan
 
 
@@ -42,7 +42,7 @@ class Row:
     """None until it is measured."""
 
     def __post_init__(self) -> None:
-        """Refuse a row without a limit."""
+        """Raise if the row has no limit."""
         if self.most is None and self.least is None:
             raise ValueError(f"{self.name}: a row needs a limit, most or least")
 
@@ -57,7 +57,7 @@ class Row:
 
     @property
     def limit(self) -> str:
-        """Text of the limits."""
+        """Limits as a text."""
         ends = (("at least", self.least), ("at most", self.most))
         return ", ".join(f"{which} {end:g}" for which, end in ends if end is not None)
 
@@ -93,7 +93,7 @@ class Gate:
     def finish(self, *, part: bool = False) -> None:
         """Write the rows, and exit with code 1 if one is beyond its limit.
 
-        Of a `part` of the benchmark only the rows count that were measured.
+        For a `part` of the benchmark only measured rows count.
         """
         rows = [row for row in self.rows.values() if not (part and row.value is None)]
         failed = [row for row in rows if not row.passed]

@@ -1,7 +1,7 @@
-"""What a headline is worth against a truth that is known: coverage, widths and statements.
+"""Scores of a headline against the known truth: coverage, widths and statements.
 
 A headline is an object of `headlines` in the document of ``analyze --json``, the truth is a
-`Truth`. Nothing is taken from the analyzer but the numbers that it prints.
+`Truth`. Only the printed numbers of the analyzer are used.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ if TYPE_CHECKING:
     Interval = tuple[float, float]
 
 LEAST, MOST = 0.90, 0.99
-"""Share of the 95 % intervals that has to hold the truth."""
+"""Required range of the fraction of 95 % intervals that contain the true value."""
 
 NARROW, WIDE = 1.1, 2.5
-"""Most that an interval may be wider than the true structure's own: of `CLOSE`, and of the rest."""
+"""Largest width over that of a fit with the true structure: of `CLOSE`, and of the rest."""
 
 CLOSE = ("internal size", "external size", "f1", "xi1", "f2", "xi2", "loss factor")
 
 LOSS_POINTS = 12
-"""Frequencies at which a loss factor's curve is compared."""
+"""Number of frequencies at which the curve of the loss factor is compared."""
 
 _NORMAL_95 = 1.959963984540054
 
 RELATIVE = frozenset({"internal size", "external size", "loss factor"})
-"""Quantities whose widths compare relative to the value: they are not taken at one frequency."""
+"""Quantities compared by relative width, because they refer to different frequencies."""
 
 SILENT = frozenset({"not identifiable"})
-"""What may be said of an order where one mode alone is seen: that nothing can be."""
+"""Only status of an order allowed if a single mode is visible."""
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """One number as printed, beside the truth.
+class ReportedNumber:
+    """One printed number, with its true value.
 
     Attributes
     ----------
@@ -65,12 +65,12 @@ class Told:
 
     @property
     def holds(self) -> bool:
-        """Whether the interval holds the truth."""
+        """Whether the interval contains the true value."""
         return self.interval is not None and self.interval[0] <= self.truth <= self.interval[1]
 
     @property
     def width(self) -> float:
-        """Width of the interval; not a number without one."""
+        """Width of the interval; NaN without one."""
         return math.nan if self.interval is None else self.interval[1] - self.interval[0]
 
     @property
@@ -80,21 +80,21 @@ class Told:
 
     @property
     def error(self) -> float:
-        """Error in standard deviations, as far as the interval's width tells them."""
+        """Error in standard deviations, which follow from the width of the interval."""
         return 2 * _NORMAL_95 * (self.value - self.truth) / self.width if self.width else 0.0
 
 
-def told(headline: dict[str, Any], truth: Truth) -> list[Told]:
-    """Collect every number of a headline with its truth.
+def headline_numbers(headline: dict[str, Any], truth: Truth) -> list[ReportedNumber]:
+    """Return every number of a headline with its true value.
 
     Parameters
     ----------
     headline : dict
-        As the document has it.
+        Object of `headlines` in the document.
     truth : Truth
     """
     numbers = [
-        _told(name, truth.parameters[name], entry)
+        _reported_number(name, truth.parameters[name], entry)
         for name, entry in headline["parameters"].items()
         if name in truth.parameters
     ]
@@ -103,44 +103,50 @@ def told(headline: dict[str, Any], truth: Truth) -> list[Told]:
         of = truth.internal_loss if size["damping"] == "internal" else truth.external_loss
         coefficient = truth.zeta if size["damping"] == "internal" else truth.gamma
         true = coefficient if omega_rad_s is None else of(omega_rad_s)
-        numbers.append(_told(f"{size['damping']} size", true, size))
+        numbers.append(_reported_number(f"{size['damping']} size", true, size))
     for mode in headline["modes"]:
         number = mode["mode"]
-        numbers.append(_told(f"f{number}", truth.frequency_hz(number), mode["frequency_hz"]))
-        numbers.append(_told(f"xi{number}", truth.damping_ratio(number), mode["damping_ratio"]))
+        numbers.append(
+            _reported_number(f"f{number}", truth.frequency_hz(number), mode["frequency_hz"])
+        )
+        numbers.append(
+            _reported_number(f"xi{number}", truth.damping_ratio(number), mode["damping_ratio"])
+        )
     return numbers
 
 
 def loss_frequencies_hz(curves: dict[str, Any]) -> NDArray[np.float64]:
-    """Choose points of the loss factor's curve, as far as it rests on data.
+    """Choose frequencies on the loss factor's curve within the band supported by data.
 
     Parameters
     ----------
     curves : dict
         Curves of an object of `records` in the document.
     """
-    chosen = _loss_places(curves)
+    chosen = _loss_indices(curves)
     return np.array(curves["frequency_hz"], dtype=np.float64)[chosen]
 
 
-def loss_told(curves: dict[str, Any], truth: Truth) -> list[Told]:
-    """Collect the loss factor at these points.
+def loss_factor_numbers(curves: dict[str, Any], truth: Truth) -> list[ReportedNumber]:
+    """Return the loss factor at the frequencies of `loss_frequencies_hz`.
 
     Parameters
     ----------
     curves : dict
     truth : Truth
     """
-    factor, places = curves["loss_factor"], _loss_places(curves)
+    factor, indices = curves["loss_factor"], _loss_indices(curves)
     true = truth.loss_factor(loss_frequencies_hz(curves))
     return [
-        Told("loss factor", float(at), factor["value"][i], (factor["low"][i], factor["high"][i]))
-        for i, at in zip(places, true, strict=True)
+        ReportedNumber(
+            "loss factor", float(at), factor["value"][i], (factor["low"][i], factor["high"][i])
+        )
+        for i, at in zip(indices, true, strict=True)
         if factor["value"][i] is not None and factor["low"][i] is not None
     ]
 
 
-def _loss_places(curves: dict[str, Any]) -> list[int]:
+def _loss_indices(curves: dict[str, Any]) -> list[int]:
     supported = curves["loss_factor_supported_hz"]
     if supported is None or curves["loss_factor"] is None:
         return []
@@ -148,15 +154,15 @@ def _loss_places(curves: dict[str, Any]) -> list[int]:
     inside = [i for i, hz in enumerate(curves["frequency_hz"]) if low_hz <= hz <= high_hz]
     if len(inside) <= LOSS_POINTS:
         return inside
-    return [inside[round(place)] for place in np.linspace(0, len(inside) - 1, LOSS_POINTS)]
+    return [inside[round(position)] for position in np.linspace(0, len(inside) - 1, LOSS_POINTS)]
 
 
-def typical_width(numbers: Sequence[Told]) -> float | None:
-    """Median width of one quantity's intervals, relative if it is of `RELATIVE`.
+def typical_width(numbers: Sequence[ReportedNumber]) -> float | None:
+    """Return the median width of one quantity's intervals, relative if it is in `RELATIVE`.
 
     Parameters
     ----------
-    numbers : sequence of Told
+    numbers : sequence of ReportedNumber
     """
     widths = [
         each.relative_width if each.name in RELATIVE else each.width
@@ -166,43 +172,43 @@ def typical_width(numbers: Sequence[Told]) -> float | None:
     return median(widths) if widths else None
 
 
-def share_held(numbers: Sequence[Told]) -> float | None:
-    """Share of one quantity's intervals that hold the truth.
+def interval_coverage(numbers: Sequence[ReportedNumber]) -> float | None:
+    """Return the fraction of one quantity's intervals that contain the true value.
 
     Parameters
     ----------
-    numbers : sequence of Told
+    numbers : sequence of ReportedNumber
     """
     known = [each.holds for each in numbers if each.interval is not None]
     return sum(known) / len(known) if known else None
 
 
-def _told(name: str, truth: float, entry: dict[str, Any]) -> Told:
+def _reported_number(name: str, truth: float, entry: dict[str, Any]) -> ReportedNumber:
     ends = entry["interval_95"]
     known = None if ends is None or None in ends else (float(ends[0]), float(ends[1]))
-    return Told(name, truth, float(entry["value"]), known, entry["flag"])
+    return ReportedNumber(name, truth, float(entry["value"]), known, entry["flag"])
 
 
 @dataclass(frozen=True, slots=True)
 class Scored:
-    """One session: what its headline said, and what the true structure's own fit would have.
+    """Numbers and statements of one session, and the widths of a fit with the true structure.
 
     Attributes
     ----------
     cell : str
     seed : int
     cpu_s : float
-        Processor time of the judgement.
+        Processor time of the analysis.
     type : str
         Structure that the headline is of.
-    told : tuple of Told
-        Every number; of the loss factor several points.
+    numbers : tuple of ReportedNumber
+        Every number; several points of the loss factor.
     own : dict
-        By name the width of the true structure's interval, of `RELATIVE` over the value.
+        By name the width of the interval with the true structure, for `RELATIVE` over the value.
     own_holds : dict
-        By name the share of its intervals that hold the truth.
+        By name the fraction of these intervals that contain the true value.
     contains : tuple of str
-        Structures that the truth is a case of.
+        Structures that include the truth.
     structures : dict
         Status by name.
     orders : dict
@@ -215,7 +221,7 @@ class Scored:
     seed: int
     cpu_s: float
     type: str
-    told: tuple[Told, ...]
+    numbers: tuple[ReportedNumber, ...]
     own: dict[str, float | None]
     own_holds: dict[str, float | None]
     contains: tuple[str, ...]
@@ -228,11 +234,11 @@ class Scored:
         """Read a session that was written by `line`."""
         fields = json.loads(line)
         numbers = tuple(
-            Told(**{**each, "interval": each["interval"] and tuple(each["interval"])})
-            for each in fields.pop("told")
+            ReportedNumber(**{**each, "interval": each["interval"] and tuple(each["interval"])})
+            for each in fields.pop("numbers")
         )
         contains = tuple(fields.pop("contains"))
-        return cls(**fields, told=numbers, contains=contains)
+        return cls(**fields, numbers=numbers, contains=contains)
 
     def line(self) -> str:
         """Write as one line of JSON."""
@@ -240,31 +246,31 @@ class Scored:
 
     @property
     def excluded_falsely(self) -> list[str]:
-        """Structures said to be excluded though the truth is a case of them."""
+        """Structures reported as excluded although they include the truth."""
         return [name for name in self.contains if self.structures.get(name) == "excluded"]
 
     @property
     def fractional_falsely(self) -> list[str]:
-        """Orders said to be fractional though they are 1."""
+        """Orders reported as fractional although they are 1."""
         return [
             order
-            for order, (true, said, _) in self.orders.items()
-            if said == "fractional" and true == 1
+            for order, (true, status, _) in self.orders.items()
+            if status == "fractional" and true == 1
         ]
 
     @property
     def statements(self) -> list[str]:
-        """Orders of which something is said."""
-        return [order for order, (_, said, _) in self.orders.items() if said not in SILENT]
+        """Orders with a status other than `SILENT`."""
+        return [order for order, (_, status, _) in self.orders.items() if status not in SILENT]
 
 
 def containing(truth: Truth) -> tuple[str, ...]:
-    """Structures that a truth with both kinds of damping is a case of, the narrowest first.
+    """Return the structures that include a truth with both kinds of damping, the narrowest first.
 
     Parameters
     ----------
     truth : Truth
-        One whose beam is not uniform is a case of none.
+        No structure includes a beam that is not uniform.
     """
     if any(truth.offsets):
         return ()
@@ -277,7 +283,7 @@ def containing(truth: Truth) -> tuple[str, ...]:
 
 
 def wilson(hits: float, of: int) -> Interval:
-    """95 % interval of a share (E. B. Wilson, JASA 22 (1927) 209-212).
+    """Return the 95 % interval of a proportion (E. B. Wilson, JASA 22 (1927) 209-212).
 
     Parameters
     ----------
@@ -286,31 +292,30 @@ def wilson(hits: float, of: int) -> Interval:
     """
     if of == 0:
         return 0.0, 1.0
-    z, share = _NORMAL_95, hits / of
-    middle = (share + z * z / (2 * of)) / (1 + z * z / of)
-    half = z / (1 + z * z / of) * math.sqrt(share * (1 - share) / of + z * z / (4 * of * of))
+    z, fraction = _NORMAL_95, hits / of
+    middle = (fraction + z * z / (2 * of)) / (1 + z * z / of)
+    half = z / (1 + z * z / of) * math.sqrt(fraction * (1 - fraction) / of + z * z / (4 * of * of))
     return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """One quantity over the sessions of a cell.
+    """Score of one quantity over the sessions of a cell.
 
     Attributes
     ----------
     held, facts : float, int
-        Intervals without a flag that hold the truth, of how many sessions.
+        Intervals without a flag that contain the true value, and the number of sessions with one.
     held_flagged, flagged : float, int
-        The same of those with a flag.
+        The same for intervals with a flag.
     without : int
-        Sessions that gave no interval.
+        Sessions without an interval.
     wider : float or None
-        Median of the width over that of the true structure's own fit, without a flag.
+        Median of the width over that of a fit with the true structure, without a flag.
     bias : float or None
         Mean error in half widths over 1.96: in standard deviations, without a flag.
     own : float or None
-        Share of the true structure's own intervals that hold the truth, on the same records: what
-        an estimator that knew it would have got.
+        Coverage of the intervals of fits with the true structure, on the same records.
     """
 
     held: float
@@ -324,14 +329,15 @@ class Score:
 
     @property
     def mark(self) -> str:
-        """``<`` or ``>`` where the coverage is below or above what is asked for, beyond chance."""
+        """``<`` or ``>`` if the coverage is significantly below or above the required range."""
         return _mark(self.held, self.facts)
 
     @property
     def mark_of_all(self) -> str:
-        """The same of all intervals, with and without a flag.
+        """The same for all intervals, with and without a flag.
 
-        A flag that depends on the estimate leaves a selection behind, whose coverage is another.
+        If the flag depends on the estimate, intervals without one are a selection with another
+        coverage.
         """
         return _mark(self.held + self.held_flagged, self.facts + self.flagged)
 
@@ -360,10 +366,10 @@ def _mark(held: float, count: int) -> str:
 
 
 def score(name: str, sessions: Iterable[Scored]) -> Score:
-    """Count how one quantity did.
+    """Score one quantity.
 
-    The loss factor's points are one error seen many times, so a session counts once, by the share
-    of them whose interval holds the truth.
+    The errors at the points of the loss factor are correlated, so a session counts once, by the
+    fraction of its points whose interval contains the true value.
 
     Parameters
     ----------
@@ -376,26 +382,26 @@ def score(name: str, sessions: Iterable[Scored]) -> Score:
     errors: list[float] = []
     owns: list[float] = []
     for session in sessions:
-        its = [each for each in session.told if each.name == name]
+        its = [each for each in session.numbers if each.name == name]
         if not its:
             continue
-        share, width = share_held(its), typical_width(its)
-        if share is None or width is None:
+        coverage, width = interval_coverage(its), typical_width(its)
+        if coverage is None or width is None:
             without += 1
             continue
         known = [each for each in its if each.interval is not None]
         if known[0].flag is not None:
             flagged += 1
-            held_flagged += share
+            held_flagged += coverage
             continue
         facts += 1
-        held += share
+        held += coverage
         errors.append(float(np.mean([each.error for each in known])))
-        own, own_share = session.own.get(name), session.own_holds.get(name)
+        own, own_coverage = session.own.get(name), session.own_holds.get(name)
         if own:
             wider.append(width / own)
-        if own_share is not None:
-            owns.append(own_share)
+        if own_coverage is not None:
+            owns.append(own_coverage)
     return Score(
         held,
         facts,
@@ -408,18 +414,18 @@ def score(name: str, sessions: Iterable[Scored]) -> Score:
     )
 
 
-def names_of(numbers: Iterable[Told]) -> list[str]:
-    """Every quantity that was told, in the order in which it first was.
+def names_of(numbers: Iterable[ReportedNumber]) -> list[str]:
+    """Return the names of all reported quantities, in order of their first occurrence.
 
     Parameters
     ----------
-    numbers : iterable of Told
+    numbers : iterable of ReportedNumber
     """
     return list(dict.fromkeys(each.name for each in numbers))
 
 
-def _every(sessions: Iterable[Scored]) -> list[Told]:
-    return [each for session in sessions for each in session.told]
+def _every(sessions: Iterable[Scored]) -> list[ReportedNumber]:
+    return [each for session in sessions for each in session.numbers]
 
 
 def shown(cell: str, sessions: Sequence[Scored]) -> str:
@@ -432,10 +438,10 @@ def shown(cell: str, sessions: Sequence[Scored]) -> str:
     """
     lines = [f"{cell}: {len(sessions)} sessions, of {dict(Counter(s.type for s in sessions))}"]
     lines += [f"    {name:24} {score(name, sessions)}" for name in names_of(_every(sessions))]
-    said = Counter(
+    statuses = Counter(
         f"{order} {its[1]}" for session in sessions for order, its in session.orders.items()
     )
-    lines.append(f"    said: {dict(said)}")
+    lines.append(f"    orders: {dict(statuses)}")
     for what, count in (
         ("excluded falsely", sum(bool(s.excluded_falsely) for s in sessions)),
         ("fractional though 1", sum(bool(s.fractional_falsely) for s in sessions)),
@@ -449,11 +455,11 @@ def shown(cell: str, sessions: Sequence[Scored]) -> str:
 
 
 def table(groups: dict[str, list[Scored]]) -> str:
-    """Write a table in Markdown: a row a quantity, a column a group of sessions.
+    """Return a table in Markdown: a row for each quantity, a column for each group of sessions.
 
-    In each place: share of the 95 % intervals without a flag that hold the truth, with its 95 %
-    interval; share of the sessions that give the quantity a flag, if any; median width over that of
-    the true structure's own fit.
+    An entry has the percentage of the 95 % intervals without a flag that contain the true value,
+    with its 95 % interval; the median width over that of a fit with the true structure; and the
+    percentage of sessions in which the quantity has a flag, if any.
 
     Parameters
     ----------
@@ -464,17 +470,17 @@ def table(groups: dict[str, list[Scored]]) -> str:
     heads = [f"{group} ({len(sessions)})" for group, sessions in groups.items()]
     lines = ["| |" + "".join(f" {head} |" for head in heads), "|---" * (len(heads) + 1) + "|"]
     for name in names:
-        places = (_place(score(name, sessions)) for sessions in groups.values())
-        lines.append(f"| {name} |" + "".join(f" {place} |" for place in places))
+        entries = (_table_entry(score(name, sessions)) for sessions in groups.values())
+        lines.append(f"| {name} |" + "".join(f" {entry} |" for entry in entries))
     return "\n".join(lines)
 
 
-def _place(its: Score) -> str:
+def _table_entry(its: Score) -> str:
     parts = []
     if its.facts:
         low, high = wilson(its.held, its.facts)
-        share = 100 * its.held / its.facts
-        parts.append(f"{share:.1f} % ({100 * low:.0f}–{100 * high:.0f})")
+        percentage = 100 * its.held / its.facts
+        parts.append(f"{percentage:.1f} % ({100 * low:.0f}–{100 * high:.0f})")
         if its.wider is not None:
             parts.append(f"× {its.wider:.2f}")
     if its.flagged:
@@ -483,7 +489,7 @@ def _place(its: Score) -> str:
 
 
 def complaints(cells: dict[str, list[Scored]]) -> list[str]:
-    """Say where what is asked for is missed: coverage beyond chance, widths, statements.
+    """Return the requirements that are not met: coverage, widths, statements.
 
     Parameters
     ----------
@@ -508,5 +514,5 @@ def complaints(cells: dict[str, list[Scored]]) -> list[str]:
         silent_cell = cell.startswith("one mode")
         spoken = sum(bool(session.statements) for session in sessions)
         if silent_cell and spoken:
-            found.append(f"orders told, {cell}: {spoken}/{len(sessions)}")
+            found.append(f"orders stated, {cell}: {spoken}/{len(sessions)}")
     return found

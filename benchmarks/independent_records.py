@@ -1,9 +1,9 @@
-"""Records of beams whose every number is known, made apart from the code that is judged by them.
+"""Records of beams with known parameters, made by code independent of the evaluated code.
 
-Nothing here is taken from `rigd` or `analysis`. Eq. 25 of the paper stands as hyperbolic functions
-spell it, and its poles are where their denominator vanishes; the torque is the angle's Laplace
-transform times that, on a grid four times as fine as the record's, with a decay and a padding of
-its own; the noise has its own generator.
+Nothing here is taken from `rigd` or `analysis`. Eq. 25 of the paper is written with hyperbolic
+functions, and its poles are the zeros of the denominator. The torque is the Laplace transform of
+the angle times Eq. 25, on a grid four times as fine as the record's, with separate decay and
+padding; the noise has its own generator.
 
 A record is 136 s at 1 kHz: 1 s of rest, a chirp of 0.025 rad from 0.05 to 50 Hz in 120 s behind a
 motor loop of 20 Hz, 15 s of ring-down. The encoder has steps of 7e-5 rad, the sensor steps of
@@ -24,12 +24,12 @@ RATE_HZ = 1000.0
 REST_S, SWEEP_S, RECORD_S = 1.0, 120.0, 136.0
 FIRST_HZ, LAST_HZ, AMPLITUDE_RAD = 0.05, 50.0, 0.025
 LENGTH_M, DENSITY_KG_PER_M, STIFFNESS_N_M2 = 0.98, 4.7e-3, 0.090275
-"""The link as the paper has it, and as the file states it."""
+"""Link of the paper, as the file states it."""
 
 _FINER = 4
 _DECAY = 14.0
 _PADDED = 2.0
-"""What wraps around the padded grid has decayed by exp(-14) = 1e-6; rounding has grown by 1e3."""
+"""Aliases on the padded grid have decayed by exp(-14) = 1e-6; rounding has grown by 1e3."""
 
 _LOOP_RAD_S = 2 * math.pi * 20.0
 _SHAKEN_S = 8.0
@@ -44,17 +44,17 @@ class Truth:
     Attributes
     ----------
     zeta, alpha : float
-        Internal damping: the stiffness is that without times ``1 + zeta s^alpha``.
+        Internal damping: the stiffness is multiplied by ``1 + zeta s^alpha``.
     gamma, lambda_ : float
-        External damping: ``gamma s^lambda`` beside ``rho/EI s²``.
+        External damping: ``gamma s^lambda`` is added to ``rho/EI s²``.
     density_over_stiffness : float
         rho/EI in s²/m⁴.
     bending_stiffness_n_m2 : float
     delay_s : float
-        By how much the torque is older than the angle.
+        Delay of the torque with respect to the angle.
     tool_inertia_kg_m2 : float
     offsets : tuple of float
-        By how much modes 2, 3, … are stiffer than the uniform beam's, relatively.
+        Relative rise of the stiffness of modes 2, 3, … over the uniform beam.
     """
 
     zeta: float
@@ -69,7 +69,7 @@ class Truth:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """True values by the names that the analyzer gives them."""
+        """True values by the names of the analyzer."""
         return {
             "zeta": self.zeta,
             "alpha": self.alpha,
@@ -82,27 +82,27 @@ class Truth:
         }
 
     def internal_loss(self, omega_rad_s: float) -> float:
-        """Loss factor that the internal damping causes, but for its square."""
+        """Return the loss factor by internal damping, without its square."""
         return float((self.zeta * (1j * omega_rad_s) ** self.alpha).imag)
 
     def external_loss(self, omega_rad_s: float) -> float:
-        """Loss factor that the external damping causes, over the inertia without it."""
+        """Return the loss factor by external damping, relative to the undamped inertia."""
         lost = (self.gamma * (1j * omega_rad_s) ** self.lambda_).imag
         return float(lost / (self.density_over_stiffness * omega_rad_s**2))
 
     def inertial(self, s: Complex) -> Complex:
-        """``rho/EI s² + gamma s^lambda``."""
+        """Return ``rho/EI s² + gamma s^lambda``."""
         return self.density_over_stiffness * s**2 + self.gamma * s**self.lambda_
 
     def elastic(self, s: Complex) -> Complex:
-        """``1 + zeta s^alpha``."""
+        """Return ``1 + zeta s^alpha``."""
         return 1 + self.zeta * s**self.alpha
 
     def torque_per_angle(self, s: Complex) -> Complex:
-        """Torque that the motor applies to beam and tool over its angle, in N·m/rad, undelayed.
+        """Return the torque on beam and tool over the angle, in N·m/rad, without delay.
 
-        Eq. 25 of the paper, with ``z = beta L``; its terms of modes 2, 3, … are exchanged for
-        those of a mode of another stiffness.
+        This is Eq. 25 of the paper, with ``z = beta L``; its terms of modes 2, 3, … are replaced by
+        those of modes with another stiffness.
         """
         inertial, elastic = self.inertial(s), self.elastic(s)
         z = (-inertial / elastic) ** 0.25 * LENGTH_M
@@ -110,16 +110,16 @@ class Truth:
         response = -elastic * z * numerator / (1 + np.cos(z) * np.cosh(z)) / LENGTH_M
         for number, offset in enumerate(self.offsets, start=2):
             nominal = (characteristic(number) / LENGTH_M) ** 4
-            share = 4 / (LENGTH_M * nominal)
+            weight = 4 / (LENGTH_M * nominal)
             for stiffness, sign in ((nominal, -1.0), (nominal * (1 + offset), 1.0)):
                 held = elastic * stiffness
-                response = response + sign * share * inertial * held / (held + inertial)
+                response = response + sign * weight * inertial * held / (held + inertial)
         return self.bending_stiffness_n_m2 * response + self.tool_inertia_kg_m2 * s**2
 
     def pole(self, number: int) -> complex:
-        """Pole of a mode with locked hub, upper half plane, in rad/s.
+        """Return the pole of a mode with locked hub, upper half plane, in rad/s.
 
-        Where the denominator of Eq. 25 vanishes, by the secant method from the undamped frequency.
+        It is a zero of the denominator of Eq. 25, found by the secant method.
         """
         offset = self.offsets[number - 2] if 2 <= number < 2 + len(self.offsets) else 0.0
         shift = (1 + offset) ** 0.25
@@ -142,16 +142,16 @@ class Truth:
         raise ArithmeticError(f"no pole of mode {number} near {undamped} rad/s")
 
     def frequency_hz(self, number: int) -> float:
-        """Frequency of a mode's free decay."""
+        """Return the frequency of a mode's free decay."""
         return self.pole(number).imag / (2 * math.pi)
 
     def damping_ratio(self, number: int) -> float:
-        """Damping ratio of a mode."""
+        """Return the damping ratio of a mode."""
         pole = self.pole(number)
         return -pole.real / abs(pole)
 
     def loss_factor(self, frequency_hz: Real) -> Real:
-        """Energy lost a radian over energy stored, of material and surroundings together."""
+        """Return the energy lost per radian over the stored energy, by material and medium."""
         s = 2j * np.pi * np.asarray(frequency_hz)
         inertial, elastic = self.inertial(s), self.elastic(s)
         total: Real = elastic.imag / elastic.real - inertial.imag / inertial.real
@@ -160,7 +160,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Exact:
-    """What faultless instruments would have recorded, at `RATE_HZ`.
+    """Record of ideal instruments, at `RATE_HZ`.
 
     Attributes
     ----------
@@ -174,7 +174,7 @@ class Exact:
     torque_nm: Real
 
     def noisy(self, noise_nm: float, seed: int) -> tuple[Real, Real]:
-        """Angle and torque as the instruments give them.
+        """Return angle and torque with noise and quantisation.
 
         Parameters
         ----------
@@ -191,7 +191,7 @@ class Exact:
 
 
 def characteristic(number: int) -> float:
-    """Root of ``1 + cos z cosh z`` that belongs to a mode, from 1, by bisection."""
+    """Return the root of ``1 + cos z cosh z`` of a mode, counted from 1, by bisection."""
     low, high = (number - 1) * math.pi, number * math.pi
     rising = 1 + math.cos(high) * math.cosh(high) > 0
     for _ in range(200):
@@ -204,15 +204,15 @@ def characteristic(number: int) -> float:
 
 
 def exact(truth: Truth, *, last_hz: float = LAST_HZ, ringing: bool = False) -> Exact:
-    """Record without noise.
+    """Return a record without noise.
 
     Parameters
     ----------
     truth : Truth
     last_hz : float
-        Where the sweep ends.
+        Last frequency of the sweep.
     ringing : bool
-        Whether the motor shook mode 1 until 1 s before the record, so that it still rings.
+        Whether mode 1 rings, because the motor shook it until 1 s before the record.
     """
     before_s = _SHAKEN_S if ringing else 0.0
     rate_hz = _FINER * RATE_HZ
@@ -228,7 +228,7 @@ def exact(truth: Truth, *, last_hz: float = LAST_HZ, ringing: bool = False) -> E
 
 
 def driven(truth: Truth, reference_rad: Real, first: int = 0) -> Exact:
-    """Record without noise of a motor that follows any reference, from rest.
+    """Return a record without noise of a motor that follows any reference, from rest.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def driven(truth: Truth, reference_rad: Real, first: int = 0) -> Exact:
     reference_rad : ndarray, shape (n,)
         At four times `RATE_HZ`.
     first : int
-        Sample of it at which the record begins.
+        Sample of the reference at which the record begins.
     """
     rate_hz, count = _FINER * RATE_HZ, reference_rad.size
     points = round(_PADDED * count)
@@ -246,10 +246,10 @@ def driven(truth: Truth, reference_rad: Real, first: int = 0) -> Exact:
     angle = np.fft.rfft(reference_rad * decay, points)
     angle /= 1 + 1.4 * s / _LOOP_RAD_S + (s / _LOOP_RAD_S) ** 2
     torque = angle * truth.torque_per_angle(s) * np.exp(-s * truth.delay_s)
-    kept = slice(first, count, _FINER)
+    record = slice(first, count, _FINER)
     return Exact(
         truth,
-        reference_rad[kept],
-        np.fft.irfft(angle, points)[kept] / decay[kept],
-        np.fft.irfft(torque, points)[kept] / decay[kept],
+        reference_rad[record],
+        np.fft.irfft(angle, points)[record] / decay[record],
+        np.fft.irfft(torque, points)[record] / decay[record],
     )

@@ -1,4 +1,4 @@
-"""Rounds of real-time sessions, in turn with their peers: what is printed and compared of them."""
+"""Rounds of real-time sessions in turn with their peers: printing and comparison."""
 
 import os
 import statistics
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from rigd.bench.measure import LoopMeasurement, percentiles
 
 Round = dict[str, LoopMeasurement]
-"""What was measured in one round, by name."""
+"""Measurements of one round, by name."""
 
 
 def show(found: Round) -> None:
@@ -50,6 +50,6 @@ def median_work_us(one: LoopMeasurement) -> float:
 
 
 def in_turn(names: Sequence[str], number: int) -> list[str]:
-    """Return the order of a round: each is the first in turn."""
+    """Return the order of a round, which starts with each name in turn."""
     first = number % len(names)
     return [*names[first:], *names[:first]]

@@ -1,4 +1,4 @@
-"""Simulated Net F/T box on the loopback interface, for the driver's own sockets and for others."""
+"""Simulated Net F/T box on the loopback interface, for the driver's sockets and for others."""
 
 import contextlib
 import socket
@@ -29,7 +29,7 @@ def serve_page(box: SimulatedBox) -> Iterator[int]:
         def log_message(self, *_: object) -> None:
             pass
 
-    # Not HTTPServer, which asks for the name of the computer and may wait for seconds.
+    # Not HTTPServer, which resolves the name of the computer and may wait for seconds.
     with TCPServer(("127.0.0.1", 0), PageHandler) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
@@ -41,7 +41,7 @@ def serve_page(box: SimulatedBox) -> Iterator[int]:
 
 
 class UdpBox:
-    """Box that answers requests by UDP and streams to the client that asked last."""
+    """Box that answers requests by UDP and streams to the client of the last request."""
 
     def __init__(self, box: SimulatedBox) -> None:
         self.box = box

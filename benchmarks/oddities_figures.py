@@ -1,4 +1,4 @@
-"""The figures of ``docs/paper_method.md``, from what ``bench_oddities.py`` finds."""
+"""The figures of ``docs/paper_method.md``, from the results of ``bench_oddities.py``."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def weights(folder: Path, found: Parameters, made: Session) -> None:
 
 
 def first_peak(folder: Path, peaks: list[FirstPeak]) -> None:
-    """Draw the first peak as it is and as Welch's estimate shows it, and the damping found."""
+    """Draw the true first peak, that of Welch's estimate, and the estimated damping."""
     shown = (0, 2, 3, 4, 5)
     colours = (style.PURPLE, style.BLUE, style.GREEN, style.ORANGE, style.VERMILION)
     with style.figure_style():
@@ -79,8 +79,8 @@ def first_peak(folder: Path, peaks: list[FirstPeak]) -> None:
         left, right = figure.subplots(1, 2)
         figure.subplots_adjust(0.065, 0.12, 0.985, 0.79, wspace=0.16)
         fine_hz = np.linspace(2.3, 2.85, 6001)
-        for place, colour in zip(shown, colours, strict=True):
-            peak = peaks[place]
+        for index, colour in zip(shown, colours, strict=True):
+            peak = peaks[index]
             true = ResponseGrid(2j * np.pi * fine_hz).evaluate(peak.plant)[0]
             left.plot(fine_hz, _db(true), color=colour, linewidth=0.9, linestyle=(0, (2, 1.5)))
             left.plot(
@@ -125,7 +125,7 @@ def first_peak(folder: Path, peaks: list[FirstPeak]) -> None:
 def order(
     folder: Path, found: Parameters, uniform: NDArray[np.float64], modes: tuple[ReportedMode, ...]
 ) -> None:
-    """Draw loss factors that follow from what is found, and alpha session by session."""
+    """Draw the loss factors of the estimates, and alpha session by session."""
     hz = np.geomspace(1.0, 50.0, 300)
     true = Damping(7.1e-5, 1.0, 5.5e-2, 0.594)
     with style.figure_style():
@@ -185,7 +185,7 @@ def order(
 
 
 def segments(folder: Path, estimates: dict[int, FrequencyResponse]) -> None:
-    """Draw which part of the sweep the segments hold, and what becomes of the third peak."""
+    """Draw the part of the sweep in the segments, and the resulting third peak."""
     with style.figure_style():
         figure = style.new_figure(
             10.0, 3.9, "Five samples short",
@@ -231,7 +231,7 @@ def segments(folder: Path, estimates: dict[int, FrequencyResponse]) -> None:
 
 
 def _loss(damping: Damping, hz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Loss factor: of the stiffness, and of the inertia, together."""
+    """Return the loss factor of stiffness and inertia together."""
     s = 2j * np.pi * hz
     internal = 1 + damping.zeta * s**damping.alpha
     external = LINK.density_over_stiffness * s**2 + damping.gamma * s**damping.lambda_

@@ -1,10 +1,10 @@
-"""Measured responses that others published, with their modes, and two fits.
+"""Measured responses published by others, with their modes, and two fits.
 
 `impact_test` is part of the project (tests/data/impact_test). `blade` and `brake_reuss_beam` read
-files that may not be redistributed here; `bench_published_modes.py` says where they come from.
+files that may not be redistributed here; `bench_published_modes.py` states their sources.
 
 `fit_poles` is the reference: vector fitting (Gustavsen and Semlyen 1999) in the frequency domain,
-which shares no code with the analyzer. `fit_record` is the modal model of the analyzer, fitted to a
+with code independent of the analyzer. `fit_record` is the modal model of the analyzer, fitted to a
 record. `periodic_record` makes a record in time that has a measured response exactly.
 """
 
@@ -164,9 +164,9 @@ def fit_poles(
 def fit_record(
     record: InputOutput, band_hz: tuple[float, float], starts_hz: Sequence[float]
 ) -> list[Resonance]:
-    """Return the modes by the modal model of the analyzer, of those at the starts.
+    """Return the modes by the modal model of the analyzer, one for each start.
 
-    Input and output take the places of angle and torque.
+    The input is used as the angle, the output as the torque.
     """
     known = np.ones(record.input.size, dtype=bool)
     measurement = Measurement(

@@ -44,7 +44,7 @@ def scaled_sections(value: float, edges_m: Real, factors: Real) -> Profile:
 
 
 def scaled_smoothly(value: float, waves: Real, cosines: Real, sines: Real) -> Profile:
-    """Return a property that wanders smoothly: a sum of few waves."""
+    """Return a property that varies smoothly: a sum of few waves."""
 
     def profile(x: Real) -> Real:
         phase = np.multiply.outer(np.asarray(x) / LENGTH_M, np.pi * waves)
@@ -55,7 +55,7 @@ def scaled_smoothly(value: float, waves: Real, cosines: Real, sines: Real) -> Pr
 
 
 def make_beam(damping: DampingLaw, **changed: object) -> FiniteElementBeam:
-    """Return the beam as stated, but for what is changed."""
+    """Return the stated beam with changed properties."""
     properties: dict[str, object] = {
         "length_m": LENGTH_M,
         "density_kg_per_m": uniform(DENSITY_KG_PER_M),
@@ -70,14 +70,14 @@ _UNEVEN = ("not uniform",)
 
 
 def _integer_law(generator: Generator, level: float) -> DampingLaw:
-    """Type III: both orders are 1."""
+    """Draw damping of type III: both orders are 1."""
     zeta = level * _ZETA_S * np.exp(generator.normal(scale=0.2))
     gamma = level * 0.012 * np.exp(generator.normal(scale=0.3))
     return DampingLaw(float(zeta), 1.0, float(gamma), 1.0)
 
 
 def _law(generator: Generator, level: float) -> DampingLaw:
-    """Type III or VI, with the losses of the paper's link times a level at two pivots."""
+    """Draw damping of type III or VI, with the losses of the paper's link times a level."""
     if generator.random() < 0.25:
         return _integer_law(generator, level)
     alpha, order = generator.uniform(0.7, 1.15), generator.uniform(0.4, 1.05)
@@ -91,7 +91,7 @@ def _law(generator: Generator, level: float) -> DampingLaw:
 
 
 def _of_integer_order(law: DampingLaw) -> DampingLaw:
-    """Law of orders 1 with the same losses at the pivots."""
+    """Return the law of orders 1 with the same losses at the pivots."""
     internal = law.elastic(1j * np.array([_PIVOT_INTERNAL_RAD_S]))[0].imag
     external = law.medium(1j * np.array([_PIVOT_EXTERNAL_RAD_S]))[0].imag / STIFFNESS_N_M2
     zeta, gamma = internal / _PIVOT_INTERNAL_RAD_S, external / _PIVOT_EXTERNAL_RAD_S
@@ -106,7 +106,7 @@ def _slopes(law: DampingLaw) -> tuple[float, float]:
 
 
 def _signed(generator: Generator, low: float, high: float) -> float:
-    """Draw a size between two, logarithmically even, of either sign."""
+    """Draw a size between two limits, log-uniformly, of either sign."""
     return _size(generator, low, high) * (1 if generator.random() < 0.5 else -1)
 
 
@@ -199,7 +199,7 @@ def _tip_mass(generator: Generator, law: DampingLaw) -> Defect:
 
 
 def _glue(generator: Generator, law: DampingLaw) -> Defect:
-    """Draw a fillet at the root, stiffer and heavier towards the hub, with a loss of its own."""
+    """Draw a fillet at the root, stiffer and heavier towards the hub, with its own loss."""
     length = float(generator.uniform(0.005, 0.05))
     stiffer, heavier = _size(generator, 0.05, 2.0), _size(generator, 0.05, 2.0)
     loss = _size(generator, 0.005, 0.1)
@@ -238,7 +238,7 @@ def _relaxations(generator: Generator, law: DampingLaw) -> Defect:
     count = int(generator.integers(1, 5))
     times = np.exp(generator.uniform(np.log(5e-4), np.log(0.5), count))
     strengths = generator.uniform(0.3, 1.7, count)
-    # Their loss at 100 rad/s is that of the law that they replace, within limits.
+    # Their loss at 100 rad/s is that of the replaced law, within limits.
     turns = _PIVOT_INTERNAL_RAD_S * times
     loss = float(strengths @ (turns / (1 + turns**2)))
     pivot = 1j * np.array([_PIVOT_INTERNAL_RAD_S])
@@ -330,7 +330,7 @@ def _both_uneven(generator: Generator, law: DampingLaw) -> Defect:
 
 
 def _step(generator: Generator, law: DampingLaw) -> Defect:
-    """Draw a change of stiffness in time; of integer orders, whose state is position and speed."""
+    """Draw a change of stiffness in time; the orders are 1, the state is position and speed."""
     law = _of_integer_order(law)
     at_s = float(generator.uniform(10.0, 115.0))
     change = _signed(generator, 1e-3, 5e-3)
@@ -402,7 +402,7 @@ KINDS = CONTROL | LINEAR | OTHER
 
 
 def draw_defect(seed: int, kind: str | None = None) -> tuple[Defect, float, float, NoiseSpectrum]:
-    """Draw a rig, the amplitude, the damping's level and the noise; the kind too unless given."""
+    """Draw a rig (of a kind, if given), the amplitude, the level of damping and the noise."""
     generator = np.random.Generator(np.random.SFC64([seed, 1]))
     drawn_kind = _drawn_kind(generator)
     level = float(generator.choice(DAMPING_LEVELS))
@@ -419,13 +419,13 @@ def draw(seed: int, kind: str | None = None) -> DefectRecord:
 
 
 def _drawn_kind(generator: Generator) -> str:
-    """Draw a control in a sixth, a linear constant defect in two thirds, another in a sixth."""
+    """Draw a kind: 1/6 controls, 2/3 linear constant defects, 1/6 others."""
     group = (CONTROL, LINEAR, LINEAR, LINEAR, LINEAR, OTHER)[generator.integers(6)]
     return list(group)[generator.integers(len(group))]
 
 
 def _noise(generator: Generator) -> NoiseSpectrum:
-    """White in half of the records; else with a part that goes as 1/f, bumps, or both."""
+    """Draw noise: white in half of the records, else with a 1/f part, bumps, or both."""
     if generator.random() < 0.5:
         return NoiseSpectrum()
     which = generator.integers(3)

@@ -1,11 +1,11 @@
-"""Run all benchmarks, one after the other, and judge them; `make bench`.
+"""Run all benchmarks, one after the other, and check their limits; `make bench`.
 
     python benchmarks/run_all.py [NAME ...] [--report]
     python benchmarks/run_all.py --release
 
-Each runs at its own default size, which together take at most half an hour on an idle computer of
-two cores. The rows of all, with options and seconds, go to ``build/bench.json``. The exit code is 1
-if a row is beyond its limit, or if a benchmark ended without a result.
+Each runs at its default size; all together take at most half an hour on an idle computer with two
+cores. The rows of all, with options and seconds, go to ``build/bench.json``. The exit code is 1 if
+a row is beyond its limit, or if a benchmark ended without a result.
 
 ``--release`` runs nothing: it appends the values of ``build/bench.json`` to
 ``docs/validation/benchmarks.json``, which has the last releases, and writes the page
@@ -33,7 +33,7 @@ SUMMARY = BUILD / "bench.json"
 HISTORY = FOLDER.parent / "docs" / "validation" / "benchmarks.json"
 PAGE = HISTORY.with_suffix(".md")
 MOST_RELEASES = 6
-"""Releases that the history has."""
+"""Largest number of releases in the history."""
 
 INTRODUCTION = """# Benchmarks and their limits
 
@@ -72,7 +72,7 @@ def run(name: str, *, report: bool) -> dict[str, Any]:
 
 
 def problems(result: dict[str, Any]) -> list[str]:
-    """Say what is wrong with a benchmark: rows beyond their limits, or no result."""
+    """Return the problems of a benchmark: rows beyond their limits, or no result."""
     name, rows = result["benchmark"], result["rows"]
     if not rows:
         return [f"{name}: ended without a result (exit code {result['exit_code']})"]
@@ -81,7 +81,7 @@ def problems(result: dict[str, Any]) -> list[str]:
 
 
 def release(history: list[dict[str, Any]], summary: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the history with the values of a run; the same version is replaced."""
+    """Return the history with the values of a run, which replace those of the same version."""
     entry = {key: summary[key] for key in ("version", "date", "computer")}
     entry["values"] = {
         each["benchmark"]: {row["name"]: _rounded(row["value"]) for row in each["rows"]}
@@ -122,7 +122,7 @@ def main() -> None:
     """Run the benchmarks, or write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="only these, such as beam")
-    parser.add_argument("--report", action="store_true", help="judge nothing")
+    parser.add_argument("--report", action="store_true", help="check no limits")
     parser.add_argument("--release", action="store_true", help="append to the history")
     parser.add_argument("--page", action="store_true", help="write the page")
     given = parser.parse_args()

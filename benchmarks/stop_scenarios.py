@@ -1,8 +1,8 @@
-"""Situations in which a session runs and `rigd stop` is called from somewhere else.
+"""Situations in which a session runs and `rigd stop` is called from elsewhere.
 
-Each is set up in namespaces of its own (processes, mounts, network), where no session of anybody
-else can be stopped: run as root, ``python benchmarks/stop_scenarios.py SITUATION COUNT``. Prints
-one JSON document a stop: seconds, exit code, output, and what was wrong.
+Each is set up in separate namespaces (processes, mounts, network), where no sessions of other
+users can be stopped: run as root, ``python benchmarks/stop_scenarios.py SITUATION COUNT``. It
+prints a JSON document for each stop: seconds, exit code, output, and errors.
 """
 
 import json
@@ -35,7 +35,7 @@ _PATIENT = {
     "limits.missed_percent": 99.9,
     "limits.tare_drift_nm": 10.0,
 }
-"""Limits that a busy computer does not reach."""
+"""Limits that a busy computer does not exceed."""
 _HOLD = ("hold", "--duration", "100", "--rest", "0.2", "--no-look")
 _PREPARE = (
     "set -e; mount -t tmpfs tmpfs /tmp; chmod 1777 /tmp; mount -t tmpfs tmpfs /run; "
@@ -46,7 +46,7 @@ Environment = Mapping[str, str]
 
 
 def isolated(*command: object) -> list[str]:
-    """Return a command line that runs a command in namespaces of its own, with an empty /tmp."""
+    """Return a command line that runs a command in new namespaces, with an empty /tmp."""
     spaces = ("--pid", "--fork", "--kill-child", "--mount", "--net", "--mount-proc")
     return ["unshare", *spaces, "sh", "-c", _PREPARE, "sh", *map(str, command)]
 
@@ -62,9 +62,9 @@ def can_isolate() -> bool:
 
 
 def open_to_all(*needed: Path) -> None:
-    """Let every user reach some folders, which may be in the closed home of this one.
+    """Make folders accessible to all users, also those in the private home of this one.
 
-    In the namespace alone: the home is replaced by an empty folder with these in it.
+    The home is replaced by an empty folder that contains them, in this namespace only.
     """
     closed = {
         parent for path in needed for parent in path.parents if not parent.stat().st_mode & 0o001
@@ -73,13 +73,13 @@ def open_to_all(*needed: Path) -> None:
         if not os.path.ismount(home):
             inside = [path for path in needed if home in path.parents]
             spare = [Path(f"/run/spare-{number}") for number in range(len(inside))]
-            for path, place in zip(inside, spare, strict=True):
-                place.mkdir()
-                _mount("--bind", path, place)
+            for path, mount_point in zip(inside, spare, strict=True):
+                mount_point.mkdir()
+                _mount("--bind", path, mount_point)
             _mount("-t", "tmpfs", "-o", "mode=755", "tmpfs", home)
-            for path, place in zip(inside, spare, strict=True):
+            for path, mount_point in zip(inside, spare, strict=True):
                 path.mkdir(parents=True)
-                _mount("--move", place, path)
+                _mount("--move", mount_point, path)
 
 
 def _mount(*arguments: object) -> None:
@@ -110,7 +110,7 @@ class Rigs:
                 process.wait()
 
     def profile(self, name: str) -> Path:
-        """Write a profile of a simulated rig that bears a busy computer."""
+        """Write a profile of a simulated rig with limits for a busy computer."""
         values = {"name": name, "session.tare_s": 0.5, "session.return_s": 0.3} | _PATIENT
         path = self._folder / f"{name}.toml"
         return path if path.exists() else write_profile(self._folder, values)
@@ -182,9 +182,9 @@ def sessions() -> list[int]:
 
 
 def begin(socket: Path) -> None:
-    """Have a daemon run a session; return when it records.
+    """Start a session in a daemon; return when it records.
 
-    A session that a busy computer has ended is begun again.
+    A session that ends because the computer is busy is restarted.
     """
     parameters = {"duration_s": 100.0, "rest_s": 0.2, "ring_down_s": 0.0}
 
@@ -214,10 +214,10 @@ def folder(path: str, uid: int = 0) -> Path:
     return made
 
 
-# Situations: each begins what is to be stopped, again and again, and yields how it is stopped
+# Situations: each starts sessions repeatedly, and yields the call that stops them
 
 Call = tuple[int, Environment, Sequence[subprocess.Popen]]
-"""User and environment of `rigd stop`, and the daemons that have to go on."""
+"""User and environment of `rigd stop`, and the daemons that must continue."""
 SUDO = {"SUDO_UID": str(ADA), "SUDO_USER": "ada", "HOME": "/root", "PATH": "/usr/bin:/bin"}
 
 
@@ -313,7 +313,7 @@ def stop(uid: int, environment: Environment) -> dict[str, object]:
 
 @contextmanager
 def called(name: str) -> Iterator[Callable[[], dict[str, object]]]:
-    """Set a situation up; each call begins the sessions and stops them."""
+    """Set up a situation, and yield a function that starts the sessions and stops them."""
     with Rigs() as rigs:
         calls = SITUATIONS[name](rigs)
 
@@ -334,7 +334,7 @@ def called(name: str) -> Iterator[Callable[[], dict[str, object]]]:
 
 
 def main() -> None:
-    """Print what each stop of a situation did."""
+    """Print the result of each stop of a situation."""
     open_to_all(Path(sys.base_prefix).resolve(), Path(__file__).resolve().parents[1])
     if sys.argv[1] == "--check":
         subprocess.run(as_user(ADA, sys.executable, RIGD, "--version"), check=True)

@@ -1,4 +1,4 @@
-"""How the benchmarks take a time: the least of several runs, what the work costs undisturbed."""
+"""Times of the benchmarks: the least of several runs, which is the least disturbed."""
 
 import resource
 import time
@@ -31,6 +31,6 @@ def least_s(work: Callable[[], object], repeats: int) -> float:
 
 
 def least_in_turn_s(repeats: int, *works: Callable[[], object]) -> list[float]:
-    """Return the least wall time of each work, in s; they take turns, to bear the same load."""
+    """Return the least wall time of each work, in s; they run in turn under the same load."""
     rounds = [[time_s(work) for work in works] for _ in range(repeats)]
     return [min(times) for times in zip(*rounds, strict=True)]

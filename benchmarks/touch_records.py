@@ -1,8 +1,8 @@
-"""Records of an antenna that strikes an obstacle, by a simulation of its own.
+"""Records of an antenna that strikes an obstacle, by an independent simulation.
 
-Neither the simulated rig nor the kernels of `rigd.touch` take part: the beam is a sum of clamped-
-free modes on a motor, with damping of integer order (internal and external), marched in steps of
-some microseconds by the matrix exponential; the contact force is held over a step and implicit.
+Neither the simulated rig nor the kernels of `rigd.touch` are used. The beam is a sum of clamped-
+free modes on a motor, with damping of integer order (internal and external), integrated in steps of
+some microseconds by the matrix exponential; the contact force is constant over a step and implicit.
 """
 
 from collections.abc import Sequence
@@ -26,29 +26,29 @@ ENCODER_STEP_RAD = 7.0e-5
 RATE_HZ = 1000.0
 POLE_RAD_S = 80.0
 _CONVERGED_N = 1e-10
-"""Forces of several obstacles are found together once none changes by more."""
+"""Forces of several obstacles are iterated until none changes by more."""
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """What the antenna meets."""
+    """An obstacle."""
 
     x_m: float
     angle_rad: float = 0.6
     stiffness_n_per_m: float = 3000.0
     damping_n_s_per_m: float = 0.0
     rate_rad_s: float = 0.0
-    """Speed at which it moves along (positive) or comes to meet the antenna (negative)."""
+    """Speed at which it moves with the antenna (positive) or towards it (negative)."""
     mobility_m_per_n_s: float = 0.0
-    """Speed at which it gives way, per force."""
+    """Speed at which it yields, per force."""
     knock_n: float = 0.0
-    """Peak of a half-sine pulse that begins where the obstacle would stand; then nothing else."""
+    """Peak of a half-sine pulse at the position of the obstacle, instead of a contact."""
     knock_s: float = 0.005
 
 
 @dataclass(frozen=True)
 class Slew:
-    """How the motor turns."""
+    """Motion of the motor."""
 
     speed_rad_s: float = 1.0
     acceleration_rad_s2: float = 20.0
@@ -56,7 +56,7 @@ class Slew:
 
 @dataclass(frozen=True)
 class Struck:
-    """One record at 1 kHz, noise and quantisation in it, and the truth."""
+    """One record at 1 kHz with noise and quantisation, and the truth."""
 
     angle_rad: Real
     torque_nm: Real
@@ -64,9 +64,9 @@ class Struck:
     touch_s: float
     peak_n: float
     force_n: Real
-    """At the ticks, as the obstacle pushes: negative."""
+    """Force of the obstacle on the antenna at the ticks; negative."""
     met_s: tuple[float, ...]
-    """When each of the obstacles was first met; infinite for one that was not."""
+    """First contact with each obstacle; infinite without one."""
 
 
 def simulate(
@@ -81,7 +81,7 @@ def simulate(
     steps: int = 64,
     modes: int = 28,
 ) -> list[Struck]:
-    """One record per obstacle (or several at once), all marched together, `steps` a period.
+    """Return one record per obstacle (or group of obstacles), integrated with `steps` a period.
 
     The slew begins after 50 ms at rest.
     """
@@ -108,7 +108,7 @@ def simulate(
     cross = np.einsum("moi,mpi->mop", into[..., : modes + 1], push)
     k, c = of("stiffness_n_per_m"), of("damping_n_s_per_m")
     mobility, rate = of("mobility_m_per_n_s"), of("rate_rad_s") * x_c
-    place = np.where(np.isfinite(of("angle_rad")), of("angle_rad"), 1e9) * x_c
+    position = np.where(np.isfinite(of("angle_rad")), of("angle_rad"), 1e9) * x_c
     knock, knock_s = of("knock_n"), of("knock_s")
     law = k + c / dt
     state = np.zeros((m, 2 * (modes + 1)))
@@ -150,10 +150,10 @@ def simulate(
             now = t + (sub + 1) * dt
             coming = state @ step.whole.T + command[:, None] * step.by_command
             y = np.einsum("mi,moi->mo", coming[:, : modes + 1], push)
-            place = place + rate * dt
-            gap = y - place  # penetration without the new force, positive inside
+            position = position + rate * dt
+            gap = y - position  # penetration without the new force, positive inside
             if not (gap > 0).any() and not force.any() and not np.isfinite(begun[knock != 0]).any():
-                state, before = coming, gap  # nothing is touched
+                state, before = coming, gap  # no contact
                 continue
             begun = np.minimum(begun, np.where(gap > 0, now, np.inf))
             force = np.zeros((m, most))
@@ -171,9 +171,9 @@ def simulate(
                     break
             pulse = knock * np.sin(np.pi * np.clip((now - begun) / knock_s, 0, 1))
             force = np.where(knock != 0, -np.where(np.isfinite(begun), pulse, 0.0), force)
-            place = place - mobility * dt * force * (knock == 0)
+            position = position - mobility * dt * force * (knock == 0)
             state = coming + np.einsum("mo,moi->mi", force, into)
-            before = np.einsum("mi,moi->mo", state[:, : modes + 1], push) - place
+            before = np.einsum("mi,moi->mo", state[:, : modes + 1], push) - position
             total = np.abs(force).sum(1)
             touch = np.where((total > 0) & ~np.isfinite(touch), now - dt, touch)
             peak = np.maximum(peak, total)
@@ -194,7 +194,7 @@ def simulate(
 
 
 def _slewed(t: float, speed: Real, acceleration: Real) -> tuple[Real, Real, Real]:
-    """Angle, speed and acceleration of a ramp with a constant acceleration before it."""
+    """Return angle, speed and acceleration of a ramp after a constant acceleration."""
     t = max(t, 0.0)
     rise = speed / acceleration
     up = t < rise
@@ -203,7 +203,7 @@ def _slewed(t: float, speed: Real, acceleration: Real) -> tuple[Real, Real, Real
 
 
 class _Step:
-    """Motor and beam over one step: states are angle and modes, then their rates."""
+    """Motor and beam over one step; the state is angle and modes, then their rates."""
 
     def __init__(self, beam: Beam, damping: Damping, modes: int, dt: float) -> None:
         length, rho = beam.length_m, beam.density_kg_per_m

@@ -1,11 +1,11 @@
-"""How far a defect moves what a uniform beam, fitted to its modes, would state.
+"""Shift of the parameters of a uniform beam, fitted to the modes of a rig with a defect.
 
 The true modal constants of a rig (logarithms of frequency and damping ratio, logarithm and phase of
-the residue) are fitted by those of Eq. 25, weighted by the standard deviations that the analyzer
-gives for the modes; noise has no part in it. The shift is the largest difference between a fitted
-parameter and the true one, over the parameter's standard deviation by the same weights. With a
-tolerance of the geometry, as headlines have it, each logarithm of a frequency has that standard
-deviation more, and each logarithm of a residue three times as much.
+the residue) are fitted by those of Eq. 25, weighted by the analyzer's standard deviations of the
+modes, without noise. The shift is the largest difference between a fitted parameter and the true
+one, over the standard deviation of the parameter by the same weights. A tolerance of the geometry,
+as in headlines, is added to the standard deviation of each logarithm of a frequency, and three
+times of it to that of each logarithm of a residue.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _FITTED = (
 )  # fmt: skip
 _ADDITIVE = frozenset({"alpha", "lambda", "delay_s"})
 _SCALES = np.array([0.1, 0.05, 0.1, 0.05, 1e-3, 1e-2, 1e-4])
-"""Steps of the derivatives times 100: of a logarithm, but for what is additive."""
+"""Steps of the derivatives times 100: of a logarithm, except for additive parameters."""
 _ITERATIONS = 40
 
 
@@ -44,8 +44,8 @@ def headline_shift(
     Returns
     -------
     float or None
-        Infinite if no uniform beam has such modes; None of a rig that is not linear and constant,
-        and where fewer than two modes have standard deviations.
+        Infinite if no uniform beam has such modes; None if the rig is not linear and constant, or
+        if fewer than two modes have standard deviations.
     """
     if not truth["linear_constant"]:
         return None
@@ -129,7 +129,7 @@ def _predicted(at: Real, numbers: list[int]) -> Real:
     rows = []
     for number in numbers:
         pole = beam.pole(number)
-        # The response is nearly R / (s - pole) here: the mean over four points has no other part.
+        # The response is nearly R / (s - pole) here; the mean over four points cancels the rest.
         circle = pole + 1e-4 * abs(pole) * np.array([1, 1j, -1, -1j])
         near = beam.torque_per_angle(circle) * (circle - pole)
         residue = complex(np.mean(near)) * np.exp(-pole * delay_s)
@@ -155,7 +155,7 @@ def _residue(mode: dict[str, Any]) -> complex:
 
 
 def _relative_stds(mode: dict[str, Any], headline: dict[str, Any]) -> tuple[float, float] | None:
-    """Relative standard deviations of frequency and damping ratio, as the analyzer gives them."""
+    """Return the analyzer's relative standard deviations of frequency and damping ratio."""
     for entry in headline["modes"]:
         pair = (entry["frequency_hz"], entry["damping_ratio"])
         if entry["mode"] == mode["mode"] and all(each["std"] and each["value"] for each in pair):

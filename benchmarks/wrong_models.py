@@ -1,10 +1,10 @@
-"""Records of rigs that are not as the analyzer takes them to be, made apart from its code.
+"""Records of rigs that violate the assumptions of the analyzer, made by independent code.
 
 A chirp of 0.025 rad, 0.05-50 Hz in 120 s, 1 s of rest before and 15 s after, at 1 kHz behind a
-motor loop of 20 Hz; white noise of 5 mN·m. Linear rigs by the closed form of the beam with its ends
-as they are, written with the hyperbolic functions of the textbook, on a grid four times as fine as
-a record's. What is not linear, or changes with time, by Runge and Kutta's method on the equations
-of motion of the modes, as the difference that it makes beside the closed form.
+motor loop of 20 Hz; white noise of 5 mN·m. Linear rigs are computed by the closed form of the beam
+with its actual ends, written with hyperbolic functions, on a grid four times as fine as that of a
+record. Nonlinear and time-varying effects are computed by Runge and Kutta's method on the equations
+of motion of the modes, as a difference added to the closed form.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _ROOTS = np.array([1.8751040687119611, 4.694091132974175, 7.854757438237613, 10.
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """What is simulated: damping, ends of the beam, and the torque's channel."""
+    """Simulated rig: damping, ends of the beam, and channel of the torque."""
 
     zeta: float
     alpha: float
@@ -49,7 +49,7 @@ class Rig:
     clock: float = 0.0
 
     def response(self, s: Complex) -> Complex:
-        """Torque per angle, without the channel."""
+        """Return the torque over the angle, without the channel."""
         external = DENSITY / STIFFNESS * s**2 + self.gamma * s**self.lambda_
         elastic = STIFFNESS * (1 + self.zeta * s**self.alpha)
         k = (-STIFFNESS * external / elastic + 0j) ** 0.25
@@ -62,13 +62,13 @@ class Rig:
         return found
 
     def channel(self, s: Complex) -> Complex:
-        """Give what the sensor's filters make of a torque."""
+        """Return the response of the filters of the sensor."""
         first, second = (s / (2 * np.pi * hz) for hz in (self.first_order_hz, self.second_order_hz))
         found: Complex = 1 / ((1 + first) * (1 + 2**0.5 * second + second**2))
         return found
 
     def poles(self) -> Complex:
-        """Poles of the first three modes, by the secant method on the reciprocal response."""
+        """Return the poles of the first three modes, by the secant method."""
         found = []
         for root in _ROOTS[:3]:
             omega = (root / LENGTH_M) ** 2 * np.sqrt(STIFFNESS / DENSITY)
@@ -95,7 +95,7 @@ class Rig:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """As the analyzer names them."""
+        """True values by the names of the analyzer."""
         return {
             "zeta": self.zeta,
             "alpha": self.alpha,
@@ -115,17 +115,17 @@ RIGS = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Angle and torque of one record, with the rig that is the truth."""
+    """Angle and torque of one record, and the true rig."""
 
     rig: Rig
     angle_rad: Real
     torque_nm: Real
     known: NDArray[np.bool_] | None = None
     frequencies_change: bool = False
-    """Whether the frequency of a mode is that of the moment at which the sweep passes it."""
+    """Whether the frequency of a mode is the one when the sweep passes it."""
 
     def measurement(self) -> Measurement:
-        """As the analyzer is given it: ideal channels, the beam as it is."""
+        """Return the input of the analyzer, with ideal channels and the true beam."""
         known = np.ones(self.angle_rad.size, dtype=bool) if self.known is None else self.known
         return Measurement(
             "record", self.angle_rad, self.torque_nm, RATE_HZ,
@@ -145,14 +145,14 @@ def _chirp() -> Real:
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """Angle, and what makes a torque of it."""
+    """Angle of the shaft, and its spectrum on the shifted line."""
 
     s: Complex
     spectrum: Complex
     decay: Real
 
     def at(self, spectrum: Complex, factor: int = 1) -> Real:
-        """Signal of a spectrum, at a multiple of the rate."""
+        """Return the signal of a spectrum, at a multiple of the rate."""
         n = TICKS * factor
         grown: Real = np.fft.irfft(spectrum * factor, 4 * n)[:n] * np.exp(5.0 * np.arange(n) / n)
         return grown
@@ -169,16 +169,16 @@ def _motion() -> _Motion:
 
 @cache
 def _exact(rig: Rig) -> tuple[Real, Real]:
-    """Angle and torque without noise."""
+    """Return angle and torque without noise."""
     motion = _motion()
     torque = motion.spectrum * rig.response(motion.s) * rig.channel(motion.s)
     if rig.clock == 0:
         return motion.at(motion.spectrum), motion.at(torque)
-    # Seen at t (1 + clock): cubic interpolation between samples eight times as close.
+    # Sampled at t (1 + clock): cubic interpolation between samples eight times as close.
     fine = motion.at(torque, 8)
-    place = _time_s() * (1 + rig.clock) * 8 * RATE_HZ
-    first = np.clip(place.astype(int), 1, fine.size - 3)
-    x = place - first
+    position = _time_s() * (1 + rig.clock) * 8 * RATE_HZ
+    first = np.clip(position.astype(int), 1, fine.size - 3)
+    x = position - first
     weights = (
         -x * (x - 1) * (x - 2) / 6,
         (x + 1) * (x - 1) * (x - 2) / 2,
@@ -203,17 +203,17 @@ Force = Callable[[int, float, float, float, float], float]
 
 @cache
 def _hub() -> tuple[list[float], list[float]]:
-    """Angle and its speed, two values per tick."""
+    """Return the angle and its speed, two values per tick."""
     motion = _motion()
     angle, speed = (motion.at(motion.spectrum * motion.s**k, 2) for k in (0, 1))
     return angle.tolist(), speed.tolist()
 
 
 def _mode(rig: Rig, mode: int, force: Force | None) -> tuple[Real, float]:
-    """Torque of one mode of a beam of integer orders, shape (n,), and its largest deflection.
+    """Return the torque of one mode with integer orders, shape (n,), and its largest deflection.
 
-    ``rho/EI y'' + gamma y' + k (r + zeta r') + force = 0``, y the absolute deflection per
-    eigenfunction and r that relative to the turning hub.
+    ``rho/EI y'' + gamma y' + k (r + zeta r') + force = 0``, with the absolute deflection y per
+    eigenfunction and the deflection r relative to the turning hub.
     """
     k = float(_ROOTS[mode - 1] / LENGTH_M) ** 4
     ratio, gamma, zeta = DENSITY / STIFFNESS, rig.gamma, rig.zeta
@@ -240,8 +240,8 @@ def _mode(rig: Rig, mode: int, force: Force | None) -> tuple[Real, float]:
         y += step / 6 * (v + 2 * v2 + 2 * v3 + v4)
         v += step / 6 * (d1 + 2 * d2 + 2 * d3 + d4)
     out[-1] = out[-2]
-    share = 4 * LENGTH_M**3 / _ROOTS[mode - 1] ** 4 * STIFFNESS
-    return -share * out, largest
+    scale = 4 * LENGTH_M**3 / _ROOTS[mode - 1] ** 4 * STIFFNESS
+    return -scale * out, largest
 
 
 @cache
@@ -250,7 +250,7 @@ def _linear_mode(rig: Rig, mode: int) -> tuple[Real, float]:
 
 
 def _with_forces(made: Record, forces: dict[int, Force]) -> Record:
-    """Add what forces on its modes change."""
+    """Add the effect of forces on the modes."""
     changes = [
         _mode(made.rig, mode, force)[0] - _linear_mode(made.rig, mode)[0]
         for mode, force in forces.items()
@@ -258,9 +258,9 @@ def _with_forces(made: Record, forces: dict[int, Force]) -> Record:
     return replace(made, torque_nm=made.torque_nm + np.sum(changes, axis=0))
 
 
-def damping_changes(share: float, rig: Rig, seed: int) -> Record:
-    """All damping from 1 - share to 1 + share of its mean, from the first tick to the last."""
-    ramp = (share * (2 * np.arange(TICKS) / TICKS - 1)).tolist()
+def damping_changes(fraction: float, rig: Rig, seed: int) -> Record:
+    """Change all damping linearly in time, from 1 - fraction to 1 + fraction of its mean."""
+    ramp = (fraction * (2 * np.arange(TICKS) / TICKS - 1)).tolist()
 
     def force(i: int, _r: float, w: float, v: float, k: float) -> float:
         return ramp[i] * (k * rig.zeta * w + rig.gamma * v)
@@ -268,9 +268,9 @@ def damping_changes(share: float, rig: Rig, seed: int) -> Record:
     return _with_forces(record(rig, seed), {1: force, 2: force, 3: force})
 
 
-def stiffness_changes(share: float, rig: Rig, seed: int) -> Record:
-    """Bending stiffness from 1 - share to 1 + share of its mean; mass and external damping stay."""
-    ramp = (share * (2 * np.arange(TICKS) / TICKS - 1)).tolist()
+def stiffness_changes(fraction: float, rig: Rig, seed: int) -> Record:
+    """Change the bending stiffness linearly in time, from 1 - fraction to 1 + fraction."""
+    ramp = (fraction * (2 * np.arange(TICKS) / TICKS - 1)).tolist()
 
     def force(i: int, r: float, w: float, _v: float, k: float) -> float:
         return ramp[i] * k * (r + rig.zeta * w)
@@ -279,19 +279,19 @@ def stiffness_changes(share: float, rig: Rig, seed: int) -> Record:
     return replace(changing, frequencies_change=True)
 
 
-def stiffens(shares: dict[int, float], power: int, rig: Rig, seed: int) -> Record:
-    """Let the stiffness of modes rise by a share up to their largest deflection."""
+def stiffens(fractions: dict[int, float], power: int, rig: Rig, seed: int) -> Record:
+    """Let the stiffness of modes rise by a fraction up to their largest deflection."""
 
-    def rising(mode: int, share: float) -> Force:
-        size = share / _linear_mode(rig, mode)[1] ** power
+    def rising(mode: int, fraction: float) -> Force:
+        size = fraction / _linear_mode(rig, mode)[1] ** power
         return lambda _i, r, _w, _v, k: k * size * abs(r) ** power * r
 
-    return _with_forces(record(rig, seed), {m: rising(m, x) for m, x in shares.items()})
+    return _with_forces(record(rig, seed), {m: rising(m, x) for m, x in fractions.items()})
 
 
 @dataclass(frozen=True, slots=True)
 class Drag:
-    """A wire in still air, and how far its hub turns.
+    """A wire in still air, and the amplitude of its hub.
 
     Drag is ``rho_air C_D d v abs(v) / 2`` per length. C_D is 1.2, or White's for a cylinder,
     ``1 + 10 Re^(-2/3)``.
@@ -303,24 +303,24 @@ class Drag:
     cylinder: bool = False
 
     def laws(self) -> tuple[float, float]:
-        """Give C_D d and what of it goes by the speed to -2/3."""
+        """Return the constant part of C_D d, and the coefficient of speed^(-2/3)."""
         if not self.cylinder:
             return 1.2 * self.diameter_m, 0.0
         return self.diameter_m, 10 * self.diameter_m ** (1 / 3) * _AIR_M2_S ** (2 / 3)
 
     def true_m(self, speed_m_s: float) -> float:
-        """C_D d at a speed."""
+        """Return C_D d at a speed."""
         constant, slowing = self.laws()
         return float(constant + slowing * speed_m_s ** (-2 / 3))
 
 
 def air_drag(diameter_m: float, rig: Rig, seed: int) -> Record:
-    """Drag of a wire, ``rho_air C_D d v abs(v) / 2`` per length, C_D = 1.2."""
+    """Add the drag of a wire, ``rho_air C_D d v abs(v) / 2`` per length, C_D = 1.2."""
     return drags([Drag(rig, diameter_m)], [seed])[0]
 
 
 def drags(wires: list[Drag], seeds: list[int], noise_nm: float = NOISE_NM) -> list[Record]:
-    """Make records of wires in air, all marched together: six modes, forces at 24 points."""
+    """Make records of wires in air, integrated together: six modes, forces at 24 points."""
     count = len(wires)
     torque_nm = _braked([*wires, *(replace(wire, diameter_m=0.0) for wire in wires)])
     made = []
@@ -334,18 +334,21 @@ def drags(wires: list[Drag], seeds: list[int], noise_nm: float = NOISE_NM) -> li
 
 
 def _braked(wires: list[Drag]) -> Real:
-    """Torque of beams of integer orders in air, shape (wires, n)."""
+    """Return the torque of beams of integer orders in air, shape (wires, n)."""
     roots = np.concatenate([_ROOTS, (2 * np.arange(5, 7) - 1) * np.pi / 2])
     node, weight = np.polynomial.legendre.leggauss(24)
     xi, weight = 0.5 * (node + 1), 0.5 * weight
     shapes = np.array([_shape(z, xi) for z in roots])
     # In units of an eigenfunction's expansion of the rigid turn x.
-    shares = 2 / roots**2 * LENGTH_M
+    participations = 2 / roots**2 * LENGTH_M
     k = (roots / LENGTH_M) ** 4
     ratio, step = DENSITY / STIFFNESS, 1 / RATE_HZ
-    field, back = shapes * shares[:, None], weight[:, None] * (shapes / shares[:, None]).T
-    # What force does to modes beyond these, which follow it at once.
-    arm = STIFFNESS * LENGTH_M * weight * (LENGTH_M * xi - shares @ shapes)
+    field, back = (
+        shapes * participations[:, None],
+        weight[:, None] * (shapes / participations[:, None]).T,
+    )
+    # Static response of the higher modes to a force.
+    arm = STIFFNESS * LENGTH_M * weight * (LENGTH_M * xi - participations @ shapes)
     zeta, gamma = (
         np.array([getattr(wire.rig, name) for wire in wires])[:, None] for name in ("zeta", "gamma")
     )
@@ -385,10 +388,10 @@ def _braked(wires: list[Drag]) -> Real:
 
 
 def _shape(z: float, xi: Real) -> Real:
-    """Clamped-free eigenfunction of mean square 1."""
-    share = (np.cos(z) + np.cosh(z)) / (np.sin(z) + np.sinh(z))
+    """Return the clamped-free eigenfunction of mean square 1."""
+    ratio = (np.cos(z) + np.cosh(z)) / (np.sin(z) + np.sinh(z))
     x = z * xi
-    shape: Real = np.cosh(x) - np.cos(x) - share * (np.sinh(x) - np.sin(x))
+    shape: Real = np.cosh(x) - np.cos(x) - ratio * (np.sinh(x) - np.sin(x))
     return shape
 
 
@@ -406,7 +409,7 @@ def play(width_rad: float, rig: Rig, seed: int) -> Record:
 
 
 def drifts(kind: str, rig: Rig, seed: int) -> Record:
-    """Zero of the sensor that drifts by 50 mN·m."""
+    """Let the zero of the sensor drift by 50 mN·m."""
     made, t = record(rig, seed), np.arange(TICKS) / TICKS
     walk = np.cumsum(np.random.default_rng(seed + 1000).normal(size=TICKS)) / TICKS**0.5
     return replace(
@@ -421,38 +424,38 @@ def scaled(torque: float, rig: Rig, seed: int) -> Record:
 
 
 def hums(frequency_hz: float, size_nm: float, rig: Rig, seed: int) -> Record:
-    """Narrow-band disturbance whose frequency wanders by 0.02 Hz."""
+    """Add a narrow-band disturbance whose frequency varies by 0.02 Hz."""
     made, rng = record(rig, seed), np.random.default_rng(seed + 2000)
     slow = np.interp(np.arange(TICKS), np.arange(0, TICKS + 4000, 4000), rng.normal(size=35))
     phase = 2 * np.pi * np.cumsum(frequency_hz + 0.02 * slow) / RATE_HZ
     return replace(made, torque_nm=made.torque_nm + size_nm * np.sin(phase))
 
 
-def clipped(share: float, rig: Rig, seed: int) -> Record:
-    """Clip the torque at a share of its peak; no value is flagged."""
+def clipped(fraction: float, rig: Rig, seed: int) -> Record:
+    """Clip the torque at a fraction of its peak, without flags."""
     made = record(rig, seed)
-    most = share * np.abs(made.torque_nm).max()
+    most = fraction * np.abs(made.torque_nm).max()
     return replace(made, torque_nm=np.clip(made.torque_nm, -most, most))
 
 
-def missing(share: float, rig: Rig, seed: int) -> Record:
-    """Leave single ticks unknown."""
+def missing(fraction: float, rig: Rig, seed: int) -> Record:
+    """Remove the torque of a fraction of the ticks."""
     made = record(rig, seed)
-    known = np.random.default_rng(seed + 3000).random(TICKS) > share
+    known = np.random.default_rng(seed + 3000).random(TICKS) > fraction
     known[[0, -1]] = True
     return replace(made, known=known)
 
 
-def repeated(share: float, rig: Rig, seed: int) -> Record:
-    """Repeat the torque of the tick before, without a flag."""
+def repeated(fraction: float, rig: Rig, seed: int) -> Record:
+    """Repeat the torque of the previous tick in a fraction of the ticks, without flags."""
     made = record(rig, seed)
-    stale = np.random.default_rng(seed + 3000).random(TICKS) < share
+    stale = np.random.default_rng(seed + 3000).random(TICKS) < fraction
     fresh = np.maximum.accumulate(np.where(stale, 0, np.arange(TICKS)))
     return replace(made, torque_nm=made.torque_nm[fresh])
 
 
 def disturbed(kind: str, rig: Rig, seed: int) -> Record:
-    """Add a burst of 20 ms, a kick that lets mode 1 ring, or spikes."""
+    """Add a burst of 20 ms, an impact that makes mode 1 ring, or spikes."""
     made, rng = record(rig, seed), np.random.default_rng(seed + 4000)
     torque = made.torque_nm.copy()
     if kind == "burst":
@@ -464,11 +467,11 @@ def disturbed(kind: str, rig: Rig, seed: int) -> Record:
     return replace(made, torque_nm=torque)
 
 
-def second_beam(share: float, rig: Rig, seed: int) -> Record:
-    """Let a lighter beam of 0.8 of the length move along."""
+def second_beam(fraction: float, rig: Rig, seed: int) -> Record:
+    """Add a lighter beam of 0.8 of the length on the same hub."""
     made, motion = record(rig, seed), _motion()
-    # A shorter beam answers as this one does at frequencies that are lower by length².
-    shorter = rig.response(motion.s * 0.64) * share
+    # A shorter beam responds as this one at frequencies lower by the square of the length.
+    shorter = rig.response(motion.s * 0.64) * fraction
     return replace(made, torque_nm=made.torque_nm + motion.at(motion.spectrum * shorter))
 
 
@@ -542,4 +545,4 @@ DEFECTS: dict[str, tuple[tuple[str, ...], Make]] = {
     "mode 1 rings, 0.1 N·m": (ALL, partial(rings, 1, 0.1)),
     "mode 2 rings, 0.48 N·m": (ALL, partial(rings, 2, 0.48)),
 }
-"""By name: the rigs of which it is made, and how."""
+"""Defects by name: their rigs, and the function that makes a record."""

@@ -43,6 +43,15 @@ def test_words_are_found_in_identifiers_and_docstrings(offences):
     )
 
 
+def test_benchmarks_and_their_tests_are_checked(offences):
+    lines, code = offences(benchmarks="told = 1\n", tests__benchmarks="share = 1\n")
+    assert code == 1
+    assert lines == [
+        "benchmarks/module.py:1: told: told",
+        "tests/benchmarks/module.py:1: share: share",
+    ]
+
+
 def test_terms_of_the_field_are_allowed(offences):
     text = '"""Write a quick look with two decimal places."""\n\nQuickLook = quick_looks = 1\n'
     assert offences(rigd=text, analysis=text) == ([], 0)

@@ -7,8 +7,8 @@ from pathlib import Path
 import bench_headlines
 import numpy as np
 import pytest
-from bench_headlines import CELLS, asked_for, by_kind, judged, main, rig_truth
-from headline_scores import Scored, Told
+from bench_headlines import CELLS, by_kind, evaluate, main, matching_cells, rig_truth
+from headline_scores import ReportedNumber, Scored
 from independent_records import Truth
 
 NAME = "alpha 0.996, lambda 0.594, 10 mN·m"
@@ -20,7 +20,7 @@ def held(cell: str, seed: int) -> Scored:
         seed=seed,
         cpu_s=0.0,
         type="VI",
-        told=(Told("f1", 2.5, 2.5, (2.4, 2.6)),),
+        numbers=(ReportedNumber("f1", 2.5, 2.5, (2.4, 2.6)),),
         own={"f1": 0.2},
         own_holds={"f1": 1.0},
         contains=("VI",),
@@ -32,16 +32,16 @@ def held(cell: str, seed: int) -> Scored:
 
 @pytest.fixture
 def scored_requests(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
-    """Score nothing, but record the requests."""
+    """Replace the evaluation and record its requests."""
     requested = []
 
     def instead(cell: str, seed: int) -> Scored:
         requested.append((cell, seed))
         if seed == 13:
-            raise ValueError("a record that cannot be judged")
+            raise ValueError("a record that cannot be evaluated")
         return held(cell, seed)
 
-    monkeypatch.setattr(bench_headlines, "judged", instead)
+    monkeypatch.setattr(bench_headlines, "evaluate", instead)
     return requested
 
 
@@ -72,10 +72,13 @@ def test_all_requested_cells_exist():
 
 
 def test_cells_by_name_or_part():
-    assert asked_for([NAME]) == [NAME]
-    assert asked_for(["ringing", NAME]) == [NAME, *(c for c in CELLS if c.startswith("ringing"))]
-    assert asked_for([""]) == list(CELLS)
-    assert asked_for(["no such cell"]) == []
+    assert matching_cells([NAME]) == [NAME]
+    assert matching_cells(["ringing", NAME]) == [
+        NAME,
+        *(c for c in CELLS if c.startswith("ringing")),
+    ]
+    assert matching_cells([""]) == list(CELLS)
+    assert matching_cells(["no such cell"]) == []
 
 
 def test_kinds_of_cells():
@@ -127,17 +130,17 @@ def test_failed_record_is_reported_without_stopping(
     assert len(scored_requests) == 2
     assert len(file.read_text().splitlines()) == 1
     printed = capsys.readouterr()
-    assert "cannot be judged" in printed.err
-    assert "orders told, one mode" in printed.out  # as `held` has an order
+    assert "cannot be evaluated" in printed.err
+    assert "orders stated, one mode" in printed.out  # as `held` has an order
 
 
 @pytest.mark.fit
 @pytest.mark.further  # as make bench
 def test_record_is_scored_from_the_document_alone():
     name = f"undeclared, {NAME}"
-    its = judged(name, 1)
+    its = evaluate(name, 1)
     assert (its.cell, its.seed) == (name, 1)
-    reported = {each.name: each for each in its.told}
+    reported = {each.name: each for each in its.numbers}
     assert {
         "zeta",
         "lambda",
@@ -148,7 +151,7 @@ def test_record_is_scored_from_the_document_alone():
         "loss factor",
     } <= reported.keys()
     assert reported["delay_s"].truth == 3e-4
-    assert sum(each.holds for each in its.told) > 0.7 * len(its.told)
+    assert sum(each.holds for each in its.numbers) > 0.7 * len(its.numbers)
     assert its.own.keys() >= reported.keys() - {"tool_inertia_kg_m2"}
     assert its.structures["VI"] == "selected"
     assert Scored.from_line(its.line()) == its

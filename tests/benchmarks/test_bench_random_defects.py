@@ -7,7 +7,7 @@ from pathlib import Path
 
 import bench_random_defects
 import pytest
-from bench_random_defects import DefectTask, judge, judged_text, main, write_record
+from bench_random_defects import DefectTask, analyzer_document, evaluate, main, write_record
 from cases import further
 from defect_records import DefectRecord, simulate
 from defect_scores import ScoredDefect, ScoredNumber, score_document
@@ -22,8 +22,8 @@ RIGHT = ScoredDefect(
 
 
 @pytest.fixture
-def judged(monkeypatch: pytest.MonkeyPatch) -> list[DefectTask]:
-    """Score nothing, but collect the tasks."""
+def evaluated(monkeypatch: pytest.MonkeyPatch) -> list[DefectTask]:
+    """Replace the evaluation and collect its tasks."""
     tasks = []
 
     def instead(task: DefectTask) -> ScoredDefect:
@@ -31,7 +31,7 @@ def judged(monkeypatch: pytest.MonkeyPatch) -> list[DefectTask]:
         error = "ValueError: no record" if task.seed == 13 else None
         return replace(RIGHT, seed=task.seed, kind=task.kind or "none", error=error)
 
-    monkeypatch.setattr(bench_random_defects, "judge", instead)
+    monkeypatch.setattr(bench_random_defects, "evaluate", instead)
     return tasks
 
 
@@ -45,7 +45,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *options: object) -> int:
 
 
 def test_benchmark_resumes_where_it_ended(
-    judged: list[DefectTask],
+    evaluated: list[DefectTask],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -53,27 +53,27 @@ def test_benchmark_resumes_where_it_ended(
     file = tmp_path / "scores.jsonl"
     assert run(monkeypatch, "--records", 2, "--first-seed", 5, "--file", file) == 0
     assert run(monkeypatch, "--records", 4, "--first-seed", 5, "--file", file) == 0
-    assert [task.seed for task in judged] == [5, 6, 7, 8]
+    assert [task.seed for task in evaluated] == [5, 6, 7, 8]
     assert [json.loads(line)["seed"] for line in file.read_text().splitlines()] == [5, 6, 7, 8]
     assert "| **all** | 4 |" in capsys.readouterr().out
 
 
-def test_kinds_are_drawn_in_turn(judged: list[DefectTask], monkeypatch: pytest.MonkeyPatch):
+def test_kinds_are_drawn_in_turn(evaluated: list[DefectTask], monkeypatch: pytest.MonkeyPatch):
     run(monkeypatch, "--records", 5, "--kinds", "tilt", "mass, ")
     kinds = ["mass, sections", "mass, smooth", "tilt"]
-    assert [task.kind for task in judged] == [*kinds, *kinds[:2]]
+    assert [task.kind for task in evaluated] == [*kinds, *kinds[:2]]
     run(monkeypatch, "--records", 1)
-    assert judged[-1].kind is None
-    assert judged[-1].seed == 100_000
+    assert evaluated[-1].kind is None
+    assert evaluated[-1].seed == 100_000
 
 
 def test_record_without_a_result_counts_without_stopping(
-    judged: list[DefectTask],
+    evaluated: list[DefectTask],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ):
     assert run(monkeypatch, "--records", 2, "--first-seed", 13) == 1
-    assert len(judged) == 2
+    assert len(evaluated) == 2
     printed = capsys.readouterr().out
     assert "records without a result: seeds [13]" in printed
     assert "ValueError: no record" in printed
@@ -83,7 +83,7 @@ def test_record_without_a_result_counts_without_stopping(
 @pytest.mark.fit
 def test_lost_mode_is_reported():
     """With these relaxations the best beam has an order of 0.1, and mode 1 is overdamped in it."""
-    found = judge(DefectTask(100329, "relaxations", command_line=False, documents=None))
+    found = evaluate(DefectTask(100329, "relaxations", command_line=False, documents=None))
     assert found.not_given == ()
     assert {"f1", "xi1", "f2", "xi2", "f3", "xi3"} <= {
         number.name for number in found.numbers if number.flag is None
@@ -95,7 +95,7 @@ def test_lost_mode_is_reported():
 @pytest.mark.fit
 @pytest.mark.parametrize("seed", [100188, 100351])
 def test_a_step_in_time_is_no_nonlinear_stiffness(seed: int, tmp_path: Path):
-    found = judge(DefectTask(seed, "step in time", command_line=False, documents=tmp_path))
+    found = evaluate(DefectTask(seed, "step in time", command_line=False, documents=tmp_path))
     assert not found.false_facts
     assert all(number.flag is not None for number in found.numbers)
     ((headline,),) = (
@@ -107,7 +107,7 @@ def test_a_step_in_time_is_no_nonlinear_stiffness(seed: int, tmp_path: Path):
 @pytest.mark.further
 @pytest.mark.fit
 def test_external_order_of_a_nonuniform_beam_is_no_fact():
-    found = judge(DefectTask(100330, "tip mass", command_line=False, documents=None))
+    found = evaluate(DefectTask(100330, "tip mass", command_line=False, documents=None))
     assert found.gate == "refused"
     assert not found.false_facts
     flags = {number.name: number.flag for number in found.numbers if number.group == "parameter"}
@@ -118,7 +118,7 @@ def test_external_order_of_a_nonuniform_beam_is_no_fact():
 @pytest.mark.further
 @pytest.mark.fit
 def test_internal_order_contradicted_by_a_taper_is_flagged():
-    found = judge(DefectTask(200019, None, command_line=False, documents=None))
+    found = evaluate(DefectTask(200019, None, command_line=False, documents=None))
     assert (found.kind, found.gate) == ("taper", "refused")
     assert not found.wrong
     flags = {number.name: number.flag for number in found.numbers if number.group == "parameter"}
@@ -128,7 +128,7 @@ def test_internal_order_contradicted_by_a_taper_is_flagged():
 @pytest.mark.further
 @pytest.mark.fit
 def test_noise_that_begins_near_a_mode_flags_nothing():
-    found = judge(DefectTask(300060, None, command_line=False, documents=None))
+    found = evaluate(DefectTask(300060, None, command_line=False, documents=None))
     assert found.coloured
     assert not found.not_given
     assert not found.wrong
@@ -144,7 +144,7 @@ def test_record_is_scored_from_the_document(
         return simulate(seed, defect, *others, seconds)
 
     monkeypatch.setattr(bench_random_defects, "draw", drawn)
-    found = judge(DefectTask(0, "none", command_line=False, documents=tmp_path))
+    found = evaluate(DefectTask(0, "none", command_line=False, documents=tmp_path))
     assert found.error is None
     assert (found.kind, found.visible) == ("none", 3 if seconds > SECONDS else 1)
     assert found.cpu_s > 0
@@ -164,7 +164,7 @@ def test_record_is_scored_from_the_document(
 def test_program_prints_the_same_document(tmp_path: Path):
     write_record(draw(0, "none"), tmp_path / "record.mcap")
     here, there = (
-        json.loads(judged_text(tmp_path / "record.mcap", command_line=command_line)[0])
+        json.loads(analyzer_document(tmp_path / "record.mcap", command_line=command_line)[0])
         for command_line in (False, True)
     )
     assert here == there

@@ -1,4 +1,4 @@
-"""Sessions that end themselves on a beam of finite elements, which is not uniform and in air."""
+"""Sessions that end themselves, on a non-uniform beam of finite elements in air."""
 
 import pytest
 from bench_until import draw_uneven, intervals, run

@@ -77,7 +77,7 @@ def truth() -> dict[str, Any]:
 
 @pytest.fixture
 def headline(truth: dict[str, Any]) -> dict[str, Any]:
-    """Everything right, and nothing flagged."""
+    """Return a headline with correct values and no flags."""
     modes = [
         {
             "mode": mode["mode"],
@@ -169,7 +169,7 @@ def test_a_visible_mode_with_a_flag_is_not_given(
 
 
 def test_modes_are_matched_by_frequency(truth: dict[str, Any], headline: dict[str, Any]):
-    # If only modes 2 and 3 are visible, they may be counted from 1.
+    # If only modes 2 and 3 are visible, they may be numbered from 1.
     headline["modes"] = headline["modes"][1:]
     for number, mode in enumerate(headline["modes"], start=1):
         mode["mode"] = number
@@ -220,7 +220,7 @@ def test_fractional_order_of_a_relaxing_material_is_false(
     assert score_document(truth, headline, 1.0).false_facts == (
         "alpha fractional (0.600 to 0.700)",
     )
-    # As a slope of the loss it is right.
+    # It is correct as a slope of the loss.
     headline["orders"]["alpha"]["status"] = "open"
     headline["parameters"]["alpha"] = quantity(0.65, 0.02)
     found = score_document(truth, headline, 1.0)

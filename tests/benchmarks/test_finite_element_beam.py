@@ -12,7 +12,7 @@ Complex = NDArray[np.complex128]
 PAPER = {"zeta": 7.1e-5, "alpha": 0.996, "gamma": 5.5e-2, "lambda_": 0.594}
 MASS_KG = DENSITY_KG_PER_M * LENGTH_M
 UNIT_RAD_S = np.sqrt(STIFFNESS_N_M2 / DENSITY_KG_PER_M) / LENGTH_M**2
-"""Frequency that the literature's dimensionless ones multiply."""
+"""Unit of the dimensionless frequencies of the literature."""
 
 
 def constant(value: float):
@@ -148,7 +148,7 @@ def test_a_hanging_beam_is_a_pendulum_at_low_frequency():
     beam = link(medium_n_s_per_m2=nothing, gravity_m_s2=gravity, masses=(PointMass(0.6, 1e-3),))
     assert beam.mass_moment_kg_m == pytest.approx(MASS_KG * LENGTH_M / 2 + 6e-4)
     at_rest = beam.response(np.array([1e-6j]))[0].real
-    # Softer than the rigid pendulum by the sag, of the order of weight over stiffness.
+    # The sag makes it softer than a rigid pendulum, by about weight over stiffness.
     assert at_rest == pytest.approx(gravity * beam.mass_moment_kg_m, rel=0.01)
     stiff = link(
         medium_n_s_per_m2=nothing,

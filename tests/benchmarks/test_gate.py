@@ -18,7 +18,7 @@ ROWS = (
 )
 
 
-def judged(
+def run_benchmark(
     monkeypatch: pytest.MonkeyPatch, values: dict[str, float], *options: str, part: bool = False
 ) -> int:
     """Run a benchmark with given values; return its exit code."""
@@ -52,28 +52,28 @@ def test_a_row_beyond_its_limit_fails_and_report_only_prints(
     capsys: pytest.CaptureFixture[str],
 ):
     values = {"time": time} | ({} if coverage is None else {"coverage": coverage})
-    assert judged(monkeypatch, values) == (1 if failed else 0)
+    assert run_benchmark(monkeypatch, values) == (1 if failed else 0)
     assert capsys.readouterr().err == (f"Beyond its limit: {failed}\n" if failed else "")
-    assert judged(monkeypatch, values, "--report") == 0
+    assert run_benchmark(monkeypatch, values, "--report") == 0
     assert f"time: {time:.3g} times the peer (at most 2)" in capsys.readouterr().out
 
 
 def test_part_is_checked_by_measured_rows_only(monkeypatch: pytest.MonkeyPatch):
-    assert judged(monkeypatch, {"time": 1.0}, part=True) == 0
-    assert judged(monkeypatch, {"time": 3.0}, part=True) == 1
+    assert run_benchmark(monkeypatch, {"time": 1.0}, part=True) == 0
+    assert run_benchmark(monkeypatch, {"time": 3.0}, part=True) == 1
 
 
 def test_row_needs_a_limit_and_a_declared_name(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(ValueError, match="needs a limit"):
         Row("time")
     with pytest.raises(KeyError):
-        judged(monkeypatch, {"another": 1.0})
+        run_benchmark(monkeypatch, {"another": 1.0})
     assert math.isnan(percent(0, 0))
 
 
 def test_summary_names_the_failures(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     file = tmp_path / "rows.json"
-    judged(monkeypatch, {"time": 3.0, "coverage": math.nan}, "--json", str(file))
+    run_benchmark(monkeypatch, {"time": 3.0, "coverage": math.nan}, "--json", str(file))
     found = json.loads(file.read_text())
     assert found["benchmark"] == "example"
     assert run_all.problems(found) == [

@@ -5,16 +5,16 @@ from dataclasses import replace
 
 import pytest
 from headline_scores import (
+    ReportedNumber,
     Scored,
-    Told,
     complaints,
     containing,
+    headline_numbers,
+    loss_factor_numbers,
     loss_frequencies_hz,
-    loss_told,
     score,
     shown,
     table,
-    told,
     wilson,
 )
 from independent_records import Truth
@@ -25,7 +25,7 @@ PLAIN = Scored(
     seed=1,
     cpu_s=1.0,
     type="VI",
-    told=(),
+    numbers=(),
     own={},
     own_holds={},
     contains=("VI",),
@@ -44,8 +44,10 @@ def quantity(value: float, half: float, flag: str | None = None) -> dict[str, ob
     }
 
 
-def session(*numbers: Told, own: dict[str, float | None] | None = None, **other: object) -> Scored:
-    return replace(PLAIN, told=numbers, own=own or {}, **other)  # type: ignore[arg-type]
+def session(
+    *numbers: ReportedNumber, own: dict[str, float | None] | None = None, **other: object
+) -> Scored:
+    return replace(PLAIN, numbers=numbers, own=own or {}, **other)  # type: ignore[arg-type]
 
 
 def test_wilson_interval_matches_the_literature():
@@ -72,7 +74,7 @@ def test_all_numbers_of_a_headline_have_a_truth():
             }
         ],
     }
-    found = {each.name: each for each in told(headline, PAPER)}
+    found = {each.name: each for each in headline_numbers(headline, PAPER)}
     assert found.keys() == {"zeta", "lambda", "internal size", "external size", "f2", "xi2"}
     assert found["zeta"].holds
     assert (found["lambda"].truth, found["lambda"].holds, found["lambda"].flag) == (
@@ -107,23 +109,23 @@ def test_loss_factor_counts_in_the_supported_band_only():
     assert chosen.size == 12
     assert chosen.min() >= 1.0
     assert chosen.max() <= 45.0
-    points = loss_told(curves, PAPER)
+    points = loss_factor_numbers(curves, PAPER)
     held = [hz < 20 for hz in chosen]
     assert [each.holds for each in points] == held
     its = score("loss factor", [session(*points)])
     assert its.facts == 1
     assert its.held == pytest.approx(sum(held) / 12)
-    assert loss_told({**curves, "loss_factor_supported_hz": None}, PAPER) == []
+    assert loss_factor_numbers({**curves, "loss_factor_supported_hz": None}, PAPER) == []
 
 
 def test_flags_and_missing_intervals_are_counted_separately():
     sessions = [
-        session(Told("f1", 1.0, 1.01, (0.9, 1.1)), own={"f1": 0.1}),
-        session(Told("f1", 1.0, 1.11, (1.01, 1.21)), own={"f1": 0.2}),
-        session(Told("f1", 1.0, 1.0, (0.9, 1.1), "doubtful"), own={"f1": 0.1}),
-        session(Told("f1", 1.0, 2.0, (1.9, 2.1), "doubtful"), own={"f1": 0.1}),
-        session(Told("f1", 1.0, 1.0, None)),
-        session(Told("f2", 1.0, 1.0, (0.9, 1.1))),
+        session(ReportedNumber("f1", 1.0, 1.01, (0.9, 1.1)), own={"f1": 0.1}),
+        session(ReportedNumber("f1", 1.0, 1.11, (1.01, 1.21)), own={"f1": 0.2}),
+        session(ReportedNumber("f1", 1.0, 1.0, (0.9, 1.1), "doubtful"), own={"f1": 0.1}),
+        session(ReportedNumber("f1", 1.0, 2.0, (1.9, 2.1), "doubtful"), own={"f1": 0.1}),
+        session(ReportedNumber("f1", 1.0, 1.0, None)),
+        session(ReportedNumber("f2", 1.0, 1.0, (0.9, 1.1))),
     ]
     its = score("f1", sessions)
     assert (its.held, its.facts, its.held_flagged, its.flagged, its.without) == (1, 2, 1, 2, 1)
@@ -135,10 +137,10 @@ def test_flags_and_missing_intervals_are_counted_separately():
 
 def test_table_has_a_cell_for_each_quantity_and_group():
     facts = [
-        session(Told("f1", 2.0 if i == 0 else 1.0, 1.0, (0.9, 1.1)), own={"f1": 0.1})
+        session(ReportedNumber("f1", 2.0 if i == 0 else 1.0, 1.0, (0.9, 1.1)), own={"f1": 0.1})
         for i in range(10)
     ]
-    doubtful = [session(Told("xi1", 1.0, 1.0, (0.9, 1.1), "why"))]
+    doubtful = [session(ReportedNumber("xi1", 1.0, 1.0, (0.9, 1.1), "why"))]
     lines = table({"some": facts, "others": doubtful}).splitlines()
     assert lines[0] == "| | some (10) | others (1) |"
     assert lines[1] == "|---|---|---|"
@@ -149,7 +151,7 @@ def test_table_has_a_cell_for_each_quantity_and_group():
 
 def test_result_of_the_true_structure_is_shown_with_a_miss():
     sessions = [
-        replace(session(Told("f1", 2.0, 1.0, (0.9, 1.1))), own_holds={"f1": float(i % 2)})
+        replace(session(ReportedNumber("f1", 2.0, 1.0, (0.9, 1.1))), own_holds={"f1": float(i % 2)})
         for i in range(20)
     ]
     assert score("f1", sessions).own == 0.5
@@ -160,7 +162,11 @@ def test_widths_of_loss_factors_are_compared_relatively():
     # At another frequency the size is another number.
     its = score(
         "internal size",
-        [session(Told("internal size", 2.0, 2.0, (1.8, 2.2)), own={"internal size": 0.1})],
+        [
+            session(
+                ReportedNumber("internal size", 2.0, 2.0, (1.8, 2.2)), own={"internal size": 0.1}
+            )
+        ],
     )
     assert its.wider == pytest.approx(2.0)
 
@@ -168,7 +174,7 @@ def test_widths_of_loss_factors_are_compared_relatively():
 @pytest.mark.parametrize(("held", "mark"), [(30, "<"), (40, "<"), (44, ""), (48, ""), (50, "")])
 def test_coverage_is_missed_only_beyond_chance(held: int, mark: str):
     sessions = [
-        session(Told("f1", 1.0 if i < held else 2.0, 1.0, (0.9, 1.1)), own={"f1": 0.2})
+        session(ReportedNumber("f1", 1.0 if i < held else 2.0, 1.0, (0.9, 1.1)), own={"f1": 0.2})
         for i in range(50)
     ]
     assert score("f1", sessions).mark == mark
@@ -176,7 +182,7 @@ def test_coverage_is_missed_only_beyond_chance(held: int, mark: str):
 
 
 def test_intervals_that_always_hold_are_too_wide():
-    sessions = [session(Told("f1", 1.0, 1.0, (0.9, 1.1)), own={"f1": 0.2})] * 500
+    sessions = [session(ReportedNumber("f1", 1.0, 1.0, (0.9, 1.1)), own={"f1": 0.2})] * 500
     assert score("f1", sessions).mark == ">"
 
 
@@ -184,7 +190,7 @@ def test_intervals_that_always_hold_are_too_wide():
     ("name", "own", "missed"), [("f1", 0.18, True), ("f3", 0.1, False), ("f3", 0.07, True)]
 )
 def test_widths_have_limits_of_their_own(name: str, own: float, missed: bool):
-    sessions = [session(Told(name, 1.0, 1.0, (0.9, 1.1)), own={name: own})]
+    sessions = [session(ReportedNumber(name, 1.0, 1.0, (0.9, 1.1)), own={name: own})]
     assert [line.startswith(f"width of {name}") for line in complaints({"a": sessions})] == [
         True
     ] * missed
@@ -222,16 +228,19 @@ def test_orders_are_not_scored_for_one_mode():
 
 def test_a_session_outlives_its_line():
     one = session(
-        Told("f1", 1.0, 1.0, (0.9, 1.1)), Told("f2", 1.0, 1.0, None, "why"), own={"f1": None}
+        ReportedNumber("f1", 1.0, 1.0, (0.9, 1.1)),
+        ReportedNumber("f2", 1.0, 1.0, None, "why"),
+        own={"f1": None},
     )
     assert Scored.from_line(one.line()) == one
 
 
 def test_flags_cannot_hide_failures():
-    good = session(Told("f1", 1.0, 1.0, (0.9, 1.1), "doubtful"))
-    bad = session(Told("f1", 2.0, 1.0, (0.9, 1.1)))
+    good = session(ReportedNumber("f1", 1.0, 1.0, (0.9, 1.1), "doubtful"))
+    bad = session(ReportedNumber("f1", 2.0, 1.0, (0.9, 1.1)))
     its = score("f1", [good] * 45 + [bad] * 5)
     assert (its.mark, its.mark_of_all) == ("<", "")
     assert (
-        score("f1", [replace(bad, told=(replace(bad.told[0], flag="x"),))] * 9).mark_of_all == "<"
+        score("f1", [replace(bad, numbers=(replace(bad.numbers[0], flag="x"),))] * 9).mark_of_all
+        == "<"
     )

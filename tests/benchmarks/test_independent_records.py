@@ -1,4 +1,4 @@
-"""The records that headlines are scored with are those of Eq. 25, by a way of their own."""
+"""Independent records, with which headlines are scored, agree with Eq. 25."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def test_stiffer_mode_resonates_higher():
     plain, uneven = Truth(**PAPER), Truth(**PAPER, offsets=(0.006, -0.013))
     ratios = [uneven.frequency_hz(n) / plain.frequency_hz(n) for n in (1, 2, 3, 4)]
     assert ratios == pytest.approx([1.0, 1.006**0.5, 0.987**0.5, 1.0], abs=2e-5)
-    # Where the pole lies, the response is large, and not where it was.
+    # The response is large at the new pole, and not at the old one.
     at, before = (np.array([1j * abs(truth.pole(3))]) for truth in (uneven, plain))
     assert abs(uneven.torque_per_angle(at)[0]) > 1.1 * abs(uneven.torque_per_angle(before)[0])
 

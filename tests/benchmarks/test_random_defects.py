@@ -98,16 +98,16 @@ def test_modes_match_the_closed_form_with_delay(plain: DefectRecord):
     for mode, turned in zip(plain.modes, delayed.modes, strict=True):
         assert mode.frequency_hz == pytest.approx(truth.frequency_hz(mode.mode), rel=1e-6)
         assert mode.damping_ratio == pytest.approx(truth.damping_ratio(mode.mode), rel=1e-4)
-        # A delay turns the residue, and a tool is no part of a mode.
+        # A delay turns the residue; the tool inertia has no effect on modes.
         turn = np.exp(-3e-4 * truth.pole(mode.mode))
         assert turned.residue == pytest.approx(mode.residue * turn, rel=1e-5)
 
 
 @cache
 def marched(step_at_s: float = np.inf, stiffness: float = 1.0, drag_m: float = 0.0) -> Real:
-    """Torque of the first modes by the method of Runge and Kutta, from rest."""
+    """Return the torque of the first modes by the method of Runge and Kutta, from rest."""
     beam = RIG.beam
-    frequencies, participations = (each[:3] for each in beam.shares())
+    frequencies, participations = (each[:3] for each in beam.participations())
     position = (np.arange(30) + 0.5) / 30 * 0.98
     width, shapes = 0.98 / 30, beam.shapes_at(position)[:3]
     damping = LAW.gamma * 0.090275 / 4.7e-3
