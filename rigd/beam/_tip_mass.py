@@ -77,16 +77,8 @@ def loaded_response(
 ) -> LoadedResponse:
     """Return the coupling torque per angle of a rigidly clamped beam with a tip mass.
 
-    Parameters
-    ----------
-    s_squared : ndarray of complex
-        Square of the Laplace variable in rad²/s², not 0.
-    elastic_factor, inertial_factor : ndarray of complex
-        Elastic factor c and inertial factor p at these s.
-    beam : Beam
-        Beam, of which stiffness and length are used; p already contains the density.
-    tip_mass_kg : float
-        Point mass at the tip.
+    `s_squared` is the square of the Laplace variable in rad²/s², not 0. The inertial factor p
+    already contains the density.
     """
     stiffness_n_m2, length_m = beam.bending_stiffness_n_m2, beam.length_m
     f, u, f_slope, u_slope = _response_functions(-(length_m**4) * inertial_factor / elastic_factor)
@@ -119,16 +111,8 @@ def add_stiffness_offsets(
 ) -> LoadedResponse:
     """Return the torque per angle with the stiffness offsets of modes 2, 3, … included.
 
-    Parameters
-    ----------
-    uniform_response : LoadedResponse
-        Response of the uniform beam.
-    elastic_factor, inertial_factor : ndarray of complex
-        Elastic factor c and inertial factor p at the same s.
-    beam : Beam
-        Uniform beam.
-    stiffness_offsets : tuple of float
-        Relative differences of the stiffness of modes 2, 3, … from the uniform beam's.
+    Offsets are relative to the stiffness of the uniform beam. The factors c and p are given at the
+    s of the uniform response.
     """
     length_m, stiffness_n_m2 = beam.length_m, beam.bending_stiffness_n_m2
     total_response, by_elastic, by_inertial = np.zeros(
@@ -181,24 +165,9 @@ def differentiated_response(
 ) -> tuple[LoadedResponse, Slopes]:
     """Return the torque per angle of a rigidly clamped beam with a tip mass, and its derivatives.
 
-    Parameters
-    ----------
-    log_s, s_squared : ndarray of complex
-        Logarithm and square of the Laplace variable, which is not 0.
-    beam, damping
-        Parameters of the exact model.
-    tip_mass_kg
-        Point mass at the tip.
-    stiffness_offsets
-        As in `rigd.beam.Plant`; no derivative with respect to them is returned.
-
-    Returns
-    -------
-    response : LoadedResponse
-        Coupling torque per motor angle.
-    slopes : dict of str to callable
-        Functions that compute the derivative with respect to a parameter, by its name in
-        `rigd.beam.GRADIENT_NAMES` or ``tip_mass_kg``.
+    The Laplace variable is not 0. The derivatives are functions by the names of
+    `rigd.beam.GRADIENT_NAMES` and ``tip_mass_kg``; there is none for the stiffness offsets, which
+    are as in `rigd.beam.Plant`.
     """
     s_alpha = np.exp(damping.alpha * log_s).astype(np.complex128)
     s_lambda = np.exp(damping.lambda_ * log_s).astype(np.complex128)
@@ -226,21 +195,9 @@ def differentiated_response(
 def uniform_tip_response(
     beam: Beam, damping: Damping, s: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return the tip's displacement and slope per motor angle.
+    """Return the tip's displacement in m/rad and its slope per motor angle, in the shape of `s`.
 
-    Parameters
-    ----------
-    beam, damping
-        Parameters of the exact model.
-    s
-        Laplace variable in rad/s, not 0.
-
-    Returns
-    -------
-    displacement
-        Displacement of the tip per angle in m/rad, in the shape of `s`.
-    tip_slope
-        Slope of the tip per angle, dimensionless, in the shape of `s`.
+    `s` is the Laplace variable in rad/s, not 0.
     """
     external_term = damping.gamma * s**damping.lambda_
     internal_factor = 1 + damping.zeta * s**damping.alpha

@@ -18,12 +18,7 @@ from rigd.profile import Profile
 class CheckFailedError(FailureError):
     """Error if offline checks have failed; the message names them, and how to accept them.
 
-    Parameters
-    ----------
-    message
-        One or two sentences for each failed row, for the operator.
-    wrong_use
-        Whether no session can be run with this profile, whatever the operator accepts.
+    With `wrong_use` no session can be run with this profile, whatever the operator accepts.
     """
 
     def __init__(self, message: str, *, wrong_use: bool = False) -> None:
@@ -106,13 +101,7 @@ _CHECK_BY_ROW_NAME: Final = {name: check for check in OFFLINE_CHECKS for name in
 
 
 def offline_rows(profile: Profile) -> list[CheckRow]:
-    """Return the rows of all offline checks, which need no device.
-
-    Parameters
-    ----------
-    profile
-        Profile of the rig.
-    """
+    """Return the rows of all offline checks, which need no device."""
     return [
         row for offline_check in OFFLINE_CHECKS for row in _rows_of_check(offline_check, profile)
     ]

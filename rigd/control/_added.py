@@ -10,16 +10,8 @@ from rigd.plugins import Plugin, error_text
 class AddedController:
     """Controller of an installed package, as the loop uses it (`LoopController`).
 
-    Parameters
-    ----------
-    controller
-        Controller of the package.
-    torque_limit_nm
-        Largest magnitude of the returned torque.
-    owner
-        Package that adds the controller, for messages.
-    pid
-        PID to whose reference the output is added; None: the output is the torque.
+    The output is limited to `torque_limit_nm`, and added to the reference of the PID if there is
+    one; otherwise it is the torque. Messages name the package `owner`.
     """
 
     __slots__ = (

@@ -337,15 +337,7 @@ def close_loop(model: LoopModel) -> ClosedLoop:
 
 
 def continuous_poles(a: RealArray, rate_hz: float) -> ComplexArray:
-    """Return the poles in continuous time, in rad/s, of the system ``x[k+1] = a x[k]``.
-
-    Parameters
-    ----------
-    a
-        State matrix, shape (n, n).
-    rate_hz
-        Ticks a second.
-    """
+    """Return the poles in continuous time, in rad/s, of the system ``x[k+1] = a x[k]``."""
     eigenvalues = np.linalg.eigvals(a).astype(complex)
     # Delays have eigenvalues at zero, which decay within a few ticks.
     poles: ComplexArray = np.log(eigenvalues[np.abs(eigenvalues) > _MAX_DELAY_EIGENVALUE]) * rate_hz
@@ -449,15 +441,7 @@ def _stability_remedy(model: LoopModel) -> str:
 
 
 def lightly_damped_model(model: LoopModel, plant: Plant) -> LoopModel:
-    """Return the model of a closed loop with a plant that has almost no damping.
-
-    Parameters
-    ----------
-    model
-        Model of the loop.
-    plant
-        Plant of the returned model, in which its damping is replaced.
-    """
+    """Return the model of a closed loop with a plant whose damping is replaced by almost none."""
     first_mode_rad_s = float(undamped_frequencies_rad_s(plant.beam, 1)[0])
     damping = Damping(zeta=2.0 * _LIGHT_DAMPING_RATIO / first_mode_rad_s)
     return replace(model, plant=replace(plant, damping=damping))

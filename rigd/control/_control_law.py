@@ -95,12 +95,7 @@ def _pid_law(model: LoopModel) -> ControlLaw:
 class LinearStep:
     """Linear controller of a package, stepped once a tick.
 
-    Parameters
-    ----------
-    controller
-        Controller.
-    torque_limit_nm
-        Torque above which the anti-windup acts; infinite for a shift of the reference.
+    The anti-windup acts above `torque_limit_nm`, which is infinite for a shift of the reference.
     """
 
     __slots__ = (

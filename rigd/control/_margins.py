@@ -119,21 +119,10 @@ def loop_margins(closed_loop: ClosedLoop) -> tuple[Margins, ...]:
 def open_loop_gain(
     closed_loop: ClosedLoop, opening: LoopOpening, phase_rad: RealArray
 ) -> ComplexArray:
-    """Return the complex gain L of the loop opened at one signal, at some frequencies.
+    """Return the complex gain L of the loop opened at one signal, at some frequencies, shape (m,).
 
-    The sensitivity of the closed loop is ``1/(1 + L)``.
-
-    Parameters
-    ----------
-    closed_loop, opening
-        Closed loop, and one of its openings.
-    phase_rad
-        Angular frequencies times the period, shape (m,); π is half the sampling rate.
-
-    Returns
-    -------
-    ndarray
-        Complex gain, shape (m,).
+    The sensitivity of the closed loop is ``1/(1 + L)``. `phase_rad` is the angular frequency times
+    the period; π is half the sampling rate.
     """
     n = opening.action.size
     open_loop_matrix = closed_loop.a - np.outer(opening.action, opening.reading)

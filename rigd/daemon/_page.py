@@ -37,21 +37,10 @@ _log = logging.getLogger(LOGGER_NAME)
 class PageProcess:
     """Supervisor of the process that serves the operator's page.
 
-    The process is restarted if it ends. The daemon does not depend on it.
-
-    Parameters
-    ----------
-    profile
-        Profile of the rig.
-    folder
-        Folder of the session files.
-    socket
-        Path of the daemon's socket.
-    port
-        Port on the loopback interface, or None for the default port or, if used, a free port.
-    on_address
-        Function that is called in a thread when the page's address changes: with the address
-        (without token), or with None if the page is not served any more.
+    The process is restarted if it ends. The daemon does not depend on it. Without `port`, the page
+    has the default port or, if that is used, a free port. `on_address` is called in a thread when
+    the address changes, with the address (without token), or with None if the page is not served
+    any more.
     """
 
     def __init__(

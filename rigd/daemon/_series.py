@@ -82,10 +82,7 @@ class ServedSeries:
     def state_after(self, fault_reason: str) -> tuple[DaemonState, str]:
         """Return the state of the daemon after the end of this series, and the reason.
 
-        Parameters
-        ----------
-        fault_reason
-            Sentence that describes the rig's fault; empty if the rig is ready.
+        `fault_reason` is empty if the rig is ready.
         """
         if fault_reason:
             return DaemonState.FAULT, fault_reason

@@ -64,10 +64,7 @@ _log = logging.getLogger(LOGGER_NAME)
 class Server:
     """Server of the daemon's socket: passes the requests of clients to the service.
 
-    Parameters
-    ----------
-    listener
-        Bound socket that does not listen yet.
+    The listener is a bound socket that does not listen yet.
     """
 
     def __init__(self, listener: socket.socket) -> None:

@@ -66,29 +66,10 @@ _log = logging.getLogger(LOGGER_NAME)
 class Service:
     """Service that controls a rig for clients; its methods run in the event loop's thread.
 
-    Parameters
-    ----------
-    rig
-        Rig that is not connected yet.
-    profile
-        Profile of the rig.
-    folder
-        Folder of the session files.
-    worker
-        Executor with one thread for slow calls of the rig.
-    publish
-        Function that sends an event to the clients that have subscribed.
-    find_target
-        Function that returns what would move, such as hardware, if the rig were connected now.
-    fast, live
-        Options with which the rig was created.
-    quick_looks
-        Whether to make a quick look at each session.
-
-    Attributes
-    ----------
-    controller
-        Client that controls the rig, or None.
+    The rig is not connected yet and was created with the options `fast` and `live`; its slow calls
+    run in the single thread of `worker`. `publish` sends an event to the clients that have
+    subscribed, `find_target` returns what would move if the rig were connected now. `controller` is
+    the client that controls the rig, or None.
     """
 
     def __init__(

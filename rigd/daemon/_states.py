@@ -82,21 +82,10 @@ class Transition:
 
 
 class DaemonStateMachine:
-    """State of the daemon, with its permitted transitions and a list of the last ones.
+    """State of the daemon, with its permitted transitions and a history of the last ones.
 
-    Parameters
-    ----------
-    on_change
-        Called with each transition after the state has changed.
-    utc_ns
-        Function that returns the wall-clock time in nanoseconds since the Unix epoch.
-
-    Attributes
-    ----------
-    state
-        Present state of the daemon.
-    history
-        Last transitions, oldest first.
+    `on_change` is called after each change of state; `utc_ns` is the clock, in ns since the Unix
+    epoch.
     """
 
     def __init__(

@@ -84,17 +84,7 @@ class TorqueModel:
 
     @classmethod
     def for_records(cls, estimate: BeamEstimate, rate_hz: float, tick_count: int) -> "TorqueModel":
-        """Return the torque model of a beam for records of at least `tick_count` ticks.
-
-        Parameters
-        ----------
-        estimate
-            Beam, damping and noise.
-        rate_hz
-            Rate of the angle.
-        tick_count
-            Smallest length of the records in ticks.
-        """
+        """Return the torque model of a beam for records of at least `tick_count` ticks."""
         ticks_per_point = ticks_per_sample(rate_hz)
         sample_count = fast_transform_length(-(-tick_count // ticks_per_point))
         # Higher frequencies belong neither to the band nor to a visible mode.
@@ -150,18 +140,8 @@ def responses(
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return the transfer functions from the motor's angle to torques and to the slope of the tip.
 
-    Parameters
-    ----------
-    estimate
-        Beam, damping, tool inertia and delay.
-    s
-        Laplace variable in rad/s, of any shape.
-
-    Returns
-    -------
-    of_beam, measured, slope
-        Torque on the beam in N·m/rad; measured torque in N·m/rad, with tool inertia and channel;
-        slope of the tip relative to the root, per angle.
+    They are the torque on the beam and the measured torque, with tool inertia and channel, in
+    N·m/rad, and the slope relative to the root, per angle. `s` is the Laplace variable in rad/s.
     """
     plant = estimate.plant
     g, slope_response = plant.transfer(s), plant.tip_slope(s)
@@ -173,16 +153,7 @@ def whitened_kernels(estimate: BeamEstimate, s: ComplexArray, sample_hz: float) 
     """Return whitened derivatives of the response from angle to torque for each parameter.
 
     They are divided by the noise spectrum so that the noise of a sample has variance 1. The shape
-    is (k, K).
-
-    Parameters
-    ----------
-    estimate
-        Beam, damping, noise, and the free parameters.
-    s
-        Laplace variable in rad/s, shape (K,).
-    sample_hz
-        Rate of the samples.
+    is (k, K) for K values of the Laplace variable `s` in rad/s.
     """
     parameter_names = [
         parameter_name for parameter_name in estimate.names if parameter_name in PARAMETERS
@@ -284,17 +255,8 @@ class RecordSoFar:
     ) -> "RecordSoFar":
         """Return a record's derivatives and continuing vibration, predicted from the motor's angle.
 
-        Parameters
-        ----------
-        angle_rad
-            Motor angle so far, measured or predicted, shape (n,). The beam is at rest at the first
-            tick.
-        estimate
-            Beam, damping and noise.
-        rate_hz
-            Rate of the angle.
-        future_s
-            Time in s from now on for which the continuing vibration is computed.
+        The angle may be measured or predicted, from rest at the first tick. The continuing
+        vibration is computed for `future_s` from now on.
         """
         ticks_per_point = ticks_per_sample(rate_hz)
         # Rest before it, so that a sample lies at its end.
@@ -336,13 +298,8 @@ class RecordSoFar:
     def information_after(self, added_rows: RealArray | None, sample_count: int) -> RealArray:
         """Return the Fisher information on the parameters after further samples, shape (k, k).
 
-        Parameters
-        ----------
-        added_rows
-            Derivatives that a segment adds from now on, shape (k, n), n at least `sample_count`;
-            None: the motor is held.
-        sample_count
-            Number of further samples that count.
+        `added_rows` are the derivatives that a segment adds from now on, shape (k, n) with n at
+        least `sample_count`; without them the motor is held.
         """
         whitened_rows = self.future_rows[:, :sample_count]
         if added_rows is not None:
@@ -391,14 +348,9 @@ def information(angle_rad: RealArray, estimate: BeamEstimate, rate_hz: float) ->
 
 
 def projected_information(gram: RealArray, k: int) -> RealArray:
-    """Return the Fisher information on k parameters if all others are unknown, shape (k, k).
+    """Return the Fisher information on the first k parameters if all others are unknown.
 
-    Parameters
-    ----------
-    gram
-        Gram matrix of the derivatives for all parameters, shape (k + m, k + m).
-    k
-        Number of parameters of interest.
+    `gram` is the Gram matrix of the derivatives for all parameters, shape (k + m, k + m).
     """
     information: RealArray = gram[:k, :k] - _regression_coefficients(gram, k) @ gram[k:, :k]
     return 0.5 * (information + information.T)

@@ -35,12 +35,7 @@ class MoveRig(Protocol):
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
         """Return the model of the rig for planning, with the beam of an analysis.
 
-        Parameters
-        ----------
-        path
-            Document of ``analyze --json`` with the beam; empty: the beam of the profile.
-        use
-            Purpose for which the beam is used.
+        `path` is a document of ``analyze --json``; if empty, the beam of the profile is used.
         """
 
 

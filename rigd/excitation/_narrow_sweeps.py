@@ -146,19 +146,11 @@ class FoundMode:
 def read_modes(document_path: str | Path) -> tuple[FoundMode, ...]:
     """Read the modes of a beam from the JSON document of an analysis, lowest frequency first.
 
-    Parameters
-    ----------
-    document_path
-        JSON with the key ``modes``: a list of objects with ``frequency_hz`` (Hz, of the free decay)
-        and ``damping_ratio``, and optionally ``frequency_std_hz``. Other keys are ignored. If
-        several fits found a mode, their medians are used. Fits of the estimator ``record`` have
-        priority over others. Modes of ``headlines``, which are those of the modal model, replace
-        all these.
-
-    Raises
-    ------
-    ExcitationError
-        If the file cannot be read or has an invalid value.
+    The key ``modes`` is a list of objects with ``frequency_hz`` (of the free decay),
+    ``damping_ratio`` and optionally ``frequency_std_hz``. If several fits found a mode, their
+    medians are used. Fits of the estimator ``record`` have priority over others. Modes of
+    ``headlines``, which are those of the modal model, replace all these. An unreadable file or an
+    invalid value raises `ExcitationError`.
     """
     document_path = Path(document_path)
     try:
@@ -331,21 +323,9 @@ def time_fractions(
 ) -> RealArray:
     """Return the fraction of the sweep's time for each band that measures damping most precisely.
 
-    The geometric mean of the standard deviations of the damping's parameters is minimised, with
-    all other parameters free, by multiplicative steps (D. M. Titterington, 1976; for criteria
-    other than the determinant S. D. Silvey, D. M. Titterington and B. Torsney, 1978).
-
-    Parameters
-    ----------
-    sweep_bands, amplitudes_rad
-        Bands, and the amplitude of the reference in each band.
-    rig
-        Predicted behaviour of the rig.
-
-    Returns
-    -------
-    ndarray, shape (len(bands),)
-        Fractions with the sum 1.
+    The geometric mean of the standard deviations of the damping's parameters is minimised, with all
+    other parameters free, by multiplicative steps (D. M. Titterington, 1976; for criteria other
+    than the determinant S. D. Silvey, D. M. Titterington and B. Torsney, 1978).
     """
     beam_damping = first_order_damping([band.mode for band in sweep_bands], rig.beam)
     information_rates, damping_count = _information_rates(

@@ -52,12 +52,7 @@ def declared_options(
 ) -> tuple[ExcitationOption, ...]:
     """Return the options of a function that returns an excitation.
 
-    Parameters
-    ----------
-    function
-        Function of rigd, or of a package's excitation.
-    with_rig
-        Whether arguments that are data of the rig (`RIG_ARGUMENTS`) are included.
+    Arguments that are data of the rig (`RIG_ARGUMENTS`) are included only `with_rig`.
     """
     return tuple(
         _option(argument)

@@ -75,14 +75,7 @@ class MoveEnd:
 def predict_move_end(rig: DisturbedRig, reference_rad: RealArray, ring_down_s: float) -> MoveEnd:
     """Predict when the motor arrives at the end of a move, and the vibration after it.
 
-    Parameters
-    ----------
-    rig
-        Predicted behaviour of the rig.
-    reference_rad
-        Reference angle at the ticks after the start, relative to the start angle; shape (n,).
-    ring_down_s
-        Duration of the ring-down in the session, in s.
+    The reference is relative to the start angle, at the ticks after the start.
     """
     rate_hz, end_tick = rig.rate_hz, reference_rad.size
     ringing_poles = rig.poles_rad_s[np.abs(rig.poles_rad_s) < 2 * np.pi * ROBUST_BELOW_HZ]

@@ -106,18 +106,9 @@ def best_mixture(
     the returned combinations, and no other sine gives more (V. V. Fedorov, Theory of optimal
     experiments, 1972).
 
-    Parameters
-    ----------
-    fisher_information
-        Information that the record contains already, shape (k, k).
-    estimate
-        Beam, damping and noise.
-    quantities
-        The q target quantities.
-    frequency_hz, angle_rad
-        Frequencies of the sines and amplitudes of the angle, each of shape (m,).
-    target_relaxation
-        Factor by which all standard deviations may exceed their targets.
+    `fisher_information` is that of the present record, shape (k, k). The sines have m frequencies
+    and amplitudes. All standard deviations may exceed their targets by the factor
+    `target_relaxation`.
     """
     information_rates = _information_rates(estimate, frequency_hz, angle_rad)
     target_stds = np.array(
@@ -171,19 +162,8 @@ def least_deviations(
 ) -> RealArray:
     """Return the smallest standard deviation that each quantity can have in a record.
 
-    For each quantity the mixture of sines is the best for this quantity alone.
-
-    Parameters
-    ----------
-    fisher_information, estimate, quantities, frequency_hz, angle_rad
-        As for `best_mixture`.
-    duration_s
-        Total duration of all sines in s.
-
-    Returns
-    -------
-    ndarray, shape (q,)
-        Lower bound of each standard deviation for a record of this duration.
+    For each quantity the mixture of sines, with the total duration `duration_s`, is the best for
+    this quantity alone. The other arguments are those of `best_mixture`.
     """
     information_rates = _information_rates(estimate, frequency_hz, angle_rad)
     least_stds = np.empty(len(quantities.gradients))

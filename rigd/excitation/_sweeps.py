@@ -149,13 +149,8 @@ def candidate_bands(modes: Sequence[Pole]) -> list[SweepBand]:
 def largest_factor(existing_motion: RealArray, added_motion: RealArray) -> float:
     """Return the largest factor with which a motion can be added within the limits.
 
-    All quantities are fractions of their limits, so the sum must be between -1 and 1. If the
-    existing motion exceeds this range by itself, the sum may be as large, but no larger.
-
-    Parameters
-    ----------
-    existing_motion, added_motion
-        Quantities of the existing motion and of the added motion, shape (c, n).
+    All quantities are fractions of their limits, shape (c, n), so the sum must be between -1 and 1.
+    If the existing motion exceeds this range by itself, the sum may be as large, but no larger.
     """
     unit_magnitude = np.abs(added_motion)
     limit_margin = (

@@ -33,17 +33,9 @@ It corresponds to 10 s at the publisher's 20 polls per second."""
 class DrawingStream:
     """Sends the drawings of one session after another to the present Rerun server.
 
-    Parameters
-    ----------
-    server_program
-        Rerun server that is replaced when it ends.
-
-    Attributes
-    ----------
-    connections
-        Number of connections so far; each one began with the drawings of `Scene.frame`.
-    stalled
-        Whether the server has not accepted the last drawings yet.
+    A server that ends is replaced. `connections` counts the connections so far, each of which began
+    with the drawings of `Scene.frame`; `stalled` states that the last drawings are not yet
+    accepted.
     """
 
     def __init__(self, server_program: RerunServer) -> None:
@@ -61,12 +53,7 @@ class DrawingStream:
     def begin(self, recording_id: str, frame_drawings: "Callable[[], Iterable[Drawing]]") -> None:
         """Start a new Rerun recording for a session; open viewers switch to it.
 
-        Parameters
-        ----------
-        recording_id
-            Identifier of the recording.
-        frame_drawings
-            Function that returns the functions to draw first on each connection.
+        `frame_drawings` returns the functions that draw first on each connection.
         """
         self._recording_id, self._frame = recording_id, frame_drawings
 

@@ -87,24 +87,9 @@ _RELOAD_SCRIPT: Final = """
 class ViewerPageServer:
     """HTTP server, in threads of its own, of the live view's page for browsers on this computer.
 
-    Parameters
-    ----------
-    port
-        Port on loopback, or 0 if the system chooses one.
-    get_address
-        Function that returns the address of the present live view, or None if there is none.
-    get_rerun_port
-        Function that returns the port on loopback at which Rerun itself serves the page, or 0.
-
-    Attributes
-    ----------
-    port
-        Port on which the server listens.
-
-    Raises
-    ------
-    OSError
-        If the port is taken.
+    It listens on a loopback port (0: the system chooses), with `OSError` if that is taken.
+    `get_address` returns the address of the present live view, or None; `get_rerun_port` the
+    loopback port at which Rerun itself serves the page, or 0.
     """
 
     def __init__(

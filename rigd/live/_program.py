@@ -56,17 +56,7 @@ class RerunError(FailureError):
 class RerunProgram:
     """Rerun's program as a child process that the system kills when this process ends.
 
-    Parameters
-    ----------
-    rerun_options
-        Options of the program's command line.
-    extra_environment
-        Environment variables in addition to those of this process.
-
-    Raises
-    ------
-    RerunError
-        If the program is missing or cannot be started.
+    Raise `RerunError` if the program is missing or cannot be started.
     """
 
     def __init__(

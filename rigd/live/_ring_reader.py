@@ -40,28 +40,11 @@ class NewDrawings:
 class SessionRecordReader:
     """Reads one session's records from the ring buffers, and provides functions that draw them.
 
-    Records that are overwritten before they are read are counted; the writer never waits.
-
-    Parameters
-    ----------
-    session
-        Session to read.
-    channels
-        Shared memory of the rig's processes.
-    seen_samples
-        Number of the first sample that no earlier publisher has shown, as in `LiveSession.begins`.
-        Earlier samples that are still in the ring are read again for the scene.
-    last_response
-        Frequency response of the last session of the same specimen, or None.
-
-    Attributes
-    ----------
-    scene
-        Scene of the session, which provides the functions that draw.
-    t_ns
-        Time of the newest sample since the start of the session.
-    read_duration_s
-        Duration of the samples that were read in the last call.
+    Records that are overwritten before they are read are counted; the writer never waits. The first
+    sample that no earlier publisher has shown has the number `seen_samples`, as in
+    `LiveSession.begins`; earlier samples that are still in the ring are read again for the scene.
+    `t_ns` is the time of the newest sample since the start of the session, `read_duration_s` the
+    duration of the samples of the last call.
     """
 
     def __init__(

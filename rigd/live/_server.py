@@ -35,20 +35,8 @@ _MIN_RESTART_INTERVAL_S: Final = 1.0
 class RerunServer:
     """Rerun server of the live view, which is restarted when it ends and announces its address.
 
-    Parameters
-    ----------
-    rig
-        Name of the rig's profile.
-
-    Attributes
-    ----------
-    address
-        Address of the present server, or None while no server accepts connections.
-
-    Raises
-    ------
-    RerunError
-        If Rerun's program cannot be started.
+    `address` is None while no server accepts connections. Raise `RerunError` if Rerun's program
+    cannot be started.
     """
 
     def __init__(self, rig: str) -> None:

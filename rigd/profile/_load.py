@@ -347,16 +347,9 @@ def validate_values(
 ) -> dict[str, Any]:
     """Check types and ranges of all values, and return them with defaults for missing keys.
 
-    Parameters
-    ----------
-    values_by_key
-        Values of the file by dotted keys.
-    problems
-        List to which a message for each problem is appended.
-    absent_sections
-        Names of sections that the file omits; the top level has the empty name.
-    unknown_keys
-        Keys whose value is unknown; their NaN is not checked.
+    Keys are dotted; the NaN of an unknown key is not checked. A message for each problem is
+    appended to `problems`. `absent_sections` are those that the file omits; the top level has the
+    empty name.
     """
     # TOML has only arrays, and strict validation requires tuples.
     tuple_values = {k: tuple(v) if isinstance(v, list) else v for k, v in values_by_key.items()}

@@ -185,20 +185,8 @@ def optional_sections() -> tuple[str, ...]:
 def add_section(kind: DeviceKind | ControllerKind, plugin: Plugin) -> None:
     """Add the section of a part of an installed package to the sections of a profile.
 
-    Nothing changes if it was added before.
-
-    Parameters
-    ----------
-    kind
-        Kind of device or controller.
-    plugin
-        Package that adds it.
-
-    Raises
-    ------
-    PluginError
-        If the declaration of its settings is invalid, or the section is one of rigd's own or of
-        another part.
+    Nothing changes if it was added before. Raise `PluginError` if the declaration of its settings
+    is invalid, or if the section is one of rigd's own or of another part.
     """
     settings = kind.settings
     if settings is None or SECTIONS.get(kind.name) is settings:

@@ -39,22 +39,11 @@ class Setting:
 
 
 def with_settings(text: str, settings: Iterable[Setting]) -> str:
-    """Return the text of a profile after the values of some keys are replaced.
+    """Return the text of a valid profile after the values of some keys are replaced.
 
-    Other comments and values are unchanged.
-
-    Parameters
-    ----------
-    text
-        Text of a valid profile.
-    settings
-        Changes. A key that the profile does not have replaces the comment that shows it, or becomes
-        the first key of its section.
-
-    Raises
-    ------
-    KeyError
-        If the profile does not have the section of a key.
+    Other comments and values are unchanged. A key that the profile does not have replaces the
+    comment that shows it, or becomes the first key of its section; without the section it raises
+    `KeyError`.
     """
     text_lines = text.splitlines()
     for new_setting in settings:

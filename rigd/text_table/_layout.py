@@ -175,17 +175,9 @@ def _count_with_noun(count: int, noun: str) -> str:
 def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLayout:
     """Return the layout of the table in a file, from the first lines of the file.
 
-    Parameters
-    ----------
-    lines : sequence of str
-        First lines with their line ends, at most `MAX_HEAD_LINES`.
-    requested_names : sequence of str
-        Titles of the requested columns, or numbers such as ``#3`` for the third column.
-
-    Raises
-    ------
-    TableError
-        If the file contains no table with these columns.
+    There are at most `MAX_HEAD_LINES` lines, with their line ends. Columns are requested by their
+    titles, or by numbers such as ``#3`` for the third. Raise `TableError` if there is no such
+    table.
     """
     if not any(line_text.strip() for line_text in lines):
         raise TableError("is empty; export the record again.")

@@ -41,11 +41,7 @@ class AnyForceLikelihood:
     def interval(self, log_likelihood_drop: float = 1.92) -> tuple[float, float, float, float]:
         """Return the likeliest position, its standard deviation and the ends of its interval, in m.
 
-        Parameters
-        ----------
-        log_likelihood_drop
-            Difference of the log-likelihood between the likeliest position and the ends; 1.92 for
-            an interval of 95 %.
+        At the ends the log-likelihood is lower by `log_likelihood_drop`; 1.92 gives 95 %.
         """
         fine_positions_m = np.linspace(self.x_m[0], self.x_m[-1], 4000)
         log_likelihood = np.interp(fine_positions_m, self.x_m, self.log_likelihood)
@@ -76,14 +72,8 @@ class AnyForceLikelihood:
 class AnyForceEstimator:
     """Estimator of the touch position for an arbitrary force over time.
 
-    Parameters
-    ----------
-    kernels
-        Contact kernels with two time steps per sample.
-    position_stride
-        The positions that are compared are every `position_stride`-th position of the kernels.
-    sample_count
-        Largest number of samples that `scan` accepts.
+    The kernels have two time steps per sample; every `position_stride`-th of their positions is
+    compared, in windows of at most `sample_count` samples.
     """
 
     __slots__ = ("_force_effects", "_x_m")
@@ -105,10 +95,7 @@ class AnyForceEstimator:
     def scan(self, sample_window: WhitenedWindow) -> AnyForceLikelihood:
         """Return the likelihood of a touch at each position, for an arbitrary force over time.
 
-        Parameters
-        ----------
-        sample_window
-            Whitened innovations of at most `sample_count` samples.
+        The window has at most `sample_count` samples.
         """
         sample_count = sample_window.end_sample - sample_window.first_sample
         noise_stds = sample_window.motion.noise_stds

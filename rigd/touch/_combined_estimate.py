@@ -51,14 +51,7 @@ def estimate_from_explanations(
 ) -> TouchEstimate:
     """Return position, instant, force and stiffness of a touch from its likeliest explanations.
 
-    Parameters
-    ----------
-    explanation_search
-        Search that found the explanations.
-    explained_record
-        Explanations of the record.
-    scan
-        Whether the estimate contains the likelihood of each position; otherwise that is empty.
+    With `scan` the estimate contains the likelihood of each position; otherwise that is empty.
     """
     obstacle_fit = explanation_search.fit
     explanations, sample_window = explained_record.explanations, explained_record.window

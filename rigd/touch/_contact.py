@@ -35,26 +35,12 @@ def integrate_contact(
 ) -> NDArray[_Precision]:
     """Return the force with which the beam presses on an obstacle, at each step since the touch.
 
-    Parameters
-    ----------
-    kernel
-        Displacement in the direction of the force per hat of force, in m/N, shape (k, n).
-    approach
-        Distance in m by which the beam would be beyond the point of touch if there were no force,
-        shape (k, n), or (k, g, n) for g candidates of each kernel. It is 0 at the first step.
-    stiffness_n_per_m
-        Stiffness of the obstacle, shape (k,) or (k, g).
-    step_s
-        Time between two steps.
-    rate_m_per_s
-        Speed at which the obstacle moves away from the beam, shape (k,) or a number.
-    mobility_m_per_n_s
-        Speed at which the obstacle yields, divided by the force, shape (k,) or a number.
-
-    Returns
-    -------
-    ndarray, shape of `approach`
-        Magnitude of the force in N, 0 without contact.
+    The force is a magnitude in N, 0 without contact, with the shape of `approach`. `kernel` is the
+    displacement in the direction of the force per hat of force, in m/N, shape (k, n). `approach` is
+    the distance in m by which the beam would be beyond the point of touch if there were no force, 0
+    at the first step, shape (k, n), or (k, g, n) for g candidates of each kernel; the stiffness has
+    the shape (k,) or (k, g). The obstacle moves away from the beam at `rate_m_per_s` and yields at
+    `mobility_m_per_n_s` times the force.
     """
     result_shape = approach.shape
     kernel_count, step_count = kernel.shape
@@ -140,24 +126,11 @@ def integrate_two_contacts(
 ) -> tuple[RealArray, RealArray]:
     """Return the forces with which the beam presses on two obstacles at rest, at each step.
 
-    Parameters
-    ----------
-    own_kernels
-        Displacement at each obstacle's position per hat of force at that position, in m/N, shape
-        (k, n).
-    cross_kernel
-        Displacement at one position per hat of force at the other, in m/N, shape (k, n); positive
-        in the directions of the two forces.
-    approach
-        Distance in m by which the beam would be beyond each obstacle if there were no force, shape
-        (k, n). It is not positive at the first step.
-    stiffness_n_per_m
-        Stiffness of each obstacle, shape (k,).
-
-    Returns
-    -------
-    tuple of ndarray, shape (k, n)
-        Magnitude of each force in N, 0 without contact.
+    The forces are magnitudes in N, 0 without contact, shape (k, n). Kernels are displacements per
+    hat of force in m/N, shape (k, n): at each obstacle by its own force, and at one by the force of
+    the other, positive in the directions of the two forces. `approach` is the distance in m by
+    which the beam would be beyond each obstacle if there were no force; it is not positive at the
+    first step.
     """
     pair_count, step_count = cross_kernel.shape
     # Force of a step without all others, (n, 2, k).
@@ -225,15 +198,6 @@ def shift_rows(value_table: RealArray, begin_columns: RealArray, column_count: i
 
     The result has the shape (k, column_count). Before the first column of the table, values are 0;
     after the last column, they equal those of the last column.
-
-    Parameters
-    ----------
-    value_table
-        Rows of values, shape (k, n).
-    begin_columns
-        Column of each row's first value in the result, shape (k,); it may be between two columns.
-    column_count
-        Number of values of the result, one column apart.
     """
     first_column = np.floor(begin_columns).astype(np.intp)
     u = (begin_columns - first_column)[:, None]
@@ -269,18 +233,9 @@ def contact_responses(
 ) -> RealArray:
     """Return the convolution of forces with kernels, shape (k, kernels, sample_count).
 
-    Only the values at the samples are computed, one every `steps_per_sample` time steps.
-
-    Parameters
-    ----------
-    kernels
-        Responses to a hat of force, each of shape (k, n) or (1, n); they are 0 from column n on.
-    forces_n
-        Force at each time step, shape (k, (sample_count - 1) · steps_per_sample + 1).
-    steps_per_sample
-        Number of time steps from one sample to the next; the first sample is at the first step.
-    sample_count
-        Number of samples.
+    Kernels are responses to a hat of force, of shape (k, n) or (1, n), and 0 from column n on.
+    Forces have one column per time step, the responses one per sample; the first sample is at the
+    first step.
     """
     candidate_count, step_count = forces_n.shape
     kernel_tables = np.stack(kernels, axis=1)

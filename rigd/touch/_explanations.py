@@ -81,17 +81,9 @@ class ExplainedRecord:
 class ExplanationSearch:
     """Search for the kinds and parameters of obstacles that explain the record of one touch.
 
-    Parameters
-    ----------
-    touch_tables
-        Precomputed tables of the model at the record's rate.
-    touch_record
-        Samples from 0.3 s or more before the touch.
-    detection_delay_s
-        Longest assumed time in s from the touch to its detection.
-    previous_search
-        Search in a shorter record of the same touch, from whose results this search starts; None:
-        the search starts from a grid of candidates.
+    The record begins at least 0.3 s before the touch, which is detected within `detection_delay_s`.
+    The search starts from the results of a previous search in a shorter record of the same touch,
+    without one from a grid of candidates.
     """
 
     def __init__(

@@ -380,23 +380,14 @@ class FreeVibration:
         return without_shapes.at_positions(x_m / beam.length_m)
 
     def at_positions(self, fractions: RealArray) -> "FreeVibration":
-        """Return the same free vibrations with displacements at other positions.
-
-        Parameters
-        ----------
-        fractions
-            Positions as fractions of the length, shape (positions,).
-        """
+        """Return the same free vibrations with displacements at other fractions of the length."""
         mode_shapes = np.stack([mode_shape(i + 1, fractions) for i in range(self.poles.size)])
         return replace(self, displacement_shapes=mode_shapes * self.amplitude_units[:, None])
 
     def torque_and_shear(self, t: RealArray) -> RealArray:
         """Return torque and base shear of each vibration over time, shape (2, t, 2 · modes).
 
-        Parameters
-        ----------
-        t
-            Times in s from the record's beginning, shape (t,).
+        Times are in s from the beginning of the record.
         """
         oscillation = np.exp(np.multiply.outer(t, self.poles))
         complex_parts = [oscillation * root_load for root_load in self.root_loads]
@@ -407,14 +398,8 @@ class FreeVibration:
     def displacement(self, t: NDArray[np.floating], amplitudes: RealArray) -> RealArray:
         """Return the beam's displacement in m for given amplitudes of the free vibrations.
 
-        The shape is (positions, t, r), or (positions, t) for amplitudes without the axis r.
-
-        Parameters
-        ----------
-        t
-            Times in s from the record's beginning, shape (t,).
-        amplitudes
-            Amplitudes of cosines and sines, shape (2 · modes, r) or (2 · modes,).
+        Amplitudes are of cosines and sines, shape (2 · modes, r) or (2 · modes,); the result has
+        the shape (positions, t, r) or (positions, t).
         """
         mode_count = self.poles.size
         oscillation = np.exp(np.multiply.outer(t, self.poles)).T

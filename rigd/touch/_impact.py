@@ -16,16 +16,8 @@ class ImpactResponse:
     """Model of the effect of an impact, a half-sine pulse of force, on torque and base shear.
 
     A candidate has four columns: position in m, instant in s, logarithm of the duration in s, and
-    peak of the force in N.
-
-    Parameters
-    ----------
-    obstacle_contact
-        Integration of the contact for the record.
-    kernels
-        Contact kernels on the time steps of the integration.
-    position_stride
-        The search starts at every `position_stride`-th position of the kernels.
+    peak of the force in N. The search starts at every `position_stride`-th position of the kernels,
+    which have the time steps of the integration.
     """
 
     __slots__ = ("_contact", "_kernels", "_position_stride")
@@ -40,15 +32,7 @@ class ImpactResponse:
         )
 
     def predict(self, parameters: RealArray, sample_window: WhitenedWindow) -> RealArray:
-        """Return the effect of impacts on torque and base shear, shape (k, c, samples).
-
-        Parameters
-        ----------
-        parameters
-            Candidates, shape (k, 4).
-        sample_window
-            Samples for which the effect is predicted.
-        """
+        """Return the effect of impacts (k, 4) on torque and base shear, shape (k, c, samples)."""
         free_motion = sample_window.motion
         last_time_s = free_motion.t[sample_window.end_sample - 1]
         step_count = int(np.ceil((last_time_s - parameters[:, 1].min()) / self._kernels.step_s)) + 3
@@ -64,17 +48,8 @@ class ImpactResponse:
     ) -> RealArray:
         """Return the likeliest candidates of a grid of impacts, shape (impact_count, 4).
 
-        The grid has positions, instants and durations; the peak is fitted by least squares.
-
-
-        Parameters
-        ----------
-        sample_window
-            Whitened innovations with which the impacts are compared.
-        latest_sample
-            Index of the last sample at which the impact may begin.
-        impact_count
-            Number of impacts that are returned.
+        The grid has positions, instants up to `latest_sample`, and durations; the peak is fitted by
+        least squares.
         """
         positions_m = self._kernels.x_m[:: self._position_stride]
         impact_grid = np.stack(
@@ -118,13 +93,7 @@ class ImpactResponse:
     def parameter_ranges(
         position_range_m: tuple[float, float], instant_range_s: tuple[float, float]
     ) -> ParameterRanges:
-        """Return bounds and step sizes of the four parameters of an impact.
-
-        Parameters
-        ----------
-        position_range_m, instant_range_s
-            Lower and upper bound of the position, and of the instant.
-        """
+        """Return bounds and step sizes of the four parameters of an impact."""
         return ParameterRanges(
             low=np.array([position_range_m[0], instant_range_s[0], np.log(3e-4), -100.0]),
             high=np.array([position_range_m[1], instant_range_s[1], np.log(0.1), 100.0]),

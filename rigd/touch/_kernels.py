@@ -43,12 +43,7 @@ _FIRST_POSITION_M = 0.003
 class ForcePulse:
     """Triangular pulse of 1 N, whose responses over time are computed from transfer functions.
 
-    Parameters
-    ----------
-    step_s
-        Half the width of the pulse, and the time between two values of a kernel.
-    step_count
-        Number of values of a kernel.
+    Its half width is `step_s`, which is also the time between the `step_count` values of a kernel.
     """
 
     __slots__ = ("_delayed_pulse", "_steps", "transform")
@@ -66,12 +61,10 @@ class ForcePulse:
         self._delayed_pulse = pulse_transform * np.exp(-s * step_s)
 
     def kernels(self, laplace_response: ComplexArray) -> RealArray:
-        """Return the responses over time to the pulse, from transfer functions, shape (k, steps).
+        """Return the responses over time to the pulse, shape (k, steps).
 
-        Parameters
-        ----------
-        laplace_response
-            Transfer functions from force, at the points `s` of the transform, shape (k, points).
+        The transfer functions from force, shape (k, points), are given at the points `s` of the
+        transform.
         """
         fine_values = self.transform.inverse(
             self._delayed_pulse * laplace_response, _OVERSAMPLING * (self._steps + 1)
@@ -101,15 +94,7 @@ class ContactKernels:
         return int(self.displacement.shape[1])
 
     def at_positions(self, x_m: RealArray, step_count: int) -> "ContactKernels":
-        """Return the responses at other positions, by cubic interpolation between positions.
-
-        Parameters
-        ----------
-        x_m
-            Positions within the range of the present positions, shape (k,).
-        step_count
-            Number of time steps of the result.
-        """
+        """Return the responses at positions within the present range, by cubic interpolation."""
         first_rows, weights = cubic_weights(x_m, self.x_m)
         kernel_tables = (
             self.displacement[:, :step_count],
@@ -123,12 +108,7 @@ class ContactKernels:
     def with_wider_pulses(self, widening_factor: int, step_count: int) -> "ContactKernels":
         """Return the responses to wider triangular pulses of force, with longer time steps.
 
-        Parameters
-        ----------
-        widening_factor
-            Ratio of the longer time step to the present one.
-        step_count
-            Number of time steps of the result.
+        `widening_factor` is the ratio of the longer time step to the present one.
         """
         pulse_weights = (
             1 - np.abs(np.arange(1 - widening_factor, widening_factor)) / widening_factor
@@ -165,21 +145,7 @@ def contact_kernels(
     step_count: int,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> ContactKernels:
-    """Return the responses of the exact model to a triangular pulse of force at some positions.
-
-    Parameters
-    ----------
-    beam, damping
-        Parameters of the exact model.
-    x_m
-        Positions of the force along the beam, shape (m,).
-    step_s
-        Time between two values of a kernel.
-    step_count
-        Number of values of a kernel.
-    sensor_filter
-        Filters of torque and shear.
-    """
+    """Return the responses of the exact model to a triangular pulse of force at some positions."""
     force_pulse = ForcePulse(step_s, step_count)
     s = force_pulse.transform.s
     force_grid = PointForceGrid(s, beam, damping)
@@ -218,12 +184,7 @@ class CrossKernels:
     def between_positions(self, x_m: RealArray, other_m: RealArray, step_count: int) -> RealArray:
         """Return the displacement in m/N for each pair of positions, shape (k, step_count).
 
-        Parameters
-        ----------
-        x_m, other_m
-            Positions of force and displacement, shape (k,); exchanging them changes nothing.
-        step_count
-            Number of time steps of the result.
+        It is symmetric in the positions of force and displacement.
         """
         first_shapes, second_shapes = (
             interpolate_rows(self.mode_shapes, *cubic_weights(x, self.x_m)) for x in (x_m, other_m)
@@ -261,15 +222,7 @@ _POSITIONS_AT_ONCE = 8
 
 
 def beam_positions(length_m: float, spacing_m: float) -> RealArray:
-    """Return equally spaced positions along the beam up to its tip, in m.
-
-    Parameters
-    ----------
-    length_m
-        Length of the beam.
-    spacing_m
-        Largest distance between two neighbouring positions.
-    """
+    """Return equally spaced positions in m up to the tip of the beam, at most `spacing_m` apart."""
     n = int(np.ceil((length_m - _FIRST_POSITION_M) / spacing_m)) + 1
     return np.linspace(_FIRST_POSITION_M, length_m, n)
 
@@ -277,19 +230,8 @@ def beam_positions(length_m: float, spacing_m: float) -> RealArray:
 def chebyshev_nodes(x_m: RealArray, node_count: int) -> tuple[RealArray, RealArray]:
     """Return Chebyshev nodes, and the matrix that interpolates from nodes to positions.
 
-    Parameters
-    ----------
-    x_m
-        Increasing positions, shape (m,).
-    node_count
-        Number of nodes.
-
-    Returns
-    -------
-    nodes_m : ndarray, shape (node_count,)
-        Positions of the nodes.
-    interpolation_matrix : ndarray, shape (m, node_count)
-        Matrix that multiplies values at the nodes, and gives interpolated values at `x_m`.
+    The matrix has the shape (positions, nodes) and multiplies values at the nodes; positions
+    increase.
     """
     from numpy.polynomial import chebyshev
 
@@ -306,19 +248,8 @@ def chebyshev_nodes(x_m: RealArray, node_count: int) -> tuple[RealArray, RealArr
 def cubic_weights(points: RealArray, grid_points: RealArray) -> tuple[NDArray[np.intp], RealArray]:
     """Return the indices and weights of a cubic interpolation on an equally spaced grid.
 
-    Parameters
-    ----------
-    points
-        Points at which interpolated values are wanted, shape (k,).
-    grid_points
-        At least four equally spaced, increasing points.
-
-    Returns
-    -------
-    first_indices : ndarray of int, shape (k,)
-        Index of the first of the four grid points for each point.
-    weights : ndarray, shape (k, 4)
-        Weights of these four grid points.
+    For each of k points these are the index of the first of four grid points, and their weights,
+    shape (k, 4). The grid has at least four increasing points.
     """
     grid_positions = (np.asarray(points) - grid_points[0]) / (grid_points[1] - grid_points[0])
     first_indices = np.clip(np.floor(grid_positions).astype(np.intp) - 1, 0, grid_points.size - 4)

@@ -76,18 +76,11 @@ class WhitenedWindow:
         end_sample: int,
         effects_per_std: RealArray | None = None,
     ) -> "WhitenedWindow":
-        """Return the whitened innovations of the samples from `first_sample` to `end_sample`.
+        """Return the whitened innovations of a range of samples; `end_sample` is exclusive.
 
-        Parameters
-        ----------
-        free_motion
-            Motion of the beam without a touch in the record.
-        first_sample, end_sample
-            Index of the first sample, and of the sample after the last.
-        effects_per_std
-            Effect of one standard deviation of each of r uncertainties on torque and shear, shape
-            (c, n, r) from `first_sample` on. None: only the uncertainty of the free motion is used,
-            without its effect on the contact.
+        `effects_per_std` is the effect of one standard deviation of each of r uncertainties on
+        torque and shear, shape (c, n, r) from `first_sample` on. Without it only the uncertainty of
+        the free motion is used, without its effect on the contact.
         """
         if effects_per_std is None:
             effects_per_std = (
@@ -108,12 +101,8 @@ class WhitenedWindow:
     def residuals(self, predicted_effects: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
         """Return the whitened innovations minus the whitened predicted effects, shape (k, n).
 
-        The result has the floating-point precision of the prediction.
-
-        Parameters
-        ----------
-        predicted_effects
-            Predicted effect of each touch on torque and base shear, shape (k, c, samples).
+        Predicted effects have the shape (k, c, samples); the result has their floating-point
+        precision.
         """
         noise_stds, whitening, whitened_data = (
             float_array.astype(predicted_effects.dtype, copy=False)
@@ -128,14 +117,8 @@ class WhitenedWindow:
 class ObstacleContact:
     """Model of the beam's contact with an obstacle, for the record of one touch.
 
-    Parameters
-    ----------
-    kernels
-        Contact kernels at some positions, on the time steps of the integration.
-    x_m
-        Positions of the displacements in `free_motion`.
-    free_motion
-        Motion of the beam without a touch in the record.
+    The kernels have the time steps of the integration; `x_m` are the positions of the displacements
+    in `free_motion`, the motion of the beam without a touch.
     """
 
     __slots__ = ("_kernels", "_motion", "_x_m")
@@ -150,26 +133,13 @@ class ObstacleContact:
         pressing_sign: float | None = None,
         kernels: ContactKernels | None = None,
     ) -> tuple[RealArray, RealArray]:
-        """Return the effect of obstacles on torque and shear, and the contact forces in N.
+        """Return the effect of obstacles on torque and shear, and the contact forces.
 
-        Parameters
-        ----------
-        parameters
-            Candidates with the columns of `OBSTACLE_PARAMETERS`, at least the first three; shape
-            (k, p).
-        sample_window
-            Samples for which the effect is predicted.
-        pressing_sign
-            Direction in which the beam presses, 1 or -1; None: that of its motion at the touch.
-        kernels
-            Kernels at the position of the only candidate; None: interpolated kernels.
-
-        Returns
-        -------
-        channels : ndarray, shape (k, c, samples)
-            Effect on torque and base shear.
-        force : ndarray, shape (k, n)
-            Force on the beam in N, at the time steps from the touch on.
+        Candidates have at least the first three columns of `OBSTACLE_PARAMETERS`. Effects have the
+        shape (k, c, samples), forces are in N at the time steps from the touch on, shape (k, n).
+        The beam presses in the direction `pressing_sign`, 1 or -1, by default that of its motion at
+        the touch. `kernels` are those at the position of a single candidate, by default
+        interpolated ones.
         """
         free_motion = self._motion
         x, instants_s = parameters[:, 0], parameters[:, 1]
@@ -202,18 +172,10 @@ class ObstacleContact:
     ) -> RealArray:
         """Return the effects of changed free motions on torque and shear through the contact.
 
-        A change of the free motion changes the instant of touch, and thereby the contact force. The
-        shape is (r, c, samples).
-
-        Parameters
-        ----------
-        parameters
-            Position, instant and logarithm of the stiffness of an obstacle at rest.
-        sample_window
-            Samples for which the effect is predicted.
-        displacement_changes_m
-            Changes of the displacement at the obstacle's position, at the time steps of the free
-            motion, shape (r, steps).
+        The shape is (r, c, samples). A change of the free motion changes the instant of touch, and
+        thereby the contact force. The parameters are position, instant and logarithm of the
+        stiffness of an obstacle at rest. The changes are of the displacement in m at its position,
+        at the time steps of the free motion, shape (r, steps).
         """
         x, instant_s = parameters[:1], parameters[1:2]
         time_steps = self.step_count(instant_s, sample_window)
@@ -244,15 +206,7 @@ class ObstacleContact:
         )
 
     def step_count(self, instants_s: RealArray, sample_window: WhitenedWindow) -> int:
-        """Return the number of time steps from the earliest touch to the end of the window.
-
-        Parameters
-        ----------
-        instants_s
-            Instants of touch, shape (k,).
-        sample_window
-            Samples; the integration ends with the last one.
-        """
+        """Return the number of time steps from the earliest touch to the end of the window."""
         step_s = self._kernels.step_s
         needed_steps = (
             int(np.ceil((self._motion.t[sample_window.end_sample - 1] - instants_s.min()) / step_s))
@@ -261,13 +215,7 @@ class ObstacleContact:
         return min(max(needed_steps, 4), self._kernels.steps)
 
     def pressing_sign(self, parameters: RealArray) -> float:
-        """Return the direction of the free beam's motion at a touch, 1 or -1.
-
-        Parameters
-        ----------
-        parameters
-            One candidate with at least position and instant.
-        """
+        """Return the direction of the free beam's motion at the touch of one candidate, 1 or -1."""
         return float(self.motion_beyond_obstacle(parameters[:1], parameters[1:2], 1)[1][0])
 
     def force_effects(
@@ -279,16 +227,8 @@ class ObstacleContact:
     ) -> RealArray:
         """Return the effect of contact forces on torque and base shear, shape (k, c, samples).
 
-        Parameters
-        ----------
-        kernel_tables
-            Kernel of torque, and of shear if measured, with as many rows as `forces_n` or one.
-        forces_n
-            Forces on the beam at the time steps of the kernels, shape (k, n).
-        instants_s
-            Instant of each force's first step, shape (k,).
-        sample_window
-            Samples for which the effect is predicted.
+        The tables are the kernel of torque, and of shear if measured, with k rows or one. Forces
+        are given at the time steps of the kernels from each instant on, shape (k, n).
         """
         free_motion = self._motion
         step_s = self._kernels.step_s
@@ -310,22 +250,9 @@ class ObstacleContact:
     ) -> tuple[RealArray, RealArray]:
         """Return the free beam's distance beyond each obstacle over time, and its direction.
 
-        Parameters
-        ----------
-        positions_m, instants_s
-            Positions and instants of touches, shape (k,).
-        steps
-            Number of time steps from the instants on.
-        given_sign
-            Direction of the motion, 1 or -1; None: the direction at the instant of touch.
-
-        Returns
-        -------
-        distance : ndarray, shape (k, steps)
-            Displacement of the free beam in m since the instant of touch, positive in the direction
-            of the motion.
-        sign : ndarray, shape (k,)
-            Direction of the motion, 1 or -1.
+        The distance is the displacement in m since the instant of touch, shape (k, steps), positive
+        in the direction of the motion. The direction is 1 or -1, by default that at the instant of
+        touch.
         """
         free_motion = self._motion
         first_rows, weights = cubic_weights(positions_m, self._x_m)
@@ -381,20 +308,8 @@ def find_minima(
 ) -> LocalMinima:
     """Return the local minima of the sum of squared residuals that are reached from given starts.
 
-    Parameters
-    ----------
-    predict_effect
-        Function that predicts the effect of candidates.
-    sample_window
-        Whitened innovations with which the predictions are compared.
-    start_candidates
-        Candidates from which the iterations start, shape (k, p).
-    parameter_ranges
-        Ranges of the parameters.
-    max_iterations
-        Largest number of iterations.
-    free_parameters
-        Whether each parameter of each start is varied, shape (k, p); None: all are varied.
+    Starts have the shape (k, p). `free_parameters` states whether each parameter of each start is
+    varied, shape (k, p); by default all are.
     """
     best_parameters = np.clip(start_candidates, parameter_ranges.low, parameter_ranges.high)
     damping_factors = np.full(len(best_parameters), 1e-2)
@@ -494,18 +409,9 @@ def _linearise(
 class CandidateGrid:
     """Grid of candidate obstacles at rest: positions, instants and stiffnesses to start a search.
 
-    The contacts of all candidates are integrated together, in coarse time steps.
-
-    Parameters
-    ----------
-    kernels
-        Contact kernels whose time step is an integer fraction of the sampling period.
-    position_stride
-        The grid has every `position_stride`-th position of the kernels.
-    rate_hz
-        Samples a second.
-    sample_count
-        Number of samples with which the candidates are compared.
+    The contacts of all candidates are integrated together, in coarse time steps, and compared with
+    `sample_count` samples. The grid has every `position_stride`-th position of the kernels, whose
+    time step is an integer fraction of the sampling period.
     """
 
     __slots__ = (
@@ -550,14 +456,7 @@ class CandidateGrid:
     ) -> tuple[RealArray, RealArray]:
         """Return all candidates of the grid (k, 3), and their sums of squared residuals (k,).
 
-        Parameters
-        ----------
-        free_motion
-            Motion of the beam without a touch in the record.
-        sample_window
-            Whitened innovations with which the candidates are compared.
-        latest_sample
-            Index of the last sample at which the touch may begin.
+        `latest_sample` is the index of the last sample at which the touch may begin.
         """
         touch_samples = np.arange(sample_window.first_sample + 1, latest_sample + 1)
         sample_batches = np.array_split(touch_samples, -(-touch_samples.size // _INSTANTS_AT_ONCE))
@@ -640,17 +539,7 @@ GRID_STIFFNESSES_N_PER_M = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 10000
 def chi2_of(
     predict_effect: Prediction, sample_window: WhitenedWindow, candidates: RealArray
 ) -> RealArray:
-    """Return the sum of squared residuals of each candidate obstacle, shape (k,).
-
-    Parameters
-    ----------
-    predict_effect
-        Function that predicts the effect of candidates.
-    sample_window
-        Whitened innovations with which the predictions are compared.
-    candidates
-        Parameters of the candidates, shape (k, p).
-    """
+    """Return the sum of squared residuals of each candidate obstacle, shape (k,)."""
     candidate_residuals = sample_window.residuals(predict_effect(candidates, sample_window))
     chi2: RealArray = np.einsum("kn,kn->k", candidate_residuals, candidate_residuals)
     return chi2

@@ -37,18 +37,10 @@ _MAX_DISTANCE_M = 0.3
 class TwoObstacleContact:
     """Model of the beam's contact with two obstacles, for the record of one touch.
 
-    Candidates have six columns. The first three are position, instant and logarithm of stiffness
-    of the first obstacle. The others are the position of the second obstacle, its distance in m
-    from the free beam at the instant of the first touch, and the logarithm of its stiffness.
-
-    Parameters
-    ----------
-    obstacle_contact
-        Integration of the contact with one obstacle.
-    kernels
-        Contact kernels on the time steps of the integration.
-    cross_kernels
-        Kernels from a force at one position to the displacement at another, on the same steps.
+    Candidates have six columns. The first three are position, instant and logarithm of stiffness of
+    the first obstacle. The others are the position of the second obstacle, its distance in m from
+    the free beam at the instant of the first touch, and the logarithm of its stiffness. All kernels
+    have the time steps of the integration.
     """
 
     __slots__ = ("_contact", "_cross_kernels", "_kernels")
@@ -66,19 +58,8 @@ class TwoObstacleContact:
     ) -> tuple[RealArray, RealArray]:
         """Return the effect of two obstacles on torque and shear, and the force of the first.
 
-        Parameters
-        ----------
-        parameters
-            Candidates, shape (k, 6).
-        sample_window
-            Samples for which the effect is predicted.
-
-        Returns
-        -------
-        channels : ndarray, shape (k, c, samples)
-            Effect on torque and base shear.
-        force : ndarray, shape (k, n)
-            Force of the first obstacle on the beam in N, at the time steps from the touch on.
+        The effect has the shape (k, c, samples); the force on the beam is in N, at the time steps
+        from the touch on, shape (k, n).
         """
         obstacle_contact, instants_s = self._contact, parameters[:, 1]
         step_count = obstacle_contact.step_count(instants_s, sample_window)
@@ -129,21 +110,9 @@ class TwoObstacleContact:
     ) -> RealArray:
         """Return pairs of obstacles from which the search starts, shape (k, 6).
 
-        Some pairs have about the effect of the single obstacle; in the others, a second obstacle is
-        added to it.
-
-        Parameters
-        ----------
-        single_obstacle
-            Position, instant and logarithm of the stiffness of the single obstacle that explains
-            the record best.
-        sample_window
-            Whitened innovations with which the pairs are compared.
-        parameter_ranges
-            Ranges of the parameters.
-        pair_count
-            Number of pairs with an added second obstacle. Its positions are those for which first-
-            order effects predict the largest reduction of the residuals.
+        Some pairs have about the effect of the single obstacle that explains the record best;
+        `pair_count` others have a second obstacle added to it, at the positions for which
+        first-order effects predict the largest reduction of the residuals.
         """
         return np.vstack(
             [
@@ -158,12 +127,7 @@ class TwoObstacleContact:
     def equivalent_pairs(single_obstacle: RealArray, relative_positions: RealArray) -> RealArray:
         """Return pairs of obstacles that have about the effect of a single one, shape (k, 6).
 
-        Parameters
-        ----------
-        single_obstacle
-            Position, instant and logarithm of the stiffness of the single obstacle.
-        relative_positions
-            Positions of the two obstacles, divided by that of the single one, shape (k, 2).
+        The positions of a pair are relative to that of the single obstacle, shape (k, 2).
         """
         pairs: RealArray = np.tile(
             np.concatenate([single_obstacle, single_obstacle]), (len(relative_positions), 1)
@@ -234,26 +198,14 @@ class TwoObstacleContact:
 
     @staticmethod
     def in_reverse_order(parameters: RealArray) -> RealArray:
-        """Return pairs with exchanged obstacles that are touched at the same instant, shape (k, 6).
-
-        Parameters
-        ----------
-        parameters
-            Candidates, shape (k, 6).
-        """
+        """Return pairs with exchanged obstacles, touched at the same instant, shape (k, 6)."""
         reversed_pairs: RealArray = parameters[:, [3, 1, 5, 0, 4, 2]]
         reversed_pairs[:, 4] = 0.0
         return reversed_pairs
 
     @staticmethod
     def parameter_ranges(single_obstacle: ParameterRanges) -> ParameterRanges:
-        """Return bounds and step sizes of the six parameters of two obstacles.
-
-        Parameters
-        ----------
-        single_obstacle
-            Bounds and step sizes of the parameters of one obstacle at rest.
-        """
+        """Return bounds and step sizes for two obstacles, from those of one obstacle at rest."""
         return ParameterRanges(
             low=np.concatenate(
                 [single_obstacle.low, [single_obstacle.low[0], 0.0, single_obstacle.low[2]]]

@@ -42,38 +42,18 @@ class Posterior:
         return float(1 / np.sum(self.weights**2))
 
     def quantiles(self, parameter_column: int, quantile_levels: tuple[float, ...]) -> RealArray:
-        """Return quantiles of one parameter's posterior distribution, in the parameter's unit.
-
-        Parameters
-        ----------
-        parameter_column
-            Column of the parameter.
-        quantile_levels
-            Probabilities of the quantiles, between 0 and 1.
-        """
+        """Return quantiles of one parameter's posterior distribution, in the parameter's unit."""
         parameter_values = self.samples[:, parameter_column]
         value_order = np.argsort(parameter_values)
         cumulated_weights = np.cumsum(self.weights[value_order]) - 0.5 * self.weights[value_order]
         return np.interp(quantile_levels, cumulated_weights, parameter_values[value_order])
 
     def mean(self, parameter_column: int) -> float:
-        """Return the mean of one obstacle parameter's posterior distribution.
-
-        Parameters
-        ----------
-        parameter_column
-            Column of the parameter.
-        """
+        """Return the mean of one obstacle parameter's posterior distribution."""
         return float(self.weights @ self.samples[:, parameter_column])
 
     def std(self, parameter_column: int) -> float:
-        """Return the standard deviation of one obstacle parameter's posterior distribution.
-
-        Parameters
-        ----------
-        parameter_column
-            Column of the parameter.
-        """
+        """Return the standard deviation of one obstacle parameter's posterior distribution."""
         deviations = self.samples[:, parameter_column] - self.mean(parameter_column)
         return float(np.sqrt(self.weights @ deviations**2))
 
@@ -92,26 +72,9 @@ def sample_posterior(
 ) -> Posterior:
     """Return weighted samples of the posterior distribution, for a uniform prior within bounds.
 
-    Parameters
-    ----------
-    chi2_of
-        Function that returns the sum of squared residuals of each row of parameters.
-    centres
-        Minima of the sum of squared residuals, around which the first samples are drawn, (k, p).
-    covariances
-        Covariance with which samples are drawn around each minimum, shape (k, p, p).
-    bounds
-        Smallest and largest value of each parameter, each of shape (p,).
-    residual_variance
-        Assumed variance of a residual.
-    samples_per_round
-        Number of samples that are drawn in a round.
-    max_rounds
-        Largest number of rounds.
-    sufficient_samples
-        Effective sample size above which no further round follows.
-    smallest_std
-        Lower limit of the standard deviation with which each parameter is drawn, shape (p,).
+    `chi2_of` returns the sum of squared residuals of each row of parameters; its minima are the
+    `centres` (k, p), around which the first samples are drawn with `covariances` (k, p, p), but at
+    least with `smallest_std` (p,). Rounds end when the effective number of samples is sufficient.
     """
     rng = np.random.default_rng(0)  # the same record gives the same answer
     parameter_count = centres.shape[1]

@@ -23,18 +23,9 @@ def uncertainty_effects(
 ) -> RealArray:
     """Return the effect of each uncertainty (one standard deviation) on innovations, (c, n, r).
 
-    c is 1 for torque alone and 2 for torque and base shear, r the number of uncertainties.
-
-    Parameters
-    ----------
-    touch_tables
-        Precomputed quantities of the model at the record's rate.
-    touch_record
-        Samples around the touch.
-    likely_obstacle
-        Position, instant and logarithm of the stiffness of the likeliest obstacle, shape (1, 3).
-    sample_window
-        Innovations from a sample that is certainly before the touch on.
+    c is 1 for torque alone and 2 for torque and base shear, r the number of uncertainties. The
+    likely obstacle has position, instant and logarithm of the stiffness, shape (1, 3). The window
+    begins before the touch.
     """
     free_motion, quiet_samples = sample_window.motion, sample_window.first_sample
     finest_effect = ObstacleContact(

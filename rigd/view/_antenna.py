@@ -91,13 +91,7 @@ _TRAIL_COLOR: Color = (70, 115, 145)
 
 
 class Antenna:
-    """Motor and antenna (a flexible beam) of one session, which are drawn as they move.
-
-    Parameters
-    ----------
-    session
-        The session.
-    """
+    """Motor and antenna (a flexible beam) of one session, which are drawn as they move."""
 
     def __init__(self, session: "SessionDescription") -> None:
         damping = session.damping or _assumed_damping(session.beam)
@@ -167,11 +161,8 @@ class Antenna:
     def touch(self, touch: Mapping[str, Any]) -> list[Drawing]:
         """Return the function that draws a touch: contact point with uncertainty, and force.
 
-        Parameters
-        ----------
-        touch
-            Estimated touch as a JSON object. The result is empty if its point or time is unknown,
-            or if the beam line at that time is not stored.
+        The result is empty if point or time of the touch are unknown, or if the beam line at that
+        time is not stored.
         """
         touch_position, touch_time = touch.get("x_m"), touch.get("time_s")
         stored_lines = list(self._shapes)
@@ -286,19 +277,8 @@ def static_drawings() -> list[Drawing]:
 def enlarged_lines(angle_rad: float, deflection_per_length: RealArray) -> npt.NDArray[np.float32]:
     """Return the coordinates of the undeformed and of the bent beam, enlarged by `ENLARGEMENT`.
 
-    Parameters
-    ----------
-    angle_rad
-        Angle of the motor.
-    deflection_per_length
-        Deflection at evenly spaced points of the beam, shape (points,), relative to the undeformed
-        beam, in beam lengths.
-
-    Returns
-    -------
-    lines
-        Coordinates x, y, z of the undeformed and of the bent beam, in beam lengths, shape
-        (2, points, 3).
+    They are in beam lengths, shape (2, points, 3), as is the deflection relative to the undeformed
+    beam at evenly spaced points.
     """
     x = np.linspace(0.0, 1.0, deflection_per_length.size)
     line_coordinates = np.zeros((2, x.size, 3), dtype=np.float32)
@@ -312,11 +292,6 @@ def unscaled_lines(angle_rad: float, deflection_per_length: RealArray) -> npt.ND
     """Return the coordinates of the undeformed and of the bent beam, true to scale.
 
     Arguments and result are those of `enlarged_lines`.
-
-    Parameters
-    ----------
-    angle_rad, deflection_per_length
-        Angle of the motor, and deflection of the beam in beam lengths.
     """
     along_beam = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
     across_beam = np.array([-along_beam[1], along_beam[0], 0.0])
@@ -340,13 +315,7 @@ def tip_label(tip_m: float, *, to_scale: bool = False) -> str:
 
 
 def touch_label(touch: Mapping[str, Any]) -> str:
-    """Return the label of a touch in the drawing: its number and its position on the beam in m.
-
-    Parameters
-    ----------
-    touch
-        Estimated touch as a JSON object.
-    """
+    """Return the label of a touch in the drawing: its number and its position on the beam in m."""
     x_m = touch["x_m"]
     return f"touch {touch['number']}: {with_half_width(x_m['value'], x_m['interval_95'])} m"
 

@@ -67,12 +67,7 @@ _TARGET_LOW_INDEX, _TARGET_HIGH_INDEX, _LOW_INDEX, _HIGH_INDEX, _VALUE_INDEX = r
 def fit_source(mode_count: int, *, with_target_std: bool) -> Source:
     """Return the plots over time of the fitted damping ratio and frequency of each mode.
 
-    Parameters
-    ----------
-    mode_count
-        Number of modes.
-    with_target_std
-        Whether to plot the limits that correspond to a requested precision.
+    With `with_target_std` the limits of a requested precision are plotted too.
     """
     plots = (
         _plot(quantity, n, with_target_std=with_target_std)
@@ -176,13 +171,7 @@ def _target_precisions(fit: Fit) -> list[Mapping[str, Any]]:
 
 
 def fit_table(fit: Fit | None) -> str:
-    """Return a fit as Markdown: tables of requested precisions, modes and parameters, and findings.
-
-    Parameters
-    ----------
-    fit
-        Fit as a JSON object; None if there is no fit yet.
-    """
+    """Return a fit as Markdown: requested precisions, modes, parameters and findings."""
     if fit is None:
         return "No fit yet."
     search_document = fit.get("search") or {}

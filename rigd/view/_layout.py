@@ -131,13 +131,7 @@ _FIT_PLOT_MARGIN_PT: Final = 50.0
 
 
 def fit_views(fit_plots: Source) -> tuple[TimeView, ...]:
-    """Return the plots of the tab Fit, with the height that their number leaves for each.
-
-    Parameters
-    ----------
-    fit_plots
-        Source of the plots, two for each mode.
-    """
+    """Return the plots of the tab Fit, two for each mode; their height depends on the number."""
     row_count = max(1, len(fit_plots.plots) // 2)
     plot_height_pt = _FIT_TAB_HEIGHT_PT / row_count - _FIT_PLOT_MARGIN_PT
     return tuple(
@@ -153,15 +147,9 @@ def blueprint(
 ) -> "rrb.Blueprint":
     """Return the layout of the live window, which follows the newest sample.
 
-    Parameters
-    ----------
-    absent_components
-        Component names of plots to omit, because the session has no values for them.
-    fit_modes
-        Number of modes whose fits are plotted over time. 0: only a table of the last fit. None: no
-        tab Fit.
-    with_target_std
-        Whether to plot the limits that correspond to a requested precision.
+    Plots of `absent_components` are omitted, because the session has no values for them.
+    `fit_modes` is the number of modes whose fits are plotted over time, if `with_target_std` with
+    the limits of a requested precision; 0 gives only a table of the last fit, None no tab Fit.
     """
     import rerun.blueprint as rrb
 
@@ -434,12 +422,7 @@ _CurvePoint = tuple[int, float]
 class Scale:
     """Extreme values of a source's plots, from which invisible points for axis labels follow.
 
-    Parameters
-    ----------
-    source
-        Source of the plotted values.
-    views
-        Plots of the window. Plots of other sources and plots with fixed axes are ignored.
+    Plots of other sources and plots with fixed axes are ignored.
     """
 
     def __init__(self, source: "Source", views: "Sequence[TimeView]") -> None:
@@ -575,19 +558,8 @@ def missing_ticks(
 ) -> tuple[float | None, float | None]:
     """Return the values to add to a plot so that its axis has two labels and spans `min_span`.
 
-    Parameters
-    ----------
-    lowest_value, highest_value
-        Least and greatest plotted value.
-    height_pt
-        Height of the plot, in points.
-    min_span
-        Least length of the axis, in the unit of the values.
-
-    Returns
-    -------
-    value_below, value_above
-        Values to add below and above the plotted values; None if none is needed on that side.
+    They are the values to add below and above the plotted ones, None if none is needed on that
+    side.
     """
     if (
         0.0 <= highest_value - lowest_value < min_span

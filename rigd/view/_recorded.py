@@ -57,21 +57,9 @@ def describe_recorded_session(
     """Return the data of a recorded session that its display needs.
 
     A stopped session is shown with its planned length, as in the live view. If the file states no
-    segments, the whole record counts as the sweep.
-
-    Parameters
-    ----------
-    session
-        Session as read from its file.
-    tick_timings
-        Ages of the devices' readings (n,), of ``TIMING_DTYPE``; None if the file has none.
-    has_fit
-        Whether the file contains a fit of the session's record (`rigd.session.fit_of`).
-
-    Raises
-    ------
-    SessionError
-        If there are no samples or far too few, or a number is missing or not plausible.
+    segments, the whole record counts as the sweep. `tick_timings` are the ages of the devices'
+    readings (n,), of ``TIMING_DTYPE``. Raise `SessionError` if there are far too few samples, or if
+    a number is missing or not plausible.
     """
     sample_ticks = session.samples["tick"]
     if len(sample_ticks) == 0:
@@ -242,14 +230,7 @@ def recorded_blueprint(
 ) -> "rrb.Blueprint":
     """Return the window's layout for a recorded session: that of the live view, playing from 0 s.
 
-    Parameters
-    ----------
-    front_tabs
-        Tabs to show before those of the live view.
-    absent_components
-        Component names of plots to omit, because the session has no values for them.
-    fit_modes
-        0: add a tab with a table of the last fit. None: no tab Fit.
+    `front_tabs` precede those of the live view; the other arguments are those of `blueprint`.
     """
     import rerun.blueprint as rrb
 

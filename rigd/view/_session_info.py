@@ -269,13 +269,7 @@ def send_recent_notes(stream: "RecordingStream", t_ns: int, notes: "Sequence[Not
 
 
 def escape_markdown(text: str) -> str:
-    """Return a text with Markdown's special characters escaped.
-
-    Parameters
-    ----------
-    text
-        Text from an operator or a process.
-    """
+    """Return a text with Markdown's special characters escaped."""
     escaped_text = "".join(f"\\{c}" if c in r"\`*_{}[]<>#|~$" else c for c in text)
     return escaped_text.replace("\n", "  \n")
 

@@ -79,10 +79,7 @@ _SECURITY_HEADERS: Final = {  # Security headers of all responses
 class WebAccess:
     """Checks where each request comes from, and whether it may act on the rig.
 
-    Parameters
-    ----------
-    token
-        Secret that a request must contain to act.
+    A request must contain the secret `token` to act.
     """
 
     def __init__(self, token: str) -> None:
@@ -118,13 +115,7 @@ class WebAccess:
     def may_command(self, request: web.Request, command: str, parameters: object) -> bool:
         """Return whether a request of a browser may send a command to the daemon.
 
-        Parameters
-        ----------
-        request
-            Request with the command.
-        command, parameters
-            Name and parameters of the command. A prediction from a file requires the token, because
-            the daemon would read that file.
+        A prediction from a file requires the token, because the daemon would read that file.
         """
         if self.may_act(request):
             return True
@@ -137,15 +128,7 @@ class WebAccess:
 async def read_json_object(request: web.Request) -> dict[str, Any]:
     """Return the JSON object in a request's body.
 
-    Parameters
-    ----------
-    request
-        Request whose body is read.
-
-    Raises
-    ------
-    HTTPException
-        If the body is no JSON object, or does not arrive in time.
+    Raise `HTTPException` if the body is no JSON object, or does not arrive in time.
     """
     try:
         request_object = json.loads(await asyncio.wait_for(request.read(), _BODY_TIMEOUT_S))
@@ -159,15 +142,7 @@ async def read_json_object(request: web.Request) -> dict[str, Any]:
 
 
 def refusal_response(status: int, text: str) -> web.Response:
-    """Return the JSON response that refuses a request.
-
-    Parameters
-    ----------
-    status
-        HTTP status code.
-    text
-        Sentence for the operator.
-    """
+    """Return the JSON response that refuses a request, with a sentence for the operator."""
     return web.json_response({"ok": False, "error": text, "wrong_use": True}, status=status)
 
 

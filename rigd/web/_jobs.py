@@ -70,17 +70,8 @@ class AnalysisJob:
 class Jobs:
     """Runs queued jobs one after the other, without disturbing a session.
 
-    Parameters
-    ----------
-    folder
-        Folder of the sessions and working directory of the jobs.
-    publish
-        Function that is called with the state of a job after each change.
-
-    Attributes
-    ----------
-    paused
-        Whether jobs are suspended because a session runs.
+    Jobs work in the folder of the sessions and are `paused` while a session runs. `publish` is
+    called with the state of a job after each change.
     """
 
     def __init__(self, folder: Path, publish: Callable[[Document], None]) -> None:
@@ -101,15 +92,7 @@ class Jobs:
     ) -> AnalysisJob:
         """Queue a run of the program `analyze`, and return it as a job.
 
-        Parameters
-        ----------
-        kind, arguments, session_name, result_url
-            Kind, arguments, session and URL path of the result: see `AnalysisJob`.
-
-        Raises
-        ------
-        JobError
-            If too many jobs are waiting.
+        Arguments are as in `AnalysisJob`. Raise `JobError` if too many jobs are waiting.
         """
         self._count += 1
         job = AnalysisJob(self._count, kind, arguments, session_name, result_url)
@@ -122,13 +105,7 @@ class Jobs:
         return job
 
     async def await_or_drop(self, job: AnalysisJob) -> None:
-        """Wait for the end of a job, but drop the job if a session begins.
-
-        Parameters
-        ----------
-        job
-            Queued job; its ``dropped`` is set if it was dropped.
-        """
+        """Wait for the end of a job; if a session begins, drop the job and set its ``dropped``."""
         while not job.done.is_set():
             if self.paused:
                 job.dropped = True

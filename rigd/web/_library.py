@@ -42,14 +42,7 @@ _SESSION_RUNS_MESSAGE: Final = "A session runs; files are converted when it has 
 class Library:
     """Serves the sessions of one folder to the page, but no other files of the computer.
 
-    Parameters
-    ----------
-    folder
-        Folder of the session files.
-    access
-        Permission to create reports.
-    jobs
-        Queue for reports and exports.
+    `access` permits reports, `jobs` is the queue for reports and exports.
     """
 
     def __init__(self, folder: Path, access: WebAccess, jobs: Jobs) -> None:
@@ -76,13 +69,7 @@ class Library:
         ]
 
     async def rows(self, **filters: Any) -> list[SessionRow]:  # noqa: ANN401 - the library's
-        """Return the sessions of the folder that pass the filters, the newest first.
-
-        Parameters
-        ----------
-        **filters
-            Filters of `rigd.library.list_sessions`.
-        """
+        """Return the sessions that pass filters as of `list_sessions`, the newest first."""
         async with self._list_lock:
             return await asyncio.to_thread(list_sessions, self._folder, **filters)
 
@@ -91,16 +78,10 @@ class Library:
         return list(dict.fromkeys(row.specimen for row in await self.rows() if row.specimen))
 
     async def last_response(self, specimen: str, excluded_session: str) -> Document | None:
-        """Return the message with the frequency response of a specimen's last session.
+        """Return the message with the frequency response of a specimen's last session, or None.
 
-        The result is None if there is none.
-
-        Parameters
-        ----------
-        specimen
-            Name of the specimen, or "" for the last session without a specimen's name.
-        excluded_session
-            Name of a session to exclude, because it is running.
+        An empty name selects sessions without a specimen. A running session can be excluded by
+        its name.
         """
         newest_pair = await asyncio.to_thread(
             partial(

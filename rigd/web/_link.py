@@ -45,14 +45,8 @@ class BusyError(Exception):
 class DaemonLink:
     """Receives the events of a daemon, and sends requests to it.
 
-    Parameters
-    ----------
-    path
-        Path of the daemon's control socket.
-    on_message
-        Function that receives each event and each status reply.
-    on_lost
-        Function that receives the reason when no messages of the daemon arrive any more.
+    `on_message` receives each event and each status reply, `on_lost` the reason when no messages
+    arrive any more.
     """
 
     def __init__(
@@ -93,22 +87,12 @@ class DaemonLink:
         self._stop_count += 1
 
     async def send_request(self, request: Document) -> Document:
-        """Send a request to the daemon, and return its reply.
+        """Send a request to the daemon (docs/control_socket.md), and return its reply.
 
         The connection that started a series controls the rig, and remains open until the end of the
-        series. Further requests that need control use the same connection.
-
-        Parameters
-        ----------
-        request
-            Request as described in docs/control_socket.md.
-
-        Raises
-        ------
-        BusyError
-            If another request is pending, or a stop was requested before this request was sent.
-        DaemonError
-            If there is no reply.
+        series. Further requests that need control use the same connection. Raise `BusyError` if
+        another request is pending, or a stop was requested before this request was sent, and
+        `DaemonError` without a reply.
         """
         if request.get("command") == "predict":
             return await self._send_on_new_connection(request)

@@ -27,15 +27,7 @@ _STORED_LOG_LINES: Final = 200
 
 
 class OpenPage:
-    """Connection to one open page, with its queue of messages.
-
-    Parameters
-    ----------
-    socket
-        WebSocket of the page, ready for writing.
-    transport
-        Transport of the connection.
-    """
+    """Connection to one open page, by a WebSocket ready for writing, with a queue of messages."""
 
     def __init__(self, socket: web.WebSocketResponse, transport: asyncio.Transport | None) -> None:
         self._socket = socket
@@ -72,15 +64,7 @@ class OpenPage:
     async def stop_on_request(
         self, stop_requested: asyncio.Event, stop: Callable[[], Awaitable[Document]]
     ) -> None:
-        """Stop the session whenever the page requests it, and send the page the result.
-
-        Parameters
-        ----------
-        stop_requested
-            Event that is set by each request.
-        stop
-            Function that stops the session.
-        """
+        """Stop the session at each event `stop_requested`, and send the page the result."""
         while True:
             await stop_requested.wait()
             stop_requested.clear()
@@ -119,15 +103,8 @@ class Pages:
     ) -> web.StreamResponse:
         """Send live messages to a new page until it is closed.
 
-        Parameters
-        ----------
-        request
-            Request for a WebSocket.
-        first_messages
-            First messages for the page.
-        stop
-            Function that stops the session. It is called for each message ``stop`` of the page, and
-            its result is sent to the page.
+        `stop`, which stops the session, is called for each message ``stop`` of the page; its result
+        is sent to the page.
         """
         if len(self._pages) >= MAX_PAGES:
             raise web.HTTPServiceUnavailable(reason=f"There are {MAX_PAGES} open pages already.")

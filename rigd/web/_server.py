@@ -66,15 +66,7 @@ _STATIC_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanif
 class OperatorPageServer:
     """Serves the operator's page of one rig.
 
-    Parameters
-    ----------
-    job
-        Data of the rig that the daemon sends at the start: see `rigd.daemon._page`.
-
-    Attributes
-    ----------
-    pages
-        Connections to the open pages.
+    `job` has the data of the rig that the daemon sends at the start: see `rigd.daemon._page`.
     """
 
     def __init__(self, job: Document) -> None:
@@ -391,20 +383,9 @@ async def start_page_server(
 ) -> tuple[OperatorPageServer, web.AppRunner, asyncio.Server]:
     """Start the page's server on the port of a job, or on a free port if the job permits it.
 
-    Parameters
-    ----------
-    job
-        Data of the rig as for :class:`OperatorPageServer`, with ``port`` and ``any_port``.
-
-    Returns
-    -------
-    tuple
-        Server of the page, whose `run` must be called; runner of its application; listening server.
-
-    Raises
-    ------
-    OSError
-        If the port is not available.
+    Return the server, whose `run` must be called, the runner of its application, and the listening
+    server. `job` is that of `OperatorPageServer`, with ``port`` and ``any_port``. Raise `OSError`
+    if the port is not available.
     """
     page_server, connections = OperatorPageServer(job), Connections()
     web_application = page_server.application()

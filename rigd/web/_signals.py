@@ -158,14 +158,8 @@ def _without_nan(numbers: RealArray) -> list[float | None]:
 class SessionResponse:
     """Estimates the frequency response of a running session up to the sweep's present frequency.
 
-    Parameters
-    ----------
-    sweep
-        First tick and end (exclusive) of the sweep.
-    rate_hz
-        Scheduled ticks per second.
-    angle_delay_s, torque_delay_s
-        Age of the angle or torque at its time stamp.
+    `sweep` has the first tick and the (exclusive) end of the sweep. Delays are the ages of angle
+    and torque at their time stamps.
     """
 
     def __init__(
@@ -246,12 +240,7 @@ class SessionResponse:
 def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) -> Document:
     """Return the message with the nominal frequency response from motor angle to sensor torque.
 
-    Parameters
-    ----------
-    beam, damping
-        Nominal beam and damping of the profile or specimen.
-    tool_inertia_kg_m2
-        Inertia between sensor and beam.
+    `tool_inertia_kg_m2` is the inertia between sensor and beam.
     """
     grid_hz, model_response = nominal_response(beam, damping, tool_inertia_kg_m2)
     shown_points = response_decimation(grid_hz).extremes(np.abs(model_response))
