@@ -88,12 +88,8 @@ def unit_factor(quantity: str, unit: str) -> float:
 
     The quantity is "angle", "torque", "force" or "time". The unit has any spelling of
     `canonical_unit`, with or without a number before it: ``0.02 N.m`` may be the value of one volt
-    of a sensor's signal.
-
-    Raises
-    ------
-    ExchangeError
-        If it is no unit of that quantity, or if the number is not finite or is 0.
+    of a sensor's signal. Raise `ExchangeError` if it is no unit of that quantity, or if the number
+    is not finite or is 0.
     """
     unit_count, unit_name = _split_number(unit)
     canonical_name = canonical_unit(unit_name)
@@ -305,12 +301,9 @@ def uniform_timebase(path: Path, samples: int, rate_hz: float) -> Timebase:
 def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) -> Timebase:
     """Return the sampling rate and the tick of each sample, determined from time stamps.
 
-    There are at least two time stamps. Path and name of the channel are for messages.
-
-    Raises
-    ------
-    ExchangeError
-        If times are not finite, do not increase, or are not equidistant apart from gaps.
+    There are at least two time stamps. Path and name of the channel are for messages. Raise
+    `ExchangeError` if times are not finite, do not increase, or are not equidistant apart from
+    gaps.
     """
     not_finite_indices = np.flatnonzero(~np.isfinite(time_s))
     if not_finite_indices.size:

@@ -100,10 +100,8 @@ class FileStatements:
     def check_units(self, channels: Mapping[str, SourceChannel]) -> None:
         """Compare the units stated by the user with those in the file.
 
-        Raises
-        ------
-        ExchangeError
-            If the file states another unit than the user, and the plan does not override it.
+        Raise `ExchangeError` if the file states another unit than the user, and the plan does not
+        override it.
         """
         for choice in self.plan.choices:
             unit_label = channels[choice.channel].unit_label.strip()
@@ -141,10 +139,8 @@ class FileStatements:
     def timebase(self, channels: Mapping[str, SourceChannel]) -> Timebase:
         """Return the time base after comparing it with the rate and the times that the file states.
 
-        Raises
-        ------
-        ExchangeError
-            If the times give no uniform time base, or the file states another rate than the user.
+        Raise `ExchangeError` if the times give no uniform time base, or the file states another
+        rate than the user.
         """
         time_choice = self.plan.time
         timebase = plan_timebase(self.path, self.plan, channels)
@@ -274,12 +270,8 @@ class FileStatements:
 
         The channels returned have equal length. Return also the time in seconds by which each
         channel's values are older than the angle of the same index: the fraction of a sample period
-        that remains after cutting whole samples.
-
-        Raises
-        ------
-        ExchangeError
-            If the channels have no common interval, or different lengths but the same start.
+        that remains after cutting whole samples. Raise `ExchangeError` if the channels have no
+        common interval, or different lengths but the same start.
         """
         time_choice, plan = self.plan.time, self.plan
         starts_ns = {n: c.start_ns for n, c in channels.items() if c.start_ns is not None}

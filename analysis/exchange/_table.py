@@ -85,12 +85,8 @@ _COLUMN_TITLES: Final = {
 def record_table(path: Path) -> ExportTable:
     """Return the samples of a session as recorded, with gaps, and the status bits as a column.
 
-    Raises
-    ------
-    rigd.session.SessionError
-        If the file cannot be read.
-    ExchangeError
-        If the session has no samples or no sampling rate.
+    Raise `SessionError` if the file cannot be read. Raise `ExchangeError` if the session has no
+    samples or no sampling rate.
     """
     session = read_session(path, fields=("t_ns", *_COLUMN_TITLES))
     rate_hz = session.number("rate_hz")
@@ -123,13 +119,8 @@ def frf_table(
     """Estimate the response from angle to coupling torque, as in the analysis of a session.
 
     The response is corrected for the channels' delays, but not for the tool inertia. The default
-    band is that of the settings, limited by the record's sampling rate.
-
-    Raises
-    ------
-    rigd.session.SessionError, analysis.record.RecordError,
-    analysis.paper.FrequencyResponseError
-        If the session cannot be read or analysed.
+    band is that of the settings, limited by the record's sampling rate. Raise `SessionError`,
+    `RecordError` or `FrequencyResponseError` if the session cannot be read or analysed.
     """
     record = load_record(path, highest_hz=highest_frequency_hz(band_hz))
     settings = welch_settings(record, settings, band_hz)

@@ -299,12 +299,8 @@ def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     Times and frequencies are stated by first value and increment, with six digits each. In a record
     with gaps, or if six digits are not enough, each abscissa is written. Numbers are 8-byte floats
     if `binary` (58b), else text with 13 digits. Integer columns (ticks, flags) are left out, as the
-    format cannot store them.
-
-    Raises
-    ------
-    ExchangeError
-        If each abscissa has to be written as text and six digits do not distinguish neighbours.
+    format cannot store them. Raise `ExchangeError` if each abscissa has to be written as text and
+    six digits do not distinguish neighbours.
     """
     abscissae = np.asarray(table.axis.values, dtype=np.float64)
     if binary:

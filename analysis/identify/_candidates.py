@@ -119,12 +119,8 @@ class CandidateSet:
     ) -> CandidateSet:
         """Fit every damping structure to a record, on a uniform beam; return the candidate set.
 
-        If a sign or unit of the record is wrong, only the freest structure is fitted.
-
-        Raises
-        ------
-        MeasurementError
-            The record cannot be used.
+        If a sign or unit of the record is wrong, only the freest structure is fitted. Raise
+        `MeasurementError` if the record cannot be used.
         """
         if misread := tuple(
             sign_and_unit_findings(Comparison.from_measurement(measurement, band_hz))
@@ -151,12 +147,7 @@ class CandidateSet:
         Each descent starts from the earlier estimate of the candidate. Return None if the residual
         of the first candidate exceeds the noise: then a full search is needed. The earlier
         candidates are in the order of rising BIC. Settings in `fixed` stay at the values the file
-        states.
-
-        Raises
-        ------
-        MeasurementError
-            The record cannot be used.
+        states. Raise `MeasurementError` if the record cannot be used.
         """
         first_candidate, *other_candidates = earlier_candidates
         unknowns = Unknowns.for_structure(
@@ -189,12 +180,7 @@ class CandidateSet:
     ) -> CandidateSet:
         """Fit the damping structure with free orders, and the `additional_structures`, to a record.
 
-        The beam is uniform.
-
-        Raises
-        ------
-        MeasurementError
-            The record cannot be used.
+        The beam is uniform. Raise `MeasurementError` if the record cannot be used.
         """
         structures = (_FREEST_STRUCTURE, *additional_structures)
         return cls._from_uniform_beam(

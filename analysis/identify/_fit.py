@@ -162,12 +162,8 @@ def refit_record(
     """Fit one structure, starting from a plant that explained an earlier part of the record.
 
     Return None if the residual is more than noise, or contains a hum: then a full search is needed.
-    `measurement` is the longer record, and `band_hz` the band that is compared.
-
-    Raises
-    ------
-    MeasurementError
-        The record cannot be used.
+    `measurement` is the longer record, and `band_hz` the band that is compared. Raise
+    `MeasurementError` if the record cannot be used.
     """
     comparison = Comparison.from_measurement(measurement, band_hz).use_reference_coherent_angle(
         plant

@@ -145,10 +145,8 @@ class UncertainDynamics:
 def beam_dynamics(plant: Plant) -> Dynamics:
     """Return the motor-to-torque dynamics of a beam with tip mass, clamp and torque channel.
 
-    Raises
-    ------
-    LinearModelError
-        If the beam has too many modes in the band, or their poles are not found.
+    Raise `LinearModelError` if the beam has too many modes in the band, or their poles are not
+    found.
     """
     pole_pairs_rad_s, mode_numbers, real_poles = _beam_poles(plant)
     pole_hz = np.abs(pole_pairs_rad_s) / (2 * np.pi)

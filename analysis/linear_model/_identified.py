@@ -173,12 +173,8 @@ class IdentifiedModel:
     def beam(self) -> UncertainDynamics:
         """Return the dynamics of the fitted beam, and the covariance of its parameters.
 
-        Raises
-        ------
-        IdentifiedBeamError
-            If a parameter is missing, not known or out of range.
-        LinearModelError
-            If the length or the covariance cannot be used.
+        Raise `IdentifiedBeamError` if a parameter is missing, not known or out of range. Raise
+        `LinearModelError` if the length or the covariance cannot be used.
         """
         estimates = parameter_estimates(self.headline_name, self._beam_part["parameters"])
         beam_values = {name: estimate.value for name, estimate in estimates.items()}
@@ -229,12 +225,8 @@ class IdentifiedModel:
     def modes(self) -> UncertainDynamics:
         """Return the dynamics of the modal model, and the covariance of its constants.
 
-        They are valid in the band of the analysis only.
-
-        Raises
-        ------
-        LinearModelError
-            If there is no modal model, or it or its covariance cannot be used.
+        They are valid in the band of the analysis only. Raise `LinearModelError` if there is no
+        modal model, or it or its covariance cannot be used.
         """
         modal_fit, band_hz = self.modal, self.band_hz
         if modal_fit is None:

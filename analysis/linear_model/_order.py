@@ -38,12 +38,8 @@ def realise_response(
 
     `order` is the number of states, including those of filters; None for as few as suffice for an
     error of `MAX_RELATIVE_ERROR`. The input is "acceleration", or "angle" for angle, velocity and
-    acceleration.
-
-    Raises
-    ------
-    LinearModelError
-        If no number of states suffices, or no stable realisation has the given number.
+    acceleration. Raise `LinearModelError` if no number of states suffices, or no stable realisation
+    has the given number.
     """
     dynamics = fit.dynamics
     if order is not None:

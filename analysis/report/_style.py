@@ -203,12 +203,7 @@ def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
 def save(figure: Figure, path: Path) -> bytes:
     """Write a figure in the format of the file's suffix; call it within `figure_style`.
 
-    Return the content of the file.
-
-    Raises
-    ------
-    OutputError
-        If the file exists or cannot be written.
+    Return the content of the file. Raise `OutputError` if the file exists or cannot be written.
     """
     (file_format,) = (
         format_name for format_name in FIGURE_FORMATS if path.suffix == f".{format_name}"
@@ -271,12 +266,8 @@ def save_pictures(
 
     The names of the figures differ. After each figure, `on_step` is called with a short text. A
     picture is an SVG image, which can be searched and is sharp on paper. It is a PNG image if SVG
-    was not among the formats, or if the SVG image is large.
-
-    Raises
-    ------
-    OutputError
-        If a file exists or cannot be written.
+    was not among the formats, or if the SVG image is large. Raise `OutputError` if a file exists or
+    cannot be written.
     """
     images = _draw_in_two_processes(illustrations, formats, on_step)
     pictures = []

@@ -47,10 +47,7 @@ class AddedController:
     def reset(self, angle_rad: float) -> None:
         """Set the state to rest at an angle.
 
-        Raises
-        ------
-        ControllerError
-            If the package's code fails.
+        Raise `ControllerError` if the package's code fails.
         """
         self.unlimited_torque_nm, self.saturated = 0.0, False
         if self._pid is not None:
@@ -65,10 +62,7 @@ class AddedController:
     def step(self, reference_rad: float, angle_rad: float, coupling_torque_nm: float) -> float:
         """Return the torque command of a tick in N·m, within the limit.
 
-        Raises
-        ------
-        ControllerError
-            If the package's code fails, or its output is not a finite number.
+        Raise `ControllerError` if the package's code fails, or its output is not a finite number.
         """
         try:
             output = self._step(reference_rad, angle_rad, coupling_torque_nm)

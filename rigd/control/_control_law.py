@@ -33,10 +33,7 @@ class ControlLaw:
 def control_law(model: LoopModel) -> ControlLaw:
     """Return the linear law of a loop's controller.
 
-    Raises
-    ------
-    ControlDesignError
-        If the PID cannot be designed.
+    Raise `ControlDesignError` if the PID cannot be designed.
     """
     controller = model.controller
     if controller is None:

@@ -106,10 +106,7 @@ def linear_controller(rig: ControlledRig) -> LinearController | None:
 def _owner_of(rig: ControlledRig) -> Plugin | None:
     """Return the package that adds the controller of a rig, or None for a shipped one.
 
-    Raises
-    ------
-    PluginError
-        If there is no such controller any more, or its package cannot be used.
+    Raise `PluginError` if there is no such controller any more, or its package cannot be used.
     """
     name = rig.loop.settings.controller
     owner = CONTROLLERS.owner(name)

@@ -117,10 +117,7 @@ class Notes(BaseModel):
     def as_metadata(self) -> dict[str, str]:
         """Return the notes that are not empty: key in the session file → text.
 
-        Raises
-        ------
-        MetadataError
-            If a name or value of `meta` breaks a rule.
+        Raise `MetadataError` if a name or value of `meta` breaks a rule.
         """
         note_texts = {metadata_name: getattr(self, metadata_name) for metadata_name in NOTES}
         return {
@@ -183,10 +180,7 @@ _COMMAND_NAMES = "status", "watch", "stop", "tare", "zero", "reset", "check", "s
 def parse_request(request_line: bytes) -> AnyRequest:
     """Return the request that a line of bytes contains.
 
-    Raises
-    ------
-    RequestError
-        If the line is not a valid request; the message states the reason.
+    Raise `RequestError` if the line is not a valid request; the message states the reason.
     """
     request_document = _parse_object(request_line)
     request_id = request_document.get("id")

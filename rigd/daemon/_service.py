@@ -204,10 +204,7 @@ class Service:
     async def execute(self, request: protocol.AnyRequest, peer: Peer) -> Document:
         """Execute a request of a client, and return the reply.
 
-        Raises
-        ------
-        CommandError
-            If the request is refused or fails.
+        Raise `CommandError` if the request is refused or fails.
         """
         match request:
             case protocol.StatusRequest():

@@ -112,10 +112,7 @@ class DaemonStateMachine:
     def change_to(self, next_state: DaemonState, reason: str) -> None:
         """Change the daemon's state for a reason.
 
-        Raises
-        ------
-        IllegalTransitionError
-            If this state must not follow the present state.
+        Raise `IllegalTransitionError` if this state must not follow the present state.
         """
         if next_state not in _NEXT_STATES[self.state]:
             raise IllegalTransitionError(f"{self.state} does not lead to {next_state} ({reason}).")

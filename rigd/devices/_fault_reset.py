@@ -13,10 +13,8 @@ class ResettableDrive(Protocol):
     def reset_fault(self) -> str | None:
         """Switch off, reset the fault, check that the drive gets ready; return the fault or None.
 
-        Raises
-        ------
-        DeviceError
-            If the drive may still turn, the fault persists, or the drive does not get ready.
+        Raise `DeviceError` if the drive may still turn, the fault persists, or the drive does not
+        get ready.
         """
 
 

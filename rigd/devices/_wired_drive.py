@@ -34,11 +34,8 @@ class WiredConnection:
 def open_wired_drive(rig: RigParameters) -> OpenedDrive:
     """Create the drive of a rig on CAN; nothing is connected yet.
 
-    Raises
-    ------
-    DeviceError
-        If identifiers collide, the bus load is too high, or both hardware and a simulated rig are
-        available.
+    Raise `DeviceError` if identifiers collide, the bus load is too high, or both hardware and a
+    simulated rig are available.
     """
     bus = rig.can
     assert bus is not None

@@ -51,12 +51,8 @@ class ProbeSequence(SessionSequence):
         """Run the probing move on the enabled drive, switch the torque off, and return the result.
 
         The result has the name of the reason why the move ended (key ``end``), and the fields of a
-        `rigd.safety.probe_estimate.ProbeEstimate`.
-
-        Raises
-        ------
-        SessionEnd
-            If the operator or an interlock ends the move.
+        `rigd.safety.probe_estimate.ProbeEstimate`. Raise `SessionEnd` if the operator or an
+        interlock ends the move.
         """
         self._shared_state[StateField.PHASE] = Phase.PROBING
         self._standstill.reset()

@@ -210,11 +210,8 @@ def shared_memory_fd() -> int:
 def reserve(fd: int, byte_count: int) -> None:
     """Allocate `byte_count` bytes of shared memory at the descriptor `fd`.
 
-    Raises
-    ------
-    OSError
-        If there is not enough memory. Without the allocation, writing to the memory would raise a
-        bus error.
+    Raise `OSError` if there is not enough memory. Without the allocation, writing to the memory
+    would raise a bus error.
     """
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(fd, 0, byte_count)

@@ -173,13 +173,8 @@ class SessionSequence:
         """Tare the sensor at rest before the drive is enabled; return the tare as metadata.
 
         The metadata are the mean and the standard deviation of each axis in N and N·m, and the
-        start angle.
-
-        Raises
-        ------
-        SessionEnd
-            If the rig does not come to rest in time, or the reference, started at the present
-            angle, would exceed the angle limit.
+        start angle. Raise `SessionEnd` if the rig does not come to rest in time, or the reference,
+        started at the present angle, would exceed the angle limit.
         """
         self._cycle.limit_monitor.reset(0.0)  # the counts of the last session no longer apply
         rest_readings = self._wait_for_rest()
@@ -283,12 +278,8 @@ class SessionSequence:
     def wait_for_go(self) -> None:
         """Hold the motor until the supervisor requests the start of the record.
 
-        Virtual time does not advance meanwhile.
-
-        Raises
-        ------
-        SessionEnd
-            If the supervisor does not start the record within 10 s.
+        Virtual time does not advance meanwhile. Raise `SessionEnd` if the supervisor does not start
+        the record within 10 s.
         """
         self._shared_state[StateField.PHASE] = Phase.READY
         deadline_s = time.monotonic() + _START_TIMEOUT_S
@@ -309,13 +300,9 @@ class SessionSequence:
     def record(self) -> None:
         """Run the excitation and log a sample of every tick.
 
-        Every tick of the record counts as recorded, missed or lost.
-
-        Raises
-        ------
-        SessionEnd
-            If the record ends early. The last sample then has the torque off, unless the last ticks
-            of the record were missed or lost.
+        Every tick of the record counts as recorded, missed or lost. Raise `SessionEnd` if the
+        record ends early. The last sample then has the torque off, unless the last ticks of the
+        record were missed or lost.
         """
         relative_reference_rad, start_rad = self._relative_reference, self._start_angle_rad
         total_ticks = len(relative_reference_rad)
@@ -475,13 +462,7 @@ class SessionSequence:
             self._run_tick(self._end_angle_rad + distance_rad * path_fraction)
 
     def check_tare(self) -> None:
-        """Measure the torque at rest after the record; raise `SessionEnd` if it drifted too much.
-
-        Raises
-        ------
-        SessionEnd
-            If the zero of the coupling torque has drifted too much.
-        """
+        """Measure the torque at rest after the record; raise `SessionEnd` if it has drifted."""
         self._read_rest(_SETTLING_S)
         rest_readings = self._read_rest(self._profile.session.tare_s)
         if rest_readings.torque_spread_nm > _VIBRATING_SPREAD_RATIO * self._rest_spread_nm:

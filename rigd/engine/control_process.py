@@ -188,12 +188,7 @@ class _ControlServer:
     def observe_standstill(self) -> None:
         """Read the devices with the torque off until the motor's angle and speed are known.
 
-        Virtual time stops after this.
-
-        Raises
-        ------
-        DeviceError, OSError
-            If a device failed.
+        Virtual time stops after this. Raise `DeviceError` or `OSError` if a device failed.
         """
         for _ in range(_STANDSTILL_TICKS):
             if not self._standstill.has_speed:
@@ -204,10 +199,7 @@ class _ControlServer:
     def serve(self) -> None:
         """Execute the supervisor's orders until the supervisor has ended or a stop is requested.
 
-        Raises
-        ------
-        DeviceError, OSError
-            If a device failed.
+        Raise `DeviceError` or `OSError` if a device failed.
         """
         while (supervisor_order := self._await_order()) is not None:
             match supervisor_order:
@@ -272,10 +264,7 @@ class _ControlServer:
     def _run_session(self, session_job: SessionJob) -> None:
         """Run one session, disable the drive in any case, and send `SessionFinished`.
 
-        Raises
-        ------
-        DeviceError
-            If a device failed. `SessionFinished` has been sent nevertheless.
+        Raise `DeviceError` if a device failed. `SessionFinished` has been sent nevertheless.
         """
         shared_state, devices = self._shared_state, self._devices
         for state_field in (
@@ -380,12 +369,8 @@ class _ControlServer:
     def _restart_noise(self, session_job: SessionJob) -> dict[str, str]:
         """Restart the noise of a simulated rig, and return the seed as metadata.
 
-        The metadata are empty for a real rig.
-
-        Raises
-        ------
-        DeviceError
-            If the simulated rig does not answer.
+        The metadata are empty for a real rig. Raise `DeviceError` if the simulated rig does not
+        answer.
         """
         renew_noise = self._devices.renew_noise
         return (
@@ -395,10 +380,7 @@ class _ControlServer:
     def _run_probe(self, profile: Profile) -> None:
         """Run the probing move, disable the drive, and send the result to the supervisor.
 
-        Raises
-        ------
-        DeviceError
-            If a device failed.
+        Raise `DeviceError` if a device failed.
         """
         from rigd.engine._probe_sequence import ProbeSequence  # late: few connections need it
 
@@ -463,12 +445,8 @@ class _ControlServer:
     def _set_zero(self) -> dict[str, object]:
         """Set the rig's zero, from which the angle limits are measured, to the present angle.
 
-        Return ``moved_rad``, the new zero relative to the previous one.
-
-        Raises
-        ------
-        SessionEnd
-            If the motor moves.
+        Return ``moved_rad``, the new zero relative to the previous one. Raise `SessionEnd` if the
+        motor moves.
         """
         rest_readings = self._read_rest(_ZERO_READING_S)
         limit_rad_s = self._profile.session.rest_velocity_rad_s

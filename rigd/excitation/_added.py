@@ -29,10 +29,7 @@ MakeExcitation = Callable[..., Excitation]
 def load_excitation(plugin: Plugin) -> ExcitationKind:
     """Import the excitation of a package, and check its declaration.
 
-    Raises
-    ------
-    PluginError
-        If the excitation cannot be used.
+    Raise `PluginError` if the excitation cannot be used.
     """
     kind = load_declaration(plugin, ExcitationKind)
     with plugin_errors(plugin):

@@ -120,12 +120,8 @@ def read_row(
 
     A file that cannot be read is reported in the row. After a system error, which may be temporary,
     the index must not store the row. `quick_look` is the file with the session's quick look, and
-    `report_folder` the folder of its last report; None if there is none.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the session file no longer exists.
+    `report_folder` the folder of its last report; None if there is none. Raise `FileNotFoundError`
+    if the session file no longer exists.
     """
     from rigd.session import SessionAccessError, SessionError, read_summary
     from rigd.session.user_metadata import added_metadata

@@ -87,7 +87,7 @@ _RELOAD_SCRIPT: Final = """
 class ViewerPageServer:
     """HTTP server, in threads of its own, of the live view's page for browsers on this computer.
 
-    It listens on a loopback port (0: the system chooses), with `OSError` if that is taken.
+    It listens on a loopback port (0: the system chooses); `OSError` is raised if that is taken.
     `get_address` returns the address of the present live view, or None; `get_rerun_port` the
     loopback port at which Rerun itself serves the page, or 0.
     """

@@ -56,7 +56,7 @@ class RerunError(FailureError):
 class RerunProgram:
     """Rerun's program as a child process that the system kills when this process ends.
 
-    Raise `RerunError` if the program is missing or cannot be started.
+    The constructor raises `RerunError` if the program is missing or cannot be started.
     """
 
     def __init__(

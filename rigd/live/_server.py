@@ -35,8 +35,8 @@ _MIN_RESTART_INTERVAL_S: Final = 1.0
 class RerunServer:
     """Rerun server of the live view, which is restarted when it ends and announces its address.
 
-    `address` is None while no server accepts connections. Raise `RerunError` if Rerun's program
-    cannot be started.
+    `address` is None while no server accepts connections. The constructor raises `RerunError` if
+    Rerun's program cannot be started.
     """
 
     def __init__(self, rig: str) -> None:
@@ -50,10 +50,7 @@ class RerunServer:
     def wait(self) -> LiveAddress:
         """Wait until the first server accepts connections, and return its address.
 
-        Raises
-        ------
-        RerunError
-            If the server ends or accepts no connections.
+        Raise `RerunError` if the server ends or accepts no connections.
         """
         deadline_s = time.monotonic() + 2 * _START_TIMEOUT_S
         while not self.poll():

@@ -79,10 +79,7 @@ def load_profile(name_or_path: str | Path) -> Profile:
 def read_text(path: Path) -> str:
     """Return the text of a profile or specimen file.
 
-    Raises
-    ------
-    ProfileError
-        If the file cannot be read, or is not text.
+    Raise `ProfileError` if the file cannot be read, or is not text.
     """
     try:
         return documents.read_text(path)
@@ -93,10 +90,7 @@ def read_text(path: Path) -> str:
 def profile_from_text(profile_text: str, profile_path: Path) -> Profile:
     """Validate a profile's text and return the profile; the file `profile_path` need not exist.
 
-    Raises
-    ------
-    ProfileError
-        If the text has mistakes.
+    Raise `ProfileError` if the text has mistakes.
     """
     document = parse_document(profile_text, profile_path)
     added_sections = _add_sections_of_devices(document, profile_path)
@@ -177,10 +171,7 @@ def _controller_settings(sections: Mapping[str, Any]) -> object | None:
 def _add_sections_of_devices(document: Mapping[str, Any], profile_path: Path) -> list[str]:
     """Register the profile sections that devices of installed packages need; return their names.
 
-    Raises
-    ------
-    ProfileError
-        If a package that adds a device of the profile cannot be used.
+    Raise `ProfileError` if a package that adds a device of the profile cannot be used.
     """
     device_selection = document.get("devices")
     device_names = device_selection.values() if isinstance(device_selection, dict) else ()
@@ -200,10 +191,7 @@ def _add_sections_of_devices(document: Mapping[str, Any], profile_path: Path) ->
 def _add_section_of_controller(document: Mapping[str, Any], profile_path: Path) -> None:
     """Register the profile section that the controller of an installed package needs.
 
-    Raises
-    ------
-    ProfileError
-        If the package that adds the controller of the profile cannot be used.
+    Raise `ProfileError` if the package that adds the controller of the profile cannot be used.
     """
     settings = document.get("control")
     name = settings.get("controller") if isinstance(settings, dict) else None
@@ -220,10 +208,7 @@ def _add_section_of_controller(document: Mapping[str, Any], profile_path: Path) 
 def parse_document(text: str, path: Path) -> dict[str, Any]:
     """Return the TOML document in the text of a file.
 
-    Raises
-    ------
-    ProfileError
-        If the text is not valid TOML.
+    Raise `ProfileError` if the text is not valid TOML.
     """
     try:
         return documents.parse_toml(text)

@@ -139,11 +139,7 @@ def decompressed_chunk(
 
     The compression is ``zstd``, ``lz4``, or empty for none. `zstd` is made by
     :func:`zstd_decompressor`. `location_text` is the position of the chunk, for error messages.
-
-    Raises
-    ------
-    McapDamageError
-        If the content cannot be decompressed, or has another length.
+    Raise `McapDamageError` if the content cannot be decompressed, or has another length.
     """
     try:
         if compression == b"":

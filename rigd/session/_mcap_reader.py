@@ -162,15 +162,10 @@ def read_mcap(
 
     With `salvage`, read as much as possible: skip damaged records outside of chunks on which no
     message depends, and read the statistics of a damaged file. `McapContents.damage` states
-    whether, where and why reading stopped.
-
-    Raises
-    ------
-    McapError
-        If the file does not begin like an MCAP file, or its schemas, channels, metadata and
-        attachments are longer than `MAX_DECLARED_BYTES`.
-    McapTooLargeError
-        If the file is too long, or contains too many records.
+    whether, where and why reading stopped. Raise `McapError` if the file does not begin like an
+    MCAP file, or its schemas, channels, metadata and attachments are longer than
+    `MAX_DECLARED_BYTES`. Raise `McapTooLargeError` if the file is too long, or contains too many
+    records.
     """
     if bytes(file_data[: len(MAGIC)]) != MAGIC:
         raise McapError("is not an MCAP file")

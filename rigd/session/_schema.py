@@ -121,12 +121,8 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
 
     Building a class takes as long as decoding dozens of messages, so the last few are cached.
     `schema_name` is the full name of the message type, such as ``rigd.Sample``, and `data` a
-    serialised ``FileDescriptorSet``.
-
-    Raises
-    ------
-    ValueError
-        If `data` is not a consistent ``FileDescriptorSet`` that contains `schema_name`.
+    serialised ``FileDescriptorSet``. Raise `ValueError` if `data` is not a consistent
+    ``FileDescriptorSet`` that contains `schema_name`.
     """
     from google.protobuf import descriptor_pool, message_factory
     from google.protobuf.descriptor_pb2 import FileDescriptorSet

@@ -112,12 +112,8 @@ def drifted_step_arrays(
     friction on the outputs, shape (8,), and the immediate effect of the motor's torque on torque
     and shear of the sensor, shape (2,). `stiffness_ratio` is relative to the start of the drift, to
     which `parameters`, `simulation` and `initial_realisation` belong. `instants` are as for
-    `free_and_locked_steps`.
-
-    Raises
-    ------
-    RealisationError
-        If the beam cannot be realised at that stiffness.
+    `free_and_locked_steps`. Raise `RealisationError` if the beam cannot be realised at that
+    stiffness.
     """
     beam_at_start = parameters.beam
     drifted_beam = replace(

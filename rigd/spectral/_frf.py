@@ -119,11 +119,7 @@ def checked_records(
     """Return the records of input and output as arrays of floats; raise SpectralError if invalid.
 
     They must have one dimension, equal length and finite values, and the input must not be zero.
-
-    Raises
-    ------
-    SpectralError
-        If the rate or a record is invalid. The message names the record and the problem.
+    The message names the record and the problem.
     """
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise SpectralError(f"The sampling rate must be a positive number of Hz, not {rate_hz!r}.")
@@ -294,13 +290,7 @@ def segment_lengths(
 
 
 def check_segmentation(segment_length: int, overlap: int, nfft: int) -> None:
-    """Raise SpectralError if the lengths of a segmentation are inconsistent.
-
-    Raises
-    ------
-    SpectralError
-        The message names the wrong length and the reason.
-    """
+    """Raise SpectralError if the lengths of a segmentation are inconsistent."""
     if segment_length < 2 or not 0 <= overlap < segment_length:
         raise SpectralError(
             "A Welch segment needs at least 2 samples and an overlap from 0 to below its length, "

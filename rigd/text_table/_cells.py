@@ -56,10 +56,7 @@ def is_any_number(cell: str) -> bool:
 def number_of(cell: str, decimal_sign: str) -> float:
     """Return the number in a cell; NaN for an empty cell.
 
-    Raises
-    ------
-    ValueError
-        If the cell is not a number with that decimal sign.
+    Raise `ValueError` if the cell is not a number with that decimal sign.
     """
     cell_text = cell.strip()
     if not cell_text:

@@ -75,10 +75,7 @@ class LabviewHead:
 def head_of(text_lines: Sequence[str]) -> LabviewHead | None:
     """Return the header of a LabVIEW measurement file; None if the text is not such a file.
 
-    Raises
-    ------
-    TableError
-        If the last line of the header is missing.
+    Raise `TableError` if the last line of the header is missing.
     """
     first_line = next((text_line for text_line in text_lines if text_line.strip()), "")
     if not first_line.lstrip('"').startswith(_FIRST_LINE_TEXT):

@@ -29,10 +29,8 @@ class StampReader:
     def __call__(self, cell: str) -> float:
         """Return the seconds from the column's first stamp to this one; NaN for an empty cell.
 
-        Raises
-        ------
-        ValueError
-            If the cell is not a time stamp, or is of another day with an ambiguous date.
+        Raise `ValueError` if the cell is not a time stamp, or is of another day with an ambiguous
+        date.
         """
         stamp_text = cell.strip()
         if not stamp_text:

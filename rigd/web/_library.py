@@ -273,10 +273,7 @@ class Library:
     def _session_path(self, session_name: str) -> Path:
         """Return the file of the session with a name.
 
-        Raises
-        ------
-        HTTPNotFound
-            If the folder has no regular file of that name.
+        Raise `HTTPNotFound` if the folder has no regular file of that name.
         """
         session_file = self._path_in_folder(f"{session_name}.mcap")
         if not session_file.is_file():
@@ -286,10 +283,7 @@ class Library:
     def _path_in_folder(self, file_name: str) -> Path:
         """Return the path of a file or folder in the sessions' folder by its name.
 
-        Raises
-        ------
-        HTTPNotFound
-            If the name is a path, a link out of the folder, or does not exist.
+        Raise `HTTPNotFound` if the name is a path, a link out of the folder, or does not exist.
         """
         with suppress(OSError, ValueError):
             path = self._folder / file_name

@@ -64,6 +64,9 @@ Below it some loads are not distinguishable in single precision."""
 class Calibration:
     """Calibration of an ATI sensor: matrix, units and identity.
 
+    The constructor raises `ValueError` if no wrench can be computed with the calibration; the
+    message is for the operator.
+
     Attributes
     ----------
     serial_number, part_number, date, family
@@ -76,11 +79,6 @@ class Calibration:
         Calibration matrix; rows Fx, Fy, Fz, Tx, Ty, Tz, columns gauges 0 to 5.
     ratings
         Largest rated load of each axis in the calibration's units; None if not stated.
-
-    Raises
-    ------
-    ValueError
-        If no wrench can be computed with the calibration; the message is for the operator.
     """
 
     serial_number: str
@@ -279,10 +277,8 @@ def first_block_register(block_number: int) -> int:
 def parse_block(registers: Sequence[int]) -> CalibrationBlock:
     """Parse the registers of a calibration block.
 
-    Raises
-    ------
-    ValueError
-        If no wrench can be computed with the calibration; the message is for the operator.
+    Raise `ValueError` if no wrench can be computed with the calibration; the message is for the
+    operator.
     """
     raw_bytes = pack(f">{BLOCK_LENGTH_REGISTERS}H", *registers)
 

@@ -164,13 +164,7 @@ class GaugePolls:
 
     @property
     def exchange(self) -> CanExchange:
-        """CAN exchange in use.
-
-        Raises
-        ------
-        DeviceError
-            If no exchange is in use.
-        """
+        """CAN exchange in use; reading it raises `DeviceError` if there is none."""
         if self._exchange is None:
             raise DeviceError(f"{self._name}: it is not connected.")
         return self._exchange

@@ -139,14 +139,9 @@ def is_refusal(reply: bytes) -> bool:
 def reply_content(request: bytes, reply: bytes) -> bytes:
     """Return the content of a Modbus reply, without address, function and checksum.
 
-    The reply is checked against its request.
-
-    Raises
-    ------
-    InvalidReplyError
-        If the reply is not a valid reply to this request.
-    ModbusExceptionError
-        If the reply is valid and refuses the request.
+    The reply is checked against its request. Raise `InvalidReplyError` if the reply is not a valid
+    reply to this request. Raise `ModbusExceptionError` if the reply is valid and refuses the
+    request.
     """
     if not reply:
         raise InvalidReplyError("no reply came")

@@ -48,18 +48,14 @@ class SerialLine:
     """Open serial port: 8 data bits, even parity, one stop bit; locked against other processes.
 
     `port` is a file name, and `baud` any bit rate in bit/s that the adapter supports. `device` is
-    the name of the device at the other end, for messages.
+    the name of the device at the other end, for messages. The constructor raises `DeviceError` if
+    the port cannot be opened; the message states the remedy.
 
     Attributes
     ----------
     low_latency : bool
         Whether the adapter's driver delivers received bytes at once. Without this mode a USB
         adapter may delay records by 16 ms.
-
-    Raises
-    ------
-    DeviceError
-        If the port cannot be opened; the message states the remedy.
     """
 
     def __init__(self, port: str, baud: int, device: str) -> None:
@@ -92,10 +88,7 @@ class SerialLine:
     def read(self) -> bytes:
         """Return all bytes that have arrived on the serial line; empty if there are none.
 
-        Raises
-        ------
-        DeviceError
-            If the line is gone.
+        Raise `DeviceError` if the line is gone.
         """
         arrived_bytes = b""
         while True:  # a short chunk need not be the last: the kernel moves bytes on with each read
@@ -112,10 +105,7 @@ class SerialLine:
     def write(self, data: bytes) -> None:
         """Send a few bytes, which always fit into the kernel's buffer.
 
-        Raises
-        ------
-        DeviceError
-            If the line has failed or does not accept the bytes.
+        Raise `DeviceError` if the line has failed or does not accept the bytes.
         """
         try:
             os.write(self._fd, data)
@@ -125,10 +115,7 @@ class SerialLine:
     def wait(self, timeout_s: float) -> None:
         """Wait until bytes may have arrived on the serial line, at most for `timeout_s`.
 
-        Raises
-        ------
-        DeviceError
-            If the line is gone.
+        Raise `DeviceError` if the line is gone.
         """
         try:
             select.select(self._descriptors, (), (), timeout_s)

@@ -368,12 +368,9 @@ class BusLock:
         self._file = LockFile(f"bus-{bus}", for_all_users=not simulated)
 
     def acquire(self) -> None:
-        """Lock the bus, or raise if another program has locked it.
+        """Lock the bus.
 
-        Raises
-        ------
-        DeviceError
-            If another program has locked the bus; the message states its process.
+        Raise `DeviceError` with the process of another program that has locked the bus.
         """
         try:
             self._file.acquire("rigd")

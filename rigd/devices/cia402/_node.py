@@ -245,12 +245,8 @@ class Node:
     def go_operational(self, *, has_heartbeat: bool = True) -> None:
         """Start the drive's CANopen node and wait for the heartbeat that confirms it.
 
-        The first TPDO of a drive that sends no heartbeat has to confirm the start.
-
-        Raises
-        ------
-        DeviceError
-            If the drive's heartbeat does not confirm the start in time.
+        The first TPDO of a drive that sends no heartbeat has to confirm the start. Raise
+        `DeviceError` if the drive's heartbeat does not confirm the start in time.
         """
         inbox = self.inbox
         inbox.nmt_state = None
@@ -282,10 +278,7 @@ class Node:
     def await_first_reply(self) -> None:
         """Send SYNC repeatedly until the drive answers within a period.
 
-        Raises
-        ------
-        DeviceError
-            If the drive does not answer within a period, or is in fault.
+        Raise `DeviceError` if the drive does not answer within a period, or is in fault.
         """
         shortest_delay_ns = None
         for _ in range(_FIRST_REPLY_ATTEMPTS):
@@ -398,13 +391,7 @@ class Node:
             )
 
     def raise_if_alarmed(self) -> None:
-        """Raise if the drive has sent an emergency message, has left operational, or is in fault.
-
-        Raises
-        ------
-        DeviceError
-            With the reason.
-        """
+        """Raise if the drive sent an emergency message, has left operational, or is in fault."""
         inbox = self.inbox
         in_fault = drive_state(inbox.statusword) in (DriveState.FAULT, DriveState.FAULT_REACTION)
         if in_fault:

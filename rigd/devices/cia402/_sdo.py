@@ -158,10 +158,7 @@ class SdoAccess:
     def enter_pre_operational(self) -> None:
         """Command the drive to the NMT state pre-operational, and check that it answers.
 
-        Raises
-        ------
-        DeviceError
-            If the drive does not answer.
+        Raise `DeviceError` if the drive does not answer.
         """
         self.request_pre_operational()
         try:
@@ -181,22 +178,14 @@ class SdoAccess:
     def load_eds(self, path: str) -> tuple[int, int]:
         """Load the objects' data types from a drive's EDS file; return vendor and product code.
 
-        A number that the file does not state is 0.
-
-        Raises
-        ------
-        DeviceError
-            If the file cannot be read.
+        A number that the file does not state is 0. Raise `DeviceError` if the file cannot be read.
         """
         return _load_integer_types(self._node.object_dictionary, path, self._node_id)
 
     def request_pre_operational(self) -> None:
         """Command the drive to pre-operational without waiting; the drive may ignore the command.
 
-        Raises
-        ------
-        DeviceError
-            If the bus does not take the command.
+        Raise `DeviceError` if the bus does not take the command.
         """
         try:
             self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
@@ -219,10 +208,7 @@ class SdoAccess:
     def read(self, index: int, sub: int = 0) -> int:
         """Read an object by SDO and return its integer value.
 
-        Raises
-        ------
-        DeviceError
-            If the drive does not answer, or refuses (:class:`SdoAbortError`).
+        Raise `DeviceError` if the drive does not answer, or refuses (:class:`SdoAbortError`).
         """
         object_value = self._transfer(index, sub, None)
         if not isinstance(object_value, int):
@@ -232,10 +218,7 @@ class SdoAccess:
     def read_or_none(self, index: int, sub: int = 0) -> int | None:
         """Read an object by SDO and return its value, or None if the drive has no such object.
 
-        Raises
-        ------
-        DeviceError
-            If the drive does not answer, or refuses for another reason.
+        Raise `DeviceError` if the drive does not answer, or refuses for another reason.
         """
         try:
             return self.read(index, sub)
@@ -254,21 +237,15 @@ class SdoAccess:
     def write(self, index: int, sub: int, value: int) -> None:
         """Write an object by SDO without reading it back.
 
-        Raises
-        ------
-        DeviceError
-            If the drive does not answer, or refuses.
+        Raise `DeviceError` if the drive does not answer, or refuses.
         """
         self._transfer(index, sub, value)
 
     def configure(self, index: int, sub: int, value: int, mask: int = EVERY_BIT) -> None:
         """Write an object by SDO, read it back, and raise if the values differ.
 
-        Raises
-        ------
-        DeviceError
-            If the drive does not answer, refuses (:class:`SdoAbortError`), or stores another value
-            in the bits of `mask` (:class:`ValueNotStoredError`).
+        Raise `DeviceError` if the drive does not answer, refuses (:class:`SdoAbortError`), or
+        stores another value in the bits of `mask` (:class:`ValueNotStoredError`).
         """
         self.write(index, sub, value)
         value_read = self.read(index, sub)

@@ -115,12 +115,8 @@ def set_up_drive(port: CanPort, rig: RigParameters, drive_name: str) -> DriveCap
     """Verify and configure the drive by SDO; the drive stays pre-operational and disabled.
 
     No other code receives from the open port meanwhile. The profile needs a section ``cia402``.
-
-    Raises
-    ------
-    DeviceError
-        If the drive does not answer, is not the one of the profile, is in fault, lacks a required
-        object, or rejects the configuration.
+    Raise `DeviceError` if the drive does not answer, is not the one of the profile, is in fault,
+    lacks a required object, or rejects the configuration.
     """
     settings = rig.cia402
     assert settings is not None
@@ -232,11 +228,8 @@ class _DriveConfiguration:
 
         A write-only object is written and not read back, if `MAY_BE_WRITE_ONLY` lists it. If
         `required` is None, the value is the one that the constructor was given for the object.
-
-        Raises
-        ------
-        DeviceError
-            If the object is indispensable, or the drive stores a value that is not acceptable.
+        Raise `DeviceError` if the object is indispensable, or the drive stores a value that is not
+        acceptable.
         """
         if required is None:
             required = self._required_values[row.index, row.sub]
@@ -314,11 +307,6 @@ class _DriveConfiguration:
         """Raise if the drive's gear ratio or encoder step differs from the profile's by over 2 %.
 
         Only values that the drive states are compared. Both values are added to `identity`.
-
-        Raises
-        ------
-        DeviceError
-            If they differ by more than 2 %.
         """
         drive_gear = self._read_ratio(objects.GEAR_RATIO)
         increments_per_turn = self._read_ratio(objects.ENCODER_RESOLUTION)
@@ -490,13 +478,7 @@ class _DriveConfiguration:
         return row.accept in self._settings.accept_without
 
     def _record_missing_object(self, row: Requirement) -> None:
-        """Record that the drive lacks an object, or raise if the object is indispensable.
-
-        Raises
-        ------
-        DeviceError
-            If the object is indispensable.
-        """
+        """Record that the drive lacks an object, or raise if it is indispensable."""
         refusal_reason = row.refusal_reason(self._settings.accept_without)
         if refusal_reason:
             raise DeviceError(f"{self._name}: {refusal_reason}")

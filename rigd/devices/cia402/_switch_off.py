@@ -46,13 +46,9 @@ def reset_fault(port: CanPort, rig: RigParameters, drive_name: str) -> str | Non
     Return the description of the fault; None if the drive was not in fault. The motor has no torque
     at any time. The drive is left pre-operational and disabled. Its monitoring of this computer's
     heartbeat is cleared only after its statusword has shown that it is off. No other code receives
-    from the open port meanwhile. The profile needs a section ``cia402``.
-
-    Raises
-    ------
-    DeviceError
-        If the drive does not answer, does not report that it is off within 0.2 s, the fault
-        persists, or the drive is disabled and does not become ready.
+    from the open port meanwhile. The profile needs a section ``cia402``. Raise `DeviceError` if the
+    drive does not answer, does not report that it is off within 0.2 s, the fault persists, or the
+    drive is disabled and does not become ready.
     """
     settings = rig.cia402
     assert settings is not None
@@ -76,12 +72,9 @@ def command_off(sdo: SdoAccess) -> None:
 
 
 def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, drive_name: str) -> None:
-    """Wait until a drive that was commanded off is disabled, or raise.
+    """Wait until a drive that was commanded off is disabled.
 
-    Raises
-    ------
-    DeviceError
-        If the drive is in fault, or stays in another state.
+    Raise `DeviceError` if the drive is in fault, or stays in another state.
     """
     settings = rig.cia402
     assert settings is not None
@@ -133,10 +126,8 @@ def wait_for(is_fulfilled: Callable[[], bool], patience_s: float) -> bool:
 def _confirm_off(sdo: SdoAccess, drive_name: str) -> None:
     """Command the drive off, from any state, until its statusword confirms it.
 
-    Raises
-    ------
-    DeviceError
-        If the drive does not report that it is off within 0.2 s, or does not answer.
+    Raise `DeviceError` if the drive does not report that it is off within 0.2 s, or does not
+    answer.
     """
     start_s = time.monotonic()
     statusword: int | None = None
@@ -200,10 +191,7 @@ def _confirm_ready(
 ) -> None:
     """Check that the drive can get ready to switch on (without torque), and disable it again.
 
-    Raises
-    ------
-    DeviceError
-        If the drive does not get ready, so that no session could be started.
+    Raise `DeviceError` if the drive does not get ready, so that no session could be started.
     """
     with suppress(SdoAbortError):
         sdo.write(objects.CONTROLWORD, 0, SHUTDOWN)

@@ -116,12 +116,9 @@ class TorqueFollowingCheck:
         )
 
     def compare(self, actual_per_mille: int) -> None:
-        """Raise if the actual torque, in 1/1000 of the rated torque, differs from the commands.
+        """Compare the actual torque, in 1/1000 of the rated torque, with the commands.
 
-        Raises
-        ------
-        DeviceError
-            If the torque has differed from the commands for too many consecutive ticks.
+        Raise `DeviceError` if the torque has differed for too many consecutive ticks.
         """
         tolerance_per_mille = self._tolerance_per_mille
         if (
@@ -166,15 +163,10 @@ class StopRequestedError(Exception):
 def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
     """Bring the drive to operation enabled; send RPDO, SYNC and heartbeat once a period.
 
-    `stop` is called once a period; True aborts the transition.
-
-    Raises
-    ------
-    StopRequestedError
-        If `stop` returned True. The drive may be enabled then.
-    DeviceError
-        If a step takes longer than ``cia402.enable_timeout_s``, or the enabled drive ignores the
-        target torque or is in another mode of operation. It may be enabled then.
+    `stop` is called once a period; True aborts the transition. Raise `StopRequestedError` if `stop`
+    returned True. The drive may be enabled then. Raise `DeviceError` if a step takes longer than
+    ``cia402.enable_timeout_s``, or the enabled drive ignores the target torque or is in another
+    mode of operation. It may be enabled then.
     """
     inbox = node.inbox
     sync_grid_ns = node.sync_ns

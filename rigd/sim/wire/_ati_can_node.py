@@ -74,7 +74,8 @@ class AtiCanNode:
     `firmware` is the major, minor and build number; before 3.7 the box reports neither counts per
     unit nor units. `calibrations` are the indices of the calibrations in the box; None: only that
     of the profile. `counts_per_unit` are the counts per N and per N·m; 1 000 000 each with a
-    firmware before 3.7.
+    firmware before 3.7. The constructor raises `DeviceError` if the profile has no section
+    ``ati_can``.
 
     Attributes
     ----------
@@ -87,11 +88,6 @@ class AtiCanNode:
     status_bits : int
         Bits set in the status word in addition to those that the box sets itself, which include bit
         15 if any other is set. They remain until they are cleared, even after a reset.
-
-    Raises
-    ------
-    DeviceError
-        If the profile has no section ``ati_can``.
     """
 
     def __init__(

@@ -106,7 +106,8 @@ class AtiSerialDevice:
     filled calibration block (the fifteen others read 0xFFFF), and the baud register after power-up.
     The stream sends the readings that the sensor of the simulated rig has taken in a period, and
     takes none itself. `write` sends the bytes of an answer, or the records of one period.
-    ``log("sensor", what, **values)`` is called when the sensor is configured, starts or stops.
+    ``log("sensor", what, **values)`` is called when the sensor is configured, starts or stops. The
+    constructor raises `DeviceError` if the profile has no section ``ati_serial``.
 
     Attributes
     ----------
@@ -120,11 +121,6 @@ class AtiSerialDevice:
         Number of a gauge that reads ±32767; None: none.
     status_bits : int
         Status word; if any bit is set, so is the error bit of every record.
-
-    Raises
-    ------
-    DeviceError
-        If the profile has no section ``ati_serial``.
     """
 
     def __init__(

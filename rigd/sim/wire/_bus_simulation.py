@@ -366,10 +366,7 @@ class BusSimulation:
     def inject(self, fault: Fault) -> None:
         """Begin a fault now, or schedule the fault if it has a start time.
 
-        Raises
-        ------
-        FaultError
-            If the fault is not possible on this rig.
+        Raise `FaultError` if the fault is not possible on this rig.
         """
         self._check_fault(fault)
         if fault.after_s is None:

@@ -334,10 +334,8 @@ class Pdo:
     def _mapped_entry(self, mapping_value: int) -> Entry:
         """Return the entry of the dictionary that a mapping entry names.
 
-        Raises
-        ------
-        Abort
-            If the object does not exist, cannot be mapped into this PDO, or has another length.
+        Raise `Abort` if the object does not exist, cannot be mapped into this PDO, or has another
+        length.
         """
         mapped_entry = self._objects.find(mapping_value >> 16, mapping_value >> 8 & 0xFF)
         if self.direction not in mapped_entry.mapping or mapped_entry.bits != mapping_value & 0xFF:

@@ -109,7 +109,9 @@ class DriveNode:
 
     `sync_timeout_s` is the time without a SYNC after which a drive in operation goes to fault; by
     default `SYNC_TIMEOUT_PERIODS` SYNC periods. With a device file, the drive has exactly the
-    objects of this file, with their types, access rights, limits and values at power-on.
+    objects of this file, with their types, access rights, limits and values at power-on. The
+    constructor raises `DeviceError` if the profile has no section [cia402], or no encoder
+    resolution.
 
     Attributes
     ----------
@@ -131,11 +133,6 @@ class DriveNode:
         Whether the wired stop (STO) is dropped. It removes the torque at once, and the drive stays
         off while it is dropped. The drive goes to fault with the profile's ``sto_error_code``, or
         to switch on disabled if there is no such code.
-
-    Raises
-    ------
-    DeviceError
-        If the profile has no section [cia402], or no encoder resolution.
 
     Notes
     -----

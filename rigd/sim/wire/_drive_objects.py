@@ -266,10 +266,7 @@ class DriveObjects:
 def rated_torque_counts(motor: Motor, drive: ServoDrive) -> int:
     """Return the rated torque at the motor shaft in counts of object 6076.
 
-    Raises
-    ------
-    DeviceError
-        If the torque is less than one count, or has more than 32 bits.
+    Raise `DeviceError` if the torque is less than one count, or has more than 32 bits.
     """
     unit_nm = drive.rated_torque_unit_nm or _TORQUE_UNIT_NM
     torque_counts = round(motor.rated_torque_nm / drive.gear_ratio / unit_nm)
@@ -380,12 +377,8 @@ def adopt_device_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
 
     Rated torque, gear, encoder, limits that the file states as zero, and an identity that it does
     not state remain as without a file. If the file does not state the supported modes, cyclic
-    synchronous torque is assumed, provided that the file has a target torque.
-
-    Raises
-    ------
-    DeviceError
-        If the data type of object 6076 in the file cannot hold the motor's rated torque.
+    synchronous torque is assumed, provided that the file has a target torque. Raise `DeviceError`
+    if the data type of object 6076 in the file cannot hold the motor's rated torque.
     """
     rated_counts = objects[0x6076, 0].value
     unchanged_indices = set(_COMMISSIONED_INDICES)

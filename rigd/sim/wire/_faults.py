@@ -405,19 +405,14 @@ _UNSHOWN_EVENTS = ("torque", "sdo write", *LINE_KINDS)
 class EventLog:
     """Log of events with simulated time, in a file of JSON lines and on the terminal.
 
-    `path` is a new file; None: no file. With `quiet` nothing is shown on the terminal.
+    `path` is a new file; None: no file. With `quiet` nothing is shown on the terminal. The
+    constructor raises `WrongUseError` if the file exists, and `DeviceError` if it cannot be
+    written.
 
     Attributes
     ----------
     time_s : float
         Simulated time in seconds, which `BusSimulation` sets.
-
-    Raises
-    ------
-    WrongUseError
-        If the file exists.
-    DeviceError
-        If the file cannot be written.
     """
 
     def __init__(self, path: Path | None, *, quiet: bool) -> None:

@@ -26,12 +26,8 @@ def without_transport_delay(rig: RigParameters) -> RigParameters:
     """Return a rig's parameters without the part of its delays that the exchange itself causes.
 
     If replies are used one tick later, this part is one period; otherwise it is zero.
-    :class:`rigd.sim._devices.SimulatedRig` subtracts the decimating filter's delay.
-
-    Raises
-    ------
-    DeviceError
-        If a delay in the profile is shorter than the part that the exchange causes.
+    :class:`rigd.sim._devices.SimulatedRig` subtracts the decimating filter's delay. Raise
+    `DeviceError` if a delay in the profile is shorter than the part that the exchange causes.
     """
     if rig.acquisition is None or rig.acquisition.mode == "same_tick":
         return rig
@@ -201,12 +197,7 @@ class VirtualCan:
     """CAN bus that the kernel simulates (vcan).
 
     `channel` is the name of the interface. `handlers` and `on_frames` are as for
-    :class:`VirtualBus`.
-
-    Raises
-    ------
-    DeviceError
-        If the interface cannot be used.
+    :class:`VirtualBus`. The constructor raises `DeviceError` if the interface cannot be used.
     """
 
     clients = 1
@@ -278,10 +269,7 @@ class VirtualCan:
 def listen(path: Path) -> socket.socket:
     """Return a listening Unix socket; replace a socket that a dead process has left.
 
-    Raises
-    ------
-    DeviceError
-        If the socket cannot be created.
+    Raise `DeviceError` if the socket cannot be created.
     """
     listening_socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -301,10 +289,7 @@ def listen(path: Path) -> socket.socket:
 def is_virtual(interface_name: str) -> bool:
     """Return whether a network interface is a virtual CAN bus; False if it does not exist.
 
-    Raises
-    ------
-    DeviceError
-        If the interface exists, but is not a virtual CAN bus.
+    Raise `DeviceError` if the interface exists, but is not a virtual CAN bus.
     """
     if not Path(f"/sys/class/net/{interface_name}").exists():
         return False

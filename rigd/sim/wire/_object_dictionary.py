@@ -195,10 +195,7 @@ class Entry:
     def store_integer(self, received_integer: int) -> None:
         """Store a received integer; the caller then has to call `after_write`.
 
-        Raises
-        ------
-        Abort
-            If the value is outside the range, or not allowed now.
+        Raise `Abort` if the value is outside the range, or not allowed now.
         """
         if not self._low <= received_integer <= self._high:
             raise Abort(AbortCode.INVALID_VALUE)
@@ -218,10 +215,7 @@ class Entry:
     def store_bytes(self, data: bytes) -> int | str:
         """Store the bytes of an SDO download; return them as an integer, or in hexadecimal.
 
-        Raises
-        ------
-        Abort
-            If the number of bytes is wrong, or the value is not allowed.
+        Raise `Abort` if the number of bytes is wrong, or the value is not allowed.
         """
         if not self.accepts_length(len(data)):
             raise Abort(AbortCode.WRONG_LENGTH)
@@ -306,10 +300,7 @@ class ObjectDictionary:
     def find(self, index: int, sub: int) -> Entry:
         """Return the entry of the dictionary at an index and sub-index.
 
-        Raises
-        ------
-        Abort
-            If there is no such entry.
+        Raise `Abort` if there is no such entry.
         """
         found_entry = self._entries.get((index, sub))
         if found_entry is not None:
@@ -319,10 +310,7 @@ class ObjectDictionary:
     def read(self, index: int, sub: int) -> bytes:
         """Return the value of an entry as bytes, as an SDO client reads it.
 
-        Raises
-        ------
-        Abort
-            If the entry does not exist or is write-only.
+        Raise `Abort` if the entry does not exist or is write-only.
         """
         read_entry = self.find(index, sub)
         if read_entry.access == "wo":
@@ -332,10 +320,7 @@ class ObjectDictionary:
     def find_writable(self, index: int, sub: int) -> Entry:
         """Return the entry that an SDO client is about to write.
 
-        Raises
-        ------
-        Abort
-            If the entry does not exist or is read-only.
+        Raise `Abort` if the entry does not exist or is read-only.
         """
         writable_entry = self.find(index, sub)
         if writable_entry.access == "ro":
@@ -345,10 +330,7 @@ class ObjectDictionary:
     def write(self, index: int, sub: int, data: bytes) -> int | str:
         """Write the bytes of an SDO client, and return them as an integer or in hexadecimal.
 
-        Raises
-        ------
-        Abort
-            If the entry cannot be written, or the value is not allowed.
+        Raise `Abort` if the entry cannot be written, or the value is not allowed.
         """
         written_entry = self.find_writable(index, sub)
         written_value = written_entry.store_bytes(data)
@@ -559,10 +541,7 @@ class DeviceFile:
 def read_device(path: Path, node_id: int) -> DeviceFile:
     """Read the EDS or DCF file of the drive to simulate, for its node number.
 
-    Raises
-    ------
-    DeviceError
-        If the file cannot be read, or is no EDS or DCF file.
+    Raise `DeviceError` if the file cannot be read, or is no EDS or DCF file.
     """
     try:
         eds = read_eds(path, node_id)
