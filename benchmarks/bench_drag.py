@@ -17,7 +17,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
-from bench_wrong_models import Judged, errors_of
+from bench_wrong_models import Verdict, errors_of
 from gate import Gate, Row, percent
 from wrong_models import RIGS, Drag, Record, drags, record
 
@@ -83,7 +83,7 @@ def evaluate(wire: Drag | None, made: Record) -> Line:
     start = time.process_time()
     selection = select(made.measurement())
     cpu_s = time.process_time() - start
-    one = Judged(selection, dict(errors_of(made, selection)), cpu_s)
+    one = Verdict(selection, dict(errors_of(made, selection)), cpu_s)
     drag = selection.headline.parameters.get("drag")
     speed_m_s = selection.headline.drag_speed_m_s
     return Line(
