@@ -147,7 +147,7 @@ def main() -> None:
         if not each.homogeneity.mixed
     ]
     gate.measured("worst error of pooled numbers", max(worst, default=math.nan))
-    lost = sum(len(each.failures) + len(each.lost_trials) for each in results)
+    lost = sum(len(each.failures) + len(each.failed_predictions) for each in results)
     gate.measured("sessions left out", lost)
     gate.finish()
 

@@ -62,7 +62,7 @@ def answers(meeting: Meeting, folder: Path) -> dict[str, Any] | None:
     read = read_session(folder / session["path"])
     noticed = int(np.argmax((read.samples["status"] & Status.TOUCHED) != 0))
     # If the last answer does not state the time of the touch, the time of its detection counts.
-    after_s = touch["time_s"]["value"] if touch["time_s"] else noticed / read.rate_hz
+    after_s = touch["time_s"]["value"] if touch["time_s"] else noticed / read.number("rate_hz")
     touch_s = read.start_utc_ns * 1e-9 + after_s
     return {name: at - touch_s for name, at in answered_s.items()} | {"kind": touch["kind"]}
 

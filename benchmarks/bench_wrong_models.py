@@ -106,7 +106,7 @@ def main() -> None:
             for seed in range(given.first, given.first + count):
                 one = Verdict.of(make(RIGS[name], seed))
                 verdicts.append(one)
-                if given.write_message:
+                if given.say:
                     _say(f"{defect}, {name}, {seed}", one)
         if verdicts:
             every[defect] = verdicts
