@@ -55,8 +55,8 @@ _MIN_VISIBLE_MODES: Final = 2
 """Smallest number of visible modes for an estimate with tolerance."""
 
 _AGREEING_DEVIANCE: Final = 1.0
-"""Increase of chi-square up to which the losses agree with an order of 1: one standard
-deviation."""
+"""Increase of chi-square up to which the losses agree with an order of 1, for frequencies within
+the stated tolerance: one standard deviation."""
 
 _DAMPING_COEFFICIENTS: Final = ("zeta", "gamma")
 """Damping coefficients that are tested for their absence."""
@@ -84,8 +84,8 @@ class TolerantEstimate:
         "geometry": all modal constants, with frequencies and residues within the tolerance.
         "losses": damping ratios and residue phases alone. "none": no beam with two dampings of one
         order each explains the losses.
-    uniformity : float
-        Assumed relative standard deviation of each frequency.
+    uniformity, stated_uniformity : float
+        Assumed relative standard deviation of each frequency, and the one that was stated.
     p_value : float or None
         Probability of at least the remaining chi-square by chance. None without degrees of
         freedom.
@@ -109,6 +109,7 @@ class TolerantEstimate:
 
     basis: EstimateBasis
     uniformity: float
+    stated_uniformity: float
     p_value: float | None
     plant: Plant
     values: Mapping[str, float]
@@ -123,11 +124,14 @@ class TolerantEstimate:
     def rests_on_frequencies(self) -> bool:
         """Return whether an order differs from 1 although the losses alone agree with 1.
 
-        Then the order was chosen for its elastic part, which shifts the frequencies.
+        Then the order was chosen for its elastic part, which shifts the frequencies. If these
+        deviate by more than the stated tolerance, the losses alone must exclude 1.
         """
+        has_stated_tolerance = self.uniformity <= self.stated_uniformity
+        agreeing_deviance = _AGREEING_DEVIANCE if has_stated_tolerance else NORMAL_95**2
         return any(
             not self.interval[order_name][0] <= 1 <= self.interval[order_name][1]
-            and deviance < _AGREEING_DEVIANCE
+            and deviance < agreeing_deviance
             for order_name, deviance in self.deviance_of_order_one.items()
         )
 
@@ -212,7 +216,7 @@ def tolerant_estimate(
             break
     else:
         estimate_basis = "none"
-    beam_estimate = _estimate_at_minimum(problem, minima, estimate_basis, p_value)
+    beam_estimate = _estimate_at_minimum(problem, minima, estimate_basis, p_value, uniformity)
     orders_excluding_one = [
         order_name for order_name in ("alpha", "lambda")
         if not beam_estimate.interval[order_name][0] <= 1 <= beam_estimate.interval[order_name][1]
@@ -243,6 +247,7 @@ def _estimate_at_minimum(
     minima: Sequence[Minimum],
     estimate_basis: EstimateBasis,
     p_value: float | None,
+    stated_uniformity: float,
 ) -> TolerantEstimate:
     """Return the beam parameters at the lowest minimum, with their uncertainties.
 
@@ -298,6 +303,7 @@ def _estimate_at_minimum(
     return TolerantEstimate(
         basis=estimate_basis,
         uniformity=problem.uniformity,
+        stated_uniformity=stated_uniformity,
         p_value=p_value,
         plant=plant,
         values=plant.parameters,

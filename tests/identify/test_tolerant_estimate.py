@@ -14,12 +14,13 @@ from rigd.testing import PAPER_BEAM
 def estimate_with():
     """Estimate whose lambda has an interval, and a rise of chi-square at 1 by the losses alone."""
 
-    def make(interval, deviance):
+    def make(interval, deviance, stated_uniformity=3e-3):
         plant = Plant(PAPER_BEAM, Damping(1e-4, 1.0, 0.05, 0.6))
         values = plant.parameters
         return TolerantEstimate(
             basis="geometry",
             uniformity=3e-3,
+            stated_uniformity=stated_uniformity,
             p_value=0.2,
             plant=plant,
             values=values,
@@ -49,3 +50,10 @@ def test_order_from_frequencies_alone_flags_internal_damping(
         assert reason == (NOT_UNIFORM_REASON if rests else None)
         assert effective_reason(estimate, name, refused=False) is None
     assert effective_reason(estimate, "lambda", refused=True) == NOT_UNIFORM_REASON
+
+
+@pytest.mark.parametrize(("deviance", "rests"), [(2.5, True), (5.0, False)])
+def test_losses_must_exclude_order_one_beyond_stated_tolerance(estimate_with, deviance, rests):
+    interval = (1.2, 1.6)
+    assert estimate_with(interval, deviance, stated_uniformity=1e-3).rests_on_frequencies is rests
+    assert not estimate_with(interval, deviance).rests_on_frequencies
