@@ -234,7 +234,7 @@ def picture(found: Finding, sound: Finding) -> Figure:
     figure = Figure(figsize=(10.0, 3.0), dpi=110, layout="constrained")
     grid = figure.add_gridspec(2, 3, height_ratios=(1.6, 1), width_ratios=(1.15, 1, 1))
     magnitude, phase = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
-    for each, colour, label in ((sound, SOUND, "sound rig"), (found, BLUE, "this record")):
+    for each, colour, label in ((sound, SOUND, "rig without fault"), (found, BLUE, "this record")):
         hz, response = each.response.frequency_hz, each.response.response
         magnitude.plot(hz, 20 * np.log10(np.abs(response)), color=colour, label=label)
         phase.plot(hz, (np.degrees(np.angle(response)) + 90) % 360 - 90, ".", color=colour, ms=1.5)
@@ -272,7 +272,7 @@ def picture(found: Finding, sound: Finding) -> Figure:
         axes.xaxis.label.set(fontsize=8)
         for line in axes.lines:
             line.set_linewidth(min(line.get_linewidth(), 1.0))
-    magnitude.legend(loc="upper left", fontsize=7)
+    magnitude.legend(loc="lower left", bbox_to_anchor=(0.2, 0.0), fontsize=7)  # clear of peaks
     power.legend(loc="upper right", fontsize=7, ncols=3)
     return figure
 
