@@ -95,6 +95,7 @@ NOT_RUN = {
     "rigd plugins new mylaw --kind controller":
         "installs a package; added/test_new_package.py does the same",
     "rigd check --profile lab": "on the bench",
+    "analyze SESSION.mcap --to 121": "a part of a record; report/test_analyze_command.py",
     "rigd bench": "three minutes; bench",
     "rigd bench --seconds 10": "three minutes; bench",
     "rigd serve --profile sim --web --output sessions": "packaging/test_automation.py, web",
