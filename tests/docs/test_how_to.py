@@ -102,7 +102,7 @@ NOT_RUN = {
     "ssh -L 8720:127.0.0.1:8720 rig-computer": "needs another computer",
     "ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 rig-computer": "needs another computer",
     "rigd run chirp --live          # in one terminal": "needs a screen; live, cli",
-    "sudo useradd --system --user-group --groups dialout rigd": "changes the computer",
+    "sudo useradd --system --gid rigd --groups dialout rigd": "changes the computer",
     "python tests/endurance/run_starved.py --minutes 10 --busy 4    "
     "# with programs that use all processor time": "make endurance",
     "python -m analysis.quick_look sessions/20261122-184457-chirp-02.mcap [--last EARLIER.mcap]":
