@@ -9,7 +9,7 @@ from analysis import campaign
 
 
 def main(paths: list[str]) -> None:
-    """Print each structure pooled over the sessions, and the verdict on the specimen."""
+    """Print the estimate of each structure pooled over the sessions, and the verdict."""
     together = campaign(paths, types=["III", "VII"])
     for failure in together.failures:
         print(f"not used: {failure.path}: {failure.message}")

@@ -22,9 +22,9 @@ def main(path: str) -> None:
     for mode in selection.headline.modes:
         print(f"mode {mode.number}: {mode.frequency_hz.value:.3f} Hz")
     for name, quantity in selection.headline.parameters.items():
-        # A flag says why a number is not a property of the antenna.
+        # A flag states why a number is not a property of the antenna.
         print(f"{name} = {quantity.value:.4g} {quantity.flag or ''}")
-    print("To learn more:", *selection.verdict.experiments, sep="\n")
+    print("Next experiments:", *selection.verdict.experiments, sep="\n")
 
 
 if __name__ == "__main__":

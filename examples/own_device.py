@@ -1,4 +1,4 @@
-"""A custom drive and sensor that implement the device interface: a rigid hub with friction.
+"""Implement the device interface with a drive and a sensor of your own: a rigid hub with friction.
 
 Usage: python own_device.py
 
@@ -30,7 +30,7 @@ class RigidHub:
 
     def latch(self, due_ns: int) -> None:
         time_s, self.angle_time_ns = (due_ns - self.angle_time_ns) / 1e9, due_ns
-        # Exact for a torque that is held: the speed tends to torque over friction.
+        # Exact for a constant torque: the speed tends to torque over friction.
         final_rad_s, rate_1_s = self.torque_nm / FRICTION_NM_S, FRICTION_NM_S / INERTIA_KG_M2
         excess_rad_s, decay = self.speed_rad_s - final_rad_s, math.exp(-rate_1_s * time_s)
         self.angle_rad += final_rad_s * time_s + excess_rad_s * (1 - decay) / rate_1_s
@@ -62,7 +62,7 @@ class RigidHub:
 
 
 def open_rigid_hub() -> Devices:
-    """Make drive and sensor, as an entry of the device registry does."""
+    """Create drive and sensor, as the device registry would."""
     hub = RigidHub()
     return Devices(drive=hub, sensor=hub, simulated=True)
 
@@ -72,7 +72,7 @@ if __name__ == "__main__":
     devices.sensor.connect()
     devices.drive.connect()
     devices.drive.enable()
-    for tick in range(1000):  # as the cycle does: latch, request, read, command
+    for tick in range(1000):  # as in the control loop: latch, request, read, command
         devices.drive.latch(tick * 1_000_000)
         devices.sensor.request(tick * 1_000_000)
         angle_rad, wrench = devices.drive.read_angle(), devices.sensor.read_wrench()

@@ -28,7 +28,7 @@ CHIRP = {
 
 
 def chirp(profile: Profile) -> Excitation:
-    """Make the excitation for a rig, whose rate and limits the profile states."""
+    """Return the excitation, planned for the rate and the limits of the profile."""
     return excitation_for(profile, "chirp", CHIRP)
 
 

@@ -465,8 +465,8 @@ def _require_known_effects(label: str, values_by_name: Mapping[str, float], use:
         values_by_name[n] for n in values_by_name if n.startswith(OFFSET_PREFIX)
     ):
         raise IdentifiedBeamError(
-            f"{label}.parameters: tip_mass_kg and {OFFSET_PREFIX}… together are not defined; take "
-            "the document of an analysis that found one of them."
+            f"{label}.parameters: tip_mass_kg and {OFFSET_PREFIX}… together are not defined; use "
+            "the JSON of an analysis that found one of them."
         )
 
 

@@ -159,7 +159,7 @@ def load_plugin(plugin: Plugin, expected: type[T]) -> T:
         ) from error
     if not isinstance(found, expected):
         raise plugin.error(
-            f"{plugin.reference} is a {type(found).__name__} and no {expected.__name__}; repair, "
+            f"{plugin.reference} is a {type(found).__name__}, not a {expected.__name__}; repair, "
             "upgrade or uninstall the package."
         )
     return found

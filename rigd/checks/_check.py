@@ -26,13 +26,13 @@ def check_rig(profile: Profile) -> list[CheckRow]:
     """
     check_rows = _rows_without_devices(profile)
     if any(row.verdict is CheckResult.FAIL for row in wiring_rows(profile.rig)):
-        skip_reason = "not connected: first the bus has to be right"
+        skip_reason = "not connected: correct the bus first"
         return [
             *check_rows,
             CheckRow("devices", "connection", skip_reason, "", CheckResult.SKIPPED),
         ]
     if unknown_values(profile.rig):
-        skip_reason = "not connected: first the unknown values have to be entered"
+        skip_reason = "not connected: enter the unknown values first"
         return [
             *check_rows,
             CheckRow("devices", "connection", skip_reason, "", CheckResult.SKIPPED),

@@ -39,8 +39,8 @@ _WATCHDOG_ADVICE = {  # Advice on watchdogs that were not proven on the drive
         "read back. Test it at low torque: kill rigd and time how long the torque stays on."
     ),
     Watchdog.NONE: (
-        "Watchdog: should this computer fail with the torque on, nothing but the wired stop (STO) "
-        "takes it off."
+        "Watchdog: if this computer fails with the torque on, only the wired stop (STO) switches "
+        "it off."
     ),
 }
 
@@ -121,11 +121,11 @@ def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[CheckRow]:
     for row in capabilities.lacks:
         is_accepted = row.accept in accepted_features
         substitute_text = (
-            f"stands in: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
+            f"in its place: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
         )
         if row.accept == WATCHDOG:
             substitute_text = (
-                f"stands in: {watchdog.value}" if watchdog is not Watchdog.NONE else ""
+                f"in its place: {watchdog.value}" if watchdog is not Watchdog.NONE else ""
             )
         acceptance_text = f'accepted by cia402.accept_without "{row.accept}"' if is_accepted else ""
         yield CheckRow(
@@ -211,7 +211,7 @@ def calibration_rows(calibration: Mapping[str, object], rig: RigParameters) -> I
             "assumed, below",
             "reported by the sensor",
             CheckResult.WARNING,
-            f"Sensor: assumed are {calibration[_ASSUMED_KEY]}; compare with its calibration "
+            f"Sensor: {calibration[_ASSUMED_KEY]} are assumed; compare them with its calibration "
             "certificate.",
         )
     sensor_status = calibration.get(_STATUS_KEY)
@@ -455,7 +455,7 @@ def _probing_rows(profile: Profile, target: ActuationTarget) -> Iterator[CheckRo
         check_result = CheckResult.SKIPPED
     detail_text = (
         f"Probing move: sessions begin with it because {', '.join(not_measured)} "
-        f"{'is' if len(not_measured) == 1 else 'are'} not measured; rigd probe makes it by itself "
+        f"{'is' if len(not_measured) == 1 else 'are'} not measured; rigd probe runs it alone "
         "(docs/safety.md)."
         if not_measured
         else ""

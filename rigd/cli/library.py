@@ -233,7 +233,7 @@ def _uniform_beam_text(row: "SessionRow") -> str:
 def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     """Yield the lines that show how each mode changes over the sessions."""
     if not trends:
-        yield "No modes are known of these sessions: analyze them first."
+        yield "No modes are known for these sessions; analyze them first."
         return
     for mode_number, mode_trend in enumerate(trends, start=1):
         if mode_number > 1:
@@ -266,7 +266,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     yield (
         "± and bars of the frequency: 95 % intervals. Changes since the mode's first session; * is "
         "significant (3 standard deviations), ? is flagged in its report or quick look. Tip slope: "
-        "the largest, and the error of the linear model at it."
+        "its largest value, and the error of the linear model there."
     )
 
 

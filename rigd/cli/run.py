@@ -294,8 +294,8 @@ def chirp(
         bool,
         typer.Option(
             "--there-and-back",
-            help="Sweep back as well, in as long again: tells a change in time from one over "
-            "frequency.",
+            help="Also sweep back, in the same time: separates a change in time from "
+            "one over frequency.",
         ),
     ] = False,
 ) -> "dict[str, Value]":
@@ -424,11 +424,11 @@ def touch(
     ] = 1.0,
     acceleration_rad_s2: Annotated[
         float,
-        typer.Option("--acceleration", help="Acceleration at most (rad/s²)."),
+        typer.Option("--acceleration", help="Largest acceleration (rad/s²)."),
     ] = 20.0,
     passes: Annotated[int, typer.Option("--passes", min=1, help="Number of passes.")] = 1,
     hold_s: Annotated[
-        float, typer.Option("--hold", help="Time from a touch to the way back (s).")
+        float, typer.Option("--hold", help="Time from a touch until the motor returns (s).")
     ] = 0.5,
     settle_s: Annotated[float, typer.Option("--settle", help="Rest before each pass (s).")] = 1.0,
     force_limit_n: Annotated[
@@ -457,7 +457,7 @@ def move(
     ] = None,
     robust: Annotated[
         bool,
-        typer.Option("--robust", help="Bear frequencies that are wrong by 1 %; takes longer."),
+        typer.Option("--robust", help="Tolerate a frequency error of 1 %; takes longer."),
     ] = False,
     path: Model = None,
     rest_s: RestS = 1.0,
@@ -477,8 +477,8 @@ def until(
         typer.Option(
             "--damping",
             metavar="STD",
-            help="Standard deviation of the modes' damping ratios, such as 1% (of each mode in "
-            "the band), 2:0.5% (of mode 2) or 1:2e-5.",
+            help="Requested standard deviation of the modes' damping ratios, such as 1% (of each "
+            "mode in the band), 2:0.5% (of mode 2) or 1:2e-5.",
         ),
     ] = None,
     frequency: Annotated[
@@ -486,20 +486,33 @@ def until(
         typer.Option(
             "--frequency",
             metavar="STD",
-            help="Of the modes' frequencies, such as 0.01% or 1:0.002 (Hz).",
+            help="Requested standard deviation of the modes' frequencies, such as 0.01% or 1:0.002 "
+            "(Hz).",
         ),
     ] = None,
     zeta: Annotated[
-        str | None, typer.Option("--zeta", metavar="STD", help="Of zeta, such as 20%.")
+        str | None,
+        typer.Option(
+            "--zeta", metavar="STD", help="Requested standard deviation of zeta, such as 20%."
+        ),
     ] = None,
     alpha: Annotated[
-        str | None, typer.Option("--alpha", metavar="STD", help="Of alpha, such as 0.03.")
+        str | None,
+        typer.Option(
+            "--alpha", metavar="STD", help="Requested standard deviation of alpha, such as 0.03."
+        ),
     ] = None,
     gamma: Annotated[
-        str | None, typer.Option("--gamma", metavar="STD", help="Of gamma, such as 30%.")
+        str | None,
+        typer.Option(
+            "--gamma", metavar="STD", help="Requested standard deviation of gamma, such as 30%."
+        ),
     ] = None,
     lambda_: Annotated[
-        str | None, typer.Option("--lambda", metavar="STD", help="Of lambda, such as 0.1.")
+        str | None,
+        typer.Option(
+            "--lambda", metavar="STD", help="Requested standard deviation of lambda, such as 0.1."
+        ),
     ] = None,
     at_most_s: Annotated[float, typer.Option("--at-most", help="Longest record (s).")] = 120.0,
     amplitude_rad: Annotated[

@@ -380,8 +380,8 @@ def check_stability(closed_loop: ClosedLoop) -> str | None:
     if growth_rate_per_s <= 0.0:
         return None
     return (
-        f"{instability_text}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost "
-        "no damping does that, so keep sessions short."
+        f"{instability_text}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; this happens if the "
+        "beam has almost no damping, so keep sessions short."
     )
 
 
@@ -430,8 +430,8 @@ def _stability_remedy(model: LoopModel) -> str:
         )
     if settings.feedforward_gain < 0.5:
         return (
-            f"control.feedforward_gain = {settings.feedforward_gain:g} leaves the beam to the "
-            "integral action, set it to 1"
+            f"control.feedforward_gain = {settings.feedforward_gain:g} leaves the beam's torque "
+            "to the integral action; set it to 1"
         )
     return (
         f"change control.pole_rad_s = {settings.pole_rad_s:g} rad/s, bring "

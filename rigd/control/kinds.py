@@ -127,5 +127,5 @@ def _linear_controller(
         return None
     linear = kind.linear(rig)
     if not isinstance(linear, LinearController):
-        raise owner.error(f"its linear returns a {type(linear).__name__}, no LinearController.")
+        raise owner.error(f"its linear returns a {type(linear).__name__}, not a LinearController.")
     return linear

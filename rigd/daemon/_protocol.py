@@ -275,7 +275,7 @@ def _checked_session_request(request: AnySessionRequest) -> AnySessionRequest:
         if parameter_name not in options:
             raise RequestError(
                 f"parameters: {_shown_value(parameter_name)} is not a parameter of "
-                f"{request.excitation}; there are {', '.join(options)}."
+                f"{request.excitation}; choose from {', '.join(options)}."
             )
         checked_values[parameter_name] = _converted_parameter(
             parameter_name, given_value, options[parameter_name].value_type

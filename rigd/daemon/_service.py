@@ -471,9 +471,9 @@ class Service:
             actuation_target = self._find_target()
             if actuation_target is not self._announced_target:
                 raise RigError(
-                    f"{actuation_target.value.capitalize()} would move now, where it was "
-                    f"{self._announced_target.value} when the daemon was started; restart the "
-                    "daemon if that is intended."
+                    f"{actuation_target.value.capitalize()} would move now, but the daemon was "
+                    f"started for {self._announced_target.value}; restart the daemon if that is "
+                    "intended."
                 )
             await self._call_in_worker(
                 partial(self._rig.connect, actuation_target, reset_fault=reset_fault)

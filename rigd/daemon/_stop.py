@@ -296,7 +296,7 @@ class _DaemonStop:
         self._error: RigdError | None = None
         self._thread = threading.Thread(target=self._stop, daemon=True)
         self.pid = 0 if peer is None else peer[0]
-        self.doubt = "It takes no connection." if peer is None else self._reason_to_doubt(*peer)
+        self.doubt = "It accepts no connection." if peer is None else self._reason_to_doubt(*peer)
         """Sentence that states why the daemon's replies are not trusted; empty if they are."""
 
     def begin(self) -> None:
@@ -341,7 +341,7 @@ class _DaemonStop:
                 return ""
         if holds_lock and os.getuid() in (0, uid):
             return ""
-        return f"It does not hold the lock of the rig {rig}, and may be no daemon."
+        return f"It does not hold the lock of the rig {rig}, so it may not be a daemon."
 
     def report_to(self, report: StopReport, *, disabled: bool) -> None:
         """Add the result of the stop to a report.
@@ -536,7 +536,7 @@ class _SupervisorStop:
             report.quiet.append(f"No session is running on {self.description}; the torque is off.")
         if self.suspended:
             report.doubts.append(
-                f"{self.description} is suspended and cannot obey; its control process has "
+                f"{self.description} is suspended and cannot respond; its control process has "
                 "disabled the drive."
             )
 

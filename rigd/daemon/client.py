@@ -145,7 +145,7 @@ class Client:
         except BlockingIOError:
             new_socket.close()
             raise DaemonUnreachableError(
-                f"The daemon on {self._path} takes no connection within "
+                f"The daemon on {self._path} accepts no connection within "
                 f"{self._connect_timeout_s:g} s: it is suspended, or overloaded by other clients. "
                 f"{UNKNOWN_STATE}"
             ) from None

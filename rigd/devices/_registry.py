@@ -151,7 +151,7 @@ def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> D
     if target is not None and devices.simulated is (target is ActuationTarget.HARDWARE):
         present_target = "a simulated rig" if devices.simulated else ActuationTarget.HARDWARE.value
         raise DeviceError(
-            f"{target.value.capitalize()} was to move, and now it would be {present_target}: rigd "
+            f"{target.value.capitalize()} was to move, but now {present_target} would: rigd "
             "simulate was started or ended in between. Nothing was sent; start again."
         )
     return devices

@@ -107,10 +107,9 @@ def _drive_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     )
     if 0 < max_speed_rad_s < speed_limit_rad_s:
         yield (
-            f"cia402.max_speed_rad_s = {max_speed_rad_s:g} rad/s is below "
-            f"limits.velocity_rad_s = {speed_limit_rad_s:g} "
-            "rad/s; the drive would hold back torques that a session may ask for. Choose a quarter "
-            "more than the limit, or 0 to leave what the drive has."
+            f"cia402.max_speed_rad_s = {max_speed_rad_s:g} rad/s is below limits.velocity_rad_s = "
+            f"{speed_limit_rad_s:g} rad/s; the drive would limit torques that a session may need. "
+            "Choose a quarter more than the limit, or 0 to leave the drive's own value."
         )
     peak_ratio = profile_values["motor.peak_torque_nm"] / profile_values["motor.rated_torque_nm"]
     if peak_ratio > _MAX_TORQUE_RATIO:
@@ -145,9 +144,9 @@ def _drive_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     for entry_number, key_name in enumerate(profile_values["cia402.accept_without"]):
         if key_name not in ACCEPTABLE:
             yield (
-                f'cia402.accept_without[{entry_number}] = "{key_name}" is nothing that a '
-                "profile can accept "
-                f"the absence of; choose {', '.join(ACCEPTABLE)}."
+                f'cia402.accept_without[{entry_number}] = "{key_name}" is not a '
+                "feature whose absence a profile can accept; "
+                f"choose {', '.join(ACCEPTABLE)}."
             )
 
 
@@ -157,8 +156,9 @@ def _serial_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
 
     if profile_values["acquisition.mode"] != "same_tick":
         yield (
-            'acquisition.mode = "previous_tick" does not go with [ati_serial]: a sensor that '
-            'streams is not asked, so there is no reply of the tick before; choose "same_tick".'
+            'acquisition.mode = "previous_tick" cannot be used with [ati_serial]: a sensor that '
+            "streams gets no requests, so there is no reply to the previous tick; choose "
+            '"same_tick".'
         )
     baud, stream_hz = profile_values["ati_serial.baud"], profile_values["ati_serial.stream_hz"]
     max_records_hz = baud / RECORD_BITS
@@ -170,7 +170,7 @@ def _serial_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     if stream_hz < profile_values["rig.rate_hz"]:
         yield (
             f"ati_serial.stream_hz = {stream_hz:g} Hz is below rig.rate_hz = "
-            f"{profile_values['rig.rate_hz']:g} Hz; there would be ticks without a record."
+            f"{profile_values['rig.rate_hz']:g} Hz; some ticks would have no record."
         )
     settings = AtiSerial(
         **{each.name: profile_values[f"ati_serial.{each.name}"] for each in fields(AtiSerial)}

@@ -250,7 +250,7 @@ def with_obstacles(rig: RigParameters, added_texts: Iterable[str]) -> RigParamet
     simulation = rig.simulation
     if simulation is None:
         raise ObstacleError(
-            f"The profile {rig.name} has no section [simulation], so that its beam can meet no "
+            f"The profile {rig.name} has no section [simulation], so that its beam cannot have an "
             "obstacle; copy it from that of rigd profiles show sim."
         )
     added_texts = tuple(added_texts)

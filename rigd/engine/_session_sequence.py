@@ -64,9 +64,7 @@ _WRONG_SIGN_REMEDY = (
     "encoder; a lower amplitude does not help."
 )
 """Advice for the operator if the sign of angle or torque is wrong."""
-_ENCODER_TESTED_MESSAGE = (
-    "The beam pulled at a shaft that stood still, so the encoder was tested: it works."
-)
+_ENCODER_TESTED_MESSAGE = "The beam pulled on a shaft at rest, so the encoder was tested: it works."
 _VIBRATING_SPREAD_RATIO = 2.0
 """Ratio of the coupling torque's standard deviation after a session to its value before the
 session, above which the beam counts as vibrating."""

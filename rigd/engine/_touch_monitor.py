@@ -87,7 +87,7 @@ class TouchMonitor:
         cycle.flags |= _TOUCHED
         if tick >= self._pass.returns:
             return DetectedContact(
-                "The beam met something on its way back. Find what stands in its way.", "stopped"
+                "The beam met something on its way back. Find what is in its way.", "stopped"
             )
         self._return_after_touch(tick)
         return DetectedContact(f"Touch detected at {tick / self._rate_hz:.3f} s.")

@@ -252,8 +252,8 @@ class _ControlServer:
             self._silent_ticks = self._silent_ticks + 1 if cycle.stale else 0
         if self._silent_ticks > _MAX_SILENCE_S * self._profile.rig.rate_hz:
             raise DeviceError(
-                f"{cycle.stale_names} has not come for {_MAX_SILENCE_S:g} s; check that the device "
-                "is on and connected."
+                f"{cycle.stale_names} has not arrived for {_MAX_SILENCE_S:g} s; check that the "
+                "device is on and connected."
             )
 
     def _read_at_rest(self) -> None:

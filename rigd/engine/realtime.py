@@ -266,7 +266,10 @@ def lock_memory(libc: ctypes.CDLL) -> str:
         return MEMORY_LOCKED
     # With MCL_FUTURE, an allocation beyond the limit would fail in mid-session.
     _check_return_code(libc.mlockall(_MCL_CURRENT))
-    return f"{MEMORY_LOCKED}, but for what is allocated later (limit of {limit_bytes / 1e6:.0f} MB)"
+    return (
+        f"{MEMORY_LOCKED}, except for memory that is allocated later (limit of "
+        f"{limit_bytes / 1e6:.0f} MB)"
+    )
 
 
 def _set_timer_slack(libc: ctypes.CDLL) -> str:
@@ -312,7 +315,7 @@ def _limit_idle_states(root_folder: Path) -> str:
     fd = os.open(root_folder / _IDLE_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
     # The bound holds while the descriptor is open, until this process ends.
     os.write(fd, struct.pack("=i", MAX_WAKE_UP_US))
-    return f"those that are left within {MAX_WAKE_UP_US} µs"
+    return f"the remaining ones within {MAX_WAKE_UP_US} µs"
 
 
 def _set_fifo_priority(realtime_priority: int) -> str:

@@ -59,7 +59,8 @@ def added_function(plugin: Plugin) -> MakeExcitation:
             sweep_rad = np.asarray(kind.reference_rad(options, time_s), dtype=np.float64)
         if sweep_rad.shape != time_s.shape or not np.isfinite(sweep_rad).all():
             raise plugin.error(
-                f"its reference is no {time_s.size} finite angles; report that to its author."
+                f"its reference is not an array of {time_s.size} finite angles; report that to its "
+                "author."
             )
         return assemble_excitation(kind.name, asdict(options), rate_hz, segments, sweep_rad)
 

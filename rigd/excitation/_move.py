@@ -99,7 +99,7 @@ def move(
     distance_rad = target_rad - start_rad
     if abs(distance_rad) < _MIN_DISTANCE_RAD:
         raise ExcitationError(
-            f"The motor stands at {start_rad:.4g} rad already, and a move is of "
+            f"The motor is already at {start_rad:.4g} rad, and a move is of "
             f"{_MIN_DISTANCE_RAD:g} rad at least; choose another angle."
         )
     planned_move = shortest_move(rig_plant, distance_rad, start_rad=start_rad, robust=bool(robust))
@@ -162,7 +162,7 @@ def _move_text(parameters: Mapping[str, float | int | str]) -> str:
         arrival_text = f"after {1e3 * float(parameters['arrival_s']):.0f} ms"
     residual_text = f"{1e3 * residual_nm:.2g} mN·m"
     if residual_nm < sensor_floor_nm:
-        residual_text = f"below what the sensor shows ({1e3 * sensor_floor_nm:.2g} mN·m)"
+        residual_text = f"below the noise of the sensor ({1e3 * sensor_floor_nm:.2g} mN·m)"
     if detuned_residual_nm > max(residual_nm, sensor_floor_nm):
         residual_text += (
             f", {1e3 * detuned_residual_nm:.2g} mN·m if the beam's frequencies are wrong by their "

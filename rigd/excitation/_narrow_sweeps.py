@@ -176,8 +176,8 @@ def read_modes(document_path: str | Path) -> tuple[FoundMode, ...]:
     )
     if not found_modes:
         raise ExcitationError(
-            f"{document_path}: modes has no mode that oscillates; take the document of an analysis "
-            "that found one (analyze session.mcap --json fits.json)."
+            f"{document_path}: modes has no mode that oscillates; use the JSON of an analysis that "
+            "found one (analyze session.mcap --json fits.json)."
         )
     return found_modes
 
@@ -204,7 +204,7 @@ def _describe_invalid_value(error_details: ErrorDetails) -> str:
             else path_part
         )
     if not document_path:
-        return 'is no JSON object; it must have the key "modes".'
+        return 'is not a JSON object; it must have the key "modes".'
     if error_details["type"] == "missing":
         return f"{document_path} is missing; give it as analyze --json writes it."
     unit_text = " Hz" if document_path.endswith("_hz") else ""

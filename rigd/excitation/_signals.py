@@ -151,7 +151,7 @@ def require_finite(option: str, value: float, unit: str) -> None:
         raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
     if not is_usable_size(value):
         raise ExcitationError(
-            f"{option} = {value:g} {unit} is of no size that a rig can have; check its unit."
+            f"{option} = {value:g} {unit} is not plausible for a rig; check its unit."
         )
 
 

@@ -141,7 +141,8 @@ def touch(
     by_rad = angle_rad - rig.start_rad
     if by_rad == 0.0:
         raise ExcitationError(
-            f"angle_rad = {angle_rad:g} rad is where the motor stands; give another angle."
+            f"angle_rad = {angle_rad:g} rad is the angle at which the motor is now; give another "
+            "angle."
         )
     require_positive("speed_rad_s", speed_rad_s, "rad/s")
     require_positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")

@@ -102,12 +102,13 @@ def parse_target(quantity: str, text: str) -> Target:
     if colon_text:
         if quantity not in MODE_QUANTITIES:
             raise ExcitationError(
-                f"{option}: {quantity} is no quantity of a mode; give for example {example_text}."
+                f"{option}: {quantity} is not a quantity of a mode; give for example "
+                f"{example_text}."
             )
         if not mode_text.strip().isdecimal() or not 1 <= int(mode_text) <= _MAX_MODE_NUMBER:
             raise ExcitationError(
-                f"{option}: {mode_text.strip()!r} is no number of a mode, 1 to {_MAX_MODE_NUMBER}; "
-                f"give for example {example_text}."
+                f"{option}: {mode_text.strip()!r} is not the number of a mode, 1 to "
+                f"{_MAX_MODE_NUMBER}; give for example {example_text}."
             )
         mode_number = int(mode_text)
     std_text = std_text.strip()
@@ -117,8 +118,8 @@ def parse_target(quantity: str, text: str) -> Target:
         std = float(number_text)
     except ValueError:
         raise ExcitationError(
-            f"{option}: {std_text!r} is no standard deviation; give a percentage of the value or a "
-            f"number{f' in {unit}' if unit else ''}, for example {example_text}."
+            f"{option}: {std_text!r} is not a standard deviation; give a percentage of the value "
+            f"or a number{f' in {unit}' if unit else ''}, for example {example_text}."
         ) from None
     std = std / 100 if is_relative else std
     if not (isfinite(std) and std > 0.0):
@@ -129,8 +130,8 @@ def parse_target(quantity: str, text: str) -> Target:
     useless_std = _USELESS_STD.get(quantity, inf)
     if not is_relative and std >= useless_std:
         raise ExcitationError(
-            f"{option}: a standard deviation of {std:g} is no precision of {quantity}, since it is "
-            f"not below {useless_std:g}; for a percentage of the value write {text.strip()}%."
+            f"{option}: a standard deviation of {std:g} says nothing about {quantity}; give less "
+            f"than {useless_std:g}; for a percentage of the value write {text.strip()}%."
         )
     return Target(quantity, std, is_relative, mode_number)
 

@@ -316,10 +316,10 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable_count: int) -> li
     )
     if estimate.misfit > _MAX_UNREMARKED_MISFIT:
         operator_notes.append(
-            f"The motor's equation leaves {estimate.misfit:.1f} times what scatter explains (up to "
-            f"{estimate.friction_departure_nm:.2g} N·m of the mean torque of a pass): friction is "
-            "not only viscous and Coulomb, or a delay of the profile is not true. The deviations "
-            "are widened for it."
+            f"The residual of the motor's equation is {estimate.misfit:.1f} times what scatter "
+            f"explains (up to {estimate.friction_departure_nm:.2g} N·m of the mean torque of a "
+            "pass): friction is not only viscous and Coulomb, or a delay of the profile is "
+            "wrong. The standard deviations include this."
         )
     omitted_count = unusable_count + estimate.dropped
     if omitted_count:

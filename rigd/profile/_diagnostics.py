@@ -107,8 +107,8 @@ def implausible_numbers(profile_values: Mapping[str, Any]) -> Iterator[str]:
         for number in key_value if isinstance(key_value, tuple) else (key_value,):
             if isinstance(number, int | float) and not is_usable_size(number):
                 yield (
-                    f"{key} = {_text(number)}{_unit(key)} is of no size that a rig can have; check "
-                    "its unit."
+                    f"{key} = {_text(number)}{_unit(key)} is not plausible for a rig; check its "
+                    "unit."
                 )
 
 
@@ -167,7 +167,10 @@ def contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
         )
     yield from first_mode_contradictions(profile_values)
     if not any(profile_values["sensor.projection"]):
-        yield "sensor.projection is all zero; give the row that makes motor torque of the wrench."
+        yield (
+            "sensor.projection is all zero; give the coefficients that turn a wrench into the "
+            "motor's torque."
+        )
     yield from _shear_contradictions(profile_values)
     yield from _obstacle_problems(profile_values)
     for key_name in profile_values["metadata.required"]:
@@ -249,9 +252,8 @@ def _shear_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     if squared_lengths > 0 and projection_product > (1 - _PARALLEL_TOLERANCE) * squared_lengths:
         yield (
             f"sensor.shear_projection = {_text(shear_projection)} is a multiple of "
-            "sensor.projection: shear "
-            "and torque could not be told apart; give the row that makes the force across the beam "
-            "of the wrench."
+            "sensor.projection: shear and torque could not be distinguished; give the coefficients "
+            "that turn a wrench into the force across the beam."
         )
 
 
@@ -305,9 +307,9 @@ def _unreachable_limits(profile_values: Mapping[str, Any]) -> Iterator[str]:
     jump_limit = profile_values["limits.acceleration_rad_s2"]
     if jump_limit > _MAX_ACCELERATION_FACTOR * own_rad_s2:
         yield (
-            f"limits.acceleration_rad_s2 = {jump_limit:g} rad/s² finds no jump of the encoder: it "
-            f"is more than {_MAX_ACCELERATION_FACTOR:g} times the {own_rad_s2:.4g} rad/s² that the "
-            "peak torque gives the motor alone; choose some two to five times that."
+            f"limits.acceleration_rad_s2 = {jump_limit:g} rad/s² cannot detect a jump of the "
+            f"encoder: it is more than {_MAX_ACCELERATION_FACTOR:g} times the {own_rad_s2:.4g} "
+            "rad/s² that the peak torque gives the motor alone; choose two to five times that."
         )
     recorder_lag_s = profile_values["limits.recorder_lag_s"]
     if recorder_lag_s >= RECORDER_BUFFER_S:

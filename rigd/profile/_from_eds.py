@@ -92,7 +92,7 @@ class Draft:
     def __init__(self, base: Profile, eds: Eds, path: Path) -> None:
         if base.rig.cia402 is None or base.rig.can is None:
             raise ProfileError(
-                f"{base.path}: has no CiA 402 drive to put another in the place of; start from "
+                f"{base.path}: has no CiA 402 drive that another can replace; start from "
                 "antenna_can or antenna_serial."
             )
         suitability = check_suitability(eds)
@@ -201,8 +201,8 @@ class Draft:
         ).findings
         remarks = [f.sentence for f in drive_findings if f.sentence]
         return remarks + [
-            f"The file does not tell what {f.what} holds, which has to be {f.wanted}: "
-            "rigd check asks the drive."
+            f"The file does not state the value of {f.what}, which has to be {f.wanted}: rigd "
+            "check reads it from the drive."
             for f in drive_findings
             if f.grade is Grade.ASK and f.wanted
         ]
@@ -272,7 +272,7 @@ class Draft:
         )
         if self._accepted:
             acceptance_comment = (
-                "The drive lacks, by its file, what these names stand for (docs/devices.md)."
+                "According to its file, the drive lacks these features (docs/devices.md)."
             )
             acceptance_comment += (
                 f" Not accepted, so that rigd refuses it: {', '.join(undecided_names)}."
@@ -282,9 +282,9 @@ class Draft:
             yield Setting(_ACCEPT_KEY, tuple(self._accepted), reason=acceptance_comment + hint_text)
         elif undecided_names:
             acceptance_comment = (
-                "TO FILL IN: the drive lacks, by its file, what these names stand for "
-                "(docs/devices.md), and rigd refuses it. Take the # away, and from the list what "
-                "must not be missing."
+                "TO FILL IN: according to its file, the drive lacks these features "
+                "(docs/devices.md), and rigd refuses it. Remove the #, and from the list each "
+                "feature that must not be missing."
             )
             yield Setting(
                 _ACCEPT_KEY,
@@ -293,7 +293,9 @@ class Draft:
                 commented=True,
             )
         elif self._base.rig.cia402 is not None and self._base.rig.cia402.accept_without:
-            yield Setting(_ACCEPT_KEY, (), reason="The drive has, by its file, all that is needed.")
+            yield Setting(
+                _ACCEPT_KEY, (), reason="According to its file, the drive has all that is needed."
+            )
 
     def _missing_feature_names(self) -> list[str]:
         """Return the names of the drive's missing features that a profile must accept."""
@@ -309,13 +311,13 @@ class Draft:
         yield Setting("description", f"{product_name}, from {eds.path.name}")
         relative_path = os.path.relpath(eds.path.resolve(), path.resolve().parent)
         yield Setting(
-            "cia402.eds", relative_path, reason="The file of the drive, from this folder on."
+            "cia402.eds", relative_path, reason="The drive's file, relative to this folder."
         )
         for key, eds_node_id in (("vendor_id", eds.vendor_id), ("product_code", eds.product_code)):
             if eds_node_id:
                 yield Setting(f"cia402.{key}", eds_node_id, "datasheet", hexadecimal=True)
         if eds.commissioned_node_id:
-            setting_comment = "The node id for which the file configures the drive."
+            setting_comment = "The node id that the file configures."
             yield Setting("cia402.node_id", eds.commissioned_node_id, "datasheet", setting_comment)
         can = self._base.rig.can
         if can is not None and eds.bit_rates_bit_s and can.bitrate_bit_s not in eds.bit_rates_bit_s:
@@ -377,13 +379,13 @@ class Draft:
             "Without the hardware, a simulated rig speaks the same protocols in its place:",
             f"  rigd simulate --profile {self._path.name}",
             "",
-            "Every number says where it comes from:",
+            "Every number states its source:",
             "  paper      printed in the paper (antenna, damping, encoder)",
-            "  datasheet  told by the drive's file, or typed in from a data sheet",
-            "  measured   on a rig or a computer, as said beside it",
+            "  datasheet  from the drive's file, or entered from a data sheet",
+            "  measured   on a rig or a computer, as the comment states",
             "  unknown    no value yet: rigd moves nothing before all of these are filled in, as",
             '             { value = 0.5, source = "datasheet" }',
-            "  assumed    of the profile started from: check those marked TO FILL IN first",
+            "  assumed    from the base profile: check those marked TO FILL IN first",
             "Units are in the keys; angles and torques are at the output shaft, behind the gear.",
             *(
                 ["", "Of this drive:", *(f"* {file_doubt}" for file_doubt in self.remarks)]

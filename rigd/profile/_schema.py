@@ -208,7 +208,7 @@ def _settings_problem(settings: type) -> str:
     """Return the reason why a class cannot declare a section of a profile, or ""."""
     parameters = getattr(settings, "__dataclass_params__", None)
     if parameters is None or not parameters.frozen:
-        return "they are no frozen dataclass; declare them with @dataclass(frozen=True)."
+        return "they are not a frozen dataclass; declare them with @dataclass(frozen=True)."
     # Late: the processes of a session, which get a loaded profile, do not need it.
     from pydantic import ConfigDict, TypeAdapter, ValidationError
 

@@ -155,7 +155,8 @@ def copy_profile(profile: Profile, path: Path, new_name: str | None = None) -> N
         except KeyError:
             raise ProfileError(
                 f"{profile.path}: is not laid out as the shipped profiles are, one key a line "
-                "under its [section], so that no changed copy can be made; copy the file, edit it."
+                "under its [section], so that no changed copy can be made; copy the file and edit "
+                "it."
             ) from None
         profile_from_text(profile_text, path)
     try:

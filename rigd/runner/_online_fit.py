@@ -149,7 +149,7 @@ class FitClient(WorkerClient):
         elif not unknown_reason and not estimates:
             unknown_reason = "Its fit has no modes."
         if unknown_reason:
-            search_text = "Reached on the way." if was_reached_before else self._end_reason
+            search_text = "Reached during the session." if was_reached_before else self._end_reason
             sentences = ["" if search_text == unknown_reason else search_text]
             sentences.append(
                 f"Not known whether the whole record has the precision: {unknown_reason}"
@@ -163,7 +163,7 @@ class FitClient(WorkerClient):
             return True, ""
         unmet_text = self._end_reason
         if was_reached_before:
-            unmet_text = self.failure or "Reached on the way, but not by the whole record."
+            unmet_text = self.failure or "Reached during the session, but not by the whole record."
         return False, f"{unmet_text} So far: {estimates_text(imprecise_estimates)}.".strip()
 
     @property

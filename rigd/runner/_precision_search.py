@@ -142,7 +142,7 @@ def _target_estimate(target: Target, estimate: Estimate | None) -> TargetEstimat
     quantity_and_mode = target.quantity, target.mode
     if estimate is None:
         return TargetEstimate(
-            *quantity_and_mode, None, inf, target.std, "it is not part of what was found"
+            *quantity_and_mode, None, inf, target.std, "the fit does not include it"
         )
     # An estimate that is less than its uncertainty does not show how small the value is.
     relative_scale = max(abs(estimate.value), estimate.std or 0.0)

@@ -118,8 +118,8 @@ class Series:
         check_required(profile, self._notes)
         if excitation.stays and repeat > 1:
             raise RefusedError(
-                f"--repeat {repeat}: a {excitation.kind} ends elsewhere than it starts and is run "
-                "once; omit the option."
+                f"--repeat {repeat}: a {excitation.kind} does not end where it starts, so it is "
+                "run once; omit the option."
             )
         self.plan = plan_session(profile, excitation, force=force, accept=accept)
         self._touch = touch_search(profile, excitation)

@@ -136,7 +136,7 @@ def tip_in_words(tip: TipMotion | None, beam: Beam, excitation: Excitation) -> s
     if excitation.kind in KINDS_WITH_TARGET_ANGLE:
         return f"{motion_text}{_STEEP_SLOPE_EFFECTS[excitation.kind]}."
     if excitation.kind not in KINDS:
-        return f"{motion_text}; the identification of the motor does not rest on it."
+        return f"{motion_text}; the identification of the motor does not depend on it."
     amplitude_factor = _rounded_down(SMALL_SLOPE_RAD / tip.slope_rad)
     advice = (
         f"; {amplitude_factor:g} times the amplitude stays within" if amplitude_factor > 0 else ""

@@ -46,7 +46,7 @@ _MAX_ITERATIONS = 10
 """Maximum number of iterations of the search for the largest amplitude, which takes 3 or 4."""
 _UNKNOWN_FORCE_WARNING = (
     "Without sensor.shear_projection in the profile the contact force is not known: force_limit_n "
-    "(--force-limit) ends nothing, and points are less precise."
+    "(--force-limit) has no effect, and points are less precise."
 )
 
 
@@ -347,7 +347,7 @@ def predict_session(
 def _amplitude_advice(profile: Profile, excitation: Excitation, *, force: bool) -> str:
     """Return advice, as part of an error message, on how to change an excitation within limits."""
     if excitation.kind in KINDS_WITH_TARGET_ANGLE:
-        return "go less far or slower"
+        return "reduce the angle or the speed"
     largest_rad = largest_amplitude(profile, excitation, force=force)
     return "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
 

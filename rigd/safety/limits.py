@@ -299,7 +299,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "stopped encoder",
-        "torque that the sudden stop of the encoder would have taken",
+        "torque that the sudden stop of the encoder would have required",
         "N·m",
         "limits.standstill_torque_nm",
         None,
@@ -434,7 +434,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "stale angle share",
-        "share of ticks without a new angle",
+        "percentage of ticks without a new angle",
         "%",
         "limits.stale_percent",
         0.5,
@@ -445,7 +445,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "stale wrench share",
-        "share of ticks without a new wrench",
+        "percentage of ticks without a new wrench",
         "%",
         "limits.stale_percent",
         0.5,
@@ -465,7 +465,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "missed share",
-        "share of missed ticks",
+        "percentage of missed ticks",
         "%",
         "limits.missed_percent",
         0.8,

@@ -408,7 +408,7 @@ def _motor_contradiction(estimate: ProbeEstimate) -> str:
             unknown_clauses.append(quantity)
     if unknown_clauses:
         return (
-            "it could not be determined how far the motor agrees with "
+            "it could not be determined whether the motor agrees with "
             f"{' and '.join(unknown_clauses)}."
         )
     return ""

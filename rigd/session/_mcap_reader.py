@@ -401,7 +401,7 @@ class _ContainerReader:
             )
             packed_bytes, _ = read_prefixed_bytes(chunk_content, packed_position, "<Q")
         except struct.error:
-            raise McapDamageError(f"has a malformed head{location_text}") from None
+            raise McapDamageError(f"has a malformed header{location_text}") from None
         self._budget.count_unpacked(stated_size, location_text)
         compression = bytes(compression_name[:20])
         if stated_size <= MAX_UNPACKED_BYTES:

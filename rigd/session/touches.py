@@ -102,7 +102,7 @@ def touch_line(touch: Mapping[str, Any]) -> str:
         if (estimate := touch.get(quantity_name)) is not None
     ]
     touch_kind = touch.get("kind", "")
-    quantity_texts.append("kind: cannot tell" if touch_kind == "unknown" else touch_kind)
+    quantity_texts.append("kind: not identifiable" if touch_kind == "unknown" else touch_kind)
     estimates_text = (
         ", ".join(quantity_text for quantity_text in quantity_texts if quantity_text)
         or "not estimated"

@@ -44,7 +44,7 @@ def check_name(metadata_name: str) -> None:
         )
     if metadata_name in NOTES:
         raise MetadataError(
-            f"metadata {metadata_name}: has its own place; give it as {metadata_name} instead."
+            f"metadata {metadata_name}: is a field of its own; give it as {metadata_name} instead."
         )
 
 

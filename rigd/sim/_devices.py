@@ -168,7 +168,7 @@ class SimulatedRig:
         if len(self._added_disturbances) == _MAX_ADDED_DISTURBANCES:
             raise ObstacleError(
                 f"{_MAX_ADDED_DISTURBANCES} obstacles and knocks were added while the simulated "
-                "rig ran, and one more would take too long a tick; start it again."
+                "rig ran, and one more would make a tick too long; start it again."
             )
 
     def add_disturbance(self, disturbance: Disturbance, *, wait: bool) -> None:
@@ -224,7 +224,7 @@ class SimulatedRig:
         try:
             disturbance_count, prepared_plant = preparation.value()
         except ComputationError:
-            raise DeviceError("The simulated rig could not make ready for an obstacle.") from None
+            raise DeviceError("The simulated rig could not prepare for an obstacle.") from None
         self._use_prepared_plant(prepared_plant)
         if disturbance_count < len(self._added_disturbances):
             self._start_preparation()

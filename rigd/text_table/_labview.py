@@ -87,7 +87,7 @@ def head_of(text_lines: Sequence[str]) -> LabviewHead | None:
     ]
     if not end_lines:
         raise TableError(
-            f"is a LabVIEW file whose head has no line {_LAST_LINE_TEXT}; export it again."
+            f"is a LabVIEW file whose header has no line {_LAST_LINE_TEXT}; export it again."
         )
     separator = next(
         (

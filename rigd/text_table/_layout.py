@@ -278,7 +278,7 @@ def _layout_with_separator(
         if column_number is None
     ]
     if not rows:
-        raise _NotThisTableError(_RANK_NO_ROWS, TableError("has no lines below its head."))
+        raise _NotThisTableError(_RANK_NO_ROWS, TableError("has no lines below its header."))
     best_failure: _NotThisTableError | None = None
     for row_index, row in enumerate(rows):
         if requested_titles and not _has_titles(row, requested_titles):
@@ -503,7 +503,7 @@ def _error_for_unexpected_row(
         ):
             return not_a_number_error(row.line, column_name, row_cells[column_index])
     return TableError(
-        f"line {row.line} has texts where the line below has numbers, and is no row of units; "
+        f"line {row.line} has texts where the line below has numbers, and is not a row of units; "
         "remove it."
     )
 

@@ -523,7 +523,7 @@ def _text_table(
             if x_dimension.lower() not in _TIME_DIMENSIONS:
                 raise TableError(
                     f"'{requested_name}' is not a function of time by the X_Dimension of the "
-                    f"head{{cell}}; give measured samples.",
+                    f"header{{cell}}; give measured samples.",
                     x_dimension,
                 )
             period_s = layout.labview.number("Delta_X", column_index)

@@ -87,7 +87,7 @@ def _plot(quantity: _Quantity, mode_number: int, *, with_target_std: bool) -> Pl
 
     # Curves with the same name have one entry in the legend.
     target_label, interval_label = (
-        f"asked for, 95 % ({unit_symbol})",
+        f"requested, 95 % ({unit_symbol})",
         f"95 % interval ({unit_symbol})",
     )
     target_limit_curves = (
@@ -182,7 +182,7 @@ def fit_table(fit: Fit | None) -> str:
     if target_precisions:
         table_rows = [_target_row(target_precision) for target_precision in target_precisions]
         paragraphs.append(
-            _markdown_table("asked for", "value", "std", "asked std", table_rows=table_rows)
+            _markdown_table("requested", "value", "std", "requested std", table_rows=table_rows)
         )
     if not search_document.get("reason") and search_document.get("left_s") is not None:
         paragraphs.append(f"About **{search_document['left_s']:.0f} s** more.")

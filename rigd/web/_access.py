@@ -133,7 +133,7 @@ async def read_json_object(request: web.Request) -> dict[str, Any]:
     try:
         request_object = json.loads(await asyncio.wait_for(request.read(), _BODY_TIMEOUT_S))
     except TimeoutError:
-        raise web.HTTPRequestTimeout(reason="The request did not come to its end.") from None
+        raise web.HTTPRequestTimeout(reason="The request is incomplete.") from None
     except (ValueError, RecursionError):
         request_object = None
     if not isinstance(request_object, dict):
@@ -160,12 +160,12 @@ def _refusal_of_other_pages(request: web.Request) -> web.Response | None:
     if fetch_site not in ("same-origin", "none") and request.path != ICON_PATH:
         return refusal_response(403, "Requests from other pages are refused.")
     if request.method not in ("GET", "HEAD", "POST"):
-        return refusal_response(405, "Only GET, HEAD and POST are answered.")
+        return refusal_response(405, "Only GET, HEAD and POST are accepted.")
     if request.method == "POST" and (
         request.headers.get(_ACTION_HEADER) != "1" or request.content_type != "application/json"
     ):
         return refusal_response(
-            403, f"A request that acts is JSON and has the header {_ACTION_HEADER}: 1."
+            403, f"A request for an action must be JSON and have the header {_ACTION_HEADER}: 1."
         )
     return None
 

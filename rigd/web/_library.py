@@ -158,7 +158,7 @@ class Library:
         if file_ending == "mcap":
             return web.FileResponse(session_path, headers=_download_headers(session_path.name))
         if file_ending not in _EXPORT_SUFFIXES:
-            return refusal_response(404, "There are .mcap, .mat and .uff.")
+            return refusal_response(404, "Choose .mcap, .mat or .uff.")
         if self._jobs.paused:
             return refusal_response(409, _SESSION_RUNS_MESSAGE)
         # A browser has few connections to a server, so none may wait here for another.

@@ -165,7 +165,7 @@ class OperatorPageServer:
         request_object = await read_json_object(request)
         command = request_object.get("command")
         if not isinstance(command, str) or command not in _COMMANDS:
-            return refusal_response(400, f"command: there are {', '.join(sorted(_COMMANDS))}.")
+            return refusal_response(400, f"command: choose {', '.join(sorted(_COMMANDS))}.")
         if not self._access.may_command(request, command, request_object.get("parameters")):
             return refusal_response(
                 403, "The token is missing or wrong: open the address of rigd status."
@@ -359,7 +359,7 @@ async def _serve_until_end(daemon: SupervisorConnection, job: Document) -> None:
     try:
         page_server, _, listening_server = await start_page_server(job)
     except OSError as error:
-        daemon.send(ProcessFailed(f"port {job['port']} cannot be had: {error.strerror}"))
+        daemon.send(ProcessFailed(f"port {job['port']} cannot be opened: {error.strerror}"))
         return
     daemon.send(PageAddress(port_of(listening_server)))
     server_task = asyncio.create_task(page_server.run())

@@ -143,7 +143,7 @@ WRONG = {  # code of a package, its entry points, and the reason that is stated
     "syntax": ("def", "w_syntax:KIND", "SyntaxError"),
     "imports": ("import no_such_module", "w_imports:KIND", "No module named 'no_such_module'"),
     "absent": ("", "w_absent:KIND", "no attribute 'KIND'"),
-    "type": ("KIND = 3", "w_type:KIND", "is a int and no DeviceKind"),
+    "type": ("KIND = 3", "w_type:KIND", "is a int, not a DeviceKind"),
     "form": ("", "w_form", "not of the form name = module:object"),
     "other": (DEVICES, "w_other:TWIN", 'declares the device "twin"'),
     "range": (
@@ -152,7 +152,7 @@ WRONG = {  # code of a package, its entry points, and the reason that is stated
     ),
     "thawed": (
         DEVICES.replace("(frozen=True)", "").replace('"twin", "', '"thawed", "'),
-        "w_thawed:TWIN", "no frozen dataclass",
+        "w_thawed:TWIN", "not a frozen dataclass",
     ),
     "motor": (DEVICES.replace('"twin", "', '"motor", "'), "w_motor:TWIN", "every profile"),
     "cia402": (DEVICES.replace('"twin", "', '"cia402", "'), "w_cia402:TWIN", "built into rigd"),

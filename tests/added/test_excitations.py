@@ -79,7 +79,7 @@ def test_socket_accepts_it_with_its_parameters(packages):
     request = {"command": "start", "excitation": "triangle", "parameters": {"period_s": 2}}
     assert parse_request(json.dumps(request).encode()).parameters == {"period_s": 2.0}
     for parameters, message in (
-        ({"period": 2}, "is not a parameter of triangle; there are amplitude_rad, period_s"),
+        ({"period": 2}, "is not a parameter of triangle; choose from amplitude_rad, period_s"),
         ({"period_s": "2"}, "period_s"),
     ):
         wrong = json.dumps(request | {"parameters": parameters}).encode()
@@ -104,7 +104,7 @@ def test_options_out_of_their_range_are_named(packages, name, value, message):
 WRONG = {  # code of a package, and the reason that is stated
     "raises": ("raise RuntimeError('no')", "RuntimeError: no"),
     "exits": ("import sys; sys.exit()", "SystemExit"),
-    "type": ("TRIANGLE = 'triangle'", "is a str and no ExcitationKind"),
+    "type": ("TRIANGLE = 'triangle'", "is a str, not a ExcitationKind"),
     "other": (EXCITATION, 'declares the excitation "triangle"'),
     "lacks": (
         EXCITATION.replace('"triangle", "S', '"lacks", "S').replace("rest_s: RestS", "rest: float"),
@@ -117,7 +117,7 @@ WRONG = {  # code of a package, and the reason that is stated
     "chirp": (EXCITATION.replace('"triangle", "S', '"chirp", "S'), "built into rigd"),
     "shape": (
         EXCITATION.replace('"triangle", "S', '"shape", "S').replace("(phase % 1)", "phase[1:] % 1"),
-        "no 4000 finite angles",
+        "not an array of 4000 finite angles",
     ),
     "fails": (
         EXCITATION.replace('"triangle", "S', '"fails", "S').replace("/ options.period_s", "/ no"),

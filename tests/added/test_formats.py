@@ -54,7 +54,7 @@ def test_unknown_suffix_is_refused_with_the_known_ones(archive):
 WRONG = {  # code of a package, and the reason that is stated
     "bad": ("raise SystemExit", "SystemExit"),
     "raises": ("raise RuntimeError('no')", "RuntimeError: no"),
-    "kind": ("NPZ = 1", "no ImportFormat"),
+    "kind": ("NPZ = 1", "not a ImportFormat"),
     "absent": ("", "AttributeError"),
     "csv": (FORMAT, "cannot be replaced"),
     "nameless": (FORMAT.replace("NumPy archive", " "), "has no name"),

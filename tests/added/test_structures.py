@@ -108,7 +108,7 @@ def changed(*pairs):
 WRONG = {  # code of a package, and the reason that is stated
     "raises": ("raise RuntimeError('no')", "RuntimeError: no"),
     "exits": ("import sys; sys.exit()", "SystemExit"),
-    "type": ("ZENER = 'zener'", "is a str and no Structure"),
+    "type": ("ZENER = 'zener'", "is a str, not a Structure"),
     "other": (STRUCTURE, 'declares the structure "zener"'),
     "vi": (STRUCTURE, "built into the analyser"),
     "lines": (changed(("material, and", "material\\nand")), "description is not one line"),
@@ -120,7 +120,10 @@ WRONG = {  # code of a package, and the reason that is stated
     "taken": (changed(('"air", "c_a"', '"zeta", "c_a"')), "zeta is taken"),
     "nan": (changed(('["air"] * s', '["air"] * s / 0 * 1j')), "ZeroDivisionError|not finite"),
     "gains": (changed(("elastic = 1 +", "elastic = 1 -")), "stiffness gains energy at"),
-    "hysteretic": (changed(("elastic = 1 +", "elastic = 1 + 0.01j +")), "not real in time"),
+    "hysteretic": (
+        changed(("elastic = 1 +", "elastic = 1 + 0.01j +")),
+        "not a real function",
+    ),
     "fails": (changed(('values["air"]', 'values["wind"]')), "KeyError"),
 }
 

@@ -75,7 +75,7 @@ def test_the_lines_to_grant_missing_rights_are_printed(settings, monkeypatch):
 
 
 def test_memory_locked_in_part_is_a_warning(settings, monkeypatch):
-    granted = {"memory": "locked, but for what is allocated later (limit of 8 MB)"}
+    granted = {"memory": "locked, except for memory that is allocated later (limit of 8 MB)"}
     monkeypatch.setattr("rigd.checks.machine.settings_granted", lambda settings: granted)
     (row,) = rights_rows(settings)
     assert row.verdict is CheckResult.WARNING

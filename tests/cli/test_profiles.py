@@ -87,14 +87,12 @@ def test_values_missing_in_the_file_are_marked_and_listed(new_profile, tmp_path)
         name = question.key.rpartition(".")[2]
         assert not unknown or f'\n{name} = {{ source = "unknown" }}\n' in text
         assert re.search(rf"^# TO FILL IN: [^\n]*\n(# [^\n]*\n)*{name} = ", text, re.MULTILINE)
-    shown = (
-        r'^# TO FILL IN: the drive lacks[^\n]*\n(# [^\n]*\n)+# accept_without = \["torque_limit"\]$'
-    )
+    shown = r'^# TO FILL IN: according[^\n]*\n(# [^\n]*\n)+# accept_without = \["torque_limit"\]$'
     assert re.search(shown, text, re.MULTILINE)
     assert "cia402.accept_without: torque_limit: what the drive lacks" in done.stderr
     assert "It has no object 6072 (Max torque)" in done.stderr
     assert "3001:2 (Output current limit, 15000)" in text.replace("\n# ", " ")
-    assert "rigd check asks the drive" in done.stderr
+    assert "rigd check reads it from the drive" in done.stderr
     # The comments of the base profile are still there.
     assert "The measured coupling torque cancels the beam's reaction" in text
     assert "Written by rigd profiles new from epos4_0170.eds" in text
@@ -356,7 +354,7 @@ def test_no_renamed_copy_of_an_unusual_text(rigd_here, user_folder, tmp_path, si
     (tmp_path / "odd.toml").write_text(sim_toml.replace('name = "sim"', '"name" = "sim"'))
     done = rigd_here("profiles", "copy", "odd.toml", "even")
     assert done.returncode == 2
-    assert "copy the file, edit it" in done.stderr
+    assert "copy the file and edit it" in done.stderr
     assert not user_folder.exists()
 
 

@@ -562,7 +562,7 @@ def test_chirp_there_and_back_begins_as_a_plain_chirp(short_chirps, tmp_path):
     settings = welch_settings(both, WelchSettings())
     responses = [estimate(record, settings)[0].response for record in (both, plain)]
     np.testing.assert_array_equal(*responses)
-    assert any("use the way there alone" in remark for remark in remarks(both))
+    assert any("use the first sweep alone" in remark for remark in remarks(both))
     assert welch_exclusion_reason(both) is None
     assert not remarks(plain)
     # The reference passes the same angles, and the frequency at equal distances from the turn.
@@ -582,7 +582,7 @@ def test_welch_estimate_there_and_back_uses_the_way_there(short_chirps):
     settings = welch_settings(both, WelchSettings(segment_length=1439, overlap=216))
     responses = [estimate(record, settings)[0].response for record in (both, plain)]
     np.testing.assert_array_equal(*responses)
-    assert any("use the way there alone" in remark for remark in remarks(both))
+    assert any("use the first sweep alone" in remark for remark in remarks(both))
     assert welch_exclusion_reason(both) is None
 
 

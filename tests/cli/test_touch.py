@@ -126,10 +126,10 @@ def test_excessive_force_is_a_fault(rigd):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        further(("0", "--fast"), "angle_rad = 0 rad is where the motor stands"),
+        further(("0", "--fast"), "angle_rad = 0 rad is the angle"),
         further(("0.5", "--speed", "0"), "speed_rad_s = 0 rad/s must be more than 0 rad/s"),
         further(("0.5", "--hold", "0.001"), "ends before the motor has stopped"),
-        (("1.8",), "limits.angle_rad); go less far or slower.\n"),
+        (("1.8",), "limits.angle_rad); reduce the angle or the speed.\n"),
         further(("0.5", "--model", "none.json"), "none.json"),
     ],
 )

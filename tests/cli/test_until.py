@@ -220,7 +220,7 @@ def test_unreached_target_is_reported(rigd, tmp_path):
         ((), ("No precision is requested", "--damping 1%")),
         (("--damping", "much"), ("--damping much", "1% or 2:0.5%")),
         (("--damping", "-1%"), ("more than 0",)),
-        (("--zeta", "2:1%"), ("no quantity of a mode",)),
+        (("--zeta", "2:1%"), ("not a quantity of a mode",)),
         (("--damping", "1%", "--at-most", "3"), ("at_most_s = 3 s", "6.5 s")),
         (("--damping", "1%", "--scan", "0.2"), ("scan_s = 0.2 s", "fades")),
         (("--damping", "1%", "--tip-slope", "0"), ("tip_slope_rad",)),

@@ -47,7 +47,7 @@ def test_virtual_clock_only_without_real_time_devices():
 
 def test_only_the_stated_target_moves(rig, stand_in):
     assert not open_devices(rig, ActuationTarget.HARDWARE).simulated
-    with pytest.raises(DeviceError, match="was to move, and now it would be the hardware"):
+    with pytest.raises(DeviceError, match="was to move, but now the hardware would"):
         open_devices(rig, ActuationTarget.SIMULATOR)
     stand_in(rig.name, can_socket="/nowhere")
     assert open_devices(rig, ActuationTarget.SIMULATOR).simulated

@@ -145,7 +145,7 @@ def test_a_silent_encoder_between_sessions_is_reported(make_session):
     session.parent.poll = lambda timeout_s: None
     session.obey()
     (ended,) = session.parent.messages_of(ControlEnded)
-    assert "A new angle has not come for 1 s" in ended.reason
+    assert "A new angle has not arrived for 1 s" in ended.reason
     session.assert_safe()
 
 

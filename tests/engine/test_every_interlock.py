@@ -183,7 +183,7 @@ CASES = {
     ),
     "stopped encoder": Case(
         lambda s: stick_encoder(s, at=FAST),
-        r"Torque that the sudden stop of the encoder would have taken \d?\.?\d+ N·m exceeds limit",
+        r"Torque that the sudden stop of the encoder would have required \d?\.?\d+ N·m exceeds",
     ),
     "repeated angle": Case(
         lambda s: stick_encoder(s, at=1500, every=2),
@@ -234,11 +234,11 @@ CASES = {
             setattr(s.drive, "stale_at", MIDDLE),
             setattr(s.drive, "stale_pattern", (False, True, True)),
         ),
-        r"Share of ticks without a new angle 1\.01 % exceeds limit 1 %",
+        r"Percentage of ticks without a new angle 1\.01 % exceeds limit 1 %",
     ),
     "stale wrench share": Case(
         lambda s: sensor(s, stale=True, stale_every=2),
-        r"Share of ticks without a new wrench 1\.01 % exceeds limit 1 %",
+        r"Percentage of ticks without a new wrench 1\.01 % exceeds limit 1 %",
     ),
     "missed ticks": Case(
         lambda s: miss(s, 80_000_000),
@@ -246,7 +246,7 @@ CASES = {
     ),
     "missed share": Case(
         lambda s: miss(s, *[45_000_000] * 6),
-        r"Share of missed ticks 2\.\d* % exceeds limit 2 %",
+        r"Percentage of missed ticks 2\.\d* % exceeds limit 2 %",
     ),
     "wired stop": Case(drop_sto, r"Simulated drive: the wired stop \(STO\) was dropped.* reset"),
     "recorder lag": Case(lag, r"Recorder backlog 1\.\d+ s exceeds limit 1 s"),

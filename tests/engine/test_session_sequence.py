@@ -245,7 +245,7 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
     assert session.shared_state[StateField.STALE_ANGLES] == len(stale)
     # Four per cent of ten seconds, of which there may be six: reported once, and past half of it.
     [warning] = [event.message for event in session.events if event.level == "warning"]
-    assert warning.startswith("Share of ticks without a new angle 3 % above warning level")
+    assert warning.startswith("Percentage of ticks without a new angle 3 % above warning level")
     assert "limit 6, limits.stale_percent" in warning
 
 
@@ -257,7 +257,7 @@ def test_two_of_three_angles_may_not_be_old(make_session):
     session.assert_safe()
     finished = session.finished
     assert finished.outcome == "fault"
-    assert "Share of ticks without a new angle 1.01 %" in finished.reason
+    assert "Percentage of ticks without a new angle 1.01 %" in finished.reason
     assert "acquisition.deadline_us" in finished.reason
     counts, samples = finished.counts, session.samples
     assert counts["stale_angles"] in (101, 102), "one may come with the last sample"

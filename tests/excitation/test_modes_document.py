@@ -114,7 +114,7 @@ def test_bad_value_is_reported_with_its_remedy(document, modes, words):
     [
         (b"", ("not a JSON document", "analyze")),
         (b"{", ("not a JSON document",)),
-        (b"[]", ("no JSON object", "modes")),
+        (b"[]", ("not a JSON object", "modes")),
         (b'{"fits": []}', ("modes is missing",)),
         (b"\xff\xfe\x00", ("UTF-8",)),
         (b"[" * 100_000, ("nested",)),

@@ -55,7 +55,7 @@ def test_the_move_is_planned_for_the_beam_of_the_analysis(analysed, profile):
         ({"angle_rad": 0.1, "by_rad": 0.1}, "either angle_rad or by_rad"),
         ({"angle_rad": 2.0}, r"limits\.angle_rad = 1\.57 rad allows 1\.539 rad"),
         ({"by_rad": 1.5}, r"by -1\.739 to 1\.339 rad from 0\.2 rad"),
-        ({"angle_rad": 0.2}, "stands at 0.2 rad already"),
+        ({"angle_rad": 0.2}, "is already at 0.2 rad"),
         ({"angle_rad": float("nan")}, "angle_rad = nan rad is not a finite number"),
         ({"angle_rad": 7.0}, "more than a full turn"),
         ({"angle_rad": 0.1, "robust": 2}, "neither 0 nor 1"),
@@ -131,7 +131,7 @@ def test_residual_vibration_with_tip_mass_is_as_planned(rigd, analysed, tmp_path
     stated = {name: float(session.metadata[name]) for name in STATED}
     floor_nm, quintic_nm = stated["residual_floor_nm"], stated["quintic_residual_nm"]
     assert stated["residual_nm"] < floor_nm < 0.02 * quintic_nm
-    assert f"below what the sensor shows ({1e3 * floor_nm:.2g} mN·m)" in done.stderr
+    assert f"below the noise of the sensor ({1e3 * floor_nm:.2g} mN·m)" in done.stderr
     first, end = session.segments["sweep"]
     # The first mode is at 2.29 Hz; that of the profile would be at 2.57 Hz.
     assert amplitude_nm(session.samples, end + 150, 2.286) < min(floor_nm, 0.01 * quintic_nm)
@@ -215,7 +215,7 @@ def test_quiet_sensor_shows_vibration_by_friction(profile):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"angle_rad": 0.2}, r"angle_rad = 0\.2 rad is where the motor stands"),
+        ({"angle_rad": 0.2}, r"angle_rad = 0\.2 rad is the angle"),
         ({"angle_rad": 0.5, "speed_rad_s": 0.0}, r"speed_rad_s = 0 rad/s must be more than 0"),
         ({"angle_rad": 0.5, "hold_s": 1e-3}, "ends before the motor has stopped"),
         ({"angle_rad": 0.5, "passes": 0}, r"passes = 0 must be at least 1"),

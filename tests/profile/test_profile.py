@@ -282,8 +282,8 @@ def test_a_peak_below_the_rated_torque_is_refused(refuse):
         (
             "acceleration_rad_s2 = { value = 2000.0",
             "acceleration_rad_s2 = { value = 1.0e12",
-            "limits.acceleration_rad_s2 = 1e+12 rad/s² finds no jump of the encoder: it is more "
-            "than 100 times the 450 rad/s² that the peak torque gives",
+            "limits.acceleration_rad_s2 = 1e+12 rad/s² cannot detect a jump of the encoder: it is "
+            "more than 100 times the 450 rad/s² that the peak torque gives",
         ),
         (
             "tracking_error_rad = { value = 0.5",

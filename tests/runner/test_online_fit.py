@@ -30,7 +30,7 @@ def fit_of_record(std: float, *, final: bool = True) -> FitReport:
     ("ended", "std", "reached", "reason"),
     [
         (REACHED, 0.9e-4, True, "Reached: damping of mode 1 0.009, standard deviation 8e-05."),
-        (REACHED, 2e-4, False, "Reached on the way, but not by the whole record. So far: damping"),
+        (REACHED, 2e-4, False, "Reached during the session, but not by the whole record."),
         (NOT_REACHED, 0.9e-4, True, "Reached by the fit of the whole record."),
         (NOT_REACHED, 2e-4, False, "Not reached within 20 s (--at-most). So far: damping of mode"),
         (None, 2e-4, False, "So far: damping of mode 1 0.01"),
@@ -59,14 +59,15 @@ NOT_A_NUMBER = fit_of_record(float("nan"))
     ("messages", "state", "reached", "words"),
     [
         ((REACHED, ON_THE_WAY), STOPPED, None,
-         ("Reached on the way. Not known", "A stop skipped the fit", "Last estimate: damping of")),
+         ("Reached during the session. Not known", "A stop skipped", "Last estimate: damping")),
         ((ON_THE_WAY,), STOPPED, None, ("Not known", "A stop skipped", "Last estimate: damping")),
-        ((REACHED,), STOPPED, None, ("Reached on the way. Not known", "A stop skipped")),
+        ((REACHED,), STOPPED, None, ("Reached during the session. Not known", "A stop skipped")),
         ((REACHED, ON_THE_WAY, ChildError("The fit process was killed.")), {}, None,
-         ("Reached on the way. Not known", "was killed.", "Last estimate: damping of mode 1")),
+         ("Reached during the session. Not known", "was killed.", "Last estimate: damping")),
         ((ON_THE_WAY, ChildError("The fit process was killed.")), {}, None,
          ("Not known", "was killed.", "Last estimate")),
-        ((REACHED, FAILED), {}, None, ("Reached on the way. Not known", "The sensor stands still")),
+        ((REACHED, FAILED), {}, None,
+         ("Reached during the session. Not known", "The sensor stands still")),
         ((REACHED, NOT_A_NUMBER), {}, False, ("not by the whole record. So far: damping of mode",)),
     ],
 )  # fmt: skip

@@ -90,7 +90,7 @@ def test_motor_identification_is_independent_of_the_model(profile):
     plan = predict_session(profile, excitation)
     assert plan.prediction.tip.slope_rad > SMALL_SLOPE_RAD
     assert not plan.refused
-    assert "does not rest on it" in plan.tip_in_words
+    assert "does not depend on it" in plan.tip_in_words
     assert "amplitude" not in plan.tip_in_words
 
 

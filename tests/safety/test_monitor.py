@@ -186,7 +186,7 @@ def test_many_old_readings_near_their_limit_mark_the_next_sample(watch):
     assert not watch.warning
     angle, wrench = watch.take_notices()
     assert angle == (
-        "Share of ticks without a new angle 0.51 % above warning level 0.5 % (limit 1, "
+        "Percentage of ticks without a new angle 0.51 % above warning level 0.5 % (limit 1, "
         "limits.stale_percent)."
     )
     assert "new wrench 0.6 %" in wrench
@@ -196,7 +196,7 @@ def test_many_old_readings_near_their_limit_mark_the_next_sample(watch):
 def test_too_many_old_readings_end_a_session(watch, angles, wrenches, which):
     assert watch.check_stale_fraction(100, 100, 10_000) is None
     violation = watch.check_stale_fraction(angles, wrenches, 5)  # as if ten seconds had passed
-    assert violation.channel == f"share of ticks without a new {which}"
+    assert violation.channel == f"percentage of ticks without a new {which}"
     assert (violation.value, violation.limit) == (pytest.approx(1.01), 1.0)
     assert watch.check_stale_fraction(400, 400, 40_000) is None
 

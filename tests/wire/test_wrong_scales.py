@@ -81,7 +81,7 @@ def rig_on_wire(write_profile, start_simulator, load, tmp_path):
 
 @pytest.mark.further
 def test_a_wrong_scale_stated_by_the_drive_is_refused(rig_on_wire):
-    with pytest.raises(RigError, match=r"608F and 6091.*resolution_rad says 2.8e-05"):
+    with pytest.raises(RigError, match=r"608F and 6091.*resolution_rad is 2.8e-05"):
         rig_on_wire({"encoder.resolution_rad": "2.8e-5"}, states_scales=True)
 
 

@@ -78,7 +78,7 @@ def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings
             )
         _require(
             _has_value(tags, "cfgtfx", ";".join(map(str, settings.tool_transform))), tags, "cfgtfx",
-            f"netft.tool_transform is {settings.tool_transform}; correct the one or the other",
+            f"netft.tool_transform is {settings.tool_transform}; correct one of them",
         )  # fmt: skip
         _require(
             settings.serial_number in ("", tags.get("cfgcalsn")), tags, "cfgcalsn",
@@ -109,7 +109,7 @@ def _box_settings(tags: Mapping[str, str]) -> BoxSettings:
         _require(unit in units, tags, unit_tag, "unknown unit; choose another")
         per_unit = _numbers(tags.get(tag, ""))
         is_positive = len(per_unit) == 1 and per_unit[0] > 0
-        _require(is_positive, tags, tag, "no number above 0; check the box")
+        _require(is_positive, tags, tag, "not a number above 0; check the box")
         counts_per_unit += 3 * per_unit
         units_per_count += 3 * [units[unit] / per_unit[0]]
     identity: dict[str, object] = {name: tags.get(tag, "") for name, tag in _IDENTITY_TAGS.items()}

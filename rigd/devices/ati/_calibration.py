@@ -102,8 +102,8 @@ class Calibration:
         if self.counts_per_force <= 0 or self.counts_per_torque <= 0:
             raise ValueError(
                 f"its calibration has {self.counts_per_force} counts per force and "
-                f"{self.counts_per_torque} per torque, where positive numbers belong. Choose "
-                "another calibration."
+                f"{self.counts_per_torque} per torque, but both must be positive. Choose another "
+                "calibration."
             )
         self._check_matrix()
 

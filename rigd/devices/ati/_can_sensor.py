@@ -37,8 +37,8 @@ _MIN_RESTART_S = 0.005
 
 _ASSUMED_SCALE_TEXT = (
     f"{netcanoem.COUNTS_OF_OLD_FIRMWARE} counts per N and per N·m: firmware before "
-    f"{'.'.join(map(str, netcanoem.FIRST_FIRMWARE_WITH_SCALE))} tells neither counts per unit nor "
-    "units"
+    f"{'.'.join(map(str, netcanoem.FIRST_FIRMWARE_WITH_SCALE))} reports neither counts per unit "
+    "nor units"
 )
 """Counts per unit assumed for old firmware, as text for the session file and the operator."""
 
@@ -77,7 +77,7 @@ class AtiCanSensor:
         if settings is None or acquisition is None:
             missing_section = "ati_can" if settings is None else "acquisition"
             raise DeviceError(
-                f"The profile has no section [{missing_section}], which a sensor on CAN needs."
+                f"The profile has no section [{missing_section}], which a sensor on CAN requires."
             )
         self._settings = settings
         self._link = link
@@ -326,8 +326,8 @@ class AtiCanSensor:
     def _restart_error(self, cause: str) -> DeviceError:
         """Return the error for a box that has restarted and lost its selected calibration."""
         return DeviceError(
-            f"{self._name}: {cause}; it is back at calibration 0, and what it measures since is "
-            f"not measured with calibration {self._settings.calibration} (ati_can.calibration). "
+            f"{self._name}: {cause}; it is back at calibration 0, so that its readings since then "
+            f"are not those of calibration {self._settings.calibration} (ati_can.calibration). "
             "Reconnecting (rigd reset, or another rigd run) selects it again. Check the box's "
             "supply and cable; if it happens again, have the box replaced."
         )
@@ -349,7 +349,8 @@ class AtiCanSensor:
                 return True
             if row_read == earlier_row:
                 raise self._restart_error(
-                    "it was silent for a moment and answers with another calibration matrix since"
+                    "it was silent for a moment and has answered with another calibration matrix "
+                    "since then"
                 )
             # A single mismatch may be a damaged reply, as at connecting.
             self._row_read_before = row_read
@@ -421,9 +422,9 @@ class AtiCanSensor:
         profile_number = self._settings.serial_number
         if not same_serial_number(profile_number, reported_number):
             raise DeviceError(
-                f"{self._name}: its serial number is {reported_number or 'empty'}, where the "
-                f"profile asks for {profile_number} (ati_can.serial_number). Check which sensor is "
-                "on the rig."
+                f"{self._name}: its serial number is {reported_number or 'empty'}, but the profile "
+                f"requires {profile_number} (ati_can.serial_number). Check which sensor is on the "
+                "rig."
             )
         return reported_number
 

@@ -463,7 +463,7 @@ class AtiSerialSensor:
                     f"{self._name}: it was commanded to stream, but of the "
                     f"{self._arrived_bytes - bytes_before} bytes that came in "
                     f"{_FIRST_RECORDS_TIMEOUT_S} s only {self.stream.records - records_before} "
-                    "were sound records. Check cable, ati_serial.baud and ati_serial.stream_hz."
+                    "were valid records. Check cable, ati_serial.baud and ati_serial.stream_hz."
                 )
             serial_line.wait(FRAME_SILENCE_S)
             self._split_records(serial_line.read())

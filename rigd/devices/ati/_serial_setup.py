@@ -263,8 +263,8 @@ class SerialSetup:
         sensor_number = calibration_block.calibration.serial_number
         if not same_serial_number(profile_number, sensor_number):
             raise DeviceError(
-                f"{self._name}: its serial number is {sensor_number or 'empty'}, where the profile "
-                f"asks for {profile_number} (ati_serial.serial_number). Check which sensor is on "
+                f"{self._name}: its serial number is {sensor_number or 'empty'}, but the profile "
+                f"requires {profile_number} (ati_serial.serial_number). Check which sensor is on "
                 "the rig."
             )
         return calibration_block
@@ -291,7 +291,7 @@ class SerialSetup:
             raise DeviceError(
                 f"{self._name}: gains and offsets read back as {active_values}, where "
                 f"{written_values} were written. Switch it off and on; without them its "
-                "calibration does not hold."
+                "calibration is not valid."
             )
 
     def start_streaming(self) -> bytes:

@@ -206,9 +206,9 @@ class PythonCanPort:
                 return DAMAGED_FRAME
             self._consecutive_damaged_frames = 0
             raise DeviceError(
-                f"CAN bus {self.name}: the adapter sends what is no CAN frame, "
-                f"{_MAX_DAMAGED_FRAMES} times in a row ({_error_text(error)}); check the adapter, "
-                "its cable and its firmware."
+                f"CAN bus {self.name}: the adapter sent {_MAX_DAMAGED_FRAMES} invalid CAN frames "
+                f"in a row ({_error_text(error)}); check the adapter, its cable and its "
+                "firmware."
             ) from None
         if raw_frame is not None and not unpack_header(raw_frame)[0] & ERROR_FLAG:
             self._consecutive_damaged_frames = 0

@@ -35,7 +35,7 @@ class DriveState(Enum):
     QUICK_STOP = "quick stop active"
     FAULT_REACTION = "fault reaction active"
     FAULT = "fault"
-    UNKNOWN = "no state of CiA 402"
+    UNKNOWN = "not a state of CiA 402"
 
 
 DISABLE_VOLTAGE: Final = 0x00
@@ -270,7 +270,7 @@ _ERROR_MEANINGS: Final = (
     (0xFF00, 0x8200, "protocol"),
     (0xF000, 0x8000, "monitoring"),
     (0xF000, 0x9000, "external error"),
-    (0xFF00, 0xFF00, "particular to the device: see its manual"),
+    (0xFF00, 0xFF00, "device-specific: see its manual"),
     (0xF000, 0xF000, "additional function"),
 )
 """Meanings of error codes: mask, masked value, meaning; the most specific masks come first."""

@@ -251,9 +251,9 @@ class SdoAccess:
         value_read = self.read(index, sub)
         if (value_read ^ value) & mask:
             raise ValueNotStoredError(
-                f"{self._name}: {self._object_name(index, sub)} was set to {show_value(value)} "
-                f"and reads {show_value(value_read)}; check with the drive's own tool why it does "
-                "not keep it.",
+                f"{self._name}: {self._object_name(index, sub)} was set to {show_value(value)} and "
+                f"reads {show_value(value_read)}; check with the drive's own tool why it does not "
+                "retain this value.",
                 value_read,
             )
 

@@ -196,8 +196,8 @@ def _check_identity(
             reported_text = "nothing" if reported_number is None else f"0x{reported_number:08X}"
             raise DeviceError(
                 f"{drive_name}: it is another drive: {requirement_source} is "
-                f"0x{required_number:08X}, it says {reported_text}. Check cia402.node_id, or write "
-                "into the profile what is really there."
+                f"0x{required_number:08X}, but it reports {reported_text}. Check cia402.node_id, "
+                "or enter the actual drive in the profile."
             )
     mode_bits = identity["supported_modes"]
     if not (isinstance(mode_bits, int) and mode_bits & objects.CYCLIC_TORQUE_MODE_BIT):
@@ -254,9 +254,10 @@ class _DriveConfiguration:
             if present_value is None:
                 raise
             readback_error = DeviceError(
-                f"{self._name}: object {row.address} ({row.name}) is {show_value(present_value)}, "
-                f"needed is {show_value(required)}, and it refuses to change it (abort code "
-                f"0x{refusal.code:08X}: {_abort_meaning(refusal)}). {row.sentence}"
+                f"{self._name}: object {row.address} ({row.name}) is "
+                f"{show_value(present_value)} but must be {show_value(required)}, and the drive "
+                f"refuses to change it (abort code 0x{refusal.code:08X}: "
+                f"{_abort_meaning(refusal)}). {row.sentence}"
             )
         else:
             return True
@@ -298,7 +299,7 @@ class _DriveConfiguration:
         if abs(reported_nm - profile_nm) > _RATED_TORQUE_TOLERANCE * profile_nm:
             raise DeviceError(
                 f"{self._name}: its rated torque (object 6076 = {torque_counts}) is "
-                f"{reported_nm:.4g} N·m at the output shaft, motor.rated_torque_nm says "
+                f"{reported_nm:.4g} N·m at the output shaft, but motor.rated_torque_nm is "
                 f"{profile_nm:.4g} N·m; every torque would be wrong by that ratio. Correct the "
                 "profile or the drive."
             )
@@ -316,8 +317,8 @@ class _DriveConfiguration:
         if drive_gear is not None and not _is_ratio_equal(drive_gear, profile_gear):
             raise DeviceError(
                 f"{self._name}: its gear (object 6091) is {drive_gear:.5g} turns of the motor in "
-                f"one of the output shaft, cia402.gear_ratio says {profile_gear:.5g}. Correct the "
-                "profile or the drive."
+                f"one of the output shaft, but cia402.gear_ratio is {profile_gear:.5g}. Correct "
+                "the profile or the drive."
             )
         # Position units per revolution of the output shaft: encoder increments, unless the drive
         # has a feed constant that defines other units.
@@ -342,9 +343,10 @@ class _DriveConfiguration:
         )
         raise DeviceError(
             f"{self._name}: its encoder step (object {gear_objects}) is {tau / turn_units[0]:.4g} "
-            f"rad at the output shaft ({turn_units[0]:.6g} steps a turn), encoder.resolution_rad "
-            f"says {step_rad:.4g} rad; every angle, speed and limit would be wrong by the ratio "
-            f"{tau / turn_units[0] / step_rad:.3g}. Correct the profile or the drive."
+            f"rad at the output shaft ({turn_units[0]:.6g} steps a turn), but "
+            f"encoder.resolution_rad is {step_rad:.4g} rad; every angle, speed and limit would be "
+            f"wrong by the ratio {tau / turn_units[0] / step_rad:.3g}. Correct the profile or the "
+            "drive."
         )
 
     def _read_ratio(self, index: int) -> float | None:

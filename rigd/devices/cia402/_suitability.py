@@ -34,13 +34,13 @@ class Grade(Enum):
 
     FITS = "as needed"
     """The object is as needed."""
-    SUBSTITUTED = "something else does its work"
+    SUBSTITUTED = "a substitute is used"
     """The object is absent, and something else replaces it."""
-    ASK = "the drive will be asked"
+    ASK = "rigd reads it from the drive"
     """The file does not state the value; it is read from the drive when connected."""
     ACCEPTED = "the profile accepts that it is missing"
     """The object is absent, and the profile accepts that."""
-    DOUBT = "a session can be run; somebody should check it"
+    DOUBT = "a session can be run; check the object"
     """A session can be run, but the operator should check the object."""
     REFUSED = "no session with this drive"
     """No session is possible with this drive."""
@@ -159,8 +159,8 @@ class _SuitabilityCheck:
                 )
                 continue
             sentence = (
-                f"The file is of another drive than the profile's: cia402.{key} is "
-                f"0x{wanted_text:08X}, the file says {value_text}."
+                f"The file describes another drive than the profile: cia402.{key} is "
+                f"0x{wanted_text:08X}, but the file states {value_text}."
             )
             yield SuitabilityFinding(
                 object_text, found_text, f"0x{wanted_text:08X}", Grade.REFUSED, sentence
@@ -207,7 +207,7 @@ class _SuitabilityCheck:
             return SuitabilityFinding(object_text, value_text, wanted_text, Grade.REFUSED, sentence)
         return SuitabilityFinding(
             object_text,
-            "the file does not state it; the drive will be asked",
+            "the file does not state it; rigd reads it from the drive",
             wanted_text,
             Grade.ASK,
         )
@@ -316,7 +316,7 @@ class _SuitabilityCheck:
             return self._read_only_object(row, eds_entry, found_text, wanted_value)
         if ObjectAccess.READ in row.access and eds_entry.access == "wo":
             return objection(
-                f"is write-only: what it holds cannot be checked. {row.sentence}".rstrip(),
+                f"is write-only: its value cannot be checked. {row.sentence}".rstrip(),
                 doubt=row.index in MAY_BE_WRITE_ONLY,
             )
         if wanted_value is not None and not _is_within_limits(eds_entry, wanted_value):
@@ -368,11 +368,11 @@ class _SuitabilityCheck:
             )
         if is_acceptable is None and row.index != objects.CONTROLWORD:
             return SuitabilityFinding(
-                object_text, f"{found_text}: the drive will be asked", wanted_text, Grade.ASK
+                object_text, f"{found_text}: rigd reads it from the drive", wanted_text, Grade.ASK
             )
         sentence = (
-            f"its object {row.address} ({row.name}) is read-only and does not hold what is "
-            f"needed{f' ({wanted_text})' if wanted_text else ''}. {row.sentence}"
+            f"its object {row.address} ({row.name}) is read-only and does not have the required "
+            f"value{f' ({wanted_text})' if wanted_text else ''}. {row.sentence}"
         )
         return SuitabilityFinding(
             object_text, found_text, wanted_text, Grade.REFUSED, _capitalise(sentence)

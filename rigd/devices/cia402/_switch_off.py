@@ -166,8 +166,8 @@ def _confirm_off(sdo: SdoAccess, drive_name: str) -> None:
     raise DeviceError(
         f"{drive_name}: it was commanded to switch off and has not done so within "
         f'{_SWITCH_OFF_TIMEOUT_S:g} s: it is in "{drive_state(statusword).value}" (statusword '
-        f"0x{statusword:04X}); {_PRESS_STO_ADVICE}. Its watch over the heartbeat (object 1016) was "
-        "left as it was."
+        f"0x{statusword:04X}); {_PRESS_STO_ADVICE}. Its heartbeat watchdog (object 1016) was left "
+        "unchanged."
     )
 
 

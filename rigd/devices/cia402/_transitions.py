@@ -134,9 +134,9 @@ class TorqueFollowingCheck:
             raise DeviceError(
                 f"{self._name}: it exerts {actual_per_mille / 10:g} % of the rated torque (object "
                 f"6077) where {self._commanded_per_mille / 10:g} % were commanded, for "
-                f"{_MAX_DEVIATING_TICKS} ticks; commands are lost, or the drive limits them. "
-                "Check its diagnosis and cia402.torque_tolerance_percent; where it measures this "
-                "torque, check cia402.torque_response_s."
+                f"{_MAX_DEVIATING_TICKS} ticks; commands are lost, or the drive limits them. Check "
+                "its diagnosis and cia402.torque_tolerance_percent; if it measures this torque, "
+                "check cia402.torque_response_s."
             )
 
 

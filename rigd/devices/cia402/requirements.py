@@ -53,7 +53,7 @@ class Watchdog(Enum):
 
     HEARTBEAT = "heartbeat consumer (1016:1)"
     RPDO_DEADLINE = "deadline of the RPDO (1400:5)"
-    OWN = "maker's own watchdog (cia402.own_watchdog_s)"
+    OWN = "manufacturer's own watchdog (cia402.own_watchdog_s)"
     NONE = "none"
 
 
@@ -333,7 +333,7 @@ OPTIONAL_REQUIREMENTS: Final = (
         "Communication cycle period",
         False,
         _READ_ACCESS | _WRITE_ACCESS,
-        "transmission type 1: the drive goes by the SYNCs that come",
+        "transmission type 1: the drive follows the SYNCs that it receives",
         "It must be the period of rig.rate_hz in microseconds, or 0.",
         AllowedValue.EQUAL_OR_UNUSED,
     ),
@@ -344,7 +344,7 @@ OPTIONAL_REQUIREMENTS: Final = (
         False,
         _READ_ACCESS | _WRITE_ACCESS,
         "no window",
-        f"A torque that comes later than it is dropped. {_CLEAR_STORED_VALUE}",
+        f"A torque that arrives later than that is dropped. {_CLEAR_STORED_VALUE}",
         must_be_zero=True,
     ),
     Requirement(
@@ -443,8 +443,8 @@ OPTIONAL_REQUIREMENTS: Final = (
         _READ_ACCESS | _WRITE_ACCESS,
         "a manufacturer-specific limit, set by cia402.set_objects (maxon EPOS4: 3001:2), the speed "
         "limit 6080, and the cut to motor.peak_torque_nm in this program",
-        "The drive then has no limit of its own for the torque that rigd could set. Set the one "
-        "that its maker gives it by cia402.set_objects.",
+        "The drive then has no limit of its own for the torque that rigd could set. Set its "
+        "manufacturer-specific limit with cia402.set_objects.",
         accept=TORQUE_LIMIT,
     ),
     *(
@@ -455,8 +455,8 @@ OPTIONAL_REQUIREMENTS: Final = (
             False,
             _READ_ACCESS | _WRITE_ACCESS,
             "Max torque (6072)",
-            "It cuts torques that the profile allows: raise it with the drive's own tool, or lower "
-            "motor.peak_torque_nm.",
+            "It limits torques that the profile allows: raise it with the drive's own tool, or "
+            "lower motor.peak_torque_nm.",
             AllowedValue.AT_LEAST,
         )
         for index, name in zip(
@@ -512,7 +512,7 @@ OPTIONAL_REQUIREMENTS: Final = (
         False,
         _READ_ACCESS | ObjectAccess.SENT,
         "",
-        "Torque commands that are lost, or cut by the drive, would not be noticed.",
+        "Torque commands that are lost, or limited by the drive, would not be noticed.",
         value_rule=AllowedValue.ANY,
         accept=TORQUE_FEEDBACK,
     ),
@@ -524,7 +524,7 @@ OPTIONAL_REQUIREMENTS: Final = (
         _READ_ACCESS | _WRITE_ACCESS,
         "nothing: cia402.max_speed_rad_s = 0, and a longer worst travel in rigd check",
         "The drive has no limit of its own for the speed: set cia402.max_speed_rad_s = 0, and see "
-        "what rigd check then says of the worst travel.",
+        "the worst travel in rigd check.",
     ),
     # Values that a drive may have stored in earlier use.
     Requirement(
@@ -534,7 +534,7 @@ OPTIONAL_REQUIREMENTS: Final = (
         False,
         _READ_ACCESS | _WRITE_ACCESS,
         "no inhibit time",
-        f"It keeps back angles that SYNC asks for. {_CLEAR_STORED_VALUE}",
+        f"It delays angles that SYNC requests. {_CLEAR_STORED_VALUE}",
         must_be_zero=True,
     ),
     Requirement(
@@ -544,8 +544,8 @@ OPTIONAL_REQUIREMENTS: Final = (
         False,
         _READ_ACCESS,
         "no polarity",
-        "It turns the position, the speed or the torque round: turned alone, one of them makes the "
-        f"loop run away. {_CLEAR_STORED_VALUE} The direction of the axis is cia402.direction.",
+        "It reverses the position, the speed or the torque: if only one of them is reversed, the "
+        f"loop is unstable. {_CLEAR_STORED_VALUE} The direction of the axis is cia402.direction.",
         must_be_zero=True,
     ),
     Requirement(

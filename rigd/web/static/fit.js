@@ -33,7 +33,7 @@ export class Fit {
 
   #targets(targets) {
     if (!targets.length) return "";
-    return table("fit-targets", ["Asked for", "Standard deviation", "Asked", "Information"],
+    return table("fit-targets", ["Quantity", "Standard deviation", "Requested", "Information"],
       targets.map(({ name, value, std, asked_std: asked, doubt }) => {
         const known = Number.isFinite(std) && Number.isFinite(asked) && std > 0;
         // Information grows with time, once what tells most is excited; deviations go slower.

@@ -280,7 +280,7 @@ def test_a_watchdog_reset_in_mid_session_is_a_fault(bench):
         DeviceError, match=r"watchdog has reset it .*back at calibration 0"
     ) as caught:
         bench.tick()
-    assert "not measured with calibration 1 (ati_can.calibration)" in str(caught.value)
+    assert "not those of calibration 1 (ati_can.calibration)" in str(caught.value)
     bench.sensor.connect()  # the bit stays, and the calibration is selected again
     assert bench.fake.requests.count((6, b"\x01")) == 2
     bench.tick()

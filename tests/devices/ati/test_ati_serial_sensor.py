@@ -507,7 +507,7 @@ def test_a_start_without_sound_records(open_sensor, digital_ft, monkeypatch, fir
     digital_ft.first_records = first * 30
     message = refusal(open_sensor())
     assert f"of the {390 if first else 0} bytes" in message
-    assert "only 0 were sound records" in message
+    assert "only 0 were valid records" in message
 
 
 def test_failure_to_stop_the_stream(open_sensor, digital_ft, monkeypatch, fakes):

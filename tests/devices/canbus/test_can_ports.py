@@ -391,7 +391,9 @@ def test_nineteen_damaged_lines_between_sound_ones_are_tolerated(scripted_port):
 def test_silence_and_reports_do_not_reset_damaged_lines(scripted_port):
     script = [ValueError("odd"), None, message(1, bytes(8), is_error_frame=True)] * 20
     exchange = CanExchange(scripted_port(*script))
-    with pytest.raises(DeviceError, match=r"slcan0 \(slcan\).*20 times in a row.*ValueError: odd"):
+    with pytest.raises(
+        DeviceError, match=r"slcan0 \(slcan\).*20 invalid CAN frames in a row.*ValueError: odd"
+    ):
         for _ in range(60):
             exchange.drain()
 

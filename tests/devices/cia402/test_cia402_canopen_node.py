@@ -208,7 +208,7 @@ def test_read_only_limits_of_elmo(node, connect, rig):
 def test_a_read_only_limit_that_is_too_low(node, connect, rig):
     node.sdo[0x60E1].raw = 500
     node.object_dictionary[0x60E1].access_type = "ro"
-    with pytest.raises(DeviceError, match=r"60E1 .*is 500, needed is 1800.*read-only"):
+    with pytest.raises(DeviceError, match=r"60E1 .*is 500 but must be 1800.*read-only"):
         connect()
 
 

@@ -65,7 +65,7 @@ class TestRealDrives:
 def test_a_low_read_only_limit_is_refused_by_name(make, scripted, index):
     scripted.objects[index, 0] = 1799
     scripted.read_only.add((index, 0))
-    words = rf"{index:04X} .*is 1799, needed is 1800.*read-only.*motor\.peak_torque_nm"
+    words = rf"{index:04X} .*is 1799 but must be 1800.*read-only.*motor\.peak_torque_nm"
     with pytest.raises(DeviceError, match=words):
         make().connect()
 
@@ -79,7 +79,7 @@ def test_a_read_only_object_with_the_needed_value_is_accepted(make, scripted):
 def test_a_high_read_only_limit_does_not_count(make, scripted):
     scripted.objects[0x6072, 0] = 5000
     scripted.read_only.add((0x6072, 0))
-    with pytest.raises(DeviceError, match=r"6072 .*is 5000, needed is 1800"):
+    with pytest.raises(DeviceError, match=r"6072 .*is 5000 but must be 1800"):
         make().connect()
 
 
@@ -161,7 +161,7 @@ class TestWatchdog:
         drive = make(own_watchdog_s=0.03)
         drive.connect()
         assert drive.statement()["drive_watchdog_s"] == "0.03"
-        assert "maker's own" in drive.statement()["drive_watchdog"]
+        assert "manufacturer's own" in drive.statement()["drive_watchdog"]
 
     def test_no_watchdog_is_accepted_by_name_and_reported(self, make, scripted, rig):
         without(scripted, (0x1016, 1))
@@ -244,7 +244,9 @@ class TestValuesFromBefore:
     @pytest.mark.parametrize("polarity", [0x80, 0x40, 0xC0])
     def test_a_polarity_is_refused_by_name(self, make, scripted, polarity):
         scripted.objects[0x607E, 0] = polarity
-        with pytest.raises(DeviceError, match=rf"607E \(Polarity\) is 0x{polarity:02X}.*run away"):
+        with pytest.raises(
+            DeviceError, match=rf"607E \(Polarity\) is 0x{polarity:02X}.*is unstable"
+        ):
             make().connect()
         assert (0x607E, 0) not in written(scripted)
 

@@ -163,7 +163,7 @@ def test_endless_lines_do_not_prevent_switching_off(behind_adapter, adapter, scr
 
     port = drive._link.exchange.port
     port._bus = AlwaysDamaged(port._bus)
-    with pytest.raises(DeviceError, match=r"no CAN frame, 20 times in a row \(ValueError: non-hex"):
+    with pytest.raises(DeviceError, match=r"20 invalid CAN frames in a row \(ValueError: non-hex"):
         ticks(drive, 100)
     drive.disable()
     assert scripted.wait_for(lambda it: it.torque == 0)

@@ -196,8 +196,8 @@ STEPS = round(tau / 7e-5)
 @pytest.mark.parametrize(
     ("stated", "words"),
     [
-        ({0x6091: (50, 1)}, ["object 6091", "50 turns", "cia402.gear_ratio says 100"]),
-        ({0x608F: (STEPS // 4, 100)}, ["608F", "resolution_rad says 7e-05", "the ratio 4"]),
+        ({0x6091: (50, 1)}, ["object 6091", "50 turns", "cia402.gear_ratio is 100"]),
+        ({0x608F: (STEPS // 4, 100)}, ["608F", "resolution_rad is 7e-05", "the ratio 4"]),
         ({0x608F: (STEPS, 50), 0x6091: (100, 1)}, ["608F and 6091", "the ratio 0.5"]),
         ({0x6092: (4 * STEPS, 1)}, ["object 6092", "the ratio 0.25"]),
     ],

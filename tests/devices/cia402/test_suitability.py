@@ -115,7 +115,7 @@ def test_a_file_without_modes_leaves_the_question_to_the_drive(check, modes):
     found = check(changed("6502", f"u32 ro {modes}"))
     assert found.refusals == ()
     assert by_address(found)["6502"].grade is Grade.ASK
-    assert "the drive will be asked" in by_address(found)["6502"].found
+    assert "rigd reads it from the drive" in by_address(found)["6502"].found
 
 
 def test_a_mode_that_cannot_be_set_does_not_count(check):
@@ -134,12 +134,16 @@ def test_a_mode_that_cannot_be_set_does_not_count(check):
     [
         ("6071", "i16 rww 0", "cannot be mapped into a PDO"),
         ("6064", "i16 ro 0 *", "has 16 bits, not 32"),
-        ("6040", "u16 ro 0 *", "is read-only and does not hold what is needed"),
-        ("1600:0", "u8 ro 1", "is read-only and does not hold"),
-        ("1800:2", "u8 ro 255", "is read-only and does not hold what is needed (1)"),
-        ("1400:1", "u32 ro 0x80000201", "is read-only and does not hold what is needed (0x201)"),
-        ("60B2", "i16 ro 5 *", "is read-only and does not hold what is needed (0)"),
-        ("1800:3", "u16 ro 10", "is read-only and does not hold what is needed (0)"),
+        ("6040", "u16 ro 0 *", "is read-only and does not have the required value"),
+        ("1600:0", "u8 ro 1", "is read-only and does not have"),
+        ("1800:2", "u8 ro 255", "is read-only and does not have the required value (1)"),
+        (
+            "1400:1",
+            "u32 ro 0x80000201",
+            "is read-only and does not have the required value (0x201)",
+        ),
+        ("60B2", "i16 ro 5 *", "is read-only and does not have the required value (0)"),
+        ("1800:3", "u16 ro 10", "is read-only and does not have the required value (0)"),
     ],
 )
 def test_unusable_objects_are_refused(check, address, line, words):
@@ -154,7 +158,7 @@ def test_unusable_objects_are_refused(check, address, line, words):
         ("1005", "u32 const 0x80", "const, 0x80: it does"),
         ("1014", "u32 const $NODEID+0x80", "const, 0x81: it does"),
         ("60B2", "i16 ro 0 *", "ro, 0: it does"),
-        ("1400:2", "u8 ro -", "ro: the drive will be asked"),
+        ("1400:2", "u8 ro -", "ro: rigd reads it from the drive"),
     ],
 )
 def test_read_only_objects_may_have_the_needed_value(check, address, line, found):
