@@ -25,22 +25,22 @@ WELCH_OMITTED_TEXT: Final = "Welch fits left out: "
 _WELCH_EXCLUSIONS: Final = {
     "step": "a step excites all frequencies at one moment, which averaging over segments loses",
     "move": "a move excites all frequencies at one moment, which averaging over segments loses",
-    "touch": "a touch excites little, and a beam that meets something responds as another one",
+    "touch": "a touch excites little, and a beam in contact responds differently",
     "multisine": "a multisine excites single lines, and segments spread noise between them",
     "modes": "narrow sweeps excite the modes alone, and the response between them is noise",
-    "until": "a search excites little beside the modes, and the response between them is noise",
+    "until": "a search excites little except the modes, and the response between them is noise",
 }
 """Reasons why Welch's method is not applicable to a session, by the name of its excitation."""
 
 _TOUCH_REMARK: Final = (
-    "The session is a touch, but the fits take the beam to be free: they hold only if it met "
-    "nothing. analyze touch finds where, when and how hard it did."
+    "The session is a touch, but the fits assume a free beam: they are valid only if it touched "
+    "nothing. analyze touch estimates where, when and how hard it touched something."
 )
 """Remark on a session with a planned touch."""
 
 _TWO_SWEEPS_REMARK: Final = (
-    "The session sweeps there and back: the Welch fits use the way there alone, those of the whole "
-    "record use both."
+    "The session sweeps there and back: the Welch fits use the first sweep alone, those of the "
+    "whole record use both."
 )
 """Remark on a session with a sweep in both directions."""
 
@@ -171,8 +171,8 @@ def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]
     if record.swept_hz is not None:
         return (
             *remark_sentences,
-            f"Fits use {first_hz:.4g} to {last_hz:.4g} Hz, which the part of the sweep covers: "
-            "beyond there is noise alone.",
+            f"Fits use {first_hz:.4g} to {last_hz:.4g} Hz, which this part of the sweep covers: "
+            "there is only noise beyond.",
         )
     return (
         *remark_sentences,
@@ -248,7 +248,7 @@ def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> 
         paper_segmentation = WelchSettings().segmentation(record.rate_hz)
         is_long_enough = record.sweep_samples >= paper_segmentation.segment_length
         method_options = "--method welch" if is_long_enough else "--method welch --frf fft"
-        return f"{exclusion} ({method_options} makes them nevertheless)"
+        return f"{exclusion} ({method_options} computes them nevertheless)"
     if record.part_s is not None:
         return None  # the default band is that of the part
     planned_s = _metadata_number(record, "duration_s")
@@ -261,7 +261,8 @@ def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> 
         return None
     return (
         f"the sweep ended after {swept_s:.4g} of {planned_s:g} s, at {reached_hz:.3g} Hz, and "
-        f"beyond there is noise alone; --band {first_hz:g},{reached_hz:.3g} makes them up to there"
+        f"there is only noise beyond; --band {first_hz:g},{reached_hz:.3g} computes them up to "
+        "there"
     )
 
 

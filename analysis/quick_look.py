@@ -351,7 +351,7 @@ def _stored_quick_look(session_path: Path) -> dict[str, Any]:
     quick_look = read_quick_look(quick_look_path(session_path))
     if quick_look is None:
         raise QuickLookError(
-            f"--last {session_path}: there is no readable quick look beside it; make one with "
+            f"--last {session_path}: there is no readable quick look next to it; make one with "
             f"python -m analysis.quick_look {session_path}."
         )
     return quick_look

@@ -147,7 +147,7 @@ class WholeRecord:
         first_sentence, other_sentences = verdict.sentences[:1], verdict.sentences[1:]
         added_sentences = (structure_fit.sentence for structure_fit in self.added)
         part_text = self.record.part_text
-        part_sentences = () if part_text is None else (f"All results are of {part_text}.",)
+        part_sentences = () if part_text is None else (f"All results are for {part_text}.",)
         return replace(
             verdict,
             sentences=(

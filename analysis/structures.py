@@ -79,8 +79,8 @@ def _check_damping(structure: Structure, values: Mapping[str, float]) -> None:
     for factor, at_conjugate in zip(factors, conjugate_factors, strict=True):
         if not np.allclose(at_conjugate, factor.conj(), rtol=1e-9, atol=0.0):
             raise ValueError(
-                f"its damping is not real in time with {parameters_text(values)}: at the conjugate "
-                "of s it must be the conjugate, which no causal force violates."
+                f"its damping is not a real function of time with {parameters_text(values)}: at "
+                "the conjugate of s it must have the conjugate value."
             )
 
 
@@ -88,7 +88,7 @@ def _check_parameter(parameter: Parameter) -> None:
     """Raise ValueError if the name, unit, range or starts of a parameter are not valid."""
     name, range_text = parameter.name, f"{parameter.lower:g} to {parameter.upper:g}"
     if not name.isidentifier():
-        raise ValueError(f"the name of its parameter {printable(name, 40)} is no identifier.")
+        raise ValueError(f"the name of its parameter {printable(name, 40)} is not an identifier.")
     if unit_of(name) not in ("", parameter.unit):
         raise ValueError(
             f'its parameter {name} has the unit "{parameter.unit}", but its name says '

@@ -215,15 +215,15 @@ class TouchAnalysis:
         warnings = []
         if shear_coefficients is None:
             warnings.append(
-                "The file states no shear_projection: the touches are estimated by the torque "
-                "alone, which tells little of the instant and the point."
+                "The file states no shear_projection: the touches are estimated from the torque "
+                "alone, which determines instant and point poorly."
             )
         marked_ticks = samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist()
         contact_ticks = round(CONTACT_S * rate_hz)
         free_ticks = [0, *(detection_tick + contact_ticks for detection_tick in marked_ticks)]
         detection_source, detected_ticks = "loop", list(zip(marked_ticks, free_ticks, strict=False))
         if not marked_ticks:
-            on_step("looking for touches")
+            on_step("searching for touches")
             detection_source, detected_ticks = (
                 "record",
                 _detect_touches(session, touch_model, rate_hz, shear_coefficients),
@@ -231,7 +231,7 @@ class TouchAnalysis:
             if len(detected_ticks) > _MAX_TOUCHES:
                 warnings.append(
                     f"More than {_MAX_TOUCHES} touches were found, of which the first are shown: "
-                    "the model does not fit the record. Take an identified one (--model)."
+                    "the model does not fit the record. Use an identified one (--model)."
                 )
                 detected_ticks = detected_ticks[:_MAX_TOUCHES]
         touches = []
@@ -508,9 +508,8 @@ def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
     without_estimate = [touch.number for touch in touches if touch.estimate is None]
     if without_estimate:
         sentences.append(
-            f"Touch {_number_list(without_estimate)}: not estimated; it takes {_MIN_BEFORE_S:g} "
-            "s of record "
-            f"before a touch and {1e3 * _MIN_AFTER_S:g} ms after it."
+            f"Touch {_number_list(without_estimate)}: not estimated, because that requires "
+            f"{_MIN_BEFORE_S:g} s of record before a touch and {1e3 * _MIN_AFTER_S:g} ms after it."
         )
     not_explained = [
         touch.number
@@ -520,10 +519,9 @@ def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
     if not_explained:
         sentences.append(
             f"Touch {_number_list(not_explained)}: the record is not explained by the model "
-            "(residuals more than "
-            f"{sqrt(_LARGEST_CHI2_PER_DEGREE):.1f} times the noise). Take an identified model "
-            "(--model); "
-            "without a contact, such a touch is the model's error."
+            f"(residuals more than {sqrt(_LARGEST_CHI2_PER_DEGREE):.1f} times the noise). Use an "
+            "identified model (--model); if there was no contact, such a touch is an error of the "
+            "model."
         )
     return sentences
 

@@ -58,9 +58,8 @@ def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate
     if estimate.uniformity > largest_stated:
         used_text = f"{100 * estimate.uniformity:g} % ({tolerance_text} does not suffice)"
     return (
-        f"{basis_sentence}; each mode lies where that of a uniform beam does, to {used_text}. An "
-        "unevenness "
-        "of the specimen is common to all sessions and does not average out."
+        f"{basis_sentence}; the mode frequencies are those of a uniform beam to {used_text}. A "
+        "non-uniformity of the specimen is common to all sessions and does not average out."
     )
 
 

@@ -115,7 +115,7 @@ def pooled_order(
     )
     if is_mixture:
         order_status = "open"
-        doubt_reason = "the sessions are not of one specimen and do not all share it"
+        doubt_reason = "the sessions are not of one specimen, and it differs between them"
     return PooledOrder(
         order=order,
         status=order_status,
@@ -204,7 +204,7 @@ def _status_and_reason(
     ):
         return "not identifiable", few_modes_reason
     if not structure.has(order):
-        return "absent", "no such damping shows"
+        return "absent", "no such damping is visible"
     parameter = freest_fit.by_name.get(order)
     if (
         parameter is None

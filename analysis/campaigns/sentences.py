@@ -495,7 +495,7 @@ def describe_prediction_errors(
     comparison_text = (
         "the others predict a session as well as its own fit"
         if mean_error <= _EQUAL_ERROR_RATIO * mean_own_error
-        else "the others predict a session worse than its own fit, as the parameters vary"
+        else "the others predict a session worse than its own fit, because the parameters vary"
     )
     sessions_remark = (
         f"; mean of {len(own_errors)} of {session_count} sessions"

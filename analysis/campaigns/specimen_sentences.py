@@ -89,7 +89,7 @@ def _describe_different_specimens(
         for scatter in homogeneity.quantities
         if scatter.mixed and not scatter.is_of_rig and scatter is not leading_scatter
     ]
-    others_sentence = f" The same holds of {', '.join(other_labels)}." if other_labels else ""
+    others_sentence = f" The same holds for {', '.join(other_labels)}." if other_labels else ""
     return [
         "The sessions are not of one specimen in one state: "
         f"{_describe_heterogeneity(leading_scatter)}.{others_sentence}",

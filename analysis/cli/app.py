@@ -368,12 +368,13 @@ def analyze(
     method = parse_option_choice(method, _METHOD_NAMES, "--method")
     if fix and method == "welch":
         raise typer.BadParameter(
-            "the Welch fits take all of them from the file; leave it out, or take --method all.",
+            "the Welch fits use the file's values for all of them; leave it out, or take --method "
+            "all.",
             param_hint="--fix",
         )
     if uniformity is not None and method == "welch":
         raise typer.BadParameter(
-            "the Welch fits, as in the paper, take the beam for exactly uniform; leave it out, or "
+            "the Welch fits, as in the paper, assume an exactly uniform beam; leave it out, or "
             "take --method all.",
             param_hint="--uniformity",
         )
@@ -497,9 +498,8 @@ def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
     if ineffective_options:
         typer.echo(
             f"Warning: {', '.join(ineffective_options)} "
-            f"{'concerns' if len(ineffective_options) == 1 else 'concern'} the Welch "
-            "fits alone, which --method record leaves out: the whole record is fitted by every "
-            "type.",
+            f"{'concerns' if len(ineffective_options) == 1 else 'concern'} the Welch fits alone, "
+            "which --method record leaves out: every type is fitted to the whole record.",
             err=True,
         )
 

@@ -135,7 +135,7 @@ def import_command(
         bool,
         typer.Option(
             "--ignore-file-metadata",
-            help="Your options count where the file states another rate, start, unit or scale.",
+            help="Your options override the rate, start, unit or scale that the file states.",
         ),
     ] = False,
     operator: Annotated[
@@ -290,7 +290,7 @@ def export_model_command(
     ],
     beam: Annotated[
         bool,
-        typer.Option("--beam", help="The beam's model, even where its test was not passed."),
+        typer.Option("--beam", help="The beam's model, even if the beam failed its test."),
     ] = False,
     input_kind: Annotated[
         str,

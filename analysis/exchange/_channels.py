@@ -103,8 +103,7 @@ def unit_factor(quantity: str, unit: str) -> float:
         raise ExchangeError(
             f"'{unit}' is not a unit of {quantity} that is known here; choose from "
             f"{', '.join(UNIT_SIZES[quantity])}. Of a signal in volts, counts or the like, state "
-            "what "
-            f"one of them stands for, as a number and a unit: CHANNEL:0.02 {base_unit}."
+            f"the value of one of them, as a number and a unit: CHANNEL:0.02 {base_unit}."
         )
     return unit_count * UNIT_SIZES[quantity][canonical_name]
 
@@ -240,7 +239,7 @@ def parse_choice(text: str, quantity: str) -> ChannelChoice:
     channel, colon, unit = text.rpartition(":")
     if not colon or not channel.strip():
         raise ExchangeError(
-            f"'{text}' does not say channel and unit; write CHANNEL:UNIT with one of the units "
+            f"'{text}' does not state channel and unit; write CHANNEL:UNIT with one of the units "
             f"{', '.join(UNIT_SIZES[quantity])}. A unit is never guessed."
         )
     unit_size = unit_factor(quantity, unit)
@@ -351,9 +350,9 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
     if tick_deviation[worst_index] > MAX_JITTER:
         raise ExchangeError(
             f"{path}: the times '{channel}' are not equidistant: sample {worst_index + 1} lies "
-            f"{tick_deviation[worst_index]:.2g} periods from where {rate_hz:g} Hz would have it. "
-            "Resample the "
-            "record to one rate, or give --rate-hz instead of --time if only the stamps are off."
+            f"{tick_deviation[worst_index]:.2g} periods from its position at {rate_hz:g} Hz. "
+            "Resample the record to one rate, or give --rate-hz instead of --time if only the "
+            "stamps are off."
         )
     return Timebase(ticks.astype(np.int64), rate_hz, float(tick_deviation[worst_index]))
 

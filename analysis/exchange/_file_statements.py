@@ -91,7 +91,7 @@ class FileStatements:
         """Raise an error for a contradiction, or record that the plan overrides the file."""
         if not self.plan.ignore_file_metadata:
             raise ExchangeError(
-                f"{self.path}: {statement}; {remedy}, or let your options count with "
+                f"{self.path}: {statement}; {remedy}, or let your options override the file with "
                 f"{IGNORE_OPTION}."
             )
         self.ignored.append(statement)
@@ -201,9 +201,8 @@ class FileStatements:
             row_number = int(np.argmin(np.isfinite(file_times.values))) + 1
             self.report_contradiction(
                 f"the times '{printable(file_times.name, 60)}' are missing from sample "
-                f"{row_number} on, "
-                f"in {len(file_times.values) - len(finite_times)} samples, so that these may be "
-                "none",
+                f"{row_number} on, in {len(file_times.values) - len(finite_times)} samples, so "
+                "these may not be samples",
                 "repair or remove their lines",
             )
             return

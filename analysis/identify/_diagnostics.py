@@ -219,7 +219,7 @@ def _equivalent_causes(candidate_set: CandidateSet, setting_name: Setting) -> st
     Return an empty string if there are none.
     """
     if setting_name == "bending_stiffness_n_m2":
-        return ", or the torque's gain is, or the clamp gives way"
+        return ", or the torque's gain is wrong, or the clamp is elastic"
     fit, stated_beam = candidate_set.best.fit, candidate_set.comparison.measurement.beam
     tip_mass_effect = (
         math.log(fit.plant.beam.density_over_stiffness / stated_beam.density_over_stiffness) / 4
@@ -318,8 +318,8 @@ def unexplained_residual_finding(
     ]
     if stiffness_step is not None:
         description = (
-            f"The modes do not fit together. The likeliest cause is {stiffness_step.text}, but "
-            "one sweep does not tell a change in time from one with the frequency."
+            f"The modes do not fit together. The likeliest cause is {stiffness_step.text}, but one "
+            "sweep does not distinguish a change in time from one with frequency."
         )
         remedy = (
             "Fasten clamp and motor mount, and sweep again in both directions "

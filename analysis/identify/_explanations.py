@@ -400,21 +400,21 @@ def finding(
         return Finding(
             kind="rival explanations",
             sentence=(
-                f"{refusal_sentence} None of the simple causes tried explains them alone: tilt, a "
-                "mass at the tip or elsewhere, an uneven or tapered beam, a soft or lossy clamp, a "
-                "filter or resonance of the sensor, a relaxation of the material."
+                f"{refusal_sentence} No single one of the simple causes tried explains them: tilt, "
+                "a mass at the tip or elsewhere, an uneven or tapered beam, a soft or lossy clamp, "
+                "a filter or resonance of the sensor, a relaxation of the material."
             ),
             remedy="Check the beam and its clamp for several of these at once.",
         )
     if len(cause_phrases) == 1:
         cause_sentence = (
-            f"{refusal_sentence} This would: {cause_phrases[0]}. "
-            "It is not established by this record."
+            f"{refusal_sentence} This would explain them: {cause_phrases[0]}. It is not "
+            "established by this record."
         )
     else:
         cause_sentence = (
-            f"{refusal_sentence} Each of these alone would: {'; '.join(cause_phrases)}. None is "
-            "established by this record."
+            f"{refusal_sentence} Each of these alone would explain them: "
+            f"{'; '.join(cause_phrases)}. None is established by this record."
         )
     return Finding(
         kind="rival explanations",

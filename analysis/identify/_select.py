@@ -80,9 +80,7 @@ _ONLINE_DRAG_COMPUTATIONS: Final = 4
 """Number of computations of the drag torque in a fit of the freest structure alone, which a running
 session repeats."""
 
-_TILTED_AXIS_REASON: Final = (
-    "the axis is tilted, and fits to the whole record are of one that is plumb"
-)
+_TILTED_AXIS_REASON: Final = "the axis is tilted, and fits to the whole record assume a plumb axis"
 """Reason to doubt the estimates for an exactly uniform beam if the axis is tilted."""
 
 ORDER_ONE_STRUCTURE: Final = STRUCTURES["III"]

@@ -62,7 +62,7 @@ class StiffnessStep:
         percent = float(f"{100 * self.relative_change:.1g}")
         return (
             f"a step of the stiffness by about {percent:+g} % near {self.instant_s:.0f} s (each "
-            "mode is then what it was when it was passed)"
+            "mode is then as it was when the sweep passed it)"
         )
 
     def as_json(self) -> dict[str, Any]:

@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from analysis.identify.tolerant_estimate import TolerantEstimate
 
 NOT_UNIFORM_REASON: Final = (
-    "the modes are not those of a uniform beam, and what makes them differ may change this value"
+    "the modes are not those of a uniform beam, and the cause of the difference may change this "
+    "value"
 )
 """Reason for a flag on parameters that a deviation from a uniform beam may change."""
 

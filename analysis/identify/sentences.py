@@ -115,7 +115,7 @@ def _damping_sentences(
     reported_structure = headline.fit.structure
     damping_phrase = reported_structure.description
     if any(each.reason == SECOND_DAMPING_REASON for each in order_verdicts):
-        damping_phrase = damping_phrase.replace("only", "alone would do")
+        damping_phrase = damping_phrase.replace("only", "alone is sufficient")
     sentences = [f"{damping_phrase}. Numbers are those of type {headline.name}, all orders free."]
     excluded_names = headline.structures_with_status("excluded")
     if headline.explained and excluded_names:

@@ -45,9 +45,7 @@ _MIN_MODES_FOR_A_SINGLE_DAMPING: Final = 3
 """Number of visible modes that show whether there is a second damping: two loss factors are
 explained by coefficient and order of one damping as well as by two dampings."""
 
-SECOND_DAMPING_REASON: Final = (
-    "from two modes it cannot be told whether there is another damping as well"
-)
+SECOND_DAMPING_REASON: Final = "two modes do not show whether there is another damping"
 """Reason against the order of a single damping if the record shows two modes."""
 
 
@@ -176,7 +174,7 @@ def _order_status(
     if reason_against is not None:
         return "not identifiable", reason_against
     if not freest_candidate.structure.has(order_name):
-        return "absent", "no such damping shows"
+        return "absent", "no such damping is visible"
     if not order_profile.identifiable:
         return "not identifiable", ORDER_NOT_DETERMINED_REASON
     if doubt_reason is not None:

@@ -282,8 +282,8 @@ def definitions(whole_record: WholeRecord) -> str:
     ]
     if whole_record.headline.modal is not None:
         definition_sentences[1:1] = [
-            "first the modal model with a pole p and a residue R of each mode, which the modes are "
-            "of, below it the beam's, which the parameters are of",
+            "first the modal model, with a pole p and a residue R for each mode, which gives the "
+            "modes; below it that of the beam, which gives the parameters",
         ]
     parameter_names = whole_record.headline.parameters
     definition_sentences += [
@@ -330,7 +330,7 @@ def types_table(whole_record: WholeRecord) -> Table:
         (
             "Internal damping multiplies EI by 1 + the term, external damping adds the term to "
             'ρ/EI s². I to VI as in the paper, VII as its conclusions propose. "Modes free": each '
-            "mode with its own stiffness. The marked type is that of the numbers reported.",
+            "mode with its own stiffness. The marked type is that of the reported numbers.",
         ),
         selected=list(STRUCTURES).index(_reported_structure(whole_record).name),
     )

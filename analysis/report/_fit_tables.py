@@ -90,12 +90,12 @@ def structures_table(whole_record: WholeRecord) -> Table:
         table_rows,
         (
             *footnotes(unsupported_orders),
-            "ΔBIC: Bayesian information criterion above the lowest; 10 = decisive. Fit: NRMSE "
-            "of the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power "
-            "over that of the noise, 1 if nothing but noise is left. Free: number of free "
-            "parameters, those of rig and beam included. * rests on the edge of the range "
-            f"searched. The marked row is {_marked_row(whole_record)}. What the record excludes "
-            "has numbers in the CSV file only, beside the sums of squares.",
+            "ΔBIC: Bayesian information criterion above the lowest; 10 = decisive. Fit: NRMSE of "
+            "the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power over "
+            "that of the noise, 1 if nothing but noise is left. Free: number of free parameters, "
+            "including those of rig and beam. * at the limit of the search range. The marked row "
+            f"is {_marked_row(whole_record)}. The numbers of excluded structures are in the CSV "
+            "file only, with the sums of squares.",
         ),
         selected=list(whole_record.fits).index(whole_record.headline.name),
     )
@@ -141,8 +141,8 @@ def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
         rows,
         (
             "ΔBIC: Bayesian information criterion above the lowest of types I to VII. These "
-            "structures are compared with the types, but are no candidates of the verdict. * rests "
-            "on the edge of the range searched.",
+            "structures are compared with the types, but are no candidates of the verdict. * at "
+            "the limit of the search range.",
         ),
         grouped=True,
     )
@@ -264,8 +264,8 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
             *footnotes(unsupported_orders),
             f"Fit: NRMSE of the complex response in the band. {_INDEX_UNITS} std (±): one standard "
             "deviation, from the scatter of the response about the model. The bias of Welch's "
-            "estimate on a chirp, which the window smears at the resonances, is not in it and is "
-            "often larger: whole-record fits do not have it.",
+            "estimate on a chirp, which the window smears at the resonances, is not included and "
+            "is often larger; whole-record fits do not have it.",
             *([_AT_LIMIT_NOTE] if any(fit.at_bounds for fit in fits) else []),
         ),
         grouped=True,

@@ -192,7 +192,7 @@ def _draw_coherence(axes: Axes, analysis: WelchAnalysis) -> None:
     axes.set_xlabel("Frequency (Hz)", labelpad=1)
     if response.coherence is None:
         axes.text(
-            0.5, 0.5, "none: it takes at least two segments", transform=axes.transAxes,
+            0.5, 0.5, "none: at least two segments are required", transform=axes.transAxes,
             ha="center", va="center", color="#606060",
         )  # fmt: skip
         return

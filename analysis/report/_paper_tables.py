@@ -77,7 +77,7 @@ _TABLE_3_HEADINGS: Final = {"zeta": ("ζ (10⁻⁴ s^α)", 1e4), "alpha": ("α",
 """Heading and display factor (a power of ten, as in the paper) of each parameter in Table 3."""
 _AT_LIMIT_NOTE: Final = "*n: at the limit of the search range in n sessions."
 """Note on estimates at the limit of the search range."""
-_PARENTHESES_NOTE: Final = "In parentheses: the paper's."
+_PARENTHESES_NOTE: Final = "In parentheses: the values of the paper."
 """Note on the numbers in parentheses."""
 
 

@@ -530,9 +530,8 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
         partial(frf_figure, measured_frf, model),
         "Frequency response from motor angle to coupling torque: magnitude and phase, measured "
         f"(empirical transfer function estimate, {delay_text} removed) and of {model.name}; "
-        f"half-width of the model's 95 % band; details of the modes ({modes_text} Hz). The band is "
-        "narrower "
-        "than the line where it is not seen.",
+        f"half-width of the model's 95 % band; details of the modes ({modes_text} Hz). Where no "
+        "band is visible, it is narrower than the line.",
     )
     uniformity_test = headline.uniform_beam
     if uniformity_test is not None and uniformity_test.p_value is not None:
@@ -560,11 +559,11 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     yield Illustration(
         residual_name,
         partial(residual_figure, model, analysis),
-        f"Residual of the torque, measured minus that of {model.name}: its spectrum beside the "
-        "noise model; its cumulative periodogram, which stays in the shaded range in 95 of 100 "
-        "records or more if only noise is left; and its power through the record. Excess at a "
-        f"mode or at one time is what the model lacks. Mean power {mean_power_ratio:.4g} times "
-        "that of the noise.",
+        f"Residual of the torque, measured minus that of {model.name}: its spectrum with the noise "
+        "model; its cumulative periodogram, which stays in the shaded range in 95 of 100 records "
+        "or more if only noise is left; and its power through the record. Excess power at a mode "
+        f"or at one time shows an effect that the model lacks. Mean power {mean_power_ratio:.4g} "
+        "times that of the noise.",
     )
     yield Illustration(
         signals_name,
@@ -591,14 +590,14 @@ def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
     )
     if whole_record.withheld_orders:
         return curves_text + (
-            "It is of all damping, not split into internal and external, and drawn between the "
-            "modes that show only: elsewhere (grey), and for either part, an order that the data "
-            f"do not support would decide.{reasons_text}"
+            "It is that of all damping, not split into internal and external, and is drawn between "
+            "the visible modes only: elsewhere (grey), and for each of the two, it would depend on "
+            f"an order that the data do not support.{reasons_text}"
         )
     return curves_text + (
         "At a mode the loss factor is about twice the damping ratio. Between the modes the model "
-        "interpolates, outside them (grey) it extrapolates; where the torque does not stand out of "
-        f"the noise nothing is drawn.{reasons_text}"
+        "interpolates, outside them (grey) it extrapolates; where the torque is not above the "
+        f"noise, nothing is drawn.{reasons_text}"
     )
 
 
@@ -610,7 +609,9 @@ def _describe_curve_model(whole_record: WholeRecord) -> str:
     if tolerant_estimate.basis == "losses":
         return "of both dampings by damping ratios and residue phases alone"
     tolerance_percent = 100 * tolerant_estimate.uniformity
-    return f"of a beam whose modes lie where those of a uniform one do, to {tolerance_percent:g} %"
+    return (
+        f"of a beam whose mode frequencies are those of a uniform beam to {tolerance_percent:g} %"
+    )
 
 
 def _reasons_of_hollow_points(headline: Headline) -> str:

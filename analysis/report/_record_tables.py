@@ -72,8 +72,8 @@ def modes_table(whole_record: WholeRecord) -> Table:
         ),
         table_rows,
         (
-            "Intervals are statistical only; no torque scale, length or density acts on "
-            "frequencies and damping ratios.",
+            "Intervals are statistical only; frequencies and damping ratios do not depend on "
+            "torque scale, length or density.",
             *_modal_notes(whole_record),
             *_reason_notes(mode.damping_ratio for mode in headline.modes),
         ),
@@ -96,7 +96,10 @@ def exact_modes_table(whole_record: WholeRecord) -> Table | None:
         f"Modes {EXACTLY_UNIFORM_CONDITION}: type {exact_estimates.name}",
         _MODE_COLUMNS,
         ((mode.number, *_mode_cells(mode)) for mode in shown_mode_values),
-        ("A condition: narrower than the modal model, and right only if the beam is uniform.",),
+        (
+            "A condition, not a result: narrower intervals than those of the modal model, valid "
+            "only if the beam is uniform.",
+        ),
     )
 
 
@@ -237,7 +240,7 @@ def _condition_text(headline: Headline) -> str:
         return f", type {headline.name}{condition_text}"
     if tolerant_estimate.basis == "geometry":
         tolerance_percent = 100 * tolerant_estimate.uniformity
-        return f" if each mode lies where that of a uniform beam does, to {tolerance_percent:g} %"
+        return f" if the mode frequencies are those of a uniform beam to {tolerance_percent:g} %"
     if tolerant_estimate.basis == "losses":
         return " by damping ratios and residue phases alone, whatever the positions of the modes"
     return " of the beam that fits the losses best: it does not explain them"

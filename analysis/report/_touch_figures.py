@@ -40,8 +40,8 @@ def touch_illustrations(sessions: Sequence[SessionTouches]) -> Iterator[Illustra
         yield Illustration(
             "map",
             partial(map_figure, sessions),
-            "Points of contact as seen from above, with their 95 % intervals (hollow: the kind of "
-            "contact cannot be told); the antenna (grey) as it was bent at each touch, from the "
+            "Points of contact as seen from above, with their 95 % intervals (hollow: kind of "
+            "contact not identifiable); the antenna (grey) as it was bent at each touch, from the "
             "motor's axis (black). The angle is zero along x.",
         )
     touch_number = 0

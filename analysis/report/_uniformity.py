@@ -125,7 +125,7 @@ def _set_axes(
 def uniformity_description(uniformity_test: UniformBeamTest) -> str:
     """Return the caption of the test's figure, which states the result of the test."""
     return (
-        "Modal constants measured, less those of the uniform beam that fits them best, by mode: "
+        "Measured modal constants minus those of the uniform beam that fits them best, by mode: "
         "above in standard deviations of the measured value (shaded: where 95 of 100 values of a "
         "uniform beam are), below in per cent with the 95 % interval (phase: per cent of 1 rad). "
         f"Chi-square {uniformity_test.chi_square:.4g} for {uniformity_test.degrees_of_freedom} "

@@ -479,5 +479,5 @@ def footnotes(unsupported_orders: Collection[str]) -> tuple[str, ...]:
     )
     return (
         f"{NOT_REPORTED_MARK} not reported: the data support no order {order_symbols}. The number "
-        "belongs to its curve, not to the antenna.",
+        "describes the fitted curve, not the antenna.",
     )

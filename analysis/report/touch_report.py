@@ -28,7 +28,7 @@ _KIND_DESCRIPTIONS = {
     "yielding": "obstacle that gives way",
     "moving": "moving obstacle",
     "knock": "knock",
-    "unknown": "cannot tell",
+    "unknown": "not identifiable",
 }
 """Descriptions of the kinds of contact, by key."""
 
@@ -279,7 +279,7 @@ def _collect_facts(session_touches: Sequence[SessionTouches]) -> list[Facts]:
                 ),
                 (
                     "contact",
-                    "springy obstacle at rest, marched through its bounces; posterior of point, "
+                    "springy obstacle at rest, simulated through its bounces; posterior of point, "
                     "instant and stiffness by population Monte Carlo, with the model's uncertainty",
                 ),
                 ("log-likelihood", "of each point with any force history (white prior)"),

@@ -97,18 +97,18 @@ def test_welch_method_is_for_sweeps(record_of, kind):
 def test_suggested_option_makes_the_fits(record_of):
     """Of 4 s the usual segments are too long, and only an estimator without them is left."""
     record = record_of(excitation="step")
-    assert "(--method welch --frf fft makes them nevertheless)" in welch_exclusion_reason(record)
+    assert "(--method welch --frf fft computes them nevertheless)" in welch_exclusion_reason(record)
     with pytest.raises(FrequencyResponseError):
         welch_analysis(record, WelchSettings(), optional=False)
     chosen = WelchSettings(estimator="fft", types=("I",), weightings=("const",))
     assert welch_analysis(record, chosen, optional=False)[0] is not None
     longer = replace(record, sweep=slice(0, 17266))
-    assert "(--method welch makes them nevertheless)" in welch_exclusion_reason(longer)
+    assert "(--method welch computes them nevertheless)" in welch_exclusion_reason(longer)
 
 
 def test_remark_that_fits_assume_a_free_beam(record_of):
     (remark,) = remarks(record_of(excitation="touch"))
-    assert "analyze touch finds where" in remark
+    assert "analyze touch estimates where" in remark
     assert remarks(record_of(excitation="chirp")) == ()
 
 

@@ -67,7 +67,7 @@ def test_touch_at_the_end_is_not_estimated(touch_file, touch_analysis, tmp_path)
     session = touch_analysis.session(touch_file.write(tmp_path / "a.mcap", length=length))
     (touch,) = session.touches
     assert (touch.estimate, touch.point_m) == (None, None)
-    assert "Touch 1: not estimated; it takes 0.3 s of record before" in session.warnings[0]
+    assert "Touch 1: not estimated, because that requires 0.3 s" in session.warnings[0]
     assert set(touch.as_dict()) >= {"number", "tick", "angle_rad"}
 
 
@@ -77,7 +77,7 @@ def test_missing_shear_is_reported(touch_file, touch_analysis, tmp_path):
     )
     session = touch_analysis.session(path)
     assert not session.has_shear
-    assert "by the torque alone" in session.warnings[0]
+    assert "from the torque alone" in session.warnings[0]
 
 
 @pytest.mark.parametrize("text", ["0,1,0", "a,b,c,d,e,f", "nan,1,0,0,0,0"])

@@ -208,7 +208,7 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     assert "external damping torque growing as f^(" in answer
     assert answer.count("consistent with order 1") == 2
     assert "for an unseen session: types III and VI with " in answer
-    assert "from the modal constants of 4 sessions; each mode lies where" in structure
+    assert "from the modal constants of 4 sessions; the mode frequencies are those of" in structure
     assert "to 0.1 % as the files state it" in structure
     (condition,) = (each for each in verdict.sentences if each.startswith("If the beam is"))
     assert condition.startswith("If the beam is uniform to 1e-5 (type VI): alpha ")

@@ -103,7 +103,7 @@ def test_order_that_differs_between_sessions_is_withheld(estimates_of, alpha):
     groups = ranked(estimates_of("VI", 100.0, alpha), estimates_of("VII", 150.0))
     order = pooled_order("alpha", groups, [session_verdict()] * 4, mixed_in("alpha"))
     assert (order.status, order.mixture) == ("open", True)
-    assert "not of one specimen and do not all share it" in sentences.describe_order(order)
+    assert "not of one specimen, and it differs" in sentences.describe_order(order)
 
 
 def test_common_order_of_a_mixture_is_reported(estimates_of):

@@ -279,7 +279,7 @@ def test_unlisted_causes_are_not_reported(plain):
     fit = fitted(moved)
     assert explanations(uniform_beam_test(fit, NOMINAL)) == ()
     report = finding(uniform_beam_test(fit, NOMINAL), ())
-    assert "None of the simple causes" in report.sentence
+    assert "No single one of the simple causes" in report.sentence
     assert (report.kind, report.value, report.interval) == ("rival explanations", None, None)
 
 

@@ -70,7 +70,7 @@ def test_report_states_the_analysed_part(session, tmp_path, analyze_here, withou
         content[key] for key in ("headlines", "files", "records")
     )
     assert (headline["part"], file["part"]) == (part, part)
-    assert from_record["verdict"][0] == "All results are of 0 to 20 s of the session."
+    assert from_record["verdict"][0] == "All results are for 0 to 20 s of the session."
     assert result.stdout.startswith(from_record["verdict"][0])
     page = (tmp_path / "session.report" / "report.html").read_text()
     assert "0 to 20 s of the session" in page

@@ -113,7 +113,7 @@ def test_ends_of_an_asymmetric_interval_are_reported(touched, tmp_path):
     session = replace(touched, touches=(replace(touch, estimate=estimate),))
     (cells,) = touches_table([session]).shown_rows
     assert "0.48 to 0.94" in [cell.text for cell in cells]
-    assert "cannot tell" in [cell.text for cell in cells]
+    assert "not identifiable" in [cell.text for cell in cells]
     write_touch_report([session], {}, tmp_path)
     drawn = sorted(path.stem for path in (tmp_path / "figures").glob("*.svg"))
     assert drawn == ["map", "touch_1"]

@@ -17,7 +17,7 @@ from analysis.report.record_report import record_page, report_tables, uniformity
 pytestmark = pytest.mark.fit
 
 EXACT = "if the beam is uniform to 1e-5"
-TOLERANT = "if each mode lies where that of a uniform beam does, to 0.1 %"
+TOLERANT = "if the mode frequencies are those of a uniform beam to 0.1 %"
 
 
 @pytest.fixture(scope="module")
