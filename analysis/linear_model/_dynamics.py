@@ -184,7 +184,7 @@ def _beam_poles(
     mode_count = int(quartic_eigenvalue_limit**0.25 * plant.beam.length_m / np.pi) + 1
     if mode_count > _MAX_BEAM_MODES:
         raise LinearModelError(
-            f"{plant.beam} has some {mode_count} modes below {BEAM_BAND_HZ[1]:g} Hz, and a model "
+            f"{plant.beam} has about {mode_count} modes below {BEAM_BAND_HZ[1]:g} Hz, and a model "
             f"of at most {_MAX_BEAM_MODES} is exported; check length and stiffness."
         )
     poles_rad_s = plant.poles(clamped_free_eigenvalues(mode_count + _MODES_BEYOND_BAND + 1))

@@ -141,7 +141,7 @@ def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
         rows,
         (
             "ΔBIC: Bayesian information criterion above the lowest of types I to VII. These "
-            "structures are compared with the types, but are no candidates of the verdict. * at "
+            "structures are compared with the types, but are not candidates of the verdict. * at "
             "the limit of the search range.",
         ),
         grouped=True,

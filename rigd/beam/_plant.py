@@ -356,7 +356,7 @@ class Plant:
     def _require_uniform(self) -> None:
         """Raise ValueError if the beam has stiffness offsets."""
         if any(self.stiffness_offsets):
-            raise ValueError("Of modes of their own stiffness the shear is not known.")
+            raise ValueError("The shear of modes with their own stiffness is not known.")
 
     def _response_and_slopes(self, s: ComplexArray) -> tuple[LoadedResponse, Slopes]:
         """Return the coupling torque per angle on a rigid clamp, and functions for its derivatives.

@@ -315,9 +315,8 @@ def _realised_poles(plant: Plant, modes_of: Beam) -> tuple[ComplexArray, NDArray
     mode_count = int(1.25 * highest_k_fourth**0.25 * modes_of.length_m / np.pi) + 3
     if mode_count > _MAX_MODES:
         raise RealisationError(
-            f"{modes_of} has some {mode_count} modes below {_HIGHEST_MODE_HZ:g} Hz, more than the "
-            f"{_MAX_MODES} that are realised; check the units of its length, density and "
-            "stiffness."
+            f"{modes_of} has about {mode_count} modes below {_HIGHEST_MODE_HZ:g} Hz, more than the "
+            f"{_MAX_MODES} that are realised; check the units of its length, density and stiffness."
         )
     eigenvalues = clamped_free_eigenvalues(mode_count)
     pole_pairs = plant.poles(eigenvalues)

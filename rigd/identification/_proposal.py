@@ -296,15 +296,15 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable_count: int) -> li
     if torque_scale.std is None:
         operator_notes = [
             "The torque constant is not identifiable: the coupling torque is too small, or follows "
-            "the shaft like a rigid inertia (no antenna mounted?). The torque is taken as the "
-            "drive states it, and inertia and friction refer to that."
+            "the shaft like a rigid inertia (no antenna mounted?). The torque is assumed to be as "
+            "the drive states it, and inertia and friction refer to that."
         ]
     else:
         value_text, std_text = _format_with_std(torque_scale.value, torque_scale.std)
         operator_notes = [
-            f"The motor exerts {value_text} ± {std_text} times the torque commanded, against the "
-            "sensor; motor.rated_torque_nm is corrected by that. Inertia and friction refer to the "
-            "sensor's N·m: paste all lines together."
+            f"The motor exerts {value_text} ± {std_text} times the torque commanded, according to "
+            "the sensor; motor.rated_torque_nm is corrected by that. Inertia and friction refer to "
+            "the sensor's N·m: paste all lines together."
         ]
     operator_notes.append(
         "Only the sum of delays from command to angle is known: actuation.delay_s is this sum "

@@ -96,7 +96,7 @@ def invalid_unknown_message(key: str, entry: Mapping[str, Any]) -> str:
 def bare_number_message(key: str, bare_value: object) -> str:
     """Return the message for a profile's number whose origin (key ``source``) is not stated."""
     return (
-        f"{key} = {_text(bare_value)}{_unit(key)} does not say where it comes from; write "
+        f"{key} = {_text(bare_value)}{_unit(key)} does not state its source; write "
         f'{{ value = {_text(bare_value)}, source = "…" }} with {_quoted_choice(SOURCES)}.'
     )
 
@@ -116,9 +116,8 @@ def contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for values that are within their ranges but contradict each other."""
     if not _RIG_NAME.fullmatch(profile_values["name"]):
         yield (
-            f"name = {_text(profile_values['name'])} is not fit for file names; take "
-            "letters, digits, "
-            "spaces and . _ - only, at most 64, and begin with a letter or digit."
+            f"name = {_text(profile_values['name'])} cannot be used in file names; use letters, "
+            "digits, spaces and . _ - only, at most 64, and begin with a letter or digit."
         )
     rated_nm, peak_nm = (
         profile_values["motor.rated_torque_nm"],

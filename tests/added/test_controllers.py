@@ -90,7 +90,7 @@ def test_a_shift_of_the_reference_damps_the_predicted_loop(packages, tmp_path):
     [
         ("statespace", SECTIONS["statespace"].replace("80", "5"), "pole_rad_s = 5 rad/s must be m"),
         ("statespace", SECTIONS["statespace"].replace("rad_s", "hz"), "wrong unit .*in rad/s"),
-        ("statespace", "pole_rad_s = 80.0", "does not say where it comes from"),
+        ("statespace", "pole_rad_s = 80.0", "does not state its source"),
         ("statespace", SECTIONS["statespace"].replace("80.0", "nan"), "pole_rad_s = nan rad/s"),
         ("statespace", SECTIONS["statespace"] + "\nspeed = 1", "statespace.speed is unknown"),
         ("statespace", "", r"section \[statespace\] is missing, which control.controller"),

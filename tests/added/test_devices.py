@@ -61,7 +61,7 @@ def test_profile_reads_their_sections(packages, tmp_path):
         ("gain_percent", "gain_hz", "wrong unit .* write scaled.gain_percent, the value in %"),
         ('"T1"', "1", 'twin.serial_number = 1 must be text'),
         ('serial_number = "T1"', "", "section .twin. is missing"),
-        ('"T1"', '"T1"\nlimit_nm = 0.1', "limit_nm = 0.1 N·m does not say where it comes from"),
+        ('"T1"', '"T1"\nlimit_nm = 0.1', "limit_nm = 0.1 N·m does not state its source"),
         ('"T1"', '"T1"\nspeed = 1', "twin.speed is unknown; .twin. has serial_number, limit_nm"),
         ('"T1"', '"T1"\nlimit_nm = { value = 0.1, source = "assumed" }', "below motor.peak_tor"),
         ("[scaled]", '[scaled]\nmode = "odd"', 'scaled.mode = "odd" must be "fast" or "slow"'),

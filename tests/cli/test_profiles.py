@@ -172,7 +172,7 @@ def test_no_file_is_overwritten(new_profile, tmp_path):
         (".", (), "a.toml", 1, "is a folder"),
         (None, (), "a.txt", 2, "ends in .toml"),
         (None, (), "nowhere/a.toml", 2, "there is no folder nowhere"),
-        (None, (), "what?.toml", 2, 'name = "what?" is not fit for file names'),
+        (None, (), "what?.toml", 2, 'name = "what?" cannot be used in file names'),
         (None, ("--from", "sim"), "a.toml", 2, "has no CiA 402 drive"),
         (None, ("--from", "none"), "a.toml", 2, "There is no profile 'none'"),
     ],

@@ -222,7 +222,7 @@ def test_a_number_without_a_source_is_refused(refuse):
     [line] = refuse((INERTIA, "inertia_kg_m2 = { value = 2.0e-3 }"))
     assert line.startswith("motor.inertia_kg_m2 has no source")
     [line] = refuse((INERTIA, "inertia_kg_m2 = 2.0e-3"))
-    assert line.startswith("motor.inertia_kg_m2 = 0.002 kg·m² does not say where it comes from")
+    assert line.startswith("motor.inertia_kg_m2 = 0.002 kg·m² does not state its source")
 
 
 def test_a_made_up_source_is_refused(refuse):

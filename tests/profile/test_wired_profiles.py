@@ -113,7 +113,7 @@ def test_a_contradiction_with_the_protocol_is_reported(refuse, name, old, new, c
 @pytest.mark.parametrize("name", ["../../evil", "a/b", "a\\u0000b", "x" * 70, ".hidden", "-x"])
 def test_a_name_has_to_be_valid_in_file_names(refuse, name):
     (line,) = refuse("antenna_can", ('name = "antenna_can"', f'name = "{name}"'))
-    assert "is not fit for file names" in line
+    assert "cannot be used in file names" in line
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_a_name_has_to_be_valid_in_file_names(refuse, name):
         ('set_objects = ["1010:1 u32 0x65766173"]', r"set_objects\[0\] .*memory at every start"),
         ('eds = "nowhere.eds"', r'eds = "nowhere.eds": there is no file .*nowhere.eds'),
         ("sync_gaps = 1", r"sync_gaps = 1 must be true or false"),
-        ("own_watchdog_s = 0.1", r"own_watchdog_s = 0.1 s does not say where it comes from"),
+        ("own_watchdog_s = 0.1", r"own_watchdog_s = 0.1 s does not state its source"),
         ('own_watchdog_s = { value = -1.0, source = "assumed" }', r"own_watchdog_s = -1 s must be"),
         (
             'torque_response_s = { value = "x", source = "assumed" }',
