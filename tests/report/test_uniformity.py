@@ -197,4 +197,4 @@ def test_the_modal_model_is_written_as_an_equation(page):
     assert r"\frac{\bar{R}_{k}}{s - \bar{p}_{k}}" in first
     assert r"\sum_{n = 0}^{4} b_{n} s^{n}" in first
     assert len(others) == 3
-    assert "modal model with a pole p and a residue R" in page
+    assert "modal model, with a pole p and a residue R" in page
