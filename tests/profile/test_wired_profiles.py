@@ -95,7 +95,7 @@ def test_an_unused_section_is_refused(refuse):
         ("antenna_can", 'serial_number = ""', "serial_number = 5",
          r"ati_can.serial_number = 5 must be text in quotes"),
         ("antenna_serial", 'mode = "same_tick"', 'mode = "previous_tick"',
-         r'acquisition.mode = "previous_tick" does not go with \[ati_serial\]'),
+         r'acquisition.mode = "previous_tick" cannot be used with \[ati_serial\]'),
         ("antenna_serial", "baud = { value = 1_250_000,", "baud = { value = 115_200,",
          r"ati_serial.stream_hz = 7000 Hz does not fit ati_serial.baud = 115200, which carries "
          r"806 records a second"),
