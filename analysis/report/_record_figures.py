@@ -246,9 +246,9 @@ def loss_figure(
 
     The modes are points, hollow for those whose damping ratio is flagged. The loss factors are
     those of `loss_model`, drawn only in the band `supported_hz`. There are no curves if
-    `loss_model` is None, because no beam explains the losses, or `supported_hz` is None, because
-    the data do not support the curves at any frequency. If the data do not support one of the
-    orders, the total is not split into its parts. The frequencies of the axis are positive.
+    `loss_model` is None, because no beam is known to explain the losses, or `supported_hz` is None,
+    because the data do not support the curves at any frequency. If the data do not support one of
+    the orders, the total is not split into its parts. The frequencies of the axis are positive.
     """
     figure = style.new_figure(9.0, 3.6)
     axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))
@@ -580,9 +580,16 @@ def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
     points_text = "twice the damping ratio of each mode with its 95 % interval"
     reasons_text = _reasons_of_hollow_points(whole_record.headline)
     if not has_curves:
+        estimate = whole_record.headline.tolerant
+        cause_text = (
+            "an order of the beam was fitted to the frequencies, which are not those of a uniform "
+            "beam"
+            if estimate is not None and estimate.basis != "none"
+            else "no beam with one internal and one external order explains the losses"
+        )
         return (
-            f"Loss factor over frequency: {points_text}. There is no curve, because no beam with "
-            f"one internal and one external order explains the losses.{reasons_text}"
+            f"Loss factor over frequency: {points_text}. There is no curve, because {cause_text}."
+            f"{reasons_text}"
         )
     curves_text = (
         f"Loss factor over frequency with 95 % bands, {_describe_curve_model(whole_record)}; "

@@ -163,16 +163,17 @@ class NearlyUniformBeam:
 
 
 def loss_estimate(whole_record: WholeRecord) -> FittedPlant | None:
-    """Return the beam whose loss factors are drawn; None if no beam explains the losses."""
+    """Return the beam whose loss factors are drawn; None if no beam is known to explain the losses.
+
+    If an order was fitted to the frequencies of a beam that is not uniform, it is unknown.
+    """
     headline = whole_record.headline
-    if headline.tolerant is not None:
-        return (
-            None
-            if headline.tolerant.basis == "none"
-            else NearlyUniformBeam.from_estimate(headline.tolerant)
-        )
     is_refused = headline.uniform_beam is not None and headline.uniform_beam.status == "refused"
-    return None if is_refused else whole_record.fit
+    if headline.tolerant is None:
+        return None if is_refused else whole_record.fit
+    if headline.tolerant.basis == "none" or (is_refused and headline.tolerant.rests_on_frequencies):
+        return None
+    return NearlyUniformBeam.from_estimate(headline.tolerant)
 
 
 _GRID_POINTS: Final = 900

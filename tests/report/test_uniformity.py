@@ -170,6 +170,21 @@ def test_unexplained_losses_are_points_without_a_curve(unexplained_losses):
     assert all(row["remark"] for row in tables["parameters"].rows if row["value"].doubtful)
 
 
+def test_no_curve_of_losses_with_an_order_fitted_to_frequencies(modal_result, with_selection):
+    headline = modal_result.whole.headline
+    test = replace(headline.uniform_beam, status="refused", p_value=2e-18)
+    tolerant = replace(
+        headline.tolerant,
+        interval={**headline.tolerant.interval, "alpha": (1.2, 1.6)},
+        deviance_of_order_one={"alpha": 0.5, "lambda": 0.0},
+    )
+    result = with_selection(
+        modal_result, headline=replace(headline, uniform_beam=test, tolerant=tolerant)
+    )
+    assert document([result])["records"][0]["curves"]["loss_factor"] is None
+    assert "an order of the beam was fitted" in drawn(result)["loss_factor"].description
+
+
 def test_the_document_has_source_participation_and_the_test(modal_result):
     (headline,) = document([modal_result])["headlines"]
     found = headline["validity"]["uniform_beam"]
