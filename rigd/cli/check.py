@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rigd.cli.daemon import reset_by_daemon
+from rigd.cli.daemon import DaemonProfile, reset_by_daemon
 from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, AsJson, ProfileName, fail, profile_named
 from rigd.runtime import raise_on_signals
 
@@ -93,24 +93,20 @@ def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, eds_only: bool
         raise typer.Exit(EXIT_FAILED)
 
 
-def reset(
-    profile: Annotated[
-        str | None,
-        typer.Option(
-            "--profile", help="Profile of the rig (default: the running daemon's, or sim)."
-        ),
-    ] = None,
-) -> None:
+def reset(profile: DaemonProfile = None) -> None:
     """Reset a fault after its cause is removed. No torque; the drive stays off.
 
-    A daemon that owns the rig does it; without one, the fault of the drive is reset directly.
+    A daemon that owns the rig does it; without one, the fault of the drive is reset directly, and
+    --profile is needed. Exits with 0 if the fault is reset or the drive has none, with 1 if it is
+    not reset, and with 2 if no rig is named.
 
     Example: rigd reset --profile antenna_can
     """
     _interrupt_on_end_signals()
     if reset_by_daemon(profile):
         return
-    rig_profile = _openable_profile("sim" if profile is None else profile)
+    assert profile is not None
+    rig_profile = _openable_profile(profile)
     from rigd.devices import reset_drive
 
     try:

@@ -215,20 +215,25 @@ def zero(profile: DaemonProfile = None, as_json: AsJson = False) -> None:
 
 
 def reset_by_daemon(profile: str | None) -> bool:
-    """Have the daemon of a rig, or the only running one, reset the fault; False if none runs."""
-    from rigd.daemon.address import running, socket_path
+    """Have the daemon of a rig, or the only running one, reset the fault.
 
-    socket_paths = running()
-    if profile is None:
-        if not socket_paths:
+    Return False if the rig has no daemon. Without a profile, the command ends then.
+    """
+    from rigd.daemon.address import AddressError, find
+    from rigd.daemon.client import Client
+
+    try:
+        daemon_socket = find(rig_name(profile))
+    except AddressError as error:
+        if profile is not None:
             return False
-    else:
-        wanted_rig = rig_name(profile)
-        if wanted_rig is None or socket_path(wanted_rig).name not in {
-            path.name for path in socket_paths
-        }:
-            return False
-    with daemon_client(profile) as client:
+        # The default rig is simulated: its success would be taken for that of the real drive.
+        fail(
+            f"Nothing was reset. {error} To reset a drive without a daemon, name your rig: rigd "
+            "reset --profile NAME (the default rig sim is simulated: nothing to reset).",
+            EXIT_WRONG_USE,
+        )
+    with Client(daemon_socket) as client:
         daemon_reply = client.ask("reset")
     typer.echo("The fault is reset; the devices are connected and the torque is off.")
     if daemon_reply["zero_lost"]:

@@ -1,4 +1,5 @@
 from ._bus_conflicts import bus_conflicts as bus_conflicts
+from ._fault_reset import ResetUnsupportedError as ResetUnsupportedError
 from ._fault_reset import reset_drive as reset_drive
 from ._registry import ActuationTarget as ActuationTarget
 from ._registry import actuation_target as actuation_target

@@ -3,7 +3,12 @@
 from typing import Protocol, runtime_checkable
 
 from rigd.devices._registry import ActuationTarget, open_devices
+from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
+
+
+class ResetUnsupportedError(DeviceError):
+    """Error: the driver of a drive cannot reset a fault."""
 
 
 @runtime_checkable
@@ -33,13 +38,25 @@ def reset_drive(rig: RigParameters, target: ActuationTarget | None = None) -> st
 
     Raises
     ------
+    ResetUnsupportedError
+        If the driver of a real drive cannot reset a fault; nothing was sent.
     DeviceError
         If the drive does not answer, may still turn, the fault persists, or the drive does not
         become ready, for instance because STO is open.
     """
-    drive = open_devices(rig, target).drive
+    devices = open_devices(rig, target)
+    drive = devices.drive
     if not isinstance(drive, ResettableDrive):
-        return "Each session simulates a new drive: there is no fault to reset."
+        if devices.simulated:
+            return (
+                f"{rig.name} is simulated, and each session simulates a new drive: there is no "
+                "fault to reset."
+            )
+        raise ResetUnsupportedError(
+            f"{rig.name}: nothing was reset, because the driver {rig.devices.drive} cannot reset a "
+            "fault. The drive may still be on: press the wired stop (STO), then reset the drive "
+            "with its manufacturer's tool."
+        )
     try:
         fault = drive.reset_fault()
     finally:

@@ -79,7 +79,8 @@ class Rig:
     connected
         Whether the control process is connected to the devices.
     zero_lost
-        Whether a zero that the operator had set was lost with the connection to the devices.
+        Whether the zero was lost with the connection to the devices: the zero that the operator had
+        set, or on hardware also the angle at the previous connection.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class Rig:
         self._group = group
         self._connection: DevicesConnected | None = None
         self._view: LiveViewClient | None = None
-        self._is_zero_set = False
+        self._has_zero_to_lose = False
         self._raised_priority: RaisedPriority | None = None
         self._status_lock = threading.Lock()
         self._status_reader = StatusReader(profile.rig.rate_hz)
@@ -177,8 +178,9 @@ class Rig:
         if LIVE in group:
             self._view = LiveViewClient(group, self._profile.name, fast=self._fast)
         self.connected = True
-        self.zero_lost |= self._is_zero_set
-        self._is_zero_set = False
+        self.zero_lost |= self._has_zero_to_lose
+        # The angle of this connection is the zero now. Only on hardware can the next one differ.
+        self._has_zero_to_lose = not connection.simulated
 
     def run(
         self,
@@ -285,7 +287,7 @@ class Rig:
             If the motor moves.
         """
         zero_reply = self._measure(ZeroOrder(), 0.0)
-        self._is_zero_set, self.zero_lost = True, False
+        self._has_zero_to_lose, self.zero_lost = True, False
         return zero_reply
 
     def probe(self, profile: Profile, stop: StopRequest) -> dict[str, Any]:
@@ -444,9 +446,12 @@ class Rig:
     def _reset_fault(self, target: ActuationTarget | None) -> None:
         """Reset the fault of the drive; raise RigError if that fails."""
         try:
-            from rigd.devices import reset_drive  # late: loads the drivers, needed only here
+            # Late: loads the drivers, needed only here.
+            from rigd.devices import ResetUnsupportedError, reset_drive
 
-            reset_drive(self._profile.rig, target)
+            # A drive whose driver cannot reset a fault reports the fault when it is connected.
+            with contextlib.suppress(ResetUnsupportedError):
+                reset_drive(self._profile.rig, target)
         except (DeviceError, OSError) as error:
             raise RigError(str(error)) from None
 

@@ -147,7 +147,28 @@ def test_reset_of_a_lasting_fault(rigd, stand_ins):
     assert stand_ins.calls[-1] == "drive.close"
 
 
+def test_reset_without_daemon_requires_the_name_of_the_rig(rigd, stand_ins):
+    """The simulated rig, to which other commands default, would report a success."""
+    code, text, errors = rigd("reset")
+    assert code == 2
+    assert text == ""
+    assert errors.startswith("Error: Nothing was reset. No daemon is running; ")
+    assert "rigd reset --profile NAME" in errors
+    assert "sim is simulated" in errors
+    assert stand_ins.calls == []
+
+
+def test_reset_by_a_driver_without_reset_reports_no_success(rigd, stand_ins):
+    stand_ins.drive = object()
+    code, text, errors = rigd("reset", "--profile", "antenna_can")
+    assert code == 1
+    assert text == ""
+    assert "antenna_can: nothing was reset" in errors
+    assert "press the wired stop" in errors
+
+
 def test_a_simulated_drive_has_no_fault(rigd):
     code, text, _ = rigd("reset", "--profile", "sim")
     assert code == 0
+    assert "sim is simulated" in text
     assert "no fault to reset" in text

@@ -259,6 +259,28 @@ def test_lost_zero_must_be_set_before_the_next_session(operated):
     assert operated.last["sessions"][0]["outcome"] == "complete"
 
 
+@pytest.mark.parametrize("simulated", [False, True], ids=["hardware", "simulated"])
+def test_zero_of_the_connection_is_lost_on_hardware_only(operate, simulated, runtime_folder):
+    """The angle at another connection is a zero that nobody has chosen, also if none was set."""
+    operated = operate()
+    operated.world.simulated = simulated
+    operated.open()
+    assert not operated.service.status()["zero_lost"]
+    operated.world.countdown, operated.world.then = 500, fail
+    operated.request("start", **SHORT)
+    assert operated.state == "fault"
+    operated.world.absent = True
+    assert "does not answer" in str(operated.request("reset"))
+    operated.world.absent = False
+    assert operated.request("reset") == {"zero_lost": not simulated}
+    assert operated.service.status()["zero_lost"] is not simulated
+    if not simulated:
+        assert "rigd zero" in str(operated.request("start", **SHORT))
+        operated.request("zero")
+    operated.request("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
 def test_failed_connection_is_a_fault_until_reset(operate):
     operated = operate()
     operated.world.absent = True

@@ -119,6 +119,7 @@ class World:
         self.countdown = 0
         self.then = None
         self.absent = False
+        self.simulated = True
         self.highest_nm = 0.0
         self.service = None
 
@@ -138,7 +139,7 @@ class World:
     def open_devices(self, rig):
         devices = open_devices(rig)
         self.drives.append(WatchedDrive(devices.drive, self))
-        return Devices(self.drives[-1], devices.sensor, simulated=True)
+        return Devices(self.drives[-1], devices.sensor, simulated=self.simulated)
 
 
 class ThreadParent:
