@@ -501,7 +501,8 @@ INTERLOCKS: Final = (
         None,
         Checked.DRIVE,
         Action.FAULT,
-        "Find out who pressed it and why, release it, then rigd reset.",
+        "Find out who pressed it and why, or whether the supply of STO or motor failed or another "
+        "program switched the drive off; release it, then rigd reset.",
     ),
     Interlock(
         "recorder lag",

@@ -260,10 +260,17 @@ def test_lost_zero_must_be_set_before_the_next_session(operated):
 
 
 @pytest.mark.parametrize("simulated", [False, True], ids=["hardware", "simulated"])
-def test_zero_of_the_connection_is_lost_on_hardware_only(operate, simulated, runtime_folder):
-    """The angle at another connection is a zero that nobody has chosen, also if none was set."""
+@pytest.mark.usefixtures("runtime_folder")
+def test_zero_of_the_connection_is_lost_on_hardware_only(operate, simulated, monkeypatch):
+    """The angle at another connection is a zero that nobody has chosen, also if none was set.
+
+    The driver of the hardware cannot reset a fault, so that the reset only connects it again.
+    """
     operated = operate()
     operated.world.simulated = simulated
+    monkeypatch.setattr(
+        "rigd.devices._fault_reset.open_devices", lambda rig, _: operated.world.open_devices(rig)
+    )
     operated.open()
     assert not operated.service.status()["zero_lost"]
     operated.world.countdown, operated.world.then = 500, fail

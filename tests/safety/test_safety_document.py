@@ -9,7 +9,8 @@ from rigd.checks.stopping_distance import max_stopping_distance, stopping_distan
 from rigd.profile import load_profile
 from rigd.safety.limits import INTERLOCKS
 
-TEXT = (Path(__file__).parents[2] / "docs" / "safety.md").read_text("utf-8")
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "safety.md").read_text("utf-8")
 
 
 def as_line(row):
@@ -22,7 +23,10 @@ def as_line(row):
         warning = f"{row.warning:g} times that"
     else:
         warning = f"{100 * row.warning:g} % of it"
-    limit = f"`{row.limit}`" if row.limit else "it happens"
+    if row.limit:
+        limit = f"`{row.limit}`"
+    else:
+        limit = "fixed, see below" if row.unit else "it happens"
     if row.name == "encoder jump":
         limit += " and two encoder steps"
     channel = row.channel.format(axis="fx … tz", channel="fx … tz, or gauge")
@@ -82,3 +86,21 @@ def test_the_document_has_the_travel_of_the_shipped_profiles(name):
         profile.rig, profile.limits, profile.rig.cia402.heartbeat_timeout_s
     )
     assert f"{free.total_rad:.2f} rad" in section
+
+
+def test_the_page_shows_the_steps_of_the_document_to_reset_a_fault():
+    page = " ".join((ROOT / "rigd" / "web" / "static" / "index.html").read_text("utf-8").split())
+    shown_list = page[page.index('<p id="fault-reason">') :].partition("</ol>")[0]
+    shown = re.findall(r"<li>(.*?)</li>", shown_list)
+    section = TEXT[TEXT.index("## How to reset") :].partition("\n\n`rigd reset`")[0]
+    stated = [" ".join(step.split()) for step in re.split(r"\n\d\. ", section)[1:]]
+    assert len(shown) == len(stated)
+    zone = re.search(r"The danger zone is [^.]+\d\.\d m\.", page).group()
+    assert zone[1:] in " ".join(TEXT.replace("**", "").split())
+    # Before the reset nothing depends on the program that the operator uses.
+    before_reset = 3
+    assert shown[:before_reset] == stated[:before_reset]
+    for words, step in zip(
+        ("<b>Reset</b>", "<b>Zero</b>", "<b>Check</b>"), shown[before_reset:], strict=True
+    ):
+        assert words in step

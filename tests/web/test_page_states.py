@@ -46,7 +46,7 @@ STATES = [
     (change("running", "stopping", "stop asked for"), "STOPPING", "Stop asked", "stopping"),
     (change("stopping", "ready", "chirp was stopped"), "READY", "was stopped", "ready"),
     (change("running", "fault", FULL_DISK), "FAULT", "Free space", "alarm"),
-    ({"type": "lost", "reason": "The daemon is gone."}, "OFFLINE", "press the STO", "quiet"),
+    ({"type": "lost", "reason": "The daemon is gone."}, "OFFLINE", "press the wired stop", "quiet"),
     (status("idle", doing="connecting"), "CONNECTING", "", "quiet"),
     (status(zero_lost=True), "READY", "The zero is lost", "ready"),
 ]
@@ -62,12 +62,14 @@ def test_states_and_failed_stops_are_shown_within_a_second(server, page, open_pa
     # The message of a failed stop names a remedy, also if the server does not answer.
     server.replies["stop"] = {"ok": False, "error": "The daemon gave no answer."}
     page.click("#stop")
-    expect_text(page, "#state-reason", "Not stopped: The daemon gave no answer. Use rigd stop")
+    expect_text(page, "#state-reason", "Not stopped. Press the wired stop (STO), then run rigd")
+    expect_text(page, "#state-reason", "The daemon gave no answer.")
     page.wait_for_timeout(100)
     assert page.inner_text("#state-word") == "READY"
     server.close()
     page.click("#stop")
-    expect_text(page, "#state-reason", "Not stopped: The page's server does not answer.")
+    expect_text(page, "#state-reason", "The page's server does not answer.")
+    expect_text(page, "#state-reason", "Not stopped. Press the wired stop (STO)")
     # The lost connection is the subject of this test; an open page would try again.
     page.close()
     open_page.complaints.clear()
@@ -144,7 +146,7 @@ def test_stop_without_an_answer_is_reported(server, page):
     server.replies["stop"] = None
     page.click("#stop")
     reason = page.locator("#state-reason")
-    expect(reason).to_contain_text("Not stopped: No answer within 3 s.", timeout=10_000)
+    expect(reason).to_contain_text("No answer within 3 s.", timeout=10_000)
     assert not page.get_attribute("#stop", "aria-busy")
 
 

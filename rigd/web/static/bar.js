@@ -82,7 +82,8 @@ export class Bar {
     if (reply.ok) {
       this.#stopped = reply.stopping ? "Stop requested." : "No session is running.";
     } else {
-      this.#stopped = `Not stopped: ${reply.error} Use rigd stop, or press the STO.`;
+      this.#stopped =
+        `Not stopped. Press the wired stop (STO), then run rigd stop. ${reply.error}`;
     }
     this.#render();
     if (reply.ok) setTimeout(() => { this.#stopped = ""; this.#render(); }, 4000);
@@ -106,7 +107,8 @@ export class Bar {
     if (this.#stopped) return this.#stopped;
     if (this.#gone) {
       return this.#connected
-        ? `${this.#gone} The state of the rig is unknown: if it moves, press the STO.` : this.#gone;
+        ? "The state of the rig is unknown: if it moves or you cannot see it, press the wired stop " +
+          `(STO). ${this.#gone}` : this.#gone;
     }
     if (this.#status === null) return "";
     const { doing, reason, zero_lost: zeroLost } = this.#status;
