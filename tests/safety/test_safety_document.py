@@ -23,10 +23,11 @@ def as_line(row):
         warning = f"{row.warning:g} times that"
     else:
         warning = f"{100 * row.warning:g} % of it"
+    limit = "it happens"
     if row.limit:
         limit = f"`{row.limit}`"
-    else:
-        limit = "fixed, see below" if row.unit else "it happens"
+    elif row.unit:
+        limit = "fixed, see below"
     if row.name == "encoder jump":
         limit += " and two encoder steps"
     channel = row.channel.format(axis="fx … tz", channel="fx … tz, or gauge")
