@@ -123,7 +123,7 @@ def test_failures_are_shown(operate, open_page):
     daemon.process.send_signal(signal.SIGSTOP)
     stopped_s = time.time()
     expect_text(page, "#state-word", "OFFLINE")
-    assert "press the wired stop (STO)" in page.inner_text("#state-reason")
+    assert "Press the wired stop (STO)" in page.inner_text("#state-reason")
     # The daemon's status, sent twice a second, may just have come.
     assert page.evaluate("() => window.shownAt.OFFLINE") - stopped_s < SHOWN_WITHIN_S + 0.2
     daemon.process.send_signal(signal.SIGCONT)

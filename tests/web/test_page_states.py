@@ -46,7 +46,7 @@ STATES = [
     (change("running", "stopping", "stop asked for"), "STOPPING", "Stop asked", "stopping"),
     (change("stopping", "ready", "chirp was stopped"), "READY", "was stopped", "ready"),
     (change("running", "fault", FULL_DISK), "FAULT", "Free space", "alarm"),
-    ({"type": "lost", "reason": "The daemon is gone."}, "OFFLINE", "press the wired stop", "quiet"),
+    ({"type": "lost", "reason": "The daemon is gone."}, "OFFLINE", "Press the wired stop", "quiet"),
     (status("idle", doing="connecting"), "CONNECTING", "", "quiet"),
     (status(zero_lost=True), "READY", "The zero is lost", "ready"),
 ]

@@ -107,8 +107,9 @@ export class Bar {
     if (this.#stopped) return this.#stopped;
     if (this.#gone) {
       return this.#connected
-        ? "The state of the rig is unknown: if it moves or you cannot see it, press the wired stop " +
-          `(STO). ${this.#gone}` : this.#gone;
+        // What to do comes first: a narrow bar cuts the text.
+        ? "Press the wired stop (STO) if the rig moves or you cannot see it: its state is unknown. " +
+          this.#gone : this.#gone;
     }
     if (this.#status === null) return "";
     const { doing, reason, zero_lost: zeroLost } = this.#status;
