@@ -122,9 +122,8 @@ def run_control(
         server = _ControlServer(
             profile, devices, clock, channels, parent, stop_request, realtime_results
         )
-        channels.shared_state[StateField.PHASE] = Phase.OFF
+        _publish_if_off(channels, devices)
         server.observe_standstill()
-        name_this_process(IDLE_NAME)
         parent.send(
             DevicesConnected(
                 calibration=devices.sensor.calibration(),
@@ -140,10 +139,21 @@ def run_control(
         end_text = failure_of_device(error, profile.rig.devices)
     finally:
         devices.drive.disable()
-        channels.shared_state[StateField.PHASE] = Phase.OFF
+        if channels.shared_state[StateField.PHASE] != Phase.PREPARING:  # it was connected
+            _publish_if_off(channels, devices)
         devices.drive.close()
         devices.sensor.close()
     parent.send(ControlEnded(f"{end_text} {devices.drive.off_doubt}".strip()))
+
+
+def _publish_if_off(channels: Channels, devices: Devices) -> None:
+    """Publish that the disabled drive is off, unless it has not shown this.
+
+    Displays claim that the torque is off in this phase, and ``rigd stop`` by this process name.
+    """
+    if not devices.drive.off_doubt:
+        channels.shared_state[StateField.PHASE] = Phase.OFF
+        name_this_process(IDLE_NAME)
 
 
 class _ControlServer:
@@ -338,7 +348,7 @@ class _ControlServer:
         finally:
             devices.drive.disable()
             cycle.torque_off()
-            shared_state[StateField.PHASE] = Phase.OFF
+            _publish_if_off(self._channels, devices)
             self._publish_readings()
         off_doubt = devices.drive.off_doubt
         if off_doubt:
@@ -347,8 +357,6 @@ class _ControlServer:
                 f"{end_reason} {off_doubt}".strip(),
                 True,
             )
-        else:
-            name_this_process(IDLE_NAME)
         failure_text, is_fault = end_reason, session_outcome == "fault"
         if was_recorded and end_reason:
             # Events after the last tick do not make the record incomplete.
@@ -409,12 +417,11 @@ class _ControlServer:
         finally:
             self._devices.drive.disable()
             cycle.torque_off()
-            self._shared_state[StateField.PHASE] = Phase.OFF
+            _publish_if_off(self._channels, self._devices)
             self._publish_readings()
         failure_text = f"{failure_text} {self._devices.drive.off_doubt}".strip()
         if failure_text:
             raise DeviceError(failure_text)
-        name_this_process(IDLE_NAME)
         self._parent.send(reply_message)
 
     def _send_measurement(self, measure_at_rest: Callable[[], dict[str, object]]) -> None:

@@ -3,6 +3,7 @@
 import itertools
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,10 +12,12 @@ from cases import further
 
 from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
-from rigd.engine.messages import DevicesConnected, ReadyToRecord, SessionFinished
-from rigd.engine.shared_state import Phase, StateField, StopReason
+from rigd.engine import IDLE_NAME
+from rigd.engine.messages import DevicesConnected, ProbeOrder, ReadyToRecord, SessionFinished
+from rigd.engine.shared_state import Activity, Phase, StateField, StopReason, activity
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import hold
+from rigd.runtime.processes import name_this_process
 from rigd.session.layout import Status, decode_samples
 from rigd.session.limits import MAX_SAMPLES
 
@@ -584,6 +587,49 @@ def test_a_drive_possibly_still_on_is_reported(make_session):
     finished = session.run().finished
     assert finished.outcome == "complete"  # the record is what it is
     assert finished.reason == "After the record: Drive: it does not show that it is off."
+
+
+@pytest.mark.parametrize("makes_probe", [False, True])
+@pytest.mark.parametrize("confirming_call", [1, 2, 99])
+def test_only_a_confirmed_off_is_published(make_session, makes_probe, confirming_call):
+    session = make_session(excitation=BRIEF)
+    drive, shared_state, published = session.drive, session.shared_state, []
+    disable = drive.disable
+
+    def publish():
+        process_name = Path("/proc/thread-self/comm").read_text().strip()
+        published.append((drive.doubt, Phase(shared_state[StateField.PHASE]), process_name))
+
+    def doubtful_disable():
+        disable()
+        publish()
+        is_confirmed = len(published) >= confirming_call
+        drive.doubt = "" if is_confirmed else "Drive: it does not show that it is off."
+
+    drive.disable = doubtful_disable
+    name_before = Path("/proc/thread-self/comm").read_text().strip()
+    try:
+        session.obey(ProbeOrder(session.profile) if makes_probe else session.order())
+        publish()
+    finally:
+        name_this_process(name_before)
+    for doubt, phase, process_name in published:
+        assert not (doubt and (phase is Phase.OFF or process_name == IDLE_NAME))
+    is_doubtful = bool(drive.doubt)
+    assert is_doubtful is (confirming_call == 99)
+    _, last_phase, last_name = published[-1]
+    assert (last_phase is Phase.OFF, last_name == IDLE_NAME) == (not is_doubtful, not is_doubtful)
+    assert (activity(shared_state) is Activity.FINISHING) is not is_doubtful
+
+
+def test_drive_that_was_never_connected_is_not_published_as_off(make_session):
+    def fail():
+        raise DeviceError("The drive does not answer.")
+
+    session = make_session()
+    session.drive.connect = fail
+    session.obey()
+    assert session.shared_state[StateField.PHASE] == Phase.PREPARING
 
 
 class StallWhileReturning(VirtualClock):
