@@ -39,8 +39,6 @@ def stop_and_report(profile: str | None, *, wait: bool) -> int:
 def _print_report(report: "StopReport") -> None:
     """Print the result of a stop to standard output, and problems to standard error."""
     report_lines = [f"Stopped: {message_text}." for message_text in report.stopped]
-    report_lines += [f"{message_text} is being stopped." for message_text in report.stopping]
-    report_lines += report.quiet
     if report.sure and not report.stopping:
         if len(report.stopped) == 1:
             report_lines.append("The session has ended; the torque is off.")
@@ -53,6 +51,8 @@ def _print_report(report: "StopReport") -> None:
             report_lines.append(
                 f"No session{owner_text} is running. Searched: {', '.join(report.searched)}."
             )
+    report_lines += [f"{message_text} is being stopped." for message_text in report.stopping]
+    report_lines += report.quiet
     problems = [
         f"Not stopped: {message_text}; only that user or root can stop it."
         for message_text in report.others
@@ -62,6 +62,9 @@ def _print_report(report: "StopReport") -> None:
         "status and "
         "the rig, and press the wired stop (STO) if anything moves."
         for message_text in report.running
+    ]
+    problems += [
+        f"Error: {message_text} Press the wired stop (STO)." for message_text in report.unconfirmed
     ]
     problems += [f"Error: {message_text}" for message_text in report.doubts]
     if report.doubts and not report.running:

@@ -3,7 +3,8 @@
 Sessions are found in two independent ways. A daemon is reached through its socket, provided that
 the listening process holds the lock of the rig. It reports the end of its session itself. Every
 other process that runs sessions is found in the process table, and gets `STOP_SIGNAL`. The process
-table shows when that process has ended, or when its control process has disabled the drive.
+table shows when that process has ended, and by the last name of its control process whether the
+drive has shown that it is off.
 """
 
 import os
@@ -21,7 +22,7 @@ from typing import Any, Final
 
 from rigd.daemon.address import GROUP_FOLDER, SOCKET_SUFFIX, own_sockets, peer_at
 from rigd.daemon.client import UNKNOWN_STATE, await_end, stop_session
-from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
+from rigd.engine import CONNECTING_NAME, IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.errors import RigdError
 from rigd.runtime import STOP_SIGNAL
 from rigd.runtime.addresses import file_name, folder_fault, known_folders
@@ -60,6 +61,8 @@ class StopReport:
         Sentences on rigs that run no session.
     running
         Sessions that were requested to stop, but have not ended in time.
+    unconfirmed
+        Sentences on rigs that run no session, but whose drive has not shown that it is off.
     doubts
         Sentences on folders and tables that could not be read, and on replies that are not trusted.
     others
@@ -72,6 +75,7 @@ class StopReport:
     stopping: list[str] = field(default_factory=list)
     quiet: list[str] = field(default_factory=list)
     running: list[str] = field(default_factory=list)
+    unconfirmed: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
     searched: list[str] = field(default_factory=list)
@@ -79,12 +83,12 @@ class StopReport:
     @property
     def found(self) -> bool:
         """Whether a process was found that can run sessions."""
-        return bool(self.stopped or self.stopping or self.quiet or self.running)
+        return bool(self.stopped or self.stopping or self.quiet or self.running or self.unconfirmed)
 
     @property
     def sure(self) -> bool:
-        """Whether it is certain that no session of this user is running any more."""
-        return not (self.running or self.doubts)
+        """Whether it is certain that no session of this user runs, and that its drive is off."""
+        return not (self.running or self.unconfirmed or self.doubts)
 
 
 def stop_all(rig: str | None, *, wait: bool = True) -> StopReport:
@@ -122,14 +126,14 @@ class _StopOfAll:
         for daemon in daemons:
             daemon.begin()
         unended_supervisors = self._stop_supervisors(daemons)
-        ended_pids = {
+        disabled_pids = {
             supervisor_stop.process.pid
             for supervisor_stop in self._own_supervisors.values()
-            if supervisor_stop not in unended_supervisors
+            if supervisor_stop not in unended_supervisors and supervisor_stop.has_shown_off
         }
         trusted_pids = set()
         for daemon in daemons:
-            daemon.report_to(self._report, disabled=daemon.pid in ended_pids)
+            daemon.report_to(self._report, disabled=daemon.pid in disabled_pids)
             if not daemon.doubt:
                 trusted_pids.add(daemon.pid)
         for supervisor in self._own_supervisors.values():
@@ -379,13 +383,22 @@ class _DaemonStop:
         """Add to a report that the daemon's session has ended, or that none was running."""
         series = status["series"]
         is_stopped_by_signal = self._reply["signalled"] and series is not None and series["stopped"]
-        if status["state"] == "fault":
+        if status["state"] == "fault" and status.get("rig") is not None:
+            # The devices stay connected only if the drive has shown that it is off.
             report.quiet.append(
-                f"No session is running on {rig_text}. The rig is in fault: {status['reason']}"
+                f"No session is running on {rig_text}; the torque is off. The rig is in fault: "
+                f"{status['reason']}"
+            )
+        elif status["state"] == "fault":
+            report.unconfirmed.append(
+                f"No session is running on {rig_text}, but the rig is in fault, and its devices "
+                "are not connected, so the drive does not show that it is off. Reason of the "
+                f"fault: {status['reason']}"
             )
         elif status["state"] == "idle":
-            report.quiet.append(
-                f"No session is running on {rig_text}; the devices are not connected yet."
+            report.unconfirmed.append(
+                f"No session is running on {rig_text}, but the devices are not connected, so the "
+                "drive does not show that it is off."
             )
         elif self._reply["stopping"] or is_stopped_by_signal:
             sessions = [] if series is None else series["sessions"]
@@ -409,6 +422,10 @@ class _SupervisorStop:
 
     def __init__(self, process: RunningProcess, control_processes: list[RunningProcess]) -> None:
         self.process = process
+        self._control_name_by_pid: dict[int, str] = {}
+        """Process id of each control process that was seen → its last name."""
+        self._was_session_seen = False
+        """Whether a session was observed, so that its file may still be open."""
         self.controls = control_processes
         self._rigd_command = _rigd_arguments(process.command)
         self._start_time = process.start_ticks or 0
@@ -418,7 +435,6 @@ class _SupervisorStop:
         """Whether the process was sent the signal but is suspended, and cannot receive it."""
         self._last_signal_s = -_REPEAT_SIGNAL_INTERVAL_S
         self._is_signal_sent = False
-        self._was_session_seen = False
         self._is_control_stopped = False
 
     @property
@@ -459,12 +475,29 @@ class _SupervisorStop:
         return self._is_foreground_command and not self.process.ignores(STOP_SIGNAL)
 
     @property
-    def _was_session_observed(self) -> bool:
-        """Whether a session was observed, so that its file may still be open."""
-        self._was_session_seen |= any(
-            control_process.name == SESSION_NAME for control_process in self.controls
-        )
-        return self._was_session_seen
+    def controls(self) -> list[RunningProcess]:
+        """Control processes that were running when the process table was last read."""
+        return self._controls
+
+    @controls.setter
+    def controls(self, control_processes: list[RunningProcess]) -> None:
+        self._controls = control_processes
+        for control_process in control_processes:
+            self._control_name_by_pid[control_process.pid] = control_process.name
+            self._was_session_seen |= control_process.name == SESSION_NAME
+
+    @property
+    def _may_be_on(self) -> bool:
+        """Whether a drive has not shown that it is off, by the last name of its control process.
+
+        Before a control process gets its first name, it has not communicated with the drive.
+        """
+        return not {CONNECTING_NAME, SESSION_NAME}.isdisjoint(self._control_name_by_pid.values())
+
+    @property
+    def has_shown_off(self) -> bool:
+        """Whether every drive that was connected has shown that it is off."""
+        return not self._may_be_on and IDLE_NAME in self._control_name_by_pid.values()
 
     @property
     def is_over(self) -> bool:
@@ -479,7 +512,9 @@ class _SupervisorStop:
         if self._is_foreground_command and self.process.handles(STOP_SIGNAL):
             # Its control process ends after the file was closed. A process without a session may
             # still be planning, but will not begin the session.
-            return has_obeyed and not (self._was_session_observed and self.controls)
+            return has_obeyed and not (
+                self.controls and (self._was_session_seen or self._may_be_on)
+            )
         return not self.has_session and (has_obeyed or not self._is_signal_sent)
 
     def may_run_rig(self, rig: str) -> bool:
@@ -530,15 +565,22 @@ class _SupervisorStop:
             report.stopping.append(self.description)
         elif not ended:
             report.running.append(self.description)
+        elif self._may_be_on:
+            report.stopped.append(self.description)
+            report.unconfirmed.append(
+                f"The drive of {self.description} has not shown that it is off."
+            )
+        elif self._had_session and not self.has_shown_off:
+            report.quiet.append(f"Stopped before it connected the devices: {self.description}.")
         elif self._had_session:
             report.stopped.append(self.description)
         elif self.controls:
             report.quiet.append(f"No session is running on {self.description}; the torque is off.")
         if self.suspended:
-            report.doubts.append(
-                f"{self.description} is suspended and cannot respond; its control process has "
-                "disabled the drive."
+            drive_text = (
+                "; its control process has disabled the drive" if self.has_shown_off else ""
             )
+            report.doubts.append(f"{self.description} is suspended and cannot respond{drive_text}.")
 
 
 def _find_supervisors(

@@ -7,6 +7,7 @@ from . import reference as reference
 from . import shared_state as shared_state
 from . import timing as timing
 from . import workers as workers
+from ._control_names import CONNECTING_NAME as CONNECTING_NAME
 from ._control_names import IDLE_NAME as IDLE_NAME
 from ._control_names import SESSION_NAME as SESSION_NAME
 from ._control_names import supervisor_of_control as supervisor_of_control

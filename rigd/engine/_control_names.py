@@ -10,10 +10,10 @@ supervisor."""
 CONNECTING_NAME: Final = "rigd connecting"
 """Name of the control process in the process table before its devices are connected."""
 IDLE_NAME: Final = "rigd idle"
-"""Name of the control process in the process table while the drive is disabled."""
+"""Name of the control process in the process table from when the drive has shown that it is off."""
 SESSION_NAME: Final = "rigd session"
-"""Name of the control process in the process table from the start of a session until the drive is
-disabled again."""
+"""Name of the control process in the process table from the start of a session until the drive has
+shown that it is off."""
 
 
 def supervisor_of_control(command: Sequence[str]) -> int | None:

@@ -152,7 +152,7 @@ class ReadyToRecord:
 
 @dataclass(frozen=True, slots=True)
 class SessionFinished:
-    """Message that a session has ended and the torque is off."""
+    """Message that a session has ended and the drive was commanded off."""
 
     outcome: str
     """Outcome of the record: ``complete``, ``stopped`` or ``fault``."""

@@ -42,7 +42,9 @@ class Phase(IntEnum):
     RETURNING = 5
     """Damping the beam and returning to the start angle after the record."""
     OFF = 6
-    """Idle with the drive disabled, between sessions and at the end."""
+    """Idle, after the drive has shown that it is off, between sessions and at the end.
+
+    If it has not shown this, the phase remains the last one of the session."""
     WAITING = 7
     """Waiting until the beam is at rest, before the tare."""
     PROBING = 8
@@ -73,7 +75,7 @@ class Activity(StrEnum):
     RETURNING = "returning"
     """The record is over, and the motor returns to its start angle."""
     FINISHING = "finishing"
-    """The record is over and the torque off; the file is being completed."""
+    """The drive has shown that it is off after the record; the file is being completed."""
     STOPPING = "stopping"
     """A stop was requested."""
 

@@ -51,7 +51,7 @@ STOPPING: Final = BannerState("STOPPING", ORANGE)
 RETURNING: Final = BannerState("RETURNING", ORANGE, "The record is over.")
 """State after the record, while the motor returns to its start."""
 FINISHING: Final = BannerState("FINISHING", ORANGE, "The record is over and the torque is off.")
-"""State after the record, when the torque is off."""
+"""State after the record, when the drive has shown that it is off."""
 SUPERVISOR_SILENT: Final = BannerState(
     "SUPERVISOR NOT RESPONDING",
     RED,
@@ -61,12 +61,12 @@ SUPERVISOR_SILENT: Final = BannerState(
 SUPERVISOR_SILENT_TORQUE_OFF: Final = BannerState(
     "SUPERVISOR NOT RESPONDING", RED, "The session has ended and the torque is off. Check CPU load."
 )
-"""State if the supervising process does not respond after the session ended."""
+"""State if the supervising process does not respond after the drive has shown that it is off."""
 SUPERVISOR_LOST: Final = BannerState(
     "SUPERVISOR LOST",
     RED,
-    "The supervising process ended. The control process ends the session and switches the torque "
-    "off.",
+    "The supervising process ended. The control process ends the session and commands the torque "
+    "off; press the wired stop (STO) if anything moves.",
     over=True,
 )
 """State after the supervising process ended before the session."""
@@ -76,7 +76,7 @@ SUPERVISOR_LOST_TORQUE_OFF: Final = BannerState(
     "The supervising process ended; the torque is off.",
     over=True,
 )
-"""State if the supervising process ended and the torque is off."""
+"""State if the supervising process ended and the drive has shown that it is off."""
 
 _COLOR_OF_OUTCOME: Final = {"complete": SKY_BLUE, "stopped": GREY, "fault": RED}
 """Colour of the band after a session, by its outcome."""
