@@ -101,7 +101,7 @@ class Status(IntFlag):
     LIMIT_WARNING = 64
     """A limit of the profile is nearly reached or exceeded."""
     TORQUE_OFF = 128
-    """The drive exerts no torque."""
+    """No torque is commanded; whether the drive obeys is stated by the outcome of the session."""
     LATE = 256
     """The control loop woke up late for this tick."""
     TOUCHED = 512
