@@ -13,6 +13,7 @@ from ._experiment import differing_fact_keys as differing_fact_keys
 from ._experiment import fact_text as fact_text
 from ._headlines import campaign_estimates as campaign_estimates
 from ._headlines import headlines as headlines
+from ._headlines import pooled_flags as pooled_flags
 from ._homogeneity import Heterogeneity as Heterogeneity
 from ._homogeneity import Homogeneity as Homogeneity
 from ._session import SessionAnalysis as SessionAnalysis

@@ -146,14 +146,18 @@ def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
     sweeps_text = f"{sweeps.rising} rising and {sweeps.falling} falling sweeps"
     if not sweeps.changed:
         lowest_p_value = min(mode_change.chance for mode_change in sweeps.modes)
-        largest_change = max(
-            abs(mode_change.frequency) + NORMAL_95 * mode_change.frequency_std
-            for mode_change in sweeps.modes
+        frequency_limit, damping_limit = (
+            max(abs(change) + NORMAL_95 * std for change, std in changes)
+            for changes in (
+                [(mode.frequency, mode.frequency_std) for mode in sweeps.modes],
+                [(mode.damping, mode.damping_std) for mode in sweeps.modes],
+            )
         )
         return [
-            f"Nothing changed along the records: {sweeps_text} have the same modal constants "
-            "(lowest "
-            f"{p_value_text(lowest_p_value)}; frequencies to {100 * largest_change:.1g} %)."
+            f"No significant change along the records was found: the modal constants of "
+            f"{sweeps_text} agree (lowest {p_value_text(lowest_p_value)}). Not excluded (95 %): "
+            f"changes of up to {100 * frequency_limit:.2g} % in a frequency and "
+            f"{100 * damping_limit:.2g} % in a damping ratio."
         ]
     changes_text = "; ".join(map(_describe_mode_change, sweeps.changed))
     return [

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from analysis.identify import headline_json
 from analysis.identify.headline import ConditionalEstimate, Estimates, ReportedLossFactor
-from analysis.identify.modal_headline import replace_by_modal_model
+from analysis.identify.modal_headline import replace_by_modal_model, uniform_beam_refusal_reason
 from analysis.models import STRUCTURES
 from analysis.statistics import BIC_DECISIVE, student_t_quantile
 from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._campaign import CampaignResult
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._statistics import RankedStructure
+    from analysis.campaigns._verdict import CampaignVerdict
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify.headline import StructureStatus
 
@@ -79,9 +80,7 @@ def campaign_estimates(campaign: CampaignResult) -> Estimates | None:
     if pooled_estimate is None or verdict is None:
         return None
     pooled_orders = (verdict.alpha, verdict.lambda_)
-    exact_orders = tuple(order.exact or order for order in pooled_orders)
-    are_explained = verdict.adequate >= _ADEQUATE_FRACTION * verdict.sessions
-    common_flag = None if are_explained else _UNEXPLAINED_FLAG
+    exact_orders, common_flag = _exact_orders(verdict), _common_flag(verdict)
     exact_estimates = Estimates(
         name=pooled_estimate.name,
         parameters=_reported_parameters(campaign, pooled_estimate, exact_orders, common_flag),
@@ -106,6 +105,41 @@ def campaign_estimates(campaign: CampaignResult) -> Estimates | None:
         half_width=modal_model.half_width,
     )
     return _add_flags(reported_estimates, campaign, pooled_orders)
+
+
+def pooled_flags(campaign: CampaignResult, pooled_estimate: PooledEstimate) -> dict[str, str]:
+    """Return the flags of a pooled estimate for an exactly uniform beam, by parameter name.
+
+    Parameters
+    ----------
+    campaign : CampaignResult
+        The analysed campaign.
+    pooled_estimate : PooledEstimate
+        One of its pooled estimates.
+    """
+    verdict, modal_model = campaign.verdict, campaign.modal
+    if verdict is None:
+        return {}
+    refusal = uniform_beam_refusal_reason(modal_model.uniform_beam) if modal_model else None
+    reported_parameters = _reported_parameters(
+        campaign, pooled_estimate, _exact_orders(verdict), _common_flag(verdict)
+    )
+    return {
+        parameter_name: flag
+        for parameter_name, parameter in reported_parameters.items()
+        if (flag := parameter.flag or refusal) is not None
+    }
+
+
+def _exact_orders(verdict: CampaignVerdict) -> tuple[PooledOrder, ...]:
+    """Return the orders of the damping for an exactly uniform beam."""
+    return tuple(order.exact or order for order in (verdict.alpha, verdict.lambda_))
+
+
+def _common_flag(verdict: CampaignVerdict) -> str | None:
+    """Return the flag of all estimates, or None if the residual of enough sessions is noise."""
+    are_explained = verdict.adequate >= _ADEQUATE_FRACTION * verdict.sessions
+    return None if are_explained else _UNEXPLAINED_FLAG
 
 
 def _add_flags(

@@ -91,14 +91,14 @@ def _order_clause(pooled_order: PooledOrder) -> str:
     if pooled_order.status == "absent":
         return f"no {damping_name}"
     if pooled_order.status == "compatible" and pooled_order.interval is None:
-        return f"{damping_name} of order 1 ({pooled_order.order} was not fitted)"
+        return f"{damping_name} compatible with order 1 ({pooled_order.order} was not fitted)"
     value_text = _value_and_half_width(pooled_order)
     if value_text is None:
         return f"{damping_name} of an order that is not established"
     assert pooled_order.value is not None
     order_text = f"{pooled_order.order} = {value_text}"
     if pooled_order.status == "compatible":
-        return f"{damping_name} of integer order ({order_text})"
+        return f"{damping_name} compatible with order 1 ({order_text})"
     if pooled_order.status == "open":
         return f"{damping_name} of an order near 1 ({order_text}; 1 is doubtful, but not excluded)"
     if abs(pooled_order.value - 1) < _NEARLY_INTEGER_DISTANCE:

@@ -247,6 +247,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
             *_damping_columns(),
             Column("Fit (%)", "nrmse_percent", ".2f"),
             *(Column(index_name.upper(), index_name) for index_name in _INDEX_NAMES),
+            Column("", "not_reported", TEXT_FORMAT),
         ),
         (
             (
@@ -257,6 +258,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
                 ),
                 response_fit_percent(analysis, model),
                 *(getattr(model.indices, index_name) for index_name in _INDEX_NAMES),
+                " ".join(sorted(unreported_parameters(fit.structure, unsupported_orders))),
             )
             for fit, model in zip(fits, analysis.models, strict=True)
         ),

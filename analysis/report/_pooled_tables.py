@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns import campaign_estimates, differing_fact_keys, fact_text
+from analysis.campaigns import campaign_estimates, differing_fact_keys, fact_text, pooled_flags
 from analysis.campaigns.labels import label, percent, probability, symbol_with_unit
 from analysis.campaigns.specimen_sentences import MIXTURE_MARK, MIXTURE_NOTE, title
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.models import STRUCTURES
 from analysis.report.table import (
-    NOT_REPORTED_MARK,
     TEXT_FORMAT,
     Cell,
     Column,
@@ -20,9 +19,12 @@ from analysis.report.table import (
     Table,
     count_cell,
     estimate_cells,
+    flag_notes,
+    flagged_cells,
     footnotes,
     grey_cell,
     mark_cell,
+    mode_flag,
     number_cell,
     unreported_parameters,
 )
@@ -78,8 +80,9 @@ def structures_table(campaign: CampaignResult) -> Table:
         ),
         tuple(map(row, campaign.structures)),
         (
-            "Damping and stiffness corrections have one value for all sessions, with a "
-            "between-session variance where they differ; settings of the rig have one per session.",
+            "Each damping parameter has one value for all sessions, with a between-session "
+            "variance where they differ, or one per session if some session does not determine "
+            "it; delay, tool inertia, ρ/EI and EI have one per session.",
             *(
                 ()
                 if all(ranked_structure.pooled for ranked_structure in campaign.structures)
@@ -166,8 +169,18 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
         "standard deviation between sessions beyond that (τ). p: p-value of Cochran's Q. "
         f"Residual {only_estimate.misfit:.4g} times the noise."
     ]
-    if unreported_parameters(STRUCTURES[only_estimate.structure], unsupported_orders):
+    unreported_names = unreported_parameters(
+        STRUCTURES[only_estimate.structure], unsupported_orders
+    )
+    if unreported_names:
         table_notes += footnotes(unsupported_orders)
+    table_notes += flag_notes(
+        flag
+        for parameter_name, flag in pooled_flags(campaign, only_estimate).items()
+        if parameter_name in only_estimate.by_name
+        and parameter_name not in unreported_names
+        and not homogeneity.is_mixed(parameter_name)
+    )
     if any(homogeneity.is_mixed(parameter.name) for parameter in only_estimate.parameters):
         table_notes.append(MIXTURE_NOTE)
     return Table(
@@ -194,6 +207,7 @@ def _pooled_row(
 ) -> Row:
     """Return the row of a parameter in the table of pooled estimates."""
     homogeneity = campaign.homogeneity
+    flag = pooled_flags(campaign, pooled_estimate).get(parameter.name)
     _, display_factor, _ = label(parameter.name)
     value_cell, std_cell, low_cell, high_cell = estimate_cells(
         (parameter.value, parameter.std, *parameter.interval), parameter.std, display_factor
@@ -201,7 +215,7 @@ def _pooled_row(
     is_reported = parameter.name not in unreported_parameters(
         STRUCTURES[pooled_estimate.structure], unsupported_orders
     )
-    if not is_reported:
+    if not is_reported or (flag and not homogeneity.is_mixed(parameter.name)):
         value_cell = mark_cell(value_cell)
     else:
         # Only usable values are bold, so that they catch the eye.
@@ -232,6 +246,7 @@ def _pooled_row(
         "next_high_95": parameter.next_interval[1],
         "reported": is_reported,
         "mixture": homogeneity.is_mixed(parameter.name),
+        "flag": flag,
     }
 
 
@@ -253,6 +268,11 @@ def tolerance_table(campaign: CampaignResult) -> Table:
     if modal_result is None or tolerant_estimate is None or reported_numbers is None:
         return Table("parameters", "", table_columns, ())
     exact_parameters = reported_numbers.exact.parameters if reported_numbers.exact else {}
+    flags = [
+        parameter.flag
+        for parameters in (reported_numbers.parameters, exact_parameters)
+        for parameter in parameters.values()
+    ]
     table_rows: list[Row] = []
     for parameter_name, reported_value in reported_numbers.parameters.items():
         _, display_factor, _ = label(parameter_name)
@@ -266,7 +286,7 @@ def tolerance_table(campaign: CampaignResult) -> Table:
         exact_cells = (
             estimate_cells((exact_value.value, exact_value.std), exact_value.std, display_factor)
             if exact_value
-            else (None, None)
+            else (number_cell(None), number_cell(None))
         )
         table_rows.append(
             {
@@ -280,15 +300,19 @@ def tolerance_table(campaign: CampaignResult) -> Table:
                 if reported_value.flag
                 else replace(value_cell, strong=True),
                 **dict(zip(("std", "low_95", "high_95"), further_cells, strict=True)),
-                **dict(zip(("exact", "exact_std"), exact_cells, strict=True)),
+                **dict(
+                    zip(
+                        ("exact", "exact_std"),
+                        flagged_cells(exact_cells, exact_value.flag if exact_value else None),
+                        strict=True,
+                    )
+                ),
                 "uniformity_percent": 100 * tolerant_estimate.uniformity,
                 "basis": tolerant_estimate.basis,
                 "flag": reported_value.flag,
+                "exact_flag": exact_value.flag if exact_value else None,
             }
         )
-    flag_texts = dict.fromkeys(
-        parameter.flag for parameter in reported_numbers.parameters.values() if parameter.flag
-    )
     return Table(
         "parameters",
         title(
@@ -305,7 +329,7 @@ def tolerance_table(campaign: CampaignResult) -> Table:
         (
             "The tolerance of the geometry is common to all sessions: more of them do not reduce "
             "it.",
-            *(f"{NOT_REPORTED_MARK} {flag_text}." for flag_text in flag_texts),
+            *flag_notes(flags),
         ),
     )
 
@@ -346,28 +370,38 @@ def uniform_beam_table(campaign: CampaignResult) -> Table:
 
 def modes_table(campaign: CampaignResult) -> Table:
     """Return the table of pooled modes: means and standard deviations between sessions."""
-    homogeneity = campaign.homogeneity
+    homogeneity, reported_numbers = campaign.homogeneity, campaign_estimates(campaign)
+    reported_modes = {
+        mode.number: mode for mode in (reported_numbers.modes if reported_numbers else ())
+    }
     table_rows: list[Row] = []
+    marked_flags: list[str | None] = []
     for pooled_mode in campaign.modes:
         mode_cells: dict[str, Entry] = {"mode": pooled_mode.number}
+        reported_mode = reported_modes.get(pooled_mode.number)
         for quantity_key, std, between_std_name, display_factor in (
             ("frequency_hz", "frequency_std_hz", "frequency_between_std_hz", 1.0),
             ("damping_ratio", "damping_ratio_std", "damping_ratio_between_std", 100.0),
         ):
             std_value = getattr(pooled_mode, std)
-            mean_value, mode_cells[std] = estimate_cells(
+            value_cells = estimate_cells(
                 (getattr(pooled_mode, quantity_key), std_value), std_value, display_factor
             )
-            value_text = with_mixture_mark(
-                mean_value.text, f"{quantity_key}_{pooled_mode.number}", homogeneity
-            )
+            quantity_name = f"{quantity_key}_{pooled_mode.number}"
+            if reported_mode is not None and not homogeneity.is_mixed(quantity_name):
+                marked_flags.append(getattr(reported_mode, quantity_key).flag)
+                value_cells = flagged_cells(value_cells, marked_flags[-1])
+            mean_value, mode_cells[std] = value_cells
+            value_text = with_mixture_mark(mean_value.text, quantity_name, homogeneity)
             mode_cells[quantity_key] = replace(mean_value, text=value_text)
             mode_cells[between_std_name] = number_cell(
                 getattr(pooled_mode, between_std_name), ".2g", display_factor
             )
         std_value = pooled_mode.participation_std_kg_m2
-        inertia_cell, std_cell = estimate_cells(
-            (pooled_mode.participation_kg_m2, std_value), std_value, 1e6
+        inertia = reported_mode.participation if reported_mode else None
+        inertia_cell, std_cell = flagged_cells(
+            estimate_cells((pooled_mode.participation_kg_m2, std_value), std_value, 1e6),
+            inertia.flag if inertia else None,
         )
         mode_cells |= {"participation_kg_m2": inertia_cell, "participation_std_kg_m2": std_cell}
         table_rows.append(
@@ -378,6 +412,7 @@ def modes_table(campaign: CampaignResult) -> Table:
                 "damping_ratio_mixture": homogeneity.is_mixed(
                     f"damping_ratio_{pooled_mode.number}"
                 ),
+                "flag": mode_flag(reported_mode) if reported_mode else None,
             }
         )
     has_mixture = any(
@@ -397,7 +432,7 @@ def modes_table(campaign: CampaignResult) -> Table:
             *(_INERTIA_COLUMNS if any(row["source"] == "modal" for row in table_rows) else ()),
         ),
         tuple(table_rows),
-        (MIXTURE_NOTE,) if has_mixture else (),
+        (*flag_notes(marked_flags), *((MIXTURE_NOTE,) if has_mixture else ())),
     )
 
 

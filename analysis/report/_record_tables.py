@@ -17,8 +17,9 @@ from analysis.report.table import (
     Table,
     count_cell,
     estimate_cells,
-    grey_cell,
-    mark_cell,
+    flag_notes,
+    flagged_cells,
+    mode_flag,
     number_cell,
 )
 from analysis.statistics import NORMAL_95
@@ -26,7 +27,7 @@ from rigd.beam import parameter_named
 from rigd.printable import listed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
     from analysis.identify.headline import Estimates, Headline, ReportedLossFactor
     from analysis.results import WholeRecord
@@ -48,19 +49,11 @@ _MARK_NOTE: Final = (
 def modes_table(whole_record: WholeRecord) -> Table:
     """Return the table of modes: frequencies, damping ratios and effective inertias.
 
-    Doubtful damping ratios have a mark (†).
+    Doubtful numbers have a mark (†). If both frequency and damping ratio of a mode are doubtful,
+    its number has the mark.
     """
     headline = whole_record.headline
     has_inertias = any(mode.participation is not None for mode in headline.modes)
-    table_rows: list[tuple[Entry, ...]] = []
-    for mode in headline.modes:
-        mode_cells = *_mode_cells(mode), *_inertia_cells(mode.participation)
-        if mode.damping_ratio.flag is None:
-            table_rows.append((mode.number, *mode_cells, mode.source))
-        else:
-            table_rows.append(
-                (mark_cell(count_cell(mode.number)), *map(grey_cell, mode_cells), mode.source)
-            )
     return Table.from_rows(
         "modes",
         f"Modes with locked hub (clamped–free): {_modes_source(headline)}",
@@ -69,13 +62,19 @@ def modes_table(whole_record: WholeRecord) -> Table:
             Column("Inertia (kg·mm²)" if has_inertias else "", "participation_kg_m2"),
             Column("std" if has_inertias else "", "participation_std_kg_m2"),
             Column("Source" if has_inertias else "", "source", TEXT_FORMAT),
+            _FILE_REMARK_COLUMN,
         ),
-        table_rows,
+        map(_mode_row, headline.modes),
         (
             "Intervals are statistical only; frequencies and damping ratios do not depend on "
             "torque scale, length or density.",
             *_modal_notes(whole_record),
-            *_reason_notes(mode.damping_ratio for mode in headline.modes),
+            *flag_notes(
+                estimate.flag
+                for mode in headline.modes
+                for estimate in (mode.damping_ratio, mode.frequency_hz, mode.participation)
+                if estimate is not None
+            ),
         ),
     )
 
@@ -113,6 +112,25 @@ _MODE_COLUMNS: Final = (
     Column("to (%)", "damping_ratio_high_95"),
 )
 """Columns of a mode's frequency and damping ratio with their uncertainties."""
+
+
+def _mode_row(mode: ReportedMode) -> tuple[Entry, ...]:
+    """Return the row of a mode in the table of modes, with marks at doubtful numbers."""
+    frequency_flag, damping_flag = mode.frequency_hz.flag, mode.damping_ratio.flag
+    mode_cells, inertia_cells = _mode_cells(mode), _inertia_cells(mode.participation)
+    last_entries = mode.source, mode_flag(mode) or ""
+    if damping_flag is not None and frequency_flag is not None:
+        marked_cells = flagged_cells(
+            (count_cell(mode.number), *mode_cells, *inertia_cells), damping_flag
+        )
+        return *marked_cells, *last_entries
+    return (
+        mode.number,
+        *flagged_cells(mode_cells[:2], frequency_flag),
+        *flagged_cells(mode_cells[2:], damping_flag),
+        *flagged_cells(inertia_cells, mode.participation.flag if mode.participation else None),
+        *last_entries,
+    )
 
 
 def _mode_cells(mode: ReportedMode) -> tuple[Cell, ...]:
@@ -218,6 +236,8 @@ _PARAMETER_COLUMNS: Final = (
 """Columns of a parameter: symbol, meaning, unit, value and uncertainty."""
 _REMARK_COLUMN: Final = Column("Remark", "remark", TEXT_FORMAT)
 """Column with the reason why a parameter has a mark."""
+_FILE_REMARK_COLUMN: Final = replace(_REMARK_COLUMN, heading="")
+"""The same column of tables whose notes state the reason."""
 _UNCERTAINTY_NOTE: Final = (
     "std is one standard deviation; intervals of ρ/EI and EI, and on an exactly uniform beam those "
     "of ζ and γ, are symmetric in the logarithm. The CSV file has SI units."
@@ -300,7 +320,8 @@ def _scale_notes(whole_record: WholeRecord) -> Iterator[str]:
         + (
             "They agree."
             if density_result.agree
-            else "The difference is significant (95 %): check torque scale and length."
+            else "The difference is significant (95 %): check torque scale, length and stated "
+            "density; a tip mass or a soft clamp acts alike."
         )
     )
 
@@ -368,6 +389,7 @@ def loss_factors_table(whole_record: WholeRecord) -> Table:
     At its pivot frequency, a loss factor is not correlated with the order of the damping.
     """
     headline = whole_record.headline
+    flags = [_loss_factor_flag(headline, loss_factor) for loss_factor in headline.sizes]
     return Table.from_rows(
         "damping_sizes",
         "Loss factor of either damping at its pivot frequency",
@@ -380,12 +402,13 @@ def loss_factors_table(whole_record: WholeRecord) -> Table:
             Column("std (%)", "relative_std"),
             Column("95 % from", "low_95"),
             Column("to", "high_95"),
+            _FILE_REMARK_COLUMN,
         ),
-        (_loss_factor_row(headline, loss_factor) for loss_factor in headline.sizes),
+        map(_loss_factor_row, headline.sizes, flags),
         (
             "Coefficient and order are strongly correlated; a loss factor is known far better than "
             "either.",
-            *_reason_notes(loss_factor.size for loss_factor in headline.sizes),
+            *flag_notes(flags),
         ),
     )
 
@@ -420,12 +443,16 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
                 *(
                     [number_cell(None)] * 3
                     if free_value is None
-                    else estimate_cells(
-                        (free_value.value, *_interval_ends(free_value)),
-                        free_value.std,
-                        display_factor,
+                    else flagged_cells(
+                        estimate_cells(
+                            (free_value.value, *_interval_ends(free_value)),
+                            free_value.std,
+                            display_factor,
+                        ),
+                        free_value.flag,
                     )
                 ),
+                (free_value.flag or "") if free_value is not None else "",
             )
         )
     return Table.from_rows(
@@ -441,11 +468,13 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
             Column("Free", "free_value"),
             Column("95 % from", "free_low_95"),
             Column("to", "free_high_95"),
+            _REMARK_COLUMN,
         ),
         table_rows,
         (
             "The intervals on the left hold only if the assumption is true"
             + (f", and both {EXACTLY_UNIFORM_CONDITION}." if whole_record.headline.exact else "."),
+            *((_MARK_NOTE,) if any(row[-1] for row in table_rows) else ()),
         ),
     )
 
@@ -508,14 +537,12 @@ def _parameter_row(
             with_scale_uncertainty.std,
             display_factor,
         )
-    if parameter.flag is not None:
-        value_cells = (mark_cell(value_cells[0]), *map(grey_cell, value_cells[1:]))
     return (
         Cell(parameter_name, definition.symbol),
         definition.meaning,
         _unit_cell(definition.display_unit),
-        *value_cells,
-        "fixed" if is_fixed else parameter.flag or "",
+        *flagged_cells(value_cells, parameter.flag),
+        "; ".join(filter(None, ("fixed" if is_fixed else None, parameter.flag))),
     )
 
 
@@ -532,23 +559,32 @@ def _unit_cell(unit_text: str) -> Cell:
     )
 
 
-def _loss_factor_row(headline: Headline, loss_factor: ReportedLossFactor) -> tuple[Entry, ...]:
+def _loss_factor_flag(headline: Headline, loss_factor: ReportedLossFactor) -> str | None:
+    """Return the flag of the loss factor of internal or external damping, or None."""
+    if loss_factor.size.flag is not None or loss_factor.omega_rad_s is not None:
+        return loss_factor.size.flag
+    # Without a pivot frequency the value is the coefficient for an order that was only assumed.
+    return headline.parameters["zeta" if loss_factor.damping == "internal" else "gamma"].flag
+
+
+def _loss_factor_row(loss_factor: ReportedLossFactor, flag_text: str | None) -> tuple[Entry, ...]:
     """Return the table row of the loss factor of internal or external damping."""
     loss_size, is_internal = loss_factor.size, loss_factor.damping == "internal"
     loss_symbol = "ζ ω^α sin(απ/2)" if is_internal else "γ ω^λ sin(λπ/2) / (ρ/EI ω²)"
-    flag_text = loss_size.flag
     if loss_factor.omega_rad_s is None:
-        # Without a pivot frequency the value is the coefficient for an order that was only assumed.
-        flag_text = flag_text or headline.parameters["zeta" if is_internal else "gamma"].flag
         loss_symbol = loss_symbol[0]
     value_cell, std_cell, low_cell, high_cell = _quantity_cells(loss_size)
     relative_std = number_cell(
         None if loss_size.std is None else loss_size.std / loss_size.value, "#.2g", 100.0
     )
-    further_cells: tuple[Cell, ...] = (std_cell, relative_std, low_cell, high_cell)
-    if flag_text is not None:
-        value_cell, further_cells = mark_cell(value_cell), tuple(map(grey_cell, further_cells))
-    return (loss_factor.damping, loss_symbol, loss_factor.omega_rad_s, value_cell, *further_cells)
+    value_cells = (value_cell, std_cell, relative_std, low_cell, high_cell)
+    return (
+        loss_factor.damping,
+        loss_symbol,
+        loss_factor.omega_rad_s,
+        *flagged_cells(value_cells, flag_text),
+        flag_text or "",
+    )
 
 
 def _quantity_cells(reported_value: Estimate, display_factor: float = 1.0) -> tuple[Cell, ...]:
@@ -563,14 +599,6 @@ def _quantity_cells(reported_value: Estimate, display_factor: float = 1.0) -> tu
 def _interval_ends(reported_value: Estimate) -> tuple[float | None, float | None]:
     """Return the ends of a quantity's 95 % interval; (None, None) without an interval."""
     return reported_value.interval_95 or (None, None)
-
-
-def _reason_notes(reported_values: Iterable[Estimate]) -> tuple[str, ...]:
-    """Return the reasons why values are not reported as notes, each different reason once."""
-    flag_texts = dict.fromkeys(
-        reported_value.flag for reported_value in reported_values if reported_value.flag is not None
-    )
-    return tuple(f"{NOT_REPORTED_MARK} {flag_text}." for flag_text in flag_texts)
 
 
 def _correlation_cell(is_diagonal: bool, correlation_value: float) -> Cell:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import rich.table
 
     from analysis.models import Structure
+    from rigd.estimates import ReportedMode
     from rigd.session import Validity
 
 ABSENT_TEXT: Final = "–"
@@ -468,6 +469,56 @@ def mark_cell(cell: Cell) -> Cell:
 def grey_cell(cell: Cell) -> Cell:
     """Return a cell in grey, for example the standard deviation of a number with the symbol †."""
     return replace(cell, doubtful=cell.value is not None)
+
+
+def flagged_cells(cells: Sequence[Cell], flag: str | None) -> tuple[Cell, ...]:
+    """Return a number's cells with the mark † at the first and all in grey, if it has a flag.
+
+    Parameters
+    ----------
+    cells : sequence of Cell
+        Number, standard deviation and ends of the interval.
+    flag : str or None
+        Reason why the number is not a property of the antenna. None changes nothing.
+    """
+    if flag is None:
+        return tuple(cells)
+    return mark_cell(cells[0]), *map(grey_cell, cells[1:])
+
+
+def flag_notes(flags: Iterable[str | None]) -> tuple[str, ...]:
+    """Return notes on the mark † that state each different flag once.
+
+    Parameters
+    ----------
+    flags : iterable of str or None
+        Reasons why numbers have the mark; None for a number without it.
+    """
+    return tuple(f"{NOT_REPORTED_MARK} {flag}." for flag in dict.fromkeys(flags) if flag)
+
+
+def mode_flag(mode: ReportedMode) -> str | None:
+    """Return the flags of a mode's numbers as one text; None if it has none.
+
+    Parameters
+    ----------
+    mode : ReportedMode
+        Mode. The text names the numbers unless frequency and damping ratio have the same flag.
+    """
+    if mode.frequency_hz.flag == mode.damping_ratio.flag is not None:
+        return mode.flag
+    return (
+        "; ".join(
+            f"{quantity_name}: {estimate.flag}"
+            for quantity_name, estimate in (
+                ("frequency", mode.frequency_hz),
+                ("damping ratio", mode.damping_ratio),
+                ("inertia", mode.participation),
+            )
+            if estimate is not None and estimate.flag
+        )
+        or None
+    )
 
 
 def footnotes(unsupported_orders: Collection[str]) -> tuple[str, ...]:

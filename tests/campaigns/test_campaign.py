@@ -15,9 +15,15 @@ from analysis.identify import BAND_HZ, Measurement, fit_record
 from analysis.models import STRUCTURES
 from analysis.record import load_record
 from analysis.report import campaign_document
-from analysis.report._campaign_tables import session_list_table, sessions_table, validation_summary
+from analysis.report._campaign_tables import (
+    all_tables,
+    headline_tables,
+    session_list_table,
+    sessions_table,
+    validation_summary,
+)
 from analysis.report.campaign_report import campaign_tables, campaign_text, write_campaign
-from analysis.report.table import json_rows
+from analysis.report.table import csv_text, json_rows
 from rigd.beam import Plant, modes, transfer
 
 pytestmark = pytest.mark.fit
@@ -189,6 +195,43 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path, without_drawing
         assert words in text
     for name in ("table5", "nominal_indices", "welch_bias", "pooled", "validation", "session_list"):
         assert (tables / f"{name}.csv").stat().st_size > 100
+
+
+def flags_of(table):
+    return [row["flag"] for row in csv.DictReader(csv_text(table).splitlines())]
+
+
+def test_tables_have_no_flag_without_a_doubt(done):
+    tables = all_tables(done[0])
+    for name in ("pooled_modes", "parameters", "pooled"):
+        assert set(flags_of(tables[name])) == {""}
+        assert "†" not in str(tables[name].shown_rows) + str(tables[name].notes)
+
+
+def test_numbers_of_unexplained_records_have_their_flag(done):
+    found, _ = done
+    few = replace(found, verdict=replace(found.verdict, adequate=2))
+    flag = "part of the records is unexplained"
+    tables = all_tables(few)
+    assert set(flags_of(tables["pooled_modes"])) == set(flags_of(tables["parameters"])) == {flag}
+    assert set(flags_of(tables["pooled"])) == {flag}
+    for table in headline_tables(few):
+        assert f"† {flag}." in table.notes
+        assert all("†" in str(row) for row in table.shown_rows)
+    (row, *_) = json_rows(tables["pooled_modes"])
+    assert list(row)[-2:] == ["damping_ratio_mixture", "flag"]
+    assert [row["exact_flag"] for row in json_rows(tables["parameters"])] == [flag] * 8
+
+
+def test_exact_values_of_a_refused_beam_have_its_flag(done):
+    found, _ = done
+    test = replace(found.modal.uniform_beam, status="refused", p_value=1e-9)
+    tables = all_tables(replace(found, modal=replace(found.modal, uniform_beam=test)))
+    reason = "a uniform beam does not predict the modal constants (p = 1e-09)"
+    assert set(flags_of(tables["pooled"])) == {reason}
+    assert set(flags_of(tables["pooled_modes"])) == {""}
+    for row in tables["parameters"].rows:
+        assert (row["exact_flag"], row["exact"].text[-1]) == (reason, "†")
 
 
 def test_the_verdict_names_the_structure_and_comes_first(done, truth):

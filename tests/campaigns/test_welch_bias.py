@@ -84,5 +84,8 @@ def test_the_verdict_states_the_bias(make_sessions, campaign_of):
     )  # fmt: skip
     sessions = [replace(each, verdict=verdict) for each in make_sessions(0.068, 0.001)]
     found = campaign_of(sessions).verdict
-    assert "external damping of integer order (lambda = 1.00000 ± 0.00124)" in found.sentences[0]
+    assert (
+        "external damping compatible with order 1 (lambda = 1.00000 ± 0.00124)"
+        in found.sentences[0]
+    )
     assert any("0.06800 above the whole records'" in each for each in found.sentences)

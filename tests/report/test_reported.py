@@ -9,12 +9,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify.headline import CONTRADICTED_FILE_REASON, headline_of_fit
+from analysis.identify.headline import (
+    CONTRADICTED_FILE_REASON,
+    ConditionalEstimate,
+    headline_of_fit,
+)
 from analysis.models import STRUCTURES
 from analysis.report import document, illustrations, result_text
 from analysis.report.bands import excited_band_hz, supported_band_hz
 from analysis.report.record_report import record_page, report_tables
-from analysis.report.table import NOT_REPORTED_MARK, Cell, csv_text, unreported_parameters
+from analysis.report.table import (
+    NOT_REPORTED_MARK,
+    Cell,
+    csv_text,
+    latex_table,
+    unreported_parameters,
+    with_validity,
+)
 
 pytestmark = pytest.mark.fit
 
@@ -72,6 +83,76 @@ def test_tables_mark_flagged_numbers_only(careful):
     assert float(by_type["VI"]["alpha"]) == careful.whole.fit.parameters["alpha"]
     assert [row[0].text for row in modes.shown_rows] == ["1", "2", f"3{NOT_REPORTED_MARK}"]
     assert "does not show" in modes.notes[-1]
+
+
+def rows_of(table):
+    return list(csv.DictReader(csv_text(table).splitlines()))
+
+
+def test_files_state_the_flags(careful):
+    modes, (sizes, *_others), (welch, _peaks) = report_tables(careful)
+    reason = "computed from the model: the record does not show this mode"
+    assert [row["remark"] for row in rows_of(modes)] == ["", "", reason]
+    for table in (modes, sizes):
+        last_two = ["predicted_peak_tip_slope_rad", "linear_model_error"]
+        assert list(with_validity(table, careful.validity).keys[-3:]) == ["remark", *last_two]
+        assert "Remark" not in {column.heading for column in table.shown_columns}
+    for row in rows_of(welch):
+        assert row["not_reported"] == ("" if row["type"] in ("II", "V") else "alpha zeta")
+
+
+@pytest.mark.parametrize(
+    ("key", "quantity", "column"),
+    [("frequency_hz", "frequency", 1), ("damping_ratio", "damping ratio", 3)],
+)
+def test_mark_is_at_the_flagged_number_of_a_mode(
+    record_result, with_selection, key, quantity, column
+):
+    headline = record_result.whole.headline
+    first, *others = headline.modes
+    flagged = replace(first, **{key: getattr(first, key).with_flag(REASON)})
+    result = with_selection(record_result, headline=replace(headline, modes=(flagged, *others)))
+    table, _, _ = report_tables(result)
+    marked = [cell.text.endswith(NOT_REPORTED_MARK) for cell in table.shown_rows[0]]
+    assert [index for index, is_marked in enumerate(marked) if is_marked] == [column]
+    assert not any(cell.doubtful for row in table.shown_rows[1:] for cell in row)
+    assert table.notes[-1] == f"{NOT_REPORTED_MARK} {REASON}."
+    assert [row["remark"] for row in rows_of(table)] == [f"{quantity}: {REASON}", "", ""]
+    source = latex_table(table)
+    assert source.count(r"\dag{}") == 2
+    assert rf"\dag{{}} {REASON}." in source
+
+
+def test_loss_factor_of_an_assumed_order_has_its_reason(record_result, with_selection):
+    fit = record_result.whole.fits["VII"]
+    headline = headline_of_fit("VII", fit, (1, 2, 3), {"alpha": REASON})
+    _, (sizes, parameters, *_others), _ = report_tables(
+        with_selection(record_result, headline=headline)
+    )
+    internal, external = rows_of(sizes)
+    assert (internal["remark"], external["remark"]) == (REASON, "")
+    assert f"{NOT_REPORTED_MARK} {REASON}." in sizes.notes
+    # A fixed number may have a flag as well.
+    remarks = {row["parameter"]: row["remark"] for row in rows_of(parameters)}
+    misread = with_selection(record_result, headline=headline.with_flag_on_all("a sign is wrong"))
+    _, (_sizes, parameters, *_others), _ = report_tables(misread)
+    fixed = [name for name, remark in remarks.items() if remark.startswith("fixed")]
+    for row in rows_of(parameters):
+        if row["parameter"] in fixed:
+            assert row["remark"].startswith("fixed; ")
+    assert fixed
+
+
+def test_free_number_of_a_condition_has_its_flag(careful, with_selection):
+    simpler = ConditionalEstimate("VII", {"alpha": 1.0}, careful.whole.headline.parameters)
+    headline = replace(careful.whole.headline, simpler=simpler)
+    _, tables, _ = report_tables(with_selection(careful, headline=headline))
+    (table,) = [table for table in tables if table.name == "on_condition"]
+    for row in table.rows:
+        is_flagged = row["parameter"].value in ("alpha", "zeta")
+        assert row["remark"] == (REASON if is_flagged else "")
+        assert row["free_value"].text.endswith(NOT_REPORTED_MARK) == is_flagged
+        assert not row["value"].doubtful
 
 
 def test_order_of_absent_damping_is_not_determined(record_result, with_selection):

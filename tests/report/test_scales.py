@@ -80,7 +80,9 @@ def test_contradicting_density_is_reported(stated):
     whole = stated(**ALL)
     beam = replace(whole.record.beam, density_kg_per_m=1.05 * whole.record.beam.density_kg_per_m)
     whole = replace(whole, record=replace(whole.record, beam=beam))
-    assert "check torque scale and length" in notes_of(whole)
+    notes = notes_of(whole)
+    assert "check torque scale, length and stated density" in notes
+    assert "a tip mass or a soft clamp acts alike" in notes
 
 
 def test_fixed_parameter_has_no_combined_interval(stated):
