@@ -153,7 +153,8 @@ def _with_scale_uncertainty(
 class DensityCheck:
     """Comparison of the mass per length of the beam from the record with that of the file.
 
-    Both agree only if torque scale and length are right.
+    A wrong torque scale, length or stated density makes them differ, and so does a tip mass or a
+    soft clamp.
 
     Attributes
     ----------
