@@ -197,6 +197,17 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path, without_drawing
         assert (tables / f"{name}.csv").stat().st_size > 100
 
 
+def test_structures_state_what_all_sessions_have_in_common(done):
+    """Density and stiffness are free in each session, as the fits of the sessions show."""
+    found, _ = done
+    (note,) = all_tables(found)["structures"].notes
+    assert note.startswith("Each damping parameter has one value for all sessions")
+    assert note.endswith("delay, tool inertia, ρ/EI and EI have one per session.")
+    for key in ("density_over_stiffness", "bending_stiffness_n_m2"):
+        values = {each.record_estimates[0].fit.parameters[key] for each in found.sessions}
+        assert len(values) == len(found.sessions)
+
+
 def flags_of(table):
     return [row["flag"] for row in csv.DictReader(csv_text(table).splitlines())]
 
