@@ -119,10 +119,10 @@ def run_control(
         devices.sensor.connect()
         drive = devices.drive
         drive.connect()
+        _publish_if_off(channels, devices)
         server = _ControlServer(
             profile, devices, clock, channels, parent, stop_request, realtime_results
         )
-        _publish_if_off(channels, devices)
         server.observe_standstill()
         parent.send(
             DevicesConnected(

@@ -30,6 +30,7 @@ from rigd.runner._live_view import LiveViewClient
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner.request import SessionOrder
 from rigd.runner.session import (
+    WITHOUT_HEARTBEAT_TEXT,
     ProgressCallback,
     SessionFailedError,
     SessionResult,
@@ -326,9 +327,12 @@ class Rig:
         try:
             group.control.send(ProbeOrder(profile))
             probe_reply = self._await_probe(group, profile)
-        except (ChildError, RigError) as error:
+        except ChildError as error:
             self.disconnect()
-            raise RigError(str(error)) from None
+            raise RigError(f"{error} {WITHOUT_HEARTBEAT_TEXT}") from None
+        except RigError:
+            self.disconnect()
+            raise
         finally:
             stop.on_request = _do_nothing_on_stop
             _reset_session_fields(shared_state)
@@ -361,8 +365,8 @@ class Rig:
             if group.stalled_s(CONTROL) > max_silence_s or now_s > deadline_s:
                 group.control.kill()
                 raise RigError(
-                    "The control process did not end the probing move and was killed: without its "
-                    "heartbeat the drive switches off by itself. Check CPU load."
+                    "The control process did not end the probing move and was killed. "
+                    f"{WITHOUT_HEARTBEAT_TEXT} Check CPU load."
                 )
 
     def watch(self) -> None:

@@ -61,7 +61,7 @@ _COUNTER_FIELDS = {
 }
 """Name of a tick count in the result → field of the shared state with the counter."""
 _ZERO_COUNTS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTER_FIELDS, 0))
-_WITHOUT_HEARTBEAT_TEXT: Final = (
+WITHOUT_HEARTBEAT_TEXT: Final = (
     "Without its heartbeat the watchdog of the drive switches the torque off; check that it is "
     "off, and press the wired stop (STO) if it is not."
 )
@@ -406,7 +406,7 @@ class SessionSupervisor:
             try:
                 control_message = self._group.control.poll(0.0 if has_waited else _POLL_S)
             except ChildError as error:
-                return self._control_died(f"{error} {_WITHOUT_HEARTBEAT_TEXT}")
+                return self._control_died(f"{error} {WITHOUT_HEARTBEAT_TEXT}")
             self._report()
             now_s = time.monotonic()
             # In lock-step with a simulated rig, a tick may wait for missing replies.
@@ -463,7 +463,7 @@ class SessionSupervisor:
         """
         self._group.control.kill()
         return self._control_died(
-            f"The control process {failure_predicate} and was killed. {_WITHOUT_HEARTBEAT_TEXT}"
+            f"The control process {failure_predicate} and was killed. {WITHOUT_HEARTBEAT_TEXT}"
         )
 
     def _control_died(self, reason: str) -> SessionFinished:

@@ -186,3 +186,10 @@ def test_death_of_the_recorder_ends_only_its_session(rig, run, tmp_path):
     assert caught.value.result().path == tmp_path / "0.mcap"
     assert rig.status().phase is Phase.OFF
     assert run(rig).is_successful
+
+
+def test_death_of_the_control_process_in_a_probing_move_asks_for_the_wired_stop(rig, profile):
+    rig._group.control.kill()
+    with pytest.raises(RigError, match=r"killed by signal 9.*press the wired stop \(STO\)"):
+        rig.probe(profile, StopRequest())
+    assert not rig.connected
