@@ -61,6 +61,9 @@ _STANDSTILL_POLL_S = 0.05
 """Longest single wait in s for an order of the supervisor while virtual time is stopped."""
 _ZERO_READING_S = 0.2
 """Duration in s of the readings whose last angle becomes the rig's zero."""
+_NAME_VISIBLE_S = 0.5
+"""Time in s after a stopped session for which the process name shows ``rigd stop`` that the drive
+is off; on an overloaded computer, ``rigd stop`` reads it only a few times a second."""
 _STANDSTILL_TICKS = 2
 """Number of ticks after which the motor's angle and speed are known."""
 
@@ -113,6 +116,7 @@ def run_control(
         Real-time settings that were granted, for the file.
     """
     end_text = ""
+    server = None
     name_this_process(CONNECTING_NAME)
     try:
         # The drive last: an operational drive expects a SYNC every period.
@@ -143,6 +147,8 @@ def run_control(
             _publish_if_off(channels, devices)
         devices.drive.close()
         devices.sensor.close()
+    if server is not None:
+        server.show_name()
     parent.send(ControlEnded(f"{end_text} {devices.drive.off_doubt}".strip()))
 
 
@@ -180,6 +186,8 @@ class _ControlServer:
         self._realtime_results = realtime_results
         self._zero_rad = 0.0
         self._silent_ticks = 0
+        self._last_stop_s = -_NAME_VISIBLE_S
+        """Time of the end of the last session that the operator stopped."""
         self._uses_line = devices.uses_line
         # A simulated motor starts cold.
         is_real_motor = not devices.simulated
@@ -189,6 +197,11 @@ class _ControlServer:
         self._standstill = StandstillMonitor(profile)
         self._reading_publisher = ReadingPublisher(channels.shared_state, devices)
         self._cycle = self._make_cycle(profile)
+
+    def show_name(self) -> None:
+        """Wait until ``rigd stop`` has read the name of this process after a stopped session."""
+        if not self._clock.virtual:
+            time.sleep(max(0.0, self._last_stop_s + _NAME_VISIBLE_S - time.monotonic()))
 
     def store_heat(self) -> None:
         """Store the heat of a real motor in a file for the next connection to the rig."""
@@ -357,6 +370,8 @@ class _ControlServer:
                 f"{end_reason} {off_doubt}".strip(),
                 True,
             )
+        if session_outcome == "stopped":
+            self._last_stop_s = time.monotonic()
         failure_text, is_fault = end_reason, session_outcome == "fault"
         if was_recorded and end_reason:
             # Events after the last tick do not make the record incomplete.

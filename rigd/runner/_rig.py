@@ -325,17 +325,18 @@ class Rig:
         if stop.requested:
             request_stop()
         try:
-            group.control.send(ProbeOrder(profile))
-            probe_reply = self._await_probe(group, profile)
+            try:
+                group.control.send(ProbeOrder(profile))
+                probe_reply = self._await_probe(group, profile)
+            finally:  # before `disconnect` releases the memory
+                stop.on_request = _do_nothing_on_stop
+                _reset_session_fields(shared_state)
         except ChildError as error:
             self.disconnect()
             raise RigError(f"{error} {WITHOUT_HEARTBEAT_TEXT}") from None
         except RigError:
             self.disconnect()
             raise
-        finally:
-            stop.on_request = _do_nothing_on_stop
-            _reset_session_fields(shared_state)
         if isinstance(probe_reply, MeasurementRefused):
             raise RigError(probe_reply.reason)
         assert isinstance(probe_reply, MeasurementResult)
