@@ -22,6 +22,7 @@ from analysis.record_checks import (
     stated_beam,
     stated_delay_s,
     stated_rate_hz,
+    stated_tip_mass_kg,
     stated_tool_inertia_kg_m2,
     stated_torque_filter_s,
 )
@@ -349,7 +350,14 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
     """Return the beam model with which the touches of a session are estimated.
 
     It is the identified model in the file `model_path`, or else the nominal model of the session.
+    Raise `RecordError` if the session states a mass at the tip, which no model of touches has.
     """
+    if tip_mass_kg := stated_tip_mass_kg(session):
+        raise RecordError(
+            f"{session.path}: tip_mass_kg = {tip_mass_kg:.4g} kg: the estimation of touches does "
+            "not take a mass at the tip into account; take it off, remove beam.tip_mass_kg from "
+            "the profile, and record again."
+        )
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
     angle_delay_s = stated_delay_s(session, "angle_delay_s")

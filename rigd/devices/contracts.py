@@ -37,7 +37,8 @@ def wired_stop_dropped(device: str, explanation: str = "") -> DeviceError:
     """
     return DeviceError(
         f"{device}: the wired stop (STO) was dropped{explanation}. Find out who pressed it and "
-        "why, check that nobody is within reach of the beam, release it, then reset the rig."
+        "why, check that nobody is within reach of the beam, and release it; if a daemon runs the "
+        "rig, then reset the rig."
     )
 
 

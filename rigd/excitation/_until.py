@@ -297,8 +297,8 @@ def _require_reachable_targets(
     raise ExcitationError(
         f"With modes that differ from those of a uniform beam by {100 * uniformity:g} % "
         f"(uniformity_percent), within {at_most_s:g} s: {floors_text}. Request a larger standard "
-        "deviation, or one of the modes (--damping, --frequency), or state --uniformity 0 if the "
-        "specimen is exactly uniform."
+        "deviation, or one of the modes (--damping, --frequency), or state --uniformity 0 on a "
+        "simulated rig: no real specimen is exactly uniform."
     )
 
 

@@ -18,6 +18,7 @@ from rigd.engine.workers import TOUCH
 from rigd.excitation import Excitation, TouchExcitation
 from rigd.profile import Profile
 from rigd.runner._worker_client import WorkerClient
+from rigd.runner.planning import RefusedError
 from rigd.session.touches import packed_touches, touch_line
 
 if TYPE_CHECKING:
@@ -43,9 +44,18 @@ class TouchSearch:
 
 
 def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None:
-    """Return the settings of the search for an obstacle, or None if there is no search."""
+    """Return the settings of the search for an obstacle, or None if there is no search.
+
+    Raise `RefusedError` if the profile states a mass at the tip, which no model of touches has.
+    """
     if not isinstance(excitation, TouchExcitation):
         return None
+    if profile.tip_mass_kg:
+        source = profile.path if profile.specimen is None else profile.specimen.path
+        raise RefusedError(
+            f"{source}: beam.tip_mass_kg = {profile.tip_mass_kg:.4g} kg: a search for touches does "
+            "not take a mass at the tip into account; take it off, and remove the key."
+        )
     from rigd.touch import DetectorSettings, TouchModel, detector_model
 
     rig = profile.rig

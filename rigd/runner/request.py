@@ -141,22 +141,21 @@ def load_rig(
         )
     if target is ActuationTarget.HARDWARE and not hardware:
         _refuse_unreachable_simulators(profile)
+    options = {"--fast": fast, "--seed": seed is not None, "--obstacle": bool(obstacles)}
+    simulation_options = [option for option, is_given in options.items() if is_given]
+    if target is ActuationTarget.HARDWARE and simulation_options:
+        raise RefusedError(
+            f"{simulation_options[0]}: {profile.path} is a profile of hardware, and the option is "
+            "for simulated rigs only. Without it, the session would move the motor. To simulate "
+            f"the session, first start rigd simulate --profile {shlex.quote(profile_name)}"
+            f"{' --lock-step' if fast else ''} in another terminal."
+        )
     if fast and not target.allows_virtual_clock:
         raise RefusedError(
             f"--fast: {target.value} of {profile.path} moves in real time, which cannot be "
-            "skipped; omit the option."
-            + (
-                " Or start rigd simulate with --lock-step."
-                if target is ActuationTarget.SIMULATOR
-                else ""
-            )
+            "skipped; omit the option. Or start rigd simulate with --lock-step."
         )
     if seed is not None:
-        if target is ActuationTarget.HARDWARE:
-            raise RefusedError(
-                f"--seed: {target.value} of {profile.path} moves, whose noise is not simulated; "
-                "omit the option."
-            )
         if profile.rig.simulation is None:
             raise RefusedError(
                 f"--seed: {profile.path} has no section [simulation]; copy it from that of rigd "
@@ -168,12 +167,7 @@ def load_rig(
         if target is not ActuationTarget.SIMULATED:
             raise RefusedError(
                 f"--obstacle: {target.value} of {profile.path} is not simulated here; omit the "
-                "option."
-                + (
-                    " Or inject the obstacle into the simulated rig (rigd inject obstacle,x=…)."
-                    if target is ActuationTarget.SIMULATOR
-                    else ""
-                )
+                "option. Or inject the obstacle into the simulated rig (rigd inject obstacle,x=…)."
             )
         profile = replace(profile, rig=with_obstacles(profile.rig, obstacles))
     return profile, target

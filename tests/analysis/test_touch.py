@@ -118,6 +118,12 @@ def test_an_unknown_filter_is_named(touch_file, touch_analysis, tmp_path, kind, 
         touch_analysis.session(path)
 
 
+def test_a_mass_at_the_tip_is_refused(touch_file, touch_analysis, tmp_path):
+    path = touch_file.write(tmp_path / "a.mcap", metadata={"tip_mass_kg": "1e-4"})
+    with pytest.raises(RecordError, match=r"a\.mcap: tip_mass_kg = 0\.0001 kg.*take it off"):
+        touch_analysis.session(path)
+
+
 def test_model_is_required_without_a_profile(touch_file, touch_analysis, tmp_path):
     path = touch_file.write(tmp_path / "a.mcap", profile="")
     with pytest.raises(SessionError, match=r"give --model FILE"):

@@ -101,6 +101,29 @@ def test_invalid_uniformity_of_a_search_is_refused(rigd_here, tmp_path, percent)
     assert not list(tmp_path.glob("sessions/*"))
 
 
+@pytest.mark.parametrize(
+    ("options", "simulate"),
+    [
+        (("--fast",), "rigd simulate --profile antenna_can --lock-step in another terminal"),
+        (("--seed", "1"), "rigd simulate --profile antenna_can in another terminal"),
+        further(("--obstacle", "x=0.5,angle=1"), "rigd simulate --profile antenna_can"),
+    ],
+)
+def test_options_of_simulated_rigs_are_refused_on_hardware(rigd_here, tmp_path, options, simulate):
+    """The message does not advise to omit the option, after which the motor would move."""
+    done = rigd_here("run", "chirp", "--profile", "antenna_can", *options)
+    assert_refused(done, 2, options[0], "profile of hardware", "would move the motor", simulate)
+    assert "omit" not in done.stderr
+    assert not (tmp_path / "sessions").exists()
+
+
+def test_search_for_touches_with_a_mass_at_the_tip_is_refused(rigd_here, write_profile, tmp_path):
+    path = write_profile("sim", {"beam.tip_mass_kg": "1e-4"})
+    done = rigd_here("run", "touch", "0.4", "--fast", "--profile", path)
+    assert_refused(done, 2, path.name, "beam.tip_mass_kg = 0.0001 kg", "take it off")
+    assert not (tmp_path / "sessions").exists()
+
+
 def test_excessive_torque_is_refused_before_motion(rigd_here, tmp_path):
     done = rigd_here("run", "chirp", "--fast", "--amplitude", "0.25")
     assert_refused(done, 2, "torque", "0.9 N·m", "peak_torque_nm")

@@ -355,7 +355,8 @@ def falls_silent(scripted):
                 "this computer did not give (a corrupt frame, a second master)",
                 'left "operation enabled"',
                 "bit 4 says that the supply is there",
-                "reset the rig. If nobody pressed it, check the bus cable",
+                "if a daemon runs the rig, then reset",
+                "If nobody pressed it, check the bus cable",
             ],
         ),
         (
