@@ -117,13 +117,6 @@ def test_options_of_simulated_rigs_are_refused_on_hardware(rigd_here, tmp_path, 
     assert not (tmp_path / "sessions").exists()
 
 
-def test_search_for_touches_with_a_mass_at_the_tip_is_refused(rigd_here, write_profile, tmp_path):
-    path = write_profile("sim", {"beam.tip_mass_kg": "1e-4"})
-    done = rigd_here("run", "touch", "0.4", "--fast", "--profile", path)
-    assert_refused(done, 2, path.name, "beam.tip_mass_kg = 0.0001 kg", "take it off")
-    assert not (tmp_path / "sessions").exists()
-
-
 def test_excessive_torque_is_refused_before_motion(rigd_here, tmp_path):
     done = rigd_here("run", "chirp", "--fast", "--amplitude", "0.25")
     assert_refused(done, 2, "torque", "0.9 N·m", "peak_torque_nm")

@@ -9,10 +9,10 @@ import pytest
 from shipped_profile import load_shipped
 
 from rigd.engine.shared_state import Phase
-from rigd.excitation import hold
+from rigd.excitation import hold, touch
 from rigd.profile import load_profile
 from rigd.runner import ProgressLine, Series, plan_lines, result_line
-from rigd.runner.planning import RefusedError
+from rigd.runner.planning import RefusedError, RigPreview
 from rigd.runner.request import NoRoomError
 from rigd.runner.session import SessionResult
 from rigd.runtime import StopRequest
@@ -276,3 +276,15 @@ def test_error_if_required_metadata_is_missing(tmp_path):
     ):
         Series(profile, excitation, tmp_path)
     Series(profile, excitation, tmp_path, notes=given | {"meta_temperature_c": "21.4"})
+
+
+def test_search_for_touches_with_a_mass_at_the_tip_is_refused(tmp_path):
+    path = write_profile(tmp_path, {"beam.tip_mass_kg": 1e-4})
+    profile = load_profile(path)
+    excitation = touch(rate_hz=1000.0, angle_rad=0.4, rig=RigPreview(profile))
+    with pytest.raises(RefusedError) as refusal:
+        Series(profile, excitation, tmp_path / "out")
+    assert str(refusal.value) == (
+        f"{path}: beam.tip_mass_kg = 0.0001 kg: a search for touches does not take a mass at the "
+        "tip into account; take it off, and remove the key."
+    )
