@@ -502,7 +502,7 @@ INTERLOCKS: Final = (
         Checked.DRIVE,
         Action.FAULT,
         "Find out who pressed it and why, or whether the supply of STO or motor failed or another "
-        "program switched the drive off; release it, then rigd reset.",
+        "program switched the drive off. Release it; if a daemon runs the rig, then rigd reset.",
     ),
     Interlock(
         "recorder lag",
