@@ -176,9 +176,10 @@ def fit(
             f"{', '.join(STRUCTURES)}."
         )
     if method == "record":
-        from analysis.applicability import record_band_hz
+        from analysis.applicability import check_excited_band, record_band_hz
         from analysis.identify import Measurement, fit_record
 
+        check_excited_band(record, band_hz)
         return fit_record(
             Measurement.from_record(record),
             [STRUCTURES[type_name] for type_name in types or STRUCTURES],

@@ -49,6 +49,15 @@ _COMPLETE_FRACTION: Final = 0.99
 end."""
 
 
+_BOUNDED_EXCITATIONS: Final = ("chirp", "multisine", "modes")
+"""Excitations that stay between the `start_hz` and `stop_hz` of their session file. A step, a move
+or a touch has neither, and a search begins with a motion that excites more."""
+
+_EXCITED_MARGIN: Final = 1.1
+"""Highest frequency of a requested band, relative to that of the excitation. The end of a sweep
+excites a little beyond."""
+
+
 def highest_frequency_hz(requested_hz: Band | None = None) -> float:
     """Return the highest frequency in Hz that any analysis of a record uses.
 
@@ -71,7 +80,7 @@ def record_band_hz(record: Record, requested_hz: Band | None = None) -> Band:
     record : Record
         Record of a session.
     requested_hz : tuple of float, optional
-        Requested band in Hz; used unchanged.
+        Requested band in Hz; used unchanged (see `check_excited_band`).
     """
     return requested_hz or _limit_band(RECORD_BAND_HZ, record)
 
@@ -100,6 +109,49 @@ def check_record_band(record: Record, requested_hz: Band | None) -> None:
             f"{limit_hz:g} Hz, {LARGEST_FRACTION_OF_RATE:g} of the rate of {record.rate_hz:g} Hz; "
             "lower --band."
         )
+
+
+def check_excited_band(record: Record, requested_hz: Band | None) -> None:
+    """Raise if a requested band of the whole-record fits reaches far beyond the excitation.
+
+    The angle there is noise of its sensor, which the beam does not feel. Nothing is checked if the
+    file does not state the band of the excitation.
+
+    Parameters
+    ----------
+    record : Record
+        Record of a session.
+    requested_hz : tuple of float or None
+        Requested band, in Hz.
+
+    Raises
+    ------
+    MeasurementError
+        The upper end of the band is too high.
+    """
+    from analysis.identify import MeasurementError
+
+    excited_hz = record.swept_hz or _stated_excitation_hz(record)
+    if requested_hz is None or excited_hz is None:
+        return
+    if requested_hz[1] > _EXCITED_MARGIN * excited_hz[1]:
+        raise MeasurementError(
+            f"{record.path}: the band reaches {requested_hz[1]:g} Hz, but the excitation covers "
+            f"{excited_hz[0]:.4g} to {excited_hz[1]:.4g} Hz, and beyond there is noise alone; "
+            f"whole-record fits need a --band that ends at {excited_hz[1]:.4g} Hz or lower."
+        )
+
+
+def _stated_excitation_hz(record: Record) -> Band | None:
+    """Return the lowest and highest frequency of the excitation; None if the file states none."""
+    if record.metadata.get("excitation") not in _BOUNDED_EXCITATIONS:
+        return None
+    start_hz, stop_hz = _metadata_number(record, "start_hz"), _metadata_number(record, "stop_hz")
+    return (
+        None
+        if start_hz is None or stop_hz is None
+        else (min(start_hz, stop_hz), max(start_hz, stop_hz))
+    )
 
 
 def welch_settings(

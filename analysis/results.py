@@ -322,11 +322,12 @@ def whole_record(
     Raises
     ------
     MeasurementError
-        The record cannot be used.
+        The record cannot be used, or not in this band.
     """
-    from analysis.applicability import record_band_hz
+    from analysis.applicability import check_excited_band, record_band_hz
     from analysis.identify import Measurement, select
 
+    check_excited_band(record, band_hz)
     band_hz = record_band_hz(record, band_hz)
     selection = select(Measurement.from_record(record), fixed=fixed, band_hz=band_hz)
     return WholeRecord(record, selection, band_hz, fixed)

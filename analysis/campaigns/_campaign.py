@@ -11,7 +11,7 @@ import numpy as np
 from analysis.campaigns._experiment import (
     CampaignError,
     SessionFailure,
-    complete_labels,
+    complete_facts,
     distinct_names,
     most_common_index,
     stated_specimens,
@@ -303,7 +303,7 @@ def _separate_experiments(
             for session_result in session_results
             if isinstance(session_result, SessionFailure)
         ]
-    session_results = _complete_labels(session_results)
+    session_results = _complete_facts(session_results)
     usable_sessions = [
         session_result
         for session_result in session_results
@@ -371,12 +371,12 @@ def _equalize_welch_fits(
     ]
 
 
-def _complete_labels(
+def _complete_facts(
     session_results: Sequence[SessionAnalysis | SessionFailure],
 ) -> list[SessionAnalysis | SessionFailure]:
-    """Return the results with the specimen labels of their experiments set by `complete_labels`."""
+    """Return the results with the specimen labels of their experiments set by `complete_facts`."""
     completed_experiments = iter(
-        complete_labels(
+        complete_facts(
             [
                 session_result.experiment
                 for session_result in session_results

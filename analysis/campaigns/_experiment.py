@@ -65,6 +65,9 @@ LABEL_KEY: Final = "specimen"
 _SPECIMEN_KEYS: Final = (LABEL_KEY, "beam_length_m", "beam_density_kg_per_m",
                          "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
 """Keys of the specimen in a session file that must agree over a campaign."""
+_TILT_KEY: Final = "axis_tilt_deg"
+"""Key of the tilt of the axis in a session file. It must agree over a campaign where stated, because
+it changes the modes."""
 _SWEEP_END_KEYS: Final = ("start_hz", "stop_hz")
 """Keys of a sweep's start and stop frequency; sweeps that differ in their order count as equal."""
 
@@ -120,6 +123,7 @@ class Experiment:
                 "beam_density_kg_per_m": beam.density_kg_per_m,
                 "beam_bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
                 "tool_inertia_kg_m2": record.tool_inertia_kg_m2,
+                **({} if record.axis_tilt_deg is None else {_TILT_KEY: record.axis_tilt_deg}),
                 **excitation_facts,
             },
             sweep_s=record.sweep_samples / record.rate_hz,
@@ -138,6 +142,12 @@ class Experiment:
     def label(self) -> str:
         """Label of the specimen stated in the file; empty if the file states none."""
         return str(self.facts.get(LABEL_KEY, ""))
+
+    @property
+    def axis_tilt_deg(self) -> float | None:
+        """Tilt of the axis in degrees stated in the file; None if the file states none."""
+        tilt_deg = self.facts.get(_TILT_KEY)
+        return tilt_deg if isinstance(tilt_deg, float) else None
 
     @property
     def is_planned_during_session(self) -> bool:
@@ -274,16 +284,22 @@ def stated_specimens(
     )
 
 
-def complete_labels(experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Return the experiments; if their specimen labels differ, add an empty one to those without.
+def complete_facts(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Return the experiments; if their labels or tilts differ, add an empty one to those without.
 
     The specimen of an experiment without a label is then unknown, and the empty label differs from
-    every other. If all stated labels are equal, it is taken to be the same specimen.
+    every other. If all stated labels are equal, it is taken to be the same specimen. The same holds
+    of the tilt of the axis.
     """
-    if len({experiment.label for experiment in experiments if experiment.label}) < 2:
+    completed_keys = [
+        key
+        for key in (LABEL_KEY, _TILT_KEY)
+        if len({experiment.facts[key] for experiment in experiments if key in experiment.facts}) > 1
+    ]
+    if not completed_keys:
         return list(experiments)
     return [
-        replace(experiment, facts={LABEL_KEY: experiment.label, **experiment.facts})
+        replace(experiment, facts={**dict.fromkeys(completed_keys, ""), **experiment.facts})
         for experiment in experiments
     ]
 
@@ -334,9 +350,9 @@ def fact_text(key: str, fact_value: str | float) -> str:
         The value.
     """
     if isinstance(fact_value, str):
-        return (
-            (f"“{fact_value}”" if fact_value else "not stated") if key == LABEL_KEY else fact_value
-        )
+        if not fact_value:
+            return "not stated"
+        return f"“{fact_value}”" if key == LABEL_KEY else fact_value
     return f"{fact_value:g} {unit_of(key)}".rstrip()
 
 

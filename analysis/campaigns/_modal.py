@@ -62,7 +62,7 @@ class PooledModalModel(ModalEstimate):
         Test of whether a uniform beam predicts the pooled constants.
     tolerant : TolerantEstimate or None
         Parameters estimated with the largest value of `stated` as tolerance. None if all files
-        state 0, or if there is a single mode.
+        state 0 and no tilt of the axis, or if there is a single mode.
     """
 
     sessions: int
@@ -130,10 +130,13 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None
     )
     nominal_plant = used_sessions[0].nominal
     assert nominal_plant is not None
-    beam_test = uniform_beam_test(modal_estimate, nominal_plant)
+    # The tilts of the sessions agree where they are stated (`Experiment.difference`).
+    tilts_deg = [session.experiment.axis_tilt_deg for session in used_sessions]
+    tilt_deg = next((each_deg for each_deg in tilts_deg if each_deg is not None), None)
+    beam_test = uniform_beam_test(modal_estimate, nominal_plant, tilt_deg)
     stated_uniformities = tuple(sorted({session.uniformity for session in used_sessions}))
     tolerant_fit = None
-    if stated_uniformities[-1]:
+    if stated_uniformities[-1] or tilt_deg:
         # The intervals assume a normal distribution, but Student's t of few sessions is wider.
         variance_factor = (student_t_quantile(0.95, len(used_sessions) - 1) / NORMAL_95) ** 2
         widened_estimate = replace(
@@ -143,6 +146,7 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None
             widened_estimate,
             nominal_plant,
             stated_uniformities[-1],
+            tilt_deg,
             is_uniform=beam_test.status != "refused",
         )
     return PooledModalModel(

@@ -266,7 +266,8 @@ def fit_modes(
     search = _ModalSearch.starting_at(comparison, noise, starts, torque_spectra)
     if search is None:
         return None
-    return search.remove_unexcited_modes().converge_with_noise().add_resonances().fit()
+    search = search.remove_unexcited_modes().converge_with_noise().remove_undamped_modes()
+    return search.add_resonances().fit()
 
 
 def modes_with_poles(
@@ -459,6 +460,24 @@ class _ModalSearch:
         ].tolist():
             search = search._remove_mode(mode_index)
         return search
+
+    def remove_undamped_modes(self) -> _ModalSearch:
+        """Return the search without modes that lost their damping and are not in the record.
+
+        Where the motor is not excited, the angle is noise of its sensor, which the beam does not
+        feel. A mode fitted there predicts a torque that was not measured, and its damping falls to
+        its bound to make this torque small. The mode then explains a torque that was corrected with
+        the mode itself, so it is tested against the torque that is corrected without it.
+        """
+        for mode_index in np.flatnonzero(self.x[1::2] < 2 * _MIN_LOSS_FACTOR).tolist():
+            without_mode = self._remove_mode(mode_index)
+            if not without_mode.numbers:
+                break
+            without_mode = without_mode.converge_with_noise()
+            with_mode = replace(without_mode, numbers=self.numbers, x=self.x)
+            if without_mode.cost() - with_mode.cost() < _MIN_DEVIANCE_REDUCTION:
+                return without_mode.remove_undamped_modes()
+        return self
 
     def _remove_mode(self, mode_index: int) -> _ModalSearch:
         """Return the search without the mode at `mode_index` in `numbers`."""

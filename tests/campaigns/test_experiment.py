@@ -44,12 +44,25 @@ def test_odd_session_is_left_out_even_if_first(of_one_experiment, chirps):
         ({"beam_length_m": 0.8}, "beam_length_m is 0.8 m, but 0.98 m in 0.mcap"),
         ({"amplitude_rad": 0.0125}, "amplitude_rad is 0.0125 rad, but 0.025 rad in 0.mcap"),
         ({"stop_hz": 20.0}, None),  # the others do not state it: no reason to doubt
+        ({"axis_tilt_deg": 2.0}, None),
     ],
 )
 def test_differences_are_reported(of_one_experiment, chirps, facts, words):
     found, failures = of_one_experiment([chirps("0.mcap"), chirps("1.mcap"), chirps("2", **facts)])
     assert len(found) == 2 + (words is None)
     assert words is None or words in failures[0].message
+
+
+def test_sessions_of_another_tilt_are_left_out(of_one_experiment, chirps):
+    """One that does not state it agrees with any other, but not with two that differ."""
+    level = [chirps(f"{n}.mcap", axis_tilt_deg=0.5) for n in range(2)]
+    tilted, unknown = chirps("tilted.mcap", axis_tilt_deg=2.0), chirps("unknown.mcap")
+    assert of_one_experiment([unknown, *level])[1] == []
+    sessions, failures = of_one_experiment([unknown, *level, tilted])
+    assert [each.path for each in sessions] == [each.path for each in level]
+    messages = " ".join(each.message for each in failures)
+    assert "axis_tilt_deg is 2 °, but 0.5 ° in 0.mcap" in messages
+    assert "axis_tilt_deg is not stated, but 0.5 °" in messages
 
 
 def test_search_joins_any_excitation_but_never_two(of_one_experiment, chirps):

@@ -11,6 +11,7 @@ from cauchy_residues import modal_constants
 
 from analysis.identify import MODE_CONSTANT_NAMES, ModalEstimate, ModalModel
 from analysis.identify.sentences import uniformity
+from analysis.identify.uniform_beam import UniformBeamProblem
 from rigd.beam import Plant
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING
 
@@ -105,6 +106,39 @@ def test_largest_stated_uniformity_is_used_and_reported(sessions_of, pooled_moda
     uneven = pooled_modal(sessions_of(4, TRUE + UNEVEN, uniformity=0.0))
     assert uneven.tolerant is None
     assert uneven.leads
+
+
+TILT_DEG = 5.0
+
+
+def tilted():
+    """Exact constants of the beam with gravity along it, from the prediction of a test."""
+    estimate = ModalEstimate(
+        ModalModel.from_constants(TRUE, (0.0,) * 5), MODES, TRUE, np.diag([1e-8] * (TRUE.size + 5))
+    )
+    problem = UniformBeamProblem(estimate, MODES, PLANT, tilt_deg=TILT_DEG)
+    return problem.constants(UniformBeamProblem(estimate, MODES, PLANT).minima()[0].x)
+
+
+def test_stated_tilt_is_part_of_the_beam(sessions_of, pooled_modal):
+    unknown, stated, zero = (
+        pooled_modal(sessions_of(8, tilted(), **facts)).uniform_beam
+        for facts in ({}, {"axis_tilt_deg": TILT_DEG}, {"axis_tilt_deg": 0.0})
+    )
+    assert stated.status == "passed"
+    assert (unknown.status, zero.status) == ("refused", "refused")
+
+
+def test_parameters_include_the_stated_tilt(sessions_of, pooled_modal):
+    """If only some of the files state it, too; and a tolerance of 0 does not omit gravity."""
+    some = [*sessions_of(4, tilted()), *sessions_of(4, tilted(), first=4, axis_tilt_deg=TILT_DEG)]
+    exact = sessions_of(8, tilted(), uniformity=0.0, axis_tilt_deg=TILT_DEG)
+    for sessions in (some, exact):
+        found = pooled_modal(sessions)
+        assert found.uniform_beam.status == "passed"
+        key = "density_over_stiffness"
+        value, std = found.tolerant.values[key], found.tolerant.std[key]
+        assert abs(value - PLANT.parameters[key]) < 4 * std
 
 
 def test_mode_visible_in_few_sessions_is_left_out(sessions_of, pooled_modal):
