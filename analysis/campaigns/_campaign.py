@@ -374,7 +374,7 @@ def _equalize_welch_fits(
 def _complete_facts(
     session_results: Sequence[SessionAnalysis | SessionFailure],
 ) -> list[SessionAnalysis | SessionFailure]:
-    """Return the results with the specimen labels of their experiments set by `complete_facts`."""
+    """Return the results with the facts of their experiments completed by `complete_facts`."""
     completed_experiments = iter(
         complete_facts(
             [

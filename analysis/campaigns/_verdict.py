@@ -18,6 +18,7 @@ from analysis.campaigns._orders import (
     tolerant_pooled_order,
 )
 from analysis.campaigns.pooling import freest_estimate
+from analysis.identify.headline import TILTED_AXIS_REASON
 from analysis.identify.modal_headline import (
     loss_factors_with_geometry_tolerance,
     uniform_beam_refusal_reason,
@@ -216,7 +217,11 @@ def campaign_verdict(
     lowest_bic_estimate, freest_fit = pooled[0], freest_estimate(pooled)
     assert freest_fit is not None
     alpha, lambda_ = (
-        _final_order(pooled_order(order, pooled, verdicts, homogeneity), verdicts, modal_model)
+        _final_order(
+            _doubt_if_tilted(pooled_order(order, pooled, verdicts, homogeneity), sessions),
+            verdicts,
+            modal_model,
+        )
         for order in ("alpha", "lambda")
     )
     sweep_comparison = opposite_sweeps(sessions)
@@ -282,6 +287,13 @@ def campaign_verdict(
             *common_advice,
         ),
     )
+
+
+def _doubt_if_tilted(exact_order: PooledOrder, sessions: Sequence[SessionAnalysis]) -> PooledOrder:
+    """Return an order on an exactly uniform beam, doubted if its fits omit a stated tilt."""
+    if not any(session.experiment.axis_tilt_deg for session in sessions):
+        return exact_order
+    return exact_order.with_doubt(TILTED_AXIS_REASON)
 
 
 def _final_order(

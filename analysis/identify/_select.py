@@ -37,6 +37,7 @@ from analysis.identify._time_varying import (
 )
 from analysis.identify.beam_uniformity import uniform_beam_test
 from analysis.identify.headline import (
+    TILTED_AXIS_REASON,
     Headline,
     headline,
     headline_of_fit,
@@ -79,9 +80,6 @@ if TYPE_CHECKING:
 _ONLINE_DRAG_COMPUTATIONS: Final = 4
 """Number of computations of the drag torque in a fit of the freest structure alone, which a running
 session repeats."""
-
-_TILTED_AXIS_REASON: Final = "the axis is tilted, and fits to the whole record assume a plumb axis"
-"""Reason to doubt the estimates for an exactly uniform beam if the axis is tilted."""
 
 ORDER_ONE_STRUCTURE: Final = STRUCTURES["III"]
 """Structure with internal and external damping of order 1. It is fitted from every start: it has no
@@ -412,7 +410,7 @@ def _add_modal_model(
         return exact_headline
     estimate_with_tolerance = None
     if measurement.axis_tilt_deg:
-        exact_headline = exact_headline.with_flag_on_all(_TILTED_AXIS_REASON)
+        exact_headline = exact_headline.with_flag_on_all(TILTED_AXIS_REASON)
     if measurement.uniformity or beam_test.status == "refused" or measurement.axis_tilt_deg:
         estimate_with_tolerance = tolerant_estimate(
             check.modal_fit,

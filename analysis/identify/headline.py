@@ -42,6 +42,9 @@ EXACTLY_UNIFORM_CONDITION: Final = "if the beam is uniform to 1e-5"
 UNEXPLAINED_REASON: Final = "part of the record is unexplained"
 """Reason against all numbers if the residual is more than noise."""
 
+TILTED_AXIS_REASON: Final = "the axis is tilted, and fits to the whole record assume a plumb axis"
+"""Reason against the estimates on an exactly uniform beam if the axis is tilted."""
+
 CONTRADICTED_FILE_REASON: Final = "the record contradicts its file"
 """Reason against all numbers if a sign or unit of the file is wrong."""
 

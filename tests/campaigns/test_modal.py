@@ -246,6 +246,15 @@ def verdict_of(make_estimate, campaign_of):
     return campaign_verdict
 
 
+def test_orders_of_an_exactly_uniform_beam_omit_the_tilt(sessions_of, verdict_of):
+    found = verdict_of(sessions_of(8, tilted(), axis_tilt_deg=TILT_DEG))
+    for order in (found.alpha, found.lambda_):
+        assert order.interval is not None
+        assert "the axis is tilted" in order.exact.reason
+    assert not any(each.startswith("If the beam is uniform to 1e-5") for each in found.sentences)
+    assert found.withheld_orders == {"alpha", "lambda"}
+
+
 def test_order_is_the_slope_of_a_loss(sessions_of, verdict_of):
     found = verdict_of(sessions_of(8))
     for order, exact in ((found.alpha, found.alpha.exact), (found.lambda_, found.lambda_.exact)):
