@@ -51,7 +51,7 @@ end."""
 
 _BOUNDED_EXCITATIONS: Final = ("chirp", "multisine", "modes")
 """Excitations that stay between the `start_hz` and `stop_hz` of their session file. A step, a move
-or a touch has neither, and a search begins with a motion that excites more."""
+or a touch has neither, and the sweeps of a search are planned while it runs."""
 
 _EXCITED_MARGIN: Final = 1.1
 """Highest frequency of a requested band, relative to that of the excitation. The end of a sweep

@@ -66,8 +66,8 @@ _SPECIMEN_KEYS: Final = (LABEL_KEY, "beam_length_m", "beam_density_kg_per_m",
                          "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
 """Keys of the specimen in a session file that must agree over a campaign."""
 _TILT_KEY: Final = "axis_tilt_deg"
-"""Key of the tilt of the axis in a session file. It must agree over a campaign where stated, because
-it changes the modes."""
+"""Key of the tilt of the axis in a session file. Where it is stated it must agree over a campaign,
+because it changes the modes."""
 _SWEEP_END_KEYS: Final = ("start_hz", "stop_hz")
 """Keys of a sweep's start and stop frequency; sweeps that differ in their order count as equal."""
 

@@ -462,22 +462,20 @@ class _ModalSearch:
         return search
 
     def remove_undamped_modes(self) -> _ModalSearch:
-        """Return the search without modes that lost their damping and are not in the record.
+        """Return the search without modes that lost their damping: they are not in the record.
 
-        Where the motor is not excited, the angle is noise of its sensor, which the beam does not
-        feel. A mode fitted there predicts a torque that was not measured, and its damping falls to
-        its bound to make this torque small. The mode then explains a torque that was corrected with
-        the mode itself, so it is tested against the torque that is corrected without it.
+        Where the reference does not excite the motor, its angle is noise. A mode fitted there
+        predicts a torque that was not measured, and its damping falls to its bound to make this
+        torque small. The fit gives evidence for the mode nevertheless, because it estimates the
+        incoherent part of angle and torque with the mode itself.
         """
-        for mode_index in np.flatnonzero(self.x[1::2] < 2 * _MIN_LOSS_FACTOR).tolist():
-            without_mode = self._remove_mode(mode_index)
-            if not without_mode.numbers:
-                break
-            without_mode = without_mode.converge_with_noise()
-            with_mode = replace(without_mode, numbers=self.numbers, x=self.x)
-            if without_mode.cost() - with_mode.cost() < _MIN_DEVIANCE_REDUCTION:
-                return without_mode.remove_undamped_modes()
-        return self
+        is_undamped = self.x[1::2] < 2 * _MIN_LOSS_FACTOR
+        if is_undamped.all() or not is_undamped.any():
+            return self
+        search = self
+        for mode_index in np.flatnonzero(is_undamped)[::-1].tolist():
+            search = search._remove_mode(mode_index)
+        return search.converge_with_noise().remove_undamped_modes()
 
     def _remove_mode(self, mode_index: int) -> _ModalSearch:
         """Return the search without the mode at `mode_index` in `numbers`."""

@@ -9,17 +9,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from analysis import fit
 from analysis.applicability import (
+    check_excited_band,
     record_band_hz,
     remarks,
     welch_analysis,
     welch_exclusion_reason,
     welch_settings,
 )
-from analysis.identify import Comparison, Measurement
+from analysis.identify import Comparison, Measurement, MeasurementError
 from analysis.models import WelchSettings
 from analysis.paper import FrequencyResponseError, SettingsError
 from analysis.record import load_record
+from analysis.results import whole_record
 
 
 @pytest.fixture
@@ -81,6 +84,40 @@ def test_requested_band_applies_to_all_fits(record_of):
     assert welch_settings(record, WelchSettings(), (0.0, 30.0)).band_hz == (1 / 160, 30.0)
     own = WelchSettings(band_hz=(1.0, 60.0))
     assert welch_settings(record_of(10), own).band_hz == (1.0, 60.0)
+
+
+@pytest.mark.parametrize("kind", ["chirp", "multisine", "modes"])
+def test_band_far_beyond_the_excitation_is_refused(record_of, kind):
+    record = record_of(excitation=kind, start_hz="50", stop_hz="0.05")
+    check_excited_band(record, (0.0, 55.0))  # the end of a sweep excites a little beyond
+    check_excited_band(record, None)
+    for refused_by in (check_excited_band, fit_in_band, whole_record_in_band):
+        with pytest.raises(MeasurementError, match=r"120 Hz, .* 0\.05 to 50 Hz, .* ends at 50 Hz"):
+            refused_by(record, (0.0, 120.0))
+    part = replace(record, part_s=(0.0, 4.0), swept_hz=(8.0, 30.0))
+    check_excited_band(part, (0.0, 33.0))
+    with pytest.raises(MeasurementError, match="8 to 30 Hz"):
+        check_excited_band(part, (0.0, 50.0))
+
+
+def fit_in_band(record, band_hz):
+    return fit(record, ["III"], band_hz=band_hz)
+
+
+def whole_record_in_band(record, band_hz):
+    return whole_record(record, band_hz=band_hz)
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        {"excitation": "step"},
+        {"excitation": "file", "stop_hz": "5"},
+        {"excitation": "", "stop_hz": "5"},
+    ],
+)
+def test_any_band_is_accepted_if_the_excited_one_is_not_stated(record_of, metadata):
+    check_excited_band(record_of(start_hz="1", **metadata), (0.0, 300.0))
 
 
 @pytest.mark.parametrize("kind", ["step", "multisine", "modes", "move", "touch"])

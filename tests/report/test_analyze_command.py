@@ -304,6 +304,13 @@ def test_wrong_options_are_refused(session, tmp_path, analyze_here, options, wor
     assert sorted(tmp_path.iterdir()) == before
 
 
+def test_band_far_beyond_the_excitation_is_refused(session, tmp_path, analyze_here):
+    before = sorted(tmp_path.iterdir())
+    result = analyze_here(session, "--band", "0,120", "--method", "record")
+    refused(result, 1, "reaches 120 Hz", "covers 0.05 to 50 Hz", "--band that ends at 50 Hz")
+    assert sorted(tmp_path.iterdir()) == before
+
+
 @pytest.mark.process
 def test_no_file_is_wrong_use(tmp_path):
     refused(run(cwd=tmp_path), 2, "FILE")
