@@ -152,7 +152,7 @@ def test_reset_without_daemon_requires_the_name_of_the_rig(rigd, stand_ins):
     code, text, errors = rigd("reset")
     assert code == 2
     assert text == ""
-    assert errors.startswith("Error: Nothing was reset. No daemon is running; ")
+    assert errors.startswith("Error: Nothing was reset. No daemon ")  # is running, or answers
     assert "rigd reset --profile NAME" in errors
     assert "sim is simulated" in errors
     assert stand_ins.calls == []

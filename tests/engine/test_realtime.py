@@ -131,7 +131,7 @@ def test_deep_idle_states_are_prevented(machine):
     root = machine("sys/devices/system/cpu/cpu0/cpuidle/state1/latency", "133\n")
     assert obtained_by_a_process(root=root)[0]["idle_states"].startswith("refused: ")
     bound = machine("dev/cpu_dma_latency", "") / "dev/cpu_dma_latency"
-    assert "left within" in obtained_by_a_process(root=root)[0]["idle_states"]
+    assert "remaining ones within" in obtained_by_a_process(root=root)[0]["idle_states"]
     assert struct.unpack("=i", bound.read_bytes()) == (MAX_WAKE_UP_US,)
 
 
