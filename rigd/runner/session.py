@@ -62,8 +62,8 @@ _COUNTER_FIELDS = {
 """Name of a tick count in the result → field of the shared state with the counter."""
 _ZERO_COUNTS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTER_FIELDS, 0))
 WITHOUT_HEARTBEAT_TEXT: Final = (
-    "Without its heartbeat the watchdog of the drive switches the torque off; check that it is "
-    "off, and press the wired stop (STO) if it is not."
+    "Without its heartbeat, the watchdog of the drive must switch the torque off, which nothing "
+    "confirms: press the wired stop (STO) before anybody approaches."
 )
 """Sentence for the operator after the control process has ended and left the drive enabled."""
 

@@ -78,9 +78,9 @@ def test_whole_record_if_control_process_dies_while_returning(tmp_path):
         rig.disconnect()
     assert result.outcome == "complete"
     assert result.reason == (
-        "After the record: The control process was killed by signal 9. Without its heartbeat the "
-        "watchdog of the drive switches the torque off; check that it is off, and press the wired "
-        "stop (STO) if it is not."
+        "After the record: The control process was killed by signal 9. Without its heartbeat, the "
+        "watchdog of the drive must switch the torque off, which nothing confirms: press the wired "
+        "stop (STO) before anybody approaches."
     )
     assert not result.is_successful
     assert result.scheduled == 400 == result.recorded
