@@ -151,7 +151,7 @@ def test_real_time_can_be_skipped_only_in_lock_step(
     for option, name in ((("--fast",), "--fast"), (("--seed", "3"), "--seed")):
         done = refuse_chirp(profile, *option)
         assert done.returncode == 2
-        assert f"{name}: the hardware of" in done.stderr
+        assert f"{name}: {profile} is a profile of hardware" in done.stderr
     start_simulator(profile)
     done = refuse_chirp(profile, "--fast")
     assert done.returncode == 2
