@@ -48,7 +48,6 @@ _COMPLETE_FRACTION: Final = 0.99
 """Fraction of the planned sweep from which it counts as complete, as samples may be missing at the
 end."""
 
-
 _BOUNDED_EXCITATIONS: Final = ("chirp", "multisine", "modes")
 """Excitations that stay between the `start_hz` and `stop_hz` of their session file. A step, a move
 or a touch has neither, and the sweeps of a search are planned while it runs."""
@@ -131,7 +130,10 @@ def check_excited_band(record: Record, requested_hz: Band | None) -> None:
     """
     from analysis.identify import MeasurementError
 
-    excited_hz = record.swept_hz or _stated_excitation_hz(record)
+    is_bounded = record.swept_hz is not None or (
+        record.metadata.get("excitation") in _BOUNDED_EXCITATIONS
+    )
+    excited_hz = record.excited_hz if is_bounded else None
     if requested_hz is None or excited_hz is None:
         return
     if requested_hz[1] > _EXCITED_MARGIN * excited_hz[1]:
@@ -140,18 +142,6 @@ def check_excited_band(record: Record, requested_hz: Band | None) -> None:
             f"{excited_hz[0]:.4g} to {excited_hz[1]:.4g} Hz, and beyond there is noise alone; "
             f"whole-record fits need a --band that ends at {excited_hz[1]:.4g} Hz or lower."
         )
-
-
-def _stated_excitation_hz(record: Record) -> Band | None:
-    """Return the lowest and highest frequency of the excitation; None if the file states none."""
-    if record.metadata.get("excitation") not in _BOUNDED_EXCITATIONS:
-        return None
-    start_hz, stop_hz = _metadata_number(record, "start_hz"), _metadata_number(record, "stop_hz")
-    return (
-        None
-        if start_hz is None or stop_hz is None
-        else (min(start_hz, stop_hz), max(start_hz, stop_hz))
-    )
 
 
 def welch_settings(

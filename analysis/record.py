@@ -214,6 +214,20 @@ class Record:
         return int(self.sweep.stop - self.sweep.start)
 
     @property
+    def excited_hz(self) -> tuple[float, float] | None:
+        """Lowest and highest stated frequency of the excitation, or of a part of a sweep.
+
+        None if the file does not state them.
+        """
+        if self.swept_hz is not None:
+            return self.swept_hz
+        try:
+            start_hz, stop_hz = float(self.metadata["start_hz"]), float(self.metadata["stop_hz"])
+        except (KeyError, ValueError):
+            return None
+        return min(start_hz, stop_hz), max(start_hz, stop_hz)
+
+    @property
     def first_sweep(self) -> slice:
         """Range of samples for Welch's method: the single sweep, or the first of two sweeps."""
         return self.sweep if self.there is None else self.there

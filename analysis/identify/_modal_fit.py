@@ -454,12 +454,7 @@ class _ModalSearch:
         if cost_increases.min() >= _MIN_DEVIANCE_REDUCTION:
             return self
         is_undamped = self.descend_to_minimum().x[1::2] < 2 * _MIN_LOSS_FACTOR
-        search = self
-        for mode_index in np.flatnonzero((cost_increases < _MIN_DEVIANCE_REDUCTION) & is_undamped)[
-            ::-1
-        ].tolist():
-            search = search._remove_mode(mode_index)
-        return search
+        return self._remove_modes((cost_increases < _MIN_DEVIANCE_REDUCTION) & is_undamped)
 
     def remove_undamped_modes(self) -> _ModalSearch:
         """Return the search without modes that lost their damping: they are not in the record.
@@ -472,25 +467,22 @@ class _ModalSearch:
         is_undamped = self.x[1::2] < 2 * _MIN_LOSS_FACTOR
         if is_undamped.all() or not is_undamped.any():
             return self
-        search = self
-        for mode_index in np.flatnonzero(is_undamped)[::-1].tolist():
-            search = search._remove_mode(mode_index)
+        search = self._remove_modes(is_undamped)
         return search.converge_with_noise().remove_undamped_modes()
 
-    def _remove_mode(self, mode_index: int) -> _ModalSearch:
-        """Return the search without the mode at `mode_index` in `numbers`."""
-        remaining_numbers = self.numbers[:mode_index] + self.numbers[mode_index + 1 :]
+    def _remove_modes(self, removed: int | NDArray[np.bool_]) -> _ModalSearch:
+        """Return the search without modes: that at an index in `numbers`, or those of a mask."""
         return replace(
             self,
-            numbers=remaining_numbers,
-            x=np.delete(self.x, [2 * mode_index, 2 * mode_index + 1]),
+            numbers=tuple(np.delete(self.numbers, removed).tolist()),
+            x=np.delete(self.x.reshape(-1, 2), removed, axis=0).ravel(),
         )
 
     def evidence(self) -> NDArray[np.float64]:
         """Return the cost increase by the removal of each mode alone, without a descent, (n,)."""
         problem = self.problem()
         full_cost = problem.cost(self.x)
-        without_mode = [self._remove_mode(i) for i in range(len(self.numbers))]
+        without_mode = [self._remove_modes(i) for i in range(len(self.numbers))]
         return np.array(
             [problem.for_modes(each.numbers).cost(each.x) - full_cost for each in without_mode]
         )
@@ -522,7 +514,7 @@ class _ModalSearch:
         )
         cost_increases = search.evidence()
         while cost_increases.size and cost_increases.min() < _MIN_DEVIANCE_REDUCTION:
-            search = search._remove_mode(int(np.argmin(cost_increases))).descend_to_minimum()
+            search = search._remove_modes(int(np.argmin(cost_increases))).descend_to_minimum()
             cost_increases = search.evidence()
         if not cost_increases.size:
             return None

@@ -21,8 +21,6 @@ from rigd.spectral import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
     from analysis.models import WelchSettings
@@ -203,7 +201,7 @@ def estimate_warnings(
             f"show the first mode, at {first_mode_hz:.3g} Hz; take longer segments, or record "
             "longer."
         )
-    excited_hz = record.swept_hz or _excited_band_hz(record.metadata)
+    excited_hz = record.excited_hz
     first_hz, last_hz = settings.band_hz
     if excited_hz is not None and (excited_hz[0] > first_hz or excited_hz[1] < last_hz):
         sentences.append(
@@ -212,12 +210,3 @@ def estimate_warnings(
             "narrow --band."
         )
     return tuple(sentences)
-
-
-def _excited_band_hz(metadata: Mapping[str, str]) -> tuple[float, float] | None:
-    """Return the lowest and highest frequency of the excitation in Hz; None if not stated."""
-    try:
-        start_hz, stop_hz = float(metadata["start_hz"]), float(metadata["stop_hz"])
-    except (KeyError, ValueError):
-        return None
-    return min(start_hz, stop_hz), max(start_hz, stop_hz)

@@ -31,7 +31,7 @@ from analysis.report.table import (
 from rigd.units import decimals
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Collection, Iterator, Mapping
 
     from analysis.campaigns import CampaignResult, Heterogeneity, Homogeneity, RankedStructure
     from analysis.campaigns.pooling import PooledEstimate, PooledParameter
@@ -141,9 +141,11 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
     if only_estimate is None:
         ordered_estimates = sorted(campaign.pooled, key=lambda item: item is not headline)
         table_rows = [
-            _pooled_row(estimate, parameter, campaign, unsupported_orders)
+            table_row
             for estimate in ordered_estimates
-            for parameter in estimate.parameters
+            for table_row in _pooled_rows(
+                estimate, campaign, unsupported_orders, pooled_flags(campaign, estimate)
+            )
         ]
         table_rows += [
             {
@@ -174,9 +176,10 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
     )
     if unreported_names:
         table_notes += footnotes(unsupported_orders)
+    flags = pooled_flags(campaign, only_estimate)
     table_notes += flag_notes(
         flag
-        for parameter_name, flag in pooled_flags(campaign, only_estimate).items()
+        for parameter_name, flag in flags.items()
         if parameter_name in only_estimate.by_name
         and parameter_name not in unreported_names
         and not homogeneity.is_mixed(parameter_name)
@@ -191,12 +194,22 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
             homogeneity,
         ),
         table_columns,
-        tuple(
-            _pooled_row(only_estimate, parameter, campaign, unsupported_orders)
-            for parameter in only_estimate.parameters
-        ),
+        tuple(_pooled_rows(only_estimate, campaign, unsupported_orders, flags)),
         tuple(table_notes),
     )
+
+
+def _pooled_rows(
+    pooled_estimate: PooledEstimate,
+    campaign: CampaignResult,
+    unsupported_orders: Collection[str],
+    flags: Mapping[str, str],
+) -> Iterator[Row]:
+    """Yield the rows of an estimate's parameters in the table of pooled estimates."""
+    for parameter in pooled_estimate.parameters:
+        yield _pooled_row(
+            pooled_estimate, parameter, campaign, unsupported_orders, flags.get(parameter.name)
+        )
 
 
 def _pooled_row(
@@ -204,10 +217,10 @@ def _pooled_row(
     parameter: PooledParameter,
     campaign: CampaignResult,
     unsupported_orders: Collection[str],
+    flag: str | None,
 ) -> Row:
     """Return the row of a parameter in the table of pooled estimates."""
     homogeneity = campaign.homogeneity
-    flag = pooled_flags(campaign, pooled_estimate).get(parameter.name)
     _, display_factor, _ = label(parameter.name)
     value_cell, std_cell, low_cell, high_cell = estimate_cells(
         (parameter.value, parameter.std, *parameter.interval), parameter.std, display_factor
