@@ -2,7 +2,8 @@
 
 Sign and unit are checked by the ratio of the measured response, torque over angle, to the response
 of the beam that the file states. The median of this ratio over the band depends neither on the
-exact mode frequencies nor on the damping.
+exact mode frequencies nor on the damping. The magnitude of a noisy ratio is too large on average.
+It is therefore averaged over adjacent frequencies, and weighted by the expected torque.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from rigd.beam import Damping, transfer
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._data import Measurement
@@ -104,6 +107,9 @@ _ASSUMED_INTERNAL_DAMPING_S: Final = 1e-4
 _MIN_DRIVEN_POWER: Final = 1e-3
 """Minimum power of the angle at a frequency that is used, relative to the largest power."""
 
+_AVERAGED_FREQUENCIES: Final = 16
+"""Number of adjacent frequencies over which the ratio of torque to angle is averaged."""
+
 _MIN_PHASE_COSINE: Final = 0.7
 """Minimum magnitude of the median cosine of the phase between measured and expected response at
 which the sign of the ratio of torque to angle is certain."""
@@ -144,7 +150,13 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
         beam,
         Damping(zeta=_ASSUMED_INTERNAL_DAMPING_S),
     )
-    torque_ratio = torque_spectrum[is_driven] / (angle_spectrum[is_driven] * expected_response)
+    expected_torque = angle_spectrum[is_driven] * expected_response
+    first_frequencies = np.arange(0, expected_torque.size, _AVERAGED_FREQUENCIES)
+    expected_power = np.add.reduceat(np.abs(expected_torque) ** 2, first_frequencies)
+    torque_ratio = (
+        np.add.reduceat(torque_spectrum[is_driven] * expected_torque.conj(), first_frequencies)
+        / expected_power
+    )
     ratio_magnitude = np.abs(torque_ratio)
     phase_cosine = float(
         np.median(torque_ratio.real / np.maximum(ratio_magnitude, np.finfo(float).tiny))
@@ -163,18 +175,22 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
                 "the beam towards positive angles."
             ),
         )
-    median_magnitude = float(np.median(ratio_magnitude))
+    median_magnitude = _weighted_median(ratio_magnitude, np.sqrt(expected_power))
     if not median_magnitude > 0 or abs(math.log(median_magnitude)) < _MIN_LOG_FACTOR:
         return
+    log_differences = {
+        unit_description: abs(abs(math.log(median_magnitude)) - abs(math.log(unit_factor)))
+        for unit_factor, unit_description in _UNIT_FACTORS
+    }
     matching_units = [
         unit_description
-        for unit_factor, unit_description in _UNIT_FACTORS
-        if abs(abs(math.log(median_magnitude)) - abs(math.log(unit_factor))) < _LOG_FACTOR_TOLERANCE
+        for unit_description in sorted(log_differences, key=log_differences.__getitem__)
+        if log_differences[unit_description] < _LOG_FACTOR_TOLERANCE
     ]
     if not matching_units and abs(math.log(median_magnitude)) < _CERTAIN_LOG_FACTOR:
         return
     explanation = (
-        f"which is the factor of {matching_units[0]}: a wrong unit"
+        f"which is the factor of {' or of '.join(matching_units)}: a wrong unit"
         if matching_units
         else "more than a beam may deviate from its data: a wrong unit or gain, or another beam"
     )
@@ -188,3 +204,10 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
         value=median_magnitude,
         remedy="Check the units of angle and torque, and import the record again.",
     )
+
+
+def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    """Return the smallest value up to which the values have half of the total weight."""
+    order = np.argsort(values)
+    cumulative_weights = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(cumulative_weights, cumulative_weights[-1] / 2)])

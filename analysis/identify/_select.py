@@ -320,7 +320,9 @@ def _select_with_known_impacts(
         effect_findings,
         tuple(
             temporal_change_findings(
-                model.temporal_changes, is_single_sweep=measurement.is_single_sweep
+                model.temporal_changes,
+                is_single_sweep=measurement.is_single_sweep,
+                explained=check.residual_tests.is_noise,
             )
         ),
         model.stiffness_step,

@@ -516,16 +516,28 @@ def is_single_change_established(
 
 
 def temporal_change_findings(
-    equivalent_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool
+    equivalent_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool, explained: bool
 ) -> Iterator[Finding]:
     """Yield a finding on each change along the record.
 
-    `equivalent_changes` explain the record best or equally well.
+    `equivalent_changes` explain the record best or equally well. `explained` states whether the
+    residual of the model with them is noise.
     """
     for change in equivalent_changes:
         finding = _established_finding(change)
         if is_single_change_established(equivalent_changes, is_single_sweep=is_single_sweep):
             yield finding
+        elif not explained:
+            # Without a model that explains the record, the fitted size means nothing.
+            yield replace(
+                finding,
+                sentence=(
+                    f"{_EFFECT_NAMES[change.effect]} would explain some of the record. How large "
+                    "the effect is remains open: in one sweep, time and frequency vary together."
+                ),
+                value=None,
+                interval=None,
+            )
         else:
             rival_names = "the others named" if len(equivalent_changes) > 1 else "any other model"
             yield replace(

@@ -39,8 +39,8 @@ def response(s, tip_mass_kg=0.0, clamp_nm_per_rad=np.inf, gamma=GAMMA):
 
 
 @cache
-def record(factor=1.0, filter_hz=np.inf, clock=0.0, **ends):
-    """Chirp of 80 s to 50 Hz; the torque as its channel shows it, with 3 mN·m of noise."""
+def record(factor=1.0, filter_hz=np.inf, clock=0.0, noise_nm=3e-3, **ends):
+    """Chirp of 80 s to 50 Hz; the torque as its channel shows it, with noise."""
     t = np.arange(TICKS) / RATE_HZ - 1
     chirp = np.where((t >= 0) & (t < 80), np.sin(2 * np.pi * (0.05 * t + 49.95 * t**2 / 160)), 0.0)
     decay = np.exp(-5.0 * np.arange(TICKS) / TICKS)
@@ -55,7 +55,7 @@ def record(factor=1.0, filter_hz=np.inf, clock=0.0, **ends):
     for power in range(20 if clock else 1):
         torque_nm += size * np.fft.irfft(torque * s**power, 4 * TICKS)[:TICKS] / decay
         size = size * clock * np.arange(TICKS) / RATE_HZ / (power + 1)
-    noise = np.random.default_rng(5).normal(scale=3e-3, size=TICKS)
+    noise = np.random.default_rng(5).normal(scale=noise_nm, size=TICKS)
     known = np.ones(TICKS, dtype=bool)
     return Measurement(
         "x", angle_rad, factor * (torque_nm + noise), RATE_HZ, LINK, known, known, uniformity=0.0
@@ -148,6 +148,16 @@ def test_very_different_clocks_flag_every_number():
 def test_wrong_sign_and_unit_are_found_immediately(factor, kinds):
     comparison = Comparison.from_measurement(record(factor), (0.0, 50.0))
     assert [finding.kind for finding in sign_and_unit_findings(comparison)] == kinds
+
+
+@pytest.mark.parametrize("noise_nm", [3e-3, 6e-2])
+def test_wrong_unit_has_its_factor_and_name_with_any_noise(noise_nm):
+    """At most frequencies the larger noise exceeds the torque."""
+    factor = 1 / 0.11298483
+    measurement = record(factor, noise_nm=noise_nm)
+    (found,) = sign_and_unit_findings(Comparison.from_measurement(measurement, (0.0, 50.0)))
+    assert abs(found.value / factor - 1) < 0.05
+    assert "pound-force inches" in found.sentence
 
 
 def test_a_wrong_sign_comes_first():
@@ -294,10 +304,17 @@ def test_hopeless_changes_are_not_fitted(candidates_of):
     assert abs(change.size - 0.2) < 3.5 * change.std
     # A fact only where time and frequency do not vary together.
     findings = {
-        is_single: list(temporal_change_findings((change,), is_single_sweep=is_single))
+        is_single: list(
+            temporal_change_findings((change,), is_single_sweep=is_single, explained=True)
+        )
         for is_single in (False, True)
     }
     assert [each.interval for each in findings[True]] == [None]
+    assert f"({100 * change.size:+.2g} % " in findings[True][0].sentence
+    # No size of a change that leaves part of the record unexplained.
+    (unexplained,) = temporal_change_findings((change,), is_single_sweep=True, explained=False)
+    assert (unexplained.value, unexplained.interval) == (None, None)
+    assert "%" not in unexplained.sentence
     (finding,) = findings[False]
     assert finding.kind == "drifting damping"
     assert finding.interval[0] < change.size < finding.interval[1]
