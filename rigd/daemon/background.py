@@ -101,6 +101,7 @@ class CheckJob:
                     "status": row.verdict.value,
                     "text": f"{row.found} (wanted: {row.wanted})" if row.wanted else row.found,
                     "remedy": row.detail,
+                    "name": row.name,
                 }
                 for row in check_rows
             ],

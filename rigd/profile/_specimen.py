@@ -1,5 +1,7 @@
 """Loader of specimen files ``specimens/NAME.toml``, whose beam replaces that of a profile."""
 
+import difflib
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Final
@@ -133,8 +135,8 @@ def with_specimen(profile: Profile, specimen_name: str) -> Profile:
     profile
         Profile of the rig.
     specimen_name
-        Name of the specimen in a session. If there is no file of that name, it is only a label and
-        the profile is returned unchanged.
+        Name of the specimen in a session. If there is no file of that name, it is only a label, and
+        the beam is that of the profile.
 
     Returns
     -------
@@ -146,9 +148,13 @@ def with_specimen(profile: Profile, specimen_name: str) -> Profile:
     ProfileError
         If the specimen's file cannot be used.
     """
-    specimen_path = specimen_files().get(specimen_name.strip())
+    paths_by_name = specimen_files()
+    specimen_path = paths_by_name.get(specimen_name.strip())
     if specimen_path is None:
-        return profile
+        similar_names = difflib.get_close_matches(specimen_name.strip(), paths_by_name)
+        return replace(
+            profile, specimen_in_words=_describe_missing_file(specimen_name, similar_names)
+        )
     specimen = load_specimen(specimen_path)
     rig = replace(profile.rig, beam=specimen.beam, damping=specimen.damping or profile.rig.damping)
     scale_percent = profile.uncertainty.torque_scale_percent
@@ -159,6 +165,16 @@ def with_specimen(profile: Profile, specimen_name: str) -> Profile:
         tip_mass_kg=specimen.tip_mass_kg,
         specimen=specimen,
         specimen_in_words=_describe_specimen(profile, specimen),
+    )
+
+
+def _describe_missing_file(specimen_name: str, similar_names: Sequence[str]) -> str:
+    """Return a sentence for the operator if a specimen without a file may be one with a file."""
+    if not similar_names:
+        return ""
+    return (
+        f"Specimen {specimen_name.strip()!r} has no file: the beam is that of the profile. "
+        f"Specimens with a similar name: {', '.join(map(repr, similar_names))}."
     )
 
 

@@ -44,7 +44,7 @@ class BannerState:
     over: bool = False
 
 
-RUNNING: Final = BannerState("RUNNING", GREEN)
+RUNNING: Final = BannerState("RUNNING", SKY_BLUE)
 """State while samples are recorded."""
 STOPPING: Final = BannerState("STOPPING", ORANGE)
 """State after a stop was requested."""
@@ -78,7 +78,7 @@ SUPERVISOR_LOST_TORQUE_OFF: Final = BannerState(
 )
 """State if the supervising process ended and the drive has shown that it is off."""
 
-_COLOR_OF_OUTCOME: Final = {"complete": SKY_BLUE, "stopped": GREY, "fault": RED}
+_COLOR_OF_OUTCOME: Final = {"complete": GREEN, "stopped": GREY, "fault": RED}
 """Colour of the band after a session, by its outcome."""
 
 

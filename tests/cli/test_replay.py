@@ -551,7 +551,7 @@ def test_death_of_the_server_is_reported(served, tmp_path):
 COLORS = {
     "Motor angle (mrad)": [ORANGE, SKY_BLUE],
     "Coupling torque, tared (N·m)": [GREEN],
-    "Values and limits": [SKY_BLUE, GREEN],  # the session was complete, and near no limit
+    "Values and limits": [GREEN],  # the session was complete, and near no limit
     "Frequency response: magnitude of torque over angle": [SKY_BLUE, ORANGE, GREY],
 }
 """Views of the first tab → expected colours."""

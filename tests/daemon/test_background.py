@@ -127,7 +127,8 @@ def test_check_reads_no_device_and_start_is_busy_meanwhile(operated, monkeypatch
     assert rows["devices: connection"]["text"] == "connected by the daemon"
     assert rows["sensor: device"]["text"] == "simulated force-torque sensor"
     assert {row["status"] for row in report["rows"]} <= {"ok", "warning", "failed", "skipped"}
-    assert all(row.keys() == {"what", "status", "text", "remedy"} for row in report["rows"])
+    assert all(row.keys() == {"what", "status", "text", "remedy", "name"} for row in report["rows"])
+    assert rows["travel: if the loop fails"]["name"] == "travel_loop_fails"
     assert operated.service.status()["last_check"]["verdict"] == report["verdict"]
     assert operated.state == "ready"
 

@@ -108,7 +108,15 @@ def test_an_equal_beam_is_reported_as_equal(write):
 def test_an_unknown_name_is_a_label(write, name):
     write(BEAM)
     profile = load_profile("sim")
-    assert with_specimen(profile, name) is profile
+    mounted = with_specimen(profile, name)
+    assert (mounted.rig, mounted.specimen) == (profile.rig, None)
+
+
+def test_a_similar_name_is_mentioned(write):
+    write(BEAM)
+    profile = load_profile("sim")
+    assert "similar name: 'antenna 4'" in with_specimen(profile, "antena 4").specimen_in_words
+    assert with_specimen(profile, "steel rod").specimen_in_words == ""
 
 
 def test_the_working_folder_comes_before_the_user_s(write, tmp_path, monkeypatch):

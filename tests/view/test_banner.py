@@ -18,7 +18,7 @@ from rigd.view.banner import (
     gauge_text,
     preparing,
 )
-from rigd.view.plots import GREEN, GREY, ORANGE, RED
+from rigd.view.plots import GREEN, GREY, ORANGE, RED, SKY_BLUE
 
 FAULT = ended("fault", "The disk is full.")
 
@@ -129,7 +129,7 @@ def test_state_and_values_are_drawn_on_arrival(sweep, make_samples, shown):
     words = [text.split("\n")[0] for (text,) in found[STATE_ENTITY].values["TextDocument:text"]]
     assert words == ["# PREPARING", "# RUNNING · 136 s left", "# RUNNING · 135 s left", "# FAULT"]
     bands = [colors[0] for colors in found[f"{GAUGES_ENTITY}/bars"].values["LineStrips2D:colors"]]
-    assert bands == [packed(color) for color in (ORANGE, GREEN, GREEN, RED)]
+    assert bands == [packed(color) for color in (ORANGE, SKY_BLUE, SKY_BLUE, RED)]
     assert "angle 0.900 of 1 rad" in found[f"{GAUGES_ENTITY}/texts"].values["Points2D:labels"][-1]
     colors = found[f"{GAUGES_ENTITY}/bars"].values["LineStrips2D:colors"][-1]
     assert packed(ORANGE) in colors  # the bar of the angle

@@ -109,7 +109,8 @@ export class Bar {
       return this.#connected
         // What to do comes first: a narrow bar cuts the text.
         ? "Press the wired stop (STO) if the rig moves or you cannot see it: its state is unknown. " +
-          this.#gone : this.#gone;
+          this.#gone
+        : `Press the wired stop (STO) if the rig moves. ${this.#gone}`;
     }
     if (this.#status === null) return "";
     const { doing, reason, zero_lost: zeroLost } = this.#status;
