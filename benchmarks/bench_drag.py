@@ -28,7 +28,7 @@ DIAMETERS_M = (0.5e-3, 1e-3, 2e-3)
 FALSE = ("delay", "beam data", "tool inertia", "rival explanations")
 """Kinds of findings for which drag was mistaken."""
 ROWS = (
-    # Measured 72 of 72, 67 of 72, 3.9, 0 and 0: docs/validation/structure_selection.md.
+    # Measured values: docs/validation/structure_selection.md.
     Row("drag named", least=100, unit="% of the records with air"),
     Row("95 % intervals of C_D d that hold the truth", least=75, unit="%"),
     Row("worst error without a flag", most=5, unit="standard deviations"),

@@ -23,7 +23,7 @@ from analysis.identify import Selection, select
 from rigd.estimates import Estimate
 
 ROWS = (
-    # Measured 3.6 in 380 records: docs/validation/structure_selection.md.
+    # Measured 3.6: docs/validation/structure_selection.md.
     Row("worst error without a flag", most=5, unit="standard deviations"),
     Row("defects that are named or leave an unexplained residual", least=80, unit="%"),
     Row("sound records of which something is named", most=0, unit="%"),

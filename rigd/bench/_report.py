@@ -63,24 +63,27 @@ def report_lines(results: Results) -> Iterator[str]:
 
 
 def verdict(results: Results) -> str:
-    """Return sentences on the rate that this computer can hold, and on what limits it."""
+    """Return sentences on the rate that this computer held, and on what limits it.
+
+    With real devices it is lower, because a tick then waits for their replies.
+    """
     highest_hz, between_stalls_hz = (
         results.highest_rate_hz,
         results.highest_rate_between_stalls_hz,
     )
     criterion_text = f"{100 * HELD_FRACTION:g} % of the ticks or more"
     if highest_hz is not None:
-        verdict_text = f"This computer holds {highest_hz:g} Hz: {criterion_text}."
+        verdict_text = f"Simulated devices: this computer held {highest_hz:g} Hz, {criterion_text}."
     else:
         best_measurement = max(results.search, key=lambda measurement: measurement.held)
         verdict_text = (
-            f"This computer holds none of these rates: {best_measurement.rate_hz:g} Hz came "
+            f"Simulated devices: this computer held none of these rates. {best_measurement.rate_hz:g} Hz came "
             f"nearest, with {100 * best_measurement.held:.2f} % of the ticks."
         )
     if between_stalls_hz is not None and between_stalls_hz != highest_hz:
         verdict_text += (
             f" Without stalls of {STALL_US * 1e-3:g} ms and more, which affect any rate, it would "
-            f"hold {between_stalls_hz:g} Hz."
+            f"have held {between_stalls_hz:g} Hz."
         )
     refused_names = [
         setting_name

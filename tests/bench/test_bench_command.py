@@ -45,7 +45,7 @@ def bench(monkeypatch, measured):
 def test_the_report_ends_with_a_verdict(bench):
     done = bench("--rate", "2000", "--seconds", "5", "--spin-us", "50")
     assert done.exit_code == 0, done.output
-    assert done.stdout.splitlines()[-1].startswith("This computer holds 1000 Hz")
+    assert done.stdout.splitlines()[-1].startswith("Simulated devices: this computer held 1000 Hz")
     ((name, options),) = bench.calls
     assert name == "sim"
     assert (options["rate_hz"], options["seconds"], options["spin_us"]) == (2000.0, 5.0, 50.0)
