@@ -77,8 +77,8 @@ def verdict(results: Results) -> str:
     else:
         best_measurement = max(results.search, key=lambda measurement: measurement.held)
         verdict_text = (
-            f"Simulated devices: this computer held none of these rates. {best_measurement.rate_hz:g} Hz came "
-            f"nearest, with {100 * best_measurement.held:.2f} % of the ticks."
+            "Simulated devices: this computer held none of these rates. "
+            f"{best_measurement.rate_hz:g} Hz came nearest, with {100 * best_measurement.held:.2f} % of the ticks."
         )
     if between_stalls_hz is not None and between_stalls_hz != highest_hz:
         verdict_text += (
