@@ -78,7 +78,8 @@ def verdict(results: Results) -> str:
         best_measurement = max(results.search, key=lambda measurement: measurement.held)
         verdict_text = (
             "Simulated devices: this computer held none of these rates. "
-            f"{best_measurement.rate_hz:g} Hz came nearest, with {100 * best_measurement.held:.2f} % of the ticks."
+            f"{best_measurement.rate_hz:g} Hz came nearest, with "
+            f"{100 * best_measurement.held:.2f} % of the ticks."
         )
     if between_stalls_hz is not None and between_stalls_hz != highest_hz:
         verdict_text += (
