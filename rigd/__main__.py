@@ -8,7 +8,7 @@ import sys
 _NOTHING_BEGAN_MESSAGE = b"Stopped before anything began.\n"
 """Message after Ctrl-C before a command has started."""
 _PORTABLE_COMMANDS = ("list", "info", "recover", "replay", "profiles", "specimens")
-"""Commands that use files only, and therefore also run on Windows."""
+"""Commands that use files only, and therefore also run on macOS and Windows."""
 
 
 def main() -> None:
@@ -16,8 +16,8 @@ def main() -> None:
     signal.signal(signal.SIGINT, _end_on_interrupt)
     _fill_standard_descriptors()
     command = next(iter(sys.argv[1:]), "--help")
-    is_posix = hasattr(os, "getuid")
-    if not is_posix and command not in _PORTABLE_COMMANDS and not command.startswith("-"):
+    has_anonymous_memory = hasattr(os, "memfd_create")  # for the rings; on Linux only
+    if not has_anonymous_memory and command not in _PORTABLE_COMMANDS and not command.startswith("-"):
         sys.exit(
             f"Error: rigd {command} needs Linux. This system has analyze, and of rigd the commands "
             f"{', '.join(_PORTABLE_COMMANDS)}."

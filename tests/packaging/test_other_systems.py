@@ -200,7 +200,6 @@ def test_every_module_can_be_imported_and_the_commands_run(run_commands, session
     assert (tmp_path / "frf.mat").stat().st_size > 1000
 
 
-@pytest.mark.skipif(sys.platform == "darwin", reason="it runs there")
 def test_a_session_needs_linux(sessions, variables):
     done = subprocess.run(
         [sys.executable, "-m", "rigd", "run", "chirp", "--fast"],
@@ -209,6 +208,17 @@ def test_a_session_needs_linux(sessions, variables):
     assert done.returncode == 1
     assert done.stderr.startswith("Error: rigd run needs Linux. ")
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="another system refuses it without this")
+def test_a_rig_is_not_run_from_macos(tmp_path):
+    without_linux_calls = "import os, sys; del os.memfd_create; from rigd.__main__ import main; "
+    done = subprocess.run(
+        [sys.executable, "-c", without_linux_calls + "sys.argv = ['rigd', 'serve']; main()"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: rigd serve needs Linux. ")
 
 
 @pytest.mark.further
