@@ -16,8 +16,8 @@ def main() -> None:
     signal.signal(signal.SIGINT, _end_on_interrupt)
     _fill_standard_descriptors()
     command = next(iter(sys.argv[1:]), "--help")
-    has_anonymous_memory = hasattr(os, "memfd_create")  # for the rings; on Linux only
-    if not has_anonymous_memory and command not in _PORTABLE_COMMANDS and not command.startswith("-"):
+    is_linux = hasattr(os, "sched_setaffinity")  # the loop needs a processor core of its own
+    if not is_linux and command not in _PORTABLE_COMMANDS and not command.startswith("-"):
         sys.exit(
             f"Error: rigd {command} needs Linux. This system has analyze, and of rigd the commands "
             f"{', '.join(_PORTABLE_COMMANDS)}."
