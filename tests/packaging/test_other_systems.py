@@ -212,9 +212,9 @@ def test_a_session_needs_linux(sessions, variables):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="another system refuses it without this")
 def test_a_rig_is_not_run_from_macos(tmp_path):
-    without_linux_calls = "import os, sys; del os.sched_setaffinity; from rigd.__main__ import main; "
+    without_affinity = "import os, sys; del os.sched_setaffinity; from rigd.__main__ import main; "
     done = subprocess.run(
-        [sys.executable, "-c", without_linux_calls + "sys.argv = ['rigd', 'serve']; main()"],
+        [sys.executable, "-c", without_affinity + "sys.argv = ['rigd', 'serve']; main()"],
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 1
