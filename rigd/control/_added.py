@@ -7,7 +7,7 @@ from rigd.control.contracts import Controller, ControllerError
 from rigd.plugins import Plugin, error_text
 
 
-class AddedController:
+class PluginController:
     """Controller of an installed package, as the loop uses it (`LoopController`).
 
     The output is limited to `torque_limit_nm`, and added to the reference of the PID if there is
@@ -65,30 +65,30 @@ class AddedController:
         Raise `ControllerError` if the package's code fails, or its output is not a finite number.
         """
         try:
-            output = self._step(reference_rad, angle_rad, coupling_torque_nm)
-            is_usable = isinstance(output, (float, int)) and isfinite(output)
+            controller_output = self._step(reference_rad, angle_rad, coupling_torque_nm)
+            is_usable = isinstance(controller_output, (float, int)) and isfinite(controller_output)
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # SystemExit is no Exception
             raise self._failure("step", error_text(error)) from error
         if not is_usable:
-            raise self._failure("step", f"it returned {output!r}")
+            raise self._failure("step", f"it returned {controller_output!r}")
         pid = self._pid
         if pid is not None:
-            torque_nm = pid.step(reference_rad + output, angle_rad, coupling_torque_nm)
+            torque_nm = pid.step(reference_rad + controller_output, angle_rad, coupling_torque_nm)
             self.unlimited_torque_nm, self.saturated = pid.unlimited_torque_nm, pid.saturated
             return torque_nm
         limit_nm = self.torque_limit_nm
-        self.unlimited_torque_nm = float(output)
-        self.saturated = not -limit_nm <= output <= limit_nm
-        return min(max(float(output), -limit_nm), limit_nm)
+        self.unlimited_torque_nm = float(controller_output)
+        self.saturated = not -limit_nm <= controller_output <= limit_nm
+        return min(max(float(controller_output), -limit_nm), limit_nm)
 
-    def _failure(self, method: str, failure_text: str) -> ControllerError:
+    def _failure(self, method_name: str, failure_text: str) -> ControllerError:
         """Return the error that names the package, the failed method and the kind of failure."""
         return ControllerError(
             str(
                 self._owner.error(
-                    f"the controller's {method} failed ({failure_text}), and the torque was "
+                    f"the controller's {method_name} failed ({failure_text}), and the torque was "
                     "switched off; report that to the package's author, or set "
                     'control.controller = "pid".'
                 )

@@ -25,7 +25,7 @@ from rigd.control._pid import ControlDesignError
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-MAX_GROWTH_PER_S = 0.02
+MAX_OSCILLATION_GROWTH_PER_S = 0.02
 """Largest growth rate of an oscillation of the loop in 1/s that is accepted, with a warning.
 
 With any controller a beam of almost no damping leaves the loop slightly unstable: at a pole of
@@ -48,10 +48,10 @@ _LIGHT_DAMPING_RATIO = 1e-4
 """Damping ratio of the beam's first mode in the check of `MAX_DAMPING_REDUCTION`. It is not 0,
 because rounding may make the realisation of an undamped beam unstable."""
 
-_MAX_DELAY_EIGENVALUE = 1e-9
+_MAX_EIGENVALUE_OF_DELAY = 1e-9
 """Magnitude of an eigenvalue below which it belongs to a delay, which decays within a few ticks."""
 _BLOCK_TICKS = 64  # ticks: fewer make the sequential part longer, more the products
-_BLOCKS_AT_ONCE = 4096
+_BLOCKS_PER_CHUNK = 4096
 """Number of blocks of ticks whose response is computed at once."""
 _OUTPUT_ROWS = 5  # angle, velocity, torque without friction, reference speed, sensor torque
 
@@ -80,9 +80,9 @@ class LoopOpening:
 
     name: str
     """Name of the signal."""
-    action: RealArray
+    action_column: RealArray
     """Effect of one unit of the signal on the next state, shape (n,)."""
-    reading: RealArray
+    reading_row: RealArray
     """Row vector that gives the signal from the state x, ``reading · x``; shape (n,)."""
 
 
@@ -109,7 +109,7 @@ class ClosedLoop:
     """Signals at which the loop can be opened: torque command, angle reading, torque reading."""
     poles_rad_s: ComplexArray
     """Poles of the loop in continuous time, the fastest growing (or slowest decaying) first."""
-    shaft_torque: RealArray
+    shaft_torque_column: RealArray
     """Effect on the next state of 1 N·m on the shaft for one period, shape (n,)."""
     realisation: Realisation | None
     """State space of the beam, whose states follow angle and velocity in x; None: no beam."""
@@ -146,11 +146,11 @@ class ClosedLoop:
             If the loop is unstable and the response overflows.
         """
         response = LoopResponse(*np.empty((len(fields(LoopResponse)), reference_rad.size)))
-        end = 0
+        chunk_end = 0
         for chunk in self.simulate_in_chunks(reference_rad):
-            begin, end = end, end + chunk.angle_rad.size
+            begin, chunk_end = chunk_end, chunk_end + chunk.angle_rad.size
             for response_field in fields(LoopResponse):
-                getattr(response, response_field.name)[begin:end] = getattr(
+                getattr(response, response_field.name)[begin:chunk_end] = getattr(
                     chunk, response_field.name
                 )
         return response
@@ -170,12 +170,12 @@ class ClosedLoop:
         """
         free_response, forced_response, state_step, reference_drive = self._block_matrices()
         block_state = np.zeros(self.b.size)
-        ticks_at_once = _BLOCKS_AT_ONCE * _BLOCK_TICKS
-        for begin in range(0, reference_rad.size, ticks_at_once):
-            references = reference_rad[begin : begin + ticks_at_once]
-            block_count = -(-references.size // _BLOCK_TICKS)
+        chunk_ticks = _BLOCKS_PER_CHUNK * _BLOCK_TICKS
+        for begin in range(0, reference_rad.size, chunk_ticks):
+            chunk_reference_rad = reference_rad[begin : begin + chunk_ticks]
+            block_count = -(-chunk_reference_rad.size // _BLOCK_TICKS)
             block_references = np.zeros((block_count, _BLOCK_TICKS))
-            block_references.ravel()[: references.size] = references
+            block_references.ravel()[: chunk_reference_rad.size] = chunk_reference_rad
             reference_effects = block_references @ reference_drive
             block_states = np.empty_like(reference_effects)
             for block_index in range(block_count):
@@ -192,7 +192,7 @@ class ClosedLoop:
                 np.matmul(block_references, forced_response[row], out=output_rows[row])
                 output_rows[row] += block_states @ free_response[row]
             angle_rad, velocity_rad_s, torque_nm, friction_speed_rad_s, coupling_torque_nm = (
-                output_rows.reshape(_OUTPUT_ROWS, -1)[:, : references.size]
+                output_rows.reshape(_OUTPUT_ROWS, -1)[:, : chunk_reference_rad.size]
             )
             settings = self.model.settings
             friction_speed_rad_s /= settings.friction_velocity_rad_s
@@ -242,9 +242,9 @@ class ClosedLoop:
             forced_response[:, tick_number, tick_number:] = impulse_response[
                 :, : _BLOCK_TICKS - tick_number
             ]
-        free_by_row = np.ascontiguousarray(free_response.transpose(1, 2, 0))
+        free_response_by_row = np.ascontiguousarray(free_response.transpose(1, 2, 0))
         return (
-            free_by_row,
+            free_response_by_row,
             forced_response,
             np.ascontiguousarray(matrix_power),
             reference_drive[::-1].copy(),
@@ -296,14 +296,14 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     output_rows[:, n:] = law.c
     torque_row = output_rows[0]
 
-    angle_action = law.d[0, 1] * command_column
-    angle_action[n:] = law.b[:, 1]
-    torque_action = law.d[0, 2] * command_column
-    torque_action[n:] = law.b[:, 2]
-    cut_signals = (
+    angle_action_column = law.d[0, 1] * command_column
+    angle_action_column[n:] = law.b[:, 1]
+    torque_action_column = law.d[0, 2] * command_column
+    torque_action_column[n:] = law.b[:, 2]
+    openings = (
         LoopOpening("torque command", command_column, torque_row),
-        LoopOpening("angle reading", angle_action, measured_angle_row),
-        LoopOpening("torque reading", torque_action, measured_torque_row),
+        LoopOpening("angle reading", angle_action_column, measured_angle_row),
+        LoopOpening("torque reading", torque_action_column, measured_torque_row),
     )
 
     a[:n, :n] = discrete_plant.a
@@ -329,9 +329,9 @@ def close_loop(model: LoopModel) -> ClosedLoop:
         c,
         d,
         model,
-        cut_signals,
+        openings,
         loop_poles[np.argsort(-loop_poles.real)],
-        np.append(discrete_plant.shaft_torque, np.zeros(len(law.a))),
+        np.append(discrete_plant.shaft_torque_column, np.zeros(len(law.a))),
         realisation,
     )
 
@@ -340,7 +340,9 @@ def continuous_poles(a: RealArray, rate_hz: float) -> ComplexArray:
     """Return the poles in continuous time, in rad/s, of the system ``x[k+1] = a x[k]``."""
     eigenvalues = np.linalg.eigvals(a).astype(complex)
     # Delays have eigenvalues at zero, which decay within a few ticks.
-    poles: ComplexArray = np.log(eigenvalues[np.abs(eigenvalues) > _MAX_DELAY_EIGENVALUE]) * rate_hz
+    poles: ComplexArray = (
+        np.log(eigenvalues[np.abs(eigenvalues) > _MAX_EIGENVALUE_OF_DELAY]) * rate_hz
+    )
     return poles
 
 
@@ -355,8 +357,8 @@ def check_stability(closed_loop: ClosedLoop) -> str | None:
     Raises
     ------
     ControlDesignError
-        If an oscillation of the loop grows faster than `MAX_GROWTH_PER_S`, or would do so without
-        the beam's own damping (`MAX_DAMPING_REDUCTION`).
+        If an oscillation of the loop grows faster than `MAX_OSCILLATION_GROWTH_PER_S`, or
+        would do so without the beam's own damping (`MAX_DAMPING_REDUCTION`).
     """
     remedy_text = _stability_remedy(closed_loop.model)
     growth_rate_per_s = closed_loop.growth_per_s
@@ -365,7 +367,7 @@ def check_stability(closed_loop: ClosedLoop) -> str | None:
         f"{closed_loop.spectral_radius:.7f}): {_describe_pole(closed_loop.poles_rad_s[0])} grows "
         f"at {growth_rate_per_s:.2g} /s"
     )
-    if growth_rate_per_s > MAX_GROWTH_PER_S:
+    if growth_rate_per_s > MAX_OSCILLATION_GROWTH_PER_S:
         raise ControlDesignError(f"{instability_text}; {remedy_text}.")
     if (plant := closed_loop.model.plant) is not None:
         lightly_damped_loop = close_loop(lightly_damped_model(closed_loop.model, plant))
@@ -380,7 +382,8 @@ def check_stability(closed_loop: ClosedLoop) -> str | None:
     if growth_rate_per_s <= 0.0:
         return None
     return (
-        f"{instability_text}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; this happens if the "
+        f"{instability_text}, which is accepted up to "
+        f"{MAX_OSCILLATION_GROWTH_PER_S:g} /s; this happens if the "
         "beam has almost no damping, so keep sessions short."
     )
 

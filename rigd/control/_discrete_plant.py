@@ -36,7 +36,7 @@ class DiscretePlant:
         Rows that give angle, velocity and the sensor's torque at a tick from the state.
     measured_angle, measured_torque
         Rows that give the readings of angle and torque at a tick from the state.
-    shaft_torque
+    shaft_torque_column
         Effect on the next state of 1 N·m on the shaft for one period.
     """
 
@@ -51,18 +51,20 @@ class DiscretePlant:
         whole_periods, period_fraction = _split_delay(
             model.actuation_delay_s, period_s, "actuation.delay_s"
         )
-        angle_chain = _split_delay(model.angle_delay_s, period_s, "encoder.delay_s")
-        torque_chain = _split_delay(model.torque_delay_s, period_s, "sensor.delay_s")
+        angle_delay_parts = _split_delay(model.angle_delay_s, period_s, "encoder.delay_s")
+        torque_delay_parts = _split_delay(model.torque_delay_s, period_s, "sensor.delay_s")
         n = coupled_plant.b.size
         command_count = whole_periods + 1
-        chain_lengths = [w + (1 if f > 0.0 else 0) for w, f in (angle_chain, torque_chain)]
-        state_size = n + command_count + sum(chain_lengths)
+        delay_chain_lengths = [
+            w + (1 if f > 0.0 else 0) for w, f in (angle_delay_parts, torque_delay_parts)
+        ]
+        state_size = n + command_count + sum(delay_chain_lengths)
 
         # Columns of the torque before and after the switch within a period. Without a whole period
         # of delay the command after it is the tick's own: the input column, last.
-        column_before = n + whole_periods
-        column_after = column_before - 1 if whole_periods else state_size
-        switch_s = period_fraction * period_s
+        column_before_switch = n + whole_periods
+        column_after_switch = column_before_switch - 1 if whole_periods else state_size
+        command_switch_s = period_fraction * period_s
         extended_matrix = np.zeros((state_size, state_size + 1))
 
         def state_map_after(duration_s: float) -> tuple[RealArray, int]:
@@ -70,10 +72,10 @@ class DiscretePlant:
 
             The second result is the column of the torque that acts at that time.
             """
-            state_map, torque_column = np.eye(n, state_size + 1), column_before
+            state_map, torque_column = np.eye(n, state_size + 1), column_before_switch
             for interval_s, acting_column in (
-                (min(duration_s, switch_s), column_before),
-                (duration_s - switch_s, column_after),
+                (min(duration_s, command_switch_s), column_before_switch),
+                (duration_s - command_switch_s, column_after_switch),
             ):
                 if interval_s > 0.0:
                     transition, torque_effect = propagator(coupled_plant, interval_s)
@@ -83,61 +85,69 @@ class DiscretePlant:
             return state_map, torque_column
 
         def reading_row(
-            quantity_row: RealArray, per_torque: float, since_tick_s: float = 0.0
+            quantity_row: RealArray, quantity_per_torque: float, time_since_tick_s: float = 0.0
         ) -> RealArray:
             """Return the row vector of a reading at a time after a tick, (state_size + 1,)."""
-            state_map, torque_column = state_map_after(since_tick_s)
-            chain_reading: RealArray = quantity_row @ state_map
-            chain_reading[torque_column] += per_torque
-            return chain_reading
+            state_map, torque_column = state_map_after(time_since_tick_s)
+            effect_row: RealArray = quantity_row @ state_map
+            effect_row[torque_column] += quantity_per_torque
+            return effect_row
 
         extended_matrix[:n] = state_map_after(period_s)[0]
-        self.shaft_torque = np.append(
+        self.shaft_torque_column = np.append(
             propagator(coupled_plant, period_s)[1], np.zeros(state_size - n)
         )
         extended_matrix[n, state_size] = 1.0
         for command_index in range(1, command_count):
             extended_matrix[n + command_index, n + command_index - 1] = 1.0
 
-        angle_row = (coupled_plant.angle, 0.0)
-        sensor_torque_row = (coupled_plant.sensor_torque, coupled_plant.sensor_torque_per_torque)
-        self.angle = reading_row(*angle_row)[:state_size]
+        angle_quantity = (coupled_plant.angle, 0.0)
+        sensor_torque_quantity = (
+            coupled_plant.sensor_torque,
+            coupled_plant.sensor_torque_per_torque,
+        )
+        self.angle = reading_row(*angle_quantity)[:state_size]
         self.velocity = reading_row(coupled_plant.velocity, 0.0)[:state_size]
-        self.sensor_torque = reading_row(*sensor_torque_row)[:state_size]
+        self.sensor_torque = reading_row(*sensor_torque_quantity)[:state_size]
 
         measured_rows = []
-        chain_begin = n + command_count
+        delay_chain_begin = n + command_count
         for (_, fraction), chain_length, reading_quantity, undelayed_row in (
-            (angle_chain, chain_lengths[0], angle_row, self.angle),
-            (torque_chain, chain_lengths[1], sensor_torque_row, self.sensor_torque),
+            (angle_delay_parts, delay_chain_lengths[0], angle_quantity, self.angle),
+            (
+                torque_delay_parts,
+                delay_chain_lengths[1],
+                sensor_torque_quantity,
+                self.sensor_torque,
+            ),
         ):
             if chain_length == 0:
                 measured_rows.append(undelayed_row)
                 continue
             # The chain's first link: the reading of the last tick, or one from the period since.
             periods_since_tick = 1.0 - fraction if fraction > 0.0 else 0.0
-            extended_matrix[chain_begin] = reading_row(
+            extended_matrix[delay_chain_begin] = reading_row(
                 *reading_quantity, periods_since_tick * period_s
             )
-            for chain_link in range(chain_begin + 1, chain_begin + chain_length):
+            for chain_link in range(delay_chain_begin + 1, delay_chain_begin + chain_length):
                 extended_matrix[chain_link, chain_link - 1] = 1.0
-            measured_rows.append(np.eye(state_size)[chain_begin + chain_length - 1])
-            chain_begin += chain_length
+            measured_rows.append(np.eye(state_size)[delay_chain_begin + chain_length - 1])
+            delay_chain_begin += chain_length
         self.measured_angle, self.measured_torque = measured_rows
         self.a = extended_matrix[:, :state_size]
         self.b = extended_matrix[:, state_size]
 
 
-def _split_delay(delay_s: float, period_s: float, key: str) -> tuple[int, float]:
+def _split_delay(delay_s: float, period_s: float, delay_key: str) -> tuple[int, float]:
     """Return the whole periods of a delay, and the remainder as a fraction of a period.
 
-    `key` is the delay's name in the message of the `ControlDesignError` for too long a delay.
+    `delay_key` is the delay's name in the message of the `ControlDesignError` for too long a delay.
     """
     delay_periods = delay_s / period_s
     if delay_periods > MAX_DELAY_PERIODS:
         raise ControlDesignError(
-            f"{key} = {delay_s:g} s is {delay_periods:.4g} periods; at most {MAX_DELAY_PERIODS} "
-            "can be controlled over."
+            f"{delay_key} = {delay_s:g} s is {delay_periods:.4g} periods; "
+            f"at most {MAX_DELAY_PERIODS} can be controlled over."
         )
     whole_periods = floor(delay_periods + 1e-9)
     period_fraction = delay_periods - whole_periods

@@ -46,8 +46,8 @@ def simulate_disturbed(
     reference_rad: RealArray,
     disturbances: Disturbances,
     *,
-    modes: int,
-    draws: int,
+    mode_count: int,
+    draw_count: int,
     seed: int = 0,
 ) -> DisturbedResponse:
     """Simulate the response to a reference from rest, with friction, encoder steps and noise.
@@ -60,9 +60,9 @@ def simulate_disturbed(
         Reference angle at each tick relative to the angle at rest, shape (n,).
     disturbances
         Friction, step of the encoder and noise of the sensor.
-    modes
+    mode_count
         Number of modes, from the first on, whose amplitudes are computed.
-    draws
+    draw_count
         Number of random realisations of the noise, and of the angle within an encoder step.
     seed
         Seed of the random numbers.
@@ -72,23 +72,29 @@ def simulate_disturbed(
     command_opening, angle_opening, torque_opening = closed_loop.openings
     n, step_rad = reference_rad.size, disturbances.encoder_step_rad
     random_numbers = np.random.default_rng(seed)
-    offset_rad = step_rad * random_numbers.uniform(-0.5, 0.5, draws)
-    torque_noise_nm = random_numbers.normal(0.0, disturbances.torque_noise_nm, (n, draws))
+    encoder_offset_rad = step_rad * random_numbers.uniform(-0.5, 0.5, draw_count)
+    torque_noise_nm = random_numbers.normal(0.0, disturbances.torque_noise_nm, (n, draw_count))
     input_columns = np.stack(
-        [closed_loop.b, command_opening.action, torque_opening.action, angle_opening.action], axis=1
+        [
+            closed_loop.b,
+            command_opening.action_column,
+            torque_opening.action_column,
+            angle_opening.action_column,
+        ],
+        axis=1,
     )
-    output_rows = np.stack([closed_loop.c[0], angle_opening.reading, closed_loop.c[3]])
-    velocity_row, shaft_effect = closed_loop.c[1], closed_loop.shaft_torque[:, None]
-    speed_per_torque = float(velocity_row @ closed_loop.shaft_torque)
+    output_rows = np.stack([closed_loop.c[0], angle_opening.reading_row, closed_loop.c[3]])
+    velocity_row, shaft_effect = closed_loop.c[1], closed_loop.shaft_torque_column[:, None]
+    speed_per_torque = float(velocity_row @ closed_loop.shaft_torque_column)
 
-    angle_rad, loop_inputs = np.empty((n, draws)), np.zeros((4, draws))
+    angle_rad, loop_inputs = np.empty((n, draw_count)), np.zeros((4, draw_count))
     # The pairs of states of the modes follow angle and velocity.
-    mode_pairs = slice(2, 2 + 2 * modes)
-    mode_states = np.empty((n, 2 * modes, draws))
-    x = np.zeros((closed_loop.b.size, draws))
+    mode_state_slice = slice(2, 2 + 2 * mode_count)
+    mode_states = np.empty((n, 2 * mode_count, draw_count))
+    loop_state = np.zeros((closed_loop.b.size, draw_count))
     for tick_number, tick_reference_rad in enumerate(reference_rad):
-        angle_rad[tick_number], angle_reading_rad, friction_speed_rad_s = output_rows @ x
-        mode_states[tick_number] = x[mode_pairs]
+        angle_rad[tick_number], angle_reading_rad, friction_speed_rad_s = output_rows @ loop_state
+        mode_states[tick_number] = loop_state[mode_state_slice]
         loop_inputs[0] = tick_reference_rad
         friction_speed_rad_s = (
             friction_speed_rad_s + closed_loop.d[3] * tick_reference_rad
@@ -97,16 +103,16 @@ def simulate_disturbed(
         loop_inputs[2] = torque_noise_nm[tick_number]
         if step_rad:
             loop_inputs[3] = (
-                step_rad * np.rint((angle_reading_rad + offset_rad) / step_rad)
-                - offset_rad
+                step_rad * np.rint((angle_reading_rad + encoder_offset_rad) / step_rad)
+                - encoder_offset_rad
                 - angle_reading_rad
             )
-        x = closed_loop.a @ x + input_columns @ loop_inputs
-        friction_error_nm = (velocity_row @ x) / speed_per_torque
-        x -= shaft_effect * friction_error_nm.clip(
+        loop_state = closed_loop.a @ loop_state + input_columns @ loop_inputs
+        stopping_torque_nm = (velocity_row @ loop_state) / speed_per_torque
+        loop_state -= shaft_effect * stopping_torque_nm.clip(
             -disturbances.coulomb_nm, disturbances.coulomb_nm
         )
-    mode_weights = np.hypot(*realisation.c[: 2 * modes].reshape(-1, 2).T)[:, None]
+    mode_weights = np.hypot(*realisation.c[: 2 * mode_count].reshape(-1, 2).T)[:, None]
     return DisturbedResponse(
         angle_rad, mode_weights * np.hypot(mode_states[:, ::2], mode_states[:, 1::2])
     )

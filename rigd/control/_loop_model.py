@@ -57,21 +57,25 @@ class LinearController:
         n = len(self.a)
         if not 0 < n <= MAX_CONTROLLER_STATES:
             raise ValueError(f"a has {n} rows; a controller has 1 to {MAX_CONTROLLER_STATES}.")
-        rows_of = {"a": (n, n), "b": (n, len(INPUTS))}
-        for name, (row_count, column_count) in rows_of.items():
+        shape_by_matrix = {"a": (n, n), "b": (n, len(INPUTS))}
+        for name, (row_count, column_count) in shape_by_matrix.items():
             matrix = tuple(tuple(map(float, row)) for row in getattr(self, name))
             if len(matrix) != row_count or {len(row) for row in matrix} != {column_count}:
                 raise ValueError(f"{name} must have the shape ({row_count}, {column_count}).")
             object.__setattr__(self, name, matrix)
-        lengths = {"c": n, "d": len(INPUTS), "anti_windup": n if len(self.anti_windup) else 0}
-        for name, length in lengths.items():
+        length_by_vector = {
+            "c": n,
+            "d": len(INPUTS),
+            "anti_windup": n if len(self.anti_windup) else 0,
+        }
+        for name, length in length_by_vector.items():
             row = tuple(map(float, getattr(self, name)))
             if len(row) != length:
                 raise ValueError(f"{name} must have {length} numbers.")
             object.__setattr__(self, name, row)
-        for name in (*rows_of, *lengths):
-            flat = getattr(self, name)
-            for row in flat if name in rows_of else (flat,):
+        for name in (*shape_by_matrix, *length_by_vector):
+            coefficients = getattr(self, name)
+            for row in coefficients if name in shape_by_matrix else (coefficients,):
                 if not all(map(isfinite, row)):
                     raise ValueError(f"{name} has a number that is not finite.")
 

@@ -33,24 +33,24 @@ from rigd.control._closed_loop import ClosedLoop, LoopOpening
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_LOWEST_FREQUENCY = 1e-6
+_MIN_FREQUENCY_FRACTION = 1e-6
 """Lowest examined frequency, as a fraction of the sampling rate."""
 _FREQUENCIES_PER_DECADE = 60
 """Number of examined frequencies in a decade, in addition to those near resonances."""
 _RESONANCE_OFFSETS = np.geomspace(0.03, 100.0, 16)
 """Offsets of examined frequencies from a resonance to either side, in its half-widths."""
-_MIN_HALF_WIDTH = 1e-6
+_MIN_RELATIVE_HALF_WIDTH = 1e-6
 """Smallest half-width of a resonance relative to its frequency, used for undamped modes."""
-_MAX_DELAY_EIGENVALUE = 1e-3
+_MAX_EIGENVALUE_OF_DELAY = 1e-3
 """Magnitude of an eigenvalue below which it belongs to a delay, not to a resonance."""
 _MAX_IMAGINARY_RATIO = 1e-3
 """Largest ratio of imaginary to real part with which the gain at either end of the frequencies
 counts as real."""
-_FREQUENCIES_AT_ONCE = 128
+_FREQUENCIES_PER_BLOCK = 128
 """Number of frequencies at which the gain is computed at once."""
-_BISECTIONS = 45
+_BISECTION_COUNT = 45
 """Number of bisections by which the zero of a function of frequency is found."""
-_REFINEMENTS = 3
+_REFINEMENT_COUNT = 3
 """Number of times that the frequencies around the smallest distance are refined."""
 
 
@@ -117,24 +117,26 @@ def loop_margins(closed_loop: ClosedLoop) -> tuple[Margins, ...]:
 
 
 def open_loop_gain(
-    closed_loop: ClosedLoop, opening: LoopOpening, phase_rad: RealArray
+    closed_loop: ClosedLoop, opening: LoopOpening, phase_per_tick_rad: RealArray
 ) -> ComplexArray:
     """Return the complex gain L of the loop opened at one signal, at some frequencies, shape (m,).
 
-    The sensitivity of the closed loop is ``1/(1 + L)``. `phase_rad` is the angular frequency times
-    the period; π is half the sampling rate.
+    The sensitivity of the closed loop is ``1/(1 + L)``. `phase_per_tick_rad` is the angular
+    frequency times the period; π is half the sampling rate.
     """
-    n = opening.action.size
-    open_loop_matrix = closed_loop.a - np.outer(opening.action, opening.reading)
-    complex_gain = np.empty(phase_rad.shape, complex)
-    for first_index in range(0, phase_rad.size, _FREQUENCIES_AT_ONCE):
-        z = np.exp(1j * phase_rad[first_index : first_index + _FREQUENCIES_AT_ONCE])[
+    n = opening.action_column.size
+    open_loop_matrix = closed_loop.a - np.outer(opening.action_column, opening.reading_row)
+    complex_gain = np.empty(phase_per_tick_rad.shape, complex)
+    for first_index in range(0, phase_per_tick_rad.size, _FREQUENCIES_PER_BLOCK):
+        z = np.exp(1j * phase_per_tick_rad[first_index : first_index + _FREQUENCIES_PER_BLOCK])[
             :, np.newaxis, np.newaxis
         ]
-        action_column = np.broadcast_to(opening.action[:, np.newaxis], (z.size, n, 1))
-        state_responses = np.linalg.solve(z * np.eye(n) - open_loop_matrix, action_column)
-        complex_gain[first_index : first_index + _FREQUENCIES_AT_ONCE] = -(
-            state_responses[:, :, 0] @ opening.reading
+        repeated_action_column = np.broadcast_to(
+            opening.action_column[:, np.newaxis], (z.size, n, 1)
+        )
+        state_responses = np.linalg.solve(z * np.eye(n) - open_loop_matrix, repeated_action_column)
+        complex_gain[first_index : first_index + _FREQUENCIES_PER_BLOCK] = -(
+            state_responses[:, :, 0] @ opening.reading_row
         )
     return complex_gain
 
@@ -142,15 +144,15 @@ def open_loop_gain(
 def _margins_at_opening(closed_loop: ClosedLoop, opening: LoopOpening) -> Margins:
     """Return the stability margins of a closed loop opened at one signal."""
 
-    def curve(phase_rad: RealArray) -> ComplexArray:
-        return open_loop_gain(closed_loop, opening, phase_rad)
+    def gain_curve(phase_per_tick_rad: RealArray) -> ComplexArray:
+        return open_loop_gain(closed_loop, opening, phase_per_tick_rad)
 
     rate_hz = closed_loop.model.rate_hz
     angular_frequencies = _examined_frequencies(closed_loop, opening)
-    complex_gain = curve(angular_frequencies)
+    complex_gain = gain_curve(angular_frequencies)
 
     crossing_phase_rad, real_gain = _negative_real_crossings(
-        curve, angular_frequencies, complex_gain
+        gain_curve, angular_frequencies, complex_gain
     )
     gain_factors = -1.0 / real_gain
     gain_up_phase_rad, gain_up = _smallest_with_frequency(
@@ -161,9 +163,9 @@ def _margins_at_opening(closed_loop: ClosedLoop, opening: LoopOpening) -> Margin
     )
 
     unity_phase_rad = _sign_changes(
-        lambda value: np.abs(value) - 1.0, curve, angular_frequencies, complex_gain
+        lambda gain_values: np.abs(gain_values) - 1.0, gain_curve, angular_frequencies, complex_gain
     )
-    lag_rad = (np.angle(curve(unity_phase_rad)) + pi) % (2.0 * pi)
+    lag_rad = (np.angle(gain_curve(unity_phase_rad)) + pi) % (2.0 * pi)
     phase_margin_at_rad, phase_rad = _smallest_with_frequency(
         unity_phase_rad, np.minimum(lag_rad, 2.0 * pi - lag_rad)
     )
@@ -172,7 +174,7 @@ def _margins_at_opening(closed_loop: ClosedLoop, opening: LoopOpening) -> Margin
     )
 
     modulus_phase_rad, modulus = _distance_to_critical_point(
-        curve, angular_frequencies, complex_gain
+        gain_curve, angular_frequencies, complex_gain
     )
     phase_rad_to_hz = rate_hz / (2.0 * pi)
     return Margins(
@@ -190,7 +192,7 @@ def _margins_at_opening(closed_loop: ClosedLoop, opening: LoopOpening) -> Margin
     )
 
 
-Curve = Callable[[RealArray], ComplexArray]
+GainCurve = Callable[[RealArray], ComplexArray]
 """Function that returns the open loop's gain at angular frequencies times the period."""
 
 
@@ -199,32 +201,38 @@ def _examined_frequencies(closed_loop: ClosedLoop, opening: LoopOpening) -> Real
 
     They are dense around the resonances of the open and the closed loop.
     """
-    open_loop_matrix = closed_loop.a - np.outer(opening.action, opening.reading)
+    open_loop_matrix = closed_loop.a - np.outer(opening.action_column, opening.reading_row)
     resonance_poles = np.concatenate(
         [np.linalg.eigvals(state_matrix) for state_matrix in (open_loop_matrix, closed_loop.a)]
     )
     resonance_poles = np.log(
-        resonance_poles[np.abs(resonance_poles) > _MAX_DELAY_EIGENVALUE].astype(complex)
+        resonance_poles[np.abs(resonance_poles) > _MAX_EIGENVALUE_OF_DELAY].astype(complex)
     )
     resonance_poles = resonance_poles[(resonance_poles.imag > 0.0) & (resonance_poles.imag < pi)]
-    half_widths = np.maximum(np.abs(resonance_poles.real), _MIN_HALF_WIDTH * resonance_poles.imag)
+    half_widths = np.maximum(
+        np.abs(resonance_poles.real), _MIN_RELATIVE_HALF_WIDTH * resonance_poles.imag
+    )
     frequency_offsets = half_widths[:, np.newaxis] * np.concatenate(
         [-_RESONANCE_OFFSETS, [0.0], _RESONANCE_OFFSETS]
     )
-    lowest_phase_rad = 2.0 * pi * _LOWEST_FREQUENCY
+    lowest_phase_per_tick_rad = 2.0 * pi * _MIN_FREQUENCY_FRACTION
     decade_grid = np.geomspace(
-        lowest_phase_rad, pi, round(_FREQUENCIES_PER_DECADE * np.log10(pi / lowest_phase_rad))
+        lowest_phase_per_tick_rad,
+        pi,
+        round(_FREQUENCIES_PER_DECADE * np.log10(pi / lowest_phase_per_tick_rad)),
     )
     angular_frequencies = np.concatenate(
         [decade_grid, (resonance_poles.imag[:, np.newaxis] + frequency_offsets).ravel()]
     )
     return np.unique(
-        angular_frequencies[(angular_frequencies >= lowest_phase_rad) & (angular_frequencies <= pi)]
+        angular_frequencies[
+            (angular_frequencies >= lowest_phase_per_tick_rad) & (angular_frequencies <= pi)
+        ]
     )
 
 
 def _negative_real_crossings(
-    gain_curve: Curve, phase_per_tick_rad: RealArray, curve_gain: ComplexArray
+    gain_curve: GainCurve, phase_per_tick_rad: RealArray, curve_gain: ComplexArray
 ) -> tuple[RealArray, RealArray]:
     """Return the frequencies at which the open loop's gain is real and negative, and the gains."""
     crossings = _sign_changes(np.imag, gain_curve, phase_per_tick_rad, curve_gain)
@@ -241,7 +249,7 @@ def _negative_real_crossings(
 
 def _sign_changes(
     real_function: Callable[[ComplexArray], RealArray],
-    gain_curve: Curve,
+    gain_curve: GainCurve,
     phase_per_tick_rad: RealArray,
     curve_gain: ComplexArray,
 ) -> RealArray:
@@ -252,7 +260,7 @@ def _sign_changes(
         phase_per_tick_rad[interval_indices],
         phase_per_tick_rad[interval_indices + 1],
     )
-    for _ in range(_BISECTIONS):
+    for _ in range(_BISECTION_COUNT):
         middle_frequencies = 0.5 * (lower_frequencies + upper_frequencies)
         is_before_zero = (
             np.signbit(real_function(gain_curve(middle_frequencies)))
@@ -280,10 +288,10 @@ def _smallest_with_frequency(
 
 
 def _distance_to_critical_point(
-    gain_curve: Curve, phase_per_tick_rad: RealArray, curve_gain: ComplexArray
+    gain_curve: GainCurve, phase_per_tick_rad: RealArray, curve_gain: ComplexArray
 ) -> tuple[float, float]:
     """Return the frequency at which the open loop's gain is closest to -1, and the distance."""
-    for _ in range(_REFINEMENTS):
+    for _ in range(_REFINEMENT_COUNT):
         nearest_index = int(np.abs(1.0 + curve_gain).argmin())
         lower_frequency, upper_frequency = (
             phase_per_tick_rad[max(nearest_index - 1, 0)],

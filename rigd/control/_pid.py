@@ -19,7 +19,7 @@ from rigd.errors import UserError
 
 SHIPPED_CONTROLLER = "pid"
 """Name of the controller that comes with rigd."""
-_OPTIONAL = {"optional": True}
+_OPTIONAL_SETTING = {"optional": True}
 """Metadata of a field whose key a profile may omit."""
 
 
@@ -39,7 +39,9 @@ class ControlSettings:
     """Coulomb friction that the controller compensates; 0 switches the compensation off."""
     friction_velocity_rad_s: Annotated[float, Gt(0)]
     """Speed at which the compensation reaches 76 % of its largest torque (the tanh of 1)."""
-    controller: Annotated[str, MinLen(1)] = field(default=SHIPPED_CONTROLLER, metadata=_OPTIONAL)
+    controller: Annotated[str, MinLen(1)] = field(
+        default=SHIPPED_CONTROLLER, metadata=_OPTIONAL_SETTING
+    )
     """Name of the controller: "pid", or one that an installed package adds."""
 
 
@@ -313,8 +315,10 @@ def derivative_coefficients(gains: PidGains, rate_hz: float) -> tuple[float, flo
     The term is ``d[k] = decay d[k-1] + gain (e[k] - e[k-1])`` for the error e, which is
     ``Kd s/(1 + Tf s)`` by Tustin's rule. The term d is in N·m, the gain in N·m/rad.
     """
-    two_tf = 2.0 * gains.filter_s * rate_hz
-    return (two_tf - 1.0) / (two_tf + 1.0), 2.0 * gains.kd_nm_s_per_rad * rate_hz / (two_tf + 1.0)
+    filter_half_periods = 2.0 * gains.filter_s * rate_hz
+    return (filter_half_periods - 1.0) / (
+        filter_half_periods + 1.0
+    ), 2.0 * gains.kd_nm_s_per_rad * rate_hz / (filter_half_periods + 1.0)
 
 
 def lowpass_coefficients(settings: ControlSettings, rate_hz: float) -> tuple[float, float]:

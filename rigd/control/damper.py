@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_DAMPING_STRENGTH = 0.25
+_RELATIVE_DAMPER_GAIN = 0.25
 """Speed of the reference per torque, times the beam's inertia and the frequency of its first mode.
 The damping ratio becomes about half of this number. Twice as much gains little, and is less stable
 at the third mode."""
-_MAX_HALVINGS = 5
+_MAX_GAIN_HALVINGS = 5
 """Largest number of times that the strength of the damping is halved to make the loop stable."""
 _STIFFNESS_RATIOS = (0.8, 1.0, 1.25)
 """Ratios of the beam's stiffness to the profile's for which the loop must be stable."""
@@ -101,18 +101,20 @@ class _DampingLaw:
 
         The state consists of both filters and the leaky integral.
         """
-        fast_filter, slow_filter, leaky_integral = law_state
-        fast_filter = fast_filter + self._low_pass_coefficient * (torque_value - fast_filter)
-        slow_filter = slow_filter + self._high_pass_coefficient * (fast_filter - slow_filter)
-        filtered_torque = fast_filter - slow_filter
+        low_passed_torque, slow_torque, leaky_integral = law_state
+        low_passed_torque = low_passed_torque + self._low_pass_coefficient * (
+            torque_value - low_passed_torque
+        )
+        slow_torque = slow_torque + self._high_pass_coefficient * (low_passed_torque - slow_torque)
+        filtered_torque = low_passed_torque - slow_torque
         leaky_integral = (
             leaky_integral
             - self._high_pass_coefficient * leaky_integral
             + self._gain * filtered_torque
         )
         return (
-            fast_filter,
-            slow_filter,
+            low_passed_torque,
+            slow_torque,
             leaky_integral,
         ), -leaky_integral - self._lead * filtered_torque
 
@@ -138,32 +140,37 @@ def design_damper(closed_loop: "ClosedLoop") -> DamperSettings | None:
     """
     # Imported here: the control process uses a finished design, and starts sooner without these.
     from rigd.beam import undamped_frequencies_rad_s
-    from rigd.control._closed_loop import MAX_GROWTH_PER_S, close_loop, lightly_damped_model
+    from rigd.control._closed_loop import (
+        MAX_OSCILLATION_GROWTH_PER_S,
+        close_loop,
+        lightly_damped_model,
+    )
 
     loop_model = closed_loop.model
     if (plant := loop_model.plant) is None:
         return None
-    first_rad_s = float(undamped_frequencies_rad_s(plant.beam, 1)[0])
+    first_mode_rad_s = float(undamped_frequencies_rad_s(plant.beam, 1)[0])
     settings = DamperSettings(
-        gain_rad_per_nm_s=_DAMPING_STRENGTH / (plant.beam.inertia_kg_m2 * first_rad_s),
+        gain_rad_per_nm_s=_RELATIVE_DAMPER_GAIN / (plant.beam.inertia_kg_m2 * first_mode_rad_s),
         lead_s=2.0 / loop_model.settings.pole_rad_s,
-        high_pass_rad_s=_HIGH_PASS_CORNER_RATIO * first_rad_s,
+        high_pass_rad_s=_HIGH_PASS_CORNER_RATIO * first_mode_rad_s,
         low_pass_rad_s=4.0 * loop_model.settings.pole_rad_s,
     )
     bending_stiffness_n_m2 = plant.beam.bending_stiffness_n_m2
-    beams = [
+    varied_beams = [
         replace(plant.beam, bending_stiffness_n_m2=stiffness_ratio * bending_stiffness_n_m2)
         for stiffness_ratio in _STIFFNESS_RATIOS
     ]
-    loops = [
-        close_loop(lightly_damped_model(loop_model, replace(plant, beam=beam))) for beam in beams
+    lightly_damped_loops = [
+        close_loop(lightly_damped_model(loop_model, replace(plant, beam=beam)))
+        for beam in varied_beams
     ]
-    for _ in range(_MAX_HALVINGS):
+    for _ in range(_MAX_GAIN_HALVINGS):
         growth_rates_per_s = [
-            damped_poles(damped_loop, settings).real.max() for damped_loop in loops
+            damped_poles(damped_loop, settings).real.max() for damped_loop in lightly_damped_loops
         ]
         # The same growth as without it is allowed, on beams with almost no damping of their own.
-        if max(growth_rates_per_s) <= MAX_GROWTH_PER_S:
+        if max(growth_rates_per_s) <= MAX_OSCILLATION_GROWTH_PER_S:
             return settings
         settings = replace(settings, gain_rad_per_nm_s=0.5 * settings.gain_rad_per_nm_s)
     return None
@@ -183,7 +190,7 @@ def damped_poles(closed_loop: "ClosedLoop", settings: DamperSettings) -> Complex
 
     n, rate_hz = closed_loop.b.size, closed_loop.model.rate_hz
     torque_reading = next(
-        opening.reading for opening in closed_loop.openings if opening.name == "torque reading"
+        opening.reading_row for opening in closed_loop.openings if opening.name == "torque reading"
     )
     fast_row, slow_row, leaky_integral = np.eye(3, n + 3, n)
     next_states, displacement = _DampingLaw(settings, rate_hz).advance(

@@ -3,7 +3,7 @@
 from functools import lru_cache
 from typing import Final
 
-from rigd.control._added import AddedController
+from rigd.control._added import PluginController
 from rigd.control._control_law import LinearStep
 from rigd.control._loop_model import LinearController
 from rigd.control._pid import SHIPPED_CONTROLLER, PidController, design_pid
@@ -80,7 +80,7 @@ def make_controller(rig: ControlledRig) -> LoopController:
         if not all(callable(getattr(controller, name, None)) for name in ("reset", "step")):
             raise owner.error(f"{type(controller).__name__} has no reset and step; add them.")
     pid = _make_pid(rig) if kind.shifts_reference else None
-    return AddedController(controller, rig.torque_limit_nm, owner, pid)
+    return PluginController(controller, rig.torque_limit_nm, owner, pid)
 
 
 def linear_controller(rig: ControlledRig) -> LinearController | None:

@@ -47,7 +47,7 @@ class ProbeSequence(SessionSequence):
         self._move: ProbingMove | None = None
         self._last_tick = 0
 
-    def move(self) -> dict[str, Any]:
+    def run_probing_move(self) -> dict[str, Any]:
         """Run the probing move on the enabled drive, switch the torque off, and return the result.
 
         The result has the name of the reason why the move ended (key ``end``), and the fields of a

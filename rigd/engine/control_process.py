@@ -425,7 +425,7 @@ class _ControlServer:
         try:
             probe_sequence.tare()
             self._devices.drive.enable(probe_sequence.stop_requested)
-            reply_message = MeasurementResult(probe_sequence.move())
+            reply_message = MeasurementResult(probe_sequence.run_probing_move())
         except SessionEnd as end:
             reply_message = MeasurementRefused(end.reason)
             failure_text = end.reason if end.device_failed else ""

@@ -85,7 +85,11 @@ def move_plant_of(
 
     def respond_disturbed(reference_rad: RealArray, modes: int) -> tuple[RealArray, RealArray]:
         disturbed_response = simulate_disturbed(
-            compensated_loop, reference_rad, disturbances, modes=modes, draws=_NOISE_REALISATIONS
+            compensated_loop,
+            reference_rad,
+            disturbances,
+            mode_count=modes,
+            draw_count=_NOISE_REALISATIONS,
         )
         return disturbed_response.angle_rad, disturbed_response.mode_torque_nm
 

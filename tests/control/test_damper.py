@@ -51,7 +51,9 @@ def test_the_recursion_gives_the_designed_poles(model):
     """Simulated with the damper, the first mode of the closed loop decays as computed."""
     settings = design_damper(close_loop(model))
     loop = close_loop(model)
-    reading = next(opening.reading for opening in loop.openings if opening.name == "torque reading")
+    reading = next(
+        opening.reading_row for opening in loop.openings if opening.name == "torque reading"
+    )
     damper = VibrationDamper(settings, model.rate_hz)
     state, torques = np.zeros(loop.b.size), []
     for tick in range(2500):

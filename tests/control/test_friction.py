@@ -16,7 +16,7 @@ def loop(loop_model):
 
 
 def simulate(loop, disturbances, reference_rad=PATH, draws=3):
-    return simulate_disturbed(loop, reference_rad, disturbances, modes=3, draws=draws)
+    return simulate_disturbed(loop, reference_rad, disturbances, mode_count=3, draw_count=draws)
 
 
 def test_linear_loop_without_disturbance_and_compensation(loop):
@@ -60,7 +60,9 @@ def test_friction_holds_a_motor_against_the_noise(loop):
 def test_the_same_seed_repeats_the_draws(loop):
     disturbances = Disturbances(0.03, 7e-5, 5e-3)
     one, same, other = (
-        simulate_disturbed(loop, PATH[:120], disturbances, modes=1, draws=2, seed=seed).angle_rad
+        simulate_disturbed(
+            loop, PATH[:120], disturbances, mode_count=1, draw_count=2, seed=seed
+        ).angle_rad
         for seed in (1, 1, 2)
     )
     assert np.array_equal(one, same)

@@ -27,8 +27,8 @@ def slower(model):
 
 
 def radius_with_gain(loop, opening, factor):
-    opened = loop.a - np.outer(opening.action, opening.reading)
-    changed = opened + factor * np.outer(opening.action, opening.reading)
+    opened = loop.a - np.outer(opening.action_column, opening.reading_row)
+    changed = opened + factor * np.outer(opening.action_column, opening.reading_row)
     return np.max(np.abs(np.linalg.eigvals(changed)))
 
 
@@ -64,11 +64,13 @@ def test_the_motor_alone_has_the_margins_of_the_designed_loop(motor_alone):
 
 def open_loop_gain(loop, opening, phase_rad):
     """Gain of the loop opened at a cut, for each angle on the unit circle."""
-    opened = loop.a - np.outer(opening.action, opening.reading)
+    opened = loop.a - np.outer(opening.action_column, opening.reading_row)
     z = np.exp(1j * np.asarray(phase_rad))[:, np.newaxis, np.newaxis]
     return (
-        -np.linalg.solve(z * np.eye(len(opened)) - opened, opening.action[:, np.newaxis])[..., 0]
-        @ opening.reading
+        -np.linalg.solve(z * np.eye(len(opened)) - opened, opening.action_column[:, np.newaxis])[
+            ..., 0
+        ]
+        @ opening.reading_row
     )
 
 
@@ -76,7 +78,7 @@ def test_no_feed_forward_without_torque_reading(loop_model):
     loop = close_loop(slower(loop_model))
     torque = loop.openings[2]
     unfed = replace(loop.model, settings=replace(loop.model.settings, feedforward_gain=0.0))
-    opened = loop.a - np.outer(torque.action, torque.reading)
+    opened = loop.a - np.outer(torque.action_column, torque.reading_row)
     np.testing.assert_allclose(opened, close_loop(unfed).a, atol=1e-12)
 
 
@@ -84,7 +86,7 @@ def test_the_command_carries_both_readings(loop_model):
     """Cut at the command, or at both readings: the same poles are left, those of the plant."""
     loop = close_loop(slower(loop_model))
     command, angle, torque = (
-        np.outer(opening.action, opening.reading) for opening in loop.openings
+        np.outer(opening.action_column, opening.reading_row) for opening in loop.openings
     )
     one, both = (
         np.sort(np.abs(np.linalg.eigvals(opened)))[-20:]
