@@ -117,8 +117,8 @@ def run_alone(
     with connected_rig(profile) as (_, process_group):
         channels, shared_state = process_group.channels, process_group.channels.shared_state
         usage_meter = UsageMeter(process_group.control.pid)
-        shared_state[StateField.STOP] = StopReason.NONE
-        shared_state[StateField.GO] = 1
+        shared_state[StateField.STOP_REASON] = StopReason.NONE
+        shared_state[StateField.RECORD_MAY_START] = 1
         reference_record = write_reference(channels.reference_fd, excitation.reference_rad)
         process_group.control.send(SessionJob(profile, reference_record))
         sample_blocks = []

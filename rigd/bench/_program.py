@@ -10,7 +10,7 @@ from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
 from rigd.bench.measure import HELD_FRACTION, LoopMeasurement, percentiles, pool_measurements
 from rigd.checks.machine import settings_granted
-from rigd.engine.realtime import REFUSED
+from rigd.engine.realtime import REFUSED_PREFIX
 from rigd.profile import Profile
 
 ROUNDS = 3
@@ -237,7 +237,9 @@ class Bench:
         if not cyclictest.is_installed():
             results.no_peer = "not installed (package rt-tests)"
             return None
-        is_realtime_granted = not results.granted.get("scheduling", REFUSED).startswith(REFUSED)
+        is_realtime_granted = not results.granted.get("scheduling", REFUSED_PREFIX).startswith(
+            REFUSED_PREFIX
+        )
         try:
             return cyclictest.run(
                 self._rate_hz,
@@ -278,7 +280,7 @@ def loop_core(granted_settings: dict[str, str]) -> int:
     core_text = granted_settings["cpu"]
     return (
         max(os.sched_getaffinity(0))
-        if core_text.startswith(REFUSED)
+        if core_text.startswith(REFUSED_PREFIX)
         else int(core_text.split(",")[0])
     )
 

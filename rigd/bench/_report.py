@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rigd.bench._program import Results
 from rigd.bench.measure import HELD_FRACTION, STALL_US, LoopMeasurement, percentiles
-from rigd.engine.realtime import REFUSED
+from rigd.engine.realtime import REFUSED_PREFIX
 
 _NAME_WIDTH = 28
 """Width of the column with the measurements' names, in characters."""
@@ -89,7 +89,7 @@ def verdict(results: Results) -> str:
     refused_names = [
         setting_name
         for setting_name, setting_text in results.granted.items()
-        if setting_text.startswith(REFUSED)
+        if setting_text.startswith(REFUSED_PREFIX)
     ]
     if refused_names:
         verdict_text += (

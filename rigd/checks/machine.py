@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rigd.check_rows import CheckResult, CheckRow, grade
-from rigd.engine.realtime import MEMORY_LOCKED, REFUSED, isolated_cores
+from rigd.engine.realtime import MEMORY_LOCKED, REFUSED_PREFIX, isolated_cores
 from rigd.profile import RealtimeSettings
 from rigd.runtime.background import OWN_PYTHON
 
@@ -28,8 +28,8 @@ import json, sys
 from rigd.engine.realtime import RaisedPriority, apply_realtime
 priority, below, cpu = map(int, sys.argv[1:])
 other = RaisedPriority(below, cpu)
-supervision = other.request()
-other.restore()
+supervision = other.request_priority()
+other.restore_priority()
 print(json.dumps([apply_realtime(priority=priority, cpu=cpu), supervision]))
 """
 """Program that requests the real-time settings and prints those granted as JSON."""
@@ -87,7 +87,7 @@ def rights_rows(settings: RealtimeSettings) -> Iterator[CheckRow]:
         yield CheckRow("real time", "scheduling", "not requested", "", CheckResult.OK)
     for setting_name, granted_text in granted_settings.items():
         is_refused = (
-            granted_text.startswith(REFUSED)
+            granted_text.startswith(REFUSED_PREFIX)
             or (setting_name == "memory" and granted_text != MEMORY_LOCKED)
             or (setting_name == "supervision" and not granted_text.startswith("SCHED_RR"))
         )

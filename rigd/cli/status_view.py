@@ -105,7 +105,7 @@ def progress_text(progress: dict[str, Any]) -> str:
     remaining_s = progress["time_left_s"]
     time_left = "" if remaining_s is None else f", {remaining_s:.0f} s left"
     return (
-        f"{Phase[progress['phase'].upper()].words}, {progress['percent']:.0f} %"
+        f"{Phase[progress['phase'].upper()].display_text}, {progress['percent']:.0f} %"
         f"{time_left}; {progress['missed']} missed, {progress['late']} late, "
         f"{progress['lost']} lost"
     )

@@ -2,8 +2,9 @@
 
 The public modules are the table of child processes (`workers`), the client of a child process and
 its connection to the supervisor (`processes`), the messages between processes (`messages`), their
-shared memory (`shared_state`, `channels`, `reference`, and `Ring` and `Observer` of this package),
-one tick of the loop (`cycle`), clocks (`timing`) and real-time settings (`realtime`). The programs
+shared memory (`shared_state`, `channels`, `reference`, and `Ring` and `RingObserver` of this
+package), one tick of the loop (`cycle`), clocks (`timing`) and real-time settings (`realtime`). The
+programs
 are `control_process`, which alone talks to the devices and switches the torque off, `recorder` and
 `touch_estimator`. The table states what happens if a child process dies; `rigd.runner` monitors
 the processes of a rig and requests the stop.

@@ -12,6 +12,6 @@ from ._control_names import IDLE_NAME as IDLE_NAME
 from ._control_names import SESSION_NAME as SESSION_NAME
 from ._control_names import supervisor_of_control as supervisor_of_control
 from ._probed_rig import probed_rig as probed_rig
-from ._ring import Observer as Observer
 from ._ring import Ring as Ring
+from ._ring import RingObserver as RingObserver
 from ._ring import shared_memory_fd as shared_memory_fd

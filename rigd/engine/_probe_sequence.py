@@ -57,16 +57,16 @@ class ProbeSequence(SessionSequence):
         self._shared_state[StateField.PHASE] = Phase.PROBING
         self._standstill.reset()
         cycle = self._cycle
-        start_rad = cycle.angle_rad
+        start_angle_rad = cycle.angle_rad
         probing_move = ProbingMove(self._rig, plan_probe(self._rig), self._rest_spread_nm)
         cycle.encoder_monitor = None  # the move itself compares angle and torques
         cycle.controller = probing_move
-        cycle.start(self._rest_spread_nm)
-        self._run_tick(start_rad, may_miss_ticks=True)  # enabling takes its time
+        cycle.start_control(self._rest_spread_nm)
+        self._run_tick(start_angle_rad, may_miss_ticks=True)  # enabling takes its time
         self._move, self._last_tick = probing_move, self._scheduler.tick
         while probing_move.end is None:
             self._run_tick(cycle.angle_rad)
-        cycle.torque_off()
+        cycle.switch_torque_off()
         return {"end": probing_move.end.name} | estimate_probe(self._rig, probing_move).as_dict()
 
     def _control_tick(self, reference_rad: float) -> SessionEnd | None:

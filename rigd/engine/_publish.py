@@ -9,7 +9,7 @@ from rigd.engine._ring import Ring
 from rigd.engine.channels import CONTROL, Channels
 from rigd.engine.cycle import Cycle
 from rigd.engine.processes import Heartbeat
-from rigd.engine.shared_state import UNKNOWN, SharedState, StateField
+from rigd.engine.shared_state import UNKNOWN_VALUE, SharedState, StateField
 from rigd.engine.timing import Clock, TickScheduler
 from rigd.session.layout import Status, pack_control_into, pack_sample_into, pack_timing_into
 
@@ -64,34 +64,34 @@ class ReadingPublisher:
             for line_health in (drive_health, sensor_health)
             if line_health.errors is not None
         ]
-        shared_state[StateField.BUS_ERRORS] = sum(error_counts) if error_counts else UNKNOWN
+        shared_state[StateField.BUS_ERRORS] = sum(error_counts) if error_counts else UNKNOWN_VALUE
         shared_state[StateField.SENSOR_STATUS] = (
-            UNKNOWN if sensor_health.status is None else sensor_health.status
+            UNKNOWN_VALUE if sensor_health.status is None else sensor_health.status
         )
-        self._publish_load((drive_health, sensor_health), now_ns)
+        self._publish_bus_load((drive_health, sensor_health), now_ns)
 
-    def _publish_load(self, line_healths: tuple[LineHealth, ...], now_ns: int) -> None:
+    def _publish_bus_load(self, line_healths: tuple[LineHealth, ...], now_ns: int) -> None:
         """Write the load in ppm of the busiest bus or serial line to the shared state.
 
         The load is averaged over the time since the last call.
         """
         line_bits = tuple(line_health.bits or 0 for line_health in line_healths)
         if self._last_bits is None:
-            self._shared_state[StateField.BUS_LOAD_PPM] = UNKNOWN
+            self._shared_state[StateField.BUS_LOAD_PPM] = UNKNOWN_VALUE
         else:
             previous_ns, previous_bits = self._last_bits
             if now_ns <= previous_ns:
                 return  # virtual time has not advanced
-            ppm_seconds = 1e-15 * (now_ns - previous_ns)  # 1e-9 s, 1e-6
+            elapsed_megaseconds = 1e-15 * (now_ns - previous_ns)  # 1e-9 s, 1e-6
             loads_ppm = [
-                (present_bits - last_bits) / (line_health.bit_rate_bit_s * ppm_seconds)
+                (present_bits - last_bits) / (line_health.bit_rate_bit_s * elapsed_megaseconds)
                 for line_health, present_bits, last_bits in zip(
                     line_healths, line_bits, previous_bits, strict=True
                 )
                 if line_health.bit_rate_bit_s
             ]
             self._shared_state[StateField.BUS_LOAD_PPM] = (
-                round(max(loads_ppm)) if loads_ppm else UNKNOWN
+                round(max(loads_ppm)) if loads_ppm else UNKNOWN_VALUE
             )
         self._last_bits = now_ns, line_bits
 
@@ -105,7 +105,7 @@ _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
 _STALE_FLAGS = _ANGLE_STALE | _WRENCH_STALE
 
-_TERMS_PERIOD_TICKS = CONTROL.tick_interval
+_CONTROLLER_TERMS_INTERVAL_TICKS = CONTROL.tick_interval
 """Number of ticks from one record of the controller's terms to the next."""
 _FREE_SLOT_TIMEOUT_S = 2.0
 """Longest time in s to wait for free space in the ring while the recorder reads nothing."""
@@ -133,7 +133,7 @@ class SampleLog:
     """Log of a record in shared memory, from which the recorder writes the session file.
 
     It contains a sample and the ages of the readings for each tick, and the controller's terms for
-    every tenth tick. A tick that is more than `late_ns` late is flagged.
+    every tenth tick. A tick that is more than `late_limit_ns` late is flagged.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class SampleLog:
         scheduler: TickScheduler,
         clock: Clock,
         channels: Channels,
-        late_ns: int,
+        late_limit_ns: int,
     ) -> None:
         self._cycle = cycle
         self._scheduler = scheduler
@@ -158,10 +158,10 @@ class SampleLog:
         # Under the virtual clock no reading has an age.
         self._timing_ring = None if clock.virtual else channels.timings
         self._shared_state = channels.shared_state
-        self._late_ns = late_ns
+        self._late_limit_ns = late_limit_ns
         self.counts = TickCounts()
 
-    def write(
+    def write_sample(
         self, tick: int, reference_rad: float, missed_ticks: int, *, wait_for_slot: bool
     ) -> None:
         """Write the sample of the last tick to the ring that the recorder reads.
@@ -182,14 +182,14 @@ class SampleLog:
             not wait_for_slot or (slot_offset := self._wait_for_free_slot()) < 0
         ):
             self.counts.lost += 1
-            self._shared_state[StateField.LOST] = self.counts.lost
+            self._shared_state[StateField.LOST_SAMPLES] = self.counts.lost
             return
-        if lateness_ns > self._late_ns:
+        if lateness_ns > self._late_limit_ns:
             status_flags |= _LATE
             self.counts.late += 1
-            self._shared_state[StateField.LATE] = self.counts.late
+            self._shared_state[StateField.LATE_TICKS] = self.counts.late
         if status_flags & _STALE_FLAGS:
-            self._count_stale(status_flags)
+            self._count_stale_readings(status_flags)
         t_ns = scheduler.t_ns
         fx, fy, fz, tx, ty, tz = cycle.wrench
         pack_sample_into(
@@ -213,11 +213,11 @@ class SampleLog:
         )
         ring.publish()
         if self._timing_ring is not None:
-            self._write_ages(self._timing_ring, tick, t_ns)
-        if tick % _TERMS_PERIOD_TICKS == 0:
-            self._write_terms(tick, t_ns)
+            self._write_reading_ages(self._timing_ring, tick, t_ns)
+        if tick % _CONTROLLER_TERMS_INTERVAL_TICKS == 0:
+            self._write_controller_terms(tick, t_ns)
 
-    def _count_stale(self, status_flags: int) -> None:
+    def _count_stale_readings(self, status_flags: int) -> None:
         """Count a tick with a stale angle or wrench, and write the counts to the shared state."""
         counts, shared_state = self.counts, self._shared_state
         if status_flags & _ANGLE_STALE:
@@ -227,7 +227,7 @@ class SampleLog:
             counts.stale_wrenches += 1
             shared_state[StateField.STALE_WRENCHES] = counts.stale_wrenches
 
-    def _write_ages(self, ring: Ring, tick: int, t_ns: int) -> None:
+    def _write_reading_ages(self, ring: Ring, tick: int, t_ns: int) -> None:
         """Write the ages of a tick's angle and wrench to a ring, unless the ring is full."""
         slot_offset = ring.next_slot()
         if slot_offset < 0:
@@ -243,7 +243,7 @@ class SampleLog:
         )
         ring.publish()
 
-    def _write_terms(self, tick: int, t_ns: int) -> None:
+    def _write_controller_terms(self, tick: int, t_ns: int) -> None:
         """Write the controller's terms of a tick to their ring, unless the ring is full."""
         terms_ring, controller = self._terms_ring, self._cycle.controller
         slot_offset = terms_ring.next_slot()

@@ -68,7 +68,7 @@ class Ring:
         fd
             Descriptor of the memory, from :func:`shared_memory_fd`.
         """
-        reserve(fd, HEADER_SIZE + capacity * record_size)
+        reserve_memory(fd, HEADER_SIZE + capacity * record_size)
         return cls(RingSpec(fd, record_size, capacity))
 
     @property
@@ -118,17 +118,17 @@ class Ring:
 
         Only records that are contiguous in memory are returned.
         """
-        oldest_record = self._counters[_READ_COUNTER]
+        oldest_index = self._counters[_READ_COUNTER]
         record_count = min(
             max_records,
-            self._counters[_WRITTEN_COUNTER] - oldest_record,
-            self.capacity - oldest_record % self.capacity,
+            self._counters[_WRITTEN_COUNTER] - oldest_index,
+            self.capacity - oldest_index % self.capacity,
         )
-        start_offset = HEADER_SIZE + oldest_record % self.capacity * self.record_size
+        start_offset = HEADER_SIZE + oldest_index % self.capacity * self.record_size
         record_bytes = bytes(
             self.buffer[start_offset : start_offset + record_count * self.record_size]
         )
-        self._counters[_READ_COUNTER] = oldest_record + record_count
+        self._counters[_READ_COUNTER] = oldest_index + record_count
         return record_bytes
 
     def discard(self) -> None:
@@ -142,7 +142,7 @@ class Ring:
         self._memory.close()
 
 
-class Observer:
+class RingObserver:
     """Reader of a ring that never delays the producer, and may therefore miss records.
 
     Parameters
@@ -175,10 +175,10 @@ class Observer:
         The oldest record comes first.
         """
         ring = self._ring
-        oldest_record = ring.oldest_index
-        if self._next_index < oldest_record:
-            self.dropped += oldest_record - self._next_index
-            self._next_index = oldest_record
+        oldest_index = ring.oldest_index
+        if self._next_index < oldest_index:
+            self.dropped += oldest_index - self._next_index
+            self._next_index = oldest_index
         ring_slot = self._next_index % ring.capacity
         record_count = min(
             max_records, ring.written_count - self._next_index, ring.capacity - ring_slot
@@ -207,7 +207,7 @@ def shared_memory_fd() -> int:
     return fd
 
 
-def reserve(fd: int, byte_count: int) -> None:
+def reserve_memory(fd: int, byte_count: int) -> None:
     """Allocate `byte_count` bytes of shared memory at the descriptor `fd`.
 
     Raise `OSError` if there is not enough memory. Without the allocation, writing to the memory

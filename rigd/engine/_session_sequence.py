@@ -26,7 +26,7 @@ from rigd.engine.reference import ReferenceReader
 from rigd.engine.shared_state import Level, LogEvent, Phase, StateField, StopReason, write_event
 from rigd.engine.timing import (
     MAX_VIRTUAL_PAUSE_S,
-    SUSPENDED_S,
+    MIN_SUSPENSION_S,
     Clock,
     SuspendMonitor,
     TickScheduler,
@@ -65,18 +65,18 @@ _WRONG_SIGN_REMEDY = (
 )
 """Advice for the operator if the sign of angle or torque is wrong."""
 _ENCODER_TESTED_MESSAGE = "The beam pulled on a shaft at rest, so the encoder was tested: it works."
-_VIBRATING_SPREAD_RATIO = 2.0
+_VIBRATING_TORQUE_SPREAD_RATIO = 2.0
 """Ratio of the coupling torque's standard deviation after a session to its value before the
 session, above which the beam counts as vibrating."""
 _LONGEST_DAMPING_S = 5.0
 """Longest duration of active damping in s, which is twice the time needed to damp a vibration with
 the sensor's full range."""
-_SPREAD_WINDOW_S = 0.4
+_TORQUE_SPREAD_WINDOW_S = 0.4
 """Window in s over which the standard deviation of the coupling torque is computed. It is one
 period of a first mode at 2.5 Hz."""
-_SPREAD_CHECK_TICKS = 50
+_TORQUE_SPREAD_CHECK_TICKS = 50
 """Number of ticks between two checks of the coupling torque's standard deviation."""
-_DAMPED_SPREAD_RATIO = 1.25
+_DAMPED_TORQUE_SPREAD_RATIO = 1.25
 """Largest ratio of the coupling torque's standard deviation to its value at rest with which the
 beam counts as damped. The vibration is then less than the noise, and the standard deviation over
 so short a time scatters by 4 %."""
@@ -150,8 +150,8 @@ class SessionSequence:
         self._doubts_reported: set[str] = set()
         self._polls_without_heartbeat = 0
         self._supervisor_beat = -1
-        late_ns = int(profile.realtime.late_us * 1000)
-        self._sample_log = SampleLog(cycle, self._scheduler, clock, channels, late_ns)
+        late_limit_ns = int(profile.realtime.late_us * 1000)
+        self._sample_log = SampleLog(cycle, self._scheduler, clock, channels, late_limit_ns)
         self._relative_reference = reference_rad
         # Each segment of a growing reference is planned with the start angle.
         planned_rad = np.asarray(reference_rad)
@@ -167,7 +167,7 @@ class SessionSequence:
         self.results: dict[str, str] = {}
         """Results for the metadata ``outcome`` of the file, in addition to the counts."""
 
-    def tare(self) -> dict[str, str]:
+    def measure_tare(self) -> dict[str, str]:
         """Tare the sensor at rest before the drive is enabled; return the tare as metadata.
 
         The metadata are the mean and the standard deviation of each axis in N and N·m, and the
@@ -177,24 +177,24 @@ class SessionSequence:
         self._cycle.limit_monitor.reset(0.0)  # the counts of the last session no longer apply
         rest_readings = self._wait_for_rest()
         self._start_angle_rad = float(np.mean(rest_readings.angles_rad))
-        limit_rad = self._profile.limits.angle_rad
-        if abs(self._start_angle_rad) > limit_rad:
+        angle_limit_rad = self._profile.limits.angle_rad
+        if abs(self._start_angle_rad) > angle_limit_rad:
             raise SessionEnd(
                 "fault",
                 f"The motor is at {self._start_angle_rad:.4g} rad, outside "
-                f"limits.angle_rad = {limit_rad:g} rad; turn it back and start again.",
+                f"limits.angle_rad = {angle_limit_rad:g} rad; turn it back and start again.",
             )
         goal_rad = max(
             (self._start_angle_rad + extreme_rad for extreme_rad in self._reference_range_rad),
             key=abs,
         )
-        if abs(goal_rad) > limit_rad:
+        if abs(goal_rad) > angle_limit_rad:
             raise SessionEnd(
                 "fault",
                 f"The motor is at {self._start_angle_rad:.4g} rad, from where the reference goes "
-                f"to {goal_rad:.4g} rad, outside limits.angle_rad = {limit_rad:g} rad. Move it "
-                "back first (rigd run move 0; rigd start move 0 with a daemon), or lower the "
-                "amplitude.",
+                f"to {goal_rad:.4g} rad, outside limits.angle_rad = {angle_limit_rad:g} rad. "
+                "Move it back first (rigd run move 0; rigd start move 0 with a daemon), or "
+                "lower the amplitude.",
             )
         sensor_violation = self._cycle.sensor_monitor.finish_learning()
         self._report_warnings()
@@ -202,23 +202,23 @@ class SessionSequence:
             raise SessionEnd("fault", str(sensor_violation))
         self._rest_spread_nm = rest_readings.torque_spread_nm
         self._compare_with_previous_tare(float(rest_readings.torques_nm.mean()))
-        self._cycle.tare = rest_readings.mean
+        self._cycle.tare = rest_readings.mean_wrench
         return rest_readings.as_metadata() | {"start_angle_rad": repr(self._start_angle_rad)}
 
-    def _compare_with_previous_tare(self, zero_nm: float) -> None:
+    def _compare_with_previous_tare(self, tare_torque_nm: float) -> None:
         """Raise `SessionEnd` if the torque at rest differs too much from the previous tare.
 
-        `zero_nm` is the coupling torque at rest in N·m, which is stored for the next comparison.
+        `tare_torque_nm` is the coupling torque at rest in N·m, stored for the next comparison.
         """
         limit_monitor = self._cycle.limit_monitor
         if limit_monitor.tared_nm is not None:
-            violation = limit_monitor.check_tare(zero_nm - limit_monitor.tared_nm)
+            violation = limit_monitor.check_tare(tare_torque_nm - limit_monitor.tared_nm)
             self._report_warnings()
             if violation is not None:
                 raise SessionEnd(
                     "fault", f"{violation} If nothing is wrong, run rigd tare to set a new zero."
                 )
-        limit_monitor.tared_nm = zero_nm
+        limit_monitor.tared_nm = tare_torque_nm
 
     def _wait_for_rest(self) -> RestReadings:
         """Wait until motor and beam are at rest, and return the readings of the interval at rest.
@@ -262,13 +262,13 @@ class SessionSequence:
             )
         return ""
 
-    def hold(self) -> None:
+    def hold_start_angle(self) -> None:
         """Hold the motor at its present angle for 0.5 s after the drive has been enabled."""
         self._shared_state[StateField.PHASE] = Phase.SETTLING
         self._standstill.reset()
         # The last reading, not the mean: the controller must start without a step.
         self._start_angle_rad = self._cycle.angle_rad
-        self._cycle.start(self._rest_spread_nm)
+        self._cycle.start_control(self._rest_spread_nm)
         for tick_number in range(round(_SETTLING_S * self._rate_hz)):
             # Enabling the drive before the first tick takes longer than a tick.
             self._run_tick(self._start_angle_rad, may_miss_ticks=tick_number == 0)
@@ -281,7 +281,7 @@ class SessionSequence:
         """
         self._shared_state[StateField.PHASE] = Phase.READY
         deadline_s = time.monotonic() + _START_TIMEOUT_S
-        while not self._shared_state[StateField.GO]:
+        while not self._shared_state[StateField.RECORD_MAY_START]:
             if time.monotonic() > deadline_s:
                 raise SessionEnd(
                     "fault",
@@ -295,7 +295,7 @@ class SessionSequence:
             else:
                 self._run_tick(self._start_angle_rad)
 
-    def record(self) -> None:
+    def run_record(self) -> None:
         """Run the excitation and log a sample of every tick.
 
         Every tick of the record counts as recorded, missed or lost. Raise `SessionEnd` if the
@@ -313,23 +313,23 @@ class SessionSequence:
         counts, is_virtual, stop_request = self.counts, self._clock.virtual, self._stop
         touch_monitor, reader = self._touch, self._reader
         stop_field, scheduled_field = (
-            shared_state.view(StateField.STOP),
-            shared_state.view(StateField.SCHEDULED),
+            shared_state.field_view(StateField.STOP_REASON),
+            shared_state.field_view(StateField.SCHEDULED_TICKS),
         )
         scheduler.restart()
         self._recording = True
         self._page_faults = page_faults()
         start_utc_ns, start_monotonic_ns = time.time_ns(), time.monotonic_ns()
         # With the real clock tick 0 is still ahead, or up to one period in the past.
-        until_start_ns = 0 if is_virtual else scheduler.start_ns - start_monotonic_ns
-        shared_state[StateField.START_UTC_NS] = start_utc_ns + until_start_ns
+        time_until_start_ns = 0 if is_virtual else scheduler.start_ns - start_monotonic_ns
+        shared_state[StateField.START_UTC_NS] = start_utc_ns + time_until_start_ns
         shared_state[StateField.PHASE] = Phase.RUNNING
         self._log_event("info", f"Record starts: {total_ticks} ticks at {self._rate_hz:g} Hz.")
         last_tick = -1
-        first_ns = last_ns = 0
+        first_tick_ns = last_tick_ns = 0
         reference_rad = start_rad
-        end: SessionEnd | None = None
-        while end is None and last_tick < total_ticks - 1:
+        session_end: SessionEnd | None = None
+        while session_end is None and last_tick < total_ticks - 1:
             if reader is not None:
                 if is_virtual:
                     self._await_segment(reader, last_tick + 1)
@@ -340,53 +340,53 @@ class SessionSequence:
             if missed_ticks:
                 missed_ticks = min(tick_number, total_ticks) - last_tick - 1
                 counts.missed += missed_ticks
-                shared_state[StateField.MISSED] = counts.missed
-                end = self._check_missed_ticks(missed_ticks, min(tick_number, total_ticks))
+                shared_state[StateField.MISSED_TICKS] = counts.missed
+                session_end = self._check_missed_ticks(missed_ticks, min(tick_number, total_ticks))
                 if tick_number >= total_ticks:
                     last_tick, reference_rad = (
                         total_ticks - 1,
                         start_rad + relative_reference_rad[-1],
                     )
                     break
-            if end is None and cycle.stale:  # in the tick before
-                end = self._check_stale_readings(tick_number)
-            if end is None and (
+            if session_end is None and cycle.has_stale_reading:  # in the tick before
+                session_end = self._check_stale_readings(tick_number)
+            if session_end is None and (
                 stop_field[0]
                 or counts.lost
                 or stop_request.requested
                 or tick_number % SLOW_CHECK_TICKS == 0
             ):
-                end = self._poll()
+                session_end = self._check_for_session_end()
             reference_rad = start_rad + (
                 relative_reference_rad[tick_number]
                 if reader is None
                 else reader.reference_at(tick_number)
             )
-            if end is None:
-                end = self._control_tick(reference_rad)
-                if touch_monitor is not None and end is None:
-                    end = self._monitor_touch(touch_monitor, tick_number, missed_ticks)
+            if session_end is None:
+                session_end = self._control_tick(reference_rad)
+                if touch_monitor is not None and session_end is None:
+                    session_end = self._monitor_touch(touch_monitor, tick_number, missed_ticks)
             else:
                 self._switch_off_and_observe()
-            wait_for_slot = is_virtual or end is not None
-            log.write(tick_number, reference_rad, missed_ticks, wait_for_slot=wait_for_slot)
+            wait_for_slot = is_virtual or session_end is not None
+            log.write_sample(tick_number, reference_rad, missed_ticks, wait_for_slot=wait_for_slot)
             scheduled_field[0] = tick_number + 1
-            last_ns = scheduler.t_ns + scheduler.lateness_ns
+            last_tick_ns = scheduler.t_ns + scheduler.lateness_ns
             if last_tick < 0:
-                first_ns = last_ns
+                first_tick_ns = last_tick_ns
             last_tick = tick_number
         self._end_angle_rad = reference_rad
         counts.scheduled = scheduled_field[0] = last_tick + 1
-        if counts.lost and end is None:
-            end = self._stop_reason()
-        if end is not None:
-            cycle.torque_off()
+        if counts.lost and session_end is None:
+            session_end = self._stop_reason()
+        if session_end is not None:
+            cycle.switch_torque_off()
         self._publish_readings()
         for doubt_count_text in self._reading_publisher.doubt_counts:
             self._log_event("warning", doubt_count_text)
-        self._record_clock_results(start_utc_ns, start_monotonic_ns, last_ns - first_ns)
-        if end is not None:
-            raise end
+        self._record_clock_results(start_utc_ns, start_monotonic_ns, last_tick_ns - first_tick_ns)
+        if session_end is not None:
+            raise session_end
 
     def _await_segment(self, reference_reader: ReferenceReader, tick: int) -> None:
         """Wait, without advancing virtual time, until the fit process has planned a tick.
@@ -415,35 +415,39 @@ class SessionSequence:
         if contact.is_touch:
             self._shared_state[StateField.TOUCHES] += 1
         if contact.session_outcome:
-            self._cycle.torque_off()  # before this tick's sample is written
+            self._cycle.switch_torque_off()  # before this tick's sample is written
             return SessionEnd(contact.session_outcome, contact.message)
         self._log_event("info", contact.message)
         return None
 
-    def damp(self) -> None:
+    def damp_vibration(self) -> None:
         """Damp the beam's vibration by small motor movements around the record's final angle."""
         self._shared_state[StateField.PHASE] = Phase.RETURNING
-        end_rad = self._end_angle_rad
+        record_end_angle_rad = self._end_angle_rad
         if self._ending.damper is None:
             return
         damper = VibrationDamper(self._ending.damper, self._rate_hz)
         cycle = self._cycle
         # The record may have ended at the limit of the angle.
-        limit_rad = self._profile.limits.angle_rad
-        min_displacement_rad = min(0.0, max(-_MAX_DAMPING_ANGLE_RAD, -limit_rad - end_rad))
-        max_displacement_rad = max(0.0, min(_MAX_DAMPING_ANGLE_RAD, limit_rad - end_rad))
-        torques_nm = np.zeros(round(_SPREAD_WINDOW_S * self._rate_hz))
+        angle_limit_rad = self._profile.limits.angle_rad
+        min_displacement_rad = min(
+            0.0, max(-_MAX_DAMPING_ANGLE_RAD, -angle_limit_rad - record_end_angle_rad)
+        )
+        max_displacement_rad = max(
+            0.0, min(_MAX_DAMPING_ANGLE_RAD, angle_limit_rad - record_end_angle_rad)
+        )
+        torques_nm = np.zeros(round(_TORQUE_SPREAD_WINDOW_S * self._rate_hz))
         for tick_number in range(round(_LONGEST_DAMPING_S * self._rate_hz)):
             damping_angle_rad = damper.step(cycle.coupling_torque_nm)
-            self._end_angle_rad = end_rad + min(
+            self._end_angle_rad = record_end_angle_rad + min(
                 max(damping_angle_rad, min_displacement_rad), max_displacement_rad
             )
             self._run_tick(self._end_angle_rad)
             torques_nm[tick_number % torques_nm.size] = cycle.coupling_torque_nm
             if (
-                tick_number % _SPREAD_CHECK_TICKS == 0
+                tick_number % _TORQUE_SPREAD_CHECK_TICKS == 0
                 and tick_number >= torques_nm.size
-                and float(torques_nm.std()) <= _DAMPED_SPREAD_RATIO * self._rest_spread_nm
+                and float(torques_nm.std()) <= _DAMPED_TORQUE_SPREAD_RATIO * self._rest_spread_nm
             ):
                 return
 
@@ -463,13 +467,13 @@ class SessionSequence:
         """Measure the torque at rest after the record; raise `SessionEnd` if it has drifted."""
         self._read_rest(_SETTLING_S)
         rest_readings = self._read_rest(self._profile.session.tare_s)
-        if rest_readings.torque_spread_nm > _VIBRATING_SPREAD_RATIO * self._rest_spread_nm:
+        if rest_readings.torque_spread_nm > _VIBRATING_TORQUE_SPREAD_RATIO * self._rest_spread_nm:
             self._log_event(
                 "info", "The beam still vibrates: the zero of the coupling torque was not checked."
             )
             return
-        zero_nm = np.dot(self._cycle.tare, self._profile.rig.sensor.projection)
-        drift_nm = float(rest_readings.torques_nm.mean() - zero_nm)
+        tare_torque_nm = np.dot(self._cycle.tare, self._profile.rig.sensor.projection)
+        drift_nm = float(rest_readings.torques_nm.mean() - tare_torque_nm)
         self.results["tare_drift_nm"] = repr(drift_nm)
         violation = self._cycle.limit_monitor.check_tare(drift_nm)
         self._report_warnings()
@@ -492,9 +496,9 @@ class SessionSequence:
                 f"{self._profile.limits.missed_ticks_in_a_row}. {OVERLOADED_ADVICE}",
             )
         self._switch_off_if_stopped()
-        end = self._control_tick(reference_rad)
-        if end is not None:
-            raise end
+        session_end = self._control_tick(reference_rad)
+        if session_end is not None:
+            raise session_end
 
     def _control_tick(self, reference_rad: float) -> SessionEnd | None:
         """Run one tick of control; return the error that ends the session, or None.
@@ -504,7 +508,7 @@ class SessionSequence:
         try:
             violation = self._cycle.step(self._scheduler.due_ns, reference_rad)
         except ControllerError as error:
-            self._cycle.torque_off()
+            self._cycle.switch_torque_off()
             return SessionEnd("fault", str(error))
         except Exception as error:
             device_failure = failure_of_device(error, self._profile.rig.devices)
@@ -533,7 +537,7 @@ class SessionSequence:
 
         Mark the readings as stale if a device no longer responds.
         """
-        self._cycle.torque_off()
+        self._cycle.switch_torque_off()
         try:
             self._cycle.observe(self._scheduler.due_ns)
         except (DeviceError, OSError):
@@ -547,7 +551,7 @@ class SessionSequence:
             rate_hz=self._rate_hz,
             duration_s=duration_s,
             projection=self._profile.rig.sensor.projection,
-            check=self._check_reading,
+            check_reading=self._check_reading,
         )
 
     def _check_reading(self) -> None:
@@ -586,7 +590,7 @@ class SessionSequence:
 
     def _stop_reason(self) -> SessionEnd | None:
         """Return the error that ends the session if a stop is requested or a process died."""
-        stop_reason = self._shared_state[StateField.STOP]
+        stop_reason = self._shared_state[StateField.STOP_REASON]
         if self._stop.requested or stop_reason == StopReason.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")
         if stop_reason == StopReason.NO_RECORDER:
@@ -598,7 +602,7 @@ class SessionSequence:
             return SessionEnd("fault", "The supervising process ended during the session.")
         return None
 
-    def _poll(self) -> SessionEnd | None:
+    def _check_for_session_end(self) -> SessionEnd | None:
         """Publish heartbeat and readings; return the error that ends the session, or None.
 
         This checks the slow limits, a suspended computer, the supervisor's heartbeat, and stop
@@ -616,7 +620,7 @@ class SessionSequence:
             return SessionEnd("fault", str(violation))
         if not self._clock.virtual:
             suspended_s = self._suspend_monitor.suspended_s()
-            if suspended_s > SUSPENDED_S:
+            if suspended_s > MIN_SUSPENSION_S:
                 return SessionEnd(
                     "fault",
                     f"The computer was suspended for {suspended_s:.1f} s and the motor was not "
@@ -641,10 +645,10 @@ class SessionSequence:
     def _switch_off_if_stopped(self) -> None:
         """Switch the torque off and raise `SessionEnd` if a stop is requested or a check fails."""
         is_poll_due = self._scheduler.tick % SLOW_CHECK_TICKS == 0
-        end = self._poll() if is_poll_due else self._stop_reason()
-        if end is not None:
-            self._cycle.torque_off()
-            raise end
+        session_end = self._check_for_session_end() if is_poll_due else self._stop_reason()
+        if session_end is not None:
+            self._cycle.switch_torque_off()
+            raise session_end
 
     def _record_clock_results(
         self, start_utc_ns: int, start_monotonic_ns: int, execution_span_ns: int

@@ -11,7 +11,7 @@ from rigd.touch import TouchDetector
 _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
 _TOUCHED = int(Status.TOUCHED)
-_EXCESSIVE_FORCE_TICKS = 2
+_MIN_EXCESSIVE_FORCE_TICKS = 2
 """Number of consecutive ticks with an excessive force that end a session: a single tick may be a
 disturbed reading."""
 
@@ -101,9 +101,9 @@ class TouchMonitor:
             reference_rad[max(tick - 1, 0)],
             reference_rad[tick],
         )
-        start_rad = reference_rad[current_pass.begins - 1] if current_pass.begins else 0.0
+        start_angle_rad = reference_rad[current_pass.begins - 1] if current_pass.begins else 0.0
         path_rad = reference_after_touch(
-            self._approach, current_pass.ends, tick, last_angles_rad, start_rad
+            self._approach, current_pass.ends, tick, last_angles_rad, start_angle_rad
         )
         reference_rad[tick + 1 : current_pass.ends] = memoryview(path_rad)  # type: ignore[arg-type] # numpy's stubs
 
@@ -112,13 +112,15 @@ class TouchMonitor:
         if self._projection is None:
             return None
         force_n = abs(self._detector.contact_force_n(shear_n))
-        limit_n = self._approach.force_limit_n
-        self._excessive_force_ticks = self._excessive_force_ticks + 1 if force_n > limit_n else 0
-        if self._excessive_force_ticks < _EXCESSIVE_FORCE_TICKS:
+        force_limit_n = self._approach.force_limit_n
+        self._excessive_force_ticks = (
+            self._excessive_force_ticks + 1 if force_n > force_limit_n else 0
+        )
+        if self._excessive_force_ticks < _MIN_EXCESSIVE_FORCE_TICKS:
             return None
         return DetectedContact(
-            f"Contact force {force_n:.3g} N exceeds force_limit_n = {limit_n:g} N. Choose a lower "
-            "speed, or a higher limit.",
+            f"Contact force {force_n:.3g} N exceeds force_limit_n = {force_limit_n:g} N. "
+            "Choose a lower speed, or a higher limit.",
             "fault",
             is_touch=False,
         )

@@ -15,7 +15,7 @@ from rigd.session.layout import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
 # Topics
 
-VIRTUAL_BUFFERED_S = 160.0
+VIRTUAL_CLOCK_BUFFER_S = 160.0
 """Time span in s of the records that the rings hold under the virtual clock.
 
 It is longer than `RECORDER_BUFFER_S`, because under the virtual clock a session takes about a
@@ -124,8 +124,8 @@ class Channels:
 
     def request_stop(self) -> None:
         """Request a stop of the control process, unless a stop was requested before."""
-        if self.shared_state[StateField.STOP] == StopReason.NONE:
-            self.shared_state[StateField.STOP] = StopReason.OPERATOR
+        if self.shared_state[StateField.STOP_REASON] == StopReason.NONE:
+            self.shared_state[StateField.STOP_REASON] = StopReason.OPERATOR
 
     def clear(self) -> None:
         """Discard all records in the rings before the next session, while no recorder runs."""

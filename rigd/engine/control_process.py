@@ -43,7 +43,7 @@ from rigd.engine.messages import (
     ZeroOrder,
 )
 from rigd.engine.processes import SupervisorConnection
-from rigd.engine.realtime import REFUSED, apply_realtime, disable_garbage_collection
+from rigd.engine.realtime import REFUSED_PREFIX, apply_realtime, disable_garbage_collection
 from rigd.engine.reference import ReferenceReader, map_reference
 from rigd.engine.shared_state import LogEvent, Phase, StateField, write_event
 from rigd.engine.timing import MAX_VIRTUAL_PAUSE_S, Clock, RealClock, TickScheduler, VirtualClock
@@ -55,13 +55,13 @@ from rigd.runtime.processes import name_this_process
 from rigd.safety import SLOW_CHECK_TICKS
 from rigd.session.layout import WRENCH_FIELDS
 
-_MAX_SILENCE_S = 1.0
+_MAX_DEVICE_SILENCE_S = 1.0
 """Longest time in s for which a device may send no reading between sessions."""
-_STANDSTILL_POLL_S = 0.05
+_ORDER_POLL_S = 0.05
 """Longest single wait in s for an order of the supervisor while virtual time is stopped."""
 _ZERO_READING_S = 0.2
 """Duration in s of the readings whose last angle becomes the rig's zero."""
-_NAME_VISIBLE_S = 0.5
+_PROCESS_NAME_VISIBLE_S = 0.5
 """Time in s after a stopped session for which the process name shows ``rigd stop`` that the drive
 is off; on an overloaded computer, ``rigd stop`` reads it only a few times a second."""
 _STANDSTILL_TICKS = 2
@@ -115,7 +115,7 @@ def run_control(
     realtime_results
         Real-time settings that were granted, for the file.
     """
-    end_text = ""
+    end_reason_text = ""
     server = None
     name_this_process(CONNECTING_NAME)
     try:
@@ -123,7 +123,7 @@ def run_control(
         devices.sensor.connect()
         drive = devices.drive
         drive.connect()
-        _publish_if_off(channels, devices)
+        _publish_phase_if_off(channels, devices)
         server = _ControlServer(
             profile, devices, clock, channels, parent, stop_request, realtime_results
         )
@@ -138,21 +138,21 @@ def run_control(
         )
         server.serve()
     except PluginError as error:
-        end_text = str(error)
+        end_reason_text = str(error)
     except Exception as error:
-        end_text = failure_of_device(error, profile.rig.devices)
+        end_reason_text = failure_of_device(error, profile.rig.devices)
     finally:
         devices.drive.disable()
         if channels.shared_state[StateField.PHASE] != Phase.PREPARING:  # it was connected
-            _publish_if_off(channels, devices)
+            _publish_phase_if_off(channels, devices)
         devices.drive.close()
         devices.sensor.close()
     if server is not None:
-        server.show_name()
-    parent.send(ControlEnded(f"{end_text} {devices.drive.off_doubt}".strip()))
+        server.wait_while_name_visible()
+    parent.send(ControlEnded(f"{end_reason_text} {devices.drive.off_doubt}".strip()))
 
 
-def _publish_if_off(channels: Channels, devices: Devices) -> None:
+def _publish_phase_if_off(channels: Channels, devices: Devices) -> None:
     """Publish that the disabled drive is off, unless it has not shown this.
 
     Displays claim that the torque is off in this phase, and ``rigd stop`` by this process name.
@@ -186,7 +186,7 @@ class _ControlServer:
         self._realtime_results = realtime_results
         self._zero_rad = 0.0
         self._silent_ticks = 0
-        self._last_stop_s = -_NAME_VISIBLE_S
+        self._last_stop_s = -_PROCESS_NAME_VISIBLE_S
         """Time of the end of the last session that the operator stopped."""
         self._uses_line = devices.uses_line
         # A simulated motor starts cold.
@@ -198,12 +198,12 @@ class _ControlServer:
         self._reading_publisher = ReadingPublisher(channels.shared_state, devices)
         self._cycle = self._make_cycle(profile)
 
-    def show_name(self) -> None:
+    def wait_while_name_visible(self) -> None:
         """Wait until ``rigd stop`` has read the name of this process after a stopped session."""
         if not self._clock.virtual:
-            time.sleep(max(0.0, self._last_stop_s + _NAME_VISIBLE_S - time.monotonic()))
+            time.sleep(max(0.0, self._last_stop_s + _PROCESS_NAME_VISIBLE_S - time.monotonic()))
 
-    def store_heat(self) -> None:
+    def store_real_motor_heat(self) -> None:
         """Store the heat of a real motor in a file for the next connection to the rig."""
         if not self._devices.simulated:
             store_motor_heat(self._profile, self._limit_monitor.heat_nm2)
@@ -230,7 +230,7 @@ class _ControlServer:
                     try:
                         self._run_session(supervisor_order)
                     finally:
-                        self.store_heat()
+                        self.store_real_motor_heat()
                     self.observe_standstill()
                     gc.collect()  # the torque is off: the only time for it
                 case TareOrder():
@@ -252,7 +252,7 @@ class _ControlServer:
             self._publish_readings()
             try:
                 supervisor_message = self._parent.poll(
-                    _STANDSTILL_POLL_S if self._clock.virtual else 0.0
+                    _ORDER_POLL_S if self._clock.virtual else 0.0
                 )
             except EOFError:
                 return None
@@ -272,11 +272,11 @@ class _ControlServer:
         for _ in range(SLOW_CHECK_TICKS):
             self._scheduler.wait()
             self._read_at_rest()
-            self._silent_ticks = self._silent_ticks + 1 if cycle.stale else 0
-        if self._silent_ticks > _MAX_SILENCE_S * self._profile.rig.rate_hz:
+            self._silent_ticks = self._silent_ticks + 1 if cycle.has_stale_reading else 0
+        if self._silent_ticks > _MAX_DEVICE_SILENCE_S * self._profile.rig.rate_hz:
             raise DeviceError(
-                f"{cycle.stale_names} has not arrived for {_MAX_SILENCE_S:g} s; check that the "
-                "device is on and connected."
+                f"{cycle.stale_reading_names} has not arrived for {_MAX_DEVICE_SILENCE_S:g} s; "
+                "check that the device is on and connected."
             )
 
     def _read_at_rest(self) -> None:
@@ -292,10 +292,10 @@ class _ControlServer:
         shared_state, devices = self._shared_state, self._devices
         for state_field in (
             StateField.START_UTC_NS,
-            StateField.SCHEDULED,
-            StateField.MISSED,
-            StateField.LATE,
-            StateField.LOST,
+            StateField.SCHEDULED_TICKS,
+            StateField.MISSED_TICKS,
+            StateField.LATE_TICKS,
+            StateField.LOST_SAMPLES,
             StateField.STALE_ANGLES,
             StateField.STALE_WRENCHES,
             StateField.TOUCHES,
@@ -340,16 +340,16 @@ class _ControlServer:
         name_this_process(SESSION_NAME)
         try:
             seed_metadata = self._restart_noise(session_job)
-            tare_metadata = session_sequence.tare()
+            tare_metadata = session_sequence.measure_tare()
             devices.drive.enable(session_sequence.stop_requested)
-            session_sequence.hold()
+            session_sequence.hold_start_angle()
             self._parent.send(ReadyToRecord(tare_metadata | seed_metadata))
             session_sequence.wait_for_go()
-            session_sequence.record()
+            session_sequence.run_record()
             was_recorded = True
-            session_sequence.damp()
+            session_sequence.damp_vibration()
             session_sequence.return_to_start()
-            cycle.torque_off()
+            cycle.switch_torque_off()
             session_sequence.check_tare()
         except SessionEnd as end:
             session_outcome, end_reason, device_failed = end.outcome, end.reason, end.device_failed
@@ -360,8 +360,8 @@ class _ControlServer:
             end_reason = failure_of_device(error, self._profile.rig.devices)
         finally:
             devices.drive.disable()
-            cycle.torque_off()
-            _publish_if_off(self._channels, devices)
+            cycle.switch_torque_off()
+            _publish_phase_if_off(self._channels, devices)
             self._publish_readings()
         off_doubt = devices.drive.off_doubt
         if off_doubt:
@@ -423,7 +423,7 @@ class _ControlServer:
         failure_text = ""
         name_this_process(SESSION_NAME)
         try:
-            probe_sequence.tare()
+            probe_sequence.measure_tare()
             self._devices.drive.enable(probe_sequence.stop_requested)
             reply_message = MeasurementResult(probe_sequence.run_probing_move())
         except SessionEnd as end:
@@ -431,8 +431,8 @@ class _ControlServer:
             failure_text = end.reason if end.device_failed else ""
         finally:
             self._devices.drive.disable()
-            cycle.torque_off()
-            _publish_if_off(self._channels, self._devices)
+            cycle.switch_torque_off()
+            _publish_phase_if_off(self._channels, self._devices)
             self._publish_readings()
         failure_text = f"{failure_text} {self._devices.drive.off_doubt}".strip()
         if failure_text:
@@ -456,11 +456,11 @@ class _ControlServer:
         sensor_violation = self._cycle.sensor_monitor.finish_learning()
         if sensor_violation is not None:
             raise SessionEnd("fault", str(sensor_violation))
-        self._cycle.tare = rest_readings.mean
+        self._cycle.tare = rest_readings.mean_wrench
         self._limit_monitor.tared_nm = float(rest_readings.torques_nm.mean())
         return {
-            "mean": dict(zip(WRENCH_FIELDS, rest_readings.mean, strict=True)),
-            "std": dict(zip(WRENCH_FIELDS, rest_readings.spread, strict=True)),
+            "mean": dict(zip(WRENCH_FIELDS, rest_readings.mean_wrench, strict=True)),
+            "std": dict(zip(WRENCH_FIELDS, rest_readings.wrench_std, strict=True)),
             "torque_std_nm": rest_readings.torque_spread_nm,
         }
 
@@ -471,19 +471,20 @@ class _ControlServer:
         motor moves.
         """
         rest_readings = self._read_rest(_ZERO_READING_S)
-        limit_rad_s = self._profile.session.rest_velocity_rad_s
-        if rest_readings.speed_rad_s > limit_rad_s:
+        rest_speed_limit_rad_s = self._profile.session.rest_velocity_rad_s
+        if rest_readings.speed_rad_s > rest_speed_limit_rad_s:
             raise SessionEnd(
                 "fault",
                 f"The motor moves by {rest_readings.speed_rad_s:.2g} rad/s, more than "
-                f"session.rest_velocity_rad_s = {limit_rad_s:g} rad/s; wait until it is at rest.",
+                f"session.rest_velocity_rad_s = {rest_speed_limit_rad_s:g} rad/s; "
+                "wait until it is at rest.",
             )
-        moved_rad = self._cycle.angle_rad
-        self._zero_rad += moved_rad
+        zero_shift_rad = self._cycle.angle_rad
+        self._zero_rad += zero_shift_rad
         self._cycle.zero_rad = self._zero_rad
         self._cycle.angle_rad = 0.0
         self._publish_readings()
-        return {"moved_rad": moved_rad}
+        return {"moved_rad": zero_shift_rad}
 
     def _publish_readings(self) -> None:
         """Write the last readings of angle and torque to the shared state."""
@@ -498,7 +499,7 @@ class _ControlServer:
             rate_hz=rig.rate_hz,
             duration_s=duration_s,
             projection=rig.sensor.projection,
-            check=self._check_reading,
+            check_reading=self._check_reading,
         )
 
     def _check_reading(self) -> None:
@@ -527,13 +528,13 @@ class _ControlServer:
 
     def _warn_of_refusals(self, session_job: SessionJob) -> None:
         """Log a warning for the real-time settings that the system did not grant."""
-        own_refusals = {
+        refusals_of_process = {
             setting_name: refusal_text
             for setting_name, refusal_text in self._realtime_results.items()
-            if refusal_text.startswith(REFUSED)
+            if refusal_text.startswith(REFUSED_PREFIX)
         }
         for refused_settings, consequence_text in (
-            (own_refusals, "more ticks will be late"),
+            (refusals_of_process, "more ticks will be late"),
             (
                 session_job.refused_settings,
                 "a computer that is busy with other programs may end the session",

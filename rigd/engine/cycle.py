@@ -48,15 +48,17 @@ _STALE_WRENCH_CHANNELS = tuple(
     INTERLOCKS_BY_NAME[name].channel for name in ("stale wrench", "stale wrench share")
 )
 
-_RECENT_TICKS = 32
+_SIGN_CHECK_TICKS = 32
 """Number of latest ticks whose angles and torques show whether a sign is wrong."""
-_SPEED_TICKS = 4
-"""Number of ticks from which the speed is computed, at either end of the last `_RECENT_TICKS`."""
-_MIN_SPEED_STEPS = 10
-"""Minimum number of encoder steps in `_SPEED_TICKS` with which the speed exceeds the noise."""
-_MIN_SPEED_CHANGE = 0.2
-"""Minimum change of the speed in `_RECENT_TICKS`, as a fraction of the speed. A smaller change does
-not show the sign of the torque."""
+_SPEED_WINDOW_TICKS = 4
+"""Number of ticks from which the speed is computed, at either end of the last `_SIGN_CHECK_TICKS`
+ticks."""
+_MIN_SPEED_ENCODER_STEPS = 10
+"""Minimum number of encoder steps in `_SPEED_WINDOW_TICKS` ticks with which the speed exceeds the
+noise."""
+_MIN_SPEED_CHANGE_RATIO = 0.2
+"""Minimum change of the speed in `_SIGN_CHECK_TICKS`, as a fraction of the speed. A smaller
+change does not show the sign of the torque."""
 _OPPOSITE_ACCELERATION_RATIOS = 1 / 3, 3.0
 """Smallest and largest ratio of the measured acceleration to minus the expected acceleration that
 show a wrong sign. The range allows for friction and for an inertia that is only assumed."""
@@ -213,7 +215,7 @@ class Cycle:
         self._last_unusable = False
         self._commanding = False
         self._torque_squares_nm2 = 0.0
-        self._recent_ticks: deque[tuple[float, float, float]] = deque(maxlen=_RECENT_TICKS)
+        self._recent_ticks: deque[tuple[float, float, float]] = deque(maxlen=_SIGN_CHECK_TICKS)
 
     def observe(self, due_ns: int) -> None:
         """Read angle and wrench from the devices without changing the torque command."""
@@ -275,7 +277,7 @@ class Cycle:
             )
         if violation is not None:
             self._recent_ticks.append((self.angle_rad, 0.0, 0.0))
-            self.torque_off()
+            self.switch_torque_off()
             self.flags |= _LIMIT_WARNING
             return violation
         if limit_monitor.warning:
@@ -285,32 +287,34 @@ class Cycle:
         if controller.saturated:  # a torque that is not a number counts as saturated
             violation = limit_monitor.check_torque(controller.unlimited_torque_nm)
             if violation is not None:
-                self.torque_off()
+                self.switch_torque_off()
                 self.flags |= _LIMIT_WARNING | _TORQUE_SATURATED
                 return violation
             status_flags |= _TORQUE_SATURATED | _LIMIT_WARNING
         if encoder_monitor is not None and encoder_monitor.test_nm:
-            limit_nm = controller.torque_limit_nm
-            torque_nm = max(-limit_nm, min(limit_nm, torque_nm + encoder_monitor.test_nm))
+            torque_limit_nm = controller.torque_limit_nm
+            torque_nm = max(
+                -torque_limit_nm, min(torque_limit_nm, torque_nm + encoder_monitor.test_nm)
+            )
         self._commanding = True
-        sent_nm = self.torque_command_nm = self._drive.command(torque_nm)
-        self._torque_squares_nm2 += sent_nm * sent_nm
-        self._recent_ticks.append((self.angle_rad, self.coupling_torque_nm, sent_nm))
+        sent_torque_nm = self.torque_command_nm = self._drive.command(torque_nm)
+        self._torque_squares_nm2 += sent_torque_nm * sent_torque_nm
+        self._recent_ticks.append((self.angle_rad, self.coupling_torque_nm, sent_torque_nm))
         self.flags = status_flags
         return None
 
-    def start(self, noise_nm: float) -> None:
+    def start_control(self, torque_noise_nm: float) -> None:
         """Reset controller and monitors to a motor at rest at the last angle.
 
         Parameters
         ----------
-        noise_nm
+        torque_noise_nm
             Standard deviation of the coupling torque at rest.
         """
         self.controller.reset(self.angle_rad)
         self.limit_monitor.reset(self.angle_rad)
         if self.encoder_monitor is not None:
-            self.encoder_monitor.reset(self.angle_rad, noise_nm)
+            self.encoder_monitor.reset(self.angle_rad, torque_noise_nm)
         self._recent_ticks.clear()
 
     def skip(self, missed_ticks: int) -> None:
@@ -344,34 +348,36 @@ class Cycle:
             Resolution of the encoder.
         """
         recent_ticks = self._recent_ticks
-        if len(recent_ticks) < _RECENT_TICKS:
+        if len(recent_ticks) < _SIGN_CHECK_TICKS:
             return False
         angles_rad = [angle_rad for angle_rad, _, _ in recent_ticks]
-        earlier_movement_rad = angles_rad[_SPEED_TICKS] - angles_rad[0]
-        last_movement_rad = angles_rad[-1] - angles_rad[-1 - _SPEED_TICKS]
+        earlier_movement_rad = angles_rad[_SPEED_WINDOW_TICKS] - angles_rad[0]
+        last_movement_rad = angles_rad[-1] - angles_rad[-1 - _SPEED_WINDOW_TICKS]
         speed_change_rad = last_movement_rad - earlier_movement_rad
-        if abs(last_movement_rad) < _MIN_SPEED_STEPS * resolution_rad or abs(
+        if abs(last_movement_rad) < _MIN_SPEED_ENCODER_STEPS * resolution_rad or abs(
             speed_change_rad
-        ) < _MIN_SPEED_CHANGE * abs(last_movement_rad):
+        ) < _MIN_SPEED_CHANGE_RATIO * abs(last_movement_rad):
             return False
-        half_window = _SPEED_TICKS // 2
+        half_window_ticks = _SPEED_WINDOW_TICKS // 2
         torques_nm = [sent_nm - coupling_nm for _, coupling_nm, sent_nm in recent_ticks]
-        impulse_nm_s = sum(torques_nm[half_window : -1 - half_window]) / rate_hz
-        expected_change_rad = impulse_nm_s / inertia_kg_m2 * _SPEED_TICKS / rate_hz
+        impulse_nm_s = sum(torques_nm[half_window_ticks : -1 - half_window_ticks]) / rate_hz
+        expected_change_rad = impulse_nm_s / inertia_kg_m2 * _SPEED_WINDOW_TICKS / rate_hz
         min_ratio, max_ratio = _OPPOSITE_ACCELERATION_RATIOS
-        opposition = -speed_change_rad * expected_change_rad
+        opposed_change_rad2 = -speed_change_rad * expected_change_rad
         return (
-            min_ratio * expected_change_rad**2 <= opposition <= max_ratio * expected_change_rad**2
-            and opposition > 0.0
+            min_ratio * expected_change_rad**2
+            <= opposed_change_rad2
+            <= max_ratio * expected_change_rad**2
+            and opposed_change_rad2 > 0.0
         )
 
     @property
-    def stale(self) -> bool:
+    def has_stale_reading(self) -> bool:
         """Whether angle or wrench of the last tick is older than the tick."""
         return bool(self.flags & (_ANGLE_STALE | _WRENCH_STALE))
 
     @property
-    def stale_names(self) -> str:
+    def stale_reading_names(self) -> str:
         """Names of the last tick's stale readings, as text for a message."""
         flag_names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
         return " and ".join(
@@ -462,10 +468,10 @@ class Cycle:
             due_ns, torque_squares_nm2, recorder_lag_s, disk_free_mb
         )
         if violation is not None:
-            self.torque_off()
+            self.switch_torque_off()
         return violation
 
-    def torque_off(self) -> None:
+    def switch_torque_off(self) -> None:
         """Set the torque to zero, and disable the drive if it is enabled."""
         if self._commanding:
             self._commanding = False
@@ -475,7 +481,7 @@ class Cycle:
 
     def mark_readings_stale(self) -> None:
         """Switch the torque off after a device failure, and mark the last readings as stale."""
-        self.torque_off()
+        self.switch_torque_off()
         self.flags |= _ANGLE_STALE | _WRENCH_STALE
 
 
@@ -514,13 +520,13 @@ class RestReadings:
         return float(self.torques_nm.std())
 
     @property
-    def mean(self) -> Wrench:
+    def mean_wrench(self) -> Wrench:
         """Mean of the raw wrench at rest on each axis, in N and N·m."""
         fx, fy, fz, tx, ty, tz = (float(axis_mean) for axis_mean in self.wrenches.mean(axis=0))
         return fx, fy, fz, tx, ty, tz
 
     @property
-    def spread(self) -> Wrench:
+    def wrench_std(self) -> Wrench:
         """Standard deviation of the raw wrench at rest on each axis, in N and N·m."""
         fx, fy, fz, tx, ty, tz = (float(axis_std) for axis_std in self.wrenches.std(axis=0, ddof=1))
         return fx, fy, fz, tx, ty, tz
@@ -529,7 +535,7 @@ class RestReadings:
         """Return duration in s, and mean and standard deviation of each axis, as file metadata."""
         return {"tare_s": repr(self.duration_s)} | {
             f"tare_{statistic}_{axis}": repr(axis_value)
-            for statistic, axis_values in (("mean", self.mean), ("std", self.spread))
+            for statistic, axis_values in (("mean", self.mean_wrench), ("std", self.wrench_std))
             for axis, axis_value in zip(WRENCH_FIELDS, axis_values, strict=True)
         }
 
@@ -541,7 +547,7 @@ def observe_rest(
     rate_hz: float,
     duration_s: float,
     projection: Wrench,
-    check: Callable[[], None],
+    check_reading: Callable[[], None],
 ) -> RestReadings:
     """Read angle and wrench for a time without changing the torque; return the readings.
 
@@ -553,7 +559,7 @@ def observe_rest(
         Rate and duration of the readings.
     projection
         Coupling torque = projection · wrench.
-    check
+    check_reading
         Function that is called after each reading. An exception of it ends the readings.
     """
     wrenches: list[Wrench] = []
@@ -561,7 +567,7 @@ def observe_rest(
     for _ in range(round(duration_s * rate_hz)):
         scheduler.wait()
         cycle.observe(scheduler.due_ns)
-        check()
+        check_reading()
         wrenches.append(cycle.raw_wrench)
         angles_rad.append(cycle.angle_rad)
     wrench_array = np.array(wrenches)
@@ -630,17 +636,21 @@ def make_reading_monitors(profile: Profile, devices: Devices) -> ReadingMonitors
         scale_monitor=ScaleMonitor(rig.motor.inertia_kg_m2, profile.limits.torque_ratio),
     )
     simulation = rig.simulation
-    is_noisy = [True] * 6
+    is_channel_noisy = [True] * 6
     if simulation is not None:
-        is_noisy = [simulation.force_noise_n > 0.0] * 3 + [simulation.torque_noise_nm > 0.0] * 3
+        is_channel_noisy = [simulation.force_noise_n > 0.0] * 3 + [
+            simulation.torque_noise_nm > 0.0
+        ] * 3
     channel_names: Sequence[str] = WRENCH_FIELDS
     if isinstance(devices.sensor, GaugeSensor):
         # Each gauge shows the noise of all axes.
-        channel_names, is_noisy = (
+        channel_names, is_channel_noisy = (
             [f"gauge {gauge_number}" for gauge_number in range(6)],
-            [all(is_noisy)] * 6,
+            [all(is_channel_noisy)] * 6,
         )
-    return ReadingMonitors(encoder_monitor, SensorMonitor(channel_names, is_noisy, rig.rate_hz))
+    return ReadingMonitors(
+        encoder_monitor, SensorMonitor(channel_names, is_channel_noisy, rig.rate_hz)
+    )
 
 
 def store_motor_heat(profile: Profile, heat_nm2: float) -> None:

@@ -419,7 +419,7 @@ class MessageReader:
         self._fd = fd
         self._pending = bytearray()
 
-    def next(self, timeout_s: float | None) -> object | None:
+    def next_message(self, timeout_s: float | None) -> object | None:
         """Return the next message, or None if no complete message arrives in time.
 
         Parameters
@@ -450,11 +450,11 @@ class MessageReader:
         (message_bytes,) = _LENGTH_HEADER.unpack_from(self._pending)
         if message_bytes > _MAX_MESSAGE_BYTES:
             raise ValueError(f"no message, but {bytes(self._pending[:80])!r}")
-        end = _LENGTH_HEADER.size + message_bytes
-        if len(self._pending) < end:
+        message_end = _LENGTH_HEADER.size + message_bytes
+        if len(self._pending) < message_end:
             return None
-        message: object = pickle.loads(self._pending[_LENGTH_HEADER.size : end])
-        del self._pending[:end]
+        message: object = pickle.loads(self._pending[_LENGTH_HEADER.size : message_end])
+        del self._pending[:message_end]
         return message
 
 

@@ -33,11 +33,11 @@ from rigd.runtime.background import (
     prefer_oom_kill,
 )
 
-_WRITE_PATIENCE_S = 5.0
+_WRITE_TIMEOUT_S = 5.0
 """Longest time in s that a child may take to read a message."""
-_EXIT_GRACE_S = 1.0
+_EXIT_TIMEOUT_S = 1.0
 """Longest time in s to wait for a child to exit after it has closed its output."""
-_KILLED_GRACE_S = 2.0
+_KILL_TIMEOUT_S = 2.0
 """Longest time in s to wait for a killed child to end."""
 _MAX_ERROR_BYTES = 65_536
 """Number of bytes at the end of a child's standard error that are read."""
@@ -81,7 +81,7 @@ class ChildProcess:
         folder: Path | None = None,
     ) -> None:
         self._worker = worker
-        is_program = not worker.sends
+        is_program = not worker.sent_messages
         command = [*OWN_PYTHON, "-m", worker.module, *arguments]
         own_pid = str(os.getpid())
         self._errors_fd: int | None = None
@@ -174,7 +174,7 @@ class ChildProcess:
         """
         process_text = f"The {self._worker.name} process"
         try:
-            message = self._messages.next(timeout_s)
+            message = self._messages.next_message(timeout_s)
         except EOFError:
             exit_code = self._process.wait()
             end_text = (
@@ -185,7 +185,7 @@ class ChildProcess:
             raise ChildError(f"{process_text} was {end_text}.") from None
         except ValueError as error:
             raise ChildError(f"{process_text} sent {error}.") from None
-        if message is not None and type(message).__name__ not in self._worker.sends:
+        if message is not None and type(message).__name__ not in self._worker.sent_messages:
             raise ChildError(f"{process_text} sent {message}.")
         return message
 
@@ -224,24 +224,26 @@ class ChildProcess:
     def error_text(self) -> str:
         """Return the last text that the child wrote to standard error, for `captures_stderr`."""
         assert self._errors_fd is not None
-        start = max(0, os.fstat(self._errors_fd).st_size - _MAX_ERROR_BYTES)
-        return os.pread(self._errors_fd, _MAX_ERROR_BYTES, start).decode(errors="replace").strip()
+        first_byte = max(0, os.fstat(self._errors_fd).st_size - _MAX_ERROR_BYTES)
+        return (
+            os.pread(self._errors_fd, _MAX_ERROR_BYTES, first_byte).decode(errors="replace").strip()
+        )
 
     def suspend(self) -> None:
         """Suspend the child until it is resumed."""
-        self._signal(signal.SIGSTOP)
+        self._send_signal(signal.SIGSTOP)
 
     def resume(self) -> None:
         """Resume the child if it is suspended, so that it can finish its work."""
-        self._signal(signal.SIGCONT)
+        self._send_signal(signal.SIGCONT)
 
     def kill(self) -> None:
         """Kill the child process at once; the next :meth:`poll` then raises `ChildError`."""
-        self._signal(signal.SIGKILL)
+        self._send_signal(signal.SIGKILL)
 
-    def _signal(self, signal_number: signal.Signals) -> None:
+    def _send_signal(self, signal_number: signal.Signals) -> None:
         """Send a signal to the child; if it is a program, also to the processes it has started."""
-        if self._worker.sends:
+        if self._worker.sent_messages:
             self._process.send_signal(signal_number)
         elif self.running:
             with contextlib.suppress(ProcessLookupError):
@@ -268,14 +270,14 @@ class ChildProcess:
             for terminate_or_kill in (self._process.terminate, self._process.kill):
                 has_ended = self._wait_for_output_end(self._worker.end_timeout_s)
                 try:
-                    self._process.wait(_EXIT_GRACE_S if has_ended else 0.0)
+                    self._process.wait(_EXIT_TIMEOUT_S if has_ended else 0.0)
                     break
                 except subprocess.TimeoutExpired:
                     terminate_or_kill()
             with contextlib.suppress(
                 subprocess.TimeoutExpired
             ):  # stuck in a call, on a disk that hangs
-                self._process.wait(_KILLED_GRACE_S)
+                self._process.wait(_KILL_TIMEOUT_S)
             self._process.stdout.close()
         self._close_errors()
 
@@ -285,9 +287,9 @@ class ChildProcess:
             os.close(self._errors_fd)
             self._errors_fd = None
 
-    def _wait_for_output_end(self, patience_s: float) -> bool:
-        """Wait until the child closes its output; return False if it does not in `patience_s`."""
-        deadline_s = time.monotonic() + patience_s
+    def _wait_for_output_end(self, timeout_s: float) -> bool:
+        """Wait until the child closes its output; return False if it does not in `timeout_s`."""
+        deadline_s = time.monotonic() + timeout_s
         while (remaining_s := deadline_s - time.monotonic()) > 0:
             if is_ready(self._stdout_fd, select.POLLIN, remaining_s) and not os.read(
                 self._stdout_fd, 65536
@@ -310,10 +312,10 @@ class ChildProcess:
     def _write(self, message_bytes: bytes) -> None:
         """Write bytes to the child's input; raise `ChildError` if it does not read them in time."""
         unsent_bytes = memoryview(message_bytes)
-        deadline_s = time.monotonic() + _WRITE_PATIENCE_S
+        deadline_s = time.monotonic() + _WRITE_TIMEOUT_S
         while unsent_bytes:
-            patience_s = max(0.0, deadline_s - time.monotonic())
-            if not is_ready(self._stdin_fd, select.POLLOUT, patience_s):
+            remaining_s = max(0.0, deadline_s - time.monotonic())
+            if not is_ready(self._stdin_fd, select.POLLOUT, remaining_s):
                 raise ChildError(f"The {self._worker.name} process does not listen.")
             try:
                 unsent_bytes = unsent_bytes[os.write(self._stdin_fd, unsent_bytes) :]
@@ -357,7 +359,7 @@ class SupervisorConnection:
         EOFError
             If the supervisor has ended.
         """
-        return self._messages.next(timeout_s)
+        return self._messages.next_message(timeout_s)
 
     def send(self, message: object) -> None:
         """Send one message to the supervisor; nothing happens if the supervisor has ended."""
@@ -378,7 +380,7 @@ class Heartbeat:
     second therefore does not make the polled process appear hung.
     """
 
-    _MAX_STEP_S = 0.2
+    _MAX_COUNTED_STEP_S = 0.2
     """Maximum time in s that is counted from one poll to the next."""
 
     def __init__(self) -> None:
@@ -396,7 +398,7 @@ class Heartbeat:
         now_s
             Time of a monotonic clock.
         """
-        passed_s = min(now_s - self._last_poll_s, self._MAX_STEP_S)
-        self.still_s = self.still_s + passed_s if beat_count == self._beat else 0.0
+        elapsed_s = min(now_s - self._last_poll_s, self._MAX_COUNTED_STEP_S)
+        self.still_s = self.still_s + elapsed_s if beat_count == self._beat else 0.0
         self._beat, self._last_poll_s = beat_count, now_s
         return self.still_s

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-REFUSED = "refused: "
+REFUSED_PREFIX = "refused: "
 """Prefix of the text for a real-time setting that the system did not grant; the reason follows."""
 MEMORY_LOCKED = "locked"
 """Text for a granted lock of the process's memory, which prevents page faults."""
@@ -101,9 +101,10 @@ def pin_off_loop_core(loop_cpu: int) -> None:
 class RaisedPriority:
     """Raised priority of this process: above ordinary programs and below the control loop.
 
-    The raised priority lasts from :meth:`request` to :meth:`restore`. If it is granted as real-time
-    priority, the process also leaves the loop's core if it may use another one. Child processes
-    have ordinary priority but inherit the cores: start them with :attr:`cores_before`.
+    The raised priority lasts from :meth:`request_priority` to :meth:`restore_priority`. If it
+    is granted as real-time priority, the process also leaves the loop's core if it may use another
+    one. Child processes have ordinary priority but inherit the cores: start them with
+    :attr:`cores_before`.
 
     Parameters
     ----------
@@ -129,7 +130,7 @@ class RaisedPriority:
         self._other_cores = self.cores_before - {core}
         self._apply_priority: Callable[[int], None] | None = None
 
-    def request(self) -> dict[str, str]:
+    def request_priority(self) -> dict[str, str]:
         """Request the raised priority; return which settings the system granted.
 
         Returns
@@ -141,18 +142,18 @@ class RaisedPriority:
         if self._priority == 0:
             return {}
         scheduling_result = _try_setting(self._raise_to_realtime)
-        if not scheduling_result.startswith(REFUSED):
+        if not scheduling_result.startswith(REFUSED_PREFIX):
             return {
                 "scheduling": scheduling_result,
                 "cores": _format_cores(self._other_cores or self.cores_before),
             }
         niceness_result = _try_setting(self._raise_by_niceness)
-        if not niceness_result.startswith(REFUSED):
+        if not niceness_result.startswith(REFUSED_PREFIX):
             return {"scheduling": f"{niceness_result} (SCHED_RR {scheduling_result})"}
         return {"scheduling": scheduling_result}
 
     def raise_new_threads(self) -> None:
-        """Give the threads that were started since `request` the priority of the process.
+        """Give the threads that were started since `request_priority` the priority of the process.
 
         All threads need it, because they compete for one interpreter lock.
         """
@@ -162,29 +163,29 @@ class RaisedPriority:
             with contextlib.suppress(OSError):  # one that has just ended
                 self._apply_priority(int(thread.name))
 
-    def restore(self) -> None:
+    def restore_priority(self) -> None:
         """Return to ordinary priority; calling this again has no effect."""
         if self._apply_priority is None:
             return
-        self._apply_priority = self._restore
+        self._apply_priority = self._restore_thread_priority
         self.raise_new_threads()
         self._apply_priority = None
 
     def _raise_to_realtime(self) -> str:
         """Set the real-time priority SCHED_RR for all threads, and return its description."""
-        self._set_realtime(0)
-        self._apply_priority = self._set_realtime
+        self._set_realtime_priority(0)
+        self._apply_priority = self._set_realtime_priority
         self.raise_new_threads()
         return f"SCHED_RR {self._priority}"
 
     def _raise_by_niceness(self) -> str:
         """Set the niceness `SUPERVISION_NICENESS` for all threads, and return its description."""
-        self._set_nice(0)
-        self._apply_priority = self._set_nice
+        self._set_niceness(0)
+        self._apply_priority = self._set_niceness
         self.raise_new_threads()
         return f"nice {SUPERVISION_NICENESS}"
 
-    def _set_realtime(self, thread_id: int) -> None:
+    def _set_realtime_priority(self, thread_id: int) -> None:
         """Set the real-time priority of a thread, and restrict it to cores without the loop."""
         # Forked processes and new threads start with the ordinary policy.
         policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
@@ -194,24 +195,24 @@ class RaisedPriority:
         try:
             os.sched_setaffinity(thread_id, self._other_cores)
         except OSError:  # the set of usable cores has changed meanwhile
-            _set_ordinary(thread_id)
+            _set_ordinary_policy(thread_id)
             raise
 
-    def _set_nice(self, thread_id: int) -> None:
+    def _set_niceness(self, thread_id: int) -> None:
         """Set the niceness `SUPERVISION_NICENESS` and the ordinary policy of a thread."""
         os.setpriority(os.PRIO_PROCESS, thread_id, SUPERVISION_NICENESS)
-        _set_ordinary(thread_id)
+        _set_ordinary_policy(thread_id)
 
-    def _restore(self, thread_id: int) -> None:
+    def _restore_thread_priority(self, thread_id: int) -> None:
         """Set ordinary priority and the original cores of a thread."""
-        _set_ordinary(thread_id)
+        _set_ordinary_policy(thread_id)
         os.setpriority(
             os.PRIO_PROCESS, thread_id, max(0, os.getpriority(os.PRIO_PROCESS, thread_id))
         )
         os.sched_setaffinity(thread_id, self.cores_before)
 
 
-def _set_ordinary(thread_id: int) -> None:
+def _set_ordinary_policy(thread_id: int) -> None:
     """Set the ordinary scheduling policy of a thread."""
     # The flag stays: removing it needs a privilege, and it is harmless.
     policy = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
@@ -226,7 +227,7 @@ def isolated_cores(root_folder: Path = Path("/")) -> frozenset[int]:
         return frozenset()
 
 
-def parse_core_list(text: str) -> frozenset[int]:
+def parse_core_list(core_list_text: str) -> frozenset[int]:
     """Return the core numbers in a list in the kernel's format, such as ``0-2,5``.
 
     Raises
@@ -235,7 +236,7 @@ def parse_core_list(text: str) -> frozenset[int]:
         If the text is no such list.
     """
     core_numbers: set[int] = set()
-    for core_range in filter(None, text.strip().split(",")):
+    for core_range in filter(None, core_list_text.strip().split(",")):
         first_core, _, last_core = core_range.partition("-")
         core_numbers.update(range(int(first_core), int(last_core or first_core) + 1))
     return frozenset(core_numbers)
@@ -243,8 +244,8 @@ def parse_core_list(text: str) -> frozenset[int]:
 
 def page_faults() -> int:
     """Return the number of page faults of this process so far."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_minflt + usage.ru_majflt
+    resource_usage = resource.getrusage(resource.RUSAGE_SELF)
+    return resource_usage.ru_minflt + resource_usage.ru_majflt
 
 
 def _try_setting(apply_setting: Callable[[], str]) -> str:
@@ -252,7 +253,7 @@ def _try_setting(apply_setting: Callable[[], str]) -> str:
     try:
         return apply_setting()
     except (OSError, AttributeError, ValueError) as error:
-        return f"{REFUSED}{error}"
+        return f"{REFUSED_PREFIX}{error}"
 
 
 def lock_memory(libc: ctypes.CDLL) -> str:

@@ -45,7 +45,7 @@ _MAX_BLOCK_RECORDS = 250
 """Largest number of records that are taken from a ring at once."""
 _IDLE_PAUSE_S = 0.005
 """Pause in s when the rings contain no new record."""
-_ORPHAN_PATIENCE_S = 3.0
+_ORPHAN_TIMEOUT_S = 3.0
 """Longest time in s without a new record before a recorder without supervisor closes the file."""
 _DISK_POLL_S = 1.0
 """Time in s between two checks of the free disk space."""
@@ -61,7 +61,7 @@ def main() -> None:
     if job.realtime is not None:
         realtime_results = RaisedPriority(
             job.realtime.supervision_priority, job.realtime.cpu
-        ).request()
+        ).request_priority()
     try:
         writer = SessionWriter(job.path)
     except SessionError as error:
@@ -102,11 +102,11 @@ def _record_until_closed(
 ) -> None:
     """Write the records of the rings until the supervisor requests the end, or has ended."""
     recorder = Recorder(channels, writer)
-    polled_s = time.monotonic()
+    last_poll_s = time.monotonic()
     while True:
-        has_transferred = recorder.transfer()
-        if time.monotonic() - polled_s > _DISK_POLL_S:
-            polled_s = time.monotonic()
+        has_transferred = recorder.transfer_records()
+        if time.monotonic() - last_poll_s > _DISK_POLL_S:
+            last_poll_s = time.monotonic()
             _publish_free_space(channels.shared_state, disk_folder)
         try:
             message = parent.poll(0.0 if has_transferred else _IDLE_PAUSE_S)
@@ -118,7 +118,7 @@ def _record_until_closed(
                 recorder.header = message
                 parent.send(RecorderReady())
             case CloseFile(outcome, touches, segments):
-                recorder.transfer()
+                recorder.transfer_records()
                 if recorder.begun:
                     writer.write_touches(touches)
                     parent.send(recorder.close(outcome, segments))
@@ -171,23 +171,25 @@ class Recorder:
         """Header of the session; None until the supervisor has sent it."""
         self.begun = False
 
-    def _begin(self, file_header: FileHeader) -> None:
+    def _begin_file(self, file_header: FileHeader) -> None:
         """Write metadata, segments and attachments at the start of the file."""
-        attachments = {
+        attachment_bytes_by_name = {
             attachment_name: attachment_text.encode()
             for attachment_name, attachment_text in file_header.attachments.items()
         }
         start_utc_ns = self._channels.shared_state[StateField.START_UTC_NS]
-        self._writer.begin(start_utc_ns, file_header.metadata, file_header.segments, attachments)
+        self._writer.begin(
+            start_utc_ns, file_header.metadata, file_header.segments, attachment_bytes_by_name
+        )
         self.begun = True
 
-    def transfer(self) -> bool:
+    def transfer_records(self) -> bool:
         """Copy available records from the rings to the file, and return whether there were any."""
         self._channels.shared_state.beat(StateField.RECORDER_BEAT)
         if not self.begun:
             if self.header is None or not self._channels.shared_state[StateField.START_UTC_NS]:
                 return False
-            self._begin(self.header)
+            self._begin_file(self.header)
         has_transferred = False
         for ring, write_block in self._ring_writers:
             record_bytes = ring.take(_MAX_BLOCK_RECORDS)
@@ -220,7 +222,7 @@ class Recorder:
         segments
             Segments that were not known before the record. They may extend beyond its last tick.
         """
-        while self.transfer():
+        while self.transfer_records():
             pass
         accounted_ticks = self._recorded_samples + int(outcome["missed"])
         # A killed control process may not have counted its last sample.
@@ -242,7 +244,7 @@ class Recorder:
         }
         shared_state = self._channels.shared_state
         if self.header is not None and (
-            shared_state[StateField.PLANNED] or shared_state[StateField.LAST_SEGMENT]
+            shared_state[StateField.PLANNED_TICKS] or shared_state[StateField.LAST_SEGMENT]
         ):
             # Segments of a growing reference end with the record.
             segments = segments_until({**self.header.segments, **segments}, scheduled_ticks)
@@ -252,16 +254,16 @@ class Recorder:
     def close_without_supervisor(self) -> None:
         """Wait until the loop has stopped, and close the file without the supervisor's order."""
         shared_state = self._channels.shared_state
-        self.transfer()  # all of the record may still be in the rings
-        deadline_s = time.monotonic() + _ORPHAN_PATIENCE_S
+        self.transfer_records()  # all of the record may still be in the rings
+        deadline_s = time.monotonic() + _ORPHAN_TIMEOUT_S
         while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < deadline_s:
-            if self.transfer():
-                deadline_s = time.monotonic() + _ORPHAN_PATIENCE_S
+            if self.transfer_records():
+                deadline_s = time.monotonic() + _ORPHAN_TIMEOUT_S
             time.sleep(_IDLE_PAUSE_S)
         if self.header is None or not self.begun:
             self._writer.discard()
             return
-        scheduled_ticks = shared_state[StateField.SCHEDULED]
+        scheduled_ticks = shared_state[StateField.SCHEDULED_TICKS]
         is_complete = covers_reference(
             shared_state, scheduled_ticks, max(end for _, end in self.header.segments.values())
         )
@@ -272,8 +274,8 @@ class Recorder:
                 if is_complete
                 else "The supervising process ended during the session.",
                 "scheduled": str(scheduled_ticks),
-                "missed": str(shared_state[StateField.MISSED]),
-                "late": str(shared_state[StateField.LATE]),
+                "missed": str(shared_state[StateField.MISSED_TICKS]),
+                "late": str(shared_state[StateField.LATE_TICKS]),
                 "stale_angles": str(shared_state[StateField.STALE_ANGLES]),
                 "stale_wrenches": str(shared_state[StateField.STALE_WRENCHES]),
             }

@@ -4,7 +4,7 @@ The control process does not pause to receive a reference in shared memory. Howe
 session is, a drive that monitors the loop's heartbeat sees no gap.
 
 The fit process appends segments, which the control process follows. As in a ring, the angles are
-written before the field that announces them (`StateField.PLANNED`). The control process never
+written before the field that announces them (`StateField.PLANNED_TICKS`). The control process never
 waits for a segment: it holds the last angle until the next segment arrives.
 """
 
@@ -12,7 +12,7 @@ import mmap
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rigd.engine._ring import reserve
+from rigd.engine._ring import reserve_memory
 from rigd.engine.shared_state import SharedState, StateField
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def write_reference(
         If there is not enough shared memory.
     """
     reference_bytes = _DOUBLE_BYTES * reference_rad.size
-    reserve(fd, reference_bytes)
+    reserve_memory(fd, reference_bytes)
     with mmap.mmap(fd, reference_bytes) as shared_memory:
         # Without a copy: that of an hour would take 30 MB.
         shared_memory[:] = reference_rad.astype("float64", "C", copy=False).data.cast("B")
@@ -92,7 +92,7 @@ def covers_reference(shared_state: SharedState, scheduled_ticks: int, reference_
     return (
         bool(shared_state[StateField.LAST_SEGMENT])
         and scheduled_ticks
-        >= shared_state[StateField.PLANNED] + shared_state[StateField.HELD_TICKS]
+        >= shared_state[StateField.PLANNED_TICKS] + shared_state[StateField.HELD_TICKS]
         > 0
     )
 
@@ -105,7 +105,7 @@ class ReferenceWriter:
     spec
         Reference that already contains the first segment.
     shared_state
-        State that announces the planned ticks (`StateField.PLANNED`).
+        State that announces the planned ticks (`StateField.PLANNED_TICKS`).
     """
 
     def __init__(self, spec: ReferenceSpec, shared_state: SharedState) -> None:
@@ -146,7 +146,7 @@ class ReferenceWriter:
         )
         self.ticks += segment_ticks
         self.room -= segment_ticks
-        self._shared_state[StateField.PLANNED] = self.ticks
+        self._shared_state[StateField.PLANNED_TICKS] = self.ticks
 
 
 class ReferenceReader:
@@ -162,10 +162,10 @@ class ReferenceReader:
     planned_ticks
         Number of ticks that are planned at the start.
     shared_state
-        State in which the writer announces the planned ticks (`StateField.PLANNED`) and the last
-        segment (`StateField.LAST_SEGMENT`). The reader writes to it the number of held ticks
-        (`StateField.HELD_TICKS`), and for the segment that began last the number of held ticks
-        before it (`HELD_TICKS_BEFORE_SEGMENT`) and its end (`BEGUN_REFERENCE_TICKS`).
+        State in which the writer announces the planned ticks (`StateField.PLANNED_TICKS`) and
+        the last segment (`StateField.LAST_SEGMENT`). The reader writes to it the number of held
+        ticks (`StateField.HELD_TICKS`), and for the segment that began last the number of held
+        ticks before it (`HELD_TICKS_BEFORE_SEGMENT`) and its end (`BEGUN_REFERENCE_TICKS`).
     """
 
     def __init__(
@@ -173,11 +173,11 @@ class ReferenceReader:
     ) -> None:
         self._reference_rad = reference_rad
         self._planned_ticks = planned_ticks
-        self._announced_ticks = shared_state.view(StateField.PLANNED)
-        self._last_segment = shared_state.view(StateField.LAST_SEGMENT)
-        self._held_ticks = shared_state.view(StateField.HELD_TICKS)
-        self._held_ticks_before = shared_state.view(StateField.HELD_TICKS_BEFORE_SEGMENT)
-        self._begun_ticks = shared_state.view(StateField.BEGUN_REFERENCE_TICKS)
+        self._announced_ticks = shared_state.field_view(StateField.PLANNED_TICKS)
+        self._last_segment = shared_state.field_view(StateField.LAST_SEGMENT)
+        self._held_ticks = shared_state.field_view(StateField.HELD_TICKS)
+        self._held_ticks_before = shared_state.field_view(StateField.HELD_TICKS_BEFORE_SEGMENT)
+        self._begun_ticks = shared_state.field_view(StateField.BEGUN_REFERENCE_TICKS)
         self._held_tick_count = 0
 
     def reference_at(self, tick: int) -> float:

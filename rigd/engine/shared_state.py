@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Literal, Self
 
-from rigd.engine._ring import Ring, reserve
+from rigd.engine._ring import Ring, reserve_memory
 
 # Fields
 
@@ -51,12 +51,12 @@ class Phase(IntEnum):
     """Probing move before a session."""
 
     @property
-    def words(self) -> str:
+    def display_text(self) -> str:
         """Name of the phase as text for the operator, such as "recording"."""
-        return _OPERATOR_NAMES.get(self, self.name.lower())
+        return _OPERATOR_PHASE_NAMES.get(self, self.name.lower())
 
 
-_OPERATOR_NAMES = {
+_OPERATOR_PHASE_NAMES = {
     Phase.RUNNING: "recording",
     Phase.OFF: "drive off",
     Phase.WAITING: "waiting for the beam to rest",
@@ -81,7 +81,7 @@ class Activity(StrEnum):
 
 
 class StopReason(IntEnum):
-    """Reason why the supervisor requests a stop, a value of :attr:`StateField.STOP`."""
+    """Reason why the supervisor requests a stop, a value of :attr:`StateField.STOP_REASON`."""
 
     NONE = 0
     """No stop is requested."""
@@ -95,9 +95,9 @@ class StateField(IntEnum):
     """Fields of the :class:`SharedState`, by their indices in the memory."""
 
     # Written by the supervisor
-    STOP = 0
+    STOP_REASON = 0
     """Reason for a requested stop, a value of :class:`StopReason`."""
-    GO = 1
+    RECORD_MAY_START = 1
     """Whether the record may begin, because the recorder is ready: 1, otherwise 0."""
     SUPERVISOR_BEAT = 2
     """Heartbeat count of the supervisor. Each process increments its count several times a second;
@@ -107,13 +107,13 @@ class StateField(IntEnum):
     """Phase of the control process, a value of :class:`Phase`."""
     START_UTC_NS = 4
     """UTC time of tick 0 in ns since 1970; 0: the record has not begun."""
-    SCHEDULED = 5
+    SCHEDULED_TICKS = 5
     """Number of ticks of the record so far, including missed and lost ticks."""
-    MISSED = 6
+    MISSED_TICKS = 6
     """Number of ticks of the record that were missed."""
-    LATE = 7
+    LATE_TICKS = 7
     """Number of ticks of the record with a late wake-up."""
-    LOST = 8
+    LOST_SAMPLES = 8
     """Number of samples of the record that were lost because the ring was full."""
     ANGLE_NRAD = 9
     """Last angle of the motor in 1e-9 rad."""
@@ -124,18 +124,18 @@ class StateField(IntEnum):
     CONTROL_BEAT = 12
     """Heartbeat count of the control process."""
     BUS_LOAD_PPM = 17
-    """Measured load of the busiest bus or serial line in ppm, or UNKNOWN."""
+    """Measured load of the busiest bus or serial line in ppm, or UNKNOWN_VALUE."""
     BUS_ERRORS = 18
-    """Number of errors on all bus and serial lines since the connection, or UNKNOWN."""
+    """Number of errors on all bus and serial lines since the connection, or UNKNOWN_VALUE."""
     SENSOR_STATUS = 19
-    """Status word of the sensor, with 0 for no fault, or UNKNOWN."""
+    """Status word of the sensor, with 0 for no fault, or UNKNOWN_VALUE."""
     # Written by the recorder
     RECORDER_BEAT = 13
     """Heartbeat count of the recorder process."""
     DISK_FREE_MB = 14
     """Free space on the disk of the session file, in 10⁶ bytes, at least 1; 0: not known yet."""
     # Written by the live publisher
-    LIVE_DROPPED = 15
+    LIVE_SAMPLES_DROPPED = 15
     """Number of samples that the live publisher did not show in time."""
     LIVE_BEAT = 16
     """Heartbeat count of the live publisher."""
@@ -160,14 +160,14 @@ class StateField(IntEnum):
     # Written by the fit process
     FIT_BEAT = 26
     """Heartbeat count of the fit process."""
-    PLANNED = 27
+    PLANNED_TICKS = 27
     """Number of ticks planned so far of a reference that grows during the session."""
     # Written by the supervisor
     LAST_SEGMENT = 28
     """Whether no further segments follow the planned ones: 1, otherwise 0."""
 
 
-UNKNOWN = -1
+UNKNOWN_VALUE = -1
 """Value of a field about a bus or serial line that does not exist or does not report."""
 
 
@@ -188,7 +188,7 @@ class SharedState:
     @classmethod
     def create(cls, fd: int) -> Self:
         """Reserve shared memory at descriptor `fd`, and return the state with all fields 0."""
-        reserve(fd, 8 * len(StateField))
+        reserve_memory(fd, 8 * len(StateField))
         return cls(fd)
 
     def __getitem__(self, field: StateField) -> int:
@@ -197,11 +197,11 @@ class SharedState:
     def __setitem__(self, field: StateField, value: int) -> None:
         self._fields[field] = value
 
-    def known(self, field: StateField) -> int | None:
-        """Return the value of a field of the shared state, or None if it is `UNKNOWN`."""
-        return None if (field_value := self._fields[field]) == UNKNOWN else field_value
+    def known_value(self, field: StateField) -> int | None:
+        """Return the value of a field of the shared state, or None if it is `UNKNOWN_VALUE`."""
+        return None if (field_value := self._fields[field]) == UNKNOWN_VALUE else field_value
 
-    def view(self, field: StateField) -> "memoryview[int]":
+    def field_view(self, field: StateField) -> "memoryview[int]":
         """Return a view of one field, for quick access: ``view[0]`` is the value."""
         return self._fields[field : field + 1]
 
@@ -225,9 +225,9 @@ LEVELS: tuple[Level, ...] = ("debug", "info", "warning", "error", "fatal")
 
 EVENT_SIZE = 512
 """Size of a log event in its ring, in bytes."""
-_HEADER = struct.Struct("<qBH")
+_EVENT_HEADER = struct.Struct("<qBH")
 """Binary header of an event: time in ns, index of the level, length of the text in bytes."""
-_TEXT_SIZE = EVENT_SIZE - _HEADER.size
+_MAX_EVENT_TEXT_BYTES = EVENT_SIZE - _EVENT_HEADER.size
 """Largest length of an event's text in bytes."""
 
 
@@ -258,11 +258,11 @@ def write_event(ring: Ring, log_event: LogEvent) -> None:
     slot_offset = ring.next_slot()
     if slot_offset < 0:
         return
-    message_bytes = log_event.message.encode()[:_TEXT_SIZE]
-    _HEADER.pack_into(
+    message_bytes = log_event.message.encode()[:_MAX_EVENT_TEXT_BYTES]
+    _EVENT_HEADER.pack_into(
         ring.buffer, slot_offset, log_event.t_ns, LEVELS.index(log_event.level), len(message_bytes)
     )
-    text_offset = slot_offset + _HEADER.size
+    text_offset = slot_offset + _EVENT_HEADER.size
     ring.buffer[text_offset : text_offset + len(message_bytes)] = message_bytes
     ring.publish()
 
@@ -271,8 +271,8 @@ def read_events(event_bytes: bytes) -> list[LogEvent]:
     """Decode the log events in a block of bytes that :meth:`Ring.take` returned."""
     events = []
     for event_offset in range(0, len(event_bytes), EVENT_SIZE):
-        t_ns, level, text_bytes = _HEADER.unpack_from(event_bytes, event_offset)
-        text_offset = event_offset + _HEADER.size
+        t_ns, level, text_bytes = _EVENT_HEADER.unpack_from(event_bytes, event_offset)
+        text_offset = event_offset + _EVENT_HEADER.size
         message_text = event_bytes[text_offset : text_offset + text_bytes].decode(errors="replace")
         events.append(LogEvent(t_ns, LEVELS[level], message_text))
     return events
@@ -296,11 +296,11 @@ def activity(shared_state: SharedState) -> Activity:
     <Activity.PREPARING: 'preparing'>
     """
     phase = Phase(shared_state[StateField.PHASE])
-    if shared_state[StateField.STOP] != StopReason.NONE:
+    if shared_state[StateField.STOP_REASON] != StopReason.NONE:
         return Activity.STOPPING
     if phase is Phase.RUNNING:
         return Activity.RUNNING
     # Until tick 0 the phase may be that of the session before.
-    if shared_state[StateField.GO] and phase is not Phase.READY:
+    if shared_state[StateField.RECORD_MAY_START] and phase is not Phase.READY:
         return Activity.FINISHING if phase is Phase.OFF else Activity.RETURNING
     return Activity.PREPARING

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Protocol
 
-SUSPENDED_S = 0.01
+MIN_SUSPENSION_S = 0.01
 """Result of :meth:`SuspendMonitor.suspended_s` in s above which the computer was suspended; any
 real suspend takes longer."""
 MAX_VIRTUAL_PAUSE_S = 1.0
@@ -105,16 +105,16 @@ class SuspendMonitor:
         self._monotonic_ns = monotonic_ns
         self._boot_ns = boot_ns or _clock_since_boot()
         # In this order a delay between the two readings is never mistaken for a suspend.
-        before_ns = self._monotonic_ns()
-        self._ahead_ns = self._boot_ns() - before_ns
+        monotonic_before_ns = self._monotonic_ns()
+        self._initial_lead_ns = self._boot_ns() - monotonic_before_ns
 
     def suspended_s(self) -> float:
         """Return the time in s for which the computer was suspended since this object was created.
 
         A call takes about a microsecond, so call it every few ticks only.
         """
-        ahead_ns = self._boot_ns() - self._monotonic_ns()
-        return max(0, ahead_ns - self._ahead_ns) * 1e-9
+        boot_clock_lead_ns = self._boot_ns() - self._monotonic_ns()
+        return max(0, boot_clock_lead_ns - self._initial_lead_ns) * 1e-9
 
 
 def _clock_since_boot() -> Callable[[], int]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.engine._ring import Observer
+from rigd.engine._ring import RingObserver
 from rigd.engine.channels import attach_channels
 from rigd.engine.messages import TouchJob, TouchReady, TouchReport
 from rigd.engine.processes import SupervisorConnection
@@ -47,7 +47,7 @@ def main() -> None:
     if job.realtime is not None:
         pin_off_loop_core(job.realtime.cpu)
     channels = attach_channels(job.channels)
-    sample_reader = Observer(channels.samples, job.first_index)
+    sample_reader = RingObserver(channels.samples, job.first_index)
     estimator = TouchEstimator(job.model, job.rate_hz)
     parent.send(TouchReady())
     running_estimator = RunningTouchEstimator(estimator, job)
@@ -75,7 +75,7 @@ class _PendingTouch:
     """Number of the touch in its session, from 1 on."""
     tick: int
     """Tick at which the touch was detected."""
-    free_from_tick: int
+    contact_end_tick: int
     """First tick at which the beam is free again after the previous touch."""
     estimate: GrowingEstimate
     """Estimate of the touch, which improves as samples arrive."""
@@ -111,7 +111,7 @@ class RunningTouchEstimator:
         )
         self._samples: NDArray[np.void] | None = None
         self._pending_touches: deque[_PendingTouch] = deque()
-        self._free_from_tick = 0
+        self._contact_end_tick = 0
         self._count = 0
         self._record_ended = False
 
@@ -132,9 +132,9 @@ class RunningTouchEstimator:
             self._count += 1
             estimate = self._estimator.follow()
             self._pending_touches.append(
-                _PendingTouch(self._count, tick, self._free_from_tick, estimate)
+                _PendingTouch(self._count, tick, self._contact_end_tick, estimate)
             )
-            self._free_from_tick = tick + self._contact_ticks
+            self._contact_end_tick = tick + self._contact_ticks
         self._record_ended |= bool(new_samples["status"][-1] & Status.TORQUE_OFF)
         if not self._pending_touches:
             self._samples = self._samples[-self._history_ticks :]
@@ -150,40 +150,48 @@ class RunningTouchEstimator:
         available_ticks = int(self._samples["tick"][-1]) - pending_touch.tick + 1
         is_final = self._record_ended or available_ticks >= self._final_ticks
         # In real time the operator waits for the first estimate, even if the record is complete.
-        is_first = self._job.realtime is not None or not is_final
-        if available_ticks >= self._first_ticks and is_first and not pending_touch.reported:
+        sends_first_estimate = self._job.realtime is not None or not is_final
+        if (
+            available_ticks >= self._first_ticks
+            and sends_first_estimate
+            and not pending_touch.reported
+        ):
             pending_touch.reported = True
-            return [self._estimate(pending_touch, self._first_ticks, is_final=False)]
+            return [self._touch_report(pending_touch, self._first_ticks, is_final=False)]
         if is_final:
             self._pending_touches.popleft()
-            return [self._estimate(pending_touch, self._final_ticks, is_final=True)]
+            return [self._touch_report(pending_touch, self._final_ticks, is_final=True)]
         if available_ticks >= self._preview_ticks and not pending_touch.previewed:
             pending_touch.previewed = True
-            record, _ = self._record(pending_touch, self._preview_ticks)
+            record, _ = self._record_around_touch(pending_touch, self._preview_ticks)
             pending_touch.estimate.preview(record)
         return []
 
-    def _estimate(
-        self, pending_touch: _PendingTouch, after_ticks: int, *, is_final: bool
+    def _touch_report(
+        self, pending_touch: _PendingTouch, ticks_after_touch: int, *, is_final: bool
     ) -> TouchReport:
-        """Return the estimate of a touch from samples up to `after_ticks` after its detection."""
-        record, start_s = self._record(pending_touch, after_ticks)
+        """Return the estimate of a touch from the samples up to a number of ticks after it."""
+        record, start_s = self._record_around_touch(pending_touch, ticks_after_touch)
         touch_estimate = pending_touch.estimate.update(record, scan=False, first=not is_final)
-        document = touch_estimate.as_dict(start_s)
-        return TouchReport(pending_touch.number, pending_touch.tick, is_final, document)
+        estimate_document = touch_estimate.as_dict(start_s)
+        return TouchReport(pending_touch.number, pending_touch.tick, is_final, estimate_document)
 
-    def _record(self, pending_touch: _PendingTouch, after_ticks: int) -> tuple[TouchRecord, float]:
-        """Return the samples around a touch, up to `after_ticks` after its detection.
+    def _record_around_touch(
+        self, pending_touch: _PendingTouch, ticks_after_touch: int
+    ) -> tuple[TouchRecord, float]:
+        """Return the samples around a touch, up to `ticks_after_touch` after its detection.
 
         Also returns their start time in s since the start of the session's record.
         """
         assert self._samples is not None
         job = self._job
         # Soon after another touch the beam may not have been free: the estimate is then unknown.
-        free_from_tick = min(pending_touch.free_from_tick, pending_touch.tick)
-        samples = around_touch(self._samples, pending_touch.tick, job.rate_hz, free_from_tick)
+        contact_end_tick = min(pending_touch.contact_end_tick, pending_touch.tick)
+        samples = around_touch(self._samples, pending_touch.tick, job.rate_hz, contact_end_tick)
         record = touch_record(samples, pending_touch.tick, job.rate_hz, job.shear_projection)
-        return record.until(record.detected + after_ticks), int(samples["tick"][0]) / job.rate_hz
+        return record.until(record.detected + ticks_after_touch), int(
+            samples["tick"][0]
+        ) / job.rate_hz
 
 
 if __name__ == "__main__":

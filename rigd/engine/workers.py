@@ -16,7 +16,7 @@ from rigd.engine.shared_state import StateField
 class MemoryLimit:
     """Limit of a worker's address space, as a fraction of the memory that is available."""
 
-    fraction: float
+    available_fraction: float
     """Fraction of the available memory that the worker may use."""
     min_bytes: int
     """Memory in bytes that the worker may use in any case."""
@@ -32,7 +32,7 @@ class MemoryLimit:
             File in which the system states the available memory.
         """
         available_text = meminfo.read_text().partition("MemAvailable:")[2].split()[0]
-        allowed_bytes = int(self.fraction * int(available_text) * 1024)
+        allowed_bytes = int(self.available_fraction * int(available_text) * 1024)
         return min(max(allowed_bytes, self.min_bytes), self.max_bytes)
 
 
@@ -44,10 +44,10 @@ class Worker:
     """Name of the process in messages to the operator."""
     module: str
     """Module that is run as ``python -m module``; empty for the supervisor."""
-    sends: tuple[str, ...] = ()
+    sent_messages: tuple[str, ...] = ()
     """Class names of the messages that the process sends; the first one means that it is ready.
     Empty for a program, whose results are files and an exit code."""
-    loss: Literal["fault", "warning", "nothing"]
+    loss_severity: Literal["fault", "warning", "nothing"]
     """How a dead or hung process is reported to the operator: fault, warning, or not at all."""
     consequence: str
     """Sentence for the operator that states what happens after the loss of the process."""
@@ -79,7 +79,7 @@ CONTROL: Final = Worker(
     name="control",
     module=CONTROL_MODULE,
     # It takes its real-time priority itself, as the profile states.
-    sends=(
+    sent_messages=(
         "DevicesConnected",
         "ReadyToRecord",
         "SessionFinished",
@@ -87,7 +87,7 @@ CONTROL: Final = Worker(
         "MeasurementRefused",
         "ControlEnded",
     ),
-    loss="fault",
+    loss_severity="fault",
     consequence="The drive's watchdog switches it off; the session ends as a fault.",
     beat=StateField.CONTROL_BEAT,
     max_silence_s=3.0,
@@ -96,8 +96,8 @@ CONTROL: Final = Worker(
 RECORDER: Final = Worker(
     name="recorder",
     module="rigd.engine.recorder",
-    sends=("FileOpened", "RecorderReady", "FileClosed", "ProcessFailed"),
-    loss="fault",
+    sent_messages=("FileOpened", "RecorderReady", "FileClosed", "ProcessFailed"),
+    loss_severity="fault",
     consequence="The session ends as a fault.",
     beat=StateField.RECORDER_BEAT,
     # A disk may stall for seconds; the number of waiting samples is checked instead.
@@ -108,8 +108,8 @@ RECORDER: Final = Worker(
 LIVE: Final = Worker(
     name="live",
     module="rigd.live.publisher",
-    sends=("LiveAddress", "LiveSessionShown", "ProcessFailed"),
-    loss="warning",
+    sent_messages=("LiveAddress", "LiveSessionShown", "ProcessFailed"),
+    loss_severity="warning",
     consequence="It is not restarted; the session continues.",
     restarts=3,
     beat=StateField.LIVE_BEAT,
@@ -120,8 +120,8 @@ LIVE: Final = Worker(
 TOUCH: Final = Worker(
     name="touch",
     module="rigd.engine.touch_estimator",
-    sends=("TouchReady", "TouchReport"),
-    loss="warning",
+    sent_messages=("TouchReady", "TouchReport"),
+    loss_severity="warning",
     consequence="Touches are detected but not estimated; the session continues.",
     beat=StateField.TOUCH_BEAT,
     start_timeout_s=60.0,  # it computes the responses of the beam first
@@ -133,8 +133,8 @@ TOUCH: Final = Worker(
 FIT: Final = Worker(
     name="fit",
     module="rigd.runner.fit_process",
-    sends=("FitReady", "FitReport", "PlannedSegment", "SearchEnded", "ProcessFailed"),
-    loss="warning",
+    sent_messages=("FitReady", "FitReport", "PlannedSegment", "SearchEnded", "ProcessFailed"),
+    loss_severity="warning",
     # A session that plans itself ends with what is planned instead.
     consequence="The session continues without fits.",
     beat=StateField.FIT_BEAT,
@@ -148,7 +148,7 @@ FIT: Final = Worker(
 SUPERVISOR: Final = Worker(
     name="supervisor",
     module="",
-    loss="fault",
+    loss_severity="fault",
     consequence="The control process ends the session as a fault.",
     beat=StateField.SUPERVISOR_BEAT,
     max_silence_s=2.0,
@@ -165,8 +165,8 @@ switches the torque off."""
 PAGE: Final = Worker(
     name="page",
     module="rigd.web",
-    sends=("PageAddress", "ProcessFailed"),
-    loss="warning",
+    sent_messages=("PageAddress", "ProcessFailed"),
+    loss_severity="warning",
     consequence="It is not started again; the rig does not need it.",
     restarts=4,
     end_timeout_s=3.0,
@@ -174,22 +174,22 @@ PAGE: Final = Worker(
 PREDICTION: Final = Worker(
     name="prediction",
     module="rigd.daemon.background",
-    sends=("JobPerformed",),
-    loss="nothing",
+    sent_messages=("JobPerformed",),
+    loss_severity="nothing",
     consequence="The client's request is refused.",
     end_timeout_s=0.0,
     niceness=19,  # it may run during a session
     # Apart from the control process of a session, the memory of no process is locked. A session of
     # two minutes needs 180 MiB, of which 120 MiB are the program.
-    memory=MemoryLimit(fraction=0.25, min_bytes=256 << 20, max_bytes=4 << 30),
+    memory=MemoryLimit(available_fraction=0.25, min_bytes=256 << 20, max_bytes=4 << 30),
     prefers_oom_kill=True,
     captures_stderr=True,
 )
 PLAN: Final = Worker(
     name="plan",
     module=PREDICTION.module,
-    sends=PREDICTION.sends,
-    loss="nothing",
+    sent_messages=PREDICTION.sent_messages,
+    loss_severity="nothing",
     consequence="The session is not started.",
     end_timeout_s=0.0,
     memory=PREDICTION.memory,
@@ -206,7 +206,7 @@ ONLINE_ESTIMATOR: Final = "analysis.online:OnlineEstimator"
 QUICK_LOOK: Final = Worker(
     name="quick look",
     module="analysis.quick_look",
-    loss="warning",
+    loss_severity="warning",
     consequence="The session has no quick look.",
     end_timeout_s=0.5,
     # Not the lowest priority, because other programs may never pause.
@@ -217,7 +217,7 @@ QUICK_LOOK: Final = Worker(
 REPORT: Final = Worker(
     name="report",
     module="analysis",
-    loss="warning",
+    loss_severity="warning",
     consequence="The report, campaign or export is not made.",
     end_timeout_s=5.0,
     niceness=None,

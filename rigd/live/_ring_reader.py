@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
-from rigd.engine import Observer, Ring
+from rigd.engine import Ring, RingObserver
 from rigd.engine.channels import EVENT, SAMPLE, TIMING, TOPICS, Channels
 from rigd.engine.shared_state import read_events
 from rigd.live.messages import LiveSession
@@ -112,7 +112,9 @@ class _RingReader:
     def __init__(self, ring: Ring, first_record: int, first_unshown: int) -> None:
         self._ring = ring
         # Overwritten records that an earlier publisher showed do not count as dropped.
-        self._observer = Observer(ring, max(first_record, min(first_unshown, ring.oldest_index)))
+        self._observer = RingObserver(
+            ring, max(first_record, min(first_unshown, ring.oldest_index))
+        )
         self._damaged_records = 0
         self.end: int | None = None
 

@@ -229,7 +229,7 @@ class _ShownSession:
         )
         # Continue the count of a previous publisher of the same session.
         self._dropped_before = (
-            shared_state[StateField.LIVE_DROPPED] if seen_samples > first_sample else 0
+            shared_state[StateField.LIVE_SAMPLES_DROPPED] if seen_samples > first_sample else 0
         )
         self.reader = SessionRecordReader(session, channels, seen_samples, earlier_response)
         self.backlog = Backlog(round(_MAX_QUEUED_S * session.description.rate_hz))
@@ -271,7 +271,7 @@ class _ShownSession:
     def _store_counts(self) -> None:
         """Store the counts of shown and dropped samples for a publisher that replaces this one."""
         shared_state = self._shared_state
-        shared_state[StateField.LIVE_DROPPED] = self.dropped
+        shared_state[StateField.LIVE_SAMPLES_DROPPED] = self.dropped
         shown_samples = self.reader.next_index - self.backlog.samples
         shared_state[StateField.LIVE_SAMPLES_SEEN] = max(
             shared_state[StateField.LIVE_SAMPLES_SEEN], shown_samples
@@ -510,12 +510,12 @@ class SessionStateReader:
         if silent_s > _SUPERVISOR_TIMEOUT_S:
             if session_phase in _TORQUE_PHASES:
                 return SUPERVISOR_SILENT
-            if shared_state[StateField.GO] and session_phase is Phase.OFF:
+            if shared_state[StateField.RECORD_MAY_START] and session_phase is Phase.OFF:
                 return SUPERVISOR_SILENT_TORQUE_OFF
         current_activity = activity(shared_state)
         if current_activity is Activity.PREPARING:
             return preparing(
-                "" if session_phase is Phase.OFF else f"{session_phase.words}.".capitalize()
+                "" if session_phase is Phase.OFF else f"{session_phase.display_text}.".capitalize()
             )
         return _ACTIVITY_BANNERS[current_activity]
 
@@ -560,17 +560,17 @@ class HealthReader:
         shared_state = self._shared_state
         self._next_reading_s = now_s + POLL_S
         # Until tick 0 the shared state has the counts of the previous session.
-        has_begun = bool(shared_state[StateField.GO])
+        has_begun = bool(shared_state[StateField.RECORD_MAY_START])
         scheduled_ticks, missed_ticks, late_ticks, lost_samples = (
             shared_state[state_field] if has_begun else 0
             for state_field in (
-                StateField.SCHEDULED,
-                StateField.MISSED,
-                StateField.LATE,
-                StateField.LOST,
+                StateField.SCHEDULED_TICKS,
+                StateField.MISSED_TICKS,
+                StateField.LATE_TICKS,
+                StateField.LOST_SAMPLES,
             )
         )
-        load_ppm = shared_state.known(StateField.BUS_LOAD_PPM)
+        load_ppm = shared_state.known_value(StateField.BUS_LOAD_PPM)
         return Health(
             missed_ticks=missed_ticks,
             late_ticks=late_ticks,
@@ -579,8 +579,8 @@ class HealthReader:
             disk_free_mb=shared_state[StateField.DISK_FREE_MB] or None,
             view_dropped=view_dropped,
             bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
-            bus_errors=shared_state.known(StateField.BUS_ERRORS),
-            sensor_status=shared_state.known(StateField.SENSOR_STATUS),
+            bus_errors=shared_state.known_value(StateField.BUS_ERRORS),
+            sensor_status=shared_state.known_value(StateField.SENSOR_STATUS),
             rate_hz=self._rate_hz(now_s, scheduled_ticks),
         )
 

@@ -117,7 +117,7 @@ class ProgressLine:
         # Before tick 0 the counter still has the value of the previous session.
         self._has_record_begun |= phase is Phase.RUNNING
         self._state = {
-            "description": f"{phase.words} {session_number_text}".rstrip(),
+            "description": f"{phase.display_text} {session_number_text}".rstrip(),
             "completed": tick if self._has_record_begun else 0,
             "total": total,
             "counts": f"{missed} missed, {late} late" if missed else "",

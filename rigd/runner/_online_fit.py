@@ -95,7 +95,7 @@ class FitClient(WorkerClient):
         def is_worth_waiting() -> bool:
             call_while_waiting()
             if (
-                self._shared_state[StateField.STOP] == StopReason.NONE
+                self._shared_state[StateField.STOP_REASON] == StopReason.NONE
                 or time.monotonic() <= stop_deadline_s
             ):
                 return True

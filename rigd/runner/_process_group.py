@@ -145,12 +145,12 @@ class ProcessGroup:
         OSError
             If there is not enough shared memory.
         """
-        from rigd.engine.channels import VIRTUAL_BUFFERED_S, create_channels
+        from rigd.engine.channels import VIRTUAL_CLOCK_BUFFER_S, create_channels
         from rigd.safety.limits import RECORDER_BUFFER_S
 
         # Readers of samples, such as a live view or a fit, are slower than the virtual clock.
         is_faster_than_observers = fast and (self.live or self._extra_processes or may_be_observed)
-        buffered_s = VIRTUAL_BUFFERED_S if is_faster_than_observers else RECORDER_BUFFER_S
+        buffered_s = VIRTUAL_CLOCK_BUFFER_S if is_faster_than_observers else RECORDER_BUFFER_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
 
     def _start(self, process: Worker) -> None:

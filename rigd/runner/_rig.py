@@ -319,7 +319,7 @@ class Rig:
         _reset_session_fields(shared_state)
 
         def request_stop() -> None:
-            shared_state[StateField.STOP] = StopReason.OPERATOR
+            shared_state[StateField.STOP_REASON] = StopReason.OPERATOR
 
         stop.on_request = request_stop
         if stop.requested:
@@ -431,7 +431,7 @@ class Rig:
         if group is not None:
             group.end()
         if self._raised_priority is not None:
-            self._raised_priority.restore()
+            self._raised_priority.restore_priority()
             self._raised_priority = None
 
     def _raise_priority(self, group: ProcessGroup) -> dict[str, str]:
@@ -445,7 +445,7 @@ class Rig:
         group.cores = self._raised_priority.cores_before
         return {
             f"supervisor_{setting_name}": setting_text
-            for setting_name, setting_text in self._raised_priority.request().items()
+            for setting_name, setting_text in self._raised_priority.request_priority().items()
         }
 
     def _reset_fault(self, target: ActuationTarget | None) -> None:
@@ -516,10 +516,10 @@ def _do_nothing_on_stop() -> None:
 
 def _reset_session_fields(shared_state: SharedState) -> None:
     """Reset the fields of the shared state that belong to a single session."""
-    shared_state[StateField.STOP] = StopReason.NONE
-    shared_state[StateField.GO] = 0
-    shared_state[StateField.LIVE_DROPPED] = 0
-    shared_state[StateField.PLANNED] = 0
+    shared_state[StateField.STOP_REASON] = StopReason.NONE
+    shared_state[StateField.RECORD_MAY_START] = 0
+    shared_state[StateField.LIVE_SAMPLES_DROPPED] = 0
+    shared_state[StateField.PLANNED_TICKS] = 0
     shared_state[StateField.LAST_SEGMENT] = 0
 
 

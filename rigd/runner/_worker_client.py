@@ -76,7 +76,7 @@ class WorkerClient(ABC):
         if not (self.failure or self._is_done):
             try:
                 for message in self._group[self.worker].messages(timeout_s):
-                    self._is_ready |= type(message).__name__ == self.worker.sends[0]
+                    self._is_ready |= type(message).__name__ == self.worker.sent_messages[0]
                     if isinstance(message, ProcessFailed):
                         self._process_failure(message.reason)
                     else:

@@ -20,7 +20,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.engine import Observer
+from rigd.engine import RingObserver
 from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.messages import FileHeader, FitJob, FitReady, FitReport, ProcessFailed, RecordEnded
 from rigd.engine.processes import SupervisorConnection
@@ -205,7 +205,7 @@ class _SessionFit:
         self._parent = parent
         self._estimator = EstimatorThread()
         self._shared_state = channels.shared_state
-        self._reader = Observer(channels.samples, job.first_index)
+        self._reader = RingObserver(channels.samples, job.first_index)
         self._job = job
         self._search: ExcitationPlanner | None = None
         self._pending: EstimateRequest | None = None  # request without an estimate so far

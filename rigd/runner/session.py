@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
-from rigd.engine import Observer
+from rigd.engine import RingObserver
 from rigd.engine.messages import (
     CloseFile,
     ControlEnded,
@@ -28,7 +28,7 @@ from rigd.engine.messages import (
     SessionJob,
 )
 from rigd.engine.processes import ChildError
-from rigd.engine.realtime import REFUSED
+from rigd.engine.realtime import REFUSED_PREFIX
 from rigd.engine.reference import covers_reference, write_reference
 from rigd.engine.shared_state import LogEvent, Phase, StateField, StopReason, read_events
 from rigd.engine.workers import CONTROL, RECORDER
@@ -53,9 +53,9 @@ _MAX_FILE_NAMES = 100
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
 _COUNTER_FIELDS = {
-    "scheduled": StateField.SCHEDULED,
-    "missed": StateField.MISSED,
-    "late": StateField.LATE,
+    "scheduled": StateField.SCHEDULED_TICKS,
+    "missed": StateField.MISSED_TICKS,
+    "late": StateField.LATE_TICKS,
     "stale_angles": StateField.STALE_ANGLES,
     "stale_wrenches": StateField.STALE_WRENCHES,
 }
@@ -247,7 +247,7 @@ class SessionSupervisor:
         self._connection = connection
         self._live = live
         self._shared_state = group.channels.shared_state
-        self._events = Observer(group.channels.events)
+        self._events = RingObserver(group.channels.events)
         self._on_progress = on_progress
         self._can_receive_stop = can_receive_stop
         self._is_virtual_clock = connection.realtime["clock"] == "virtual"
@@ -277,7 +277,7 @@ class SessionSupervisor:
         except (ChildError, SessionFailedError) as error:
             self._recorder_failure = self._recorder_failure or str(error)
             if self._is_control_busy:
-                self._shared_state[StateField.STOP] = StopReason.NO_RECORDER
+                self._shared_state[StateField.STOP_REASON] = StopReason.NO_RECORDER
                 self._await_control()
             failure_error = SessionFailedError(
                 f"{self._recorder_failure} {self._final_drive_state}"
@@ -290,7 +290,7 @@ class SessionSupervisor:
 
     def _request_stop(self) -> None:
         """Request the control process to stop the session."""
-        self._shared_state[StateField.STOP] = StopReason.OPERATOR
+        self._shared_state[StateField.STOP_REASON] = StopReason.OPERATOR
 
     def _run(self) -> SessionResult:
         """Start the processes of the session, supervise them to the end, and close the file."""
@@ -345,7 +345,7 @@ class SessionSupervisor:
             if self._fit is not None:
                 self._fit.begin(file_header_data)
             self._await_recorder(RecorderReady)
-            self._shared_state[StateField.GO] = 1
+            self._shared_state[StateField.RECORD_MAY_START] = 1
             control_message = self._await_control()
         if self._recorder_failure is not None:
             raise SessionFailedError(self._recorder_failure)
@@ -355,7 +355,7 @@ class SessionSupervisor:
     def _report_and_check_stop(self) -> bool:
         """Report progress before any motion; return False if a stop is requested."""
         self._report()
-        return self._shared_state[StateField.STOP] == StopReason.NONE
+        return self._shared_state[StateField.STOP_REASON] == StopReason.NONE
 
     def _open_file(self) -> None:
         """Start the recorder, which creates the session file; change the name if it is used."""
@@ -391,7 +391,7 @@ class SessionSupervisor:
             setting_name: setting_text
             for setting_name, setting_text in self._connection.realtime.items()
             if setting_name.startswith(("supervisor_", "recorder_"))
-            and setting_text.startswith(REFUSED)
+            and setting_text.startswith(REFUSED_PREFIX)
         }
 
     def _await_control(self) -> ReadyToRecord | SessionFinished:
@@ -415,7 +415,7 @@ class SessionSupervisor:
                 and not self._is_virtual_clock
             )
             if (
-                self._shared_state[StateField.STOP] == StopReason.NONE
+                self._shared_state[StateField.STOP_REASON] == StopReason.NONE
                 or self._shared_state[StateField.PHASE] != last_phase
             ):
                 last_phase = self._shared_state[StateField.PHASE]
@@ -433,7 +433,7 @@ class SessionSupervisor:
             if self._recorder_failure is None:
                 self._recorder_failure = self._recorder_failure_reason()
                 if self._recorder_failure is not None:
-                    self._shared_state[StateField.STOP] = StopReason.NO_RECORDER
+                    self._shared_state[StateField.STOP_REASON] = StopReason.NO_RECORDER
 
     def _checked_control_message(self, control_message: object) -> ReadyToRecord | SessionFinished:
         """Return a message of the control process, with ``ControlEnded`` as the session's end."""
@@ -491,7 +491,9 @@ class SessionSupervisor:
         shared_state = self._shared_state
         # Before the record of this session the counters are those of the previous one.
         return {
-            count_name: shared_state[state_field] if shared_state[StateField.GO] else 0
+            count_name: shared_state[state_field]
+            if shared_state[StateField.RECORD_MAY_START]
+            else 0
             for count_name, state_field in _COUNTER_FIELDS.items()
         }
 
@@ -554,9 +556,9 @@ class SessionSupervisor:
         self._on_progress(
             SessionProgress(
                 Phase(shared_state[StateField.PHASE]),
-                shared_state[StateField.SCHEDULED],
-                shared_state[StateField.MISSED],
-                shared_state[StateField.LATE],
+                shared_state[StateField.SCHEDULED_TICKS],
+                shared_state[StateField.MISSED_TICKS],
+                shared_state[StateField.LATE_TICKS],
                 tuple(new_fits),
             ),
             new_events,
@@ -615,7 +617,7 @@ class SessionSupervisor:
             fault=finished.fault
             or outcome_text == "fault"
             or (self._fit is not None and bool(self._fit.search_failure)),
-            live_dropped=self._shared_state[StateField.LIVE_DROPPED],
+            live_dropped=self._shared_state[StateField.LIVE_SAMPLES_DROPPED],
             touches=None if touch_documents is None else tuple(touch_documents),
             fit=fit,
         )

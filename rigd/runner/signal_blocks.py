@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.engine import Observer, Ring
+from rigd.engine import Ring, RingObserver
 from rigd.engine.channels import Channels
 from rigd.engine.shared_state import Phase, StateField
 from rigd.gauges import Gauge, Gauges
@@ -67,7 +67,7 @@ class SignalBlockReader:
         self._rate_hz = rig.rate_hz
         time_constant_s = rig.motor.thermal_time_constant_s
         self._gauges = Gauges(rig.rate_hz, gauge_limits(profile), time_constant_s)
-        self._ring_and_observer: tuple[Ring, Observer] | None = None
+        self._ring_and_observer: tuple[Ring, RingObserver] | None = None
         self._last_call_s = 0.0
         self._last_gauges_s = 0.0
         self._samples_since_gauges: list[npt.NDArray[Any]] = []
@@ -93,7 +93,7 @@ class SignalBlockReader:
             or self._ring_and_observer[0] is not sample_ring
             or now_s > self._last_call_s + _ABANDONED_AFTER_S
         ):
-            self._ring_and_observer = sample_ring, Observer(sample_ring)
+            self._ring_and_observer = sample_ring, RingObserver(sample_ring)
             self._last_tick = None
             self._samples_since_gauges = []
             self._gauges.forget_angle()
@@ -129,7 +129,7 @@ class SignalBlockReader:
         self._cooled_torque_nm(sample_array.size / self._rate_hz)
         return self._gauges.take(sample_array)
 
-    def _read_blocks(self, observer: Observer, end: int) -> Iterator[SignalBlock]:
+    def _read_blocks(self, observer: RingObserver, end: int) -> Iterator[SignalBlock]:
         """Yield the unread samples before position `end` of the ring buffer in blocks."""
         while observer.next_index < end:
             ring_bytes = observer.take(min(_MAX_BLOCK_TICKS, end - observer.next_index))

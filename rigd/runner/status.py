@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.engine import Observer, Ring
+from rigd.engine import Ring, RingObserver
 from rigd.engine.channels import TOPICS
 from rigd.engine.processes import Heartbeat
 from rigd.engine.shared_state import Activity, Phase, StateField, activity
@@ -59,7 +59,7 @@ class SignalStatisticsReader:
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
-        self._ring_and_observer: tuple[Ring, Observer] | None = None
+        self._ring_and_observer: tuple[Ring, RingObserver] | None = None
         self._recent_samples: deque[npt.NDArray[Any]] = deque()
         self._peaks = np.zeros(3)
 
@@ -73,7 +73,7 @@ class SignalStatisticsReader:
             window_position = max(
                 0, ring.written_count - round(_STATISTICS_WINDOW_S * self._rate_hz)
             )
-            self._ring_and_observer = ring, Observer(ring, window_position)
+            self._ring_and_observer = ring, RingObserver(ring, window_position)
         while ring_bytes := self._ring_and_observer[1].take(ring.capacity // 4):
             try:
                 sample_array = decode_samples(ring_bytes)
@@ -214,22 +214,22 @@ class StatusReader:
     def read(self, group: ProcessGroup) -> RigStatus:
         """Return the present status of the rig that these processes operate."""
         shared_state = group.channels.shared_state
-        load_ppm = shared_state.known(StateField.BUS_LOAD_PPM)
+        load_ppm = shared_state.known_value(StateField.BUS_LOAD_PPM)
         return RigStatus(
             phase=Phase(shared_state[StateField.PHASE]),
             activity=activity(shared_state),
             angle_rad=shared_state[StateField.ANGLE_NRAD] * 1e-9,
             coupling_torque_nm=shared_state[StateField.COUPLING_TORQUE_NNM] * 1e-9,
             torque_command_nm=shared_state[StateField.TORQUE_COMMAND_NNM] * 1e-9,
-            tick=shared_state[StateField.SCHEDULED],
-            missed=shared_state[StateField.MISSED],
-            late=shared_state[StateField.LATE],
-            lost=shared_state[StateField.LOST],
+            tick=shared_state[StateField.SCHEDULED_TICKS],
+            missed=shared_state[StateField.MISSED_TICKS],
+            late=shared_state[StateField.LATE_TICKS],
+            lost=shared_state[StateField.LOST_SAMPLES],
             bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
-            bus_errors=shared_state.known(StateField.BUS_ERRORS),
-            sensor_status=shared_state.known(StateField.SENSOR_STATUS),
+            bus_errors=shared_state.known_value(StateField.BUS_ERRORS),
+            sensor_status=shared_state.known_value(StateField.SENSOR_STATUS),
             disk_free_mb=shared_state[StateField.DISK_FREE_MB] or None,
-            view_dropped=shared_state[StateField.LIVE_DROPPED],
+            view_dropped=shared_state[StateField.LIVE_SAMPLES_DROPPED],
             signals=self._signals.poll(group.channels.samples),
             processes=tuple(self._process_statuses(group)),
             topics=tuple(self._topic_statuses(group)),

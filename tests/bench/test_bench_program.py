@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from rigd.bench import Bench, as_json, cores_without_loop, report_lines
-from rigd.engine.realtime import REFUSED
+from rigd.engine.realtime import REFUSED_PREFIX
 from rigd.profile import load_profile
 
 
@@ -98,7 +98,7 @@ def test_measurement_without_cyclictest(bench, cyclictest, monkeypatch, installe
 
 
 def test_cyclictest_runs_with_the_rights_of_the_loop(bench, computer, cyclictest):
-    computer.granted["scheduling"] = f"{REFUSED}not permitted"
+    computer.granted["scheduling"] = f"{REFUSED_PREFIX}not permitted"
     results = bench()
     calls = cyclictest.calls.read_text().splitlines()
     assert len(calls) == 3
@@ -139,7 +139,7 @@ def test_cores_without_the_loop(monkeypatch):
     assert cores_without_loop({"cpu": "2"}) == {0, 1}
     assert cores_without_loop({"cpu": "2, isolated"}) == {0, 1}
     monkeypatch.setattr("rigd.bench._program.os.sched_getaffinity", lambda _: {0})
-    assert cores_without_loop({"cpu": f"{REFUSED}no"}) == {0}
+    assert cores_without_loop({"cpu": f"{REFUSED_PREFIX}no"}) == {0}
 
 
 @pytest.mark.parametrize("name", ["sim", "antenna_can", "antenna_serial"])

@@ -46,7 +46,7 @@ def test_recorder_alone_recognises_a_whole_record(channels, tmp_path, ticks, out
         pack_sample_into(ring.buffer, ring.next_slot(), tick * 10**6, tick, *[0.0] * 10, 0, 0, 0)
         ring.publish()
     shared_state[StateField.START_UTC_NS] = 10**18
-    shared_state[StateField.SCHEDULED] = ticks
+    shared_state[StateField.SCHEDULED_TICKS] = ticks
     shared_state[StateField.PHASE] = Phase.OFF
     recorder.close_without_supervisor()  # which finds all of it in the rings
     session = read_session(tmp_path / "alone.mcap")

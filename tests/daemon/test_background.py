@@ -102,7 +102,7 @@ def test_job_is_killed_first_if_memory_is_short():
 @pytest.mark.process
 def test_prediction_without_enough_memory_is_refused(profile, monkeypatch):
     without_memory = replace(
-        PREDICTION, memory=replace(PREDICTION.memory, fraction=0.0), niceness=0
+        PREDICTION, memory=replace(PREDICTION.memory, available_fraction=0.0), niceness=0
     )
     monkeypatch.setattr(background.PredictionJob, "worker", without_memory)
     job = background.PredictionJob(profile, "chirp", {"duration_s": 2300.0}, False, "")

@@ -158,7 +158,7 @@ class Session:
         self.drive = WatchedDrive(devices.drive)
         self.devices = Devices(self.drive, devices.sensor, True, devices.renew_noise)
         self.clock = clock or VirtualClock()
-        self.shared_state[StateField.GO] = 1
+        self.shared_state[StateField.RECORD_MAY_START] = 1
 
     def run(self):
         return self.obey(self.order())

@@ -193,7 +193,7 @@ def test_a_hanging_supervisor_ends_the_session(make_session):
         calls.append(1)
         if (
             session.shared_state[StateField.PHASE] != Phase.RUNNING
-            or session.shared_state[StateField.SCHEDULED] < 500
+            or session.shared_state[StateField.SCHEDULED_TICKS] < 500
         ):
             session.shared_state.beat(StateField.SUPERVISOR_BEAT)
         return True
@@ -220,7 +220,7 @@ def test_a_suspend_of_the_computer_ends_the_session(make_session, monkeypatch):
     read_angle = session.drive.read_angle
 
     def suspended():
-        if session.shared_state[StateField.SCHEDULED] == 1000:
+        if session.shared_state[StateField.SCHEDULED_TICKS] == 1000:
             boot_ns[0] = 90_000_000_000
         return read_angle()
 

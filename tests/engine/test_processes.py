@@ -70,7 +70,7 @@ def test_no_wait_for_an_invalid_message(pipe):
     read, write = pipe
     os.write(write, b"Warning: something has been printed\n")
     with pytest.raises(ValueError, match="no message, but b'Warning: "):
-        MessageReader(read).next(0.0)
+        MessageReader(read).next_message(0.0)
 
 
 @pytest.mark.process

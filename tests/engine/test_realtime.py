@@ -184,7 +184,7 @@ def as_child():
 
 told = dict(before=state())
 raised_priority = RaisedPriority({priority}, {cpu}, root_folder=Path("{root}"))
-told["obtained"], told["with"] = raised_priority.request(), state()
+told["obtained"], told["with"] = raised_priority.request_priority(), state()
 wait = threading.Event()
 thread = threading.Thread(target=wait.wait, daemon=True)
 thread.start()
@@ -195,7 +195,7 @@ if {with_child}:
     rig_child = ChildProcess(RECORDER, cores=raised_priority.cores_before)
     told["cores of a process of the rig"] = sorted(os.sched_getaffinity(rig_child.pid))
     rig_child.stop()
-raised_priority.restore()
+raised_priority.restore_priority()
 told["after"], told["thread after"] = state(), state(thread.native_id)
 wait.set()
 print(json.dumps(told))

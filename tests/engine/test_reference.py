@@ -157,7 +157,7 @@ def test_a_segment_without_space_is_refused():
     writer, _, shared_state = growing(space=2)
     with pytest.raises(ValueError, match="room for 2"):
         writer.append(np.zeros(3))
-    assert shared_state[StateField.PLANNED] == 0
+    assert shared_state[StateField.PLANNED_TICKS] == 0
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_a_segment_not_beginning_and_ending_at_rest_is_refused(segment_rad):
     writer, _, shared_state = growing()
     with pytest.raises(ValueError, match="a segment from"):
         writer.append(np.array(segment_rad) / UNIT_RAD)
-    assert shared_state[StateField.PLANNED] == 0
+    assert shared_state[StateField.PLANNED_TICKS] == 0
 
 
 @given(
@@ -200,7 +200,7 @@ def test_angles_of_segments_are_followed_in_order(segments, missed):
 
 def wait_until_followed(session, ticks):
     """Wait until a session has followed so many ticks of its reference."""
-    assert eventually(lambda: session.shared_state[StateField.SCHEDULED] >= ticks)
+    assert eventually(lambda: session.shared_state[StateField.SCHEDULED_TICKS] >= ticks)
 
 
 def test_a_session_follows_segments_appended_while_running(make_session):
@@ -265,7 +265,7 @@ def test_a_stop_ends_the_wait_for_a_segment(make_session):
 
     def stop():
         wait_until_followed(session, 300)
-        session.shared_state[StateField.STOP] = StopReason.OPERATOR
+        session.shared_state[StateField.STOP_REASON] = StopReason.OPERATOR
 
     stopping = threading.Thread(target=stop)
     stopping.start()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.engine import Observer, Ring, shared_memory_fd
+from rigd.engine import Ring, RingObserver, shared_memory_fd
 
 RECORD = struct.Struct("<Q")
 
@@ -65,7 +65,7 @@ def test_a_full_ring_takes_no_more_until_something_is_read(ring):
 
 
 def test_an_observer_counts_missed_records_without_blocking(ring):
-    observer = Observer(ring)
+    observer = RingObserver(ring)
     for number in range(20):
         assert put(ring, number)
         ring.take(1)
@@ -76,7 +76,7 @@ def test_an_observer_counts_missed_records_without_blocking(ring):
 
 
 def test_an_observer_in_time_sees_everything(ring):
-    observer = Observer(ring)
+    observer = RingObserver(ring)
     seen = []
     for number in range(20):
         put(ring, number)

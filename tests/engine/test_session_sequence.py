@@ -112,12 +112,12 @@ class StopAt(VirtualClock):
     ("action", "outcome", "words"),
     [
         (
-            lambda s: s.shared_state.__setitem__(StateField.STOP, StopReason.OPERATOR),
+            lambda s: s.shared_state.__setitem__(StateField.STOP_REASON, StopReason.OPERATOR),
             "stopped",
             "operator",
         ),
         (
-            lambda s: s.shared_state.__setitem__(StateField.STOP, StopReason.NO_RECORDER),
+            lambda s: s.shared_state.__setitem__(StateField.STOP_REASON, StopReason.NO_RECORDER),
             "fault",
             "recorder",
         ),
@@ -133,7 +133,7 @@ def test_a_stop_leaves_the_torque_off(make_session, action, outcome, words, at_s
 @pytest.mark.parametrize("at_s", [0.3, 0.8])
 def test_a_stop_before_the_record_leaves_the_torque_off(make_session, at_s):
     def stop(session):
-        session.shared_state[StateField.STOP] = StopReason.OPERATOR
+        session.shared_state[StateField.STOP_REASON] = StopReason.OPERATOR
 
     assert_stop_leaves_torque_off(make_session(), stop, "stopped", "operator", at_s)
 
@@ -562,7 +562,7 @@ def test_refusals_of_supervisor_and_recorder_are_reported(make_session):
 def test_torque_ends_without_action_of_the_supervisor(make_session, monkeypatch):
     monkeypatch.setattr("rigd.engine._session_sequence._START_TIMEOUT_S", 0.2)
     session = make_session()
-    session.shared_state[StateField.GO] = 0
+    session.shared_state[StateField.RECORD_MAY_START] = 0
     session.run()
     session.assert_safe()
     assert session.finished.outcome == "fault"
@@ -659,10 +659,10 @@ def test_doubt_about_reading_age_is_reported_once_per_session(make_session):
     health = session.devices.sensor.health
 
     def doubtful():
-        late = session.shared_state[StateField.SCHEDULED] > 1000 or session.parent.messages_of(
-            SessionFinished
-        )
-        count = f"Late so far: {session.shared_state[StateField.SCHEDULED]}." if late else ""
+        late = session.shared_state[
+            StateField.SCHEDULED_TICKS
+        ] > 1000 or session.parent.messages_of(SessionFinished)
+        count = f"Late so far: {session.shared_state[StateField.SCHEDULED_TICKS]}." if late else ""
         return replace(health(), doubt="Records are late." if late else "", doubt_count=count)
 
     session.devices.sensor.health = doubtful

@@ -21,7 +21,7 @@ ARCHITECTURE = Path(__file__).parents[2] / "docs" / "architecture.md"
 def test_module_and_messages_of_each_row_exist(worker):
     assert find_spec(worker.module)
     elsewhere = {each.__name__ for each in (LiveAddress, LiveSessionShown)}
-    assert all(hasattr(messages, name) or name in elsewhere for name in worker.sends)
+    assert all(hasattr(messages, name) or name in elsewhere for name in worker.sent_messages)
 
 
 def test_the_estimator_of_the_fit_exists():

@@ -98,7 +98,7 @@ def record(profile, true_rig, scale, excitation):
         wrenches.append(cycle.raw_wrench)
     cycle.tare = tuple(np.mean(wrenches, axis=0))
     devices.drive.enable()
-    cycle.start(5e-3)
+    cycle.start_control(5e-3)
     rows = []
     for reference_rad in (cycle.angle_rad + excitation.reference_rad).tolist():
         violation = cycle.step(next(due), reference_rad)

@@ -59,7 +59,7 @@ class Producer(threading.Thread):
             for topic, fd in zip(TOPICS, for_rings, strict=True)
         ]
         self.channels = Channels(*rings, SharedState.create(for_shared_state))
-        self.channels.shared_state[StateField.GO] = 1
+        self.channels.shared_state[StateField.RECORD_MAY_START] = 1
         self.written = [0] * len(rings)
         self.tick = 0
         self.refused = 0
@@ -67,7 +67,7 @@ class Producer(threading.Thread):
 
     @property
     def dropped(self) -> int:
-        return self.channels.shared_state[StateField.LIVE_DROPPED]
+        return self.channels.shared_state[StateField.LIVE_SAMPLES_DROPPED]
 
     def run(self) -> None:
         write_event(self.channels.events, LogEvent(0, "info", "Record starts"))
@@ -112,7 +112,7 @@ class Producer(threading.Thread):
             )  # fmt: skip
             samples.publish()
         self.tick += 1
-        self.channels.shared_state[StateField.SCHEDULED] = self.tick
+        self.channels.shared_state[StateField.SCHEDULED_TICKS] = self.tick
 
 
 def reference_rad(t_s):
@@ -226,7 +226,7 @@ class Publisher:
     def _receive(self, kind: type) -> object:
         """Return its next message of a kind, or of its failure."""
         while True:
-            message = self._messages.next(300.0)
+            message = self._messages.next_message(300.0)
             assert message is not None, "the publisher does not answer"
             if isinstance(message, kind | ProcessFailed):
                 return message
@@ -451,7 +451,7 @@ def send():
 
 
 def read_message(pipe, timeout_s: float = 60.0) -> object:
-    return MessageReader(pipe.fileno()).next(timeout_s)
+    return MessageReader(pipe.fileno()).next_message(timeout_s)
 
 
 @pytest.fixture

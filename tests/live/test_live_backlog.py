@@ -80,10 +80,10 @@ def test_overwritten_samples_are_counted(start_producer):
 def test_health_in_units_of_the_view(channels):
     shared_state = channels.shared_state
     for word, value in {
-        StateField.GO: 1,
-        StateField.MISSED: 3,
-        StateField.LATE: 7,
-        StateField.LOST: 2,
+        StateField.RECORD_MAY_START: 1,
+        StateField.MISSED_TICKS: 3,
+        StateField.LATE_TICKS: 7,
+        StateField.LOST_SAMPLES: 2,
         StateField.DISK_FREE_MB: 12_000,
         StateField.BUS_LOAD_PPM: 345_000,
         StateField.BUS_ERRORS: 4,
@@ -109,26 +109,26 @@ def test_absent_values_of_health_are_unknown(channels):
 
 
 def test_counts_of_the_session_before_are_ignored(channels):
-    channels.shared_state[StateField.MISSED] = 5
+    channels.shared_state[StateField.MISSED_TICKS] = 5
     reader = HealthReader(channels)
     assert reader.read(0.0, view_dropped=0).missed_ticks == 0
-    channels.shared_state[StateField.GO] = 1
+    channels.shared_state[StateField.RECORD_MAY_START] = 1
     assert reader.read(1.0, view_dropped=0).missed_ticks == 5
 
 
 def test_rate_is_that_of_the_last_second(channels):
     reader, shared_state = HealthReader(channels), channels.shared_state
-    shared_state[StateField.GO] = 1
+    shared_state[StateField.RECORD_MAY_START] = 1
     rates = []
     for poll in range(20):
         now_s = poll * POLL_S
         assert reader.is_due(now_s)
-        shared_state[StateField.SCHEDULED] = round(
+        shared_state[StateField.SCHEDULED_TICKS] = round(
             1000 * now_s if poll < 10 else 1250 + 500 * now_s
         )
         rates.append(reader.read(now_s, view_dropped=0).rate_hz)
         assert not reader.is_due(now_s + 0.9 * POLL_S)
     assert rates[9] == pytest.approx(1000.0, abs=2.0)
     assert rates[-1] == pytest.approx(500.0, abs=2.0)
-    shared_state[StateField.SCHEDULED] = 10
+    shared_state[StateField.SCHEDULED_TICKS] = 10
     assert reader.read(6.0, view_dropped=0).rate_hz is None, "another session has begun"

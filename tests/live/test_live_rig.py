@@ -109,9 +109,9 @@ def test_view_of_a_series_is_complete_and_restarted(rig, run, save):
 def test_counts_of_a_session_are_not_shown_in_the_next(rig, run, order):
     run("first")
     shared_state = rig._group.channels.shared_state
-    assert shared_state[StateField.GO]
+    assert shared_state[StateField.RECORD_MAY_START]
     rig.show(order("second"), StopRequest())
-    assert shared_state[StateField.GO] == 0
+    assert shared_state[StateField.RECORD_MAY_START] == 0
 
 
 @pytest.mark.further  # as a fault in test_live_state.py

@@ -42,16 +42,16 @@ def test_every_state_of_a_session_in_the_shared_state(channels):
     assert state(PHASE=Phase.OFF) == preparing()
     assert state(PHASE=Phase.TARING) == preparing("Taring.")
     assert state(PHASE=Phase.WAITING) == preparing("Waiting for the beam to rest.")
-    assert state(PHASE=Phase.READY, GO=1) == preparing("Ready.")
+    assert state(PHASE=Phase.READY, RECORD_MAY_START=1) == preparing("Ready.")
     assert state(PHASE=Phase.RUNNING) == RUNNING
-    assert state(STOP=StopReason.OPERATOR) == STOPPING
-    assert state(STOP=StopReason.NONE, PHASE=Phase.RETURNING) == RETURNING
+    assert state(STOP_REASON=StopReason.OPERATOR) == STOPPING
+    assert state(STOP_REASON=StopReason.NONE, PHASE=Phase.RETURNING) == RETURNING
     assert state(PHASE=Phase.OFF) == FINISHING
 
 
 def test_hanging_supervisor_is_reported_within_a_second(channels):
     shared_state, states, now_s = channels.shared_state, SessionStateReader(channels), 100.0
-    shared_state[StateField.GO], shared_state[StateField.PHASE] = 1, Phase.RUNNING
+    shared_state[StateField.RECORD_MAY_START], shared_state[StateField.PHASE] = 1, Phase.RUNNING
     for _ in range(100):
         now_s += PERIOD_S
         shared_state.beat(StateField.SUPERVISOR_BEAT)
@@ -67,7 +67,7 @@ def test_hanging_supervisor_is_reported_within_a_second(channels):
         now_s += PERIOD_S
         state = states.read(now_s)
     assert state == SUPERVISOR_SILENT_TORQUE_OFF
-    shared_state[StateField.GO] = 0  # before a record the supervisor may be silent
+    shared_state[StateField.RECORD_MAY_START] = 0  # before a record the supervisor may be silent
     assert states.read(now_s + PERIOD_S) == preparing()
 
 

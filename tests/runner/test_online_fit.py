@@ -49,7 +49,7 @@ def test_reason_and_result_agree(ended, std, reached, reason):
     assert (fit.unmet_reason == "") == reached
 
 
-STOPPED = {StateField.STOP: StopReason.OPERATOR}
+STOPPED = {StateField.STOP_REASON: StopReason.OPERATOR}
 ON_THE_WAY = fit_of_record(0.9e-4, final=False)
 FAILED = FitReport({"problem": "The sensor stands still.", "modes": [], "text": []}, final=True)
 NOT_A_NUMBER = fit_of_record(float("nan"))

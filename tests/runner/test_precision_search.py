@@ -103,7 +103,7 @@ def test_next_segment_follows_an_uncertain_estimate(bench):
     assert isinstance(segment, PlannedSegment)
     assert bench.search.due_tick == planned
     assert bench.writer.ticks - planned == round(RATE_HZ * segment.document["duration_s"])
-    assert bench.shared_state[StateField.PLANNED] == bench.writer.ticks
+    assert bench.shared_state[StateField.PLANNED_TICKS] == bench.writer.ticks
     assert not bench.search.may_be_last
     heads, row = fit.document["text"]
     assert heads.split()[:5] == ["time", "damping", "of", "mode", "1"]
