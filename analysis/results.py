@@ -368,7 +368,7 @@ def record_result(
     )
     from analysis.identify import MeasurementError
     from analysis.record import load_record
-    from rigd.runtime.computations import computed_meanwhile
+    from rigd.runtime.computations import computed_in_parallel
 
     record = load_record(path, options.part_s, highest_hz=highest_frequency_hz(options.band_hz))
     record = with_uniformity(record, options.uniformity)
@@ -387,7 +387,7 @@ def record_result(
     on_step("Welch fits and whole record")
     computation: AbstractContextManager[Callable[[], tuple[WelchAnalysis | None, str | None]]]
     if options.settings.are_from_paper:
-        computation = computed_meanwhile(fit_welch)
+        computation = computed_in_parallel(fit_welch)
     else:  # chosen settings may not suit the record, which is reported before the other fits
         welch_of_settings = fit_welch()
         computation = nullcontext(lambda: welch_of_settings)

@@ -36,7 +36,7 @@ def main() -> None:
     """Run the sessions and print how they ended."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "sessions")
     stop = StopRequest()
-    stop.catch()  # Ctrl-C, a closed terminal and SIGTERM stop the session and close its file
+    stop.catch_signals()  # Ctrl-C, a closed terminal and SIGTERM stop the session, close its file
     try:
         results = run_in_foreground(
             chirp,

@@ -226,7 +226,7 @@ def rigd_here(tmp_path, monkeypatch):
     no_group = StopRequest(), contextlib.nullcontext()
     for command in ("run", "identify"):
         monkeypatch.setattr(f"rigd.cli.{command}.start_processes", lambda **_: no_group)
-    monkeypatch.setattr("rigd.runtime.ignore", lambda **_: None)  # of the test runner
+    monkeypatch.setattr("rigd.runtime.ignore_end_signals", lambda **_: None)  # of the test runner
 
     return partial(run_here, app)
 

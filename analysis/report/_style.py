@@ -29,7 +29,7 @@ from analysis.models import STRUCTURES
 from analysis.report.folder import write_new
 from analysis.results import DEFAULT_FORMATS, FIGURE_FORMATS
 from rigd.beam import parameter_named
-from rigd.runtime.computations import computed_meanwhile
+from rigd.runtime.computations import computed_in_parallel
 from rigd.spectral import magnitude_db
 
 if TYPE_CHECKING:
@@ -298,7 +298,7 @@ def _draw_in_two_processes(
     own_illustrations, copied_illustrations = illustrations[::2], illustrations[1::2]
     images: dict[str, Images] = {}
     computation = (
-        computed_meanwhile(
+        computed_in_parallel(
             lambda: {each.name: _images(each, formats) for each in copied_illustrations}
         )
         if copied_illustrations

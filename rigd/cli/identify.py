@@ -139,7 +139,7 @@ def _run_sessions(
     from rigd.identification import with_cautious_controller, with_tuned_controller
     from rigd.identification.experiments import multisine_session, speeds_session, trial_session
     from rigd.runner import ProcessGroup, run_in_foreground
-    from rigd.runtime import ignore
+    from rigd.runtime import ignore_end_signals
 
     def run(
         session_builder: "Session",
@@ -190,7 +190,7 @@ def _run_sessions(
             )
         ]
     finally:
-        ignore()  # nothing is left to stop; another Ctrl-C must not change the exit code
+        ignore_end_signals()  # nothing is left to stop; another Ctrl-C must not change the code
 
 
 def _estimate_motor(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":

@@ -26,7 +26,7 @@ def probe(
     """
     stop_request, process_group = start_processes(live=False)
     from rigd.runner import probe_in_foreground
-    from rigd.runtime import ignore
+    from rigd.runtime import ignore_end_signals
 
     try:
         rig_profile, probe_result = probe_in_foreground(
@@ -38,7 +38,7 @@ def probe(
             report_line=partial(typer.echo, err=True),
         )
     finally:
-        ignore()
+        ignore_end_signals()
     contradiction_text = probe_result.contradiction(rig_profile)
     if as_json:
         json_document = {"end": probe_result.end.name.lower(), **probe_result.estimate.as_dict()}

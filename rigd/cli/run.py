@@ -241,7 +241,7 @@ def run_sessions(
     )
     from rigd.runner import SeriesFailedError, run_in_foreground
     from rigd.runner.planning import excitation_for
-    from rigd.runtime import ignore
+    from rigd.runtime import ignore_end_signals
 
     try:
         session_results = run_in_foreground(
@@ -270,7 +270,7 @@ def run_sessions(
             _write_json(error.results)
         raise
     finally:
-        ignore()  # nothing is left to stop; another Ctrl-C must not change the exit code
+        ignore_end_signals()  # nothing is left to stop; another Ctrl-C must not change the code
     if as_json:
         _write_json(session_results)
     if any(session_result.fault for session_result in session_results):

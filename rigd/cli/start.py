@@ -75,7 +75,7 @@ def start_processes(
     from rigd.runtime import StopRequest
 
     stop_request = StopRequest()
-    stop_request.catch()
+    stop_request.catch_signals()
     try:
         extra_processes = [
             extra_process for extra_process, is_needed in ((TOUCH, touch), (FIT, fit)) if is_needed

@@ -19,7 +19,13 @@ from rigd.daemon._log import LOGGER_NAME
 from rigd.engine.messages import PageAddress, ProcessFailed
 from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.workers import PAGE
-from rigd.runtime.addresses import announce, file_name, read_address, runtime_folder, started_at
+from rigd.runtime.addresses import (
+    file_name,
+    process_start_ticks,
+    read_address,
+    runtime_folder,
+    write_address,
+)
 
 if TYPE_CHECKING:
     from rigd.profile import Profile
@@ -117,9 +123,9 @@ class PageProcess:
         self._job["port"] = port
         url = f"http://127.0.0.1:{port}/"
         pid = os.getpid()
-        announce(
+        write_address(
             self._address_path,
-            {"pid": pid, "born": started_at(pid), "url": url, "token": self._token},
+            {"pid": pid, "born": process_start_ticks(pid), "url": url, "token": self._token},
         )
         self._on_address(url)
         # The token is printed only on a terminal, because other users may read the journal.
@@ -141,7 +147,7 @@ def page_address(rig: str) -> str | None:
     )
     if not isinstance(pid, int) or not isinstance(url, str) or not isinstance(token, str):
         return None
-    return f"{url}#token={token}" if started_at(pid) == start_ticks else None
+    return f"{url}#token={token}" if process_start_ticks(pid) == start_ticks else None
 
 
 def _address_path(rig: str) -> Path:

@@ -10,7 +10,13 @@ from contextlib import suppress
 from pathlib import Path
 
 from rigd.errors import FailureError, UserError
-from rigd.runtime.addresses import address_files, answers, file_name, folder_fault, runtime_folder
+from rigd.runtime.addresses import (
+    address_files,
+    file_name,
+    folder_fault,
+    runtime_folder,
+    socket_answers,
+)
 from rigd.runtime.processes import listening_sockets
 
 GROUP_FOLDER = Path("/run/rigd")
@@ -78,7 +84,7 @@ def bind(path: Path, group: str | None) -> socket.socket:
     folder_fault_text = folder_fault(path.parent, shared=group is not None)
     if folder_fault_text:
         raise AddressError(folder_fault_text)
-    if answers(path):
+    if socket_answers(path):
         raise AddressError(f"Another daemon answers on {path}; see rigd status.")
     bound_socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:
@@ -104,7 +110,7 @@ def bind(path: Path, group: str | None) -> socket.socket:
 def running() -> list[Path]:
     """Return the paths of the sockets of all daemons that this user can connect to."""
     sockets = address_files(f"*{SOCKET_SUFFIX}", *_searched_folders())
-    return [path for path in sockets if answers(path)]
+    return [path for path in sockets if socket_answers(path)]
 
 
 def find(rig: str | None) -> Path:
@@ -118,7 +124,7 @@ def find(rig: str | None) -> Path:
     if rig is not None:
         for folder in _searched_folders():
             path = socket_path(rig, folder)
-            if answers(path):
+            if socket_answers(path):
                 return path
         raise AddressError(
             f"No daemon of the rig {rig} {_not_found_reason(file_name(rig))}"

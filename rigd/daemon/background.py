@@ -22,7 +22,7 @@ from rigd.profile import Profile, with_specimen
 from rigd.runner import Series, with_tip_slope
 from rigd.runner.planning import excitation_for, largest_amplitude, plan_document, predict_session
 from rigd.runner.request import NoRoomError
-from rigd.runtime import ignore as ignore_signals
+from rigd.runtime import ignore_end_signals as ignore_signals
 
 _JOB_TIMEOUT_S: Final = 50.0
 """Maximum time in seconds for a job, below the client's timeout so that the client gets a reply."""

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigd.devices.contracts import DeviceError
-from rigd.runtime.addresses import announce as write_address
-from rigd.runtime.addresses import answers, read_address, runtime_folder
+from rigd.runtime.addresses import read_address, runtime_folder, socket_answers, write_address
 from rigd.runtime.processes import listening_sockets
 
 if TYPE_CHECKING:  # it imports numpy, which takes longer than a stop may take
@@ -98,7 +97,7 @@ def find_simulator(rig_name: str) -> SimulatorAddress | None:
         simulator_address = SimulatorAddress(**read_address(_address_file(rig_name)))
     except TypeError:  # the file has missing or other members
         return None
-    is_running = isinstance(simulator_address.control_socket, str) and answers(
+    is_running = isinstance(simulator_address.control_socket, str) and socket_answers(
         simulator_address.control_socket
     )
     return simulator_address if is_running else None

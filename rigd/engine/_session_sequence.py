@@ -229,7 +229,7 @@ class SessionSequence:
         self._shared_state[StateField.PHASE] = Phase.TARING
         remaining_s = session_settings.rest_timeout_s
         while True:
-            self._cycle.sensor_monitor.learn()
+            self._cycle.sensor_monitor.start_learning()
             rest_readings = self._read_rest(session_settings.tare_s)
             motion_text = self._describe_motion(rest_readings)
             if not motion_text:
@@ -514,7 +514,9 @@ class SessionSequence:
             device_failure = failure_of_device(error, self._profile.rig.devices)
             self._cycle.mark_readings_stale()
             # A drive whose host stalled switches itself off by its own watchdog.
-            violation_text = f"{device_failure} {self._cycle.limit_monitor.after_missed}".strip()
+            violation_text = (
+                f"{device_failure} {self._cycle.limit_monitor.missed_ticks_text}".strip()
+            )
             return SessionEnd("fault", violation_text, device_failed=True)
         if violation is None:
             return None

@@ -71,7 +71,7 @@ _STANDSTILL_TICKS = 2
 def main() -> None:
     """Run the control process, started as ``python -m rigd.engine.control_process``."""
     stop_request = StopRequest()
-    stop_request.catch()
+    stop_request.catch_signals()
     parent = SupervisorConnection()
     job: ControlJob = parent.receive_job()
     channels = attach_channels(job.channels)
@@ -451,7 +451,7 @@ class _ControlServer:
 
         The returned values are for display, because each session repeats the tare.
         """
-        self._cycle.sensor_monitor.learn()
+        self._cycle.sensor_monitor.start_learning()
         rest_readings = self._read_rest(self._profile.session.tare_s)
         sensor_violation = self._cycle.sensor_monitor.finish_learning()
         if sensor_violation is not None:

@@ -273,7 +273,7 @@ class Cycle:
                 self.angle_rad,
                 self.coupling_torque_nm,
                 self.torque_command_nm,
-                fresh=not status_flags & _UNUSABLE_FLAGS,
+                is_fresh=not status_flags & _UNUSABLE_FLAGS,
             )
         if violation is not None:
             self._recent_ticks.append((self.angle_rad, 0.0, 0.0))
@@ -632,7 +632,7 @@ def make_reading_monitors(profile: Profile, devices: Devices) -> ReadingMonitors
         resolution_rad=rig.encoder.resolution_rad,
         inertia_kg_m2=rig.motor.inertia_kg_m2,
         breakaway_nm=profile.standstill_torque_nm,
-        delay_ticks=max(1, round(rig.actuation.delay_s * rig.rate_hz)),
+        command_delay_ticks=max(1, round(rig.actuation.delay_s * rig.rate_hz)),
         scale_monitor=ScaleMonitor(rig.motor.inertia_kg_m2, profile.limits.torque_ratio),
     )
     simulation = rig.simulation

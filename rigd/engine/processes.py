@@ -29,8 +29,8 @@ from rigd.runtime.background import (
     OWN_PYTHON,
     RUN_PROGRAM,
     SINGLE_THREADED,
-    give_way,
     prefer_oom_kill,
+    set_idle_priority,
 )
 
 _WRITE_TIMEOUT_S = 5.0
@@ -127,7 +127,7 @@ class ChildProcess:
                 raised_niceness = os.getpriority(os.PRIO_PROCESS, pid) + worker.niceness
                 os.setpriority(os.PRIO_PROCESS, pid, raised_niceness)
         if worker.niceness is None:
-            give_way(pid)
+            set_idle_priority(pid)
         if worker.prefers_oom_kill:
             prefer_oom_kill(pid)
 

@@ -37,7 +37,7 @@ from rigd.engine.processes import SupervisorConnection
 from rigd.engine.realtime import RaisedPriority
 from rigd.engine.reference import covers_reference
 from rigd.engine.shared_state import Phase, SharedState, StateField, read_events
-from rigd.runtime import ignore as ignore_signals
+from rigd.runtime import ignore_end_signals as ignore_signals
 from rigd.session import SessionError, SessionExistsError, SessionWriter, segments_until
 from rigd.session.layout import SAMPLE_SIZE
 

@@ -19,7 +19,7 @@ from rigd.engine.messages import TouchJob, TouchReady, TouchReport
 from rigd.engine.processes import SupervisorConnection
 from rigd.engine.realtime import pin_off_loop_core
 from rigd.engine.shared_state import StateField
-from rigd.runtime import ignore as ignore_signals
+from rigd.runtime import ignore_end_signals as ignore_signals
 from rigd.session.layout import Status, decode_samples
 from rigd.touch import GrowingEstimate, TouchEstimator, TouchRecord
 from rigd.touch.samples import (

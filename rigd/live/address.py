@@ -12,11 +12,11 @@ from typing import Final, Self
 from rigd.runtime.addresses import (
     address_files,
     file_name,
+    process_start_ticks,
     read_address,
     runtime_folder,
-    started_at,
+    write_address,
 )
-from rigd.runtime.addresses import announce as write_address
 
 LOOPBACK: Final = "127.0.0.1"
 """Address of this computer's loopback interface, on which all servers of the view listen."""
@@ -67,7 +67,7 @@ class LiveAddress:
             Unique number of the server.
         """
         pid = os.getpid()
-        return cls(rig, pid, started_at(pid) or 0, grpc_port, page_port, server)
+        return cls(rig, pid, process_start_ticks(pid) or 0, grpc_port, page_port, server)
 
     @property
     def proxy_url(self) -> str:
@@ -88,7 +88,7 @@ class LiveAddress:
     @property
     def alive(self) -> bool:
         """Whether the publisher's process still runs."""
-        return started_at(self.pid) == self.born
+        return process_start_ticks(self.pid) == self.born
 
 
 def proxy_url(host: str, grpc_port: int) -> str:

@@ -26,7 +26,7 @@ from rigd.live._program import RerunError
 from rigd.live._ring_reader import SessionRecordReader
 from rigd.live._server import RerunServer
 from rigd.live.messages import LiveFit, LiveSession, LiveSessionEnded, LiveSessionShown, LiveTouches
-from rigd.runtime import ignore as ignore_signals
+from rigd.runtime import ignore_end_signals as ignore_signals
 from rigd.session.quick_look import last_quick_look, quick_look_path, read_quick_look
 from rigd.session.touches import touch_line
 from rigd.view import Health, Note, outcome_note

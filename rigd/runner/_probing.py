@@ -51,7 +51,7 @@ class ProbeResult:
 
         If `checks_motor` is False, torque and inertia of the motor are not compared.
         """
-        return contradiction(probed_rig(profile), self.end, self.estimate, motor=checks_motor)
+        return contradiction(probed_rig(profile), self.end, self.estimate, with_motor=checks_motor)
 
     def as_metadata(self) -> dict[str, str]:
         """Return the probing move's result as metadata of a session file."""

@@ -29,7 +29,7 @@ from rigd.engine.reference import ReferenceWriter
 from rigd.engine.shared_state import StateField
 from rigd.engine.workers import ONLINE_ESTIMATOR
 from rigd.runner._precision_search import ExcitationPlanner
-from rigd.runtime import ignore as ignore_signals
+from rigd.runtime import ignore_end_signals as ignore_signals
 from rigd.session.layout import decode_samples
 from rigd.session.online_fit import estimate_lines
 

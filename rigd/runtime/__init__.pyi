@@ -7,7 +7,7 @@ from ._plain_files import open_plain_file as open_plain_file
 from ._plain_files import read_plain_file as read_plain_file
 from ._session_signals import STOP_SIGNAL as STOP_SIGNAL
 from ._session_signals import StopRequest as StopRequest
-from ._session_signals import ignore as ignore
+from ._session_signals import ignore_end_signals as ignore_end_signals
 from ._session_signals import signals_blocked as signals_blocked
 from ._stop_signals import ignore_handled_signals as ignore_handled_signals
 from ._stop_signals import raise_on_signals as raise_on_signals

@@ -33,7 +33,7 @@ def signals_blocked() -> Iterator[None]:
     """Block, within this context, the signals that request an end.
 
     A process that is started in the context inherits the block. It unblocks the signals by
-    :meth:`StopRequest.catch` or :func:`ignore` when it can handle them.
+    :meth:`StopRequest.catch_signals` or :func:`ignore_end_signals` when it can handle them.
     """
     previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, _END_SIGNALS)
     try:
@@ -42,7 +42,7 @@ def signals_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
 
 
-def ignore() -> None:
+def ignore_end_signals() -> None:
     """Make this process ignore the signals that request an end, such as SIGINT and SIGTERM."""
     for signal_number in _END_SIGNALS:
         signal.signal(signal_number, signal.SIG_IGN)
@@ -64,7 +64,7 @@ class StopRequest:
         self.requested = False
         self.on_request: Callable[[], None] = lambda: None
 
-    def catch(self) -> None:
+    def catch_signals(self) -> None:
         """Make the signals that request an end set this flag, except ignored ones (nohup)."""
         for signal_number in _END_SIGNALS:
             if signal.getsignal(signal_number) != signal.SIG_IGN:

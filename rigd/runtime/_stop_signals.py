@@ -21,11 +21,11 @@ class Interruption(KeyboardInterrupt):
     """
 
 
-def raise_on_signals(*numbers: int) -> None:
+def raise_on_signals(*signal_numbers: int) -> None:
     """Make the given signals raise an :class:`Interruption` in the main thread."""
     if hasattr(signal, "SIGALRM"):  # not on Windows
         sys.unraisablehook = _repeat_dropped_signal
-    for signal_number in numbers:
+    for signal_number in signal_numbers:
         signal.signal(signal_number, interrupt)
 
 

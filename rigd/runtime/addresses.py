@@ -1,8 +1,8 @@
 """Addresses of this user's processes in the runtime folder, and detection of dead processes.
 
 The address of a process is a Unix socket or a small JSON file in the runtime folder. The socket of
-a dead process is detected because no process listens (`answers`), and its file because the process
-no longer exists (`started_at`).
+a dead process is detected because no process listens (`socket_answers`), and its file because the
+process no longer exists (`process_start_ticks`).
 """
 
 import itertools
@@ -162,9 +162,9 @@ def _own_fallback_folder(temporary_folder: Path) -> Path:
 # Files and sockets in the runtime folder
 
 
-def file_name(rig: str) -> str:
+def file_name(rig_name: str) -> str:
     """Return a rig's name for use in file names: only letters and digits, others become ``-``."""
-    return "".join(c if c.isalnum() else "-" for c in rig).strip("-")
+    return "".join(c if c.isalnum() else "-" for c in rig_name).strip("-")
 
 
 def address_files(pattern: str, *folders: Path) -> list[Path]:
@@ -184,7 +184,7 @@ def address_files(pattern: str, *folders: Path) -> list[Path]:
     return sorted(file_paths)
 
 
-def announce(path: Path, address: Mapping[str, object]) -> None:
+def write_address(path: Path, address: Mapping[str, object]) -> None:
     """Write the address of a process to a JSON file that only this user can read.
 
     The file is replaced atomically. Its folder is created if necessary.
@@ -221,7 +221,7 @@ def read_address(path: Path) -> dict[str, Any]:
     return address_document if isinstance(address_document, dict) else {}
 
 
-def answers(path: str | Path) -> bool:
+def socket_answers(path: str | Path) -> bool:
     """Return whether a process listens on the Unix socket with a path."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe_socket:
         probe_socket.settimeout(_CONNECT_TIMEOUT_S)
@@ -234,7 +234,7 @@ def answers(path: str | Path) -> bool:
     return True
 
 
-def started_at(pid: int) -> int | None:
+def process_start_ticks(pid: int) -> int | None:
     """Return the start time of a process in clock ticks since the computer was started.
 
     Process id and start time together identify a process uniquely. The result is None if the

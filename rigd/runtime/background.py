@@ -19,7 +19,7 @@ OWN_PYTHON: Final = (sys.executable, "-P")
 """First words of the command line that runs a Python module of this project. With -P no file of the
 working folder is imported by mistake."""
 
-_LOWEST_PRIORITY: Final = 19
+_MAX_NICENESS: Final = 19
 """Niceness with the lowest priority."""
 
 
@@ -75,7 +75,7 @@ def prefer_oom_kill(pid: int) -> None:
         Path(f"/proc/{pid}/oom_score_adj").write_text("1000")
 
 
-def give_way(pid: int = 0) -> None:
+def set_idle_priority(pid: int = 0) -> None:
     """Give a process and its children idle priority: they run while no other process needs to.
 
     Parameters
@@ -84,7 +84,7 @@ def give_way(pid: int = 0) -> None:
         Process id, or 0 for this process.
     """
     with suppress(OSError, AttributeError):  # AttributeError on Windows
-        os.setpriority(os.PRIO_PROCESS, pid, _LOWEST_PRIORITY)
+        os.setpriority(os.PRIO_PROCESS, pid, _MAX_NICENESS)
     with suppress(OSError, AttributeError):  # not everywhere
         os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
 

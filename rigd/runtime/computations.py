@@ -76,17 +76,17 @@ class ForkedComputation(Generic[ValueT]):
             self._wait()
         self._value_file.close()
 
-    def _wait(self, options: int = 0) -> bool:
-        """Call `os.waitpid` with `options` for the copy, and return whether the copy has ended."""
+    def _wait(self, wait_options: int = 0) -> bool:
+        """Call `os.waitpid` with `wait_options` for the copy, and return whether it has ended."""
         if self._exit_status is None:
-            process_id, exit_status = os.waitpid(self._process_id, options)
+            process_id, exit_status = os.waitpid(self._process_id, wait_options)
             if process_id:
                 self._exit_status = exit_status
         return self._exit_status is not None
 
 
 @contextmanager
-def computed_meanwhile(compute: Callable[[], ValueT]) -> Iterator[Callable[[], ValueT]]:
+def computed_in_parallel(compute: Callable[[], ValueT]) -> Iterator[Callable[[], ValueT]]:
     """Compute a value in a copy of this process, if this computer has two processors for it.
 
     If not, or if the copy fails, this process computes the value when the caller requests it. An

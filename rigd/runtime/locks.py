@@ -38,10 +38,10 @@ class LockFile:
 
     def __init__(self, name: str, *, for_all_users: bool) -> None:
         file_stem = file_name(name)
-        is_common = for_all_users and os.access(_COMMON_LOCK_FOLDER, os.W_OK)
+        uses_common_folder = for_all_users and os.access(_COMMON_LOCK_FOLDER, os.W_OK)
         self.path = (
             _COMMON_LOCK_FOLDER / f"rigd-{file_stem}.lock"
-            if is_common
+            if uses_common_folder
             else runtime_folder() / f"{file_stem}.lock"
         )
         self._fd: int | None = None
@@ -148,7 +148,7 @@ class RigLock:
 
     Parameters
     ----------
-    rig
+    rig_name
         Name of the rig's profile.
     holder
         Name of this program, for error messages of a second program.
@@ -159,11 +159,13 @@ class RigLock:
         because each simulates a rig of its own.
     """
 
-    def __init__(self, rig: str, holder: str, *, hardware: bool, exclusive: bool = True) -> None:
-        self._rig = rig
+    def __init__(
+        self, rig_name: str, holder: str, *, hardware: bool, exclusive: bool = True
+    ) -> None:
+        self._rig = rig_name
         self._holder = holder
         self._is_exclusive = exclusive
-        self._file = LockFile(f"rig-{rig}", for_all_users=hardware)
+        self._file = LockFile(f"rig-{rig_name}", for_all_users=hardware)
 
     def acquire(self) -> None:
         """Acquire the lock of the rig.
@@ -198,14 +200,14 @@ class RigLock:
         self.release()
 
 
-def holds_rig_lock(pid: int, rig: str, folder: Path) -> bool:
+def holds_rig_lock(pid: int, rig_name: str, folder: Path) -> bool:
     """Return whether a process holds the lock of a rig, according to the kernel's table of locks.
 
     Parameters
     ----------
     pid
         Process id.
-    rig
+    rig_name
         Name of the rig.
     folder
         Runtime folder that may contain the lock file. The files that the process has open are
@@ -217,12 +219,12 @@ def holds_rig_lock(pid: int, rig: str, folder: Path) -> bool:
         If the system has no table of locks.
     """
     held_inodes = _held_inodes()
-    file_stem = f"rig-{file_name(rig)}"
+    file_stem = f"rig-{file_name(rig_name)}"
     lock_files = [folder / f"{file_stem}.lock", _COMMON_LOCK_FOLDER / f"rigd-{file_stem}.lock"]
     lock_files += [
         lock_path
         for open_lock_name, lock_path in _open_rig_locks(pid)
-        if open_lock_name == file_name(rig)
+        if open_lock_name == file_name(rig_name)
     ]
     for lock_path in lock_files:
         with suppress(OSError):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rigd.runtime.addresses import started_at
+from rigd.runtime.addresses import process_start_ticks
 
 _PROCESS_TABLE: Final = Path("/proc")
 _SOCKET_TABLE: Final = Path("/proc/net/unix")
@@ -34,11 +34,11 @@ class RunningProcess:
     """Short name, which `name_this_process` sets."""
     command: tuple[str, ...]
     """Command line: program and arguments."""
-    handled_signals: int
+    handled_signal_mask: int
     """Bit mask of the signals that have a handler; bit n-1 represents signal n."""
-    ignored_signals: int
+    ignored_signal_mask: int
     """Bit mask of the ignored signals; bit n-1 represents signal n."""
-    pending_signals: int
+    pending_signal_mask: int
     """Bit mask of the signals that were sent but not received yet; bit n-1 represents signal n."""
     suspended: bool
     """Whether the process is suspended by a signal or a debugger."""
@@ -46,19 +46,19 @@ class RunningProcess:
     @property
     def start_ticks(self) -> int | None:
         """Start time in clock ticks since the computer was started, or None if it has ended."""
-        return started_at(self.pid)
+        return process_start_ticks(self.pid)
 
     def handles(self, signal_number: int) -> bool:
         """Return whether the process has a handler for a signal."""
-        return bool(self.handled_signals >> (signal_number - 1) & 1)
+        return bool(self.handled_signal_mask >> (signal_number - 1) & 1)
 
     def ignores(self, signal_number: int) -> bool:
         """Return whether the process ignores a signal."""
-        return bool(self.ignored_signals >> (signal_number - 1) & 1)
+        return bool(self.ignored_signal_mask >> (signal_number - 1) & 1)
 
     def has_pending(self, signal_number: int) -> bool:
         """Return whether a signal was sent to the process but not received yet."""
-        return bool(self.pending_signals >> (signal_number - 1) & 1)
+        return bool(self.pending_signal_mask >> (signal_number - 1) & 1)
 
 
 def read_processes() -> list[RunningProcess]:
@@ -94,9 +94,9 @@ def read_process(pid: int) -> RunningProcess | None:
         return None
 
 
-def _parsed_process(pid: int, status: str, command: bytes) -> RunningProcess | None:
+def _parsed_process(pid: int, status_text: str, command_bytes: bytes) -> RunningProcess | None:
     """Return a process from the texts of its files in /proc, or None if it has ended."""
-    status_rows = [status_line.partition(":\t") for status_line in status.split("\n")]
+    status_rows = [status_line.partition(":\t") for status_line in status_text.split("\n")]
     status_fields = {
         key: field_value for key, _, field_value in reversed(status_rows)
     }  # a name's first value is used
@@ -109,10 +109,10 @@ def _parsed_process(pid: int, status: str, command: bytes) -> RunningProcess | N
         parent=int(status_fields["PPid"]),
         uid=user_ids.pop() if len(user_ids) == 1 else -1,
         name=status_fields["Name"],
-        command=tuple(os.fsdecode(command).split("\0")[:-1]),
-        handled_signals=int(status_fields["SigCgt"], 16),
-        ignored_signals=int(status_fields["SigIgn"], 16),
-        pending_signals=int(status_fields["SigPnd"], 16) | int(status_fields["ShdPnd"], 16),
+        command=tuple(os.fsdecode(command_bytes).split("\0")[:-1]),
+        handled_signal_mask=int(status_fields["SigCgt"], 16),
+        ignored_signal_mask=int(status_fields["SigIgn"], 16),
+        pending_signal_mask=int(status_fields["SigPnd"], 16) | int(status_fields["ShdPnd"], 16),
         suspended=process_state in "Tt",
     )
 

@@ -62,33 +62,35 @@ class BeamPrediction:
             else 2 * pi * _MAX_FREQUENCY_FRACTION * rate_hz
         )
         stiffness_nm = 4.0 * beam.bending_stiffness_n_m2 / beam.length_m
-        m = len(oscillating_poles)
+        mode_count = len(oscillating_poles)
         # Input [modes, offset, angle before, angle, torque], output [modes, offset, angle, error].
-        state_size = 2 * m + 2
+        state_size = 2 * mode_count + 2
         a = np.zeros((state_size + 1, state_size + 2))
         error_row = np.zeros(state_size + 2)
         observer_gain = np.zeros(state_size + 1)
-        a[2 * m, 2 * m] = 1.0
-        a[2 * m + 1, 2 * m + 2] = 1.0
-        error_row[-1], error_row[2 * m] = 1.0, -1.0
-        observer_gain[2 * m] = _OFFSET_BANDWIDTH_RAD_S * period_s
+        a[2 * mode_count, 2 * mode_count] = 1.0
+        a[2 * mode_count + 1, 2 * mode_count + 2] = 1.0
+        error_row[-1], error_row[2 * mode_count] = 1.0, -1.0
+        observer_gain[2 * mode_count] = _OFFSET_BANDWIDTH_RAD_S * period_s
         for mode_index, mode_pole in enumerate(oscillating_poles):
             # φ = 2 Re(r z) with z' = p z + θ, and θ is linear between two ticks.
             mode_rows = slice(2 * mode_index, 2 * mode_index + 2)
             step_factor = cexp(mode_pole * period_s)
-            present_gain = (step_factor - 1.0 - mode_pole * period_s) / (mode_pole**2 * period_s)
-            previous_gain = (step_factor - 1.0) / mode_pole - present_gain
+            present_angle_gain = (step_factor - 1.0 - mode_pole * period_s) / (
+                mode_pole**2 * period_s
+            )
+            previous_angle_gain = (step_factor - 1.0) / mode_pole - present_angle_gain
             a[mode_rows, mode_rows] = (
                 (step_factor.real, -step_factor.imag),
                 (step_factor.imag, step_factor.real),
             )
-            a[mode_rows, 2 * m + 1] = previous_gain.real, previous_gain.imag
-            a[mode_rows, 2 * m + 2] = present_gain.real, present_gain.imag
-            gain_factor = stiffness_nm * abs(mode_pole) ** 2 / (2j * mode_pole.imag)
-            error_row += 2.0 * np.array([gain_factor.real, -gain_factor.imag]) @ a[mode_rows]
-            error_row[2 * m + 2] -= stiffness_nm
-            gain_of_mode = -_OBSERVER_BANDWIDTH_RAD_S * period_s / gain_factor
-            observer_gain[mode_rows] = gain_of_mode.real, gain_of_mode.imag
+            a[mode_rows, 2 * mode_count + 1] = previous_angle_gain.real, previous_angle_gain.imag
+            a[mode_rows, 2 * mode_count + 2] = present_angle_gain.real, present_angle_gain.imag
+            mode_residue = stiffness_nm * abs(mode_pole) ** 2 / (2j * mode_pole.imag)
+            error_row += 2.0 * np.array([mode_residue.real, -mode_residue.imag]) @ a[mode_rows]
+            error_row[2 * mode_count + 2] -= stiffness_nm
+            observer_gain_of_mode = -_OBSERVER_BANDWIDTH_RAD_S * period_s / mode_residue
+            observer_gain[mode_rows] = observer_gain_of_mode.real, observer_gain_of_mode.imag
         update_matrix = a + np.outer(observer_gain, error_row)
         update_matrix[-1] = error_row
         self._state_size = state_size
@@ -121,5 +123,5 @@ class BeamPrediction:
 
     def skip(self, angle_rad: float) -> None:
         """Advance the prediction by a tick without a measured torque."""
-        error_nm = self.step(angle_rad, 0.0)
-        self._vectors[0][: self._state_size] -= self._gain * error_nm
+        prediction_error_nm = self.step(angle_rad, 0.0)
+        self._vectors[0][: self._state_size] -= self._gain * prediction_error_nm

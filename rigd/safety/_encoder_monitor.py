@@ -30,9 +30,9 @@ _AVERAGING_WINDOWS_S = ENCODER_FAILURE_S, 0.008, 0.016, 0.032, 0.064, 0.128, 0.2
 """Durations in seconds over which torques are averaged.
 
 The short ones are within half a period of any excitation; in the long ones noise averages out."""
-_STANDSTILL_S = 0.016
+_MIN_STANDSTILL_S = 0.016
 """Time in seconds without an encoder step after which the coupling torque is compared."""
-_SIGNIFICANT_STDS = 5.0
+_MIN_SIGNIFICANT_STDS = 5.0
 """Standard deviations of the averaged noise above which a torque of the beam is significant."""
 _MIN_SIGNIFICANT_FRACTION = 0.005
 """Smallest significant torque of the beam, as a fraction of the breakaway torque.
@@ -49,7 +49,7 @@ _TEST_RAMP_S = 0.02
 """Time in seconds in which the test torque rises by the breakaway torque."""
 _MAX_TEST_BREAKAWAY_TORQUES = 2.0
 """Largest test torque, in breakaway torques; the test then restarts in the other direction."""
-_PASSED_TEST_STEPS = 1.5
+_PASSED_TEST_ENCODER_STEPS = 1.5
 """Movement of the shaft, in encoder steps, that proves during a test that the encoder works."""
 _TEST_PAUSE_S = 0.5
 """Shortest time in seconds between a passed test and the next one."""
@@ -63,13 +63,13 @@ _STANDSTILL_TICKS_AT_STOP = 2
 """Ticks without an encoder step after which the torques are checked to explain the stop."""
 _MIN_STEPS_PER_TICK_AT_STOP = 4.0
 """Speed before a stop from which the stop is checked, in encoder steps per tick."""
-_MIN_SCALE_STEPS = 3.0
+_MIN_SCALE_CHECK_ENCODER_STEPS = 3.0
 """Smallest movement within `SPEED_TICKS` that the scale comparison uses, in encoder steps."""
-_MAX_REPEATS = 6
+_FAULTY_REPEAT_COUNT = 6
 """Number of repeated readings within `_REPEAT_WINDOW_TICKS` from which they are a fault."""
 _REPEAT_WINDOW_TICKS = 32
 """Ticks within which repeated readings are counted."""
-_MIN_REPEAT_STEPS = 3.5
+_MIN_REPEAT_CHECK_ENCODER_STEPS = 3.5
 """Smallest movement per tick before and after a repeated reading, in encoder steps."""
 
 
@@ -140,7 +140,7 @@ class EncoderMonitor:
         resolution_rad: float,
         inertia_kg_m2: float,
         breakaway_nm: float,
-        delay_ticks: int,
+        command_delay_ticks: int,
         scale_monitor: ScaleMonitor | None = None,
     ) -> None:
         self._prediction = prediction
@@ -153,9 +153,11 @@ class EncoderMonitor:
             max(_STANDSTILL_TICKS_AT_STOP + 1, round(w * rate_hz)) for w in _AVERAGING_WINDOWS_S
         ]
         # Within an encoder step the shaft may reverse, with an acceleration of at most `8 step/T²`.
-        turn_nm = inertia_kg_m2 * 8.0 * resolution_rad * rate_hz**2
-        self._windows = [(tick_count, turn_nm / tick_count**2) for tick_count in window_ticks]
-        self._min_test_ticks = max(window_ticks[0], round(_STANDSTILL_S * rate_hz))
+        turning_torque_nm = inertia_kg_m2 * 8.0 * resolution_rad * rate_hz**2
+        self._windows = [
+            (tick_count, turning_torque_nm / tick_count**2) for tick_count in window_ticks
+        ]
+        self._min_test_ticks = max(window_ticks[0], round(_MIN_STANDSTILL_S * rate_hz))
         # The mean of a sine over a time T is at most 2/(ω T) of its amplitude.
         self._half_period_ticks = (
             inf if prediction is None else 2.0 / prediction.first_rad_s * rate_hz
@@ -166,27 +168,27 @@ class EncoderMonitor:
         self._torque_history: deque[tuple[float, float]] = deque(maxlen=history_ticks)
         self._error_sums: deque[float] = deque(maxlen=history_ticks)
         self._angles: deque[float] = deque(maxlen=SPEED_TICKS + WINDOW_TICKS + 1)
-        self._repeat_ticks: deque[int] = deque(maxlen=_MAX_REPEATS)
-        self._delayed_commands_nm: deque[float] = deque(maxlen=delay_ticks)
+        self._repeat_ticks: deque[int] = deque(maxlen=_FAULTY_REPEAT_COUNT)
+        self._delayed_commands_nm: deque[float] = deque(maxlen=command_delay_ticks)
         self.test_nm = 0.0
         self._test_step_nm = 0.0
         self._test_start_rad = 0.0
         self.tests = 0
         self.reset(0.0, 0.0)
 
-    def reset(self, angle_rad: float, noise_nm: float) -> None:
+    def reset(self, angle_rad: float, torque_noise_nm: float) -> None:
         """Forget all readings and start again with the shaft at rest.
 
         Parameters
         ----------
         angle_rad
             Angle of the shaft.
-        noise_nm
+        torque_noise_nm
             Standard deviation of a reading of the coupling torque.
         """
         if self._prediction is not None:
             self._prediction.reset(angle_rad)
-        self._noise_nm = noise_nm
+        self._noise_nm = torque_noise_nm
         for history in (
             self._torque_history,
             self._error_sums,
@@ -205,10 +207,10 @@ class EncoderMonitor:
         self._standstill_count = self._tick_count = self._next_test_tick = 0
         self._irregular_ticks = 0
         self.tests = 0
-        self._end_test()
+        self._end_encoder_test()
 
     def step(
-        self, angle_rad: float, coupling_nm: float, sent_nm: float, *, fresh: bool = True
+        self, angle_rad: float, coupling_nm: float, sent_torque_nm: float, *, is_fresh: bool = True
     ) -> Violation | None:
         """Check the readings of one tick for signs of a failed encoder.
 
@@ -216,9 +218,9 @@ class EncoderMonitor:
         ----------
         angle_rad, coupling_nm
             Measured angle and coupling torque.
-        sent_nm
+        sent_torque_nm
             Torque that was commanded in the previous tick.
-        fresh
+        is_fresh
             Whether angle and coupling torque were measured in this tick.
 
         Returns
@@ -228,20 +230,22 @@ class EncoderMonitor:
         """
         prediction = self._prediction
         pending_commands_nm = self._delayed_commands_nm
-        pending_commands_nm.append(sent_nm)
-        motor_nm = pending_commands_nm[0]
-        if not fresh:
+        pending_commands_nm.append(sent_torque_nm)
+        motor_torque_nm = pending_commands_nm[0]
+        if not is_fresh:
             self.skip(1, angle_rad)
             return None
-        error_nm = 0.0 if prediction is None else prediction.step(angle_rad, coupling_nm)
+        prediction_error_nm = 0.0 if prediction is None else prediction.step(angle_rad, coupling_nm)
         net_sum, motor_sum = self._torque_history[-1]
-        self._torque_history.append((net_sum + motor_nm - coupling_nm, motor_sum + motor_nm))
-        self._error_sums.append(self._error_sums[-1] + error_nm)
+        self._torque_history.append(
+            (net_sum + motor_torque_nm - coupling_nm, motor_sum + motor_torque_nm)
+        )
+        self._error_sums.append(self._error_sums[-1] + prediction_error_nm)
         self._coupling_nm2 += self._decay * (coupling_nm * coupling_nm - self._coupling_nm2)
         self._tick_count += 1
         angles = self._angles
         standstill_ticks = self._standstill_count
-        moved_rad = angle_rad - angles[-1]
+        movement_rad = angle_rad - angles[-1]
         angles.append(angle_rad)
         if self._irregular_ticks:
             self._irregular_ticks -= 1
@@ -249,14 +253,14 @@ class EncoderMonitor:
             violation = self._compare_scales(self._scale_monitor)
             if violation is not None:
                 return violation
-        if moved_rad:
+        if movement_rad:
             self._standstill_count = 0
             if standstill_ticks == 1 and not self._irregular_ticks:
-                return self._check_repeats(moved_rad)
+                return self._check_repeats(movement_rad)
             if self._test_step_nm:
-                passed_rad = _PASSED_TEST_STEPS * self._resolution_rad
-                if abs(angle_rad - self._test_start_rad) > passed_rad:
-                    self._end_test()
+                min_passed_movement_rad = _PASSED_TEST_ENCODER_STEPS * self._resolution_rad
+                if abs(angle_rad - self._test_start_rad) > min_passed_movement_rad:
+                    self._end_encoder_test()
                     self.tests += 1
                     self._next_test_tick = self._tick_count + round(_TEST_PAUSE_S * self._rate_hz)
                     return None
@@ -330,30 +334,30 @@ class EncoderMonitor:
         index_before_stop = -1 - _STANDSTILL_TICKS_AT_STOP
         if len(angles) < SPEED_TICKS - index_before_stop:
             return None
-        moved_rad = angles[index_before_stop] - angles[index_before_stop - SPEED_TICKS]
+        movement_rad = angles[index_before_stop] - angles[index_before_stop - SPEED_TICKS]
         if (
-            abs(moved_rad) < _MIN_STEPS_PER_TICK_AT_STOP * SPEED_TICKS * self._resolution_rad
-            or not moved_rad
+            abs(movement_rad) < _MIN_STEPS_PER_TICK_AT_STOP * SPEED_TICKS * self._resolution_rad
+            or not movement_rad
         ):
             return None
         ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._torque_history) - 2)
         net_sum, motor_sum = self._torque_sums(ticks)
         momentum_per_tick = (
-            _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
+            _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(movement_rad) / SPEED_TICKS
         )
         stopping_torque_nm = momentum_per_tick * self._rate_hz**2 / _STANDSTILL_TICKS_AT_STOP
-        braking_nm = max(0.0, -net_sum if moved_rad > 0 else net_sum)
-        allowed_nm = (
+        braking_torque_nm = max(0.0, -net_sum if movement_rad > 0 else net_sum)
+        allowed_torque_nm = (
             self._breakaway_nm
             + (
-                (1.0 + _TORQUE_RELATIVE_ERROR) * braking_nm
+                (1.0 + _TORQUE_RELATIVE_ERROR) * braking_torque_nm
                 + _TORQUE_RELATIVE_ERROR * abs(motor_sum)
             )
             / _STANDSTILL_TICKS_AT_STOP
         )
-        if stopping_torque_nm <= allowed_nm:
+        if stopping_torque_nm <= allowed_torque_nm:
             return None
-        return INTERLOCKS_BY_NAME["stopped encoder"].violated(stopping_torque_nm, allowed_nm)
+        return INTERLOCKS_BY_NAME["stopped encoder"].violated(stopping_torque_nm, allowed_torque_nm)
 
     def _check_net_torque(self, ticks: int, max_turning_nm: float) -> Violation | None:
         """Return a violation if the mean net torque should have turned a shaft that seems at rest.
@@ -362,32 +366,36 @@ class EncoderMonitor:
         """
         net_sum, motor_sum = self._torque_sums(ticks)
         net_nm, coupling_nm = net_sum / ticks, (motor_sum - net_sum) / ticks
-        limit_nm = self._breakaway_nm + _TORQUE_RELATIVE_ERROR * abs(coupling_nm) + max_turning_nm
-        if -limit_nm < net_nm < limit_nm:
+        net_torque_limit_nm = (
+            self._breakaway_nm + _TORQUE_RELATIVE_ERROR * abs(coupling_nm) + max_turning_nm
+        )
+        if -net_torque_limit_nm < net_nm < net_torque_limit_nm:
             return None
-        return INTERLOCKS_BY_NAME["frozen encoder"].violated(net_nm, limit_nm)
+        return INTERLOCKS_BY_NAME["frozen encoder"].violated(net_nm, net_torque_limit_nm)
 
     def _compare_coupling_torque(self, ticks: int) -> None:
         """Start a test of the encoder if the beam's torque differs from its prediction."""
         error_sums, noise_nm = self._error_sums, self._noise_nm
-        error_nm = (error_sums[-1] - error_sums[-1 - ticks]) / ticks
-        vibration_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
-        significant_nm = max(
+        prediction_error_nm = (error_sums[-1] - error_sums[-1 - ticks]) / ticks
+        vibration_rms_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
+        significant_error_nm = max(
             _MIN_SIGNIFICANT_FRACTION * self._breakaway_nm,
-            _SIGNIFICANT_STDS * noise_nm / sqrt(ticks),
-            _MODEL_ERROR_FRACTION * vibration_nm * min(1.0, self._half_period_ticks / ticks),
+            _MIN_SIGNIFICANT_STDS * noise_nm / sqrt(ticks),
+            _MODEL_ERROR_FRACTION * vibration_rms_nm * min(1.0, self._half_period_ticks / ticks),
         )
-        if -significant_nm < error_nm < significant_nm:
+        if -significant_error_nm < prediction_error_nm < significant_error_nm:
             return
         # The test torque acts against the beam's torque, which brakes a runaway shaft, or in the
         # direction in which the breakaway torque is reached sooner.
-        net_nm = self._torque_sums(ticks)[0] / ticks
-        near_breakaway = abs(net_nm) > 0.5 * self._breakaway_nm
-        ramp_nm = self._breakaway_nm / (_TEST_RAMP_S * self._rate_hz)
-        self._test_step_nm = copysign(ramp_nm, net_nm if near_breakaway else -error_nm)
+        net_torque_nm = self._torque_sums(ticks)[0] / ticks
+        is_near_breakaway = abs(net_torque_nm) > 0.5 * self._breakaway_nm
+        ramp_step_nm = self._breakaway_nm / (_TEST_RAMP_S * self._rate_hz)
+        self._test_step_nm = copysign(
+            ramp_step_nm, net_torque_nm if is_near_breakaway else -prediction_error_nm
+        )
         self._test_start_rad = self._angles[-1]
 
-    def _check_repeats(self, moved_rad: float) -> Violation | None:
+    def _check_repeats(self, movement_rad: float) -> Violation | None:
         """Return a violation if the encoder repeats readings too often while the shaft moves.
 
         The last tick showed no movement between two ticks with movement in the same direction.
@@ -396,20 +404,22 @@ class EncoderMonitor:
         if len(angles) < SPEED_TICKS:
             return None
         previous_movement_rad = angles[-3] - angles[-4]
-        least_rad = _MIN_REPEAT_STEPS * self._resolution_rad
+        min_movement_rad = _MIN_REPEAT_CHECK_ENCODER_STEPS * self._resolution_rad
         if (
-            moved_rad * previous_movement_rad <= 0.0
-            or min(abs(moved_rad), abs(previous_movement_rad)) < least_rad
+            movement_rad * previous_movement_rad <= 0.0
+            or min(abs(movement_rad), abs(previous_movement_rad)) < min_movement_rad
         ):
             return None
         repeat_ticks = self._repeat_ticks
         repeat_ticks.append(self._tick_count)
         if (
-            len(repeat_ticks) < _MAX_REPEATS
+            len(repeat_ticks) < _FAULTY_REPEAT_COUNT
             or self._tick_count - repeat_ticks[0] >= _REPEAT_WINDOW_TICKS
         ):
             return None
-        return INTERLOCKS_BY_NAME["repeated angle"].violated(len(repeat_ticks), _MAX_REPEATS - 1)
+        return INTERLOCKS_BY_NAME["repeated angle"].violated(
+            len(repeat_ticks), _FAULTY_REPEAT_COUNT - 1
+        )
 
     def _compare_scales(self, scale_monitor: ScaleMonitor) -> Violation | None:
         """Pass acceleration and net torque of the last window to the scale monitor."""
@@ -419,27 +429,38 @@ class EncoderMonitor:
             return None
         recent_movement_rad = angles[-1] - angles[-1 - SPEED_TICKS]
         previous_movement_rad = angles[-1 - n] - angles[-1 - n - SPEED_TICKS]
-        least_rad = _MIN_SCALE_STEPS * self._resolution_rad
+        min_movement_rad = _MIN_SCALE_CHECK_ENCODER_STEPS * self._resolution_rad
         if (
             recent_movement_rad * previous_movement_rad <= 0.0
-            or min(abs(recent_movement_rad), abs(previous_movement_rad)) < least_rad
+            or min(abs(recent_movement_rad), abs(previous_movement_rad)) < min_movement_rad
         ):
             return None
         # Weighted like the difference of two mean speeds, the torques match the acceleration.
-        net_nm = motor_nm = 0.0
+        net_torque_nm = motor_torque_nm = 0.0
         for j in range(1, SPEED_TICKS + 1):
             for window_end in (torque_history[-1 - j], torque_history[-2 - j]):
-                net_nm, motor_nm = net_nm + window_end[0], motor_nm + window_end[1]
+                net_torque_nm, motor_torque_nm = (
+                    net_torque_nm + window_end[0],
+                    motor_torque_nm + window_end[1],
+                )
             for window_start in (torque_history[-1 - j - n], torque_history[-2 - j - n]):
-                net_nm, motor_nm = net_nm - window_start[0], motor_nm - window_start[1]
-        net_nm, motor_nm = net_nm / (2 * SPEED_TICKS * n), motor_nm / (2 * SPEED_TICKS * n)
+                net_torque_nm, motor_torque_nm = (
+                    net_torque_nm - window_start[0],
+                    motor_torque_nm - window_start[1],
+                )
+        net_torque_nm, motor_torque_nm = (
+            net_torque_nm / (2 * SPEED_TICKS * n),
+            motor_torque_nm / (2 * SPEED_TICKS * n),
+        )
         acceleration_rad_s2 = (
             (recent_movement_rad - previous_movement_rad) * self._rate_hz**2 / (SPEED_TICKS * n)
         )
         speed_rad_s = (
             (recent_movement_rad + previous_movement_rad) * self._rate_hz / (2 * SPEED_TICKS)
         )
-        return scale_monitor.add(acceleration_rad_s2, speed_rad_s, motor_nm - net_nm, net_nm)
+        return scale_monitor.add_window(
+            acceleration_rad_s2, speed_rad_s, motor_torque_nm - net_torque_nm, net_torque_nm
+        )
 
     def _torque_sums(self, ticks: int) -> tuple[float, float]:
         """Return the sums of net torque and motor torque over the last `ticks` ticks in N·m.
@@ -450,6 +471,6 @@ class EncoderMonitor:
         earlier_net_sum, earlier_motor_sum = self._torque_history[-2 - ticks]
         return net_sum - earlier_net_sum, motor_sum - earlier_motor_sum
 
-    def _end_test(self) -> None:
+    def _end_encoder_test(self) -> None:
         """Stop the test of the encoder and remove its torque."""
         self.test_nm = self._test_step_nm = 0.0

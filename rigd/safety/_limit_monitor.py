@@ -25,9 +25,9 @@ Readings of the encoder are then taken at irregular times."""
 _MIN_STALL_S = 0.005
 """Shortest stall of the loop in seconds that is reported as the cause of a later violation."""
 
-_AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
+_WRENCH_AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 """Names of the force-torque sensor's axes in messages."""
-_FORCE_AXES = 3
+_FORCE_AXIS_COUNT = 3
 """Number of axes that measure a force; they come before the torques."""
 _CheckedValue = tuple[str, str, str, float, float, float]
 """Checked value: name of the interlock, channel, unit, value, limit and warning level.
@@ -181,12 +181,12 @@ class LimitMonitor:
         self._elapsed_ticks += missed_ticks
         if missed_ticks:
             self._recently_missed = missed_ticks + (
-                self._recently_missed if self.after_missed else 0
+                self._recently_missed if self.missed_ticks_text else 0
             )
             self._last_missed_check = self._slow_checks
 
     @property
-    def after_missed(self) -> str:
+    def missed_ticks_text(self) -> str:
         """Sentence for the operator on ticks that were missed just before, or an empty string.
 
         It counts ticks missed within the last 64 to 128 ticks.
@@ -279,13 +279,13 @@ class LimitMonitor:
             (
                 "wrench range",
                 f"sensor's {axis_name}",
-                "N" if i < _FORCE_AXES else "N·m",
+                "N" if i < _FORCE_AXIS_COUNT else "N·m",
                 axis_value,
                 axis_limit,
                 warning_level,
             )
             for i, (axis_name, axis_value, axis_limit, warning_level) in enumerate(
-                zip(_AXES, wrench, self._wrench_limits, self._wrench_warnings, strict=True)
+                zip(_WRENCH_AXES, wrench, self._wrench_limits, self._wrench_warnings, strict=True)
             )
         )
         if angle_stale:
@@ -301,8 +301,8 @@ class LimitMonitor:
         `angle_rad` is the new angle, with which the next one is compared.
         """
         elapsed_ticks, previous_moved_rad = self._elapsed_ticks, self._previous_moved_rad
-        moved_rad = angle_rad - self._previous_angle_rad
-        speed_rad_s = moved_rad * self._rate_hz / elapsed_ticks
+        movement_rad = angle_rad - self._previous_angle_rad
+        speed_rad_s = movement_rad * self._rate_hz / elapsed_ticks
         # One latch of the encoder may be late by most of a period and the next one not: the time
         # between them is longer or shorter by that much.
         max_jump_rad = (
@@ -311,7 +311,7 @@ class LimitMonitor:
             + abs(previous_moved_rad)
             + abs(self._second_last_moved_rad)
         )
-        jump_rad = moved_rad - elapsed_ticks * previous_moved_rad
+        jump_rad = movement_rad - elapsed_ticks * previous_moved_rad
         if elapsed_ticks > 1:
             self._ticks_without_jump_check = _NO_JUMP_CHECK_TICKS
         elif self._ticks_without_jump_check:
@@ -319,17 +319,19 @@ class LimitMonitor:
         self._previous_angle_rad = angle_rad
         self._second_last_moved_rad, self._previous_moved_rad = (
             previous_moved_rad,
-            moved_rad / elapsed_ticks,
+            movement_rad / elapsed_ticks,
         )
         self._previous_elapsed_ticks, self._elapsed_ticks = elapsed_ticks, 1
-        limit_rad_s = self._limits.velocity_rad_s
-        warning_rad_s = _warning_fraction("velocity") * limit_rad_s
+        velocity_limit_rad_s = self._limits.velocity_rad_s
+        velocity_warning_rad_s = _warning_fraction("velocity") * velocity_limit_rad_s
         checked_values: list[_CheckedValue] = [
-            ("velocity", "", "", speed_rad_s, limit_rad_s, warning_rad_s)
+            ("velocity", "", "", speed_rad_s, velocity_limit_rad_s, velocity_warning_rad_s)
         ]
         if not self._ticks_without_jump_check:
-            warning_rad = _warning_fraction("encoder jump") * max_jump_rad
-            checked_values.append(("encoder jump", "", "", jump_rad, max_jump_rad, warning_rad))
+            jump_warning_rad = _warning_fraction("encoder jump") * max_jump_rad
+            checked_values.append(
+                ("encoder jump", "", "", jump_rad, max_jump_rad, jump_warning_rad)
+            )
         return checked_values
 
     def check_stale(
@@ -364,15 +366,15 @@ class LimitMonitor:
             )
         )
 
-    def check_torque(self, requested_nm: float) -> Violation | None:
+    def check_torque(self, requested_torque_nm: float) -> Violation | None:
         """Return a violation if the controller requests a torque above its limit, else None."""
         limit_nm = self._limits.torque_command_nm
         return self._assess_values(
-            (("torque command", "", "", requested_nm, limit_nm, self._peak_nm),)
+            (("torque command", "", "", requested_torque_nm, limit_nm, self._peak_nm),)
         )
 
     def check_missed(
-        self, missed_in_row: int, missed_in_session: int, scheduled_ticks: int
+        self, consecutive_missed_ticks: int, session_missed_ticks: int, scheduled_ticks: int
     ) -> Violation | None:
         """Return a violation if too many ticks were missed in a row or in the session, else None.
 
@@ -380,18 +382,18 @@ class LimitMonitor:
 
         Parameters
         ----------
-        missed_in_row
+        consecutive_missed_ticks
             Number of consecutive ticks missed just now.
-        missed_in_session, scheduled_ticks
+        session_missed_ticks, scheduled_ticks
             Numbers of missed and of scheduled ticks since the record's first.
         """
-        self.skip(missed_in_row)
+        self.skip(consecutive_missed_ticks)
         limits = self._limits
         return self._assess_fraction(
-            _checked_value("missed ticks", missed_in_row, limits.missed_ticks_in_a_row),
+            _checked_value("missed ticks", consecutive_missed_ticks, limits.missed_ticks_in_a_row),
             _checked_value(
                 "missed share",
-                self._percentage(missed_in_session, scheduled_ticks),
+                self._percentage(session_missed_ticks, scheduled_ticks),
                 limits.missed_percent,
             ),
         )
@@ -411,15 +413,17 @@ class LimitMonitor:
             Numbers of ticks with an old angle, of ticks with an old wrench, and of scheduled ticks,
             since the record's first.
         """
-        percent_limit = self._limits.stale_percent
+        stale_percent_limit = self._limits.stale_percent
         return self._assess_fraction(
             _checked_value(
-                "stale angle share", self._percentage(stale_angles, scheduled_ticks), percent_limit
+                "stale angle share",
+                self._percentage(stale_angles, scheduled_ticks),
+                stale_percent_limit,
             ),
             _checked_value(
                 "stale wrench share",
                 self._percentage(stale_wrenches, scheduled_ticks),
-                percent_limit,
+                stale_percent_limit,
             ),
         )
 
@@ -463,11 +467,11 @@ class LimitMonitor:
         """
         self._slow_checks += 1
         if self._last_warnings:
-            oldest_check = self._slow_checks - self._rearm_checks
+            oldest_recent_check = self._slow_checks - self._rearm_checks
             self._last_warnings = {
                 channel_name: last_check
                 for channel_name, last_check in self._last_warnings.items()
-                if last_check >= oldest_check
+                if last_check >= oldest_recent_check
             }
         elapsed_s = (
             0.0 if self._last_slow_check_ns is None else (due_ns - self._last_slow_check_ns) * 1e-9
@@ -508,7 +512,7 @@ class LimitMonitor:
         A value that is not a number counts as infinitely far beyond its limit.
         """
         worst_value, worst_ratio = None, 1.0
-        near_limit = []
+        warned_values = []
         for checked_value in checked_values:
             interlock_name, _, _, measured_value, limit_value, warning_level = checked_value
             if INTERLOCKS_BY_NAME[interlock_name].below:
@@ -522,21 +526,24 @@ class LimitMonitor:
             if limit_ratio > worst_ratio:
                 worst_value, worst_ratio = checked_value, limit_ratio
             elif is_near_limit:
-                near_limit.append(checked_value)
+                warned_values.append(checked_value)
         if worst_value is not None:
             self.warning = True
             return self._violation_with_cause(worst_value)
-        for checked_value in near_limit:
+        for checked_value in warned_values:
             self.warning = True
             channel = checked_value[1] or checked_value[0]
             if channel not in self._last_warnings:
-                self._notices.append(str(_make_violation(checked_value, warns=True)))
+                self._notices.append(str(_make_violation(checked_value, is_warning=True)))
             self._last_warnings[channel] = self._slow_checks
         return None
 
     def _violation_with_cause(self, checked_value: _CheckedValue) -> Violation:
         """Return the violation of a limit, with advice that mentions ticks missed just before."""
-        violation, missed_text = _make_violation(checked_value, warns=False), self.after_missed
+        violation, missed_text = (
+            _make_violation(checked_value, is_warning=False),
+            self.missed_ticks_text,
+        )
         if not missed_text or not INTERLOCKS_BY_NAME[checked_value[0]].follows_missed_ticks:
             return violation
         if OVERLOADED_ADVICE not in missed_text:
@@ -563,8 +570,8 @@ def _checked_value(interlock_name: str, measured_value: float, limit_value: floa
     )
 
 
-def _make_violation(checked_value: _CheckedValue, *, warns: bool) -> Violation:
-    """Return the violation of a reading's limit, or of its warning level if `warns` is true."""
+def _make_violation(checked_value: _CheckedValue, *, is_warning: bool) -> Violation:
+    """Return the violation of a reading's limit, or of its warning level if `is_warning`."""
     interlock_name, channel_text, unit, measured_value, limit_value, warning_level = checked_value
     interlock = INTERLOCKS_BY_NAME[interlock_name]
     return Violation(
@@ -572,8 +579,8 @@ def _make_violation(checked_value: _CheckedValue, *, warns: bool) -> Violation:
         measured_value,
         limit_value,
         unit or interlock.unit,
-        "" if warns else interlock.remedy,
+        "" if is_warning else interlock.remedy,
         interlock.limit,
         below=interlock.below,
-        warning=warning_level if warns else None,
+        warning=warning_level if is_warning else None,
     )

@@ -22,11 +22,11 @@ WINDOW_TICKS = 8
 The difference of the two gives the acceleration."""
 SPEED_TICKS = 4
 """Number of ticks over which a mean speed is computed."""
-_TORQUE_ERROR_STD = 0.25
+_RELATIVE_TORQUE_ERROR_STD = 0.25
 """Expected standard deviation of the relative error of the motor's torque."""
 _FORGETTING_FACTOR = 0.995
 """Weight of a window relative to the next window."""
-_MIN_WINDOWS = 60.0
+_MIN_WINDOW_COUNT = 60.0
 """Smallest number of windows from which the ratio is checked."""
 _MIN_TORQUE_STD_NM = 2e-3
 """Smallest standard deviation that is assumed of a window's mean torques, in N·m."""
@@ -36,9 +36,9 @@ _MIN_INERTIA_TORQUE_RMS_NM = 2e-2
 Below it the encoder's steps distort the ratio."""
 _FRICTION_PRIOR_PRECISION = 1.0
 """Inverse variance of the prior of viscous friction, in (rad/(N·m·s))²."""
-_SIGNIFICANT_STDS = 4.0
+_MIN_SIGNIFICANT_STDS = 4.0
 """Standard deviations by which the ratio has to exceed its limit to be a fault."""
-_CHECK_WINDOWS = 8
+_WINDOWS_PER_CHECK = 8
 """Number of windows from one check of the ratio to the next."""
 
 
@@ -68,8 +68,12 @@ class ScaleMonitor:
         self._moments = np.zeros((5, 5))
         self._windows = 0
 
-    def add(
-        self, acceleration_rad_s2: float, speed_rad_s: float, coupling_nm: float, net_nm: float
+    def add_window(
+        self,
+        acceleration_rad_s2: float,
+        speed_rad_s: float,
+        coupling_nm: float,
+        net_torque_nm: float,
     ) -> Violation | None:
         """Add a window's means to the estimate, and check the ratio from time to time.
 
@@ -77,7 +81,7 @@ class ScaleMonitor:
         ----------
         acceleration_rad_s2, speed_rad_s
             Measured mean acceleration and speed.
-        coupling_nm, net_nm
+        coupling_nm, net_torque_nm
             Mean coupling torque, and mean of motor minus coupling torque.
 
         Returns
@@ -85,18 +89,24 @@ class ScaleMonitor:
         Violation or None
             Violation if the ratio is beyond its limit.
         """
-        inertia_nm = self._inertia_kg_m2 * acceleration_rad_s2
+        inertial_torque_nm = self._inertia_kg_m2 * acceleration_rad_s2
         window_row = np.array(
-            (inertia_nm, coupling_nm, copysign(1.0, speed_rad_s), speed_rad_s, net_nm)
+            (
+                inertial_torque_nm,
+                coupling_nm,
+                copysign(1.0, speed_rad_s),
+                speed_rad_s,
+                net_torque_nm,
+            )
         )
         self._moments *= _FORGETTING_FACTOR
         self._moments += window_row[:, None] * window_row
         self._windows += 1
-        if self._windows < _MIN_WINDOWS or self._windows % _CHECK_WINDOWS:
+        if self._windows < _MIN_WINDOW_COUNT or self._windows % _WINDOWS_PER_CHECK:
             return None
         return self._check_ratio()
 
-    def estimate(self) -> tuple[float, float]:
+    def estimate_ratio(self) -> tuple[float, float]:
         """Return the ratio of net torque to inertia times acceleration, and its standard deviation.
 
         The standard deviation is infinite if the windows do not determine the ratio.
@@ -106,29 +116,29 @@ class ScaleMonitor:
         if moment_matrix[0, 0] < window_weight * _MIN_INERTIA_TORQUE_RMS_NM**2:
             return 1.0, inf
         variance_nm2 = _MIN_TORQUE_STD_NM**2
-        ratio = ratio_std = inf
+        torque_ratio = ratio_std = inf
         for _ in range(2):
-            information = moment_matrix[:4, :4] / variance_nm2
-            information[1, 1] += 1.0 / _TORQUE_ERROR_STD**2
-            information[3, 3] += _FRICTION_PRIOR_PRECISION
-            covariance = np.linalg.inv(information)
+            information_matrix = moment_matrix[:4, :4] / variance_nm2
+            information_matrix[1, 1] += 1.0 / _RELATIVE_TORQUE_ERROR_STD**2
+            information_matrix[3, 3] += _FRICTION_PRIOR_PRECISION
+            covariance = np.linalg.inv(information_matrix)
             solution = covariance @ (moment_matrix[:4, 4] / variance_nm2)
             residual_squares = (
                 moment_matrix[4, 4]
                 - 2 * solution @ moment_matrix[:4, 4]
                 + solution @ moment_matrix[:4, :4] @ solution
             )
-            ratio, ratio_std = float(solution[0]), sqrt(max(0.0, float(covariance[0, 0])))
+            torque_ratio, ratio_std = float(solution[0]), sqrt(max(0.0, float(covariance[0, 0])))
             variance_nm2 = max(_MIN_TORQUE_STD_NM**2, float(residual_squares) / window_weight)
-        return ratio, ratio_std
+        return torque_ratio, ratio_std
 
     def _check_ratio(self) -> Violation | None:
         """Return a violation if the torque ratio is significantly beyond its limit, else None."""
-        ratio, ratio_std = self.estimate()
+        ratio, ratio_std = self.estimate_ratio()
         interlock = INTERLOCKS_BY_NAME["scales"]
         lower_bound, upper_bound = (
-            ratio - _SIGNIFICANT_STDS * ratio_std,
-            ratio + _SIGNIFICANT_STDS * ratio_std,
+            ratio - _MIN_SIGNIFICANT_STDS * ratio_std,
+            ratio + _MIN_SIGNIFICANT_STDS * ratio_std,
         )
         ratio_limit = self._limit
         if lower_bound > ratio_limit:

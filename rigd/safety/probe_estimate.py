@@ -23,15 +23,15 @@ _FREQUENCY_FACTORS = tuple(float(x) for x in np.linspace(0.9, 1.1, 21))
 """Candidate factors by which the beam's frequencies are multiplied in the estimate.
 
 Without them a stiffer beam would count as a wrong scale."""
-_WINDOW_STD_S = 0.008
+_SMOOTHING_STD_S = 0.008
 """Standard deviation in seconds of the Gaussian window that smooths all signals."""
 _MIN_SPEED_FRACTION = 0.1
 """Fraction of the largest speed below which the sign of the friction is uncertain."""
-_MIN_SAMPLES = 50
+_MIN_SAMPLE_COUNT = 50
 """Smallest number of samples of an estimate; the motor's equation requires twice as many."""
 _WINDOW_CUTOFF_HZ = 100.0
 """Frequency in Hz above which the smoothing window passes nothing."""
-_DECAY_EXPONENT = 12.0
+_TRANSFORM_DECAY_EXPONENT = 12.0
 """Exponent of the transform's damping."""
 _MAX_CONDITION_NUMBER = 1e6
 """Largest condition number of the normal equations that gives an estimate."""
@@ -41,7 +41,7 @@ _SAME_RATIO_FACTOR = 1.3
 """Factor by which two ratios may differ and still count as the same."""
 _NO_TORQUE_RATIO = 0.15
 """Ratio of measured torque to beam's torque below which the sensor counts as dead."""
-_ADVICE = (
+_PROBE_ADVICE = (
     "Correct the profile or the rig. A value that was measured by other means and is marked "
     'source = "measured" (docs/safety.md) is not probed.'
 )
@@ -98,23 +98,28 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
     """
     angle_rad = np.array(move.angles_rad)
     smoothing_window = _smoothing_window(rig.rate_hz)
-    if angle_rad.size < smoothing_window.size + _MIN_SAMPLES:
+    if angle_rad.size < smoothing_window.size + _MIN_SAMPLE_COUNT:
         return ProbeEstimate(*(None,) * 8, travel_rad=float(np.ptp(angle_rad)), speed_rad_s=0.0)
 
     def smooth(signal: RealArray) -> RealArray:
         return np.convolve(signal, smoothing_window, "valid")
 
     speed_rad_s = np.gradient(smooth(angle_rad)) * rig.rate_hz
-    acceleration = np.gradient(speed_rad_s) * rig.rate_hz
-    max_speed = float(np.max(np.abs(speed_rad_s)))
+    acceleration_rad_s2 = np.gradient(speed_rad_s) * rig.rate_hz
+    max_speed_rad_s = float(np.max(np.abs(speed_rad_s)))
     coupling_ratio, ratio_std, beam_nm = _coupling_ratio(
         rig, angle_rad, smooth(np.array(move.coupling_nm)), smoothing_window
     )
     delay_ticks = max(0, round(rig.command_delay_s * rig.rate_hz))
     command_nm = np.concatenate([np.zeros(delay_ticks), move.torques_nm])[: angle_rad.size]
-    is_moving: NDArray[np.bool_] = np.abs(speed_rad_s) > _MIN_SPEED_FRACTION * max_speed
+    is_moving: NDArray[np.bool_] = np.abs(speed_rad_s) > _MIN_SPEED_FRACTION * max_speed_rad_s
     motor_fit = _fit_motor_equation(
-        smooth(command_nm), acceleration, speed_rad_s, beam_nm, is_moving, smoothing_window.size
+        smooth(command_nm),
+        acceleration_rad_s2,
+        speed_rad_s,
+        beam_nm,
+        is_moving,
+        smoothing_window.size,
     )
     torque_scale, scale_std, inertia, inertia_std, coulomb_nm, viscous_nm_s_per_rad = motor_fit
     if coupling_ratio and ratio_std and torque_scale and scale_std and inertia and inertia_std:
@@ -132,16 +137,16 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
         coulomb_nm,
         viscous_nm_s_per_rad,
         float(np.ptp(angle_rad)),
-        max_speed,
+        max_speed_rad_s,
     )
 
 
 def _smoothing_window(rate_hz: float) -> RealArray:
     """Return the Gaussian smoothing window, of unit sum, odd length and at least three ticks."""
-    spread_ticks = max(1.0, _WINDOW_STD_S * rate_hz)
-    half_width = int(3.0 * spread_ticks)
+    window_std_ticks = max(1.0, _SMOOTHING_STD_S * rate_hz)
+    half_width = int(3.0 * window_std_ticks)
     window_weights: RealArray = np.exp(
-        -0.5 * (np.arange(-half_width, half_width + 1) / spread_ticks) ** 2
+        -0.5 * (np.arange(-half_width, half_width + 1) / window_std_ticks) ** 2
     )
     window_weights /= window_weights.sum()
     return window_weights
@@ -162,17 +167,17 @@ def _coupling_ratio(
         if torque_squares == 0.0:
             continue
         coupling_ratio = float(expected_nm @ measured_nm) / torque_squares
-        residual_nm = float(np.sum((measured_nm - coupling_ratio * expected_nm) ** 2))
-        if best_fit is None or residual_nm < best_fit[0]:
+        residual_squares_nm2 = float(np.sum((measured_nm - coupling_ratio * expected_nm) ** 2))
+        if best_fit is None or residual_squares_nm2 < best_fit[0]:
             # Smoothed samples within a window are not independent.
             ratio_variance = (
-                residual_nm
+                residual_squares_nm2
                 / expected_nm.size
                 * _samples_per_independent_sample(smoothing_window)
                 / torque_squares
             )
             best_fit = (
-                residual_nm,
+                residual_squares_nm2,
                 coupling_ratio,
                 sqrt(ratio_variance),
                 coupling_ratio * expected_nm,
@@ -192,14 +197,17 @@ def _beam_torques(rig: ProbedRig, angle_rad: RealArray) -> RealArray:
     """
     n = angle_rad.size
     transform = CausalTransform(
-        1 << (2 * n - 1).bit_length(), rig.rate_hz, _DECAY_EXPONENT, highest_hz=_WINDOW_CUTOFF_HZ
+        1 << (2 * n - 1).bit_length(),
+        rig.rate_hz,
+        _TRANSFORM_DECAY_EXPONENT,
+        highest_hz=_WINDOW_CUTOFF_HZ,
     )
     s = transform.s
     angle_spectrum = transform.forward(angle_rad, hold=True)
     torques_nm = np.empty((len(_FREQUENCY_FACTORS), n))
     for row, frequency_factor in zip(torques_nm, _FREQUENCY_FACTORS, strict=True):
-        stiffness = rig.beam.bending_stiffness_n_m2 * frequency_factor**2
-        scaled_beam = replace(rig.beam, bending_stiffness_n_m2=stiffness)
+        bending_stiffness_n_m2 = rig.beam.bending_stiffness_n_m2 * frequency_factor**2
+        scaled_beam = replace(rig.beam, bending_stiffness_n_m2=bending_stiffness_n_m2)
         torque_per_angle = transfer(s, scaled_beam, rig.damping) + rig.tool_inertia_kg_m2 * s * s
         row[:] = transform.inverse(torque_per_angle * angle_spectrum, n)
     return torques_nm
@@ -207,9 +215,9 @@ def _beam_torques(rig: ProbedRig, angle_rad: RealArray) -> RealArray:
 
 def _fit_motor_equation(
     command_nm: RealArray,
-    acceleration: RealArray,
+    acceleration_rad_s2: RealArray,
     speed_rad_s: RealArray,
-    beam_nm: RealArray,
+    beam_torque_nm: RealArray,
     is_moving: NDArray[np.bool_],
     window_ticks: float,
 ) -> tuple[float | None, ...]:
@@ -218,11 +226,11 @@ def _fit_motor_equation(
     Returns the torque scale and its standard deviation, the inertia and its standard deviation,
     Coulomb and viscous friction. All are None if they cannot be estimated.
     """
-    equation_columns = np.stack([beam_nm, acceleration, np.sign(speed_rad_s), speed_rad_s], axis=1)[
-        is_moving
-    ]
+    equation_columns = np.stack(
+        [beam_torque_nm, acceleration_rad_s2, np.sign(speed_rad_s), speed_rad_s], axis=1
+    )[is_moving]
     column_norms = np.linalg.norm(equation_columns, axis=0)
-    if len(equation_columns) < 2 * _MIN_SAMPLES or not column_norms.all():
+    if len(equation_columns) < 2 * _MIN_SAMPLE_COUNT or not column_norms.all():
         return (None,) * 6
     equation_columns = equation_columns / column_norms
     normal_matrix = equation_columns.T @ equation_columns
@@ -254,7 +262,7 @@ def _fit_motor_equation(
 
 
 def contradiction(
-    rig: ProbedRig, end: ProbeEnd | None, estimate: ProbeEstimate, *, motor: bool = True
+    rig: ProbedRig, end: ProbeEnd | None, estimate: ProbeEstimate, *, with_motor: bool = True
 ) -> str:
     """Describe a contradiction between a probing move and the profile, for the operator.
 
@@ -266,7 +274,7 @@ def contradiction(
         Reason for the end of the move.
     estimate
         Estimate from the record of the move, as returned by `estimate_probe`.
-    motor
+    with_motor
         Whether to check the motor's torque and inertia too, not only the quantities on which the
         bounds of travel and speed depend.
 
@@ -276,17 +284,19 @@ def contradiction(
         Message with advice, or an empty string if there is no contradiction.
     """
     description = _motion_contradiction(rig, end)
-    if not description and (end is ProbeEnd.PULLED or not _is_accepted(estimate.coupling_ratio)):
-        description = _coupling_contradiction(estimate, with_motor=motor)
-    if not description and motor:
+    if not description and (
+        end is ProbeEnd.PULLED or not _is_ratio_accepted(estimate.coupling_ratio)
+    ):
+        description = _coupling_contradiction(estimate, with_motor=with_motor)
+    if not description and with_motor:
         description = _motor_contradiction(estimate)
-    if not description and end is ProbeEnd.AWAY and motor:
+    if not description and end is ProbeEnd.AWAY and with_motor:
         description = (
             f"The shaft left the bounds of the probing move after {estimate.travel_rad:.2g} rad at "
             f"up to {estimate.speed_rad_s:.2g} rad/s: check motor.inertia_kg_m2, "
             "motor.rated_torque_nm and encoder.resolution_rad."
         )
-    return f"Probing move: {description} {_ADVICE}" if description else ""
+    return f"Probing move: {description} {_PROBE_ADVICE}" if description else ""
 
 
 def doubts(estimate: ProbeEstimate) -> list[str]:
@@ -311,7 +321,7 @@ _COUPLING_RATIO_KEYS = "encoder.resolution_rad, sensor.projection and calibratio
 """Keys of the profile on which the ratio of the coupling torques depends, for messages."""
 
 
-def _is_accepted(ratio: float | None) -> bool:
+def _is_ratio_accepted(ratio: float | None) -> bool:
     """Return whether a ratio is known and within `RATIO_BAND`."""
     lowest_ratio, highest_ratio = RATIO_BAND
     return ratio is not None and lowest_ratio <= ratio <= highest_ratio
@@ -402,7 +412,7 @@ def _motor_contradiction(estimate: ProbeEstimate) -> str:
     for clause, checked_ratio, std, quantity in checked_ratios:
         if checked_ratio is None or std is None:
             unknown_clauses.append(quantity)
-        elif not _is_accepted(checked_ratio):
+        elif not _is_ratio_accepted(checked_ratio):
             return f"{clause} {checked_ratio:.2g} ± {std:.1g} times {quantity}."
         elif std > _MAX_RELATIVE_STD * checked_ratio:
             unknown_clauses.append(quantity)

@@ -25,9 +25,9 @@ The move is not needed if all of them have the source "measured"."""
 
 # Beam at the measured angle
 
-_BEAM_MODES = 4
+_BEAM_MODE_COUNT = 4
 """Number of the beam's modes that the strokes excite."""
-_REMAINDER_RAD_S = 300.0
+_HIGHER_MODES_RAD_S = 300.0
 """Angular frequency in rad/s of the damped oscillator that models tool and higher modes."""
 
 
@@ -59,7 +59,7 @@ class ProbedRig:
     """Largest speed of the output shaft."""
 
 
-class BeamFollower:
+class BeamTorqueFilter:
     """Computes the coupling torque of the profile's beam from the measured angle, tick by tick.
 
     The beam is at rest in the beginning. Each mode is an oscillator driven by the angle. Fractional
@@ -73,9 +73,9 @@ class BeamFollower:
 
     def __init__(self, rig: ProbedRig) -> None:
         beam = rig.beam
-        inertias = participation(beam, _BEAM_MODES) * beam.density_kg_per_m
+        inertias = participation(beam, _BEAM_MODE_COUNT) * beam.density_kg_per_m
         remaining_inertia = beam.inertia_kg_m2 - float(inertias.sum()) + rig.tool_inertia_kg_m2
-        beam_poles = poles(beam, rig.damping, _BEAM_MODES)[:, 0]
+        beam_poles = poles(beam, rig.damping, _BEAM_MODE_COUNT)[:, 0]
         beam_modes = [
             (complex(mode_pole), float(mode_inertia))
             for mode_pole, mode_inertia in zip(beam_poles, inertias, strict=True)
@@ -84,7 +84,7 @@ class BeamFollower:
         self._oscillators: list[tuple[complex, complex, complex, float]] = []
         for mode_pole, mode_inertia in [
             *beam_modes,
-            (_REMAINDER_RAD_S * (-0.7 + 0.714j), remaining_inertia),
+            (_HIGHER_MODES_RAD_S * (-0.7 + 0.714j), remaining_inertia),
         ]:
             squared_magnitude = abs(mode_pole) ** 2
             mode_residue = (squared_magnitude - 2.0 * mode_pole.real * mode_pole) / (
@@ -132,11 +132,11 @@ def _linear_input_step(
 
 # Plan
 
-_FIRST_SPEED_RAD_S = 0.4
+_FIRST_STROKE_SPEED_RAD_S = 0.4
 """Speed of the first strokes in rad/s; the second strokes are twice as fast."""
-_FIRST_TRAVEL_RAD = 0.16
+_FIRST_STROKE_TRAVEL_RAD = 0.16
 """Travel of the first strokes in rad, if the limits of speed and angle allow it."""
-_RATED_TORQUES_PER_S = 0.4
+_TORQUE_RISE_RATED_TORQUES_PER_S = 0.4
 """Rise of the torque until the shaft moves, in rated torques per second.
 
 A slower rise would not stop a shaft with a frozen encoder any earlier: the beam's torque is then
@@ -180,7 +180,7 @@ class ProbePlan:
         return self.fast_speed_rad_s * self.cruise_s
 
     @property
-    def bound_rad(self) -> float:
+    def travel_bound_rad(self) -> float:
         """Angle in rad from the start of the probing move beyond which the move ends."""
         return 1.5 * self.travel_rad + 0.05
 
@@ -199,17 +199,20 @@ def plan_probe(rig: ProbedRig) -> ProbePlan:
         Values of the profile.
     """
     first_pole_rad_s = abs(complex(poles(rig.beam, rig.damping, 1)[0, 0]))
-    period_s = 2.0 * pi / first_pole_rad_s
-    cruise_s = period_s * max(1, round(_MIN_CRUISE_S / period_s + 0.3))
+    first_mode_period_s = 2.0 * pi / first_pole_rad_s
+    cruise_s = first_mode_period_s * max(1, round(_MIN_CRUISE_S / first_mode_period_s + 0.3))
     fast_speed_rad_s = min(
-        2.0 * _FIRST_SPEED_RAD_S,
-        2.0 * _FIRST_TRAVEL_RAD / cruise_s,
+        2.0 * _FIRST_STROKE_SPEED_RAD_S,
+        2.0 * _FIRST_STROKE_TRAVEL_RAD / cruise_s,
         _MAX_SPEED_FRACTION * rig.velocity_limit_rad_s,
         _MAX_TRAVEL_FRACTION * rig.angle_limit_rad / cruise_s,
     )
-    torque_nm = min(_BLOCKED_TORQUE_FRACTION * rig.rated_torque_nm, rig.peak_torque_nm)
+    torque_limit_nm = min(_BLOCKED_TORQUE_FRACTION * rig.rated_torque_nm, rig.peak_torque_nm)
     return ProbePlan(
-        0.5 * fast_speed_rad_s, cruise_s, torque_nm, _RATED_TORQUES_PER_S * rig.rated_torque_nm
+        0.5 * fast_speed_rad_s,
+        cruise_s,
+        torque_limit_nm,
+        _TORQUE_RISE_RATED_TORQUES_PER_S * rig.rated_torque_nm,
     )
 
 
@@ -227,7 +230,7 @@ class ProbeEnd(Enum):
     AWAY = "the shaft left the bounds of the move"
 
 
-_BANDWIDTH_RAD_S = 25.0
+_SPEED_CONTROLLER_BANDWIDTH_RAD_S = 25.0
 """Bandwidth of the speed controller in rad/s, for the profile's inertia of motor and beam."""
 _INTEGRAL_RATE_RAD_S = 6.0
 """Ratio of the speed controller's integral to its proportional gain, in rad/s."""
@@ -235,17 +238,17 @@ _SPEED_WINDOW_S = 0.004
 """Time in seconds over which the speed is measured."""
 _COMPARISON_TIME_CONSTANT_S = 0.012
 """Time constant in seconds of the filter before the coupling torque is compared."""
-_MIN_MOVEMENT_STEPS = 8
+_MIN_MOVEMENT_ENCODER_STEPS = 8
 """Smallest movement that proves motion of the shaft, in encoder steps of any size."""
 _MIN_MOVEMENT_RAD = 2e-4
 """Smallest movement in rad that proves motion of the shaft."""
-_MIN_DIFFERENCE_NM = 8e-3
+_MIN_TORQUE_DIFFERENCE_NM = 8e-3
 """Smallest difference in N·m between coupling torque and beam's torque that ends the move."""
-_MIN_DIFFERENCE_STDS = 2.0
+_MIN_TORQUE_DIFFERENCE_STDS = 2.0
 """Smallest difference between coupling torque and beam's torque that ends the move.
 
 It is in standard deviations of the coupling torque at rest."""
-_MIN_DIFFERENCE_FRACTION = 0.6
+_MIN_TORQUE_DIFFERENCE_FRACTION = 0.6
 """Smallest difference between coupling torque and beam's torque that ends the move.
 
 It is a fraction of the largest recent torque of the beam."""
@@ -296,22 +299,26 @@ class ProbingMove:
         self.torque_limit_nm = plan.torque_limit_nm
         self._period_s = 1.0 / rate_hz
         inertia_kg_m2 = rig.inertia_kg_m2 + rig.beam.inertia_kg_m2 + rig.tool_inertia_kg_m2
-        bandwidth_rad_s = min(_BANDWIDTH_RAD_S, 0.05 * rate_hz)
+        bandwidth_rad_s = min(_SPEED_CONTROLLER_BANDWIDTH_RAD_S, 0.05 * rate_hz)
         self._gain = inertia_kg_m2 * bandwidth_rad_s
         self._integral_gain = self._gain * min(_INTEGRAL_RATE_RAD_S, 0.25 * bandwidth_rad_s)
         self._speed_ticks = max(2, round(_SPEED_WINDOW_S * rate_hz))
         self._filter_gain = 1.0 / (1.0 + _COMPARISON_TIME_CONSTANT_S * rate_hz)
-        self._min_difference_nm = max(_MIN_DIFFERENCE_NM, _MIN_DIFFERENCE_STDS * torque_noise_nm)
-        self._min_movement_rad = max(_MIN_MOVEMENT_STEPS * rig.resolution_rad, _MIN_MOVEMENT_RAD)
+        self._min_difference_nm = max(
+            _MIN_TORQUE_DIFFERENCE_NM, _MIN_TORQUE_DIFFERENCE_STDS * torque_noise_nm
+        )
+        self._min_movement_rad = max(
+            _MIN_MOVEMENT_ENCODER_STEPS * rig.resolution_rad, _MIN_MOVEMENT_RAD
+        )
         self.reset(0.0)
 
     def reset(self, angle_rad: float) -> None:
         """Set the move to its start, with the shaft at rest at an angle."""
         self._start_rad = angle_rad
-        self._beam_follower = BeamFollower(self._rig)
-        first_side = -1.0 if angle_rad > 0.0 else 1.0
+        self._beam_follower = BeamTorqueFilter(self._rig)
+        first_stroke_side = -1.0 if angle_rad > 0.0 else 1.0
         self._strokes = [
-            (stroke_side * first_side, speed_rad_s)
+            (stroke_side * first_stroke_side, speed_rad_s)
             for speed_rad_s in (self._plan.speed_rad_s, self._plan.fast_speed_rad_s)
             for stroke_side in (1.0, -1.0)
         ]
@@ -358,10 +365,10 @@ class ProbingMove:
         previous_rad, before_nm = self.angles_rad[-1], self.coupling_nm[-1]
         for tick_number in range(1, self.missed + 1):
             time_fraction = tick_number / (self.missed + 1)
-            between_rad = previous_rad + time_fraction * (angle_rad - previous_rad)
-            between_nm = before_nm + time_fraction * (coupling_torque_nm - before_nm)
-            self._compare_coupling_torque(between_rad, between_nm)
-            self._record_tick(between_rad, self._torque_nm, between_nm)
+            interpolated_angle_rad = previous_rad + time_fraction * (angle_rad - previous_rad)
+            interpolated_torque_nm = before_nm + time_fraction * (coupling_torque_nm - before_nm)
+            self._compare_coupling_torque(interpolated_angle_rad, interpolated_torque_nm)
+            self._record_tick(interpolated_angle_rad, self._torque_nm, interpolated_torque_nm)
         self.missed = 0
 
     def _record_tick(self, angle_rad: float, torque_nm: float, coupling_nm: float) -> None:
@@ -372,33 +379,35 @@ class ProbingMove:
 
     def _compare_coupling_torque(self, angle_rad: float, coupling_nm: float) -> None:
         """End the move if the measured coupling torque differs too much from the beam's torque."""
-        beam_nm = self._beam_follower.step(angle_rad)
-        self._smooth_beam_nm += self._filter_gain * (beam_nm - self._smooth_beam_nm)
+        beam_torque_nm = self._beam_follower.step(angle_rad)
+        self._smooth_beam_nm += self._filter_gain * (beam_torque_nm - self._smooth_beam_nm)
         self._smooth_coupling_nm += self._filter_gain * (coupling_nm - self._smooth_coupling_nm)
         self._beam_squares += self._smooth_beam_nm**2
         self._beam_coupling_products += self._smooth_beam_nm * self._smooth_coupling_nm
         # The tolerance uses the largest torque of the last third of a second, since the torque is
         # small at zero crossings.
-        decay = 1.0 - 3.0 * self._period_s
-        self._recent_beam_nm = max(abs(self._smooth_beam_nm), decay * self._recent_beam_nm)
+        torque_decay_factor = 1.0 - 3.0 * self._period_s
+        self._recent_beam_nm = max(
+            abs(self._smooth_beam_nm), torque_decay_factor * self._recent_beam_nm
+        )
         difference_nm = abs(self._smooth_coupling_nm - self._smooth_beam_nm)
         if self.end is None and difference_nm > max(
-            self._min_difference_nm, _MIN_DIFFERENCE_FRACTION * self._recent_beam_nm
+            self._min_difference_nm, _MIN_TORQUE_DIFFERENCE_FRACTION * self._recent_beam_nm
         ):
             self.end = ProbeEnd.STILL if self._is_encoder_frozen(angle_rad) else ProbeEnd.PULLED
 
     def _is_encoder_frozen(self, angle_rad: float) -> bool:
         """Return whether the encoder has shown the same angle for `_FROZEN_ENCODER_S`."""
-        recent_angles_rad = self.angles_rad[-max(3, self._to_ticks(_FROZEN_ENCODER_S)) :]
+        recent_angles_rad = self.angles_rad[-max(3, self._ticks_in(_FROZEN_ENCODER_S)) :]
         return all(angle == angle_rad for angle in recent_angles_rad)
 
     def _check_bounds(self, angle_rad: float) -> None:
         """End the move if angle, speed or duration exceeds its bound."""
         plan = self._plan
         if (
-            abs(angle_rad) > plan.bound_rad
+            abs(angle_rad) > plan.travel_bound_rad
             or abs(self._speed_rad_s) > plan.velocity_bound_rad_s
-            or self._tick_count - self._stroke_start > self._to_ticks(_MAX_STROKE_S)
+            or self._tick_count - self._stroke_start > self._ticks_in(_MAX_STROKE_S)
         ):
             self.end = ProbeEnd.AWAY
 
@@ -407,7 +416,7 @@ class ProbingMove:
         """Number of recorded ticks."""
         return len(self.angles_rad)
 
-    def _to_ticks(self, duration_s: float) -> int:
+    def _ticks_in(self, duration_s: float) -> int:
         """Return the number of ticks in a duration."""
         return round(duration_s / self._period_s)
 
@@ -429,12 +438,12 @@ class ProbingMove:
             return self._start_next_stroke(angle_rad)
         return self._speed_controller_torque(stroke_side * stroke_rad_s * speed_fraction)
 
-    def _breakaway_torque(self, stroke_side: float, moved_rad: float) -> float:
+    def _breakaway_torque(self, stroke_side: float, movement_rad: float) -> float:
         """Return the torque in N·m until the shaft breaks away; it rises from tick to tick."""
-        if moved_rad < -self._min_movement_rad and self._stroke_index == 0:
+        if movement_rad < -self._min_movement_rad and self._stroke_index == 0:
             self.end = ProbeEnd.REVERSED
             return 0.0
-        if moved_rad > self._min_movement_rad:
+        if movement_rad > self._min_movement_rad:
             self._moving_since_tick = self._tick_count
             return self._integral_nm
         self._integral_nm += stroke_side * self._plan.torque_rise_nm_per_s * self._period_s
@@ -469,13 +478,15 @@ class ProbingMove:
         )
         return self._integral_nm
 
-    def _speed_controller_torque(self, wanted_rad_s: float) -> float:
+    def _speed_controller_torque(self, target_speed_rad_s: float) -> float:
         """Return the speed controller's torque in N·m for a wanted speed."""
-        error_rad_s = wanted_rad_s - self._speed_rad_s
-        limit_nm = self._plan.torque_limit_nm
+        error_rad_s = target_speed_rad_s - self._speed_rad_s
+        torque_limit_nm = self._plan.torque_limit_nm
         self._integral_nm += self._integral_gain * self._period_s * error_rad_s
-        self._integral_nm = min(max(self._integral_nm, -limit_nm), limit_nm)
-        return min(max(self._gain * error_rad_s + self._integral_nm, -limit_nm), limit_nm)
+        self._integral_nm = min(max(self._integral_nm, -torque_limit_nm), torque_limit_nm)
+        return min(
+            max(self._gain * error_rad_s + self._integral_nm, -torque_limit_nm), torque_limit_nm
+        )
 
     @property
     def _speed_rad_s(self) -> float:

@@ -20,7 +20,7 @@ from rigd.engine.processes import SupervisorConnection
 from rigd.excitation import KINDS, excitation_options
 from rigd.profile import specimen_files
 from rigd.runner.quick_looks import QuickLook
-from rigd.runtime import ignore
+from rigd.runtime import ignore_end_signals
 from rigd.sweep_response import sweep_ticks
 from rigd.units import UNITS
 from rigd.web._access import (
@@ -346,7 +346,7 @@ def _excitations() -> Iterator[tuple[str, list[Document]]]:
 
 def run_page() -> None:
     """Serve the page until the daemon ends; called by ``python -m rigd.web``."""
-    ignore()
+    ignore_end_signals()
     # No log: a stopped terminal (Ctrl-S) would block all pages, and invalid requests would fill the
     # journal.
     logging.disable()

@@ -29,7 +29,9 @@ def run_patched(made_once):
                     patch.setattr(target, value)
                 group = ProcessGroup(live=False, extra_processes=extra_processes)
                 patch.setattr("rigd.cli.run.start_processes", lambda **_: (StopRequest(), group))
-                patch.setattr("rigd.runtime.ignore", lambda **_: None)  # of the test runner
+                patch.setattr(
+                    "rigd.runtime.ignore_end_signals", lambda **_: None
+                )  # of the test runner
                 done = CliRunner().invoke(app, ["run", *command, "--output", str(folder)])
             printed = [done.exit_code, done.stdout, done.stderr]
             (folder / "told.json").write_text(json.dumps(printed))

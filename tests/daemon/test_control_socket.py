@@ -19,7 +19,7 @@ from rigd.daemon import _server as server
 from rigd.daemon import address
 from rigd.daemon.address import AddressError, UnknownGroupError, find, running, socket_path
 from rigd.runner import signal_blocks
-from rigd.runtime.addresses import answers
+from rigd.runtime.addresses import socket_answers
 
 LONG = {
     "command": "start",
@@ -325,14 +325,14 @@ def test_socket_belongs_to_its_user(runtime_folder):
     listener = address.bind(path, None)
     assert mode(path) == 0o600
     assert mode(path.parent) == 0o700
-    assert not answers(path)  # not before it listens
+    assert not socket_answers(path)  # not before it listens
     listener.listen(5)
-    assert answers(path)
+    assert socket_answers(path)
     with pytest.raises(AddressError, match="Another daemon"):
         address.bind(path, None)
     listener.close()
     with address.bind(path, None):  # what a dead daemon left
-        assert not answers(path)
+        assert not socket_answers(path)
 
 
 def test_socket_of_a_group(runtime_folder):

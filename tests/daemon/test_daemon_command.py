@@ -14,7 +14,7 @@ from processes import eventually
 
 from rigd.daemon.address import socket_path
 from rigd.runtime import STOP_SIGNAL
-from rigd.runtime.addresses import answers
+from rigd.runtime.addresses import socket_answers
 from rigd.session import read_session
 
 pytestmark = pytest.mark.process
@@ -83,7 +83,7 @@ def serve(rigd, profile):
 
     def start(*options):
         daemon = rigd("serve", "--profile", profile, "--output", "out", *options)
-        until(lambda: answers(socket_path("sim")), daemon)
+        until(lambda: socket_answers(socket_path("sim")), daemon)
         until(lambda: request("status")["state"] != "idle", daemon)
         return daemon
 

@@ -12,7 +12,7 @@ import pytest
 from processes import eventually
 
 from rigd.daemon.address import socket_path
-from rigd.runtime.addresses import answers
+from rigd.runtime.addresses import socket_answers
 
 pytestmark = pytest.mark.process
 
@@ -29,7 +29,7 @@ def daemon(runtime_folder, write_profile, tmp_path):
         [*map(str, command), "--output", str(tmp_path / "out")], stderr=subprocess.DEVNULL
     )
     try:
-        assert eventually(lambda: answers(socket_path("sim")))
+        assert eventually(lambda: socket_answers(socket_path("sim")))
         assert eventually(lambda: send_request({"command": "status"})["state"] == "ready")
         yield process
     finally:

@@ -22,7 +22,7 @@ from rigd.daemon.client import Client
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.engine.workers import CONTROL, RECORDER
 from rigd.runtime import STOP_SIGNAL
-from rigd.runtime.addresses import answers
+from rigd.runtime.addresses import socket_answers
 from rigd.runtime.processes import read_process
 
 
@@ -39,7 +39,8 @@ def start_session(daemon):
     path = socket_path("sim")
     assert eventually(
         lambda: (
-            daemon.poll() is not None or (answers(path) and control_of(daemon.pid) == IDLE_NAME)
+            daemon.poll() is not None
+            or (socket_answers(path) and control_of(daemon.pid) == IDLE_NAME)
         ),
         every_s=0.1,
     )
@@ -266,19 +267,19 @@ ABSENT_PID = 2**22 + 1
         (RUN, {}, STOP_SIGNAL),
         (
             RUN,
-            {"handled_signals": 0},
+            {"handled_signal_mask": 0},
             signal.SIGTERM,
         ),  # it has not begun, and its SIGINT is ignored
-        (RUN, {"handled_signals": 1 << signal.SIGINT - 1}, signal.SIGINT),
+        (RUN, {"handled_signal_mask": 1 << signal.SIGINT - 1}, signal.SIGINT),
         (
             RUN,
-            {"ignored_signals": 1 << STOP_SIGNAL - 1, "handled_signals": 0},
+            {"ignored_signal_mask": 1 << STOP_SIGNAL - 1, "handled_signal_mask": 0},
             None,
         ),  # only a quick look remains
         (("python3", "-m", "rigd", "identify", "motor"), {}, STOP_SIGNAL),
         (
             ("python3", "rigd", "identify", "motor", "--from", "a.mcap"),
-            {"handled_signals": 0},
+            {"handled_signal_mask": 0},
             None,
         ),
         (("sudo", "rigd", "run", "hold"), {}, None),
@@ -318,7 +319,7 @@ def test_off_is_stated_only_by_the_last_name_of_the_control_process(
     stop_here, bystander, names, expected_code, stated
 ):
     process, row = bystander
-    run = replace(row, command=RUN, handled_signals=1 << STOP_SIGNAL - 1)
+    run = replace(row, command=RUN, handled_signal_mask=1 << STOP_SIGNAL - 1)
     command = (*FORGED, str(row.pid))
     control = replace(row, pid=ABSENT_PID, parent=row.pid, command=command)
     first_call_s = []

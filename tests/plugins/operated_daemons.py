@@ -263,7 +263,7 @@ class ThreadGroup(ProcessGroup):
 
 
 class QuietStop(StopRequest):
-    def catch(self):
+    def catch_signals(self):
         pass
 
 

@@ -242,9 +242,9 @@ def test_a_violation_after_a_pause_is_due_to_the_computer(watch):
 
 def test_missed_ticks_of_several_gaps_are_reported_together(watch):
     watch.skip(4)
-    assert watch.after_missed == "It came after 4 missed ticks."
+    assert watch.missed_ticks_text == "It came after 4 missed ticks."
     watch.skip(5)
-    assert watch.after_missed == f"It came after 9 missed ticks. {OVERLOADED_ADVICE}"
+    assert watch.missed_ticks_text == f"It came after 9 missed ticks. {OVERLOADED_ADVICE}"
 
 
 def test_few_missed_ticks_do_not_explain_a_violation(watch):
@@ -258,9 +258,9 @@ def test_few_missed_ticks_do_not_explain_a_violation(watch):
 def test_missed_ticks_expire_after_two_checks(watch):
     watch.skip(20)
     watch.check_slow(0)
-    assert watch.after_missed
+    assert watch.missed_ticks_text
     watch.check_slow(SLOW_CHECK_TICKS * PERIOD_NS)
-    assert watch.after_missed == ""
+    assert watch.missed_ticks_text == ""
     assert "amplitude" in tracking_violation(watch)
 
 
@@ -273,7 +273,7 @@ def test_missed_ticks_do_not_explain_a_full_disk(watch):
 def test_a_new_session_resets_the_missed_ticks(watch):
     watch.skip(20)
     watch.reset(0.0)
-    assert watch.after_missed == ""
+    assert watch.missed_ticks_text == ""
 
 
 @pytest.mark.parametrize(("readings", "checked"), [(90, False), (110, True)])

@@ -237,10 +237,10 @@ def test_job_is_suspended_during_a_session(jobs, tmp_path):
 PAGE_PROGRAM = """
 import asyncio, os, pathlib, sys
 from dataclasses import replace
-from rigd.runtime import ignore
+from rigd.runtime import ignore_end_signals
 from rigd.web import _jobs
 
-ignore()
+ignore_end_signals()
 _jobs.REPORT = replace(_jobs.REPORT, module="stand_in")
 _jobs._POLL_PERIOD_S = 0.02
 
