@@ -6,8 +6,8 @@ a rig and other lock files that state their holder (module `locks`), work at low
 `background`), computations in a copy of this process (module `computations`), safe opening of files
 whose names come from users (`open_plain_file`), and the signals that request a program's end.
 Commands use `raise_on_signals` for these signals, and the processes of a rig use `StopRequest`,
-`ignore` and `signals_blocked`. The package depends on no other package, and knows rigs by name
-only.
+`ignore_end_signals` and `signals_blocked`. The package depends on no other package, and knows rigs
+by name only.
 """
 
 import lazy_loader as lazy

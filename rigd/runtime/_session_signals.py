@@ -3,9 +3,9 @@ r"""Signals that request the end of a rig's session, and how its processes react
 Ctrl-C, Ctrl-\, Ctrl-Z and the closing of a terminal send a signal to all processes of the terminal,
 and a service manager sends SIGTERM to all processes. The supervisor and the control process stop
 their session safely at each of these signals (`StopRequest`), because a suspended control process
-would leave its last torque on. The recorder and the live publisher ignore the signals (`ignore`),
-and are ended by the supervisor. The analyser, which runs on every system, does not import this
-module.
+would leave its last torque on. The recorder and the live publisher ignore the signals
+(`ignore_end_signals`), and are ended by the supervisor. The analyser, which runs on every system,
+does not import this module.
 """
 
 import contextlib

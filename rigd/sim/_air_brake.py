@@ -26,12 +26,12 @@ RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 """Array of complex numbers."""
 
-_DRAG_MODES = 5
+_DRAG_MODE_COUNT = 5
 """Number of modes of the beam on which the drag acts.
 
 The fifth mode of the reference paper's beam is at 145 Hz, three times the highest frequency of its
 sweep."""
-_DRAG_POINTS = 16
+_DRAG_POINT_COUNT = 16
 """Number of points along the beam at which the drag force is computed."""
 _EXTRAPOLATION_WEIGHTS = (23 / 12, -16 / 12, 5 / 12)
 """Weights of the last three drag forces, newest first, in the extrapolated mean of the next period.
@@ -70,42 +70,48 @@ class AirBrake:
     def __init__(
         self, beam: Beam, damping: Damping, realisation: Realisation, drag_m: float
     ) -> None:
-        poles = realisation.poles_rad_s[realisation.poles_rad_s.imag > 0][:_DRAG_MODES]
+        poles = realisation.poles_rad_s[realisation.poles_rad_s.imag > 0][:_DRAG_MODE_COUNT]
         mode_count = poles.size
         self._poles = poles
-        self._grid = drag_grid = DragGrid.of(beam, mode_count, _DRAG_POINTS)
+        self._grid = drag_grid = DragGrid.of(beam, mode_count, _DRAG_POINT_COUNT)
         k_fourth = (clamped_free_eigenvalues(mode_count) / beam.length_m) ** 4
         inertial_terms = beam.density_over_stiffness * poles**2
         external_terms = damping.gamma * poles**damping.lambda_
         internal_terms = damping.zeta * poles**damping.alpha * k_fourth
         load_terms = inertial_terms + external_terms
-        pole_slopes = (
+        derivatives_at_poles = (
             2 * inertial_terms + damping.lambda_ * external_terms + damping.alpha * internal_terms
         ) / poles
         leverage_m2 = beam.length_m * drag_grid.leverage_m
-        self._torque_of_mode = _real_part_rows(leverage_m2 * load_terms / pole_slopes).sum(axis=0)
-        self._torque_per_force_m2 = leverage_m2 @ drag_grid.to_modes - drag_grid.to_moment
-        mean_deflections_m = beam.length_m * mode_mean(mode_count)
-        self._shear_of_mode = _real_part_rows(mean_deflections_m * load_terms / pole_slopes).sum(
+        self._torque_of_mode = _real_part_rows(leverage_m2 * load_terms / derivatives_at_poles).sum(
             axis=0
         )
+        self._torque_per_force_m2 = leverage_m2 @ drag_grid.to_modes - drag_grid.to_moment
+        mean_deflections_m = beam.length_m * mode_mean(mode_count)
+        self._shear_of_mode = _real_part_rows(
+            mean_deflections_m * load_terms / derivatives_at_poles
+        ).sum(axis=0)
         self._shear_per_force_m = mean_deflections_m @ drag_grid.to_modes - drag_grid.weight_m
 
         coupled_state_count = 2 + realisation.b.size
-        self.speed_rows: RealArray = np.zeros((_DRAG_POINTS, coupled_state_count + 2 * mode_count))
+        self.speed_rows: RealArray = np.zeros(
+            (_DRAG_POINT_COUNT, coupled_state_count + 2 * mode_count)
+        )
         self.speed_rows[:, 1] = drag_grid.x_m
-        modal_rows = _real_part_rows(-drag_grid.leverage_m * load_terms / pole_slopes / poles)
+        modal_rows = _real_part_rows(
+            -drag_grid.leverage_m * load_terms / derivatives_at_poles / poles
+        )
         self.speed_rows[:, 2 : 2 + 2 * mode_count] = drag_grid.shapes.T @ modal_rows
-        force_rows = _real_part_rows(poles / pole_slopes / beam.bending_stiffness_n_m2)
+        force_rows = _real_part_rows(poles / derivatives_at_poles / beam.bending_stiffness_n_m2)
         self.speed_rows[:, coupled_state_count:] = drag_grid.shapes.T @ force_rows
 
-        self._forces = np.zeros((3, _DRAG_POINTS))
-        self._magnitude = np.zeros(_DRAG_POINTS)
+        self._forces = np.zeros((3, _DRAG_POINT_COUNT))
+        self._magnitude = np.zeros(_DRAG_POINT_COUNT)
         self._newest = 0
         # The forces are in a ring buffer: one set of weights for each position of the newest.
-        ages_by_newest = (newest_index - np.arange(3) for newest_index in range(3))
+        ages_by_newest_index = (newest_index - np.arange(3) for newest_index in range(3))
         self._weights = [
-            np.array(_EXTRAPOLATION_WEIGHTS)[force_ages % 3] for force_ages in ages_by_newest
+            np.array(_EXTRAPOLATION_WEIGHTS)[force_ages % 3] for force_ages in ages_by_newest_index
         ]
         self._force_per_square_speed = -0.5 * AIR_DENSITY_KG_PER_M3 * drag_m
 
@@ -120,34 +126,38 @@ class AirBrake:
         a = np.zeros((n + added_state_count, n + added_state_count))
         a[:n, :n] = model.a
         a[:n, n:] = -np.outer(model.b, self._torque_of_mode)
-        first_states = np.arange(n, n + added_state_count, 2)
-        a[first_states, first_states] = a[first_states + 1, first_states + 1] = self._poles.real
-        a[first_states, first_states + 1] = self._poles.imag
-        a[first_states + 1, first_states] = -self._poles.imag
-        force_input = np.zeros((n + added_state_count, _DRAG_POINTS))
+        pole_state_indices = np.arange(n, n + added_state_count, 2)
+        a[pole_state_indices, pole_state_indices] = a[
+            pole_state_indices + 1, pole_state_indices + 1
+        ] = self._poles.real
+        a[pole_state_indices, pole_state_indices + 1] = self._poles.imag
+        a[pole_state_indices + 1, pole_state_indices] = -self._poles.imag
+        force_input = np.zeros((n + added_state_count, _DRAG_POINT_COUNT))
         force_input[:n] = -np.outer(model.b, self._torque_per_force_m2)
-        force_input[first_states] = self._grid.to_modes
+        force_input[pole_state_indices] = self._grid.to_modes
 
-        def row(
-            model_row: RealArray, per_torque: float = 0.0, direct_effect: float = 0.0
+        def extended_row(
+            model_row: RealArray, output_per_torque: float = 0.0, direct_effect: float = 0.0
         ) -> RealArray:
-            return np.concatenate([model_row, (direct_effect - per_torque) * self._torque_of_mode])
+            return np.concatenate(
+                [model_row, (direct_effect - output_per_torque) * self._torque_of_mode]
+            )
 
-        extended_coupled = replace(
+        extended_coupled_model = replace(
             model,
             a=a,
             b=np.concatenate([model.b, np.zeros(added_state_count)]),
-            angle=row(model.angle),
-            velocity=row(model.velocity),
-            acceleration=row(model.acceleration, model.acceleration_per_torque),
-            beam_torque=row(model.beam_torque, model.beam_torque_per_torque, 1.0),
-            sensor_torque=row(model.sensor_torque, model.sensor_torque_per_torque, 1.0),
+            angle=extended_row(model.angle),
+            velocity=extended_row(model.velocity),
+            acceleration=extended_row(model.acceleration, model.acceleration_per_torque),
+            beam_torque=extended_row(model.beam_torque, model.beam_torque_per_torque, 1.0),
+            sensor_torque=extended_row(model.sensor_torque, model.sensor_torque_per_torque, 1.0),
             shear=np.append(
                 model.shear,
                 self._shear_of_mode - model.shear_per_torque * self._torque_of_mode,
             ),
         )
-        return extended_coupled, force_input
+        return extended_coupled_model, force_input
 
     def update_force(self, speed_m_s: RealArray) -> tuple[float, float]:
         """Compute and store the drag force for given speeds in m/s; return its immediate effect.

@@ -43,38 +43,40 @@ class StuckReadings:
 
     Parameters
     ----------
-    refresh_every
+    calls_per_refresh
         Number of calls after which a new reading is returned; 0: the first reading is repeated for
         ever.
     """
 
-    __slots__ = ("_count", "_refresh_every", "_value")
+    __slots__ = ("_calls_per_refresh", "_count", "_value")
 
-    def __init__(self, refresh_every: int = 0) -> None:
-        self._refresh_every = refresh_every
+    def __init__(self, calls_per_refresh: int = 0) -> None:
+        self._calls_per_refresh = calls_per_refresh
         self._count = 0
         self._value: object = None
 
-    def __call__(self, value: T) -> T:
+    def __call__(self, reading: T) -> T:
         """Return the given reading, or the earlier reading that is repeated in its stead."""
-        if self._count == 0 or (self._refresh_every and self._count % self._refresh_every == 0):
-            self._value = value
+        if self._count == 0 or (
+            self._calls_per_refresh and self._count % self._calls_per_refresh == 0
+        ):
+            self._value = reading
         self._count += 1
         return cast("T", self._value)
 
 
 def open_simulated_rig(rig: RigParameters) -> Devices:
     """Create drive and sensor of a rig that is simulated in this process."""
-    simulated = SimulatedRig(rig)
+    simulated_rig = SimulatedRig(rig)
 
     def renew_noise(seed: int | None) -> int:
         noise_seed = fresh_seed() if seed is None else seed
-        simulated.begin_session(noise_seed)
+        simulated_rig.begin_session(noise_seed)
         return noise_seed
 
     return Devices(
-        SimulatedDrive(simulated, rig.rate_hz),
-        simulated.sensor,
+        SimulatedDrive(simulated_rig, rig.rate_hz),
+        simulated_rig.sensor,
         simulated=True,
         renew_noise=renew_noise,
     )
@@ -142,18 +144,18 @@ class SimulatedRig:
         if scatters_between_sessions(self._parameters):
             self.plant.adopt(SimulatedPlant(session_parameters(self._parameters, seed)))
 
-    def advance(self, n_periods: int) -> None:
+    def advance(self, period_count: int) -> None:
         """Advance plant and sensor by whole periods, while the last torque command acts."""
         if self._preparation is not None:
             self._poll_preparation()
         if self.records_per_period == 1:
-            self.plant.advance(n_periods)
-            self.sensor.advance_hum(n_periods)
+            self.plant.advance(period_count)
+            self.sensor.advance_hum(period_count)
             return
-        for _ in range(n_periods * self.records_per_period):
+        for _ in range(period_count * self.records_per_period):
             self.plant.advance(1)
             self.sensor.advance_hum(1)
-            self.sensor.sample()
+            self.sensor.sample_wrench()
 
     def check_disturbance(self, disturbance: Disturbance) -> None:
         """Raise if an obstacle or impact cannot be simulated in addition to the present ones.
@@ -205,12 +207,12 @@ class SimulatedRig:
     def _start_preparation(self) -> None:
         """Start computing the plant with all obstacles and impacts in another process."""
 
-        def prepared() -> tuple[int, SimulatedPlant]:
+        def prepare_plant() -> tuple[int, SimulatedPlant]:
             with suppress(OSError):  # it has time
                 os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
             return self._plant_with_disturbances()
 
-        self._preparation = ForkedComputation(prepared)
+        self._preparation = ForkedComputation(prepare_plant)
 
     def _poll_preparation(self) -> None:
         """Use the plant that the other process has computed, if it is ready.
@@ -238,9 +240,9 @@ class SimulatedRig:
     def read_angle(self) -> float:
         """Return the sensed angle of the output shaft in rad, rounded to encoder steps."""
         angle_rad = self.plant.sensed_angle_rad
-        step_rad = self._resolution_rad
-        if step_rad:
-            angle_rad = round(angle_rad / step_rad) * step_rad
+        encoder_step_rad = self._resolution_rad
+        if encoder_step_rad:
+            angle_rad = round(angle_rad / encoder_step_rad) * encoder_step_rad
         return angle_rad if self.stuck_encoder is None else self.stuck_encoder(angle_rad)
 
 
@@ -264,8 +266,8 @@ class SimulatedDrive:
         return self._rig.stuck_encoder
 
     @stuck_encoder.setter
-    def stuck_encoder(self, stuck: StuckReadings | None) -> None:
-        self._rig.stuck_encoder = stuck
+    def stuck_encoder(self, stuck_readings: StuckReadings | None) -> None:
+        self._rig.stuck_encoder = stuck_readings
 
     def connect(self) -> None:
         """Do nothing: a drive simulated in this process needs no connection."""
@@ -322,8 +324,8 @@ class SimulatedSensor:
     The wrench is the smallest one whose projections are the coupling torque (with hum) and the base
     shear; crosstalk is added to it. If the sensor streams, the wrench read is the output of the
     decimating filter for the last readings. `rate_hz` is the number of readings per second, which
-    determines the phase of the hum. `weights` are those of the last readings in the decimating
-    filter, oldest first. A single weight means that a reading is taken on request.
+    determines the phase of the hum. `filter_weights` are those of the last readings in the
+    decimating filter, oldest first. A single weight means that a reading is taken on request.
 
     Attributes
     ----------
@@ -337,11 +339,11 @@ class SimulatedSensor:
         sensor: WrenchSensorSettings,
         simulation: Simulation,
         rate_hz: float,
-        weights: tuple[float, ...] = (1.0,),
+        filter_weights: tuple[float, ...] = (1.0,),
     ) -> None:
         self._plant = plant
-        self._weights = weights
-        self.records: deque[Wrench] = deque(maxlen=len(weights))
+        self._weights = filter_weights
+        self.records: deque[Wrench] = deque(maxlen=len(filter_weights))
         self._sensor = sensor
         self._simulation = simulation
         torque_wrench, shear_wrench = _unit_wrenches(sensor, simulation.crosstalk_percent)
@@ -358,7 +360,7 @@ class SimulatedSensor:
             for axis in range(6)
             if torque_wrench[axis] != 0.0 or shear_wrench[axis] != 0.0
         ]
-        self._noise_rows = chain.from_iterable(self._noise(simulation.seed))
+        self._noise_rows = chain.from_iterable(self._noise_blocks(simulation.seed))
         self._hum_nm = simulation.hum_nm
         self._hum_cycles_per_reading = simulation.hum_hz / rate_hz
         self._hum_cycles = 0.0
@@ -389,7 +391,7 @@ class SimulatedSensor:
         if len(self._weights) == 1:
             return self.measure()
         while len(self.records) < len(self._weights):  # before the first period
-            self.sample()
+            self.sample_wrench()
         self.wrench_saturated, self._saturated = self._saturated, False
         fx, fy, fz, tx, ty, tz = (
             sum(map(mul, self._weights, axis)) for axis in zip(*self.records, strict=True)
@@ -402,10 +404,10 @@ class SimulatedSensor:
 
     def renew_noise(self, seed: int) -> None:
         """Restart the simulated sensor's noise from a seed."""
-        self._noise_rows = chain.from_iterable(self._noise(seed))
+        self._noise_rows = chain.from_iterable(self._noise_blocks(seed))
         self.records.clear()
 
-    def sample(self) -> None:
+    def sample_wrench(self) -> None:
         """Measure the wrench of the simulated sensor once, and add it to the decimating filter."""
         self.records.append(self.measure())
         self._saturated |= self.wrench_saturated
@@ -452,7 +454,7 @@ class SimulatedSensor:
     def close(self) -> None:
         """Do nothing: a sensor simulated in this process has no connection to close."""
 
-    def _noise(self, seed: int | None) -> Iterator[list[list[float]]]:
+    def _noise_blocks(self, seed: int | None) -> Iterator[list[list[float]]]:
         """Yield blocks of unloaded readings, that is noise and offset in N and N·m.
 
         If the seed is None, the noise differs each time.
@@ -506,10 +508,10 @@ def _unit_wrenches(
 ) -> tuple[list[float], list[float]]:
     """Return the wrenches that a torque of 1 N·m alone and a base shear of 1 N alone cause."""
     projections = np.array([sensor.projection, sensor.shear_projection])
-    is_known = projections.any(axis=1)
+    has_projection = projections.any(axis=1)
     unit_wrenches = np.zeros((6, 2))
-    projection_rows = projections[is_known]
-    unit_wrenches[:, is_known] = projection_rows.T @ np.linalg.inv(
+    projection_rows = projections[has_projection]
+    unit_wrenches[:, has_projection] = projection_rows.T @ np.linalg.inv(
         projection_rows @ projection_rows.T
     )
     if crosstalk_percent:

@@ -45,7 +45,7 @@ _SUBSTEPS_PER_CONTACT_TIME = 6
 """Number of substeps in the time in which a beam that is hit recedes from an obstacle."""
 _MIN_SUBSTEPS_PER_S = 16e3
 """Smallest number of substeps per second."""
-_MIN_SUBSTEPS = 8
+_MIN_SUBSTEPS_PER_PERIOD = 8
 """Smallest number of substeps per period."""
 _TIP_COMPLIANCE_RATIO = 4.0
 """Compliance of a beam at its tip, relative to that of a beam without ends."""
@@ -55,7 +55,7 @@ _SMALL_DISPLACEMENT_RATIO = 0.01
 """Displacement, relative to a rigid beam's, below which the fit limits the absolute error.
 
 A beam that moves so little hardly follows the motor, and needs no relative accuracy."""
-_CONTACT_ITERATIONS = 3
+_CONTACT_ITERATION_COUNT = 3
 """Number of iterations over several obstacles that the beam touches in one substep."""
 
 
@@ -164,7 +164,7 @@ class AttachedObstacles:
             )
             a[body_states, body_states] = self._a
             force_input[body_states, body_index] = self._b
-        extended_coupled = replace(
+        extended_coupled_model = replace(
             model,
             a=a,
             b=np.append(model.b, np.zeros(added_state_count)),
@@ -179,14 +179,14 @@ class AttachedObstacles:
             ),
             shear=np.append(model.shear, shear_row - model.shear_per_torque * torque_row),
         )
-        return extended_coupled, force_input
+        return extended_coupled_model, force_input
 
     def substep_matrices(
         self,
         model: CoupledModel,
         force_input: RealArray,
-        holding_torque: RealArray,
-        switch_s: float,
+        holding_torque_row: RealArray,
+        torque_switch_s: float,
         angle_instant_s: float,
         torque_instant_s: float,
         friction_effect: RealArray,
@@ -208,27 +208,29 @@ class AttachedObstacles:
 
         # Displacement without a force: rows for the states, columns for the torques.
         displacement_per_state = np.empty((substep_count, body_count, n))
-        row = displacement_rows
+        propagated_rows = displacement_rows
         for j in range(substep_count):
-            displacement_per_state[j] = row = row @ phi
+            displacement_per_state[j] = propagated_rows = propagated_rows @ phi
         displacement_per_torque = np.empty((substep_count, body_count, 2))
         state_per_torque = np.zeros((n, 2))
         for j in range(substep_count):
-            time_before_switch_s = min(max(switch_s - j * substep_s, 0.0), substep_s)
-            response_after = (
+            time_before_switch_s = min(max(torque_switch_s - j * substep_s, 0.0), substep_s)
+            response_after_switch = (
                 propagator(model, substep_s - time_before_switch_s)[1]
                 if 0 < time_before_switch_s < substep_s
                 else step_response
             )
-            response_after = response_after * (time_before_switch_s < substep_s)
+            response_after_switch = response_after_switch * (time_before_switch_s < substep_s)
             state_per_torque = phi @ state_per_torque + np.column_stack(
-                [step_response - response_after, response_after]
+                [step_response - response_after_switch, response_after_switch]
             )
             displacement_per_torque[j] = displacement_rows @ state_per_torque
-        free_matrix = np.column_stack(
+        unforced_displacement_matrix = np.column_stack(
             [displacement_per_state.reshape(-1, n), displacement_per_torque.reshape(-1, 2)]
         )
-        free_matrix = np.column_stack([free_matrix, free_matrix[:, :n] @ friction_effect])
+        unforced_displacement_matrix = np.column_stack(
+            [unforced_displacement_matrix, unforced_displacement_matrix[:, :n] @ friction_effect]
+        )
 
         # State j substeps after a force of 1 N that acted for one substep.
         decayed_states = np.empty((substep_count, n, body_count))
@@ -238,18 +240,20 @@ class AttachedObstacles:
         force_kernel = displacement_rows @ decayed_states
         force_kernel[0] += self._direct_rows[:-2]
 
-        def effect_on(row: RealArray, direct_effect: RealArray, instant_s: float) -> RealArray:
+        def forces_effect_on_output(
+            output_row: RealArray, direct_effect: RealArray, instant_s: float
+        ) -> RealArray:
             """Return the effect of each substep's force on an output at an instant."""
-            substeps_before = instant_s / substep_s
-            substep_index = min(int(substeps_before), substep_count - 1)
-            substep_fraction = substeps_before - substep_index
+            substeps_until_instant = instant_s / substep_s
+            substep_index = min(int(substeps_until_instant), substep_count - 1)
+            substep_fraction = substeps_until_instant - substep_index
             effect_matrix = np.zeros((substep_count, body_count))
             for substep_node, node_weight in (
                 (substep_index, 1 - substep_fraction),
                 (substep_index + 1, substep_fraction),
             ):
                 effect_matrix[:substep_node] += (
-                    node_weight * (row @ decayed_states[:substep_node])[::-1]
+                    node_weight * (output_row @ decayed_states[:substep_node])[::-1]
                 )
             effect_matrix[substep_index] += direct_effect
             return effect_matrix.ravel()
@@ -260,23 +264,25 @@ class AttachedObstacles:
         effect_matrix = np.vstack(
             [
                 decayed_states[::-1].transpose(1, 0, 2).reshape(n, -1),
-                effect_on(model.angle, zero_row, period_s),
-                effect_on(model.velocity, zero_row, period_s),
-                effect_on(model.sensor_torque, direct_sensor_torque, period_s),
-                effect_on(holding_torque, self._direct_rows[-2], period_s),
-                effect_on(model.shear, direct_shear, period_s),
-                effect_on(model.angle, zero_row, angle_instant_s),
-                effect_on(model.sensor_torque, direct_sensor_torque, torque_instant_s),
-                effect_on(model.shear, direct_shear, torque_instant_s),
+                forces_effect_on_output(model.angle, zero_row, period_s),
+                forces_effect_on_output(model.velocity, zero_row, period_s),
+                forces_effect_on_output(model.sensor_torque, direct_sensor_torque, period_s),
+                forces_effect_on_output(holding_torque_row, self._direct_rows[-2], period_s),
+                forces_effect_on_output(model.shear, direct_shear, period_s),
+                forces_effect_on_output(model.angle, zero_row, angle_instant_s),
+                forces_effect_on_output(
+                    model.sensor_torque, direct_sensor_torque, torque_instant_s
+                ),
+                forces_effect_on_output(model.shear, direct_shear, torque_instant_s),
             ]
         )
         return SubstepMatrices(
-            free_displacement=np.asfortranarray(free_matrix).dot,
+            free_displacement=np.asfortranarray(unforced_displacement_matrix).dot,
             displacement_per_friction=-displacement_per_torque.sum(axis=2),
             displacement_kernel=force_kernel,
             displacement_history=_history_matrices(force_kernel),
             force_effect=np.asfortranarray(effect_matrix).dot,
-            velocity_row=n + 1,
+            velocity_index=n + 1,
         )
 
     def cannot_touch(self, displacement_m: RealArray, time_s: float) -> bool:
@@ -285,36 +291,36 @@ class AttachedObstacles:
         `displacement_m`, shape (bodies,), is the beam's displacement at each body at the end of the
         period if no force acts, and `time_s` the start of the period.
         """
-        end_s = time_s + self._period_s
+        period_end_s = time_s + self._period_s
         start_displacement_m = self._start_displacement_m = self._displacement_m
         self._displacement_m = displacement_m.copy()
         for _, active_impact in self._impacts:
             if (
                 time_s < active_impact.at_s + active_impact.duration_s
-                and active_impact.at_s < end_s
+                and active_impact.at_s < period_end_s
             ):
                 return False
         for body_index, active_body, _ in self._obstacles:
-            if active_body.from_s < end_s and time_s < active_body.until_s:
+            if active_body.from_s < period_end_s and time_s < active_body.until_s:
                 if self._penetration_m[body_index] > 0:
                     return False
                 old_m, new_m = (
                     start_displacement_m.item(body_index),
                     displacement_m.item(body_index),
                 )
-                motion_m = (
+                max_motion_m = (
                     2 * abs(new_m - old_m)
                     + active_body.x_m * abs(active_body.rate_rad_s) * self._period_s
                 )
-                if active_body.side * (new_m - _surface_displacement_m(active_body, end_s)) > -(
-                    motion_m + _CONTACT_MARGIN_M
-                ):
+                if active_body.side * (
+                    new_m - _surface_displacement_m(active_body, period_end_s)
+                ) > -(max_motion_m + _CONTACT_MARGIN_M):
                     return False
         self._penetration_m = dict.fromkeys(range(self._positions_m.size), -inf)
         self.forces_n = self._zero_forces
         return True
 
-    def forces(
+    def compute_forces(
         self, substep_matrices: "SubstepMatrices", free_displacement_m: RealArray, time_s: float
     ) -> RealArray:
         """Return the forces in N of obstacles and impacts on the beam in each substep of a period.
@@ -356,7 +362,7 @@ class AttachedObstacles:
             )
             if not is_present.any():
                 continue
-            surface_m = _surface_displacement_m(active_body, substep_ends_s)
+            surface_displacement_m = _surface_displacement_m(active_body, substep_ends_s)
             start_penetration_m = self._penetration_m[body_index]
             if start_penetration_m == -inf and active_body.from_s <= time_s:
                 start_penetration_m = active_body.side * (
@@ -365,14 +371,15 @@ class AttachedObstacles:
                 )
             active_obstacles.append(
                 _ActiveObstacle(
-                    index=body_index,
+                    body_index=body_index,
                     side=active_body.side,
                     stiffness_n_per_m=stiffness_n_per_m,
                     damping_n_per_m=active_body.damping_n_s_per_m / substep_s,
                     compliance_m_per_n=force_kernel.item(0, body_index, body_index),
                     free_penetration_m=np.where(
                         is_present,
-                        active_body.side * (free_displacement_m[:, body_index] - surface_m),
+                        active_body.side
+                        * (free_displacement_m[:, body_index] - surface_displacement_m),
                         -inf,
                     ),
                     start_penetration_m=start_penetration_m,
@@ -383,8 +390,12 @@ class AttachedObstacles:
             self._compute_obstacle_forces(substep_matrices, active_obstacles)
         self._end_penetrations_m = dict.fromkeys(range(self._positions_m.size), -inf)
         for active_obstacle in active_obstacles:
-            self._end_penetrations_m[active_obstacle.index] = active_obstacle.start_penetration_m
-            forces_n[:, active_obstacle.index] = -active_obstacle.side * active_obstacle.force_n
+            self._end_penetrations_m[active_obstacle.body_index] = (
+                active_obstacle.start_penetration_m
+            )
+            forces_n[:, active_obstacle.body_index] = (
+                -active_obstacle.side * active_obstacle.force_n
+            )
         return forces_n
 
     def _compute_obstacle_forces(
@@ -398,7 +409,7 @@ class AttachedObstacles:
         # By how much each force moves the beam out of an obstacle until the end of each substep.
         displacement_kernels = [
             [(one.side * other_one.side
-              * substep_matrices.displacement_history[one.index, other_one.index],
+              * substep_matrices.displacement_history[one.body_index, other_one.body_index],
               other_one.force_n) for other_one in obstacles]
             for one in obstacles
         ]  # fmt: skip
@@ -407,9 +418,9 @@ class AttachedObstacles:
             for kernel_pairs in displacement_kernels
         ]
         obstacles_with_rows = list(zip(obstacles, kernel_rows, strict=True))
-        iteration_count = _CONTACT_ITERATIONS if len(obstacles) > 1 else 1
-        j = 0
-        while j < substep_count:
+        iteration_count = _CONTACT_ITERATION_COUNT if len(obstacles) > 1 else 1
+        substep_index = 0
+        while substep_index < substep_count:
             if all(obstacle.start_penetration_m <= 0 for obstacle in obstacles):
                 # Nothing is touched: skip to the first substep with a contact at its end.
                 contact_substep = substep_count
@@ -419,30 +430,30 @@ class AttachedObstacles:
                     for obstacle, kernel_pairs in zip(obstacles, displacement_kernels, strict=True)
                 ]
                 for free_penetration_m in free_penetrations_m:
-                    is_touching = free_penetration_m[j:contact_substep] > 0
+                    is_touching = free_penetration_m[substep_index:contact_substep] > 0
                     if is_touching.any():
-                        contact_substep = j + int(is_touching.argmax())
-                if contact_substep > j:
+                        contact_substep = substep_index + int(is_touching.argmax())
+                if contact_substep > substep_index:
                     for obstacle, free_penetration_m in zip(
                         obstacles, free_penetrations_m, strict=True
                     ):
                         obstacle.start_penetration_m = free_penetration_m.item(contact_substep - 1)
-                j = contact_substep
-                if j == substep_count:
+                substep_index = contact_substep
+                if substep_index == substep_count:
                     return
             for _ in range(iteration_count):
                 for obstacle, row_pairs in obstacles_with_rows:
-                    obstacle.force_n[j] = 0.0
-                    free_end_m = obstacle.free_penetration_m.item(j)
+                    obstacle.force_n[substep_index] = 0.0
+                    free_end_penetration_m = obstacle.free_penetration_m.item(substep_index)
                     for matrix_rows, force_n in row_pairs:
-                        free_end_m -= matrix_rows[j].dot(force_n)
+                        free_end_penetration_m -= matrix_rows[substep_index].dot(force_n)
                     mean_force_n, obstacle.end_penetration_m = obstacle.force_and_penetration(
-                        free_end_m
+                        free_end_penetration_m
                     )
-                    obstacle.force_n[j] = mean_force_n
+                    obstacle.force_n[substep_index] = mean_force_n
             for obstacle in obstacles:
                 obstacle.start_penetration_m = obstacle.end_penetration_m
-            j += 1
+            substep_index += 1
 
     def adopt_states(
         self, old_state: RealArray, old_obstacles: "AttachedObstacles | None"
@@ -511,7 +522,7 @@ class AttachedObstacles:
 class _ActiveObstacle:
     """Obstacle in one period: how far the beam penetrates it, and its force on the beam."""
 
-    index: int
+    body_index: int
     side: int
     stiffness_n_per_m: float
     damping_n_per_m: float  # damping coefficient divided by the length of a substep
@@ -521,59 +532,73 @@ class _ActiveObstacle:
     force_n: RealArray  # forces of the substeps computed so far, else 0; positive on either side
     end_penetration_m: float = -inf  # penetration at the end of the present substep
 
-    def force_and_penetration(self, p: float) -> tuple[float, float]:
+    def force_and_penetration(self, free_end_m: float) -> tuple[float, float]:
         """Return the mean force in N over a substep, and the penetration in m at its end.
 
-        `p` is the penetration in m that the substep would end with if the obstacle exerted no
-        force. The mean force follows from the work, as the module's docstring explains.
+        `free_end_m` is the penetration in m that the substep would end with if the obstacle
+        exerted no force. The mean force follows from the work, as the module's docstring explains.
         """
-        if p == -inf:  # the obstacle is not present
-            return 0.0, p
-        a, compliance_m_per_n, damping_n_per_m = (
+        if free_end_m == -inf:  # the obstacle is not present
+            return 0.0, free_end_m
+        start_m, compliance_m_per_n, damping_n_per_m = (
             self.start_penetration_m,
             self.compliance_m_per_n,
             self.damping_n_per_m,
         )
         stiffness_n_per_m = self.stiffness_n_per_m
-        if a == -inf:  # the obstacle has just appeared
-            a = 0.0
-        if a >= 0:
-            squared_ratio = (stiffness_n_per_m * compliance_m_per_n) ** 2
+        if start_m == -inf:  # the obstacle has just appeared
+            start_m = 0.0
+        if start_m >= 0:
+            squared_stiffness_ratio = (stiffness_n_per_m * compliance_m_per_n) ** 2
             # From 1/2, which conserves energy, to 1, which damps oscillation between substeps.
-            end_weight = 0.5 + 0.5 * squared_ratio / (1 + squared_ratio)
+            end_weight = 0.5 + 0.5 * squared_stiffness_ratio / (1 + squared_stiffness_ratio)
             mean_force_n = stiffness_n_per_m * (
-                (1 - end_weight) * a + end_weight * p
-            ) + damping_n_per_m * (p - a)
+                (1 - end_weight) * start_m + end_weight * free_end_m
+            ) + damping_n_per_m * (free_end_m - start_m)
             mean_force_n /= 1 + compliance_m_per_n * (
                 stiffness_n_per_m * end_weight + damping_n_per_m
             )
-            q = p - compliance_m_per_n * mean_force_n
-            if q >= 0:
-                return (mean_force_n, q) if mean_force_n > 0 else (0.0, p)
-            # The beam leaves: (p - q) (a - q) / compliance = k a²/2 - damping a (a - q)
-            damped_end_m = p + compliance_m_per_n * damping_n_per_m * a
+            end_m = free_end_m - compliance_m_per_n * mean_force_n
+            if end_m >= 0:
+                return (mean_force_n, end_m) if mean_force_n > 0 else (0.0, free_end_m)
+            # The beam leaves: (free_end - end) (start - end) / compliance
+            # = k start²/2 - damping start (start - end)
+            damped_end_m = free_end_m + compliance_m_per_n * damping_n_per_m * start_m
             root_m = sqrt(
-                (damped_end_m - a) ** 2 + 2 * compliance_m_per_n * stiffness_n_per_m * a * a
+                (damped_end_m - start_m) ** 2
+                + 2 * compliance_m_per_n * stiffness_n_per_m * start_m * start_m
             )
-            q = 0.5 * (damped_end_m + a - root_m)
-            mean_force_n = 0.5 * stiffness_n_per_m * a * a / (a - q) - damping_n_per_m * a
-        elif p > 0:
-            # The beam arrives: (p - q) (q - a) / compliance = k q²/2 + damping q (q - a)
+            end_m = 0.5 * (damped_end_m + start_m - root_m)
+            mean_force_n = (
+                0.5 * stiffness_n_per_m * start_m * start_m / (start_m - end_m)
+                - damping_n_per_m * start_m
+            )
+        elif free_end_m > 0:
+            # The beam arrives: (free_end - end) (end - start) / compliance
+            # = k end²/2 + damping end (end - start)
             square_coefficient = 1 + compliance_m_per_n * (
                 0.5 * stiffness_n_per_m + damping_n_per_m
             )
-            linear_coefficient = p + a + compliance_m_per_n * damping_n_per_m * a
-            root_m = sqrt(linear_coefficient * linear_coefficient - 4 * square_coefficient * p * a)
+            linear_coefficient = (
+                free_end_m + start_m + compliance_m_per_n * damping_n_per_m * start_m
+            )
+            root_m = sqrt(
+                linear_coefficient * linear_coefficient
+                - 4 * square_coefficient * free_end_m * start_m
+            )
             # Two forms of the positive root: choose the one without cancellation.
-            q = (
+            end_m = (
                 (linear_coefficient + root_m) / (2 * square_coefficient)
                 if linear_coefficient > 0
-                else 2 * p * a / (linear_coefficient - root_m)
+                else 2 * free_end_m * start_m / (linear_coefficient - root_m)
             )
-            mean_force_n = 0.5 * stiffness_n_per_m * q * q / (q - a) + damping_n_per_m * q
+            mean_force_n = (
+                0.5 * stiffness_n_per_m * end_m * end_m / (end_m - start_m)
+                + damping_n_per_m * end_m
+            )
         else:
-            return 0.0, p
-        return (mean_force_n, q) if mean_force_n > 0 else (0.0, p)
+            return 0.0, free_end_m
+        return (mean_force_n, end_m) if mean_force_n > 0 else (0.0, free_end_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -596,20 +621,22 @@ class SubstepMatrices:
     shape (bodies, bodies, substeps, substeps)."""
     force_effect: Callable[[RealArray], RealArray]
     """Function that returns the effect of the forces of all substeps on [next state, outputs]."""
-    velocity_row: int
+    velocity_index: int
     """Index of the velocity in [next state, outputs]."""
 
 
-def _history_matrices(kernel: RealArray) -> RealArray:
+def _history_matrices(displacement_kernel: RealArray) -> RealArray:
     """Return the displacement in m per N at the end of each substep by a force in each substep.
 
-    A `kernel` of shape (substeps, m, m) gives lower triangular matrices of shape (m, m, substeps,
-    substeps) for m obstacles and impacts.
+    A `displacement_kernel` of shape (substeps, m, m) gives lower triangular matrices of shape
+    (m, m, substeps, substeps) for m obstacles and impacts.
     """
-    substep_count = len(kernel)
-    lag = np.subtract.outer(np.arange(substep_count), np.arange(substep_count))
+    substep_count = len(displacement_kernel)
+    substep_lags = np.subtract.outer(np.arange(substep_count), np.arange(substep_count))
     history_matrices: RealArray = np.where(
-        lag >= 0, kernel.transpose(1, 2, 0)[:, :, np.maximum(lag, 0)], 0.0
+        substep_lags >= 0,
+        displacement_kernel.transpose(1, 2, 0)[:, :, np.maximum(substep_lags, 0)],
+        0.0,
     )
     return history_matrices
 
@@ -622,20 +649,23 @@ def _surface_displacement_m(body: Obstacle, time_s: Any) -> Any:  # noqa: ANN401
 def _substeps_per_period(beam: Beam, bodies: tuple[Disturbance, ...], period_s: float) -> int:
     """Return how many substeps per period are needed to resolve the contacts with all obstacles."""
     # A force that grows like k t moves a beam without ends by k t^(3/2) / unit.
-    rate_factor = 2 * sqrt(2) * beam.density_kg_per_m**0.75 * beam.bending_stiffness_n_m2**0.25
+    endless_beam_factor = (
+        2 * sqrt(2) * beam.density_kg_per_m**0.75 * beam.bending_stiffness_n_m2**0.25
+    )
     required_rates_per_s = [_MIN_SUBSTEPS_PER_S]
     for attached_body in bodies:
         if isinstance(attached_body, Obstacle):
-            rate_per_s = (
-                min(attached_body.stiffness_n_per_m, _MAX_RESOLVED_STIFFNESS_N_PER_M) / rate_factor
+            contact_rate_per_s = (
+                min(attached_body.stiffness_n_per_m, _MAX_RESOLVED_STIFFNESS_N_PER_M)
+                / endless_beam_factor
             ) ** (2 / 3)
-            reach_m = (beam.density_over_stiffness * rate_per_s**2) ** -0.25
+            reach_m = (beam.density_over_stiffness * contact_rate_per_s**2) ** -0.25
             tip_proximity = exp((attached_body.x_m - beam.length_m) / reach_m)
             compliance_ratio = 1 + (_TIP_COMPLIANCE_RATIO - 1) * tip_proximity
             required_rates_per_s.append(
-                _SUBSTEPS_PER_CONTACT_TIME * rate_per_s * compliance_ratio ** (2 / 3)
+                _SUBSTEPS_PER_CONTACT_TIME * contact_rate_per_s * compliance_ratio ** (2 / 3)
             )
-    return max(_MIN_SUBSTEPS, ceil(max(required_rates_per_s) * period_s))
+    return max(_MIN_SUBSTEPS_PER_PERIOD, ceil(max(required_rates_per_s) * period_s))
 
 
 def _displacement_per_angle(

@@ -22,7 +22,7 @@ from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._air_brake import AirBrake
 from rigd.sim._obstacle import AttachedObstacles, SubstepMatrices
 from rigd.sim._step import (
-    OUTPUT_COUNT,
+    STEP_OUTPUT_COUNT,
     beam_and_coupled_models,
     constant_force_effect,
     drifted_step_arrays,
@@ -40,12 +40,12 @@ _OBSTACLE_ATTRIBUTES = (
 )  # fmt: skip
 """Attributes of a plant that depend on its obstacles."""
 
-_FRICTION_ITERATIONS = 4
+_MAX_FRICTION_ITERATIONS = 4
 """Largest number of iterations between friction and contact forces in one period."""
-_FRICTION_TOLERANCE = 1e-3
+_RELATIVE_FRICTION_TOLERANCE = 1e-3
 """Change of the friction, relative to the Coulomb friction, at which the iterations end."""
 
-_INTERPOLATION_POINTS = 4
+_INTERPOLATION_POINT_COUNT = 4
 """Number of readings through which the interpolating polynomial of `GrowingDelayLine` passes."""
 
 
@@ -146,7 +146,7 @@ class SimulatedPlant:
         delay_periods, switch_s = split_delay(parameters.actuation.delay_s, period_s)
         angle_periods, angle_age_s = split_delay(parameters.encoder.delay_s, period_s)
         torque_periods, torque_age_s = split_delay(parameters.sensor.delay_s, period_s)
-        sample_instants_s = (switch_s, period_s - angle_age_s, period_s - torque_age_s)
+        switch_and_sample_instants_s = (switch_s, period_s - angle_age_s, period_s - torque_age_s)
 
         simulation = parameters.simulation or Simulation(torque_noise_nm=0.0, force_noise_n=0.0)
         nominal_beam = parameters.beam
@@ -174,21 +174,25 @@ class SimulatedPlant:
             locked_model.a[2:, 2:], locked_model.a[2:, 0]
         )
         free_matrix, locked_matrix, friction_effect = free_and_locked_steps(
-            free_model, locked_model, period_s, sample_instants_s
+            free_model, locked_model, period_s, switch_and_sample_instants_s
         )
         self._friction_effects: list[float] = friction_effect[n:].tolist()
-        point_count = 0
+        beam_point_count = 0
         if self._air is not None:
-            point_count = len(self._air.speed_rows)
+            beam_point_count = len(self._air.speed_rows)
             free_drag_effect = constant_force_effect(
-                free_model, free_input, locked_model.sensor_torque, period_s, *sample_instants_s[1:]
+                free_model,
+                free_input,
+                locked_model.sensor_torque,
+                period_s,
+                *switch_and_sample_instants_s[1:],
             )
             locked_drag_effect = constant_force_effect(
                 locked_model,
                 locked_input,
                 locked_model.sensor_torque,
                 period_s,
-                *sample_instants_s[1:],
+                *switch_and_sample_instants_s[1:],
             )
             free_matrix, locked_matrix = (
                 np.vstack(
@@ -208,13 +212,13 @@ class SimulatedPlant:
             self._drag_shear_fraction = -free_model.shear_per_torque
             self._torque_instant_fraction = 1 - torque_age_s / period_s
         if self._contact is not None:
-            point_count = len(self._contact.displacement_rows)
+            beam_point_count = len(self._contact.displacement_rows)
             self._free_substeps, self._locked_substeps = (
                 self._contact.substep_matrices(
                     coupled_model,
                     force_input,
                     locked_model.sensor_torque,
-                    *sample_instants_s,
+                    *switch_and_sample_instants_s,
                     friction_effect=friction_effect[:n],
                 )
                 for coupled_model, force_input in (
@@ -240,7 +244,7 @@ class SimulatedPlant:
                     simulation,
                     beam_realisation,
                     period_s,
-                    sample_instants_s,
+                    switch_and_sample_instants_s,
                 ),
             )
             free_matrix, locked_matrix = self._drift.arrays[:2]
@@ -252,7 +256,7 @@ class SimulatedPlant:
         # friction, drag force] and the output [state, outputs, speeds or displacements at the
         # obstacles] of a step. Each has the views that a step needs.
         self._vectors = _step_vectors(
-            n, point_count, drag_points=point_count if self._air is not None else 0
+            n, beam_point_count, drag_point_count=beam_point_count if self._air is not None else 0
         )
         self._state_count = n
 
@@ -269,10 +273,10 @@ class SimulatedPlant:
         self._torque_nm = 0.0
         self._torques = deque([0.0] * (delay_periods + 2), maxlen=delay_periods + 2)
         self._sensed_angles = deque([0.0] * (angle_periods + 1), maxlen=angle_periods + 1)
-        clock_difference = simulation.clock_rate_difference
+        clock_rate_difference = simulation.clock_rate_difference
         self._sensed_torques, self._sensed_shears = (
-            GrowingDelayLine(torque_periods, -clock_difference)
-            if clock_difference
+            GrowingDelayLine(torque_periods, -clock_rate_difference)
+            if clock_rate_difference
             else deque([0.0] * (torque_periods + 1), maxlen=torque_periods + 1)
             for _ in range(2)
         )
@@ -347,7 +351,9 @@ class SimulatedPlant:
         )
         for attribute_name in _OBSTACLE_ATTRIBUTES:
             setattr(self, attribute_name, getattr(prepared_plant, attribute_name))
-        self._vectors = _step_vectors(plant_state.size, len(new_obstacles.bodies), drag_points=0)
+        self._vectors = _step_vectors(
+            plant_state.size, len(new_obstacles.bodies), drag_point_count=0
+        )
         self._vectors[0][0][: plant_state.size] = plant_state
 
     def remove_obstacle(self, obstacle: Disturbance) -> None:
@@ -372,11 +378,11 @@ class SimulatedPlant:
         self._torque_nm = torque_nm
         return torque_nm
 
-    def advance(self, n_periods: int = 1) -> None:
-        """Advance the plant by `n_periods` ticks; the last torque command acts in all of them."""
+    def advance(self, period_count: int = 1) -> None:
+        """Advance the plant by `period_count` ticks, in which the last torque command acts."""
         n = self._state_count
         torques_nm = self._torques
-        for _ in range(n_periods):
+        for _ in range(period_count):
             if self._drift is not None and self._drift.refresh_if_due(self._periods_since_enabling):
                 self._use_stiffness(self._drift)
             torques_nm.append(self._torque_nm)
@@ -389,10 +395,10 @@ class SimulatedPlant:
             if self._air is not None:
                 self._air.write_held_force(step_input[n + 3 :])
 
-            fraction_before = self._fraction_before_switch
+            fraction_before_switch = self._fraction_before_switch
             shaft_load_nm = (
-                fraction_before * old_torque_nm
-                + (1 - fraction_before) * new_torque_nm
+                fraction_before_switch * old_torque_nm
+                + (1 - fraction_before_switch) * new_torque_nm
                 - self._holding_beam_nm
             )
             if self._is_stuck and abs(shaft_load_nm) <= self._coulomb_nm:
@@ -432,21 +438,23 @@ class SimulatedPlant:
                     sensed_shear_n += self._sensed_shear_jump_gain * torque_jump_nm
                 if self._coulomb_nm:
                     friction_effects = self._friction_effects
-                    friction_nm = -velocity_rad_s / friction_effects[1]
-                    self._is_stuck = abs(friction_nm) <= self._coulomb_nm
+                    friction_torque_nm = -velocity_rad_s / friction_effects[1]
+                    self._is_stuck = abs(friction_torque_nm) <= self._coulomb_nm
                     if self._is_stuck:
                         velocity_rad_s = 0.0
                     else:
-                        friction_nm = self._coulomb_nm if friction_nm > 0 else -self._coulomb_nm
-                        velocity_rad_s += friction_effects[1] * friction_nm
-                    self._friction_nm = friction_nm
-                    angle_rad += friction_effects[0] * friction_nm
-                    torque_nm += friction_effects[2] * friction_nm
-                    holding_torque_nm += friction_effects[3] * friction_nm
-                    shear_n += friction_effects[4] * friction_nm
-                    sensed_angle_rad += friction_effects[5] * friction_nm
-                    sensed_torque_nm += friction_effects[6] * friction_nm
-                    sensed_shear_n += friction_effects[7] * friction_nm
+                        friction_torque_nm = (
+                            self._coulomb_nm if friction_torque_nm > 0 else -self._coulomb_nm
+                        )
+                        velocity_rad_s += friction_effects[1] * friction_torque_nm
+                    self._friction_nm = friction_torque_nm
+                    angle_rad += friction_effects[0] * friction_torque_nm
+                    torque_nm += friction_effects[2] * friction_torque_nm
+                    holding_torque_nm += friction_effects[3] * friction_torque_nm
+                    shear_n += friction_effects[4] * friction_torque_nm
+                    sensed_angle_rad += friction_effects[5] * friction_torque_nm
+                    sensed_torque_nm += friction_effects[6] * friction_torque_nm
+                    sensed_shear_n += friction_effects[7] * friction_torque_nm
             if self._air is not None:
                 torque_nm, holding_torque_nm, shear_n, sensed_torque_nm, sensed_shear_n = (
                     self._with_drag_effect(
@@ -465,7 +473,7 @@ class SimulatedPlant:
             self._sensed_angles.append(sensed_angle_rad)
             self._sensed_torques.append(sensed_torque_nm)
             self._sensed_shears.append(sensed_shear_n)
-        if n_periods > 0:
+        if period_count > 0:
             self.angle_rad = angle_rad
             self.velocity_rad_s = velocity_rad_s
             self.coupling_torque_nm = torque_nm
@@ -492,8 +500,8 @@ class SimulatedPlant:
     def _add_contact_effect(
         self,
         substep_matrices: SubstepMatrices,
-        input_: RealArray,
-        output: RealArray,
+        step_input: RealArray,
+        step_output: RealArray,
         *,
         is_turning: bool,
     ) -> None:
@@ -506,36 +514,40 @@ class SimulatedPlant:
         assert attached_obstacles is not None
         n = self._state_count
         time_s = self.elapsed_s
-        if attached_obstacles.cannot_touch(output[n + OUTPUT_COUNT :], time_s):
+        if attached_obstacles.cannot_touch(step_output[n + STEP_OUTPUT_COUNT :], time_s):
             return
-        free_displacement_m = substep_matrices.free_displacement(input_).reshape(
+        free_displacement_m = substep_matrices.free_displacement(step_input).reshape(
             attached_obstacles.substeps, -1
         )
-        friction_nm = self._friction_nm if is_turning else 0.0
-        for _ in range(_FRICTION_ITERATIONS):
+        friction_torque_nm = self._friction_nm if is_turning else 0.0
+        for _ in range(_MAX_FRICTION_ITERATIONS):
             displacement_m = (
-                free_displacement_m + friction_nm * substep_matrices.displacement_per_friction
+                free_displacement_m
+                + friction_torque_nm * substep_matrices.displacement_per_friction
             )
-            forces_n = attached_obstacles.forces(substep_matrices, displacement_m, time_s)
+            forces_n = attached_obstacles.compute_forces(substep_matrices, displacement_m, time_s)
             contact_effect = substep_matrices.force_effect(forces_n.ravel())
             if not is_turning or not self._coulomb_nm:
                 break
-            velocity_rad_s = output.item(substep_matrices.velocity_row) + contact_effect.item(
-                substep_matrices.velocity_row
+            velocity_rad_s = step_output.item(
+                substep_matrices.velocity_index
+            ) + contact_effect.item(substep_matrices.velocity_index)
+            required_friction_torque_nm = -velocity_rad_s / self._friction_effects[1]
+            required_friction_torque_nm = min(
+                max(required_friction_torque_nm, -self._coulomb_nm), self._coulomb_nm
             )
-            required_friction_nm = -velocity_rad_s / self._friction_effects[1]
-            required_friction_nm = min(
-                max(required_friction_nm, -self._coulomb_nm), self._coulomb_nm
-            )
-            if abs(required_friction_nm - friction_nm) < _FRICTION_TOLERANCE * self._coulomb_nm:
+            if (
+                abs(required_friction_torque_nm - friction_torque_nm)
+                < _RELATIVE_FRICTION_TOLERANCE * self._coulomb_nm
+            ):
                 break
-            friction_nm = required_friction_nm
+            friction_torque_nm = required_friction_torque_nm
         attached_obstacles.store_forces(substep_matrices, forces_n, displacement_m)
-        output[: contact_effect.size] += contact_effect
+        step_output[: contact_effect.size] += contact_effect
 
     def _with_drag_effect(
         self,
-        output: RealArray,
+        step_output: RealArray,
         is_shaft_free: bool,
         torque_nm: float,
         holding_torque_nm: float,
@@ -545,7 +557,7 @@ class SimulatedPlant:
     ) -> tuple[float, float, float, float, float]:
         """Return the outputs at the end of a step, with the immediate effect of the drag added."""
         assert self._air is not None
-        speed_m_s = output[self._state_count + OUTPUT_COUNT :]
+        speed_m_s = step_output[self._state_count + STEP_OUTPUT_COUNT :]
         if is_shaft_free and self._friction_nm:
             speed_m_s += self._friction_nm * self._speed_per_friction
         old_drag_nm, old_drag_n = self._drag_torque_nm, self._drag_shear_n
@@ -555,14 +567,15 @@ class SimulatedPlant:
         )
         new_drag_n += shear_fraction * new_drag_nm
         self._drag_torque_nm, self._drag_shear_n = new_drag_nm, new_drag_n
-        instant_fraction = self._torque_instant_fraction
+        torque_instant_fraction = self._torque_instant_fraction
         return (
             torque_nm + torque_fraction * new_drag_nm,
             holding_torque_nm + new_drag_nm,
             shear_n + new_drag_n,
             sensed_torque_nm
-            + torque_fraction * (old_drag_nm + instant_fraction * (new_drag_nm - old_drag_nm)),
-            sensed_shear_n + old_drag_n + instant_fraction * (new_drag_n - old_drag_n),
+            + torque_fraction
+            * (old_drag_nm + torque_instant_fraction * (new_drag_nm - old_drag_nm)),
+            sensed_shear_n + old_drag_n + torque_instant_fraction * (new_drag_n - old_drag_n),
         )
 
 
@@ -582,29 +595,29 @@ def _attached_obstacles(
     if simulation is None or not simulation.obstacles:
         return None
     disturbances = tuple(parse_obstacle(obstacle_text) for obstacle_text in simulation.obstacles)
-    simulated_effects = {
+    effect_by_name = {
         effect_name: getattr(simulation, effect_name) for effect_name in INCOMPATIBLE_WITH_OBSTACLES
     }
-    check_obstacles(disturbances, parameters.beam, simulated_effects)
+    check_obstacles(disturbances, parameters.beam, effect_by_name)
     return AttachedObstacles(
         parameters.beam, parameters.damping, beam_realisation, disturbances, period_s
     )
 
 
 def _step_vectors(
-    state_count: int, point_count: int, *, drag_points: int
+    state_count: int, beam_point_count: int, *, drag_point_count: int
 ) -> tuple[tuple[RealArray, RealArray, RealArray], ...]:
     """Return the two vectors that alternate in steps, each with views of its input and outputs.
 
-    The input contains `drag_points` drag forces.
+    The input contains `drag_point_count` drag forces.
     """
     return tuple(
         (
             step_vector,
-            step_vector[: state_count + 3 + drag_points],
-            step_vector[state_count : state_count + OUTPUT_COUNT],
+            step_vector[: state_count + 3 + drag_point_count],
+            step_vector[state_count : state_count + STEP_OUTPUT_COUNT],
         )
-        for step_vector in np.zeros((2, state_count + OUTPUT_COUNT + point_count))
+        for step_vector in np.zeros((2, state_count + STEP_OUTPUT_COUNT + beam_point_count))
     )
 
 
@@ -612,23 +625,23 @@ class GrowingDelayLine:
     """Delay line of readings whose delay grows, for a sensor whose clock differs from the loop's.
 
     Between ticks the reading is interpolated by a cubic through the four nearest readings.
-    `periods` is the initial delay in ticks, and `growth` its increase per tick, in ticks and not
-    negative.
+    `initial_delay_ticks` is the initial delay in ticks, and `delay_growth_per_tick` its increase per
+    tick, in ticks and not negative.
     """
 
-    __slots__ = ("_age", "_growth", "_readings")
+    __slots__ = ("_age", "_delay_growth_per_tick", "_readings")
 
-    def __init__(self, periods: int, growth: float) -> None:
-        self._age = float(periods)
-        self._growth = growth
-        self._readings = [0.0] * (periods + _INTERPOLATION_POINTS)
+    def __init__(self, initial_delay_ticks: int, delay_growth_per_tick: float) -> None:
+        self._age = float(initial_delay_ticks)
+        self._delay_growth_per_tick = delay_growth_per_tick
+        self._readings = [0.0] * (initial_delay_ticks + _INTERPOLATION_POINT_COUNT)
 
     def append(self, new_reading: float) -> None:
         """Append the reading of the next tick to the delay line, and increase the delay."""
-        self._age += self._growth
+        self._age += self._delay_growth_per_tick
         stored_readings = self._readings
         stored_readings.append(new_reading)
-        if len(stored_readings) > self._age + _INTERPOLATION_POINTS:
+        if len(stored_readings) > self._age + _INTERPOLATION_POINT_COUNT:
             del stored_readings[0]
 
     def __getitem__(self, index: int) -> float:
@@ -637,10 +650,10 @@ class GrowingDelayLine:
         stored_readings = self._readings
         read_position = len(stored_readings) - 1 - self._age
         first_index = min(
-            max(int(read_position) - 1, 0), len(stored_readings) - _INTERPOLATION_POINTS
+            max(int(read_position) - 1, 0), len(stored_readings) - _INTERPOLATION_POINT_COUNT
         )
         x = read_position - first_index
-        a, b, c, d = stored_readings[first_index : first_index + _INTERPOLATION_POINTS]
+        a, b, c, d = stored_readings[first_index : first_index + _INTERPOLATION_POINT_COUNT]
         return (
             -a * (x - 1) * (x - 2) * (x - 3) / 6
             + b * x * (x - 2) * (x - 3) / 2

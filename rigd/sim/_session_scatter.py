@@ -6,7 +6,7 @@ import numpy as np
 
 from rigd.devices.parameters import RigParameters
 
-_RANDOM_STREAM = 1
+_SCATTER_RANDOM_STREAM = 1
 """Number that makes these random draws differ from those of the noise with the same seed."""
 
 
@@ -38,15 +38,15 @@ def session_parameters(rig: RigParameters, seed: int) -> RigParameters:
     >>> print(*(f"{session_parameters(rig, seed).damping.gamma:.4f}" for seed in (1, 2, 3)))
     0.0585 0.0498 0.0536
     """
-    percentages = np.array(_scatter_percentages(rig))
+    scatter_percentages = np.array(_scatter_percentages(rig))
     simulation = rig.simulation
-    if simulation is None or not percentages.any():
+    if simulation is None or not scatter_percentages.any():
         return rig
-    standard_normals = np.random.default_rng((seed, _RANDOM_STREAM)).standard_normal(
-        percentages.size
+    standard_normals = np.random.default_rng((seed, _SCATTER_RANDOM_STREAM)).standard_normal(
+        scatter_percentages.size
     )
     zeta_factor, gamma_factor, stiffness_factor = np.exp(
-        0.01 * percentages * standard_normals
+        0.01 * scatter_percentages * standard_normals
     ).tolist()
     damping = rig.damping
     return replace(

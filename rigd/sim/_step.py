@@ -29,7 +29,7 @@ from rigd.sim._stiffness_drift import with_modal_displacements
 RealArray = NDArray[np.float64]
 """Array of real numbers."""
 
-OUTPUT_COUNT = 8
+STEP_OUTPUT_COUNT = 8
 """Number of outputs of a step in addition to the state.
 
 They are angle, velocity, sensor torque, sensor torque on a shaft that does not accelerate, base
@@ -40,12 +40,13 @@ _SAME_INSTANT_PERIODS = 1e-9
 
 
 def beam_and_coupled_models(
-    parameters: RigParameters, simulation: Simulation, modes_of: Beam | None = None
+    parameters: RigParameters, simulation: Simulation, mode_reference_beam: Beam | None = None
 ) -> tuple[Realisation, CoupledModel, CoupledModel]:
     """Return the realisation of the beam, and the models of the beam on a free and a locked shaft.
 
     The beam of `parameters` is simulated, with tip mass, clamp compliance and sensor filter of
-    `simulation`. `modes_of` is as for :func:`rigd.beam.realisation.realise`.
+    `simulation`. `mode_reference_beam` is the argument `modes_of` of
+    :func:`rigd.beam.realisation.realise`.
     """
     plant = Plant(
         parameters.beam,
@@ -53,7 +54,7 @@ def beam_and_coupled_models(
         tip_mass_kg=simulation.tip_mass_kg,
         root_compliance_rad_per_nm=simulation.clamp_compliance_rad_per_nm,
     )
-    beam_realisation = realise(plant, modes_of=modes_of)
+    beam_realisation = realise(plant, modes_of=mode_reference_beam)
     attach_beam = partial(
         couple,
         beam_realisation,
@@ -78,24 +79,32 @@ def free_and_locked_steps(
     free_model: CoupledModel,
     locked_model: CoupledModel,
     period_s: float,
-    instants: tuple[float, float, float],
+    switch_and_sample_instants_s: tuple[float, float, float],
 ) -> tuple[RealArray, RealArray, RealArray]:
     """Return the step matrices for a free and a locked shaft, and the effect of 1 N·m of friction.
 
-    The matrices have the shape (n + 8, n + 3), and the effect has the shape (n + 8,). `instants`
-    are `switch_s`, `angle_instant_s` and `torque_instant_s` of `_step_matrix`.
+    The matrices have the shape (n + 8, n + 3), and the effect has the shape (n + 8,).
+    `switch_and_sample_instants_s` are `torque_switch_s`, `angle_instant_s` and `torque_instant_s` of `_step_matrix`.
 
     The friction of a period is known only after the period's step, from the speed reached without
     friction. The outputs are then corrected at once, and the state by the last column of the next
     step's matrix.
     """
     n = free_model.b.size
-    free_matrix = _step_matrix(free_model, locked_model.sensor_torque, period_s, *instants)
-    locked_matrix = _step_matrix(locked_model, locked_model.sensor_torque, period_s, *instants)
-    friction_effect = -(free_matrix[:, n] + free_matrix[:, n + 1])
-    free_matrix = np.column_stack([free_matrix, free_matrix[:, :n] @ friction_effect[:n]])
-    locked_matrix = np.column_stack([locked_matrix, locked_matrix[:, :n] @ friction_effect[:n]])
-    return free_matrix, locked_matrix, friction_effect
+    free_shaft_matrix = _step_matrix(
+        free_model, locked_model.sensor_torque, period_s, *switch_and_sample_instants_s
+    )
+    locked_shaft_matrix = _step_matrix(
+        locked_model, locked_model.sensor_torque, period_s, *switch_and_sample_instants_s
+    )
+    friction_effect = -(free_shaft_matrix[:, n] + free_shaft_matrix[:, n + 1])
+    free_shaft_matrix = np.column_stack(
+        [free_shaft_matrix, free_shaft_matrix[:, :n] @ friction_effect[:n]]
+    )
+    locked_shaft_matrix = np.column_stack(
+        [locked_shaft_matrix, locked_shaft_matrix[:, :n] @ friction_effect[:n]]
+    )
+    return free_shaft_matrix, locked_shaft_matrix, friction_effect
 
 
 def drifted_step_arrays(
@@ -104,16 +113,16 @@ def drifted_step_arrays(
     simulation: Simulation,
     initial_realisation: Realisation,
     period_s: float,
-    instants: tuple[float, float, float],
+    switch_and_sample_instants_s: tuple[float, float, float],
 ) -> tuple[RealArray, RealArray, RealArray, RealArray]:
     """Return matrices and effects of a step for a beam whose bending stiffness has drifted.
 
     Return the matrices for a free and a locked shaft, shape (n + 8, n + 3), the effect of 1 N·m of
     friction on the outputs, shape (8,), and the immediate effect of the motor's torque on torque
     and shear of the sensor, shape (2,). `stiffness_ratio` is relative to the start of the drift, to
-    which `parameters`, `simulation` and `initial_realisation` belong. `instants` are as for
-    `free_and_locked_steps`. Raise `RealisationError` if the beam cannot be realised at that
-    stiffness.
+    which `parameters`, `simulation` and `initial_realisation` belong. `switch_and_sample_instants_s`
+    are as for `free_and_locked_steps`. Raise `RealisationError` if the beam cannot be realised at
+    that stiffness.
     """
     beam_at_start = parameters.beam
     drifted_beam = replace(
@@ -134,7 +143,7 @@ def drifted_step_arrays(
         for coupled_model in coupled_models
     )
     free_matrix, locked_matrix, friction_effect = free_and_locked_steps(
-        free_model, locked_model, period_s, instants
+        free_model, locked_model, period_s, switch_and_sample_instants_s
     )
     effects_per_torque = np.array(
         [free_model.sensor_torque_per_torque, free_model.shear_per_torque]
@@ -151,26 +160,26 @@ def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
 
 def _step_matrix(
     model: CoupledModel,
-    holding_torque: RealArray,
+    holding_torque_row: RealArray,
     period_s: float,
-    switch_s: float,
+    torque_switch_s: float,
     angle_instant_s: float,
     torque_instant_s: float,
 ) -> RealArray:
     """Return the matrix of a step of the plant, which lasts one period.
 
     The matrix, shape (n + 8, n + 2), maps [state, motor torque before and after its change] to
-    [state, outputs]. The row `holding_torque`, shape (n,), gives from the state the sensor torque
-    on a shaft that does not accelerate. Counted from the start of the step, the motor's torque
-    changes at `switch_s`, and angle and torque are sensed at `angle_instant_s` and
+    [state, outputs]. The row `holding_torque_row`, shape (n,), gives from the state the sensor
+    torque on a shaft that does not accelerate. Counted from the start of the step, the motor's torque
+    changes at `torque_switch_s`, and angle and torque are sensed at `angle_instant_s` and
     `torque_instant_s`.
     """
 
     @cache
     def state_at(instant_s: float) -> RealArray:
         phi, step_response = propagator(model, instant_s)
-        response_after = propagator(model, max(instant_s - switch_s, 0.0))[1]
-        return np.column_stack([phi, step_response - response_after, response_after])
+        response_after_switch = propagator(model, max(instant_s - torque_switch_s, 0.0))[1]
+        return np.column_stack([phi, step_response - response_after_switch, response_after_switch])
 
     def torque_at(instant_s: float) -> RealArray:
         return row_with_immediate_effect(
@@ -181,22 +190,24 @@ def _step_matrix(
         return row_with_immediate_effect(model.shear, model.shear_per_torque, instant_s)
 
     def row_with_immediate_effect(
-        state_row: RealArray, per_torque: float, instant_s: float
+        state_row: RealArray, output_per_torque: float, instant_s: float
     ) -> RealArray:
         """Return the row of an output on which the motor torque acts at once."""
-        row: RealArray = state_row @ state_at(instant_s)
-        after_switch_s = instant_s - switch_s
-        if abs(after_switch_s) <= _SAME_INSTANT_PERIODS * period_s:
-            fraction_after = 0.5
+        output_row: RealArray = state_row @ state_at(instant_s)
+        time_after_switch_s = instant_s - torque_switch_s
+        if abs(time_after_switch_s) <= _SAME_INSTANT_PERIODS * period_s:
+            fraction_after_switch = 0.5
         else:
-            fraction_after = 1.0 if after_switch_s > 0 else 0.0
-        row[-2:] += per_torque * np.array([1 - fraction_after, fraction_after])
-        return row
+            fraction_after_switch = 1.0 if time_after_switch_s > 0 else 0.0
+        output_row[-2:] += output_per_torque * np.array(
+            [1 - fraction_after_switch, fraction_after_switch]
+        )
+        return output_row
 
-    end_rows = state_at(period_s)
+    end_state_rows = state_at(period_s)
     return np.vstack(
         [
-            *_output_rows(model, end_rows, torque_at(period_s), holding_torque),
+            *_output_rows(model, end_state_rows, torque_at(period_s), holding_torque_row),
             shear_at(period_s),
             model.angle @ state_at(angle_instant_s),
             torque_at(torque_instant_s)
@@ -210,22 +221,25 @@ def _step_matrix(
 
 
 def _output_rows(
-    model: CoupledModel, end_rows: RealArray, torque_row: RealArray, holding_torque: RealArray
+    model: CoupledModel,
+    end_state_rows: RealArray,
+    torque_row: RealArray,
+    holding_torque_row: RealArray,
 ) -> tuple[RealArray, ...]:
     """Return the step matrix's first rows: state after a period, angle, speed and both torques."""
     return (
-        end_rows,
-        model.angle @ end_rows,
-        model.velocity @ end_rows,
+        end_state_rows,
+        model.angle @ end_state_rows,
+        model.velocity @ end_state_rows,
         torque_row,
-        holding_torque @ end_rows,
+        holding_torque_row @ end_state_rows,
     )
 
 
 def constant_force_effect(
     model: CoupledModel,
     force_input: RealArray,
-    holding_torque: RealArray,
+    holding_torque_row: RealArray,
     period_s: float,
     angle_instant_s: float,
     torque_instant_s: float,
@@ -243,7 +257,7 @@ def constant_force_effect(
     end_states = state_at(period_s)
     return np.vstack(
         [
-            *_output_rows(model, end_states, model.sensor_torque @ end_states, holding_torque),
+            *_output_rows(model, end_states, model.sensor_torque @ end_states, holding_torque_row),
             model.shear @ end_states,
             model.angle @ state_at(angle_instant_s),
             model.sensor_torque @ state_at(torque_instant_s),

@@ -20,7 +20,7 @@ from rigd.beam.realisation import CoupledModel, Realisation
 RealArray = NDArray[np.float64]
 """Array of real numbers."""
 
-LARGEST_DRIFT = 0.05
+MAX_STIFFNESS_DRIFT = 0.05
 """Relative change of the stiffness at which the drift ends."""
 _UPDATE_INTERVAL_S = 0.02
 """Time in seconds between two updates of the matrices."""
@@ -33,7 +33,7 @@ class StiffnessDrift:
 
     `rate_per_s` is the relative change of the stiffness per second, not 0, `period_s` the duration
     of a step, and `highest_mode_rad_s` the largest natural frequency of the modelled modes.
-    `arrays_at` returns the arrays for a stiffness relative to the initial one.
+    `arrays_at_stiffness_ratio` returns the arrays for a stiffness relative to the initial one.
 
     Attributes
     ----------
@@ -54,20 +54,24 @@ class StiffnessDrift:
         rate_per_s: float,
         period_s: float,
         highest_mode_rad_s: float,
-        arrays_at: Callable[[float], Sequence[RealArray]],
+        arrays_at_stiffness_ratio: Callable[[float], Sequence[RealArray]],
     ) -> None:
         # The phase of the fastest mode in a step, from the middle of the drift to its ends.
-        half_angle_rad = 0.25 * LARGEST_DRIFT * highest_mode_rad_s * period_s
-        point_count = 3
+        half_phase_range_rad = 0.25 * MAX_STIFFNESS_DRIFT * highest_mode_rad_s * period_s
+        chebyshev_point_count = 3
         while (
-            2 * (0.5 * half_angle_rad) ** point_count / math.factorial(point_count)
+            2
+            * (0.5 * half_phase_range_rad) ** chebyshev_point_count
+            / math.factorial(chebyshev_point_count)
             > _LARGEST_INTERPOLATION_ERROR
         ):
-            point_count += 1
-        chebyshev_points = -np.cos(np.pi * np.arange(point_count) / (point_count - 1))
-        end_drift = math.copysign(LARGEST_DRIFT, rate_per_s)
+            chebyshev_point_count += 1
+        chebyshev_points = -np.cos(
+            np.pi * np.arange(chebyshev_point_count) / (chebyshev_point_count - 1)
+        )
+        end_stiffness_drift = math.copysign(MAX_STIFFNESS_DRIFT, rate_per_s)
         arrays_at_points = [
-            arrays_at(1 + end_drift * 0.5 * (1 + chebyshev_point))
+            arrays_at_stiffness_ratio(1 + end_stiffness_drift * 0.5 * (1 + chebyshev_point))
             for chebyshev_point in chebyshev_points.tolist()
         ]
         array_shapes = [start_array.shape for start_array in arrays_at_points[0]]
@@ -78,7 +82,8 @@ class StiffnessDrift:
             ]
         )
         self._coefficients = np.linalg.solve(
-            np.polynomial.chebyshev.chebvander(chebyshev_points, point_count - 1), stacked_values
+            np.polynomial.chebyshev.chebvander(chebyshev_points, chebyshev_point_count - 1),
+            stacked_values,
         )
         self._flat_arrays = stacked_values[0].copy()
         array_sizes = [math.prod(array_shape) for array_shape in array_shapes]
@@ -88,23 +93,25 @@ class StiffnessDrift:
             for flat_part, array_shape in zip(flat_parts, array_shapes, strict=True)
         )
         self._periods_per_update = max(1, round(_UPDATE_INTERVAL_S / period_s))
-        self._drift_fraction_per_period = abs(rate_per_s) * period_s / LARGEST_DRIFT
+        self._drift_fraction_per_period = abs(rate_per_s) * period_s / MAX_STIFFNESS_DRIFT
 
-    def refresh_if_due(self, periods: int) -> bool:
+    def refresh_if_due(self, elapsed_periods: int) -> bool:
         """Update the step matrices for the coming periods if due; return whether they have changed.
 
         Call this method in every period, with the number of periods since the drift began.
         """
-        if periods < 0 or periods % self._periods_per_update:
+        if elapsed_periods < 0 or elapsed_periods % self._periods_per_update:
             return False
         drift_fraction = (
-            periods + 0.5 * self._periods_per_update
+            elapsed_periods + 0.5 * self._periods_per_update
         ) * self._drift_fraction_per_period
         if drift_fraction - self._periods_per_update * self._drift_fraction_per_period > 1:
             return False  # the drift has ended
-        chebyshev_rad = math.acos(1 - 2 * min(drift_fraction, 1.0))
+        chebyshev_angle_rad = math.acos(1 - 2 * min(drift_fraction, 1.0))
         # The k-th polynomial is cos(k arccos x); x runs from -1 to 1.
-        polynomial_values = np.cos((math.pi - chebyshev_rad) * np.arange(len(self._coefficients)))
+        polynomial_values = np.cos(
+            (math.pi - chebyshev_angle_rad) * np.arange(len(self._coefficients))
+        )
         polynomial_values.dot(self._coefficients, self._flat_arrays)
         return True
 
@@ -118,28 +125,28 @@ def with_modal_displacements(
     `initial_realisation`, at the start of the drift, defines the units of the displacements.
     """
     n, beam_state_count = model.b.size, beam_realisation.b.size
-    from_displacements = np.eye(n)
-    from_displacements[2 : 2 + beam_state_count, 2 : 2 + beam_state_count] = (
+    states_per_displacement = np.eye(n)
+    states_per_displacement[2 : 2 + beam_state_count, 2 : 2 + beam_state_count] = (
         _states_from_displacements(beam_realisation, initial_realisation)
     )
-    to_displacements = np.linalg.inv(from_displacements)
+    displacements_per_state = np.linalg.inv(states_per_displacement)
 
-    def row(old_row: RealArray) -> RealArray:
-        new_row: RealArray = old_row @ from_displacements
+    def transformed_row(old_row: RealArray) -> RealArray:
+        new_row: RealArray = old_row @ states_per_displacement
         return new_row
 
     return replace(
         model,
-        a=to_displacements @ model.a @ from_displacements,
-        b=to_displacements @ model.b,
-        angle=row(model.angle),
-        velocity=row(model.velocity),
-        acceleration=row(model.acceleration),
-        beam_torque=row(model.beam_torque),
-        sensor_torque=row(model.sensor_torque),
-        sensed_torque=None if model.sensed_torque is None else row(model.sensed_torque),
-        shear=row(model.shear),
-        sensed_shear=None if model.sensed_shear is None else row(model.sensed_shear),
+        a=displacements_per_state @ model.a @ states_per_displacement,
+        b=displacements_per_state @ model.b,
+        angle=transformed_row(model.angle),
+        velocity=transformed_row(model.velocity),
+        acceleration=transformed_row(model.acceleration),
+        beam_torque=transformed_row(model.beam_torque),
+        sensor_torque=transformed_row(model.sensor_torque),
+        sensed_torque=None if model.sensed_torque is None else transformed_row(model.sensed_torque),
+        shear=transformed_row(model.shear),
+        sensed_shear=None if model.sensed_shear is None else transformed_row(model.sensed_shear),
     )
 
 
@@ -150,7 +157,7 @@ def _states_from_displacements(
 
     States that belong to no mode are unchanged.
     """
-    rates_at_start = {
+    initial_rate_by_mode = {
         beam_mode: abs(pole)
         for beam_mode, pole in zip(
             initial_realisation.modes.tolist(),
@@ -159,13 +166,13 @@ def _states_from_displacements(
         )
     }
     poles, pole_modes = beam_realisation.poles_rad_s, beam_realisation.modes
-    first_states = np.cumsum([0, *np.where(poles.imag > 0, 2, 1)])  # state of each pole
+    first_state_of_pole = np.cumsum([0, *np.where(poles.imag > 0, 2, 1)])  # state of each pole
     state_matrix = np.zeros((beam_realisation.b.size, beam_realisation.b.size))
     column_index = 0
     unchanged_states: list[int] = []
     for beam_mode in np.unique(pole_modes):
         mode_poles = np.flatnonzero(pole_modes == beam_mode)
-        mode_states = first_states[mode_poles]
+        mode_states = first_state_of_pole[mode_poles]
         if beam_mode >= 0 and poles[mode_poles[0]].imag > 0:
             pole = poles[mode_poles[0]]
             # With x - i y of the realisation: x - i y = p* q - q'.
@@ -176,7 +183,7 @@ def _states_from_displacements(
         else:
             unchanged_states += mode_states.tolist()
             continue
-        column_scales = np.array([1 / rates_at_start[int(beam_mode)], 1.0])
+        column_scales = np.array([1 / initial_rate_by_mode[int(beam_mode)], 1.0])
         state_matrix[mode_states, column_index : column_index + 2] = (
             np.array(state_rows) * column_scales
         )
