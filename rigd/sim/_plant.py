@@ -625,8 +625,8 @@ class GrowingDelayLine:
     """Delay line of readings whose delay grows, for a sensor whose clock differs from the loop's.
 
     Between ticks the reading is interpolated by a cubic through the four nearest readings.
-    `initial_delay_ticks` is the initial delay in ticks, and `delay_growth_per_tick` its increase per
-    tick, in ticks and not negative.
+    `initial_delay_ticks` is the initial delay in ticks, and `delay_growth_per_tick` its increase
+    per tick, in ticks and not negative.
     """
 
     __slots__ = ("_age", "_delay_growth_per_tick", "_readings")

@@ -84,7 +84,8 @@ def free_and_locked_steps(
     """Return the step matrices for a free and a locked shaft, and the effect of 1 N·m of friction.
 
     The matrices have the shape (n + 8, n + 3), and the effect has the shape (n + 8,).
-    `switch_and_sample_instants_s` are `torque_switch_s`, `angle_instant_s` and `torque_instant_s` of `_step_matrix`.
+    `switch_and_sample_instants_s` are `torque_switch_s`, `angle_instant_s` and `torque_instant_s`
+    of `_step_matrix`.
 
     The friction of a period is known only after the period's step, from the speed reached without
     friction. The outputs are then corrected at once, and the state by the last column of the next
@@ -120,9 +121,9 @@ def drifted_step_arrays(
     Return the matrices for a free and a locked shaft, shape (n + 8, n + 3), the effect of 1 N·m of
     friction on the outputs, shape (8,), and the immediate effect of the motor's torque on torque
     and shear of the sensor, shape (2,). `stiffness_ratio` is relative to the start of the drift, to
-    which `parameters`, `simulation` and `initial_realisation` belong. `switch_and_sample_instants_s`
-    are as for `free_and_locked_steps`. Raise `RealisationError` if the beam cannot be realised at
-    that stiffness.
+    which `parameters`, `simulation` and `initial_realisation` belong.
+    `switch_and_sample_instants_s` are as for `free_and_locked_steps`. Raise
+    `RealisationError` if the beam cannot be realised at that stiffness.
     """
     beam_at_start = parameters.beam
     drifted_beam = replace(
@@ -170,8 +171,8 @@ def _step_matrix(
 
     The matrix, shape (n + 8, n + 2), maps [state, motor torque before and after its change] to
     [state, outputs]. The row `holding_torque_row`, shape (n,), gives from the state the sensor
-    torque on a shaft that does not accelerate. Counted from the start of the step, the motor's torque
-    changes at `torque_switch_s`, and angle and torque are sensed at `angle_instant_s` and
+    torque on a shaft that does not accelerate. Counted from the start of the step, the motor's
+    torque changes at `torque_switch_s`, and angle and torque are sensed at `angle_instant_s` and
     `torque_instant_s`.
     """
 

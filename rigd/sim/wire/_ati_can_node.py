@@ -38,7 +38,7 @@ _pack_matrix_entries = Struct(">2f").pack
 """Pack two entries of the matrix."""
 _pack_counts_per_unit = Struct(">2I").pack
 """Pack the counts per unit of force and torque."""
-_pack_word = Struct(">H").pack
+_pack_diagnostic_value = Struct(">H").pack
 """Pack a 16-bit word."""
 _pack_firmware = Struct(">BBH").pack
 """Pack major, minor and build number of the firmware."""
@@ -49,7 +49,7 @@ _BAD_CALIBRATION_BIT = 1 << 6
 """Status bit: the active calibration is bad."""
 _ANY_ERROR_BIT = 1 << 15
 """Status bit that is set if any other is set."""
-_ERASED_ROW = (float("nan"),) * 6
+_ERASED_MATRIX_ROW = (float("nan"),) * 6
 """Row of the matrix of a calibration that is not in the box."""
 _DIAGNOSTIC_VALUES = (32768, 0, 21450, 43690, 32771, 12)
 """Raw ADC values of the diagnostic channels.
@@ -107,8 +107,10 @@ class AtiCanNode:
                 "The profile has no section [ati_can], which the simulated sensor on CAN needs; "
                 "copy it from a profile that has one."
             )
-        reports_counts = firmware[:2] >= _FIRST_FIRMWARE_WITH_COUNTS
-        self.gauges = AtiGauges(rig.sensor, counts_per_unit if reports_counts else COUNTS_PER_UNIT)
+        reports_counts_per_unit = firmware[:2] >= _FIRST_FIRMWARE_WITH_COUNTS
+        self.gauges = AtiGauges(
+            rig.sensor, counts_per_unit if reports_counts_per_unit else COUNTS_PER_UNIT
+        )
         self.frozen = False
         self.saturate: int | None = None
         self.status_bits = 0
@@ -130,11 +132,11 @@ class AtiCanNode:
             0x5: (0, self._read_serial_number),
             0x6: (1, self._set_calibration),
             0xC: (0, self._reset),
-            0xD: (1, self._set_base),
-            0xE: (1, self._set_baud),
+            0xD: (1, self._set_base_identifier),
+            0xE: (1, self._set_bit_rate),
             0xF: (0, self._read_firmware),
         }
-        if reports_counts:
+        if reports_counts_per_unit:
             self._requests[0x7] = (0, self._read_counts_per_unit)
             self._requests[0x8] = (0, self._read_units)
         if firmware[:2] >= _FIRST_FIRMWARE_WITH_DIAGNOSTICS:
@@ -181,23 +183,27 @@ class AtiCanNode:
         self._reply(0x0, _pack_status_and_even_gauges(status_word, g0, g2, g4))
         self._reply(0x1, _pack_odd_gauges(g1, g3, g5))
 
-    def _read_matrix_row(self, data: bytes) -> None:
+    def _read_matrix_row(self, request_data: bytes) -> None:
         """Answer a request for a row of the calibration matrix with three frames."""
-        axis_index = data[0]
+        axis_index = request_data[0]
         if axis_index > 5:
             return
-        is_known = self._active_calibration in self._calibrations
-        row = self.gauges.matrix[axis_index].tolist() if is_known else _ERASED_ROW
+        is_calibration_known = self._active_calibration in self._calibrations
+        matrix_row = (
+            self.gauges.matrix[axis_index].tolist() if is_calibration_known else _ERASED_MATRIX_ROW
+        )
         for opcode, first_entry in ((0x2, 0), (0x3, 2), (0x4, 4)):
-            self._reply(opcode, _pack_matrix_entries(row[first_entry], row[first_entry + 1]))
+            self._reply(
+                opcode, _pack_matrix_entries(matrix_row[first_entry], matrix_row[first_entry + 1])
+            )
 
     def _read_serial_number(self, _: bytes) -> None:
         """Answer a request for the serial number."""
         self._reply(0x5, self._serial_number)
 
-    def _set_calibration(self, data: bytes) -> None:
+    def _set_calibration(self, request_data: bytes) -> None:
         """Select a calibration by its index, and confirm it."""
-        calibration_index = data[0]
+        calibration_index = request_data[0]
         if calibration_index > 15:
             return
         self._active_calibration = calibration_index
@@ -207,7 +213,7 @@ class AtiCanNode:
             index=calibration_index,
             present=calibration_index in self._calibrations,
         )
-        self._reply(0x6, data)
+        self._reply(0x6, request_data)
 
     def _read_counts_per_unit(self, _: bytes) -> None:
         """Answer a request for the counts per unit of force and torque."""
@@ -217,26 +223,31 @@ class AtiCanNode:
         """Answer a request for the unit codes of force and torque."""
         self._reply(0x8, bytes((UNIT_NEWTON, UNIT_NEWTON_METRE)))
 
-    def _read_diagnostic(self, data: bytes) -> None:
+    def _read_diagnostic(self, request_data: bytes) -> None:
         """Answer a request for the raw value of a diagnostic channel."""
-        if data[0] < len(_DIAGNOSTIC_VALUES):
-            self._reply(0x9, _pack_word(_DIAGNOSTIC_VALUES[data[0]]))
+        if request_data[0] < len(_DIAGNOSTIC_VALUES):
+            self._reply(0x9, _pack_diagnostic_value(_DIAGNOSTIC_VALUES[request_data[0]]))
 
     def _reset(self, _: bytes) -> None:
         """Reset the box on request."""
         self.reset()
 
-    def _set_base(self, data: bytes) -> None:
+    def _set_base_identifier(self, request_data: bytes) -> None:
         """Store a new identifier base for the next power-up, and confirm it."""
-        if data[0] > 0x7F:
+        if request_data[0] > 0x7F:
             return
         self._reply(0xD, b"")
-        self._next_base = data[0]
-        self._log("sensor", "base identifier set", base_id=data[0])
+        self._next_base = request_data[0]
+        self._log("sensor", "base identifier set", base_id=request_data[0])
 
-    def _set_baud(self, data: bytes) -> None:
+    def _set_bit_rate(self, request_data: bytes) -> None:
         """Confirm a new bit rate, which has no effect here."""
-        self._log("sensor", "baud set", divisor=data[0], bitrate_bit_s=2_000_000 / (data[0] + 1))
+        self._log(
+            "sensor",
+            "baud set",
+            divisor=request_data[0],
+            bitrate_bit_s=2_000_000 / (request_data[0] + 1),
+        )
         self._reply(0xE, b"")
 
     def _read_firmware(self, _: bytes) -> None:

@@ -11,7 +11,7 @@ from rigd.sim import StuckReadings
 
 COUNTS_PER_UNIT = (1_000_000, 1_000_000)
 """Counts per N and per N·m, as documented for two sensors of this family."""
-WIRE_ORDER = (0, 2, 4, 1, 3, 5)
+GAUGE_ORDER_ON_WIRE = (0, 2, 4, 1, 3, 5)
 """Number of the gauge at each position, in the order in which both protocols send them."""
 UNIT_NEWTON, UNIT_NEWTON_METRE = 2, 3
 """ATI's unit codes of force in N and of torque in N·m."""

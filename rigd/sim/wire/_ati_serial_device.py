@@ -28,15 +28,15 @@ from rigd.devices.contracts import DeviceError, Wrench
 from rigd.devices.parameters import AtiSerial, RigParameters
 from rigd.sim import SimulatedRig
 from rigd.sim.wire._ati_gauges import (
+    GAUGE_ORDER_ON_WIRE,
     PART_NUMBER,
     SERIAL_NUMBER,
     UNIT_NEWTON,
     UNIT_NEWTON_METRE,
-    WIRE_ORDER,
     AtiGauges,
 )
 
-_ADDRESS = 0x0A
+_MODBUS_ADDRESS = 0x0A
 """Modbus address of the sensor."""
 _READ_HOLDING_FUNCTION, _READ_INPUT_FUNCTION, _WRITE_FUNCTION = 0x03, 0x04, 0x10
 """Modbus functions: read holding registers, read input registers, write registers."""
@@ -62,13 +62,13 @@ _SESSION_ID_REGISTER, _STATUS_REGISTER, _BAUD_IS_STORED_REGISTER, _BAUD_REGISTER
 """Addresses of further holding registers."""
 _BAUD_RATES_BIT_S = (1_250_000, 19_200, 115_200)
 """Bit rates in bit/s by the value of the baud register."""
-_POLLED_GAUGES = 6
+_POLLED_GAUGE_COUNT = 6
 """Number of input registers with polled gauges, from address 0 on."""
-_DIAGNOSTICS_REGISTER = 0x27
+_FIRST_DIAGNOSTIC_REGISTER = 0x27
 """Address of the first input register with a diagnostic value."""
 _DIAGNOSTIC_VALUES = (32768, 21450, 43690, 32771, 12, 30102)
 """Values of the diagnostic input registers."""
-_CALIBRATIONS_REGISTER, _CALIBRATION_SIZE, _CALIBRATION_COUNT = 0x00E3, 192, 16
+_FIRST_CALIBRATION_REGISTER, _CALIBRATION_SIZE, _CALIBRATION_COUNT = 0x00E3, 192, 16
 """Address of the first calibration block, registers per block, and number of blocks."""
 _ERASED_REGISTER = 0xFFFF
 """Value of a register of an empty calibration block."""
@@ -88,7 +88,7 @@ _REQUEST_TIMEOUT_S = 0.05
 """Silence in seconds after which an incomplete request is discarded."""
 _MAX_FRAME_BYTES = 256
 """Longest Modbus frame in bytes."""
-_RECORD_SIZE = 13
+_STREAM_RECORD_BYTES = 13
 """Size of a record of the stream in bytes."""
 _UNSET_GAUGE_COUNTS = -32768
 """Reading of a gauge whose gain or offset differs from the calibration."""
@@ -206,8 +206,8 @@ class AtiSerialDevice:
         wrenches = self._newest_wrenches()
         if not wrenches:
             return
-        gauge_counts = self._read_gauges(wrenches).take(WIRE_ORDER, axis=1)
-        stream_records = np.empty((len(wrenches), _RECORD_SIZE), dtype=np.uint8)
+        gauge_counts = self._read_gauges(wrenches).take(GAUGE_ORDER_ON_WIRE, axis=1)
+        stream_records = np.empty((len(wrenches), _STREAM_RECORD_BYTES), dtype=np.uint8)
         stream_records[:, :12] = gauge_counts.astype(">i2").view(np.uint8)
         checksums = stream_records[:, :12].sum(axis=1, dtype=np.uint8) & 0x7F
         stream_records[:, 12] = checksums | _RECORD_ERROR_BIT if self.status_bits else checksums
@@ -232,31 +232,31 @@ class AtiSerialDevice:
     def _answer(self, request: bytes) -> None:
         """Answer a complete request, by the requested data or an exception response."""
         function_code, request_content = request[1], request[2:-2]
-        answer_request = {
-            _READ_HOLDING_FUNCTION: self._read_holding,
-            _READ_INPUT_FUNCTION: self._read_input,
+        request_handler = {
+            _READ_HOLDING_FUNCTION: self._read_holding_registers,
+            _READ_INPUT_FUNCTION: self._read_input_registers,
             _WRITE_FUNCTION: self._write_registers,
             _STREAM_FUNCTION: self._start_stream,
-            _LOCK_FUNCTION: self._set_lock,
+            _LOCK_FUNCTION: self._set_storage_lock,
         }.get(function_code)
         reply_content = (
-            _ILLEGAL_FUNCTION if answer_request is None else answer_request(request_content)
+            _ILLEGAL_FUNCTION if request_handler is None else request_handler(request_content)
         )
         if isinstance(reply_content, int):
             function_code, reply_content = function_code | _EXCEPTION_BIT, bytes((reply_content,))
-        reply_frame = bytes((_ADDRESS, function_code)) + reply_content
+        reply_frame = bytes((_MODBUS_ADDRESS, function_code)) + reply_content
         self._write(reply_frame + _checksum(reply_frame).to_bytes(2, "little"))
 
-    def _read_holding(self, request_content: bytes) -> bytes | int:
+    def _read_holding_registers(self, request_content: bytes) -> bytes | int:
         """Return the reply content to a request for holding registers, or an exception code."""
         self._holding_registers[_STATUS_REGISTER] = self.status_bits & 0xFFFF
         return _answer_with_registers(self._holding_registers, request_content)
 
-    def _read_input(self, request_content: bytes) -> bytes | int:
+    def _read_input_registers(self, request_content: bytes) -> bytes | int:
         """Return the reply content to a request for input registers, or an exception code."""
-        input_registers = dict(enumerate(_DIAGNOSTIC_VALUES, start=_DIAGNOSTICS_REGISTER))
+        input_registers = dict(enumerate(_DIAGNOSTIC_VALUES, start=_FIRST_DIAGNOSTIC_REGISTER))
         first_register, _ = _unpack_register_range(request_content)
-        if first_register < _POLLED_GAUGES:
+        if first_register < _POLLED_GAUGE_COUNT:
             newest_wrenches = self._newest_wrenches()[-1:] or [self._sensor.measure()]
             input_registers.update(
                 enumerate(self._read_gauges(newest_wrenches)[0].astype(np.uint16).tolist())
@@ -311,7 +311,7 @@ class AtiSerialDevice:
             self._log("sensor", "gains and offsets not loaded", gauges=self._unset_gauges)
         return b"\x01"
 
-    def _set_lock(self, request_content: bytes) -> bytes | int:
+    def _set_storage_lock(self, request_content: bytes) -> bytes | int:
         """Lock or unlock the sensor's storage; return the content of the answer."""
         if request_content[0] not in (_UNLOCK_PARAMETER, _LOCK_PARAMETER):
             return b"\x00"
@@ -321,7 +321,7 @@ class AtiSerialDevice:
 
 
 def _holding_registers_at_power_up(
-    settings: AtiSerial, gauges: AtiGauges, ratings: tuple[float, ...]
+    settings: AtiSerial, gauges: AtiGauges, axis_ranges: tuple[float, ...]
 ) -> dict[int, int]:
     """Return the values of the holding registers after power-up, by address."""
     holding_registers = dict.fromkeys(
@@ -340,7 +340,8 @@ def _holding_registers_at_power_up(
     register_count = _CALIBRATION_SIZE * _CALIBRATION_COUNT
     holding_registers.update(
         dict.fromkeys(
-            range(_CALIBRATIONS_REGISTER, _CALIBRATIONS_REGISTER + register_count), _ERASED_REGISTER
+            range(_FIRST_CALIBRATION_REGISTER, _FIRST_CALIBRATION_REGISTER + register_count),
+            _ERASED_REGISTER,
         )
     )
     calibration_bytes = _CALIBRATION_LAYOUT.pack(
@@ -351,14 +352,18 @@ def _holding_registers_at_power_up(
         *gauges.matrix.ravel().tolist(),
         UNIT_NEWTON,
         UNIT_NEWTON_METRE,
-        *ratings,
+        *axis_ranges,
         *gauges.counts_per_unit,
         *_GAUGE_GAINS,
         *_GAUGE_OFFSETS,
     ).ljust(2 * _CALIBRATION_SIZE, b"\0")
-    block_register = _CALIBRATIONS_REGISTER + (settings.calibration - 1) * _CALIBRATION_SIZE
+    calibration_block_register = (
+        _FIRST_CALIBRATION_REGISTER + (settings.calibration - 1) * _CALIBRATION_SIZE
+    )
     holding_registers.update(
-        enumerate(np.frombuffer(calibration_bytes, ">u2").tolist(), start=block_register)
+        enumerate(
+            np.frombuffer(calibration_bytes, ">u2").tolist(), start=calibration_block_register
+        )
     )
     return holding_registers
 
@@ -370,13 +375,13 @@ def _answer_with_registers(
     first_register, register_count = _unpack_register_range(request_content)
     if not 1 <= register_count <= _MAX_REGISTERS_READ:
         return _ILLEGAL_VALUE
-    addresses = range(first_register, first_register + register_count)
-    if not all(map(registers_by_address.__contains__, addresses)):
+    register_addresses = range(first_register, first_register + register_count)
+    if not all(map(registers_by_address.__contains__, register_addresses)):
         return _ILLEGAL_ADDRESS
     return pack_struct(
         f">B{register_count}H",
         2 * register_count,
-        *map(registers_by_address.__getitem__, addresses),
+        *map(registers_by_address.__getitem__, register_addresses),
     )
 
 
@@ -389,8 +394,8 @@ def _next_request(received_bytes: bytes) -> tuple[bytes | None, bytes]:
     The request includes its checksum and is None if there is none. The remaining bytes are those
     after the request, or from the first position at which a request may have begun.
     """
-    possible_start = len(received_bytes)
-    request_start = received_bytes.find(_ADDRESS)
+    possible_request_start = len(received_bytes)
+    request_start = received_bytes.find(_MODBUS_ADDRESS)
     while request_start >= 0:
         available_bytes = len(received_bytes) - request_start
         request_length = _request_length(received_bytes, request_start)
@@ -400,31 +405,33 @@ def _next_request(received_bytes: bytes) -> tuple[bytes | None, bytes]:
                     request_start : request_start + request_length
                 ], received_bytes[request_start + request_length :]
         elif available_bytes < _MAX_FRAME_BYTES:
-            possible_start = min(possible_start, request_start)
-        request_start = received_bytes.find(_ADDRESS, request_start + 1)
-    return None, received_bytes[possible_start:]
+            possible_request_start = min(possible_request_start, request_start)
+        request_start = received_bytes.find(_MODBUS_ADDRESS, request_start + 1)
+    return None, received_bytes[possible_request_start:]
 
 
-def _request_length(received_bytes: bytes, start: int) -> int:
-    """Return the length in bytes of the request at `start`.
+def _request_length(received_bytes: bytes, request_start: int) -> int:
+    """Return the length in bytes of the request at `request_start`.
 
     If the length is unknown, a length is returned that exceeds the data.
     """
-    available_bytes = len(received_bytes) - start
-    unknown_length = available_bytes + 1
+    available_bytes = len(received_bytes) - request_start
+    length_if_incomplete = available_bytes + 1
     if available_bytes < 4:
-        return unknown_length
-    function_code = received_bytes[start + 1]
+        return length_if_incomplete
+    function_code = received_bytes[request_start + 1]
     if function_code in (_READ_HOLDING_FUNCTION, _READ_INPUT_FUNCTION):
         return 8
     if function_code in (_STREAM_FUNCTION, _LOCK_FUNCTION):
         return 5
     if function_code == _WRITE_FUNCTION:
-        return 9 + received_bytes[start + 6] if available_bytes > 6 else unknown_length
+        return (
+            9 + received_bytes[request_start + 6] if available_bytes > 6 else length_if_incomplete
+        )
     # A request with an unknown function ends where its checksum holds.
     return (
-        unknown_length
-        if available_bytes > _MAX_FRAME_BYTES or _checksum(received_bytes[start:])
+        length_if_incomplete
+        if available_bytes > _MAX_FRAME_BYTES or _checksum(received_bytes[request_start:])
         else available_bytes
     )
 

@@ -17,8 +17,8 @@ from rigd.devices.obstacles import Obstacle, ObstacleError
 from rigd.devices.parameters import RigParameters
 from rigd.sim import SimulatedRig, StuckReadings
 from rigd.sim.wire._faults import (
-    DISTURBANCE_KINDS,
-    LINE_KINDS,
+    DISTURBANCE_FAULT_KINDS,
+    LINE_FAULT_KINDS,
     SERIAL_PSEUDO_ID,
     EventLog,
     Fault,
@@ -27,7 +27,7 @@ from rigd.sim.wire._faults import (
     disturbance_of,
 )
 
-_AVERAGED_SYNCS = 256
+_AVERAGED_SYNC_COUNT = 256
 """Number of SYNCs over which the phase of the tick grid is averaged.
 
 A single late SYNC then hardly changes the phase."""
@@ -37,7 +37,7 @@ _OBSTACLE_LEAD_TIME_S = 0.5
 Preparing the obstacle takes less."""
 _NEW_PHASE_PERIODS = 100
 """Number of periods without SYNC after which the next SYNC may have a new phase (another host)."""
-_LOCK_STEP_WAIT_NS = 5_000_000_000
+_LOCK_STEP_MAX_WAIT_NS = 5_000_000_000
 """Time in nanoseconds that simulated time waits for a SYNC in lock-step."""
 
 
@@ -81,7 +81,7 @@ class WallClock:
         nearest_tick = round(elapsed_periods)
         if nearest_tick - self._last_sync > _NEW_PHASE_PERIODS:
             self._averaged_syncs = 0
-        self._averaged_syncs = min(self._averaged_syncs + 1, _AVERAGED_SYNCS)
+        self._averaged_syncs = min(self._averaged_syncs + 1, _AVERAGED_SYNC_COUNT)
         self._last_sync = nearest_tick
         self._origin_ns += (elapsed_periods - nearest_tick) * self._period_ns / self._averaged_syncs
         return self._advance_to(nearest_tick)
@@ -119,7 +119,7 @@ class LockStep:
 
     def sync(self, now_ns: float) -> int:
         """Process a SYNC received at `now_ns`; return the number of elapsed periods, always 1."""
-        self._waiting_until_ns = now_ns + _LOCK_STEP_WAIT_NS
+        self._waiting_until_ns = now_ns + _LOCK_STEP_MAX_WAIT_NS
         return 1
 
     def elapse(self, now_ns: int) -> int:
@@ -139,9 +139,9 @@ _SYNC_ID = 0x80
 """CAN identifier of SYNC."""
 _SYNC_ID_BYTES = pack_frame(_SYNC_ID)[:4]
 """First bytes of a raw SYNC frame: its identifier."""
-_HIGHEST_ID = 0x7FF
+_MAX_CAN_ID = 0x7FF
 """Highest 11-bit CAN identifier."""
-_RECORD_SIZE = 13
+_STREAM_RECORD_BYTES = 13
 """Size in bytes of a record on the serial line."""
 _CAN_ONLY_KEYS = ("id",)
 """Keys of a fault that make sense only on the CAN bus."""
@@ -204,8 +204,8 @@ class _AttributeOverride:
 
     fault: Fault
     device: Any
-    attribute: str
-    value: object
+    attribute_name: str
+    faulty_value: object
     normal_value: object
 
 
@@ -213,10 +213,10 @@ class BusSimulation:
     """Simulated rig with its lines, which transfers frames between host and nodes.
 
     In lock-step, each SYNC advances the rig by one period; otherwise, wall time advances it.
-    `now_ns` is the present time on a monotonic clock. `send` sends a frame to the hosts on the CAN
-    bus; its second argument is the host that sent the frame, or None for a node. `write` sends
-    bytes to the host on the serial line. `cut` and `mend` interrupt and reconnect the "bus" or the
-    line of the "sensor". This class sets the time of `log`.
+    `now_ns` is the present time on a monotonic clock. `send_frame` sends a frame to the hosts on
+    the CAN bus; its second argument is the host that sent the frame, or None for a node.
+    `write_bytes` sends bytes to the host on the serial line. `interrupt_line` and
+    `reconnect_line` interrupt and reconnect the "bus" or the line of the "sensor". This class sets the time of `log`.
 
     Attributes
     ----------
@@ -238,10 +238,10 @@ class BusSimulation:
         *,
         lock_step: bool,
         now_ns: int,
-        send: Callable[[bytes, object], None],
-        write: Callable[[bytes], None],
-        cut: Callable[[str], None],
-        mend: Callable[[str], None],
+        send_frame: Callable[[bytes, object], None],
+        write_bytes: Callable[[bytes], None],
+        interrupt_line: Callable[[str], None],
+        reconnect_line: Callable[[str], None],
         log: EventLog,
     ) -> None:
         self._simulated_rig = simulated_rig
@@ -250,10 +250,10 @@ class BusSimulation:
         self._lock_step = lock_step
         self.clock = (LockStep if lock_step else WallClock)(self._period_ns, now_ns)
         self._now_ns = float(now_ns)
-        self._send_to_hosts = send
-        self._write_to_host = write
-        self._interrupt = cut
-        self._reconnect = mend
+        self._send_to_hosts = send_frame
+        self._write_to_host = write_bytes
+        self._interrupt = interrupt_line
+        self._reconnect = reconnect_line
         self._log = log
         self._nodes: dict[str, SimulatedNode] = {}
         self._serial_device: SerialDevice | None = None
@@ -287,18 +287,20 @@ class BusSimulation:
         """Simulated time since the start in seconds."""
         return self.periods * self._period_s
 
-    def wait_s(self, now_ns: int, longest_s: float) -> float:
-        """Return the time in s until an action is due even without input, at most `longest_s`."""
+    def wait_s(self, now_ns: int, max_wait_s: float) -> float:
+        """Return the time in s until an action is due even without input, at most `max_wait_s`."""
         due_ns = float("inf") if self.clock.is_idle else float(self.clock.due_ns)
         if self._delayed_deliveries and not self._lock_step:
             due_ns = min(due_ns, self._delayed_deliveries[0][0])
-        return min(longest_s, max(0.0, (due_ns - now_ns) * 1e-9))
+        return min(max_wait_s, max(0.0, (due_ns - now_ns) * 1e-9))
 
     @property
     def disturbed_senders(self) -> list[str]:
         """Names of the senders whose next frames a fault may affect."""
         return [
-            sender_name for sender_name, faulty_line in self._lines.items() if faulty_line.disturbed
+            sender_name
+            for sender_name, faulty_line in self._lines.items()
+            if faulty_line.is_disturbed
         ]
 
     def can_sender(self, sender: str) -> Callable[[int, bytes], None]:
@@ -326,7 +328,7 @@ class BusSimulation:
             self._advance_is_due = False
             self._advance_rig()
 
-    def receive_frames(self, frames: list[bytes], origin: object, now_ns: int) -> None:
+    def receive_frames(self, frames: list[bytes], sending_host: object, now_ns: int) -> None:
         """Process frames of a host, in order; `now_ns` is the time at which they were read.
 
         Frames that are read together may have been sent at different times: after a pause of this
@@ -336,14 +338,14 @@ class BusSimulation:
         sync_count = sum(can_frame.startswith(_SYNC_ID_BYTES) for can_frame in frames)
         if not sync_count and self.clock.is_idle:
             self.elapse(now_ns)
-        sent_ns = now_ns - (sync_count - 1) * self._period_ns
+        sync_sent_ns = now_ns - (sync_count - 1) * self._period_ns
         for can_frame in frames:
             can_id, data = unpack_frame(can_frame)
             if can_id == _SYNC_ID:
-                self._sync(data, origin, sent_ns)
-                sent_ns += self._period_ns
-            elif can_id <= _HIGHEST_ID:
-                self._lines["host"].send(can_id, data, origin)
+                self._process_sync(data, sending_host, sync_sent_ns)
+                sync_sent_ns += self._period_ns
+            elif can_id <= _MAX_CAN_ID:
+                self._lines["host"].send(can_id, data, sending_host)
 
     def receive_serial(self, data: bytes) -> None:
         """Pass bytes of the host on the serial line to the simulated sensor."""
@@ -356,7 +358,7 @@ class BusSimulation:
         for _ in range(self.clock.elapse(now_ns)):
             self._run_period()
         if self._delayed_deliveries and not self._lock_step:
-            self._run_due(self._delayed_deliveries, now_ns)
+            self._run_due_actions(self._delayed_deliveries, now_ns)
 
     def stop_waiting(self, now_ns: int) -> None:
         """Stop waiting for a SYNC, since no host is connected any more."""
@@ -376,14 +378,14 @@ class BusSimulation:
         else:
             self._schedule(self._enabled_s + fault.after_s, partial(self._begin_fault, fault))
 
-    def _sync(self, data: bytes, origin: object, now_ns: float) -> None:
+    def _process_sync(self, data: bytes, sending_host: object, now_ns: float) -> None:
         """Process a SYNC: advance clock, rig and nodes, and deliver the SYNC."""
         self.syncs += 1
         elapsed_periods = self.clock.sync(now_ns)
         for _ in range(elapsed_periods - 1):
             self._run_period()
         self._advance_is_due = elapsed_periods > 0
-        self._lines["host"].send(_SYNC_ID, data, origin)
+        self._lines["host"].send(_SYNC_ID, data, sending_host)
         self.step()  # the rig advances even if the drive has not received the SYNC
         if elapsed_periods:
             self._run_nodes()
@@ -422,17 +424,17 @@ class BusSimulation:
             for due_fault in self._faults_after_enabling:
                 self.inject(due_fault)
         if self._scheduled_actions:
-            self._run_due(self._scheduled_actions, self.now_s)
+            self._run_due_actions(self._scheduled_actions, self.now_s)
         if self._delayed_deliveries and self._lock_step:
-            self._run_due(self._delayed_deliveries, self.periods * self._period_ns)
+            self._run_due_actions(self._delayed_deliveries, self.periods * self._period_ns)
 
     # Delivery of frames and bytes.
 
-    def _deliver_from_host(self, can_id: int, data: bytes, origin: object) -> None:
+    def _deliver_from_host(self, can_id: int, data: bytes, sending_host: object) -> None:
         """Deliver a frame of a host to the other hosts and to the nodes."""
         if self.bus_off:
             return
-        self._send_to_hosts(pack_frame(can_id, data), origin)
+        self._send_to_hosts(pack_frame(can_id, data), sending_host)
         for simulated_node in self._nodes.values():
             simulated_node.receive(can_id, data)
         self._deliver_to_nodes()
@@ -454,10 +456,10 @@ class BusSimulation:
     def _write_serial(self, data: bytes) -> None:
         """Send bytes of the sensor over the serial line, record by record if a fault acts on it."""
         serial_line = self._lines["sensor"]
-        if self._is_streaming and serial_line.disturbed:  # record by record
-            for record_offset in range(0, len(data), _RECORD_SIZE):
+        if self._is_streaming and serial_line.is_disturbed:  # record by record
+            for record_offset in range(0, len(data), _STREAM_RECORD_BYTES):
                 serial_line.send(
-                    SERIAL_PSEUDO_ID, data[record_offset : record_offset + _RECORD_SIZE]
+                    SERIAL_PSEUDO_ID, data[record_offset : record_offset + _STREAM_RECORD_BYTES]
                 )
         else:
             serial_line.send(SERIAL_PSEUDO_ID, data)
@@ -474,27 +476,27 @@ class BusSimulation:
         device_name = fault_values.get("device", fault_values.get("from", "drive"))
         if fault.kind in ("saturate", "status") or fault_values.get("what") in ("sensor", "gauge"):
             device_name = "sensor"
-        is_on_serial = self._serial_device is not None and device_name == "sensor"
+        is_on_serial_line = self._serial_device is not None and device_name == "sensor"
         if (
             device_name in ("drive", "sensor")
             and device_name not in self._nodes
-            and not is_on_serial
+            and not is_on_serial_line
         ):
             raise FaultError(f"Fault '{fault}': this rig has no {device_name} on its lines.")
-        if fault.kind == "cut" and device_name == "sensor" and not is_on_serial:
+        if fault.kind == "cut" and device_name == "sensor" and not is_on_serial_line:
             raise FaultError(
                 f"Fault '{fault}': this rig's sensor has no serial line; use "
                 "freeze,device=sensor, or cut for the whole bus."
             )
-        for key in _CAN_ONLY_KEYS if is_on_serial else _SERIAL_ONLY_KEYS:
+        for key in _CAN_ONLY_KEYS if is_on_serial_line else _SERIAL_ONLY_KEYS:
             if key in fault_values:
                 raise FaultError(
                     f"Fault '{fault}': {key} is for a sensor on "
-                    f"{'CAN' if is_on_serial else 'a serial line'}, which this one is not."
+                    f"{'CAN' if is_on_serial_line else 'a serial line'}, which this one is not."
                 )
         if (
             fault.kind == "corrupt"
-            and not is_on_serial
+            and not is_on_serial_line
             and int(fault_values["byte"]) >= _MAX_CAN_DATA_BYTES
         ):
             raise FaultError(
@@ -502,7 +504,7 @@ class BusSimulation:
                 f"most the bytes 0 to {_MAX_CAN_DATA_BYTES - 1}."
             )
 
-        if fault.kind in DISTURBANCE_KINDS:
+        if fault.kind in DISTURBANCE_FAULT_KINDS:
             try:
                 self._simulated_rig.check_disturbance(disturbance_of(fault, 0.0))
             except (ObstacleError, RealisationError) as error:
@@ -514,7 +516,7 @@ class BusSimulation:
         fault_values: dict[str, Any] = dict(fault.values)
         sensor_device: Any = self._serial_device or self._nodes.get("sensor")
         drive_node: Any = self._nodes.get("drive")
-        if fault.kind in LINE_KINDS:
+        if fault.kind in LINE_FAULT_KINDS:
             self._lines[fault_values["from"]].add(fault)
         elif fault.kind == "freeze":
             self._override_attribute(
@@ -549,11 +551,11 @@ class BusSimulation:
             self._override_attribute(fault, drive_node, "torque_lag_s", 1e-3 * fault_values["ms"])
         elif fault.kind in _DRIVE_ATTRIBUTES:
             self._override_attribute(fault, drive_node, _DRIVE_ATTRIBUTES[fault.kind], True)
-        elif fault.kind in DISTURBANCE_KINDS:
-            now_s = self._simulated_rig.plant.elapsed_s + (
+        elif fault.kind in DISTURBANCE_FAULT_KINDS:
+            obstacle_start_s = self._simulated_rig.plant.elapsed_s + (
                 0.0 if self._lock_step else _OBSTACLE_LEAD_TIME_S
             )
-            disturbance = disturbance_of(fault, now_s)
+            disturbance = disturbance_of(fault, obstacle_start_s)
             self._simulated_rig.add_disturbance(disturbance, wait=self._lock_step)
             if isinstance(disturbance, Obstacle):
                 self._obstacles.append((fault, disturbance))
@@ -577,20 +579,26 @@ class BusSimulation:
                 fault, sensor.gauges, "stuck", (int(fault.values["gauge"]), stuck_readings)
             )
 
-    def _override_attribute(self, fault: Fault, device: Any, attribute: str, value: object) -> None:  # noqa: ANN401
+    def _override_attribute(
+        self,
+        fault: Fault,
+        device: Any,  # noqa: ANN401
+        attribute_name: str,
+        faulty_value: object,
+    ) -> None:
         """Let a fault give an attribute of a device another value until the fault ends."""
         other_overrides = [
-            s for s in self._overrides if (s.device, s.attribute) == (device, attribute)
+            s for s in self._overrides if (s.device, s.attribute_name) == (device, attribute_name)
         ]
         normal_value = (
-            other_overrides[0].normal_value if other_overrides else getattr(device, attribute)
+            other_overrides[0].normal_value if other_overrides else getattr(device, attribute_name)
         )
-        override = _AttributeOverride(fault, device, attribute, value, normal_value)
+        override = _AttributeOverride(fault, device, attribute_name, faulty_value, normal_value)
         self._overrides.append(override)
-        setattr(device, attribute, value)
+        setattr(device, attribute_name, faulty_value)
         if "for" in fault.values:
-            end_s = self.now_s + float(fault.values["for"])
-            self._schedule(end_s, partial(self._end_override, override))
+            fault_end_s = self.now_s + float(fault.values["for"])
+            self._schedule(fault_end_s, partial(self._end_override, override))
 
     def _end_override(self, override: "_AttributeOverride") -> None:
         """End a fault that overrides an attribute of a device.
@@ -603,18 +611,18 @@ class BusSimulation:
         self._overrides.remove(override)
         restored_value = override.normal_value
         for other_override in self._overrides:
-            if (other_override.device, other_override.attribute) == (
+            if (other_override.device, other_override.attribute_name) == (
                 override.device,
-                override.attribute,
+                override.attribute_name,
             ):
-                restored_value = other_override.value
-        setattr(override.device, override.attribute, restored_value)
+                restored_value = other_override.faulty_value
+        setattr(override.device, override.attribute_name, restored_value)
         self._log("simulator", "fault over", fault=str(override.fault))
 
     def _end_faults(self, fault_kind: str | None) -> None:
         """End all faults of a kind, or all faults if it is None."""
         for faulty_line in self._lines.values():
-            for ended_kind in faulty_line.end(fault_kind):
+            for ended_kind in faulty_line.end_faults(fault_kind):
                 self._log("simulator", "fault over", fault=ended_kind)
         for override in [s for s in self._overrides if fault_kind in (None, s.fault.kind)]:
             self._end_override(override)
@@ -629,12 +637,12 @@ class BusSimulation:
                 self._reconnect(device_name)
                 self._log("simulator", "fault over", fault=str(fault))
 
-    def _schedule(self, when_s: float, action: Callable[[], None]) -> None:
+    def _schedule(self, due_s: float, action: Callable[[], None]) -> None:
         """Schedule an action at a simulated time in seconds since the start."""
         self._action_count += 1
         # Half a period of tolerance, so that the end of an interval does not depend on rounding.
         heapq.heappush(
-            self._scheduled_actions, (when_s - 0.5 * self._period_s, self._action_count, action)
+            self._scheduled_actions, (due_s - 0.5 * self._period_s, self._action_count, action)
         )
 
     def _schedule_delivery(self, delay_s: float, action: Callable[[], None]) -> None:
@@ -645,8 +653,10 @@ class BusSimulation:
             self._delayed_deliveries, (now_ns + delay_s * 1e9, self._action_count, action)
         )
 
-    def _run_due(self, queue: list[tuple[float, int, Callable[[], None]]], now: float) -> None:
-        """Run the actions of a queue that are due at time `now`, and deliver the nodes' frames."""
-        while queue and queue[0][0] <= now:
-            heapq.heappop(queue)[2]()
+    def _run_due_actions(
+        self, action_queue: list[tuple[float, int, Callable[[], None]]], present_time: float
+    ) -> None:
+        """Run the actions of a queue that are due at a time, and deliver the nodes' frames."""
+        while action_queue and action_queue[0][0] <= present_time:
+            heapq.heappop(action_queue)[2]()
         self._deliver_to_nodes()

@@ -41,14 +41,18 @@ class EmergencyMessages:
         self._send = send
         self.active_errors: dict[int, int] = {}
         self._history: list[int] = []
-        objects.add(0x1001, Entry("B", access="ro", mapping="t", read_value=self._error_register))
+        objects.add(
+            0x1001, Entry("B", access="ro", pdo_directions="t", read_value=self._error_register)
+        )
         count_entry = Entry(
             "B", read_value=lambda: len(self._history), high=0, after_write=self._history.clear
         )
         objects.add(0x1003, count_entry)
         for sub in range(1, _ERROR_HISTORY_LENGTH + 1):
             objects.add(0x1003, Entry("I", access="ro", read_value=self._history_reader(sub)), sub)
-        self._cob_id = objects.add(0x1014, Entry("I", 0x80 + node_id, check=self._check_cob_id))
+        self._cob_id = objects.add(
+            0x1014, Entry("I", 0x80 + node_id, check_value=self._check_cob_id)
+        )
 
     def reset(self) -> None:
         """Clear active errors and error history, as at power-on."""
@@ -69,11 +73,11 @@ class EmergencyMessages:
         self._transmit(error_code, vendor_bytes)
         return True
 
-    def clear(self, *codes: int) -> None:
+    def clear(self, *codes_to_clear: int) -> None:
         """Remove errors from the active errors; send an emergency message if any was active."""
         cleared_codes = [
             error_code
-            for error_code in codes
+            for error_code in codes_to_clear
             if self.active_errors.pop(error_code, None) is not None
         ]
         if cleared_codes:
@@ -94,24 +98,24 @@ class EmergencyMessages:
             error_register |= error_bits
         return error_register
 
-    def _history_reader(self, sub: int) -> Callable[[], int]:
+    def _history_reader(self, sub_index: int) -> Callable[[], int]:
         """Return the function that reads an entry of the error history."""
 
-        def read() -> int:
-            if sub > len(self._history):
+        def read_history_entry() -> int:
+            if sub_index > len(self._history):
                 raise Abort(AbortCode.NO_DATA)
-            return self._history[sub - 1]
+            return self._history[sub_index - 1]
 
-        return read
+        return read_history_entry
 
     def _check_cob_id(self, new_cob_id: int) -> None:
         """Raise `Abort` if object 1014 may not be set to a value now."""
-        present_value = self._cob_id.value
+        present_cob_id = self._cob_id.value
         if new_cob_id & 0x7FFF_F800 or not is_free_id(new_cob_id & 0x7FF):
             raise Abort(AbortCode.INVALID_VALUE)
         if (
-            not (present_value | new_cob_id) & COB_ID_DISABLED_BIT
-            and (present_value ^ new_cob_id) & 0x7FF
+            not (present_cob_id | new_cob_id) & COB_ID_DISABLED_BIT
+            and (present_cob_id ^ new_cob_id) & 0x7FF
         ):
             raise Abort(AbortCode.WRONG_STATE)
 
@@ -140,9 +144,9 @@ class HeartbeatProducer:
         period_s = 1e-3 * self._period_ms.value
         if not period_s or (self._due_s is not None and now_s < self._due_s - _TIME_TOLERANCE_S):
             return False
-        next_s = (now_s if self._due_s is None else self._due_s) + period_s
+        next_due_s = (now_s if self._due_s is None else self._due_s) + period_s
         # Heartbeats that a late call has missed are not made up for.
-        self._due_s = next_s if next_s > now_s else now_s + period_s
+        self._due_s = next_due_s if next_due_s > now_s else now_s + period_s
         return True
 
 
@@ -201,24 +205,24 @@ def add_heartbeat_monitors(
     monitor_entries = {sub: Entry("I") for sub in range(1, monitor_count + 1)}
     monitors = [HeartbeatMonitor(monitor_entry) for monitor_entry in monitor_entries.values()]
 
-    def check(monitor_entry: Entry, value: int) -> None:
-        if value >> 24 or value >> 16 > 0x7F:
+    def check_monitor_value(monitor_entry: Entry, monitor_value: int) -> None:
+        if monitor_value >> 24 or monitor_value >> 16 > 0x7F:
             raise Abort(AbortCode.INVALID_VALUE)
         other_nodes = {
             _monitored_node(other_entry.value)
             for other_entry in monitor_entries.values()
             if other_entry is not monitor_entry
         }
-        if _monitored_node(value) and _monitored_node(value) in other_nodes:
+        if _monitored_node(monitor_value) and _monitored_node(monitor_value) in other_nodes:
             raise Abort(AbortCode.INCOMPATIBLE_PARAMETERS)
 
-    def restart(monitor: HeartbeatMonitor) -> None:
+    def restart_monitor(monitor: HeartbeatMonitor) -> None:
         monitor.restart()
         on_restart()
 
     for monitor_entry, monitor in zip(monitor_entries.values(), monitors, strict=True):
-        monitor_entry.check = partial(check, monitor_entry)
-        monitor_entry.after_write = partial(restart, monitor)
+        monitor_entry.check_value = partial(check_monitor_value, monitor_entry)
+        monitor_entry.after_write = partial(restart_monitor, monitor)
     if monitor_entries:
         objects.add_record(0x1016, monitor_entries)
     return monitors
@@ -254,14 +258,14 @@ class Pdo:
     """PDO of a node: its communication and mapping parameters.
 
     The parameters are added to the dictionary `objects`, which contains the mapped objects.
-    `communication` and `mapping` are the indices of the parameters, such as 1400 and 1600.
-    `direction` is "r" (received) or "t" (transmitted), which the `Entry.mapping` of mapped objects
-    must contain.
+    `communication_index` and `mapping_index` are the indices of the parameters, such as 1400 and
+    1600. `direction` is "r" (received) or "t" (transmitted), which the `Entry.pdo_directions` of
+    mapped objects must contain.
 
     `cob_id` and `default_mapping` are the values at power-on: the COB-ID with or without
-    `COB_ID_DISABLED_BIT`, and for each mapped object index << 16 | sub-index << 8 | bits. `slots`
-    is the largest number of mapped objects. `on_change` is called after identifier, type or mapping
-    have changed.
+    `COB_ID_DISABLED_BIT`, and for each mapped object index << 16 | sub-index << 8 | bits.
+    `slot_count` is the largest number of mapped objects. `on_change` is called after identifier,
+    type or mapping have changed.
 
     Attributes
     ----------
@@ -279,39 +283,48 @@ class Pdo:
     def __init__(
         self,
         objects: ObjectDictionary,
-        communication: int,
-        mapping: int,
+        communication_index: int,
+        mapping_index: int,
         cob_id: int,
         default_mapping: tuple[int, ...],
-        slots: int,
+        slot_count: int,
         on_change: Callable[[], None],
     ) -> None:
         self._objects = objects
         self._on_change = on_change
-        self._cob_id = Entry("I", cob_id, check=self._check_cob_id, after_write=self._rebuild)
-        self._type = Entry("B", 255, check=_check_transmission_type, after_write=self._rebuild)
-        self._inhibit = Entry("H", check=self._check_inhibit)
+        self._cob_id = Entry("I", cob_id, check_value=self._check_cob_id, after_write=self._rebuild)
+        self._type = Entry(
+            "B", 255, check_value=_check_transmission_type, after_write=self._rebuild
+        )
+        self._inhibit = Entry("H", check_value=self._check_inhibit_time)
         self._timer = Entry("H")
         objects.add_record(
-            communication, {1: self._cob_id, 2: self._type, 3: self._inhibit, 5: self._timer}
+            communication_index, {1: self._cob_id, 2: self._type, 3: self._inhibit, 5: self._timer}
         )
         self._count = Entry(
-            "B", len(default_mapping), check=self._check_count, after_write=self._rebuild
+            "B",
+            len(default_mapping),
+            check_value=self._check_mapping_count,
+            after_write=self._rebuild,
         )
-        objects.add(mapping, self._count)
+        objects.add(mapping_index, self._count)
         self._slots = [
-            objects.add(mapping, Entry("I", mapping_value, check=self._check_slot), sub)
-            for sub, mapping_value in enumerate((default_mapping + (0,) * slots)[:slots], 1)
+            objects.add(
+                mapping_index, Entry("I", mapping_value, check_value=self._check_mapping_slot), sub
+            )
+            for sub, mapping_value in enumerate(
+                (default_mapping + (0,) * slot_count)[:slot_count], 1
+            )
         ]
 
-    def compile(self) -> None:
+    def compile_mapping(self) -> None:
         """Rebuild the PDO's mapping from the object dictionary."""
         used_slots = self._slots[: self._count.value]
         try:
             self.entries = [self._mapped_entry(mapping_slot.value) for mapping_slot in used_slots]
         except Abort:  # a device's file may map objects at power-on that it declares unmappable
             self.entries = []
-        self._struct = Struct("<" + "".join(entry.kind for entry in self.entries))
+        self._struct = Struct("<" + "".join(entry.type_letter for entry in self.entries))
         self.size = self._struct.size
         is_enabled = self.entries and not self._cob_id.value & COB_ID_DISABLED_BIT
         self.can_id = self._cob_id.value & 0x7FF if is_enabled else -1
@@ -328,7 +341,7 @@ class Pdo:
 
     def _rebuild(self) -> None:
         """Rebuild the mapping after a parameter was written, and report the change."""
-        self.compile()
+        self.compile_mapping()
         self._on_change()
 
     def _mapped_entry(self, mapping_value: int) -> Entry:
@@ -338,7 +351,10 @@ class Pdo:
         length.
         """
         mapped_entry = self._objects.find(mapping_value >> 16, mapping_value >> 8 & 0xFF)
-        if self.direction not in mapped_entry.mapping or mapped_entry.bits != mapping_value & 0xFF:
+        if (
+            self.direction not in mapped_entry.pdo_directions
+            or mapped_entry.bits != mapping_value & 0xFF
+        ):
             raise Abort(AbortCode.NOT_MAPPABLE)
         return mapped_entry
 
@@ -354,28 +370,28 @@ class Pdo:
         ):
             raise Abort(AbortCode.WRONG_STATE)
 
-    def _check_inhibit(self, new_time: int) -> None:  # noqa: ARG002
+    def _check_inhibit_time(self, new_inhibit_time: int) -> None:  # noqa: ARG002
         """Raise `Abort` if the PDO's inhibit time may not be set to a value now."""
         if not self._cob_id.value & COB_ID_DISABLED_BIT:
             raise Abort(AbortCode.WRONG_STATE)
 
-    def _check_slot(self, new_entry: int) -> None:
+    def _check_mapping_slot(self, new_mapping_value: int) -> None:
         """Raise `Abort` if a mapping entry of the PDO may not be set to a value now."""
         if not self._cob_id.value & COB_ID_DISABLED_BIT or self._count.value:
             raise Abort(AbortCode.WRONG_STATE)
-        if new_entry:
-            self._mapped_entry(new_entry)
+        if new_mapping_value:
+            self._mapped_entry(new_mapping_value)
 
-    def _check_count(self, new_count: int) -> None:
+    def _check_mapping_count(self, new_mapping_count: int) -> None:
         """Raise `Abort` if the number of mapped objects may not be set to a value now."""
         if not self._cob_id.value & COB_ID_DISABLED_BIT:
             raise Abort(AbortCode.WRONG_STATE)
-        if new_count > len(self._slots):
+        if new_mapping_count > len(self._slots):
             raise Abort(AbortCode.PDO_TOO_LONG)
         if (
             sum(
                 self._mapped_entry(mapping_slot.value).bits
-                for mapping_slot in self._slots[:new_count]
+                for mapping_slot in self._slots[:new_mapping_count]
             )
             > _MAX_PDO_BITS
         ):
@@ -426,9 +442,9 @@ class TransmitPdo(Pdo):
 
     direction = "t"
 
-    def compile(self) -> None:
+    def compile_mapping(self) -> None:
         """Rebuild the PDO's mapping from the object dictionary, and its list of readers."""
-        super().compile()
+        super().compile_mapping()
         self._readers: list[Callable[[], int]] = [
             entry.read_value or entry.get for entry in self.entries
         ]
@@ -439,9 +455,9 @@ class TransmitPdo(Pdo):
         self._last_data: bytes | None = None
         self._sent_s = -math.inf
 
-    def build(self) -> bytes:
+    def build_data(self) -> bytes:
         """Return the PDO's data with the present values."""
-        return self._struct.pack(*[read() for read in self._readers])
+        return self._struct.pack(*[read_value() for read_value in self._readers])
 
     def data_at_sync(self, now_s: float) -> bytes | None:
         """Return the data to send at a SYNC, or None if nothing is to be sent.
@@ -462,27 +478,27 @@ class TransmitPdo(Pdo):
         """Return the data that the transmission type requires to send at a SYNC, or None."""
         transmission_type = self._type.value
         if transmission_type == 1:
-            return self.build()
+            return self.build_data()
         if transmission_type == 0:
-            pdo_data = self.build()
+            pdo_data = self.build_data()
             has_changed, self._last_data = pdo_data != self._last_data, pdo_data
             return pdo_data if has_changed else None
         self._syncs += 1
         if self._syncs < transmission_type:
             return None
         self._syncs = 0
-        return self.build()
+        return self.build_data()
 
     def data_at_event(self, now_s: float) -> bytes | None:
         """Return the data to send if a value has changed or the timer has expired, else None."""
-        pdo_data = self.build()
+        pdo_data = self.build_data()
         age_s = now_s - self._sent_s
-        timer_s = 1e-3 * self._timer.value
-        is_due = timer_s > 0 and age_s >= timer_s - 1e-9
+        event_timer_s = 1e-3 * self._timer.value
+        is_timer_due = event_timer_s > 0 and age_s >= event_timer_s - 1e-9
         is_inhibited = age_s < 1e-4 * self._inhibit.value - 1e-9
         if (
             self._last_data is not None
-            and not is_due
+            and not is_timer_due
             and (pdo_data == self._last_data or is_inhibited)
         ):
             return None
@@ -491,7 +507,10 @@ class TransmitPdo(Pdo):
         return pdo_data
 
 
-def _check_transmission_type(new_type: int) -> None:
+def _check_transmission_type(new_transmission_type: int) -> None:
     """Raise `Abort` if a value is not a supported transmission type of a PDO."""
-    if new_type > _MAX_SYNCHRONOUS_TYPE and new_type not in _EVENT_DRIVEN_TYPES:
+    if (
+        new_transmission_type > _MAX_SYNCHRONOUS_TYPE
+        and new_transmission_type not in _EVENT_DRIVEN_TYPES
+    ):
         raise Abort(AbortCode.INVALID_VALUE)

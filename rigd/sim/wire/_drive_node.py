@@ -79,7 +79,7 @@ _UNCHANGED_OPERATION_BITS = 0x8F, 0x0F
 _LAST_COMMUNICATION_INDEX, _LAST_INDEX = 0x1FFF, 0xFFFF
 _DEFAULT_PDO_COUNT = 4
 """Number of PDOs per direction of a drive without a device file."""
-_LAST_PDO_OFFSET = 0x1FF
+_MAX_PDO_INDEX_OFFSET = 0x1FF
 """Largest offset of a PDO's index from that of the first PDO."""
 _TIME_TOLERANCE_S = 1e-9
 """Tolerance in seconds for rounding errors of times."""
@@ -101,15 +101,15 @@ class DriveNode:
     these calls.
 
     The profile needs a section [cia402]. The drive moves and measures the plant of `simulated_rig`.
-    `advance` advances the simulated rig to the present SYNC. It is called at each valid SYNC, in
-    every state, frozen or not, because simulated time goes on. `send` sends a frame with identifier
-    and data.
+    `advance_rig` advances the simulated rig to the present SYNC. It is called at each valid SYNC,
+    in every state, frozen or not, because simulated time goes on. `send` sends a frame with
+    identifier and data.
     `log` logs an event, with the source "drive", the event and values by name. It records the
     torque: event "torque" with torque_nm and enabled at every change of either.
 
     `sync_timeout_s` is the time without a SYNC after which a drive in operation goes to fault; by
-    default `SYNC_TIMEOUT_PERIODS` SYNC periods. With a device file, the drive has exactly the
-    objects of this file, with their types, access rights, limits and values at power-on. The
+    default `SYNC_TIMEOUT_PERIODS` SYNC periods. With a `device_file`, the drive has exactly
+    the objects of this file, with their types, access rights, limits and values at power-on. The
     constructor raises `DeviceError` if the profile has no section [cia402], or no encoder
     resolution.
 
@@ -136,10 +136,10 @@ class DriveNode:
 
     Notes
     -----
-    At a SYNC in the NMT state operational, first a pending RPDO takes effect, then `advance` is
-    called, and then the TPDOs are sent. The plant's own delay covers the whole path of a torque. So
-    a torque that arrives after SYNC k and takes effect at SYNC k + 1 is passed to the plant while
-    the plant is still at tick k.
+    At a SYNC in the NMT state operational, first a pending RPDO takes effect, then `advance_rig`
+    is called, and then the TPDOs are sent. The plant's own delay covers the whole path of a torque.
+    So a torque that arrives after SYNC k and takes effect at SYNC k + 1 is passed to the plant
+    while the plant is still at tick k.
 
     Before the owner calls `tick`, it has to pass the frames that arrived before that time.
     Otherwise a pause of the owner would have the same effect as a silent host.
@@ -149,11 +149,11 @@ class DriveNode:
         self,
         rig: RigParameters,
         simulated_rig: SimulatedRig,
-        advance: Callable[[], None],
+        advance_rig: Callable[[], None],
         send: Callable[[int, bytes], None],
         log: Log,
         sync_timeout_s: float | None = None,
-        file: "DeviceFile | None" = None,
+        device_file: "DeviceFile | None" = None,
     ) -> None:
         if rig.cia402 is None:
             raise DeviceError("Simulated drive: the profile has no section [cia402]; add one.")
@@ -171,7 +171,7 @@ class DriveNode:
         self._sto_error_code = rig.cia402.sto_error_code
         self._simulated_rig = simulated_rig
         self._plant = simulated_rig.plant
-        self._advance = advance
+        self._advance = advance_rig
         self._send = send
         self._log = partial(log, "drive")
         self._sync_timeout_s = sync_timeout_s
@@ -198,17 +198,19 @@ class DriveNode:
         )
         self._emergencies = EmergencyMessages(object_dictionary, node_id, self._send_emergency)
         self._producer = HeartbeatProducer(object_dictionary)
-        monitor_count = DEFAULT_MONITOR_COUNT if file is None else file.sub_index_count(0x1016)
+        heartbeat_monitor_count = (
+            DEFAULT_MONITOR_COUNT if device_file is None else device_file.sub_index_count(0x1016)
+        )
         self._heartbeat_monitors = add_heartbeat_monitors(
-            object_dictionary, monitor_count, self._clear_heartbeat_error
+            object_dictionary, heartbeat_monitor_count, self._clear_heartbeat_error
         )
         self._receive_pdos = [
             ReceivePdo(object_dictionary, *pdo, self._rebuild_tables)
-            for pdo in _pdo_parameters(0x1400, 0x200 + node_id, 0x6040, file)
+            for pdo in _pdo_parameters(0x1400, 0x200 + node_id, 0x6040, device_file)
         ]
         self._transmit_pdos = [
             TransmitPdo(object_dictionary, *pdo, self._rebuild_tables)
-            for pdo in _pdo_parameters(0x1800, 0x180 + node_id, 0x6041, file)
+            for pdo in _pdo_parameters(0x1800, 0x180 + node_id, 0x6041, device_file)
         ]
         self._sdo = SdoServer(
             object_dictionary, partial(self._transmit, 0x580 + node_id), self._log_sdo_write
@@ -221,15 +223,15 @@ class DriveNode:
         drive_entries.statusword.read_value = self._statusword
         drive_entries.mode.after_write = self._on_mode
         drive_entries.mode_display.read_value = drive_entries.mode.get
-        drive_entries.position.read_value = self._position
-        drive_entries.velocity.read_value = self._velocity
-        drive_entries.actual_torque.read_value = self._actual_torque
+        drive_entries.position.read_value = self._position_counts
+        drive_entries.velocity.read_value = self._velocity_counts_per_s
+        drive_entries.actual_torque.read_value = self._actual_torque_per_mille
         for torque_entry in (
             drive_entries.target_torque,
             drive_entries.torque_offset,
             drive_entries.max_torque,
-            drive_entries.positive_limit,
-            drive_entries.negative_limit,
+            drive_entries.positive_torque_limit,
+            drive_entries.negative_torque_limit,
         ):
             torque_entry.after_write = self._refresh_torque
         self._state_machine = PdsStateMachine(
@@ -240,8 +242,8 @@ class DriveNode:
             may_enable=lambda: self._nmt is Nmt.OPERATIONAL and self._has_all_heartbeats(),
             may_reset=self._may_reset,
         )
-        if file is not None:
-            adopt_device_file(object_dictionary, file)
+        if device_file is not None:
+            adopt_device_file(object_dictionary, device_file)
         self._rebuild_pdos()
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -291,9 +293,9 @@ class DriveNode:
         """Restart the drive as after a loss of power; it equals `reset` here."""
         self.reset()
 
-    def override_object(self, index: int, sub: int, value: int | None) -> None:
+    def override_object(self, index: int, sub_index: int, value: int | None) -> None:
         """Set an object to another value, or make it absent if `value` is None."""
-        self._objects.override_entry(index, sub, value)
+        self._objects.override_entry(index, sub_index, value)
 
     @property
     def sto_dropped(self) -> bool:
@@ -330,11 +332,11 @@ class DriveNode:
         self._transmit(0x700 + self._node_id, bytes([Nmt.INITIALISING]))
         self._enter_nmt(Nmt.PRE_OPERATIONAL)
 
-    def _on_nmt(self, data: bytes) -> None:
+    def _on_nmt(self, frame_data: bytes) -> None:
         """Process an NMT command: start, stop, pre-operational or reset."""
-        if len(data) != 2 or data[1] not in (0, self._node_id):
+        if len(frame_data) != 2 or frame_data[1] not in (0, self._node_id):
             return
-        nmt_command = data[0]
+        nmt_command = frame_data[0]
         if nmt_command == 128 and self.stays_operational:
             return
         if nmt_command == 1:
@@ -373,12 +375,12 @@ class DriveNode:
 
     # Frames ------------------------------------------------------------------------------------
 
-    def _on_sync(self, data: bytes) -> None:
+    def _on_sync(self, frame_data: bytes) -> None:
         """Process a SYNC: apply pending RPDOs, advance the rig, send TPDOs."""
         is_operational = self._nmt is Nmt.OPERATIONAL and not self.frozen
-        if len(data) != self._sync_length:
+        if len(frame_data) != self._sync_length:
             if is_operational:
-                self._report(_SYNC_LENGTH_CODE, _COMMUNICATION_ERROR_BIT, bytes([len(data)]))
+                self._report(_SYNC_LENGTH_CODE, _COMMUNICATION_ERROR_BIT, bytes([len(frame_data)]))
             return
         if is_operational:
             if self._emergencies.active_errors:
@@ -396,8 +398,8 @@ class DriveNode:
         if self.torque_lag_s:
             self._measure_torque()
         if is_operational:
-            limit_rad_s = self._entries.max_speed_rpm.value * self._rad_s_per_rpm
-            is_too_fast = not -limit_rad_s <= self._plant.velocity_rad_s <= limit_rad_s
+            speed_limit_rad_s = self._entries.max_speed_rpm.value * self._rad_s_per_rpm
+            is_too_fast = not -speed_limit_rad_s <= self._plant.velocity_rad_s <= speed_limit_rad_s
             if is_too_fast or self._is_too_fast:
                 self._is_too_fast = is_too_fast
                 self._refresh_torque()
@@ -406,36 +408,40 @@ class DriveNode:
                 if tpdo_data is not None:
                     self._transmit(tpdo.can_id, tpdo_data)
 
-    def _on_rpdo(self, pdo: ReceivePdo, data: bytes) -> None:
+    def _on_rpdo(self, pdo: ReceivePdo, frame_data: bytes) -> None:
         """Process a received RPDO: check its length, and apply it now or at the next SYNC."""
         if self._nmt is not Nmt.OPERATIONAL:
             return
-        if len(data) < pdo.size:
-            vendor_bytes = bytes([len(data), pdo.size])
+        if len(frame_data) < pdo.size:
+            vendor_bytes = bytes([len(frame_data), pdo.size])
             if self._state_machine.state is PdsState.OPERATION_ENABLED:
                 self._fail(_PDO_TOO_SHORT_CODE, _COMMUNICATION_ERROR_BIT, vendor_bytes)
             else:
                 self._report(_PDO_TOO_SHORT_CODE, _COMMUNICATION_ERROR_BIT, vendor_bytes)
             return
-        if len(data) > pdo.size:  # the first bytes are used (CiA 301)
-            self._report(_PDO_TOO_LONG_CODE, _COMMUNICATION_ERROR_BIT, bytes([len(data), pdo.size]))
-            data = data[: pdo.size]
+        if len(frame_data) > pdo.size:  # the first bytes are used (CiA 301)
+            self._report(
+                _PDO_TOO_LONG_CODE, _COMMUNICATION_ERROR_BIT, bytes([len(frame_data), pdo.size])
+            )
+            frame_data = frame_data[: pdo.size]
         elif self._emergencies.active_errors:
             self._clear(_PDO_TOO_SHORT_CODE, _PDO_TOO_LONG_CODE)
         pdo.received_s = self._now_s
         if pdo.is_synchronous:
-            pdo.pending = data
+            pdo.pending = frame_data
         else:
-            pdo.apply(data)
+            pdo.apply(frame_data)
 
-    def _on_sdo(self, data: bytes) -> None:
+    def _on_sdo(self, frame_data: bytes) -> None:
         """Process an SDO request, unless the node is stopped."""
         if self._nmt is not Nmt.STOPPED:
-            self._sdo.receive(data)
+            self._sdo.receive(frame_data)
 
-    def _on_heartbeat(self, node_id: int, data: bytes) -> None:
+    def _on_heartbeat(self, node_id: int, frame_data: bytes) -> None:
         """Process the heartbeat of another node."""
-        if len(data) != 1 or data[0] & 0x7F == Nmt.INITIALISING:  # a boot-up is not a heartbeat
+        if (
+            len(frame_data) != 1 or frame_data[0] & 0x7F == Nmt.INITIALISING
+        ):  # a boot-up is not a heartbeat
             return
         for heartbeat_monitor in self._heartbeat_monitors:
             if heartbeat_monitor.node_id == node_id:
@@ -448,14 +454,14 @@ class DriveNode:
         if not self.frozen:
             self._send(can_id, data)
 
-    def _log_sdo_write(self, index: int, sub: int, value: int | str) -> None:
+    def _log_sdo_write(self, index: int, sub_index: int, value: int | str) -> None:
         """Log a successful SDO write."""
-        self._log("sdo write", index=f"{index:04X}", sub=sub, value=value)
+        self._log("sdo write", index=f"{index:04X}", sub=sub_index, value=value)
 
     def _rebuild_pdos(self) -> None:
         """Rebuild the mappings of all PDOs from the dictionary."""
         for pdo in (*self._receive_pdos, *self._transmit_pdos):
-            pdo.compile()
+            pdo.compile_mapping()
         self._rebuild_tables()
 
     def _rebuild_tables(self) -> None:
@@ -464,9 +470,9 @@ class DriveNode:
         self._sync_length = 1 if self._entries.sync_overflow.value else 0
         active_rpdos = [pdo for pdo in self._receive_pdos if pdo.can_id >= 0]
         self._sync_rpdos = [pdo for pdo in active_rpdos if pdo.is_synchronous]
-        target_entry = self._entries.target_torque
+        target_torque_entry = self._entries.target_torque
         self._target_pdos = [
-            pdo for pdo in active_rpdos if any(e is target_entry for e in pdo.entries)
+            pdo for pdo in active_rpdos if any(e is target_torque_entry for e in pdo.entries)
         ]
         active_tpdos = [pdo for pdo in self._transmit_pdos if pdo.can_id >= 0]
         self._sync_tpdos = [pdo for pdo in active_tpdos if pdo.is_synchronous]
@@ -497,7 +503,7 @@ class DriveNode:
             self._report(
                 _HEARTBEAT_LOST_CODE, _COMMUNICATION_ERROR_BIT, bytes([heartbeat_monitor.node_id])
             )
-            communication_option = self._entries.communication_error.value
+            communication_option = self._entries.communication_error_option.value
             if communication_option == 2:
                 self._end_connection()
                 self._enter_nmt(Nmt.STOPPED)
@@ -545,9 +551,9 @@ class DriveNode:
 
     def _may_reset(self) -> bool:
         """Return whether a fault may be reset, and log the attempt."""
-        is_allowed = self._has_all_heartbeats() and not self._sto_dropped
-        self._log("fault reset", accepted=is_allowed)
-        return is_allowed
+        is_reset_allowed = self._has_all_heartbeats() and not self._sto_dropped
+        self._log("fault reset", accepted=is_reset_allowed)
+        return is_reset_allowed
 
     def _fail(self, error_code: int, register_bits: int, vendor_bytes: bytes = b"") -> None:
         """Bring the simulated drive to fault, and report an error code by an emergency message."""
@@ -559,10 +565,10 @@ class DriveNode:
         if self._emergencies.report(error_code, register_bits, vendor_bytes):
             self._entries.error_code.value = error_code
 
-    def _clear(self, *codes: int) -> None:
+    def _clear(self, *codes_to_clear: int) -> None:
         """Clear active errors whose cause has ended; errors of a fault remain until its reset."""
         if self._state_machine.state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
-            self._emergencies.clear(*codes)
+            self._emergencies.clear(*codes_to_clear)
 
     def _send_emergency(self, can_id: int, data: bytes) -> None:
         """Log an emergency message, and send it if the NMT state allows."""
@@ -636,9 +642,9 @@ class DriveNode:
             else 0
         )
         limit_per_mille = min(drive_entries.max_torque.value, self._peak_per_mille)
-        highest_per_mille = min(limit_per_mille, abs(drive_entries.positive_limit.value))
+        highest_per_mille = min(limit_per_mille, abs(drive_entries.positive_torque_limit.value))
         lowest_per_mille = -min(
-            limit_per_mille, abs(drive_entries.negative_limit.value)
+            limit_per_mille, abs(drive_entries.negative_torque_limit.value)
         )  # some drives state a negative limit
         torque_per_mille = (
             lowest_per_mille
@@ -683,7 +689,7 @@ class DriveNode:
         """Return whether the shaft turns by less than one count per second."""
         return abs(self._plant.velocity_rad_s) < self._resolution_rad
 
-    def _position(self) -> int:
+    def _position_counts(self) -> int:
         """Return the position in encoder counts as a 32-bit integer."""
         encoder_steps = round(self._simulated_rig.read_angle() / self._resolution_rad)
         position_counts = encoder_steps * self._direction + self.angle_offset_counts
@@ -695,18 +701,21 @@ class DriveNode:
         lag_fraction = -math.expm1(-elapsed_s / self.torque_lag_s)
         self._measured_per_mille += lag_fraction * (self._per_mille - self._measured_per_mille)
 
-    def _actual_torque(self) -> int:
+    def _actual_torque_per_mille(self) -> int:
         """Return the torque that the drive reports, in 1/1000 of the rated torque."""
         return round(self._measured_per_mille) if self.torque_lag_s else self._per_mille
 
-    def _velocity(self) -> int:
+    def _velocity_counts_per_s(self) -> int:
         """Return the speed in encoder counts per second as a 32-bit integer."""
         counts_per_s = round(self._plant.velocity_rad_s / self._resolution_rad) * self._direction
         return max(-0x8000_0000, min(counts_per_s, 0x7FFF_FFFF))
 
 
 def _pdo_parameters(
-    communication: int, cob_id: int, first_mapped_index: int, file: "DeviceFile | None"
+    first_communication_index: int,
+    first_cob_id: int,
+    first_mapped_index: int,
+    device_file: "DeviceFile | None",
 ) -> Iterator[tuple[int, int, int, tuple[int, ...], int]]:
     """Yield the properties of each PDO: two indices, COB-ID, mapping entries, number of slots.
 
@@ -715,15 +724,21 @@ def _pdo_parameters(
     file. Only the first four have predefined identifiers.
     """
     pdo_numbers: Iterable[int] = range(_DEFAULT_PDO_COUNT)
-    if file is not None:
-        pdo_numbers = file.present_offsets(communication, communication + _LAST_PDO_OFFSET)
+    if device_file is not None:
+        pdo_numbers = device_file.present_offsets(
+            first_communication_index, first_communication_index + _MAX_PDO_INDEX_OFFSET
+        )
     for pdo_number in pdo_numbers:
-        mapping_index = communication + 0x200 + pdo_number
-        slot_count = MAX_MAPPING_ENTRIES if file is None else file.sub_index_count(mapping_index)
-        default_cob_id = cob_id + 0x100 * pdo_number if pdo_number < _DEFAULT_PDO_COUNT else 0
+        mapping_index = first_communication_index + 0x200 + pdo_number
+        slot_count = (
+            MAX_MAPPING_ENTRIES
+            if device_file is None
+            else device_file.sub_index_count(mapping_index)
+        )
+        default_cob_id = first_cob_id + 0x100 * pdo_number if pdo_number < _DEFAULT_PDO_COUNT else 0
         default_mapping = () if pdo_number else (first_mapped_index << 16 | 16,)
         yield (
-            communication + pdo_number,
+            first_communication_index + pdo_number,
             mapping_index,
             default_cob_id | (COB_ID_DISABLED_BIT if pdo_number else 0),
             default_mapping,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 # State machine
 
-RAMP_S = 0.05
+COASTING_RAMP_S = 0.05
 """Duration of a ramp in seconds, during which the shaft coasts in a torque mode."""
 
 _SWITCH_ON_BIT, _ENABLE_VOLTAGE_BIT, _NO_QUICK_STOP_BIT, _ENABLE_OPERATION_BIT = (
@@ -148,7 +148,7 @@ class PdsStateMachine:
             return
         if self._ramp_since_s is None:
             self._ramp_since_s = now_s
-        if now_s - self._ramp_since_s < RAMP_S:
+        if now_s - self._ramp_since_s < COASTING_RAMP_S:
             return
         if self.state is PdsState.FAULT_REACTION:
             self._enter(PdsState.FAULT)
@@ -234,7 +234,7 @@ class DriveObjects:
     sync_cob_id: Entry
     sync_period_us: Entry
     sync_overflow: Entry
-    communication_error: Entry
+    communication_error_option: Entry
     abort_option: Entry
     error_code: Entry
     controlword: Entry
@@ -252,8 +252,8 @@ class DriveObjects:
     torque_offset: Entry
     interpolation_value: Entry
     interpolation_exponent: Entry
-    positive_limit: Entry
-    negative_limit: Entry
+    positive_torque_limit: Entry
+    negative_torque_limit: Entry
 
     @property
     def sync_period_s(self) -> float:
@@ -268,13 +268,13 @@ def rated_torque_counts(motor: Motor, drive: ServoDrive) -> int:
 
     Raise `DeviceError` if the torque is less than one count, or has more than 32 bits.
     """
-    unit_nm = drive.rated_torque_unit_nm or _TORQUE_UNIT_NM
-    torque_counts = round(motor.rated_torque_nm / drive.gear_ratio / unit_nm)
+    torque_unit_nm = drive.rated_torque_unit_nm or _TORQUE_UNIT_NM
+    torque_counts = round(motor.rated_torque_nm / drive.gear_ratio / torque_unit_nm)
     if not 0 < torque_counts < 1 << 32:
         raise DeviceError(
             f"Simulated drive: a rated torque of {motor.rated_torque_nm:g} N·m behind a gear of "
-            f"{drive.gear_ratio:g} does not fit into object 6076 in units of {unit_nm:g} N·m; "
-            "check cia402.rated_torque_unit_nm."
+            f"{drive.gear_ratio:g} does not fit into object 6076 in units of "
+            f"{torque_unit_nm:g} N·m; check cia402.rated_torque_unit_nm."
         )
     return torque_counts
 
@@ -293,14 +293,14 @@ def add_drive_objects(
 ) -> DriveObjects:
     """Add the drive's objects to a dictionary; return the entries that the simulation uses."""
 
-    def add(object_index: int, entry: Entry) -> Entry:
+    def add_object(object_index: int, entry: Entry) -> Entry:
         return objects.add(object_index, entry)
 
-    add(0x1000, Entry("I", _DEVICE_TYPE, "ro"))
-    sync_cob_id = add(0x1005, Entry("I", 0x80, check=_check_sync_id))
-    sync_period_us = add(0x1006, Entry("I"))
-    add(0x1008, Entry("s", access="ro", text=_DEVICE_NAME))
-    add(0x100A, Entry("s", access="ro", text=_SOFTWARE_VERSION))
+    add_object(0x1000, Entry("I", _DEVICE_TYPE, "ro"))
+    sync_cob_id = add_object(0x1005, Entry("I", 0x80, check_value=_check_sync_id))
+    sync_period_us = add_object(0x1006, Entry("I"))
+    add_object(0x1008, Entry("s", access="ro", text=_DEVICE_NAME))
+    add_object(0x100A, Entry("s", access="ro", text=_SOFTWARE_VERSION))
     vendor_and_product = drive.vendor_id or _VENDOR_ID, drive.product_code or _PRODUCT_CODE
     identity_numbers = (*vendor_and_product, _REVISION, _SERIAL_NUMBER)
     objects.add_record(
@@ -313,15 +313,15 @@ def add_drive_objects(
         if sync_period_us.value:
             raise Abort(AbortCode.WRONG_STATE)
 
-    sync_overflow = add(0x1019, Entry("B", check=check_overflow))
-    communication_error = Entry("B", high=2)
-    objects.add_record(0x1029, {1: communication_error})
+    sync_overflow = add_object(0x1019, Entry("B", check_value=check_overflow))
+    communication_error_option = Entry("B", high=2)
+    objects.add_record(0x1029, {1: communication_error_option})
 
     peak_torque_per_mille = peak_per_mille(motor)
-    add(0x605B, Entry("h", 0, low=0, high=1))
-    add(0x605C, Entry("h", 0, low=0, high=1))
-    add(0x6076, Entry("I", rated_torque_counts(motor, drive), "ro"))
-    supported_modes = add(_SUPPORTED_MODES_INDEX, Entry("I", _SUPPORTED_MODES, "ro"))
+    add_object(0x605B, Entry("h", 0, low=0, high=1))
+    add_object(0x605C, Entry("h", 0, low=0, high=1))
+    add_object(0x6076, Entry("I", rated_torque_counts(motor, drive), "ro"))
+    supported_modes = add_object(_SUPPORTED_MODES_INDEX, Entry("I", _SUPPORTED_MODES, "ro"))
 
     def check_mode(written_value: int) -> None:
         if written_value != NO_MODE and not (
@@ -330,11 +330,9 @@ def add_drive_objects(
             raise Abort(AbortCode.INVALID_VALUE)
 
     gear_ratio = Fraction(drive.gear_ratio).limit_denominator(_LARGEST_GEAR_REVOLUTIONS)
-    increments_per_turns = round(
-        _ENCODER_REVOLUTIONS * math.tau / resolution_rad / drive.gear_ratio
-    )
+    encoder_increments = round(_ENCODER_REVOLUTIONS * math.tau / resolution_rad / drive.gear_ratio)
     ratios_by_index = {
-        0x608F: (increments_per_turns, _ENCODER_REVOLUTIONS),
+        0x608F: (encoder_increments, _ENCODER_REVOLUTIONS),
         0x6091: (gear_ratio.numerator, gear_ratio.denominator),
     }
     for object_index, object_ratio in ratios_by_index.items():
@@ -349,30 +347,34 @@ def add_drive_objects(
         sync_cob_id=sync_cob_id,
         sync_period_us=sync_period_us,
         sync_overflow=sync_overflow,
-        communication_error=communication_error,
-        abort_option=add(0x6007, Entry("h", 1, low=0, high=3)),
-        error_code=add(0x603F, Entry("H", 0, "ro", "t")),
-        controlword=add(0x6040, Entry("H", 0, mapping="rt")),
-        statusword=add(0x6041, Entry("H", 0, "ro", "t")),
-        quick_stop_option=add(0x605A, Entry("h", 2, check=_check_quick_stop)),
-        fault_option=add(0x605E, Entry("h", 0, low=0, high=2)),
-        mode=add(0x6060, Entry("b", NO_MODE, mapping="rt", check=check_mode)),
-        mode_display=add(0x6061, Entry("b", NO_MODE, "ro", "t")),
-        position=add(0x6064, Entry("i", 0, "ro", "t")),
-        velocity=add(0x606C, Entry("i", 0, "ro", "t")),
-        target_torque=add(0x6071, Entry("h", 0, mapping="rt")),
-        max_torque=add(0x6072, Entry("H", peak_torque_per_mille, mapping="rt")),
-        actual_torque=add(0x6077, Entry("h", 0, "ro", "t")),
-        max_speed_rpm=add(0x6080, Entry("I", _MAX_SPEED_RPM)),
-        torque_offset=add(0x60B2, Entry("h", 0, mapping="rt")),
+        communication_error_option=communication_error_option,
+        abort_option=add_object(0x6007, Entry("h", 1, low=0, high=3)),
+        error_code=add_object(0x603F, Entry("H", 0, "ro", "t")),
+        controlword=add_object(0x6040, Entry("H", 0, pdo_directions="rt")),
+        statusword=add_object(0x6041, Entry("H", 0, "ro", "t")),
+        quick_stop_option=add_object(0x605A, Entry("h", 2, check_value=_check_quick_stop)),
+        fault_option=add_object(0x605E, Entry("h", 0, low=0, high=2)),
+        mode=add_object(0x6060, Entry("b", NO_MODE, pdo_directions="rt", check_value=check_mode)),
+        mode_display=add_object(0x6061, Entry("b", NO_MODE, "ro", "t")),
+        position=add_object(0x6064, Entry("i", 0, "ro", "t")),
+        velocity=add_object(0x606C, Entry("i", 0, "ro", "t")),
+        target_torque=add_object(0x6071, Entry("h", 0, pdo_directions="rt")),
+        max_torque=add_object(0x6072, Entry("H", peak_torque_per_mille, pdo_directions="rt")),
+        actual_torque=add_object(0x6077, Entry("h", 0, "ro", "t")),
+        max_speed_rpm=add_object(0x6080, Entry("I", _MAX_SPEED_RPM)),
+        torque_offset=add_object(0x60B2, Entry("h", 0, pdo_directions="rt")),
         interpolation_value=interpolation_entries[1],
         interpolation_exponent=interpolation_entries[2],
-        positive_limit=add(0x60E0, Entry("H", peak_torque_per_mille, mapping="rt")),
-        negative_limit=add(0x60E1, Entry("H", peak_torque_per_mille, mapping="rt")),
+        positive_torque_limit=add_object(
+            0x60E0, Entry("H", peak_torque_per_mille, pdo_directions="rt")
+        ),
+        negative_torque_limit=add_object(
+            0x60E1, Entry("H", peak_torque_per_mille, pdo_directions="rt")
+        ),
     )
 
 
-def adopt_device_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
+def adopt_device_file(objects: ObjectDictionary, device_file: "DeviceFile") -> None:
     """Restrict the dictionary to the objects of a drive's file, with their values at power-on.
 
     Rated torque, gear, encoder, limits that the file states as zero, and an identity that it does
@@ -380,28 +382,33 @@ def adopt_device_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
     synchronous torque is assumed, provided that the file has a target torque. Raise `DeviceError`
     if the data type of object 6076 in the file cannot hold the motor's rated torque.
     """
-    rated_counts = objects[0x6076, 0].value
+    rated_counts_before = objects[0x6076, 0].value
     unchanged_indices = set(_COMMISSIONED_INDICES)
     unchanged_indices |= {
         object_index
         for object_index in (*_LIMIT_INDICES, _SUPPORTED_MODES_INDEX)
-        if (object_description := file.entries.get((object_index, 0))) is not None
+        if (object_description := device_file.entries.get((object_index, 0))) is not None
         and not object_description.default
     }
     if not any(
-        file.entries[key].default for key in file.entries if key[0] == _IDENTITY_INDEX and key[1]
+        device_file.entries[key].default
+        for key in device_file.entries
+        if key[0] == _IDENTITY_INDEX and key[1]
     ):
         unchanged_indices.add(_IDENTITY_INDEX)
-    objects.adopt_file_entries(file.entries, unchanged_indices)
-    if (_SUPPORTED_MODES_INDEX, 0) in file.entries and _SUPPORTED_MODES_INDEX in unchanged_indices:
+    objects.adopt_file_entries(device_file.entries, unchanged_indices)
+    if (
+        _SUPPORTED_MODES_INDEX,
+        0,
+    ) in device_file.entries and _SUPPORTED_MODES_INDEX in unchanged_indices:
         supported_modes = objects[_SUPPORTED_MODES_INDEX, 0]
         supported_modes.value = supported_modes.default = (
-            _SUPPORTED_MODES if (_TARGET_TORQUE_INDEX, 0) in file.entries else 0
+            _SUPPORTED_MODES if (_TARGET_TORQUE_INDEX, 0) in device_file.entries else 0
         )
-    if (0x6076, 0) in file.entries and objects[0x6076, 0].value != rated_counts:
+    if (0x6076, 0) in device_file.entries and objects[0x6076, 0].value != rated_counts_before:
         raise DeviceError(
-            f"Simulated drive: object 6076 of {file.name} cannot hold the rated torque, "
-            f"{rated_counts}; check cia402.rated_torque_unit_nm."
+            f"Simulated drive: object 6076 of {device_file.name} cannot hold the rated torque, "
+            f"{rated_counts_before}; check cia402.rated_torque_unit_nm."
         )
 
 
@@ -412,7 +419,7 @@ def _check_sync_id(sync_id: int) -> None:
         raise Abort(AbortCode.INVALID_VALUE)
 
 
-def _check_quick_stop(stop_option: int) -> None:
+def _check_quick_stop(quick_stop_option: int) -> None:
     """Raise `Abort` if a quick stop option is not supported."""
-    if stop_option not in _QUICK_STOP_OPTIONS:
+    if quick_stop_option not in _QUICK_STOP_OPTIONS:
         raise Abort(AbortCode.INVALID_VALUE)

@@ -27,8 +27,8 @@ class WrongUseError(UserError, ValueError):
 
 FaultValue = int | float | str
 """Value of a fault's key."""
-Deliver = Callable[[int, bytes, object], None]
-"""Function that delivers a frame: identifier, data and origin."""
+DeliverFrame = Callable[[int, bytes, object], None]
+"""Function that delivers a frame: identifier, data and sending host."""
 
 SERIAL_PSEUDO_ID = -1
 """Pseudo-identifier of data on a serial line."""
@@ -42,7 +42,7 @@ class FaultError(WrongUseError):
 class _FaultKey:
     """Key of a fault: its parser, its allowed values and its default."""
 
-    read: Callable[[str], FaultValue]
+    parse_value: Callable[[str], FaultValue]
     """Function that parses the value, or raises ValueError."""
     allowed_text: str
     """Description of the allowed values, for error messages."""
@@ -55,46 +55,46 @@ class _FaultKey:
 def _integer_key(low: int, high: int, **key_options: Any) -> _FaultKey:  # noqa: ANN401 - passed on
     """Return a key whose value is an integer from `low` to `high`."""
 
-    def read(text: str) -> int:
-        parsed_number = int(text, 0)
+    def parse_value(value_text: str) -> int:
+        parsed_number = int(value_text, 0)
         if not low <= parsed_number <= high:
-            raise ValueError(text)
+            raise ValueError(value_text)
         return parsed_number
 
-    return _FaultKey(read, f"a whole number from {low} to {high}", **key_options)
+    return _FaultKey(parse_value, f"a whole number from {low} to {high}", **key_options)
 
 
 def _positive_number_key(**key_options: Any) -> _FaultKey:  # noqa: ANN401 - passed on
     """Return a key whose value is a number above 0."""
 
-    def read(text: str) -> float:
-        parsed_number = float(text)
-        if not 0 < parsed_number <= _LARGEST_TIME_S:
-            raise ValueError(text)
+    def parse_value(value_text: str) -> float:
+        parsed_number = float(value_text)
+        if not 0 < parsed_number <= _MAX_FAULT_TIME_S:
+            raise ValueError(value_text)
         return parsed_number
 
-    return _FaultKey(read, f"a number above 0, up to {_LARGEST_TIME_S:g}", **key_options)
+    return _FaultKey(parse_value, f"a number above 0, up to {_MAX_FAULT_TIME_S:g}", **key_options)
 
 
-def _choice_key(*choices: str, **key_options: Any) -> _FaultKey:  # noqa: ANN401 - passed on
+def _choice_key(*allowed_words: str, **key_options: Any) -> _FaultKey:  # noqa: ANN401 - passed on
     """Return a key whose value is one of several words."""
 
-    def read(text: str) -> str:
-        if text not in choices:
-            raise ValueError(text)
-        return text
+    def parse_value(value_text: str) -> str:
+        if value_text not in allowed_words:
+            raise ValueError(value_text)
+        return value_text
 
-    return _FaultKey(read, " or ".join(choices), **key_options)
+    return _FaultKey(parse_value, " or ".join(allowed_words), **key_options)
 
 
-_LARGEST_TIME_S = 1e6
+_MAX_FAULT_TIME_S = 1e6
 """Largest time in seconds in a fault."""
-_LARGEST_COUNT = 1_000_000_000
+_MAX_AFFECTED_COUNT = 1_000_000_000
 """Largest number of frames or bytes on which a fault acts."""
 _LINE_KEYS = {
     "from": _choice_key("drive", "sensor", "host", is_required=True),
     "id": _integer_key(0, 0x7FF),
-    "frames": _integer_key(1, _LARGEST_COUNT, default=1),
+    "frames": _integer_key(1, _MAX_AFFECTED_COUNT, default=1),
 }
 """Keys of the faults on a line: sender, CAN identifier, number of frames."""
 _DEVICE_KEY = _choice_key("drive", "sensor", is_required=True)
@@ -107,10 +107,10 @@ _OPTIONAL_TEXT_KEY = _FaultKey(str, "a value")
 _REQUIRED_TEXT_KEY = _FaultKey(str, "a value", is_required=True)
 """Required key whose value `parse_obstacle` checks."""
 
-LINE_KINDS = ("drop", "delay", "corrupt", "reorder")
+LINE_FAULT_KINDS = ("drop", "delay", "corrupt", "reorder")
 """Kinds of faults on the line of one sender."""
-KINDS: dict[str, dict[str, _FaultKey]] = {
-    "drop": _LINE_KEYS | {"bytes": _integer_key(1, _LARGEST_COUNT)},
+KEYS_BY_FAULT_KIND: dict[str, dict[str, _FaultKey]] = {
+    "drop": _LINE_KEYS | {"bytes": _integer_key(1, _MAX_AFFECTED_COUNT)},
     "delay": _LINE_KEYS | {"ms": _positive_number_key(is_required=True)},
     "corrupt": _LINE_KEYS | {"byte": _integer_key(0, 255, default=0)},
     "reorder": _LINE_KEYS,
@@ -152,14 +152,16 @@ KINDS: dict[str, dict[str, _FaultKey]] = {
     "knock": {"x": _REQUIRED_TEXT_KEY, "force": _REQUIRED_TEXT_KEY, "duration": _REQUIRED_TEXT_KEY},
 }
 """Keys of each kind of fault."""
-_MOMENTARY_KINDS = ("emcy", "jump", "restart", "power_cycle", "object", "knock")
+_MOMENTARY_FAULT_KINDS = ("emcy", "jump", "restart", "power_cycle", "object", "knock")
 """Kinds of faults without duration."""
-LASTING_KINDS = tuple(kind for kind in KINDS if kind not in _MOMENTARY_KINDS)
+LASTING_FAULT_KINDS = tuple(
+    kind for kind in KEYS_BY_FAULT_KIND if kind not in _MOMENTARY_FAULT_KINDS
+)
 """Kinds of faults that last until they expire or are ended."""
-DISTURBANCE_KINDS = ("obstacle", "knock")
+DISTURBANCE_FAULT_KINDS = ("obstacle", "knock")
 """Kinds of faults that disturb the beam, with the keys of
 `rigd.devices.obstacles.parse_obstacle`."""
-KINDS["end"] = {"fault": _choice_key(*LASTING_KINDS)}
+KEYS_BY_FAULT_KIND["end"] = {"fault": _choice_key(*LASTING_FAULT_KINDS)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +169,7 @@ class Fault:
     """Fault to inject, as requested by the operator."""
 
     kind: str
-    """Kind of the fault, one of :data:`KINDS`."""
+    """Kind of the fault, one of :data:`KEYS_BY_FAULT_KIND`."""
     values: Mapping[str, FaultValue]
     """Values by key; an omitted key without default is absent."""
     after_s: float | None = None
@@ -177,7 +179,9 @@ class Fault:
     def is_persistent(self) -> bool:
         """Whether the fault lasts until it is ended, having neither duration nor frame count."""
         return (
-            self.kind in LASTING_KINDS and self.kind not in LINE_KINDS and "for" not in self.values
+            self.kind in LASTING_FAULT_KINDS
+            and self.kind not in LINE_FAULT_KINDS
+            and "for" not in self.values
         )
 
     def __str__(self) -> str:
@@ -205,11 +209,13 @@ def parse_fault(spec: str) -> Fault:
     """
     fault_text, at_sign, time_text = spec.partition("@")
     fault_kind, *assignments = (assignment.strip() for assignment in fault_text.split(","))
-    if fault_kind not in KINDS:
+    if fault_kind not in KEYS_BY_FAULT_KIND:
         raise FaultError(
-            _error_message(spec, f"unknown fault '{fault_kind}'; choose {', '.join(KINDS)}")
+            _error_message(
+                spec, f"unknown fault '{fault_kind}'; choose {', '.join(KEYS_BY_FAULT_KIND)}"
+            )
         )
-    allowed_keys = KINDS[fault_kind]
+    allowed_keys = KEYS_BY_FAULT_KIND[fault_kind]
     fault_values: dict[str, FaultValue] = {}
     for assignment in assignments:
         key, _, value_text = assignment.partition("=")
@@ -222,7 +228,7 @@ def parse_fault(spec: str) -> Fault:
         if key in fault_values:
             raise FaultError(_error_message(spec, f"'{key}' is given twice"))
         try:
-            fault_values[key] = allowed_keys[key].read(value_text)
+            fault_values[key] = allowed_keys[key].parse_value(value_text)
         except ValueError:
             raise FaultError(
                 _error_message(spec, f"{key}={value_text}: give {allowed_keys[key].allowed_text}")
@@ -237,7 +243,7 @@ def parse_fault(spec: str) -> Fault:
         if fault_key.default is not None and not (key_name == "frames" and "bytes" in fault_values):
             fault_values.setdefault(key_name, fault_key.default)
     fault = Fault(fault_kind, fault_values, _parse_start_time(spec, time_text) if at_sign else None)
-    if fault_kind in DISTURBANCE_KINDS:
+    if fault_kind in DISTURBANCE_FAULT_KINDS:
         try:
             disturbance_of(fault, 0.0)
         except ObstacleError as error:
@@ -250,8 +256,8 @@ def parse_fault(spec: str) -> Fault:
 def disturbance_of(fault: Fault, now_s: float) -> Disturbance:
     """Return the obstacle or impact that a fault describes, beginning at `now_s`.
 
-    The fault is of a kind in `DISTURBANCE_KINDS`. `now_s` is the time since the drive was first
-    enabled.
+    The fault is of a kind in `DISTURBANCE_FAULT_KINDS`. `now_s` is the time since the drive was
+    first enabled.
     """
     assignments = [f"{key}={key_value}" for key, key_value in fault.values.items() if key != "for"]
     if fault.kind == "knock":
@@ -263,16 +269,17 @@ def disturbance_of(fault: Fault, now_s: float) -> Disturbance:
     return parse_obstacle(",".join(assignments))
 
 
-def _parse_start_time(spec: str, text: str) -> float:
+def _parse_start_time(fault_spec: str, time_text: str) -> float:
     """Parse the time after ``@`` in a fault, in seconds."""
     try:
-        start_s = float(text)
+        start_s = float(time_text)
     except ValueError:
         start_s = -1.0
-    if not 0 <= start_s <= _LARGEST_TIME_S:
+    if not 0 <= start_s <= _MAX_FAULT_TIME_S:
         raise FaultError(
             _error_message(
-                spec, f"'@{text}': give the seconds after enabling, 0 to {_LARGEST_TIME_S:g}"
+                fault_spec,
+                f"'@{time_text}': give the seconds after enabling, 0 to {_MAX_FAULT_TIME_S:g}",
             )
         )
     return start_s
@@ -283,9 +290,9 @@ def _format_value(key: str, value: FaultValue) -> str:
     return f"{value:#x}" if key in ("id", "code", "bits") else f"{value}"
 
 
-def _error_message(spec: str, reason: str) -> str:
+def _error_message(fault_spec: str, reason: str) -> str:
     """Return the message for a text that describes no valid fault: the text and the reason."""
-    return f"Fault '{spec}': {reason}."
+    return f"Fault '{fault_spec}': {reason}."
 
 
 # Faults on a line
@@ -315,26 +322,26 @@ class _ActiveFault:
 class FaultyLine:
     """Line from one sender to all receivers, on which faults act.
 
-    The sender's name is for the log. `postpone` calls a function after a delay in seconds. `log`
-    logs each frame on which a fault acts.
+    The sender's name is for the log. `postpone_call` calls a function after a delay in seconds.
+    `log` logs each frame on which a fault acts.
     """
 
     def __init__(
         self,
         sender: str,
-        deliver: Deliver,
-        postpone: Callable[[float, Callable[[], None]], None],
+        deliver_frame: DeliverFrame,
+        postpone_call: Callable[[float, Callable[[], None]], None],
         log: Callable[..., None],
     ) -> None:
         self._sender = sender
-        self._deliver = deliver
-        self._postpone = postpone
+        self._deliver = deliver_frame
+        self._postpone = postpone_call
         self._log = log
         self._active_faults: list[_ActiveFault] = []
         self._held_frames: list[tuple[int, bytes, object]] = []
 
     @property
-    def disturbed(self) -> bool:
+    def is_disturbed(self) -> bool:
         """Whether a fault may act on the next frame."""
         return bool(self._active_faults or self._held_frames)
 
@@ -342,16 +349,16 @@ class FaultyLine:
         """Let a fault act on this line from now on."""
         self._active_faults.append(_ActiveFault(fault))
 
-    def end(self, fault_kind: str | None) -> list[str]:
+    def end_faults(self, fault_kind: str | None) -> list[str]:
         """End the line's faults of a kind (None: of all kinds); return the ended faults' kinds."""
         ended_faults = [fault for fault in self._active_faults if fault_kind in (None, fault.kind)]
         self._active_faults = [fault for fault in self._active_faults if fault not in ended_faults]
         return [fault.kind for fault in ended_faults]
 
-    def send(self, can_id: int, data: bytes, origin: object = None) -> None:
+    def send(self, can_id: int, data: bytes, sending_host: object = None) -> None:
         """Send a frame, or a record of a serial line, over this line."""
         if not self._active_faults and not self._held_frames:
-            self._deliver(can_id, data, origin)
+            self._deliver(can_id, data, sending_host)
             return
         held_frames, self._held_frames = self._held_frames, []
         acting_fault = next(
@@ -365,17 +372,17 @@ class FaultyLine:
         if held_frames and acting_fault is not None and acting_fault.kind == "reorder":
             acting_fault = None  # this is the frame for which the held frame waits
         if acting_fault is None:
-            self._deliver(can_id, data, origin)
+            self._deliver(can_id, data, sending_host)
         else:
-            self._disturb(acting_fault, can_id, data, origin)
+            self._disturb(acting_fault, can_id, data, sending_host)
         # A held frame follows the next frame, whatever happens to that frame.
         for held_frame in held_frames:
             self._deliver(*held_frame)
 
-    def _disturb(self, fault: _ActiveFault, can_id: int, data: bytes, origin: object) -> None:
+    def _disturb(self, fault: _ActiveFault, can_id: int, data: bytes, sending_host: object) -> None:
         """Apply a fault to a frame: drop, delay, corrupt or hold it, and log it."""
-        affected_bytes = min(fault.remaining_count, len(data)) if fault.counts_bytes else 1
-        fault.remaining_count -= affected_bytes
+        affected_count = min(fault.remaining_count, len(data)) if fault.counts_bytes else 1
+        fault.remaining_count -= affected_count
         if fault.remaining_count == 0:
             self._active_faults.remove(fault)
         logged_identifier = {} if can_id == SERIAL_PSEUDO_ID else {"can_id": can_id}
@@ -383,22 +390,22 @@ class FaultyLine:
             "simulator", fault.kind, sender=self._sender, data=data.hex(), **logged_identifier
         )
         if fault.kind == "delay":
-            self._postpone(fault.delay_s, lambda: self._deliver(can_id, data, origin))
+            self._postpone(fault.delay_s, lambda: self._deliver(can_id, data, sending_host))
         elif fault.kind == "corrupt":
             corrupted_byte = data[fault.byte_index] ^ 0xFF
             data = data[: fault.byte_index] + bytes([corrupted_byte]) + data[fault.byte_index + 1 :]
-            self._deliver(can_id, data, origin)
+            self._deliver(can_id, data, sending_host)
         elif fault.kind == "reorder":
-            self._held_frames.append((can_id, data, origin))
-        elif fault.counts_bytes and affected_bytes < len(data):
-            self._deliver(can_id, data[affected_bytes:], origin)
+            self._held_frames.append((can_id, data, sending_host))
+        elif fault.counts_bytes and affected_count < len(data):
+            self._deliver(can_id, data[affected_count:], sending_host)
 
 
 # Log of events
 
 _FLUSH_INTERVAL_S = 0.2
 """Time in seconds between two writes of the log to its file."""
-_UNSHOWN_EVENTS = ("torque", "sdo write", *LINE_KINDS)
+_UNSHOWN_EVENTS = ("torque", "sdo write", *LINE_FAULT_KINDS)
 """Events that are too frequent to be shown on the terminal."""
 
 
@@ -422,16 +429,23 @@ class EventLog:
         self._flushed_s = 0.0
         self.time_s = 0.0
 
-    def __call__(self, device: str, what: str, **values: object) -> None:
+    def __call__(self, device: str, event_name: str, **values: object) -> None:
         """Log an event of a device, with values by name."""
         if self._file is not None:
-            log_entry = {"t_s": round(self.time_s, 9), "device": device, "what": what, **values}
+            log_entry = {
+                "t_s": round(self.time_s, 9),
+                "device": device,
+                "what": event_name,
+                **values,
+            }
             self._run_on_file(lambda file: file.write(json.dumps(log_entry) + "\n"))
-        if what not in _UNSHOWN_EVENTS:
+        if event_name not in _UNSHOWN_EVENTS:
             # States and faults must be in the file even if the process is killed.
             self._write_out()
             detail_text = "  ".join(f"{key} {event_value}" for key, event_value in values.items())
-            self.print_line(f"{self.time_s:10.3f} s  {device}: {what}  {detail_text}".rstrip())
+            self.print_line(
+                f"{self.time_s:10.3f} s  {device}: {event_name}  {detail_text}".rstrip()
+            )
 
     def print_line(self, text_line: str) -> None:
         """Print a line for the operator, unless quiet; ignore a closed terminal."""

@@ -48,14 +48,14 @@ def without_transport_delay(rig: RigParameters) -> RigParameters:
 
 # CAN bus
 
-Handlers = dict[int, Callable[[], None]]
+HandlersByDescriptor = dict[int, Callable[[], None]]
 """Functions to call when a file descriptor is readable, by file descriptor."""
-OnFrames = Callable[[list[bytes], object], None]
+FrameCallback = Callable[[list[bytes], object], None]
 """Function that processes the frames of a sender, in order, and the sender."""
 
-_READ_SIZE = 65_536
+_MAX_READ_BYTES = 65_536
 """Largest number of bytes in one read from a socket."""
-_SEND_BUFFER_SIZE = 425_984  # the kernel derives from it a buffer for some 0.2 s of a full bus
+_SEND_BUFFER_BYTES = 425_984  # the kernel derives from it a buffer for some 0.2 s of a full bus
 _MAX_FRAMES_PER_READ = 256
 """Largest number of frames in one read from a virtual interface."""
 
@@ -74,9 +74,9 @@ _VIRTUAL_KINDS = ("vcan", "vxcan")
 class _LinkConnection:
     """Connection of a client to the bus, with incomplete received and unsent bytes."""
 
-    def __init__(self, link: socket.socket, number: int) -> None:
-        self.link = link
-        self.number = number
+    def __init__(self, client_socket: socket.socket, client_number: int) -> None:
+        self.link = client_socket
+        self.number = client_number
         self.received_bytes = b""
         self.unsent_bytes = b""
 
@@ -85,33 +85,33 @@ class VirtualBus:
     """Simulated CAN bus on a Unix socket.
 
     This class updates `handlers`, the handlers of the event loop by file descriptor. `on_frames`
-    processes the frames that a client sends. `on_clients` is called with a text and the number of
-    clients when one connects or disconnects.
+    processes the frames that a client sends. `on_client_change` is called with a text and the
+    number of clients when one connects or disconnects.
 
     Attributes
     ----------
-    lost : int
+    lost_frame_count : int
         Number of frames that clients have not received because they do not read.
     """
 
     def __init__(
         self,
         path: Path,
-        handlers: Handlers,
-        on_frames: OnFrames,
-        on_clients: Callable[[str, int], None],
+        handlers: HandlersByDescriptor,
+        on_frames: FrameCallback,
+        on_client_change: Callable[[str, int], None],
     ) -> None:
         self._handlers = handlers
         self._on_frames = on_frames
-        self._on_clients = on_clients
+        self._on_client_change = on_client_change
         self._clients: list[_LinkConnection] = []
         self._count = 0
-        self.lost = 0
+        self.lost_frame_count = 0
         self._path = path
         self.open()
 
     @property
-    def clients(self) -> int:
+    def client_count(self) -> int:
         """Number of connected clients."""
         return len(self._clients)
 
@@ -120,10 +120,10 @@ class VirtualBus:
         self._listener = listen(self._path)
         self._handlers[self._listener.fileno()] = self._accept
 
-    def send(self, frame: bytes, origin: object = None) -> None:
+    def send(self, frame: bytes, sending_host: object = None) -> None:
         """Send a frame to all clients except the one that sent it."""
         for other_client in self._clients:
-            if other_client is not origin:
+            if other_client is not sending_host:
                 self._send(other_client, frame)
 
     def close(self) -> None:
@@ -140,17 +140,17 @@ class VirtualBus:
         with suppress(OSError):
             client_socket, _ = self._listener.accept()
             client_socket.setblocking(False)
-            client_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_SIZE)
+            client_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
             self._count += 1
             new_client = _LinkConnection(client_socket, self._count)
             self._clients.append(new_client)
             self._handlers[client_socket.fileno()] = lambda: self._receive(new_client)
-            self._on_clients(f"client {new_client.number} connected", len(self._clients))
+            self._on_client_change(f"client {new_client.number} connected", len(self._clients))
 
     def _receive(self, client: _LinkConnection) -> None:
         """Receive frames of a client, and pass them on; drop a client that has closed."""
         try:
-            received_bytes = client.link.recv(_READ_SIZE)
+            received_bytes = client.link.recv(_MAX_READ_BYTES)
         except BlockingIOError:
             return
         except OSError:
@@ -161,10 +161,11 @@ class VirtualBus:
         pending_bytes = (
             client.received_bytes + received_bytes if client.received_bytes else received_bytes
         )
-        complete_size = len(pending_bytes) - len(pending_bytes) % FRAME_SIZE
-        client.received_bytes = pending_bytes[complete_size:]
+        complete_byte_count = len(pending_bytes) - len(pending_bytes) % FRAME_SIZE
+        client.received_bytes = pending_bytes[complete_byte_count:]
         self._on_frames(
-            [pending_bytes[i : i + FRAME_SIZE] for i in range(0, complete_size, FRAME_SIZE)], client
+            [pending_bytes[i : i + FRAME_SIZE] for i in range(0, complete_byte_count, FRAME_SIZE)],
+            client,
         )
 
     def _send(self, client: _LinkConnection, frame: bytes) -> None:
@@ -176,11 +177,11 @@ class VirtualBus:
                 _send_without_blocking(client.link, client.unsent_bytes) :
             ]
             if client.unsent_bytes:
-                self.lost += 1
+                self.lost_frame_count += 1
                 return
         sent_bytes = _send_without_blocking(client.link, frame)
         if sent_bytes == 0:
-            self.lost += 1
+            self.lost_frame_count += 1
         elif sent_bytes < len(frame):
             client.unsent_bytes = frame[sent_bytes:]
 
@@ -190,7 +191,7 @@ class VirtualBus:
             self._clients.remove(client)
             del self._handlers[client.link.fileno()]
             client.link.close()
-            self._on_clients(f"client {client.number} gone", len(self._clients))
+            self._on_client_change(f"client {client.number} gone", len(self._clients))
 
 
 class VirtualCan:
@@ -200,12 +201,14 @@ class VirtualCan:
     :class:`VirtualBus`. The constructor raises `DeviceError` if the interface cannot be used.
     """
 
-    clients = 1
+    client_count = 1
     """Number of clients, which is unknown on such a bus and assumed to be 1."""
-    lost = 0
+    lost_frame_count = 0
     """Number of frames that could not be sent."""
 
-    def __init__(self, channel: str, handlers: Handlers, on_frames: OnFrames) -> None:
+    def __init__(
+        self, channel: str, handlers: HandlersByDescriptor, on_frames: FrameCallback
+    ) -> None:
         self._channel = channel
         self._use_socket(self._bound_socket(), handlers, on_frames)
 
@@ -233,7 +236,7 @@ class VirtualCan:
         return can_socket
 
     def _use_socket(
-        self, can_socket: socket.socket, handlers: Handlers, on_frames: OnFrames
+        self, can_socket: socket.socket, handlers: HandlersByDescriptor, on_frames: FrameCallback
     ) -> None:
         """Use a socket, and register its handler in the event loop."""
         can_socket.setblocking(False)
@@ -242,13 +245,13 @@ class VirtualCan:
         self._on_frames = on_frames
         handlers[can_socket.fileno()] = self._receive
 
-    def send(self, frame: bytes, origin: object = None) -> None:
-        """Send a frame of a node; frames of other senders (`origin`) are on the bus already."""
-        if origin is None and self._link.fileno() >= 0:
+    def send(self, frame: bytes, sending_host: object = None) -> None:
+        """Send a frame of a node; frames of another `sending_host` are on the bus already."""
+        if sending_host is None and self._link.fileno() >= 0:
             try:
                 self._link.send(frame)
             except OSError:
-                self.lost += 1
+                self.lost_frame_count += 1
 
     def close(self) -> None:
         """Close the socket on the kernel's CAN interface."""
@@ -286,7 +289,7 @@ def listen(path: Path) -> socket.socket:
     return listening_socket
 
 
-def is_virtual(interface_name: str) -> bool:
+def is_virtual_can(interface_name: str) -> bool:
     """Return whether a network interface is a virtual CAN bus; False if it does not exist.
 
     Raise `DeviceError` if the interface exists, but is not a virtual CAN bus.
@@ -303,40 +306,42 @@ def is_virtual(interface_name: str) -> bool:
     )
 
 
-def interface_kind(name: str) -> str:
+def interface_kind(interface_name: str) -> str:
     """Return the kernel's name for the kind of a network interface; empty for hardware.
 
     A serial CAN adapter is also among the virtual devices of ``/sys``, so the kernel's attribute
     ``IFLA_INFO_KIND`` is used.
     """
     try:
-        interface_index = socket.if_nametoindex(name)
+        interface_index = socket.if_nametoindex(interface_name)
         with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, 0) as netlink_socket:
             request_body = _LINK_HEADER.pack(socket.AF_UNSPEC, 0, interface_index, 0, 0)
             request_header = struct.pack(
                 "=IHHII", 16 + len(request_body), _RTM_GETLINK, _NLM_F_REQUEST, 1, 0
             )
             netlink_socket.send(request_header + request_body)
-            kernel_reply = netlink_socket.recv(_READ_SIZE)
+            kernel_reply = netlink_socket.recv(_MAX_READ_BYTES)
     except OSError:
         return ""
     return kind_in_reply(kernel_reply)
 
 
-def kind_in_reply(reply: bytes) -> str:
+def kind_in_reply(netlink_reply: bytes) -> str:
     """Return the kind of interface in a netlink message RTM_NEWLINK, or an empty text."""
-    if len(reply) < 32 or struct.unpack_from("=H", reply, 4)[0] != _RTM_NEWLINK:
+    if len(netlink_reply) < 32 or struct.unpack_from("=H", netlink_reply, 4)[0] != _RTM_NEWLINK:
         return ""
-    message_length = struct.unpack_from("=I", reply)[0]
-    for link_type, link_value in _attributes(reply[16 + _LINK_HEADER.size : message_length]):
+    message_length = struct.unpack_from("=I", netlink_reply)[0]
+    for link_type, link_value in _netlink_attributes(
+        netlink_reply[16 + _LINK_HEADER.size : message_length]
+    ):
         if link_type == _IFLA_LINKINFO:
-            for info_type, info_value in _attributes(link_value):
+            for info_type, info_value in _netlink_attributes(link_value):
                 if info_type == _IFLA_INFO_KIND:
                     return info_value.rstrip(b"\0").decode()
     return ""
 
 
-def _attributes(data: bytes) -> Iterable[tuple[int, bytes]]:
+def _netlink_attributes(data: bytes) -> Iterable[tuple[int, bytes]]:
     """Yield type and value of the netlink attributes in a message."""
     byte_offset = 0
     while byte_offset + 4 <= len(data):
@@ -360,7 +365,7 @@ def _send_without_blocking(link: socket.socket, data: bytes) -> int:
 
 # Serial line
 
-_LINE_READ_SIZE = 4096
+_MAX_LINE_READ_BYTES = 4096
 """Largest number of bytes in one read from the serial line."""
 
 
@@ -378,20 +383,20 @@ class PtyLine:
     ----------
     port : str
         Path of the terminal that the host opens.
-    lost : int
+    lost_byte_count : int
         Number of bytes that the host did not accept.
     """
 
     def __init__(
         self,
-        handlers: Handlers,
+        handlers: HandlersByDescriptor,
         on_bytes: Callable[[bytes], None],
         on_open: Callable[[bool], None],
     ) -> None:
         self._handlers = handlers
         self._on_bytes = on_bytes
         self._on_open = on_open
-        self.lost = 0
+        self.lost_byte_count = 0
         self.open()
 
     def open(self) -> None:
@@ -409,7 +414,7 @@ class PtyLine:
         if self._is_open:
             with suppress(OSError):
                 sent_bytes = os.write(self._simulator_end, data)
-            self.lost += len(data) - sent_bytes
+            self.lost_byte_count += len(data) - sent_bytes
 
     def poll(self) -> None:
         """Check whether the host has opened or closed the port."""
@@ -428,7 +433,7 @@ class PtyLine:
         """Read bytes of the host, and register whether the host has the port open."""
         received_bytes = b""
         try:
-            received_bytes = os.read(self._simulator_end, _LINE_READ_SIZE)
+            received_bytes = os.read(self._simulator_end, _MAX_LINE_READ_BYTES)
             is_open = True
         except BlockingIOError:
             is_open = True

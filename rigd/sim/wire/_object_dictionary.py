@@ -13,9 +13,9 @@ from rigd.devices.eds import EdsEntry, EdsError, read_eds
 
 # Objects
 
-INTEGER_LETTERS = "bBhHiIqQ"
+INTEGER_TYPE_LETTERS = "bBhHiIqQ"
 """Letters of :mod:`struct` for the integer types."""
-_INTEGER_LAYOUTS = {kind: Struct("<" + kind) for kind in INTEGER_LETTERS}
+_INTEGER_LAYOUTS = {type_letter: Struct("<" + type_letter) for type_letter in INTEGER_TYPE_LETTERS}
 """Binary layout of each integer type, by its letter."""
 _MAX_TEXT_BYTES = 1024
 """Largest number of bytes that can be written to a text of variable length."""
@@ -57,11 +57,11 @@ class Abort(Exception):
 class EntryDescription:
     """Description of one sub-index in a device's file."""
 
-    kind: str
+    type_letter: str
     """Type letter, as in `Entry`."""
     access: str
     """Access right by SDO: "rw", "ro" or "wo"."""
-    mapping: str
+    pdo_directions: str
     """Kinds of PDO into which the object can be mapped: "r", "t", "rt" or none."""
     default: int | None = None
     """Value at power-on; None if the file does not state it."""
@@ -74,13 +74,13 @@ class EntryDescription:
     has_fixed_length: bool = False
     """Whether bytes can be written only with the length of `text`."""
 
-    def entry(self) -> "Entry":
+    def make_entry(self) -> "Entry":
         """Return an entry that stores what is written to it, and has no other function."""
         return Entry(
-            self.kind,
+            self.type_letter,
             self.default or 0,
             self.access,
-            self.mapping,
+            self.pdo_directions,
             self.low,
             self.high,
             self.text,
@@ -94,14 +94,14 @@ class Entry:
 
     Attributes
     ----------
-    kind
+    type_letter
         Letter of :mod:`struct` for the number ("b", "B", "h", "H", "i", "I", "q", "Q"), or "s" for
         bytes: a text, or a value that the simulation does not use.
     value
         Value at power-on.
     access
         "rw", "ro" or "wo", as seen by SDO.
-    mapping
+    pdo_directions
         Kinds of PDO into which it can be mapped: "r" (received), "t" (transmitted), "rt" or none.
     low, high
         Range of values that can be written; by default that of the type.
@@ -111,22 +111,22 @@ class Entry:
         Whether bytes can be written only with the length of `text`.
     read_value
         Function that returns the value if it is not stored; None if it is stored.
-    check
+    check_value
         Function that raises `Abort` if a value cannot be written now.
     after_write
         Function that is called after a value has been written.
     """
 
-    kind: str
+    type_letter: str
     value: int = 0
     access: str = "rw"
-    mapping: str = ""
+    pdo_directions: str = ""
     low: int | None = None
     high: int | None = None
     text: bytes = b""
     has_fixed_length: bool = False
     read_value: Callable[[], int] | None = None
-    check: Callable[[int], None] | None = None
+    check_value: Callable[[int], None] | None = None
     after_write: Callable[[], None] | None = None
     default: int = field(init=False)
     default_text: bytes = field(init=False)
@@ -148,14 +148,14 @@ class Entry:
         the value, check it and react to it remain. `default` is the new value at power-on; None
         leaves it unchanged.
         """
-        if self.read_value is not None and description.kind != self.kind:
+        if self.read_value is not None and description.type_letter != self.type_letter:
             self.read_value = partial(
-                _clamped_value, self.read_value, *_type_range(description.kind)
+                _clamped_value, self.read_value, *_type_range(description.type_letter)
             )
-        self.kind, self.access, self.mapping = (
-            description.kind,
+        self.type_letter, self.access, self.pdo_directions = (
+            description.type_letter,
             description.access,
-            description.mapping,
+            description.pdo_directions,
         )
         # The capabilities of the simulated drive limit the range, too.
         lower_limit = max((x for x in (self.low, description.low) if x is not None), default=None)
@@ -163,19 +163,19 @@ class Entry:
         self._set_range(lower_limit, upper_limit)
         if default is not None:
             self.default = default
-        type_minimum, type_maximum = _type_range(self.kind)
+        type_minimum, type_maximum = _type_range(self.type_letter)
         self.value = self.default = min(max(self.default, type_minimum), type_maximum)
 
     def _set_range(self, low: int | None, high: int | None) -> None:
         """Set the length in bits, and the range of values, by default that of the type."""
-        self.bits = 0 if self.kind == "s" else 8 * _INTEGER_LAYOUTS[self.kind].size
-        type_minimum, type_maximum = _type_range(self.kind)
+        self.bits = 0 if self.type_letter == "s" else 8 * _INTEGER_LAYOUTS[self.type_letter].size
+        type_minimum, type_maximum = _type_range(self.type_letter)
         self._low = type_minimum if low is None else low
         self._high = type_maximum if high is None else high
 
     def accepts_length(self, byte_count: int) -> bool:
         """Return whether a value of `byte_count` bytes can be written to the entry."""
-        if self.kind != "s":
+        if self.type_letter != "s":
             return 8 * byte_count == self.bits
         return (
             byte_count == len(self.text) if self.has_fixed_length else byte_count <= _MAX_TEXT_BYTES
@@ -184,7 +184,7 @@ class Entry:
     @property
     def max_bytes(self) -> int:
         """Largest number of bytes that can be written to the entry."""
-        if self.kind != "s":
+        if self.type_letter != "s":
             return self.bits // 8
         return len(self.text) if self.has_fixed_length else _MAX_TEXT_BYTES
 
@@ -199,8 +199,8 @@ class Entry:
         """
         if not self._low <= received_integer <= self._high:
             raise Abort(AbortCode.INVALID_VALUE)
-        if self.check is not None:
-            self.check(received_integer)
+        if self.check_value is not None:
+            self.check_value(received_integer)
         self.value = received_integer
 
     def reset(self) -> None:
@@ -210,7 +210,11 @@ class Entry:
 
     def encode(self) -> bytes:
         """Return the value as bytes for an SDO upload."""
-        return self.text if self.kind == "s" else _INTEGER_LAYOUTS[self.kind].pack(self.get())
+        return (
+            self.text
+            if self.type_letter == "s"
+            else _INTEGER_LAYOUTS[self.type_letter].pack(self.get())
+        )
 
     def store_bytes(self, data: bytes) -> int | str:
         """Store the bytes of an SDO download; return them as an integer, or in hexadecimal.
@@ -219,20 +223,20 @@ class Entry:
         """
         if not self.accepts_length(len(data)):
             raise Abort(AbortCode.WRONG_LENGTH)
-        if self.kind == "s":
+        if self.type_letter == "s":
             self.text = data
             return data.hex()
-        stored_integer: int = _INTEGER_LAYOUTS[self.kind].unpack(data)[0]
+        stored_integer: int = _INTEGER_LAYOUTS[self.type_letter].unpack(data)[0]
         self.store_integer(stored_integer)
         return stored_integer
 
 
-def _type_range(type_letter: str) -> tuple[int, int]:
+def _type_range(integer_type_letter: str) -> tuple[int, int]:
     """Return the smallest and the largest value of a type."""
-    length_bit = 0 if type_letter == "s" else 8 * _INTEGER_LAYOUTS[type_letter].size
-    if type_letter == "s" or type_letter.isupper():
-        return 0, (1 << length_bit) - 1
-    return -(1 << (length_bit - 1)), (1 << (length_bit - 1)) - 1
+    bit_length = 0 if integer_type_letter == "s" else 8 * _INTEGER_LAYOUTS[integer_type_letter].size
+    if integer_type_letter == "s" or integer_type_letter.isupper():
+        return 0, (1 << bit_length) - 1
+    return -(1 << (bit_length - 1)), (1 << (bit_length - 1)) - 1
 
 
 def _clamped_value(read_value: Callable[[], int], lowest: int, largest: int) -> int:
@@ -247,93 +251,98 @@ class ObjectDictionary:
         self._entries: dict[tuple[int, int], Entry] = {}
         self._indices: set[int] = set()
 
-    def __getitem__(self, key: tuple[int, int]) -> Entry:
-        return self._entries[key]
+    def __getitem__(self, index_and_sub_index: tuple[int, int]) -> Entry:
+        return self._entries[index_and_sub_index]
 
-    def add(self, index: int, entry: Entry, sub: int = 0) -> Entry:
+    def add(self, index: int, entry: Entry, sub_index: int = 0) -> Entry:
         """Add an entry to the dictionary, and return the entry."""
-        self._entries[index, sub] = entry
+        self._entries[index, sub_index] = entry
         self._indices.add(index)
         return entry
 
     def add_record(self, index: int, entries: dict[int, Entry]) -> None:
         """Add entries from sub-index 1 on, and the highest sub-index as sub-index 0."""
         self.add(index, Entry("B", max(entries), access="ro"))
-        for sub, sub_entry in entries.items():
-            self.add(index, sub_entry, sub)
+        for sub_index, sub_entry in entries.items():
+            self.add(index, sub_entry, sub_index)
 
     def adopt_file_entries(
-        self, file: Mapping[tuple[int, int], EntryDescription], unchanged_indices: Container[int]
+        self,
+        description_by_index: Mapping[tuple[int, int], EntryDescription],
+        unchanged_indices: Container[int],
     ) -> None:
         """Restrict the dictionary to the entries in a device's file, with the file's descriptions.
 
         Entries that are integers in dictionary and file retain their functions. All other entries
-        of the file only store values. The entries of `file` are by index and sub-index. Objects
-        with an index in `unchanged_indices` retain their values at power-on.
+        of the file only store values. The entries of `description_by_index` are by index and
+        sub-index. Objects with an index in `unchanged_indices` retain their values at power-on.
         """
         previous_entries, self._entries = self._entries, {}
         self._indices.clear()
-        for (index, sub), entry_description in file.items():
-            adopted_entry = previous_entries.get((index, sub))
-            if adopted_entry is None or "s" in (adopted_entry.kind, entry_description.kind):
-                adopted_entry = entry_description.entry()
+        for (index, sub_index), entry_description in description_by_index.items():
+            adopted_entry = previous_entries.get((index, sub_index))
+            if adopted_entry is None or "s" in (
+                adopted_entry.type_letter,
+                entry_description.type_letter,
+            ):
+                adopted_entry = entry_description.make_entry()
             else:
                 adopted_entry.adopt_description(
                     entry_description,
                     None if index in unchanged_indices else entry_description.default,
                 )
-            self.add(index, adopted_entry, sub)
+            self.add(index, adopted_entry, sub_index)
 
-    def override_entry(self, index: int, sub: int, value: int | None) -> None:
+    def override_entry(self, index: int, sub_index: int, value: int | None) -> None:
         """Set the present value and the power-on value of an entry; None removes the entry.
 
         An entry that does not exist is added.
         """
         if value is None:
-            self._entries.pop((index, sub), None)
+            self._entries.pop((index, sub_index), None)
             return
-        overridden_entry = self._entries.get((index, sub))
+        overridden_entry = self._entries.get((index, sub_index))
         if overridden_entry is None:
-            overridden_entry = self.add(index, Entry("I"), sub)
+            overridden_entry = self.add(index, Entry("I"), sub_index)
         overridden_entry.value = overridden_entry.default = value
 
-    def find(self, index: int, sub: int) -> Entry:
+    def find(self, index: int, sub_index: int) -> Entry:
         """Return the entry of the dictionary at an index and sub-index.
 
         Raise `Abort` if there is no such entry.
         """
-        found_entry = self._entries.get((index, sub))
+        found_entry = self._entries.get((index, sub_index))
         if found_entry is not None:
             return found_entry
         raise Abort(AbortCode.NO_SUB_INDEX if index in self._indices else AbortCode.NO_OBJECT)
 
-    def read(self, index: int, sub: int) -> bytes:
+    def read(self, index: int, sub_index: int) -> bytes:
         """Return the value of an entry as bytes, as an SDO client reads it.
 
         Raise `Abort` if the entry does not exist or is write-only.
         """
-        read_entry = self.find(index, sub)
+        read_entry = self.find(index, sub_index)
         if read_entry.access == "wo":
             raise Abort(AbortCode.WRITE_ONLY)
         return read_entry.encode()
 
-    def find_writable(self, index: int, sub: int) -> Entry:
+    def find_writable(self, index: int, sub_index: int) -> Entry:
         """Return the entry that an SDO client is about to write.
 
         Raise `Abort` if the entry does not exist or is read-only.
         """
-        writable_entry = self.find(index, sub)
+        writable_entry = self.find(index, sub_index)
         if writable_entry.access == "ro":
             raise Abort(AbortCode.READ_ONLY)
         return writable_entry
 
-    def write(self, index: int, sub: int, data: bytes) -> int | str:
+    def write(self, index: int, sub_index: int, value_bytes: bytes) -> int | str:
         """Write the bytes of an SDO client, and return them as an integer or in hexadecimal.
 
         Raise `Abort` if the entry cannot be written, or the value is not allowed.
         """
-        written_entry = self.find_writable(index, sub)
-        written_value = written_entry.store_bytes(data)
+        written_entry = self.find_writable(index, sub_index)
+        written_value = written_entry.store_bytes(value_bytes)
         if written_entry.after_write is not None:
             written_entry.after_write()
         return written_value
@@ -347,9 +356,9 @@ class ObjectDictionary:
 
 # SDO server
 
-_SDO_HEADER = Struct("<BHB")
+_SDO_HEADER_LAYOUT = Struct("<BHB")
 """Layout of the beginning of an SDO frame: command, index, sub-index."""
-_SDO_ABORT = Struct("<BHBI")
+_SDO_ABORT_LAYOUT = Struct("<BHBI")
 """Layout of an SDO abort: command, index, sub-index, abort code."""
 
 # Client command specifiers, in the three upper bits of the first byte.
@@ -372,18 +381,18 @@ _SEGMENT_SIZE = 7
 class SdoServer:
     """SDO server of a node, for one client.
 
-    `reply` sends the eight bytes of a reply. `after_write` is called after each write with index,
-    sub-index and the value: an integer, or bytes in hexadecimal.
+    `send_reply` sends the eight bytes of a reply. `after_write` is called after each write with
+    index, sub-index and the value: an integer, or bytes in hexadecimal.
     """
 
     def __init__(
         self,
         objects: ObjectDictionary,
-        reply: Callable[[bytes], None],
+        send_reply: Callable[[bytes], None],
         after_write: Callable[[int, int, int | str], None],
     ) -> None:
         self._objects = objects
-        self._reply = reply
+        self._reply = send_reply
         self._after_write = after_write
         self.reset()
 
@@ -394,51 +403,51 @@ class SdoServer:
         self._buffer = b""
         self._toggle = 0
 
-    def receive(self, data: bytes) -> None:
+    def receive(self, request_frame: bytes) -> None:
         """Process an SDO request; ignore a frame that does not have eight bytes."""
-        if len(data) != 8:
+        if len(request_frame) != 8:
             return
-        specifier = data[0] >> 5
-        is_segment = specifier in (_DOWNLOAD_SEGMENT, _UPLOAD_SEGMENT)
+        command_specifier = request_frame[0] >> 5
+        is_segment = command_specifier in (_DOWNLOAD_SEGMENT, _UPLOAD_SEGMENT)
         if not is_segment:
             self.reset()
-            _, self._index, self._sub = _SDO_HEADER.unpack_from(data)
+            _, self._index, self._sub = _SDO_HEADER_LAYOUT.unpack_from(request_frame)
         try:
             if is_segment:
-                self._process_segment(specifier, data)
-            elif specifier == _DOWNLOAD:
-                self._start_download(data)
-            elif specifier == _UPLOAD:
+                self._process_segment(command_specifier, request_frame)
+            elif command_specifier == _DOWNLOAD:
+                self._start_download(request_frame)
+            elif command_specifier == _UPLOAD:
                 self._start_upload()
-            elif specifier != _ABORTED:  # block transfers and invalid specifiers
+            elif command_specifier != _ABORTED:  # block transfers and invalid specifiers
                 raise Abort(AbortCode.UNKNOWN_COMMAND)
         except Abort as abort:
-            self._reply(_SDO_ABORT.pack(0x80, self._index, self._sub, abort.code))
+            self._reply(_SDO_ABORT_LAYOUT.pack(0x80, self._index, self._sub, abort.code))
             self.reset()
 
-    def _start_download(self, data: bytes) -> None:
+    def _start_download(self, request_frame: bytes) -> None:
         """Process a write request: write an expedited value, or expect segments."""
-        command_byte = data[0]
+        command_byte = request_frame[0]
         target_entry = self._objects.find_writable(self._index, self._sub)
         if command_byte & _EXPEDITED_BIT:
             data_size = min(target_entry.max_bytes, _EXPEDITED_SIZE)
             if command_byte & _SIZE_STATED_BIT:
                 data_size = _EXPEDITED_SIZE - (command_byte >> 2 & 0x03)
-            self._write(data[4 : 4 + data_size])
+            self._write(request_frame[4 : 4 + data_size])
         else:
             # An integer has one length, so the segments need not be compared with this length.
-            stated_size = int.from_bytes(data[4:8], "little")
+            stated_size = int.from_bytes(request_frame[4:8], "little")
             if command_byte & _SIZE_STATED_BIT and not target_entry.accepts_length(stated_size):
                 raise Abort(AbortCode.WRONG_LENGTH)
             self._expected_specifier = _DOWNLOAD_SEGMENT
-        self._reply(_SDO_HEADER.pack(0x60, self._index, self._sub).ljust(8, b"\0"))
+        self._reply(_SDO_HEADER_LAYOUT.pack(0x60, self._index, self._sub).ljust(8, b"\0"))
 
     def _start_upload(self) -> None:
         """Process a read request: reply with an expedited value, or offer segments."""
         value_bytes = self._objects.read(self._index, self._sub)
         value_size = len(value_bytes)
         if 0 < value_size <= _EXPEDITED_SIZE:
-            reply_header = _SDO_HEADER.pack(
+            reply_header = _SDO_HEADER_LAYOUT.pack(
                 0x43 | (_EXPEDITED_SIZE - value_size) << 2, self._index, self._sub
             )
             self._reply(reply_header + value_bytes.ljust(_EXPEDITED_SIZE, b"\0"))
@@ -446,46 +455,48 @@ class SdoServer:
         self._expected_specifier = _UPLOAD_SEGMENT
         self._buffer = value_bytes
         self._reply(
-            _SDO_HEADER.pack(0x41, self._index, self._sub) + value_size.to_bytes(4, "little")
+            _SDO_HEADER_LAYOUT.pack(0x41, self._index, self._sub) + value_size.to_bytes(4, "little")
         )
 
-    def _process_segment(self, specifier: int, data: bytes) -> None:
+    def _process_segment(self, command_specifier: int, request_frame: bytes) -> None:
         """Process the request for the next segment: store or send it."""
-        command_byte = data[0]
-        if specifier != self._expected_specifier:
+        command_byte = request_frame[0]
+        if command_specifier != self._expected_specifier:
             raise Abort(AbortCode.UNKNOWN_COMMAND)
         if command_byte & _TOGGLE_BIT != self._toggle:
             raise Abort(AbortCode.WRONG_TOGGLE)
         toggle_bit, self._toggle = self._toggle, self._toggle ^ _TOGGLE_BIT
-        if specifier == _UPLOAD_SEGMENT:
+        if command_specifier == _UPLOAD_SEGMENT:
             segment_bytes, self._buffer = self._buffer[:_SEGMENT_SIZE], self._buffer[_SEGMENT_SIZE:]
-            is_last = not self._buffer
+            is_last_segment = not self._buffer
             reply_header = (
                 toggle_bit
                 | (_SEGMENT_SIZE - len(segment_bytes)) << 1
-                | (_LAST_SEGMENT_BIT if is_last else 0)
+                | (_LAST_SEGMENT_BIT if is_last_segment else 0)
             )
             self._reply(bytes([reply_header]) + segment_bytes.ljust(_SEGMENT_SIZE, b"\0"))
         else:
-            self._buffer += data[1 : 1 + _SEGMENT_SIZE - (command_byte >> 1 & 0x07)]
+            self._buffer += request_frame[1 : 1 + _SEGMENT_SIZE - (command_byte >> 1 & 0x07)]
             # No writable entry is longer. Without this check a client could fill the memory.
             if len(self._buffer) > self._objects.find_writable(self._index, self._sub).max_bytes:
                 raise Abort(AbortCode.WRONG_LENGTH)
-            is_last = bool(command_byte & _LAST_SEGMENT_BIT)
-            if is_last:
+            is_last_segment = bool(command_byte & _LAST_SEGMENT_BIT)
+            if is_last_segment:
                 self._write(self._buffer)
             self._reply(bytes([0x20 | toggle_bit]).ljust(8, b"\0"))
-        if is_last:
+        if is_last_segment:
             self.reset()
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, value_bytes: bytes) -> None:
         """Write a completely received value to the object dictionary, and report the write."""
-        self._after_write(self._index, self._sub, self._objects.write(self._index, self._sub, data))
+        self._after_write(
+            self._index, self._sub, self._objects.write(self._index, self._sub, value_bytes)
+        )
 
 
 # EDS files
 
-_FIRST_INDEX = 0x1000
+_FIRST_OBJECT_INDEX = 0x1000
 """Lowest index of objects; below it are types and dummies, which cannot be read."""
 _IDENTITY_INDEX = 0x1018
 """Index of the identity object."""
@@ -509,9 +520,9 @@ _TYPE_LETTERS: Final = {
 """Letters of :mod:`struct` for the integer types of CiA 301; other types are stored as bytes."""
 _TIME_TYPE_LENGTHS: Final = {0x0C: 6, 0x0D: 6}
 """Lengths in bytes of the data types (CiA 301) for time of day and time difference."""
-_SDO_ACCESS: Final = {"const": "ro", "rwr": "rw", "rww": "rw"}
+_SDO_ACCESS_BY_FILE_ACCESS: Final = {"const": "ro", "rwr": "rw", "rww": "rw"}
 """Access right by SDO for an access right in a file that also concerns PDOs."""
-_PDO_DIRECTIONS: Final = {"ro": "t", "const": "t", "wo": "r", "rwr": "t", "rww": "r"}
+_PDO_DIRECTIONS_BY_ACCESS: Final = {"ro": "t", "const": "t", "wo": "r", "rwr": "t", "rww": "r"}
 """Kinds of PDO into which an object can be mapped, by its access right."""
 
 
@@ -532,10 +543,10 @@ class DeviceFile:
 
     def sub_index_count(self, index: int) -> int:
         """Return the number of sub-indices of an object, counted from 1 on without a gap."""
-        sub = 0
-        while (index, sub + 1) in self.entries:
-            sub += 1
-        return sub
+        sub_index = 0
+        while (index, sub_index + 1) in self.entries:
+            sub_index += 1
+        return sub_index
 
 
 def read_device(path: Path, node_id: int) -> DeviceFile:
@@ -547,47 +558,47 @@ def read_device(path: Path, node_id: int) -> DeviceFile:
         eds = read_eds(path, node_id)
     except EdsError as error:
         raise DeviceError(f"The simulated drive cannot be made: {error}") from None
-    descriptions = {
+    description_by_key = {
         key: _to_description(eds_entry)
         for key, eds_entry in eds.entries.items()
-        if key[0] >= _FIRST_INDEX
+        if key[0] >= _FIRST_OBJECT_INDEX
     }
     for sub, identity_number in enumerate((eds.vendor_id, eds.product_code, eds.revision), 1):
-        description = descriptions.get((_IDENTITY_INDEX, sub))
+        description = description_by_key.get((_IDENTITY_INDEX, sub))
         if description is not None and not description.default:
-            descriptions[_IDENTITY_INDEX, sub] = replace(description, default=identity_number)
-    highest_subs: dict[int, int] = {}
-    for index, sub in descriptions:
-        highest_subs[index] = max(sub, highest_subs.get(index, 0))
-    for index, last_sub in highest_subs.items():
-        description = descriptions.get((index, 0))
+            description_by_key[_IDENTITY_INDEX, sub] = replace(description, default=identity_number)
+    highest_sub_by_index: dict[int, int] = {}
+    for index, sub in description_by_key:
+        highest_sub_by_index[index] = max(sub, highest_sub_by_index.get(index, 0))
+    for index, last_sub in highest_sub_by_index.items():
+        description = description_by_key.get((index, 0))
         if (
             last_sub
             and description is not None
             and description.default is None
-            and description.kind == "B"
+            and description.type_letter == "B"
         ):
-            descriptions[index, 0] = replace(description, default=last_sub)
-    return DeviceFile(path.name, descriptions)
+            description_by_key[index, 0] = replace(description, default=last_sub)
+    return DeviceFile(path.name, description_by_key)
 
 
 def _to_description(eds_entry: EdsEntry) -> EntryDescription:
     """Convert the entry of an EDS file to a description for a simulated node."""
-    sdo_access = _SDO_ACCESS.get(eds_entry.access, eds_entry.access)
+    sdo_access = _SDO_ACCESS_BY_FILE_ACCESS.get(eds_entry.access, eds_entry.access)
     type_letter = _TYPE_LETTERS.get(eds_entry.data_type)
     if type_letter is None:
-        size_bytes = _TIME_TYPE_LENGTHS.get(eds_entry.data_type) or (eds_entry.bits or 0) // 8
+        byte_count = _TIME_TYPE_LENGTHS.get(eds_entry.data_type) or (eds_entry.bits or 0) // 8
         return EntryDescription(
             "s",
             sdo_access,
             "",
-            text=_default_bytes(eds_entry, size_bytes),
-            has_fixed_length=size_bytes > 0,
+            text=_default_bytes(eds_entry, byte_count),
+            has_fixed_length=byte_count > 0,
         )
     is_boolean = eds_entry.data_type == _BOOLEAN_TYPE
     # A boolean takes one bit in a PDO, which is not needed here.
     is_mappable = eds_entry.mappable and not is_boolean
-    pdo_directions = _PDO_DIRECTIONS.get(eds_entry.access, "rt") if is_mappable else ""
+    pdo_directions = _PDO_DIRECTIONS_BY_ACCESS.get(eds_entry.access, "rt") if is_mappable else ""
     lower_limit, upper_limit = eds_entry.low, 1 if is_boolean else eds_entry.high
     if (
         lower_limit is not None and upper_limit is not None and lower_limit >= upper_limit
@@ -611,11 +622,11 @@ def _to_description(eds_entry: EdsEntry) -> EntryDescription:
 
 def _to_type_range(file_value: int, type_letter: str) -> int:
     """Convert a value to the range of its type; files may state negative values as unsigned."""
-    length_bit = 8 * calcsize("<" + type_letter)
-    file_value &= (1 << length_bit) - 1
+    bit_length = 8 * calcsize("<" + type_letter)
+    file_value &= (1 << bit_length) - 1
     return (
-        file_value - (1 << length_bit)
-        if type_letter.islower() and file_value >> (length_bit - 1)
+        file_value - (1 << bit_length)
+        if type_letter.islower() and file_value >> (bit_length - 1)
         else file_value
     )
 

@@ -36,11 +36,11 @@ from rigd.sim import SimulatedRig
 from rigd.sim.wire._bus_simulation import BusSimulation
 from rigd.sim.wire._faults import EventLog, Fault, FaultError, WrongUseError, parse_fault
 from rigd.sim.wire._links import (
-    Handlers,
+    HandlersByDescriptor,
     PtyLine,
     VirtualBus,
     VirtualCan,
-    is_virtual,
+    is_virtual_can,
     listen,
     without_transport_delay,
 )
@@ -117,19 +117,19 @@ def stop_requested() -> Iterator[Callable[[], bool]]:
     previous_handlers = {
         signal_number: signal.getsignal(signal_number) for signal_number in _STOP_SIGNALS
     }
-    handled_signals = [
+    caught_signals = [
         signal_number
         for signal_number, signal_handler in previous_handlers.items()
         if signal_handler != signal.SIG_IGN
     ]
-    for signal_number in handled_signals:
+    for signal_number in caught_signals:
         signal.signal(
-            signal_number, lambda number_received, _: received_signals.append(number_received)
+            signal_number, lambda signal_received, _: received_signals.append(signal_received)
         )
     try:
         yield lambda: bool(received_signals)
     finally:
-        for signal_number in handled_signals:
+        for signal_number in caught_signals:
             signal.signal(signal_number, previous_handlers[signal_number])
 
 
@@ -145,13 +145,15 @@ _MAX_REQUEST_BYTES = 65_536
 class ControlSocket:
     """Unix socket on which other processes send requests, served by the event loop.
 
-    This class updates `handlers`, the handlers of the event loop by file descriptor. `answer`
-    returns the reply to a request.
+    This class updates `handlers`, the handlers of the event loop by file descriptor.
+    `answer_request` returns the reply to a request.
     """
 
-    def __init__(self, path: Path, handlers: Handlers, answer: RequestHandler) -> None:
+    def __init__(
+        self, path: Path, handlers: HandlersByDescriptor, answer_request: RequestHandler
+    ) -> None:
         self._handlers = handlers
-        self._answer = answer
+        self._answer = answer_request
         self._links: dict[socket.socket, bytes] = {}
         self._path = path
         self._listener = listen(path)
@@ -211,7 +213,7 @@ class ControlSocket:
 
 # The process
 
-_LONGEST_WAIT_S = 0.01
+_MAX_EVENT_WAIT_S = 0.01
 """Longest time in seconds that the event loop waits while nothing is due."""
 
 
@@ -289,14 +291,14 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
     return 0
 
 
-def inject(rig_name: str, specs: list[str]) -> list[str]:
+def inject(rig_name: str, fault_specs: list[str]) -> list[str]:
     """Inject faults into the running simulated rig of a profile.
 
     Parameters
     ----------
     rig_name
         Name of the profile.
-    specs
+    fault_specs
         Faults in the syntax of `parse_fault`; an empty list requests the status.
 
     Returns
@@ -318,8 +320,10 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
             f"No simulated rig of the profile {rig_name} runs; start it with: rigd simulate "
             f"--profile {rig_name}"
         )
-    faults = [parse_fault(spec) for spec in specs]  # all of them, before the first one happens
-    if not specs:
+    faults = [
+        parse_fault(spec) for spec in fault_specs
+    ]  # all of them, before the first one happens
+    if not fault_specs:
         return [
             f"{value_name}: {injected_value}"
             for value_name, injected_value in ask_simulator(
@@ -327,11 +331,13 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
             ).items()
         ]
     report_lines = []
-    for fault, spec in zip(faults, specs, strict=True):
+    for fault, spec in zip(faults, fault_specs, strict=True):
         injected_fault = str(ask_simulator(simulator_address, {"inject": spec})["injected"])
-        end = f"rigd inject --profile {rig_name} end,fault={fault.kind}"
+        end_command = f"rigd inject --profile {rig_name} end,fault={fault.kind}"
         report_lines.append(
-            f"{injected_fault}; it lasts until: {end}" if fault.is_persistent else injected_fault
+            f"{injected_fault}; it lasts until: {end_command}"
+            if fault.is_persistent
+            else injected_fault
         )
     return report_lines
 
@@ -347,23 +353,23 @@ class _SimulatorProcess:
         self._options = options
         self._log = log
         self._exit_stack = exit_stack
-        self._handlers: Handlers = {}
+        self._handlers: HandlersByDescriptor = {}
         self._device_file: DeviceFile | None = None
         assert rig.cia402 is not None
-        eds = options.eds or (Path(rig.cia402.eds) if rig.cia402.eds else None)
-        if eds is not None:
+        eds_path = options.eds or (Path(rig.cia402.eds) if rig.cia402.eds else None)
+        if eds_path is not None:
             from rigd.sim.wire._object_dictionary import read_device
 
-            self._device_file = read_device(eds, rig.cia402.node_id)
-        socket_path = exit_stack.enter_context(socket_folder(rig.name))
+            self._device_file = read_device(eds_path, rig.cia402.node_id)
+        socket_folder_path = exit_stack.enter_context(socket_folder(rig.name))
         self._bus: VirtualBus | VirtualCan
-        can_socket = ""
-        if rig.can.interface == "socketcan" and is_virtual(rig.can.channel):
+        can_socket_path = ""
+        if rig.can.interface == "socketcan" and is_virtual_can(rig.can.channel):
             self._bus = VirtualCan(rig.can.channel, self._handlers, self._on_frames)
         else:
-            can_socket = str(socket_path / f"{rig.name}.can")
+            can_socket_path = str(socket_folder_path / f"{rig.name}.can")
             self._bus = VirtualBus(
-                Path(can_socket), self._handlers, self._on_frames, self._on_clients
+                Path(can_socket_path), self._handlers, self._on_frames, self._on_clients
             )
         exit_stack.callback(self._bus.close)
         self._serial_line: PtyLine | None = None
@@ -375,14 +381,14 @@ class _SimulatorProcess:
         self._sessions = 0
         self._bus_simulation = self._make_bus_simulation()
         control_socket = ControlSocket(
-            socket_path / f"{rig.name}.control", self._handlers, self._answer
+            socket_folder_path / f"{rig.name}.control", self._handlers, self._answer
         )
         exit_stack.callback(control_socket.close)
         self._address = SimulatorAddress(
             pid=os.getpid(),
-            control_socket=str(socket_path / f"{rig.name}.control"),
-            can_socket=can_socket,
-            serial_port=self._port,
+            control_socket=str(socket_folder_path / f"{rig.name}.control"),
+            can_socket=can_socket_path,
+            serial_port=self._serial_port,
             lock_step=options.lock_step,
             rig=described(rig),
         )
@@ -391,14 +397,14 @@ class _SimulatorProcess:
         """Inject the initial faults, print the rig's addresses, and write the address file."""
         for initial_fault in self._options.faults:
             self._bus_simulation.inject(initial_fault)
-        start_values = {} if self._options.lock_step else {"monotonic_ns": time.monotonic_ns()}
+        start_log_values = {} if self._options.lock_step else {"monotonic_ns": time.monotonic_ns()}
         self._log(
             "simulator",
             "started",
             rig=self._rig.name,
             lock_step=self._options.lock_step,
             **({} if self._device_file is None else {"eds": self._device_file.name}),
-            **start_values,
+            **start_log_values,
         )
         for start_line in self._start_messages():
             self._log.print_line(start_line)
@@ -415,7 +421,7 @@ class _SimulatorProcess:
             with suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
 
-    def serve(self, stop: Callable[[], bool]) -> None:
+    def serve(self, is_stop_requested: Callable[[], bool]) -> None:
         """Run the simulator's event loop until a stop is requested."""
         event_handlers, bus_simulation, serial_line, log = (
             self._handlers,
@@ -423,20 +429,20 @@ class _SimulatorProcess:
             self._serial_line,
             self._log,
         )
-        now_ns = time.monotonic_ns
-        poll_ns = 0
-        while not stop():
+        monotonic_ns = time.monotonic_ns
+        next_poll_ns = 0
+        while not is_stop_requested():
             ready_descriptors, _, _ = select.select(
-                event_handlers, (), (), bus_simulation.wait_s(now_ns(), _LONGEST_WAIT_S)
+                event_handlers, (), (), bus_simulation.wait_s(monotonic_ns(), _MAX_EVENT_WAIT_S)
             )
             for descriptor in ready_descriptors:
                 event_handler = event_handlers.get(descriptor)
                 if event_handler is not None:  # not closed by one of the others
                     event_handler()
-            now = now_ns()
-            bus_simulation.elapse(now)
-            if now > poll_ns:
-                poll_ns = now + round(_LONGEST_WAIT_S * 1e9)
+            now_ns = monotonic_ns()
+            bus_simulation.elapse(now_ns)
+            if now_ns > next_poll_ns:
+                next_poll_ns = now_ns + round(_MAX_EVENT_WAIT_S * 1e9)
                 log.flush()
                 if serial_line is not None:
                     serial_line.poll()
@@ -455,10 +461,10 @@ class _SimulatorProcess:
             simulated_rig,
             lock_step=self._options.lock_step,
             now_ns=time.monotonic_ns(),
-            send=self._bus.send,
-            write=_discard_output if serial_line is None else serial_line.write,
-            cut=self._interrupt,
-            mend=self._reconnect,
+            send_frame=self._bus.send,
+            write_bytes=_discard_output if serial_line is None else serial_line.write,
+            interrupt_line=self._interrupt,
+            reconnect_line=self._reconnect,
             log=self._log,
         )
         assert rig.cia402 is not None
@@ -469,7 +475,7 @@ class _SimulatorProcess:
             bus_simulation.can_sender("drive"),
             self._log,
             sync_timeout_s=self._sync_timeout_s(),
-            file=self._device_file,
+            device_file=self._device_file,
         )
         bus_simulation.add_node("drive", drive_node)
         if rig.ati_serial is not None:
@@ -516,18 +522,18 @@ class _SimulatorProcess:
         yield f"  session  rigd run chirp --profile {rig.name}{fast_option}"
         yield f"  fault    rigd inject --profile {rig.name} freeze,device=drive,for=0.5"
 
-    def _on_frames(self, frames: list[bytes], origin: object) -> None:
+    def _on_frames(self, frames: list[bytes], sending_host: object) -> None:
         """Pass frames of a host to the simulation."""
-        self._bus_simulation.receive_frames(frames, origin, time.monotonic_ns())
+        self._bus_simulation.receive_frames(frames, sending_host, time.monotonic_ns())
 
     def _on_bytes(self, data: bytes) -> None:
         """Pass bytes of the serial host to the simulation."""
         self._bus_simulation.receive_serial(data)
 
-    def _on_clients(self, event: str, count: int) -> None:
+    def _on_clients(self, event_text: str, client_count: int) -> None:
         """Log that a client of the CAN bus has connected or disconnected."""
-        self._log("bus", event, clients=count)
-        if count == 0:
+        self._log("bus", event_text, clients=client_count)
+        if client_count == 0:
             self._bus_simulation.stop_waiting(time.monotonic_ns())
 
     def _on_port(self, is_open: bool) -> None:
@@ -548,11 +554,11 @@ class _SimulatorProcess:
         elif self._serial_line is not None:
             self._serial_line.open()
             # The line may have a new name, which the next process has to find.
-            self._address = replace(self._address, serial_port=self._port)
+            self._address = replace(self._address, serial_port=self._serial_port)
             announce(self._rig.name, self._address)
 
     @property
-    def _port(self) -> str:
+    def _serial_port(self) -> str:
         """Name of the serial port for the host; empty if there is none."""
         return "" if self._serial_line is None else self._serial_line.port
 
@@ -581,9 +587,9 @@ class _SimulatorProcess:
                 "lock_step": self._options.lock_step,
                 "moved_periods": self._bus_simulation.rig_periods,
                 "syncs": self._bus_simulation.syncs,
-                "clients": self._bus.clients,
-                "lost_frames": self._bus.lost,
-                "lost_bytes": 0 if self._serial_line is None else self._serial_line.lost,
+                "clients": self._bus.client_count,
+                "lost_frames": self._bus.lost_frame_count,
+                "lost_bytes": 0 if self._serial_line is None else self._serial_line.lost_byte_count,
                 "disturbed": self._bus_simulation.disturbed_senders,
             }
         return {"error": "A request has to be 'inject', 'status' or 'renew_noise'."}

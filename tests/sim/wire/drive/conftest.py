@@ -252,6 +252,6 @@ def eds_bench():
     """Make the bench of a drive as an EDS file describes it."""
 
     def make(path):
-        return Bench(make_rig(), file=read_device(path, NODE)).boot()
+        return Bench(make_rig(), device_file=read_device(path, NODE)).boot()
 
     return make

@@ -126,10 +126,10 @@ class Recording:
             simulated,
             lock_step=lock_step,
             now_ns=0,
-            send=lambda raw, origin: self.sent.append((raw, origin)),
-            write=self._write,
-            cut=self.cuts.append,
-            mend=self.mended.append,
+            send_frame=lambda raw, origin: self.sent.append((raw, origin)),
+            write_bytes=self._write,
+            interrupt_line=self.cuts.append,
+            reconnect_line=self.mended.append,
             log=log,
         )
         self.drive = Drive(self.world.step, self.world.can_sender("drive"))
