@@ -56,14 +56,14 @@ def test_no_wait_for_the_rest_of_a_message(pipe):
     reader, message = MessageReader(read), ReadyToRecord({"start_angle_rad": "0.1"})
     for byte in (data := encode(message))[:-1]:
         os.write(write, bytes([byte]))
-        assert reader.next(0.0) is None
+        assert reader.next_message(0.0) is None
     os.write(write, data[-1:] + encode(ControlEnded("")) + data[:7])
-    assert reader.next(0.0) == message
-    assert reader.next(None) == ControlEnded("")
-    assert reader.next(0.01) is None
+    assert reader.next_message(0.0) == message
+    assert reader.next_message(None) == ControlEnded("")
+    assert reader.next_message(0.01) is None
     os.close(write)
     with pytest.raises(EOFError):
-        reader.next(None)
+        reader.next_message(None)
 
 
 def test_no_wait_for_an_invalid_message(pipe):

@@ -216,7 +216,8 @@ class BusSimulation:
     `now_ns` is the present time on a monotonic clock. `send_frame` sends a frame to the hosts on
     the CAN bus; its second argument is the host that sent the frame, or None for a node.
     `write_bytes` sends bytes to the host on the serial line. `interrupt_line` and
-    `reconnect_line` interrupt and reconnect the "bus" or the line of the "sensor". This class sets the time of `log`.
+    `reconnect_line` interrupt and reconnect the "bus" or the line of the "sensor". This class sets
+    the time of `log`.
 
     Attributes
     ----------
