@@ -129,8 +129,8 @@ def run_alone(
             usage_meter.sample(Phase(shared_state[StateField.PHASE]))
             while sample_block := channels.samples.take(_BLOCK_RECORDS):
                 sample_blocks.append(sample_block)
-            channels.controls.discard()
-            channels.timings.discard()
+            channels.controls.discard_records()
+            channels.timings.discard_records()
             on_poll()
     _require_complete(finished_message.outcome, finished_message.reason)
     return record_measurement(

@@ -57,7 +57,7 @@ class PluginController:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # SystemExit is no Exception
-            raise self._failure("reset", error_text(error)) from error
+            raise self._controller_error("reset", error_text(error)) from error
 
     def step(self, reference_rad: float, angle_rad: float, coupling_torque_nm: float) -> float:
         """Return the torque command of a tick in N·m, within the limit.
@@ -70,9 +70,9 @@ class PluginController:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # SystemExit is no Exception
-            raise self._failure("step", error_text(error)) from error
+            raise self._controller_error("step", error_text(error)) from error
         if not is_usable:
-            raise self._failure("step", f"it returned {controller_output!r}")
+            raise self._controller_error("step", f"it returned {controller_output!r}")
         pid = self._pid
         if pid is not None:
             torque_nm = pid.step(reference_rad + controller_output, angle_rad, coupling_torque_nm)
@@ -83,7 +83,7 @@ class PluginController:
         self.saturated = not -limit_nm <= controller_output <= limit_nm
         return min(max(float(controller_output), -limit_nm), limit_nm)
 
-    def _failure(self, method_name: str, failure_text: str) -> ControllerError:
+    def _controller_error(self, method_name: str, failure_text: str) -> ControllerError:
         """Return the error that names the package, the failed method and the kind of failure."""
         return ControllerError(
             str(

@@ -89,7 +89,7 @@ def _pid_law(model: LoopModel) -> ControlLaw:
     return ControlLaw(a, b, c, d)
 
 
-class LinearStep:
+class RunningLinearController:
     """Linear controller of a package, stepped once a tick.
 
     The anti-windup acts above `torque_limit_nm`, which is infinite for a shift of the reference.
@@ -132,9 +132,9 @@ class LinearStep:
         states_and_inputs[n + 2] = coupling_torque_nm
         np.dot(self._matrix, states_and_inputs, out=result)
         self._next_states[:] = result[:n]
-        output = float(result[n])
+        controller_output = float(result[n])
         limit_nm = self._torque_limit_nm
-        if self._anti_windup is not None and not -limit_nm <= output <= limit_nm:
-            limited_nm = min(max(output, -limit_nm), limit_nm)
-            self._next_states += self._anti_windup * (limited_nm - output)
-        return output
+        if self._anti_windup is not None and not -limit_nm <= controller_output <= limit_nm:
+            limited_nm = min(max(controller_output, -limit_nm), limit_nm)
+            self._next_states += self._anti_windup * (limited_nm - controller_output)
+        return controller_output

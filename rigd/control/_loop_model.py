@@ -7,7 +7,7 @@ from math import isfinite
 from rigd.beam import Plant
 from rigd.control._pid import ControlSettings
 
-INPUTS = ("reference_rad", "angle_rad", "coupling_torque_nm")
+CONTROLLER_INPUTS = ("reference_rad", "angle_rad", "coupling_torque_nm")
 """Inputs of a linear controller, in the order of the columns of its matrices b and d."""
 
 MAX_CONTROLLER_STATES = 200
@@ -57,7 +57,7 @@ class LinearController:
         n = len(self.a)
         if not 0 < n <= MAX_CONTROLLER_STATES:
             raise ValueError(f"a has {n} rows; a controller has 1 to {MAX_CONTROLLER_STATES}.")
-        shape_by_matrix = {"a": (n, n), "b": (n, len(INPUTS))}
+        shape_by_matrix = {"a": (n, n), "b": (n, len(CONTROLLER_INPUTS))}
         for name, (row_count, column_count) in shape_by_matrix.items():
             matrix = tuple(tuple(map(float, row)) for row in getattr(self, name))
             if len(matrix) != row_count or {len(row) for row in matrix} != {column_count}:
@@ -65,7 +65,7 @@ class LinearController:
             object.__setattr__(self, name, matrix)
         length_by_vector = {
             "c": n,
-            "d": len(INPUTS),
+            "d": len(CONTROLLER_INPUTS),
             "anti_windup": n if len(self.anti_windup) else 0,
         }
         for name, length in length_by_vector.items():

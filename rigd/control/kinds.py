@@ -4,7 +4,7 @@ from functools import lru_cache
 from typing import Final
 
 from rigd.control._added import PluginController
-from rigd.control._control_law import LinearStep
+from rigd.control._control_law import RunningLinearController
 from rigd.control._loop_model import LinearController
 from rigd.control._pid import SHIPPED_CONTROLLER, PidController, design_pid
 from rigd.control.contracts import Controller, LoopController
@@ -61,26 +61,28 @@ def make_controller(rig: ControlledRig) -> LoopController:
     ControlDesignError
         If the PID cannot be designed.
     """
-    owner = _owner_of(rig)
-    if owner is None:
+    controller_plugin = _plugin_of_controller(rig)
+    if controller_plugin is None:
         make_shipped = SHIPPED[rig.loop.settings.controller].make
         assert make_shipped is not None
         loop_controller = make_shipped(rig)
         assert isinstance(loop_controller, LoopController)
         return loop_controller
-    kind = CONTROLLERS.load(owner)
+    kind = CONTROLLERS.load(controller_plugin)
     if kind.make is None:
-        linear = linear_controller(rig)
-        assert linear is not None
-        limit_nm = float("inf") if kind.shifts_reference else rig.torque_limit_nm
-        controller: Controller = LinearStep(linear, limit_nm)
+        linear_law = linear_controller(rig)
+        assert linear_law is not None
+        torque_limit_nm = float("inf") if kind.shifts_reference else rig.torque_limit_nm
+        controller: Controller = RunningLinearController(linear_law, torque_limit_nm)
     else:
-        with plugin_errors(owner):
+        with plugin_errors(controller_plugin):
             controller = kind.make(rig)
         if not all(callable(getattr(controller, name, None)) for name in ("reset", "step")):
-            raise owner.error(f"{type(controller).__name__} has no reset and step; add them.")
+            raise controller_plugin.error(
+                f"{type(controller).__name__} has no reset and step; add them."
+            )
     pid = _make_pid(rig) if kind.shifts_reference else None
-    return PluginController(controller, rig.torque_limit_nm, owner, pid)
+    return PluginController(controller, rig.torque_limit_nm, controller_plugin, pid)
 
 
 def linear_controller(rig: ControlledRig) -> LinearController | None:
@@ -96,36 +98,38 @@ def linear_controller(rig: ControlledRig) -> LinearController | None:
     PluginError
         If the package that adds the kind cannot be used, or its code fails.
     """
-    owner = _owner_of(rig)
+    owner = _plugin_of_controller(rig)
     if owner is None:
         return None
     with plugin_errors(owner):
         return _linear_controller(CONTROLLERS.load(owner), owner, rig)
 
 
-def _owner_of(rig: ControlledRig) -> Plugin | None:
+def _plugin_of_controller(rig: ControlledRig) -> Plugin | None:
     """Return the package that adds the controller of a rig, or None for a shipped one.
 
     Raise `PluginError` if there is no such controller any more, or its package cannot be used.
     """
     name = rig.loop.settings.controller
-    owner = CONTROLLERS.owner(name)
-    if owner is None and name not in SHIPPED:
+    controller_plugin = CONTROLLERS.owner(name)
+    if controller_plugin is None and name not in SHIPPED:
         raise PluginError(
             f'control.controller = "{name}": no installed package adds it; install the package, or '
             f'set control.controller = "{SHIPPED_CONTROLLER}".'
         )
-    return owner
+    return controller_plugin
 
 
 @lru_cache(maxsize=8)
 def _linear_controller(
-    kind: ControllerKind, owner: Plugin, rig: ControlledRig
+    kind: ControllerKind, controller_plugin: Plugin, rig: ControlledRig
 ) -> LinearController | None:
     """Return the matrices of a kind of controller for a rig; a design may take seconds."""
     if kind.linear is None:
         return None
-    linear = kind.linear(rig)
-    if not isinstance(linear, LinearController):
-        raise owner.error(f"its linear returns a {type(linear).__name__}, not a LinearController.")
-    return linear
+    linear_law = kind.linear(rig)
+    if not isinstance(linear_law, LinearController):
+        raise controller_plugin.error(
+            f"its linear returns a {type(linear_law).__name__}, not a LinearController."
+        )
+    return linear_law

@@ -167,7 +167,7 @@ class _StopOfAll:
             socket_paths = set()
         for folder in [*known_folders(self._uid or None), GROUP_FOLDER]:
             report.searched.append(str(folder))
-            folder_fault_text = folder_fault(folder, shared=folder == GROUP_FOLDER)
+            folder_fault_text = folder_fault(folder, is_shared=folder == GROUP_FOLDER)
             if folder_fault_text:
                 report.doubts.append(folder_fault_text)
             try:
@@ -332,7 +332,7 @@ class _DaemonStop:
         """Return the reason not to trust the replies of a process on the socket; "" if trusted."""
         folder, rig = self._path.parent, self._path.name.removesuffix(SOCKET_SUFFIX)
         is_group_folder = folder == GROUP_FOLDER
-        if folder_fault(folder, shared=is_group_folder):
+        if folder_fault(folder, is_shared=is_group_folder):
             return "Other users can write to its folder."
         try:
             holds_lock = holds_rig_lock(pid, rig, folder)

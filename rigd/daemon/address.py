@@ -81,7 +81,7 @@ def bind(path: Path, group: str | None) -> socket.socket:
         or a running daemon uses it.
     """
     group_id = None if group is None else _group_number(group)
-    folder_fault_text = folder_fault(path.parent, shared=group is not None)
+    folder_fault_text = folder_fault(path.parent, is_shared=group is not None)
     if folder_fault_text:
         raise AddressError(folder_fault_text)
     if socket_answers(path):
@@ -143,7 +143,7 @@ def _searched_folders() -> list[Path]:
     """Return the folders that may contain sockets of daemons, without an unsafe group folder."""
     return (
         [runtime_folder()]
-        if folder_fault(GROUP_FOLDER, shared=True)
+        if folder_fault(GROUP_FOLDER, is_shared=True)
         else [runtime_folder(), GROUP_FOLDER]
     )
 
@@ -153,7 +153,7 @@ def _not_found_reason(rig: str | None) -> str:
 
     `rig` is the rig's name as in file names, or None for any rig.
     """
-    folder_fault_text = folder_fault(GROUP_FOLDER, shared=True)
+    folder_fault_text = folder_fault(GROUP_FOLDER, is_shared=True)
     sockets_in_unsafe_folder = (
         address_files(f"*{SOCKET_SUFFIX}", GROUP_FOLDER) if folder_fault_text else []
     )

@@ -131,7 +131,7 @@ class Ring:
         self._counters[_READ_COUNTER] = oldest_index + record_count
         return record_bytes
 
-    def discard(self) -> None:
+    def discard_records(self) -> None:
         """Mark all records of the ring as read, for a consumer that begins with new records."""
         self._counters[_READ_COUNTER] = self._counters[_WRITTEN_COUNTER]
 

@@ -541,7 +541,7 @@ class SessionSequence:
         """
         self._cycle.switch_torque_off()
         try:
-            self._cycle.observe(self._scheduler.due_ns)
+            self._cycle.read_devices(self._scheduler.due_ns)
         except (DeviceError, OSError):
             self._cycle.mark_readings_stale()
 

@@ -127,10 +127,10 @@ class Channels:
         if self.shared_state[StateField.STOP_REASON] == StopReason.NONE:
             self.shared_state[StateField.STOP_REASON] = StopReason.OPERATOR
 
-    def clear(self) -> None:
+    def discard_records(self) -> None:
         """Discard all records in the rings before the next session, while no recorder runs."""
         for ring in self.rings:
-            ring.discard()
+            ring.discard_records()
 
     def close(self) -> None:
         """Unmap the shared memory of rings and state; the descriptors stay open."""

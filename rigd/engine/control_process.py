@@ -281,7 +281,7 @@ class _ControlServer:
 
     def _read_at_rest(self) -> None:
         """Read the devices for one tick with the torque off."""
-        self._cycle.observe(self._scheduler.due_ns)
+        self._cycle.read_devices(self._scheduler.due_ns)
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
 
     def _run_session(self, session_job: SessionJob) -> None:

@@ -100,7 +100,7 @@ class StandstillMonitor:
         """Whether the last angle and speed are known, so that the next angle can be checked."""
         return self._last_movements_rad is not None
 
-    def check(self, angle_rad: float, due_ns: int) -> None:
+    def check_angle(self, angle_rad: float, due_ns: int) -> None:
         """Raise `DeviceError` if the angle has jumped since the last tick.
 
         Parameters
@@ -217,7 +217,7 @@ class Cycle:
         self._torque_squares_nm2 = 0.0
         self._recent_ticks: deque[tuple[float, float, float]] = deque(maxlen=_SIGN_CHECK_TICKS)
 
-    def observe(self, due_ns: int) -> None:
+    def read_devices(self, due_ns: int) -> None:
         """Read angle and wrench from the devices without changing the torque command."""
         drive, sensor = self._drive, self._sensor
         drive.latch(due_ns)
@@ -257,7 +257,7 @@ class Cycle:
         ControllerError
             If the controller of an installed package fails. The torque command is then unchanged.
         """
-        self.observe(due_ns)
+        self.read_devices(due_ns)
         status_flags = self.flags & ~_TORQUE_OFF
         limit_monitor = self.limit_monitor
         violation = limit_monitor.check(
@@ -400,7 +400,7 @@ class Cycle:
             If the encoder jumped.
         """
         if not self.flags & _ANGLE_STALE:
-            standstill.check(self.angle_rad + self.zero_rad, due_ns)
+            standstill.check_angle(self.angle_rad + self.zero_rad, due_ns)
 
     def check_sensor(self) -> Violation | None:
         """Return a violation if the sensor repeats its readings, otherwise None.
@@ -566,7 +566,7 @@ def observe_rest(
     angles_rad: list[float] = []
     for _ in range(round(duration_s * rate_hz)):
         scheduler.wait()
-        cycle.observe(scheduler.due_ns)
+        cycle.read_devices(scheduler.due_ns)
         check_reading()
         wrenches.append(cycle.raw_wrench)
         angles_rad.append(cycle.angle_rad)

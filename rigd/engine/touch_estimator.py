@@ -55,7 +55,7 @@ def main() -> None:
         channels.shared_state.beat(StateField.TOUCH_BEAT)
         sample_bytes = sample_reader.take(_MAX_BLOCK_SAMPLES)
         if sample_bytes:
-            running_estimator.take(decode_samples(sample_bytes))
+            running_estimator.add_samples(decode_samples(sample_bytes))
         else:
             time.sleep(_IDLE_PAUSE_S if running_estimator.idle else _PENDING_PAUSE_S)
         for touch_report in running_estimator.reports():
@@ -71,7 +71,7 @@ def main() -> None:
 class _PendingTouch:
     """Detected touch that waits for its final estimate."""
 
-    number: int
+    touch_number: int
     """Number of the touch in its session, from 1 on."""
     tick: int
     """Tick at which the touch was detected."""
@@ -79,9 +79,9 @@ class _PendingTouch:
     """First tick at which the beam is free again after the previous touch."""
     estimate: GrowingEstimate
     """Estimate of the touch, which improves as samples arrive."""
-    previewed: bool = False
+    is_previewed: bool = False
     """Whether the preview has been computed, so that the first estimate takes less time."""
-    reported: bool = False
+    is_reported: bool = False
     """Whether the first estimate has been sent."""
 
 
@@ -120,7 +120,7 @@ class RunningTouchEstimator:
         """Whether all detected touches have their final estimate."""
         return not self._pending_touches
 
-    def take(self, new_samples: NDArray[np.void]) -> None:
+    def add_samples(self, new_samples: NDArray[np.void]) -> None:
         """Add the next samples of the record, shape (n,), and register the touches in them."""
         earlier_samples = self._samples
         self._samples = (
@@ -154,15 +154,15 @@ class RunningTouchEstimator:
         if (
             available_ticks >= self._first_ticks
             and sends_first_estimate
-            and not pending_touch.reported
+            and not pending_touch.is_reported
         ):
-            pending_touch.reported = True
+            pending_touch.is_reported = True
             return [self._touch_report(pending_touch, self._first_ticks, is_final=False)]
         if is_final:
             self._pending_touches.popleft()
             return [self._touch_report(pending_touch, self._final_ticks, is_final=True)]
-        if available_ticks >= self._preview_ticks and not pending_touch.previewed:
-            pending_touch.previewed = True
+        if available_ticks >= self._preview_ticks and not pending_touch.is_previewed:
+            pending_touch.is_previewed = True
             record, _ = self._record_around_touch(pending_touch, self._preview_ticks)
             pending_touch.estimate.preview(record)
         return []
@@ -174,7 +174,9 @@ class RunningTouchEstimator:
         record, start_s = self._record_around_touch(pending_touch, ticks_after_touch)
         touch_estimate = pending_touch.estimate.update(record, scan=False, first=not is_final)
         estimate_document = touch_estimate.as_dict(start_s)
-        return TouchReport(pending_touch.number, pending_touch.tick, is_final, estimate_document)
+        return TouchReport(
+            pending_touch.touch_number, pending_touch.tick, is_final, estimate_document
+        )
 
     def _record_around_touch(
         self, pending_touch: _PendingTouch, ticks_after_touch: int

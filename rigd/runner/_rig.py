@@ -218,7 +218,7 @@ class Rig:
         if self._raised_priority is not None:
             self._raised_priority.raise_new_threads()
         _reset_session_fields(group.channels.shared_state)
-        group.channels.clear()
+        group.channels.discard_records()
         session_run = SessionSupervisor(
             order, group, self._connection, self._view, on_progress, can_receive_stop
         )

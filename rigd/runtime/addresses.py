@@ -55,14 +55,14 @@ def runtime_folder() -> Path:
     return folder
 
 
-def folder_fault(folder: Path, *, shared: bool = False) -> str:
+def folder_fault(folder: Path, *, is_shared: bool = False) -> str:
     """Return the reason why other users could replace files in a runtime folder; "" if they cannot.
 
     Parameters
     ----------
     folder
         Path of the folder. A folder that does not exist is safe if its parent folder is safe.
-    shared
+    is_shared
         Whether the folder may belong to any user, like the folder of a group.
     """
     for path in (folder.parent, folder):
@@ -81,7 +81,7 @@ def folder_fault(folder: Path, *, shared: bool = False) -> str:
                 f"chmod go-w {path}, or set XDG_RUNTIME_DIR to a folder that only you can write to."
             )
         trusted_uids = (0, os.getuid())
-        if path == folder and not shared and os.getuid() and status.st_uid not in trusted_uids:
+        if path == folder and not is_shared and os.getuid() and status.st_uid not in trusted_uids:
             return (
                 f"The runtime folder {path} belongs to another user ({status.st_uid}); set "
                 "XDG_RUNTIME_DIR to a folder that is yours."
@@ -210,7 +210,7 @@ def write_address(path: Path, address: Mapping[str, object]) -> None:
 
 
 def read_address(path: Path) -> dict[str, Any]:
-    """Return the address that `announce` wrote to a file; empty if the file is not valid."""
+    """Return the address that `write_address` wrote to a file; empty if the file is not valid."""
     try:
         # The file may be of any kind, even one that blocks on opening.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)

@@ -91,7 +91,7 @@ class EncoderMonitor:
         Inertia of the motor.
     breakaway_nm
         Net torque that exceeds any friction of the shaft.
-    delay_ticks
+    command_delay_ticks
         Ticks from a torque command to the torque.
     scale_monitor
         Check of the scales of encoder and motor, or None to omit it.
@@ -228,14 +228,16 @@ class EncoderMonitor:
         Violation or None
             Evidence of a failed encoder, or None. With a violation `test_nm` must be ignored.
         """
-        prediction = self._prediction
+        beam_prediction = self._prediction
         pending_commands_nm = self._delayed_commands_nm
         pending_commands_nm.append(sent_torque_nm)
         motor_torque_nm = pending_commands_nm[0]
         if not is_fresh:
             self.skip(1, angle_rad)
             return None
-        prediction_error_nm = 0.0 if prediction is None else prediction.step(angle_rad, coupling_nm)
+        prediction_error_nm = (
+            0.0 if beam_prediction is None else beam_prediction.step(angle_rad, coupling_nm)
+        )
         net_sum, motor_sum = self._torque_history[-1]
         self._torque_history.append(
             (net_sum + motor_torque_nm - coupling_nm, motor_sum + motor_torque_nm)
@@ -281,21 +283,21 @@ class EncoderMonitor:
                 self.test_nm = 0.0
         return None
 
-    def skip(self, ticks: int, angle_rad: float) -> None:
+    def skip(self, skipped_ticks: int, angle_rad: float) -> None:
         """Advance the monitor over ticks that were missed or have only old readings.
 
         The torque was constant in these ticks.
 
         Parameters
         ----------
-        ticks
+        skipped_ticks
             Number of these ticks.
         angle_rad
             Last angle that was read.
         """
         net_sum, motor_sum = self._torque_history[-1]
         error_sum = self._error_sums[-1]
-        for _ in range(ticks):
+        for _ in range(skipped_ticks):
             if self._prediction is not None:
                 self._prediction.skip(angle_rad)
             self._torque_history.append((net_sum, motor_sum))
@@ -340,8 +342,8 @@ class EncoderMonitor:
             or not movement_rad
         ):
             return None
-        ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._torque_history) - 2)
-        net_sum, motor_sum = self._torque_sums(ticks)
+        window_ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._torque_history) - 2)
+        net_sum, motor_sum = self._torque_sums(window_ticks)
         momentum_per_tick = (
             _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(movement_rad) / SPEED_TICKS
         )
@@ -359,13 +361,13 @@ class EncoderMonitor:
             return None
         return INTERLOCKS_BY_NAME["stopped encoder"].violated(stopping_torque_nm, allowed_torque_nm)
 
-    def _check_net_torque(self, ticks: int, max_turning_nm: float) -> Violation | None:
+    def _check_net_torque(self, window_ticks: int, max_turning_nm: float) -> Violation | None:
         """Return a violation if the mean net torque should have turned a shaft that seems at rest.
 
         `max_turning_nm` is the torque that may turn the shaft within an encoder step in this time.
         """
-        net_sum, motor_sum = self._torque_sums(ticks)
-        net_nm, coupling_nm = net_sum / ticks, (motor_sum - net_sum) / ticks
+        net_sum, motor_sum = self._torque_sums(window_ticks)
+        net_nm, coupling_nm = net_sum / window_ticks, (motor_sum - net_sum) / window_ticks
         net_torque_limit_nm = (
             self._breakaway_nm + _TORQUE_RELATIVE_ERROR * abs(coupling_nm) + max_turning_nm
         )
@@ -373,21 +375,23 @@ class EncoderMonitor:
             return None
         return INTERLOCKS_BY_NAME["frozen encoder"].violated(net_nm, net_torque_limit_nm)
 
-    def _compare_coupling_torque(self, ticks: int) -> None:
+    def _compare_coupling_torque(self, window_ticks: int) -> None:
         """Start a test of the encoder if the beam's torque differs from its prediction."""
         error_sums, noise_nm = self._error_sums, self._noise_nm
-        prediction_error_nm = (error_sums[-1] - error_sums[-1 - ticks]) / ticks
+        prediction_error_nm = (error_sums[-1] - error_sums[-1 - window_ticks]) / window_ticks
         vibration_rms_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
         significant_error_nm = max(
             _MIN_SIGNIFICANT_FRACTION * self._breakaway_nm,
-            _MIN_SIGNIFICANT_STDS * noise_nm / sqrt(ticks),
-            _MODEL_ERROR_FRACTION * vibration_rms_nm * min(1.0, self._half_period_ticks / ticks),
+            _MIN_SIGNIFICANT_STDS * noise_nm / sqrt(window_ticks),
+            _MODEL_ERROR_FRACTION
+            * vibration_rms_nm
+            * min(1.0, self._half_period_ticks / window_ticks),
         )
         if -significant_error_nm < prediction_error_nm < significant_error_nm:
             return
         # The test torque acts against the beam's torque, which brakes a runaway shaft, or in the
         # direction in which the breakaway torque is reached sooner.
-        net_torque_nm = self._torque_sums(ticks)[0] / ticks
+        net_torque_nm = self._torque_sums(window_ticks)[0] / window_ticks
         is_near_breakaway = abs(net_torque_nm) > 0.5 * self._breakaway_nm
         ramp_step_nm = self._breakaway_nm / (_TEST_RAMP_S * self._rate_hz)
         self._test_step_nm = copysign(
@@ -462,13 +466,13 @@ class EncoderMonitor:
             acceleration_rad_s2, speed_rad_s, motor_torque_nm - net_torque_nm, net_torque_nm
         )
 
-    def _torque_sums(self, ticks: int) -> tuple[float, float]:
-        """Return the sums of net torque and motor torque over the last `ticks` ticks in N·m.
+    def _torque_sums(self, window_ticks: int) -> tuple[float, float]:
+        """Return the sums of net torque and motor torque over the last `window_ticks` ticks in N·m.
 
         The present tick is excluded: its torque turns the shaft from now on.
         """
         net_sum, motor_sum = self._torque_history[-2]
-        earlier_net_sum, earlier_motor_sum = self._torque_history[-2 - ticks]
+        earlier_net_sum, earlier_motor_sum = self._torque_history[-2 - window_ticks]
         return net_sum - earlier_net_sum, motor_sum - earlier_motor_sum
 
     def _end_encoder_test(self) -> None:

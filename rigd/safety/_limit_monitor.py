@@ -532,10 +532,10 @@ class LimitMonitor:
             return self._violation_with_cause(worst_value)
         for checked_value in warned_values:
             self.warning = True
-            channel = checked_value[1] or checked_value[0]
-            if channel not in self._last_warnings:
+            channel_name = checked_value[1] or checked_value[0]
+            if channel_name not in self._last_warnings:
                 self._notices.append(str(_make_violation(checked_value, is_warning=True)))
-            self._last_warnings[channel] = self._slow_checks
+            self._last_warnings[channel_name] = self._slow_checks
         return None
 
     def _violation_with_cause(self, checked_value: _CheckedValue) -> Violation:

@@ -25,7 +25,7 @@ from rigd.runtime.computations import ComputationError, ForkedComputation
 from rigd.sim._plant import SimulatedPlant
 from rigd.sim._session_scatter import scatters_between_sessions, session_parameters
 
-T = TypeVar("T")
+ReadingT = TypeVar("ReadingT")
 """Type of a reading."""
 
 _DRIVE_NAME = "Simulated drive"
@@ -55,14 +55,14 @@ class StuckReadings:
         self._count = 0
         self._value: object = None
 
-    def __call__(self, reading: T) -> T:
+    def __call__(self, reading: ReadingT) -> ReadingT:
         """Return the given reading, or the earlier reading that is repeated in its stead."""
         if self._count == 0 or (
             self._calls_per_refresh and self._count % self._calls_per_refresh == 0
         ):
             self._value = reading
         self._count += 1
-        return cast("T", self._value)
+        return cast("ReadingT", self._value)
 
 
 def open_simulated_rig(rig: RigParameters) -> Devices:
@@ -142,7 +142,7 @@ class SimulatedRig:
         """
         self.sensor.renew_noise(seed)
         if scatters_between_sessions(self._parameters):
-            self.plant.adopt(SimulatedPlant(session_parameters(self._parameters, seed)))
+            self.plant.adopt_parameters(SimulatedPlant(session_parameters(self._parameters, seed)))
 
     def advance(self, period_count: int) -> None:
         """Advance plant and sensor by whole periods, while the last torque command acts."""
@@ -511,12 +511,12 @@ def _unit_wrenches(
     has_projection = projections.any(axis=1)
     unit_wrenches = np.zeros((6, 2))
     projection_rows = projections[has_projection]
-    unit_wrenches[:, has_projection] = projection_rows.T @ np.linalg.inv(
-        projection_rows @ projection_rows.T
+    unit_wrenches[:, has_projection] = projection_rows.ReadingT @ np.linalg.inv(
+        projection_rows @ projection_rows.ReadingT
     )
     if crosstalk_percent:
         full_ranges = np.array(sensor.range)
         crosstalk_matrix = 0.01 * crosstalk_percent * np.array(_CROSSTALK_PATTERN)
         unit_wrenches += crosstalk_matrix * full_ranges[:, None] / full_ranges @ unit_wrenches
-    torque_wrench, shear_wrench = unit_wrenches.T.tolist()
+    torque_wrench, shear_wrench = unit_wrenches.ReadingT.tolist()
     return torque_wrench, shear_wrench

@@ -317,7 +317,7 @@ class SimulatedPlant:
         """Time in seconds since the drive was first enabled; 0 before."""
         return max(self._periods_since_enabling, 0) * self._period_s
 
-    def adopt(self, other_plant: "SimulatedPlant") -> None:
+    def adopt_parameters(self, other_plant: "SimulatedPlant") -> None:
         """Take over another plant's parameters; the beam then rests at its angle, the drive off.
 
         Parameters

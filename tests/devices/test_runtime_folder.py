@@ -59,7 +59,7 @@ def test_a_folder_writable_by_others_is_refused(runtime_folder, mode):
     folder.chmod(mode)
     with pytest.raises(UnsafeFolderError, match=rf"{folder} .*{mode:04o}.*chmod go-w {folder}"):
         LockFile("rig-a", for_all_users=False)
-    assert folder_fault(folder, shared=True)
+    assert folder_fault(folder, is_shared=True)
     folder.chmod(0o2750)
     assert not folder_fault(folder)
     assert LockFile("rig-a", for_all_users=False).path.parent == folder
@@ -81,7 +81,7 @@ def test_a_folder_of_another_user_is_refused(runtime_folder, monkeypatch):
     assert not folder_fault(folder)
     monkeypatch.setattr("os.getuid", lambda: owner + 1)
     assert f"{folder} belongs to another user ({owner})" in folder_fault(folder)
-    assert not folder_fault(folder, shared=True)
+    assert not folder_fault(folder, is_shared=True)
 
 
 def test_a_lock_follows_no_link(runtime_folder):

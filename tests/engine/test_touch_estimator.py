@@ -51,7 +51,7 @@ def followed():
             SimpleNamespace(follow=lambda: RecordingFollower(requests)), job
         )
         for first, last in zip([0, *ends], ends, strict=False):
-            follower.take(samples(first, last, *touches, off=off and last == ends[-1]))
+            follower.add_samples(samples(first, last, *touches, off=off and last == ends[-1]))
             while some := follower.reports():
                 reports += some
         return requests, reports

@@ -94,7 +94,7 @@ def record(profile, true_rig, scale, excitation):
     due = range(0, 10**12, round(1e9 / rig.rate_hz)).__iter__()
     wrenches = []
     for _ in range(1000):
-        cycle.observe(next(due))
+        cycle.read_devices(next(due))
         wrenches.append(cycle.raw_wrench)
     cycle.tare = tuple(np.mean(wrenches, axis=0))
     devices.drive.enable()

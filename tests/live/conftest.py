@@ -77,7 +77,7 @@ class Producer(threading.Thread):
             while self.tick < (time.monotonic() - start) * self.speed * RATE_HZ:
                 self._write()
                 for ring in self.channels.rings:  # what the recorder does
-                    ring.discard()
+                    ring.discard_records()
 
     def stop(self) -> None:
         self._halt.set()
@@ -87,8 +87,8 @@ class Producer(threading.Thread):
         """Write more records after the end of the thread."""
         for _ in range(ticks):
             self._write()
-            self.channels.samples.discard()
-            self.channels.timings.discard()
+            self.channels.samples.discard_records()
+            self.channels.timings.discard_records()
 
     def close(self) -> None:
         self.stop()

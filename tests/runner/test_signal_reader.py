@@ -59,7 +59,7 @@ def put(channels, ticks, angle_rad=0.0, *, command_nm=0.0, wrench=(0.0,) * 6):
             *wrench, 0, 0, 0,
         )  # fmt: skip
         ring.publish()
-    ring.discard()
+    ring.discard_records()
 
 
 def test_gauges_without_ticks_between_records(reader, channels):

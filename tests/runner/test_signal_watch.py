@@ -24,7 +24,7 @@ def put(ring, ticks, *, error_rad=0.0, coupling_nm=0.0, command_nm=0.0, lateness
             coupling_nm, *[0.0] * 6, 0, lateness_ns, 80_000,
         )  # fmt: skip
         ring.publish()
-    ring.discard()
+    ring.discard_records()
 
 
 def test_no_statistics_before_the_first_sample(ring):

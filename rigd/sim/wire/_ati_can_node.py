@@ -172,7 +172,9 @@ class AtiCanNode:
 
     def _read_gauges(self, _: bytes) -> None:
         """Answer a poll with two frames: status word and gauges."""
-        g0, g1, g2, g3, g4, g5 = self.gauges.read((self._measure(),), self.saturate)[0].tolist()
+        g0, g1, g2, g3, g4, g5 = self.gauges.read_counts((self._measure(),), self.saturate)[
+            0
+        ].tolist()
         status_word = self.status_bits & 0xFFFF
         if self._was_reset:
             status_word |= _WATCHDOG_RESET_BIT

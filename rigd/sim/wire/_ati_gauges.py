@@ -84,7 +84,7 @@ class AtiGauges:
         self.stuck: tuple[int, StuckReadings] | None = None
         self._bias = np.array(_BIAS_COUNTS, dtype=np.float64)
 
-    def read(
+    def read_counts(
         self, wrenches: Sequence[Wrench], saturated_gauge: int | None = None
     ) -> NDArray[np.int16]:
         """Return the counts of gauges 0 to 5 under each wrench, shape (n, 6).

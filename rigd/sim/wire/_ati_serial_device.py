@@ -224,7 +224,7 @@ class AtiSerialDevice:
 
     def _read_gauges(self, wrenches: list[Wrench]) -> NDArray[np.int16]:
         """Return the gauge counts under wrenches; unset gauges read the end of their range."""
-        gauge_counts = self.gauges.read(wrenches, self.saturate)
+        gauge_counts = self.gauges.read_counts(wrenches, self.saturate)
         if self._unset_gauges:
             gauge_counts[:, self._unset_gauges] = _UNSET_GAUGE_COUNTS
         return gauge_counts

@@ -518,7 +518,7 @@ class BusSimulation:
         sensor_device: Any = self._serial_device or self._nodes.get("sensor")
         drive_node: Any = self._nodes.get("drive")
         if fault.kind in LINE_FAULT_KINDS:
-            self._lines[fault_values["from"]].add(fault)
+            self._lines[fault_values["from"]].add_fault(fault)
         elif fault.kind == "freeze":
             self._override_attribute(
                 fault,

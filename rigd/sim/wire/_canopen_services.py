@@ -353,7 +353,7 @@ class Pdo:
         mapped_entry = self._objects.find(mapping_value >> 16, mapping_value >> 8 & 0xFF)
         if (
             self.direction not in mapped_entry.pdo_directions
-            or mapped_entry.bits != mapping_value & 0xFF
+            or mapped_entry.bit_length != mapping_value & 0xFF
         ):
             raise Abort(AbortCode.NOT_MAPPABLE)
         return mapped_entry
@@ -390,7 +390,7 @@ class Pdo:
             raise Abort(AbortCode.PDO_TOO_LONG)
         if (
             sum(
-                self._mapped_entry(mapping_slot.value).bits
+                self._mapped_entry(mapping_slot.value).bit_length
                 for mapping_slot in self._slots[:new_mapping_count]
             )
             > _MAX_PDO_BITS
@@ -446,7 +446,7 @@ class TransmitPdo(Pdo):
         """Rebuild the PDO's mapping from the object dictionary, and its list of readers."""
         super().compile_mapping()
         self._readers: list[Callable[[], int]] = [
-            entry.read_value or entry.get for entry in self.entries
+            entry.read_value or entry.read_integer for entry in self.entries
         ]
 
     def reset_exchange(self) -> None:

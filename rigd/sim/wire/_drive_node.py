@@ -222,7 +222,7 @@ class DriveNode:
         drive_entries.controlword.after_write = self._on_controlword
         drive_entries.statusword.read_value = self._statusword
         drive_entries.mode.after_write = self._on_mode
-        drive_entries.mode_display.read_value = drive_entries.mode.get
+        drive_entries.mode_display.read_value = drive_entries.mode.read_integer
         drive_entries.position.read_value = self._position_counts
         drive_entries.velocity.read_value = self._velocity_counts_per_s
         drive_entries.actual_torque.read_value = self._actual_torque_per_mille

@@ -345,7 +345,7 @@ class FaultyLine:
         """Whether a fault may act on the next frame."""
         return bool(self._active_faults or self._held_frames)
 
-    def add(self, fault: Fault) -> None:
+    def add_fault(self, fault: Fault) -> None:
         """Let a fault act on this line from now on."""
         self._active_faults.append(_ActiveFault(fault))
 

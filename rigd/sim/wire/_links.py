@@ -355,10 +355,10 @@ def _netlink_attributes(data: bytes) -> Iterable[tuple[int, bytes]]:
         byte_offset += (attribute_length + 3) & ~3
 
 
-def _send_without_blocking(link: socket.socket, data: bytes) -> int:
+def _send_without_blocking(target_socket: socket.socket, data: bytes) -> int:
     """Send bytes on a socket without blocking; return the number sent, 0 if the socket is dead."""
     try:
-        return link.send(data)
+        return target_socket.send(data)
     except OSError:
         return 0
 

@@ -130,7 +130,7 @@ class Entry:
     after_write: Callable[[], None] | None = None
     default: int = field(init=False)
     default_text: bytes = field(init=False)
-    bits: int = field(init=False)
+    bit_length: int = field(init=False)
     """Length of the integer in bits; 0 for bytes, which no PDO carries."""
     _low: int = field(init=False)
     _high: int = field(init=False)
@@ -168,7 +168,9 @@ class Entry:
 
     def _set_range(self, low: int | None, high: int | None) -> None:
         """Set the length in bits, and the range of values, by default that of the type."""
-        self.bits = 0 if self.type_letter == "s" else 8 * _INTEGER_LAYOUTS[self.type_letter].size
+        self.bit_length = (
+            0 if self.type_letter == "s" else 8 * _INTEGER_LAYOUTS[self.type_letter].size
+        )
         type_minimum, type_maximum = _type_range(self.type_letter)
         self._low = type_minimum if low is None else low
         self._high = type_maximum if high is None else high
@@ -176,7 +178,7 @@ class Entry:
     def accepts_length(self, byte_count: int) -> bool:
         """Return whether a value of `byte_count` bytes can be written to the entry."""
         if self.type_letter != "s":
-            return 8 * byte_count == self.bits
+            return 8 * byte_count == self.bit_length
         return (
             byte_count == len(self.text) if self.has_fixed_length else byte_count <= _MAX_TEXT_BYTES
         )
@@ -185,10 +187,10 @@ class Entry:
     def max_bytes(self) -> int:
         """Largest number of bytes that can be written to the entry."""
         if self.type_letter != "s":
-            return self.bits // 8
+            return self.bit_length // 8
         return len(self.text) if self.has_fixed_length else _MAX_TEXT_BYTES
 
-    def get(self) -> int:
+    def read_integer(self) -> int:
         """Return the present value of an integer entry."""
         return self.value if self.read_value is None else self.read_value()
 
@@ -213,7 +215,7 @@ class Entry:
         return (
             self.text
             if self.type_letter == "s"
-            else _INTEGER_LAYOUTS[self.type_letter].pack(self.get())
+            else _INTEGER_LAYOUTS[self.type_letter].pack(self.read_integer())
         )
 
     def store_bytes(self, data: bytes) -> int | str:

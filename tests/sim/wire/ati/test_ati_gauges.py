@@ -36,7 +36,7 @@ def test_the_matrix_is_as_large_as_those_of_real_sensors(gauges):
 
 
 def test_unloaded_gauges_are_not_zero(gauges):
-    assert gauges.read([(0.0,) * 6]).tolist() == [UNLOADED]
+    assert gauges.read_counts([(0.0,) * 6]).tolist() == [UNLOADED]
 
 
 def test_the_bias_resembles_a_small_load(gauges):
@@ -46,7 +46,7 @@ def test_the_bias_resembles_a_small_load(gauges):
 
 def test_the_full_range_saturates_no_gauge(gauges):
     corners = np.array(np.meshgrid(*[[-1, 1]] * 6)).reshape(6, -1).T * RANGE
-    counts = gauges.read([tuple(corner) for corner in corners]) - np.array(UNLOADED)
+    counts = gauges.read_counts([tuple(corner) for corner in corners]) - np.array(UNLOADED)
     assert np.all(np.abs(counts).max(axis=0) > 23_500)
     assert np.all(np.abs(counts).max(axis=0) < 28_000)
 
@@ -60,7 +60,7 @@ def test_rounding_and_one_count_are_below_half_the_resolution(gauges):
 def test_the_stated_quantisation_is_nearly_reached(gauges):
     """It is a bound on all wrenches, and nearly reached."""
     wrenches = np.random.default_rng(3).uniform(-1, 1, (20_000, 6)) * RANGE
-    counts = gauges.read([tuple(w) for w in wrenches]).astype(float) - UNLOADED
+    counts = gauges.read_counts([tuple(w) for w in wrenches]).astype(float) - UNLOADED
     error = np.abs(counts @ gauges.matrix.astype(float).T / 1e6 - wrenches).max(axis=0)
     assert np.all(error > 0.7 * gauges.quantisation)
 
@@ -68,11 +68,11 @@ def test_the_stated_quantisation_is_nearly_reached(gauges):
 def test_another_range_uses_the_gauges_as_well(gauges, make_can_host):
     small = make_can_host(sensor=replace(SENSOR, range=tuple(0.1 * RANGE))).node.gauges
     counts = small.read([tuple(0.1 * RANGE)])
-    assert np.abs(counts - gauges.read([tuple(RANGE)])).max() <= 1
+    assert np.abs(counts - gauges.read_counts([tuple(RANGE)])).max() <= 1
 
 
 def test_a_gauge_saturates_beyond_sixteen_bits(gauges):
-    ((*high,), (*low,)) = gauges.read([(0, 0, 0, 0, 0, 5.0), (0, 0, 0, 0, 0, -5.0)]).tolist()
+    ((*high,), (*low,)) = gauges.read_counts([(0, 0, 0, 0, 0, 5.0), (0, 0, 0, 0, 0, -5.0)]).tolist()
     assert [high[0], high[2], high[4]] == [32767] * 3
     assert [low[0], low[2], low[4]] == [-32768] * 3
 
@@ -80,4 +80,4 @@ def test_a_gauge_saturates_beyond_sixteen_bits(gauges):
 @pytest.mark.parametrize(("gauge", "value"), [(0, 32767), (1, -32767), (4, -32767), (5, 32767)])
 def test_one_gauge_can_saturate_alone(gauges, gauge, value):
     expected = [value if n == gauge else UNLOADED[n] for n in range(6)]
-    assert gauges.read([(0.0,) * 6] * 2, gauge).tolist() == [expected, expected]
+    assert gauges.read_counts([(0.0,) * 6] * 2, gauge).tolist() == [expected, expected]

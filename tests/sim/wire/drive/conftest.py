@@ -201,7 +201,7 @@ class Bench:
         assert self.read_torque() == 0
 
     def read_torque(self):
-        return self.node._objects[0x6077, 0].get()
+        return self.node._objects[0x6077, 0].read_integer()
 
 
 class _Spy:
