@@ -135,6 +135,6 @@ class RunningLinearController:
         controller_output = float(result[n])
         limit_nm = self._torque_limit_nm
         if self._anti_windup is not None and not -limit_nm <= controller_output <= limit_nm:
-            limited_nm = min(max(controller_output, -limit_nm), limit_nm)
-            self._next_states += self._anti_windup * (limited_nm - controller_output)
+            limited_torque_nm = min(max(controller_output, -limit_nm), limit_nm)
+            self._next_states += self._anti_windup * (limited_torque_nm - controller_output)
         return controller_output

@@ -61,10 +61,10 @@ class RealClock:
         remaining_ns = deadline_ns - time.monotonic_ns() - self._spin_ns
         if remaining_ns > 0:
             time.sleep(remaining_ns * 1e-9)
-        late_ns = time.monotonic_ns() - deadline_ns
-        while late_ns < 0:
-            late_ns = time.monotonic_ns() - deadline_ns
-        return late_ns
+        lateness_ns = time.monotonic_ns() - deadline_ns
+        while lateness_ns < 0:
+            lateness_ns = time.monotonic_ns() - deadline_ns
+        return lateness_ns
 
 
 class VirtualClock:
@@ -182,16 +182,16 @@ class TickScheduler:
         tick = self.tick + 1
         t_ns = round(tick * self._period_ns)
         due_ns = self._start_ns + t_ns
-        late_ns = self._clock.wait_until(due_ns)
+        lateness_ns = self._clock.wait_until(due_ns)
         missed_ticks = 0
-        if late_ns >= self._period_ns:
-            missed_ticks = int(late_ns / self._period_ns)
+        if lateness_ns >= self._period_ns:
+            missed_ticks = int(lateness_ns / self._period_ns)
             tick += missed_ticks
             t_ns = round(tick * self._period_ns)
-            late_ns = max(0, late_ns + due_ns - self._start_ns - t_ns)
+            lateness_ns = max(0, lateness_ns + due_ns - self._start_ns - t_ns)
             due_ns = self._start_ns + t_ns
         self.tick = tick
         self.t_ns = t_ns
         self.due_ns = due_ns
-        self.lateness_ns = late_ns
+        self.lateness_ns = lateness_ns
         return missed_ticks

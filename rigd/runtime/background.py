@@ -107,10 +107,10 @@ def processor_use(pid: int) -> tuple[bool, float] | None:
         stat_text = Path(f"/proc/{pid}/stat").read_text()
         # The state and numbers follow the program's name, which may contain any character.
         stat_fields = stat_text.rpartition(")")[2].split()
-        used_ticks = int(stat_fields[11]) + int(stat_fields[12])
+        used_clock_ticks = int(stat_fields[11]) + int(stat_fields[12])
     except (OSError, ValueError, IndexError):
         return None
-    return stat_fields[0] == "R", used_ticks / os.sysconf("SC_CLK_TCK")
+    return stat_fields[0] == "R", used_clock_ticks / os.sysconf("SC_CLK_TCK")
 
 
 def die_with_parent(parent_pid: int) -> None:

@@ -61,7 +61,7 @@ class BeamPrediction:
             if oscillating_poles
             else 2 * pi * _MAX_FREQUENCY_FRACTION * rate_hz
         )
-        stiffness_nm = 4.0 * beam.bending_stiffness_n_m2 / beam.length_m
+        stiffness_nm_per_rad = 4.0 * beam.bending_stiffness_n_m2 / beam.length_m
         mode_count = len(oscillating_poles)
         # Input [modes, offset, angle before, angle, torque], output [modes, offset, angle, error].
         state_size = 2 * mode_count + 2
@@ -86,9 +86,9 @@ class BeamPrediction:
             )
             a[mode_rows, 2 * mode_count + 1] = previous_angle_gain.real, previous_angle_gain.imag
             a[mode_rows, 2 * mode_count + 2] = present_angle_gain.real, present_angle_gain.imag
-            mode_residue = stiffness_nm * abs(mode_pole) ** 2 / (2j * mode_pole.imag)
+            mode_residue = stiffness_nm_per_rad * abs(mode_pole) ** 2 / (2j * mode_pole.imag)
             error_row += 2.0 * np.array([mode_residue.real, -mode_residue.imag]) @ a[mode_rows]
-            error_row[2 * mode_count + 2] -= stiffness_nm
+            error_row[2 * mode_count + 2] -= stiffness_nm_per_rad
             observer_gain_of_mode = -_OBSERVER_BANDWIDTH_RAD_S * period_s / mode_residue
             observer_gain[mode_rows] = observer_gain_of_mode.real, observer_gain_of_mode.imag
         update_matrix = a + np.outer(observer_gain, error_row)

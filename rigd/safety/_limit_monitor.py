@@ -191,11 +191,13 @@ class LimitMonitor:
 
         It counts ticks missed within the last 64 to 128 ticks.
         """
-        missed_count = self._recently_missed
-        if not missed_count or self._slow_checks - self._last_missed_check > 1:
+        missed_tick_count = self._recently_missed
+        if not missed_tick_count or self._slow_checks - self._last_missed_check > 1:
             return ""
-        ticks_text = "1 missed tick" if missed_count == 1 else f"{missed_count} missed ticks"
-        if missed_count < _MIN_STALL_S * self._rate_hz:
+        ticks_text = (
+            "1 missed tick" if missed_tick_count == 1 else f"{missed_tick_count} missed ticks"
+        )
+        if missed_tick_count < _MIN_STALL_S * self._rate_hz:
             return f"It came after {ticks_text}."
         return f"It came after {ticks_text}. {OVERLOADED_ADVICE}"
 
@@ -368,9 +370,9 @@ class LimitMonitor:
 
     def check_torque(self, requested_torque_nm: float) -> Violation | None:
         """Return a violation if the controller requests a torque above its limit, else None."""
-        limit_nm = self._limits.torque_command_nm
+        torque_limit_nm = self._limits.torque_command_nm
         return self._assess_values(
-            (("torque command", "", "", requested_torque_nm, limit_nm, self._peak_nm),)
+            (("torque command", "", "", requested_torque_nm, torque_limit_nm, self._peak_nm),)
         )
 
     def check_missed(
@@ -493,9 +495,9 @@ class LimitMonitor:
 
     def check_tare(self, drift_nm: float) -> Violation | None:
         """Return a violation if the coupling torque's zero drifted too far since the last tare."""
-        limit_nm = self._limits.tare_drift_nm
+        drift_limit_nm = self._limits.tare_drift_nm
         return self._assess_values(
-            (("tare drift", "", "", drift_nm, limit_nm, self._tare_warning_nm),)
+            (("tare drift", "", "", drift_nm, drift_limit_nm, self._tare_warning_nm),)
         )
 
     def take_notices(self) -> list[str]:

@@ -111,10 +111,10 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
         rig, angle_rad, smooth(np.array(move.coupling_nm)), smoothing_window
     )
     delay_ticks = max(0, round(rig.command_delay_s * rig.rate_hz))
-    command_nm = np.concatenate([np.zeros(delay_ticks), move.torques_nm])[: angle_rad.size]
+    command_torque_nm = np.concatenate([np.zeros(delay_ticks), move.torques_nm])[: angle_rad.size]
     is_moving: NDArray[np.bool_] = np.abs(speed_rad_s) > _MIN_SPEED_FRACTION * max_speed_rad_s
     motor_fit = _fit_motor_equation(
-        smooth(command_nm),
+        smooth(command_torque_nm),
         acceleration_rad_s2,
         speed_rad_s,
         beam_nm,
@@ -153,7 +153,7 @@ def _smoothing_window(rate_hz: float) -> RealArray:
 
 
 def _coupling_ratio(
-    rig: ProbedRig, angle_rad: RealArray, measured_nm: RealArray, smoothing_window: RealArray
+    rig: ProbedRig, angle_rad: RealArray, measured_torque_nm: RealArray, smoothing_window: RealArray
 ) -> tuple[float | None, float | None, RealArray]:
     """Fit the measured coupling torque by the torque of the profile's beam at the measured angle.
 
@@ -162,17 +162,19 @@ def _coupling_ratio(
     """
     best_fit: tuple[float, float, float, RealArray] | None = None
     for beam_nm in _beam_torques(rig, angle_rad):
-        expected_nm = np.convolve(beam_nm, smoothing_window, "valid")
-        torque_squares = float(expected_nm @ expected_nm)
+        expected_torque_nm = np.convolve(beam_nm, smoothing_window, "valid")
+        torque_squares = float(expected_torque_nm @ expected_torque_nm)
         if torque_squares == 0.0:
             continue
-        coupling_ratio = float(expected_nm @ measured_nm) / torque_squares
-        residual_squares_nm2 = float(np.sum((measured_nm - coupling_ratio * expected_nm) ** 2))
+        coupling_ratio = float(expected_torque_nm @ measured_torque_nm) / torque_squares
+        residual_squares_nm2 = float(
+            np.sum((measured_torque_nm - coupling_ratio * expected_torque_nm) ** 2)
+        )
         if best_fit is None or residual_squares_nm2 < best_fit[0]:
             # Smoothed samples within a window are not independent.
             ratio_variance = (
                 residual_squares_nm2
-                / expected_nm.size
+                / expected_torque_nm.size
                 * _samples_per_independent_sample(smoothing_window)
                 / torque_squares
             )
@@ -180,9 +182,9 @@ def _coupling_ratio(
                 residual_squares_nm2,
                 coupling_ratio,
                 sqrt(ratio_variance),
-                coupling_ratio * expected_nm,
+                coupling_ratio * expected_torque_nm,
             )
-    return (None, None, np.zeros_like(measured_nm)) if best_fit is None else best_fit[1:]
+    return (None, None, np.zeros_like(measured_torque_nm)) if best_fit is None else best_fit[1:]
 
 
 def _samples_per_independent_sample(smoothing_window: RealArray) -> float:
@@ -214,7 +216,7 @@ def _beam_torques(rig: ProbedRig, angle_rad: RealArray) -> RealArray:
 
 
 def _fit_motor_equation(
-    command_nm: RealArray,
+    command_torque_nm: RealArray,
     acceleration_rad_s2: RealArray,
     speed_rad_s: RealArray,
     beam_torque_nm: RealArray,
@@ -237,8 +239,8 @@ def _fit_motor_equation(
     if np.linalg.cond(normal_matrix) > _MAX_CONDITION_NUMBER:
         return (None,) * 6
     inverse_matrix = np.linalg.inv(normal_matrix)
-    solution = inverse_matrix @ (equation_columns.T @ command_nm[is_moving])
-    residual_nm = command_nm[is_moving] - equation_columns @ solution
+    solution = inverse_matrix @ (equation_columns.T @ command_torque_nm[is_moving])
+    residual_nm = command_torque_nm[is_moving] - equation_columns @ solution
     variances = (
         float(residual_nm @ residual_nm) / len(residual_nm) * window_ticks * np.diag(inverse_matrix)
     )

@@ -277,7 +277,7 @@ class AttachedObstacles:
             ]
         )
         return SubstepMatrices(
-            free_displacement=np.asfortranarray(unforced_displacement_matrix).dot,
+            unforced_displacement=np.asfortranarray(unforced_displacement_matrix).dot,
             displacement_per_friction=-displacement_per_torque.sum(axis=2),
             displacement_kernel=force_kernel,
             displacement_history=_history_matrices(force_kernel),
@@ -321,19 +321,19 @@ class AttachedObstacles:
         return True
 
     def compute_forces(
-        self, substep_matrices: "SubstepMatrices", free_displacement_m: RealArray, time_s: float
+        self, substep_matrices: "SubstepMatrices", unforced_displacement_m: RealArray, time_s: float
     ) -> RealArray:
         """Return the forces in N of obstacles and impacts on the beam in each substep of a period.
 
         The forces have the shape (substeps, bodies) and are positive in the direction of increasing
-        angles. The matrices are those of the free or the locked motor. `free_displacement_m`, shape
-        (substeps, bodies), is the beam's displacement at each body at the end of each substep if no
-        force acts, and `time_s` the start of the period.
+        angles. The matrices are those of the free or the locked motor.
+        `unforced_displacement_m`, shape (substeps, bodies), is the beam's displacement at each body at
+        the end of each substep if no force acts, and `time_s` the start of the period.
         """
         substep_count, substep_s = self.substeps, self._substep_s
         force_kernel = substep_matrices.displacement_kernel
         forces_n = np.zeros_like(self._zero_forces)
-        free_displacement_m = free_displacement_m.copy()
+        unforced_displacement_m = unforced_displacement_m.copy()
         for body_index, active_impact in self._impacts:
             substep_edges_s = time_s - active_impact.at_s + substep_s * np.arange(substep_count + 1)
             # Mean of half a sine over each substep.
@@ -350,7 +350,7 @@ class AttachedObstacles:
                 * np.diff(np.cos(pulse_phase))
             )
             for j in np.flatnonzero(forces_n[:, body_index]).tolist():
-                free_displacement_m[j:] += (
+                unforced_displacement_m[j:] += (
                     force_kernel[: substep_count - j, :, body_index] * forces_n[j, body_index]
                 )
 
@@ -376,10 +376,10 @@ class AttachedObstacles:
                     stiffness_n_per_m=stiffness_n_per_m,
                     damping_n_per_m=active_body.damping_n_s_per_m / substep_s,
                     compliance_m_per_n=force_kernel.item(0, body_index, body_index),
-                    free_penetration_m=np.where(
+                    unforced_penetration_m=np.where(
                         is_present,
                         active_body.side
-                        * (free_displacement_m[:, body_index] - surface_displacement_m),
+                        * (unforced_displacement_m[:, body_index] - surface_displacement_m),
                         -inf,
                     ),
                     start_penetration_m=start_penetration_m,
@@ -424,31 +424,33 @@ class AttachedObstacles:
             if all(obstacle.start_penetration_m <= 0 for obstacle in obstacles):
                 # Nothing is touched: skip to the first substep with a contact at its end.
                 contact_substep = substep_count
-                free_penetrations_m = [
-                    obstacle.free_penetration_m
+                unforced_penetration_arrays = [
+                    obstacle.unforced_penetration_m
                     - sum(kernel_matrix @ force_n for kernel_matrix, force_n in kernel_pairs)
                     for obstacle, kernel_pairs in zip(obstacles, displacement_kernels, strict=True)
                 ]
-                for free_penetration_m in free_penetrations_m:
-                    is_touching = free_penetration_m[substep_index:contact_substep] > 0
+                for unforced_penetration_m in unforced_penetration_arrays:
+                    is_touching = unforced_penetration_m[substep_index:contact_substep] > 0
                     if is_touching.any():
                         contact_substep = substep_index + int(is_touching.argmax())
                 if contact_substep > substep_index:
-                    for obstacle, free_penetration_m in zip(
-                        obstacles, free_penetrations_m, strict=True
+                    for obstacle, unforced_penetration_m in zip(
+                        obstacles, unforced_penetration_arrays, strict=True
                     ):
-                        obstacle.start_penetration_m = free_penetration_m.item(contact_substep - 1)
+                        obstacle.start_penetration_m = unforced_penetration_m.item(
+                            contact_substep - 1
+                        )
                 substep_index = contact_substep
                 if substep_index == substep_count:
                     return
             for _ in range(iteration_count):
                 for obstacle, row_pairs in obstacles_with_rows:
                     obstacle.force_n[substep_index] = 0.0
-                    free_end_penetration_m = obstacle.free_penetration_m.item(substep_index)
+                    unforced_end_penetration_m = obstacle.unforced_penetration_m.item(substep_index)
                     for matrix_rows, force_n in row_pairs:
-                        free_end_penetration_m -= matrix_rows[substep_index].dot(force_n)
+                        unforced_end_penetration_m -= matrix_rows[substep_index].dot(force_n)
                     mean_force_n, obstacle.end_penetration_m = obstacle.force_and_penetration(
-                        free_end_penetration_m
+                        unforced_end_penetration_m
                     )
                     obstacle.force_n[substep_index] = mean_force_n
             for obstacle in obstacles:
@@ -508,12 +510,12 @@ class AttachedObstacles:
         self,
         substep_matrices: "SubstepMatrices",
         forces_n: RealArray,
-        free_displacement_m: RealArray,
+        unforced_displacement_m: RealArray,
     ) -> None:
         """Store the forces of a period, and the displacements and penetrations at its end."""
         self.forces_n = forces_n
         self._penetration_m = self._end_penetrations_m
-        self._displacement_m = free_displacement_m[-1] + np.einsum(
+        self._displacement_m = unforced_displacement_m[-1] + np.einsum(
             "jab,jb->a", substep_matrices.displacement_kernel[::-1], forces_n
         )
 
@@ -527,19 +529,19 @@ class _ActiveObstacle:
     stiffness_n_per_m: float
     damping_n_per_m: float  # damping coefficient divided by the length of a substep
     compliance_m_per_n: float  # displacement of the beam by 1 N within a substep
-    free_penetration_m: RealArray  # penetration at the end of each substep if no force acts
+    unforced_penetration_m: RealArray  # penetration at the end of each substep if no force acts
     start_penetration_m: float  # penetration at the start of the present substep
     force_n: RealArray  # forces of the substeps computed so far, else 0; positive on either side
     end_penetration_m: float = -inf  # penetration at the end of the present substep
 
-    def force_and_penetration(self, free_end_m: float) -> tuple[float, float]:
+    def force_and_penetration(self, unforced_end_m: float) -> tuple[float, float]:
         """Return the mean force in N over a substep, and the penetration in m at its end.
 
-        `free_end_m` is the penetration in m that the substep would end with if the obstacle
+        `unforced_end_m` is the penetration in m that the substep would end with if the obstacle
         exerted no force. The mean force follows from the work, as the module's docstring explains.
         """
-        if free_end_m == -inf:  # the obstacle is not present
-            return 0.0, free_end_m
+        if unforced_end_m == -inf:  # the obstacle is not present
+            return 0.0, unforced_end_m
         start_m, compliance_m_per_n, damping_n_per_m = (
             self.start_penetration_m,
             self.compliance_m_per_n,
@@ -553,17 +555,17 @@ class _ActiveObstacle:
             # From 1/2, which conserves energy, to 1, which damps oscillation between substeps.
             end_weight = 0.5 + 0.5 * squared_stiffness_ratio / (1 + squared_stiffness_ratio)
             mean_force_n = stiffness_n_per_m * (
-                (1 - end_weight) * start_m + end_weight * free_end_m
-            ) + damping_n_per_m * (free_end_m - start_m)
+                (1 - end_weight) * start_m + end_weight * unforced_end_m
+            ) + damping_n_per_m * (unforced_end_m - start_m)
             mean_force_n /= 1 + compliance_m_per_n * (
                 stiffness_n_per_m * end_weight + damping_n_per_m
             )
-            end_m = free_end_m - compliance_m_per_n * mean_force_n
+            end_m = unforced_end_m - compliance_m_per_n * mean_force_n
             if end_m >= 0:
-                return (mean_force_n, end_m) if mean_force_n > 0 else (0.0, free_end_m)
-            # The beam leaves: (free_end - end) (start - end) / compliance
+                return (mean_force_n, end_m) if mean_force_n > 0 else (0.0, unforced_end_m)
+            # The beam leaves: (unforced_end - end) (start - end) / compliance
             # = k start²/2 - damping start (start - end)
-            damped_end_m = free_end_m + compliance_m_per_n * damping_n_per_m * start_m
+            damped_end_m = unforced_end_m + compliance_m_per_n * damping_n_per_m * start_m
             root_m = sqrt(
                 (damped_end_m - start_m) ** 2
                 + 2 * compliance_m_per_n * stiffness_n_per_m * start_m * start_m
@@ -573,32 +575,32 @@ class _ActiveObstacle:
                 0.5 * stiffness_n_per_m * start_m * start_m / (start_m - end_m)
                 - damping_n_per_m * start_m
             )
-        elif free_end_m > 0:
-            # The beam arrives: (free_end - end) (end - start) / compliance
+        elif unforced_end_m > 0:
+            # The beam arrives: (unforced_end - end) (end - start) / compliance
             # = k end²/2 + damping end (end - start)
             square_coefficient = 1 + compliance_m_per_n * (
                 0.5 * stiffness_n_per_m + damping_n_per_m
             )
             linear_coefficient = (
-                free_end_m + start_m + compliance_m_per_n * damping_n_per_m * start_m
+                unforced_end_m + start_m + compliance_m_per_n * damping_n_per_m * start_m
             )
             root_m = sqrt(
                 linear_coefficient * linear_coefficient
-                - 4 * square_coefficient * free_end_m * start_m
+                - 4 * square_coefficient * unforced_end_m * start_m
             )
             # Two forms of the positive root: choose the one without cancellation.
             end_m = (
                 (linear_coefficient + root_m) / (2 * square_coefficient)
                 if linear_coefficient > 0
-                else 2 * free_end_m * start_m / (linear_coefficient - root_m)
+                else 2 * unforced_end_m * start_m / (linear_coefficient - root_m)
             )
             mean_force_n = (
                 0.5 * stiffness_n_per_m * end_m * end_m / (end_m - start_m)
                 + damping_n_per_m * end_m
             )
         else:
-            return 0.0, free_end_m
-        return (mean_force_n, end_m) if mean_force_n > 0 else (0.0, free_end_m)
+            return 0.0, unforced_end_m
+        return (mean_force_n, end_m) if mean_force_n > 0 else (0.0, unforced_end_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -608,7 +610,7 @@ class SubstepMatrices:
     One instance is for a free motor, another for a locked motor.
     """
 
-    free_displacement: Callable[[RealArray], RealArray]
+    unforced_displacement: Callable[[RealArray], RealArray]
     """Function that returns the displacement at the end of each substep if no force acts, body by
     body, from [state, torque before and after the switch, friction of the previous period]."""
     displacement_per_friction: RealArray

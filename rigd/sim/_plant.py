@@ -156,41 +156,43 @@ class SimulatedPlant:
             bending_stiffness_n_m2=simulation.stiffness_ratio * nominal_beam.bending_stiffness_n_m2,
         )
         parameters = replace(parameters, beam=simulated_beam)
-        beam_realisation, free_model, locked_model = beam_and_coupled_models(parameters, simulation)
+        beam_realisation, free_shaft_model, locked_shaft_model = beam_and_coupled_models(
+            parameters, simulation
+        )
         has_sensor_filter = simulation.torque_filter_hz > 0
         self._air = _air_brake(parameters, beam_realisation)
         if self._air is not None:
-            (free_model, free_input), (locked_model, locked_input) = map(
-                self._air.extended_model, (free_model, locked_model)
+            (free_shaft_model, free_input), (locked_shaft_model, locked_input) = map(
+                self._air.extended_model, (free_shaft_model, locked_shaft_model)
             )
         self._contact = _attached_obstacles(parameters, beam_realisation, period_s)
         if self._contact is not None:
-            (free_model, free_input), (locked_model, locked_input) = map(
-                self._contact.extended_model, (free_model, locked_model)
+            (free_shaft_model, free_input), (locked_shaft_model, locked_input) = map(
+                self._contact.extended_model, (free_shaft_model, locked_shaft_model)
             )
-        n = free_model.b.size
+        n = free_shaft_model.b.size
         self._rest_state_per_angle = np.eye(1, n)[0]
         self._rest_state_per_angle[2:] = -np.linalg.solve(
-            locked_model.a[2:, 2:], locked_model.a[2:, 0]
+            locked_shaft_model.a[2:, 2:], locked_shaft_model.a[2:, 0]
         )
         free_matrix, locked_matrix, friction_effect = free_and_locked_steps(
-            free_model, locked_model, period_s, switch_and_sample_instants_s
+            free_shaft_model, locked_shaft_model, period_s, switch_and_sample_instants_s
         )
         self._friction_effects: list[float] = friction_effect[n:].tolist()
         beam_point_count = 0
         if self._air is not None:
             beam_point_count = len(self._air.speed_rows)
-            free_drag_effect = constant_force_effect(
-                free_model,
+            free_shaft_drag_effect = constant_force_effect(
+                free_shaft_model,
                 free_input,
-                locked_model.sensor_torque,
+                locked_shaft_model.sensor_torque,
                 period_s,
                 *switch_and_sample_instants_s[1:],
             )
-            locked_drag_effect = constant_force_effect(
-                locked_model,
+            locked_shaft_drag_effect = constant_force_effect(
+                locked_shaft_model,
                 locked_input,
-                locked_model.sensor_torque,
+                locked_shaft_model.sensor_torque,
                 period_s,
                 *switch_and_sample_instants_s[1:],
             )
@@ -202,14 +204,14 @@ class SimulatedPlant:
                     ]
                 )
                 for matrix_parts in (
-                    (free_matrix, free_drag_effect),
-                    (locked_matrix, locked_drag_effect),
+                    (free_matrix, free_shaft_drag_effect),
+                    (locked_matrix, locked_shaft_drag_effect),
                 )
             )
             self._speed_per_friction = self._air.speed_rows @ friction_effect[:n]
             self._drag_torque_nm = self._drag_shear_n = 0.0
-            self._drag_torque_fraction = 1 - free_model.sensor_torque_per_torque
-            self._drag_shear_fraction = -free_model.shear_per_torque
+            self._drag_torque_fraction = 1 - free_shaft_model.sensor_torque_per_torque
+            self._drag_shear_fraction = -free_shaft_model.shear_per_torque
             self._torque_instant_fraction = 1 - torque_age_s / period_s
         if self._contact is not None:
             beam_point_count = len(self._contact.displacement_rows)
@@ -217,13 +219,13 @@ class SimulatedPlant:
                 self._contact.substep_matrices(
                     coupled_model,
                     force_input,
-                    locked_model.sensor_torque,
+                    locked_shaft_model.sensor_torque,
                     *switch_and_sample_instants_s,
                     friction_effect=friction_effect[:n],
                 )
                 for coupled_model, force_input in (
-                    (free_model, free_input),
-                    (locked_model, locked_input),
+                    (free_shaft_model, free_input),
+                    (locked_shaft_model, locked_input),
                 )
             )
             free_matrix, locked_matrix = (
@@ -268,7 +270,9 @@ class SimulatedPlant:
         self._fraction_before_switch = switch_s / period_s
         self._next_torque_is_known = switch_s == 0 and delay_periods > 0
         self._jump_is_sensed = torque_age_s == 0 and not has_sensor_filter
-        self._set_jump_gains(free_model.sensor_torque_per_torque, free_model.shear_per_torque)
+        self._set_jump_gains(
+            free_shaft_model.sensor_torque_per_torque, free_shaft_model.shear_per_torque
+        )
 
         self._torque_nm = 0.0
         self._torques = deque([0.0] * (delay_periods + 2), maxlen=delay_periods + 2)
@@ -516,13 +520,13 @@ class SimulatedPlant:
         time_s = self.elapsed_s
         if attached_obstacles.cannot_touch(step_output[n + STEP_OUTPUT_COUNT :], time_s):
             return
-        free_displacement_m = substep_matrices.free_displacement(step_input).reshape(
+        unforced_displacement_m = substep_matrices.unforced_displacement(step_input).reshape(
             attached_obstacles.substeps, -1
         )
         friction_torque_nm = self._friction_nm if is_turning else 0.0
         for _ in range(_MAX_FRICTION_ITERATIONS):
             displacement_m = (
-                free_displacement_m
+                unforced_displacement_m
                 + friction_torque_nm * substep_matrices.displacement_per_friction
             )
             forces_n = attached_obstacles.compute_forces(substep_matrices, displacement_m, time_s)

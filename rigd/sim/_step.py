@@ -61,23 +61,23 @@ def beam_and_coupled_models(
         tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
         shear=state_output(beam_realisation, plant.shear, inertial=True),
     )
-    free_model = attach_beam(
+    free_shaft_model = attach_beam(
         motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,
         viscous_nm_s_per_rad=parameters.motor.viscous_nm_s_per_rad,
     )
     # No torque turns an infinite inertia: the beam on a locked shaft.
-    locked_model = attach_beam(motor_inertia_kg_m2=np.inf)
+    locked_shaft_model = attach_beam(motor_inertia_kg_m2=np.inf)
     if simulation.torque_filter_hz > 0:
-        free_model, locked_model = (
+        free_shaft_model, locked_shaft_model = (
             with_filter(coupled_model, simulation.torque_filter_hz, simulation.torque_filter_order)
-            for coupled_model in (free_model, locked_model)
+            for coupled_model in (free_shaft_model, locked_shaft_model)
         )
-    return beam_realisation, free_model, locked_model
+    return beam_realisation, free_shaft_model, locked_shaft_model
 
 
 def free_and_locked_steps(
-    free_model: CoupledModel,
-    locked_model: CoupledModel,
+    free_shaft_model: CoupledModel,
+    locked_shaft_model: CoupledModel,
     period_s: float,
     switch_and_sample_instants_s: tuple[float, float, float],
 ) -> tuple[RealArray, RealArray, RealArray]:
@@ -91,12 +91,15 @@ def free_and_locked_steps(
     friction. The outputs are then corrected at once, and the state by the last column of the next
     step's matrix.
     """
-    n = free_model.b.size
+    n = free_shaft_model.b.size
     free_shaft_matrix = _step_matrix(
-        free_model, locked_model.sensor_torque, period_s, *switch_and_sample_instants_s
+        free_shaft_model, locked_shaft_model.sensor_torque, period_s, *switch_and_sample_instants_s
     )
     locked_shaft_matrix = _step_matrix(
-        locked_model, locked_model.sensor_torque, period_s, *switch_and_sample_instants_s
+        locked_shaft_model,
+        locked_shaft_model.sensor_torque,
+        period_s,
+        *switch_and_sample_instants_s,
     )
     friction_effect = -(free_shaft_matrix[:, n] + free_shaft_matrix[:, n + 1])
     free_shaft_matrix = np.column_stack(
@@ -139,17 +142,22 @@ def drifted_step_arrays(
             f"{stiffness_ratio:.4g} times its stiffness, which it drifts to; leave the drift out. "
             f"{error}"
         ) from error
-    free_model, locked_model = (
+    free_shaft_model, locked_shaft_model = (
         with_modal_displacements(coupled_model, drifted_realisation, initial_realisation)
         for coupled_model in coupled_models
     )
     free_matrix, locked_matrix, friction_effect = free_and_locked_steps(
-        free_model, locked_model, period_s, switch_and_sample_instants_s
+        free_shaft_model, locked_shaft_model, period_s, switch_and_sample_instants_s
     )
     effects_per_torque = np.array(
-        [free_model.sensor_torque_per_torque, free_model.shear_per_torque]
+        [free_shaft_model.sensor_torque_per_torque, free_shaft_model.shear_per_torque]
     )
-    return free_matrix, locked_matrix, friction_effect[free_model.b.size :], effects_per_torque
+    return (
+        free_matrix,
+        locked_matrix,
+        friction_effect[free_shaft_model.b.size :],
+        effects_per_torque,
+    )
 
 
 def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
