@@ -327,8 +327,8 @@ class AttachedObstacles:
 
         The forces have the shape (substeps, bodies) and are positive in the direction of increasing
         angles. The matrices are those of the free or the locked motor.
-        `unforced_displacement_m`, shape (substeps, bodies), is the beam's displacement at each body at
-        the end of each substep if no force acts, and `time_s` the start of the period.
+        `unforced_displacement_m`, shape (substeps, bodies), is the beam's displacement at each body
+        at the end of each substep if no force acts, and `time_s` the start of the period.
         """
         substep_count, substep_s = self.substeps, self._substep_s
         force_kernel = substep_matrices.displacement_kernel
