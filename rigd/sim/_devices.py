@@ -511,12 +511,12 @@ def _unit_wrenches(
     has_projection = projections.any(axis=1)
     unit_wrenches = np.zeros((6, 2))
     projection_rows = projections[has_projection]
-    unit_wrenches[:, has_projection] = projection_rows.ReadingT @ np.linalg.inv(
-        projection_rows @ projection_rows.ReadingT
+    unit_wrenches[:, has_projection] = projection_rows.T @ np.linalg.inv(
+        projection_rows @ projection_rows.T
     )
     if crosstalk_percent:
         full_ranges = np.array(sensor.range)
         crosstalk_matrix = 0.01 * crosstalk_percent * np.array(_CROSSTALK_PATTERN)
         unit_wrenches += crosstalk_matrix * full_ranges[:, None] / full_ranges @ unit_wrenches
-    torque_wrench, shear_wrench = unit_wrenches.ReadingT.tolist()
+    torque_wrench, shear_wrench = unit_wrenches.T.tolist()
     return torque_wrench, shear_wrench
