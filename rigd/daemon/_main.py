@@ -18,7 +18,7 @@ from rigd.devices import (
     ActuationTarget,
     actuation_target,
     describe_actuation_target,
-    simulated_differently,
+    simulation_differences,
 )
 from rigd.profile import Profile
 from rigd.runner import Rig
@@ -98,7 +98,7 @@ def run_daemon(
         _log.info(
             "%s Listening on %s", describe_actuation_target(profile.rig, target), daemon_socket
         )
-        for simulation_difference in simulated_differently(profile.rig):
+        for simulation_difference in simulation_differences(profile.rig):
             _log.warning("the simulated rig has %s", simulation_difference)
         if page:
             from rigd.daemon._page import PageProcess

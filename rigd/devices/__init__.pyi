@@ -7,7 +7,7 @@ from ._registry import check_selection as check_selection
 from ._registry import describe_actuation_target as describe_actuation_target
 from ._registry import is_simulated_here as is_simulated_here
 from ._registry import open_devices as open_devices
-from ._registry import simulated_differently as simulated_differently
+from ._registry import simulation_differences as simulation_differences
 from ._registry import simulator as simulator
 from ._seeds import fresh_seed as fresh_seed
 from ._seeds import session_seed as session_seed

@@ -39,14 +39,14 @@ class ActuationTarget(Enum):
         return self in (ActuationTarget.SIMULATED, ActuationTarget.LOCK_STEP)
 
 
-def check_selection(selection: DeviceSelection, source: Path | None = None) -> None:
+def check_selection(selection: DeviceSelection, profile_path: Path | None = None) -> None:
     """Raise if there are no drivers for the drive and sensor that a profile names.
 
     Parameters
     ----------
     selection
         Drive and sensor that a profile names.
-    source
+    profile_path
         Path of the profile's file, for the message; None: not stated.
 
     Raises
@@ -59,7 +59,7 @@ def check_selection(selection: DeviceSelection, source: Path | None = None) -> N
     drive, sensor = DEVICES.get(selection.drive), DEVICES.get(selection.sensor)
     if drive is None or sensor is None or not fits(drive, sensor):
         known_pairs = "; ".join(known_selections())
-        file_prefix = "" if source is None else f"{source}: "
+        file_prefix = "" if profile_path is None else f"{profile_path}: "
         raise UnknownDeviceError(
             f'{file_prefix}devices: drive = "{selection.drive}" with sensor = '
             f'"{selection.sensor}" is no '
@@ -94,8 +94,10 @@ def describe_actuation_target(rig: RigParameters, target: ActuationTarget) -> st
         Result of `actuation_target`.
     """
     if target is not ActuationTarget.HARDWARE:
-        simulation_text = "in this process" if target is ActuationTarget.SIMULATED else target.value
-        return f"No hardware: {rig.name} is simulated ({simulation_text})."
+        simulation_location = (
+            "in this process" if target is ActuationTarget.SIMULATED else target.value
+        )
+        return f"No hardware: {rig.name} is simulated ({simulation_location})."
     return f"HARDWARE: {rig.name} moves the drive on {drive_address(rig)}."
 
 
@@ -108,7 +110,7 @@ def drive_address(rig: RigParameters) -> str:
         return kind.address(rig)
 
 
-def simulated_differently(rig: RigParameters) -> list[str]:
+def simulation_differences(rig: RigParameters) -> list[str]:
     """Return the differences between a profile and the running simulator of its rig, as phrases.
 
     The list is empty if no simulator runs.
@@ -141,11 +143,11 @@ def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> D
         else would move now than was confirmed.
     """
     check_selection(rig.devices)
-    unknown_text = describe_unknown_values(rig)
-    if unknown_text:
-        raise DeviceError(unknown_text)
+    unknown_values_message = describe_unknown_values(rig)
+    if unknown_values_message:
+        raise DeviceError(unknown_values_message)
     try:
-        devices = _create(rig)
+        devices = _create_devices(rig)
     except PluginError as error:
         raise DeviceError(str(error)) from error
     if target is not None and devices.simulated is (target is ActuationTarget.HARDWARE):
@@ -157,7 +159,7 @@ def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> D
     return devices
 
 
-def _create(rig: RigParameters) -> Devices:
+def _create_devices(rig: RigParameters) -> Devices:
     """Create drive and sensor of a rig with a valid selection of devices."""
     drive_kind, sensor_kind = DEVICES.get(rig.devices.drive), DEVICES.get(rig.devices.sensor)
     assert drive_kind is not None
@@ -165,7 +167,7 @@ def _create(rig: RigParameters) -> Devices:
     assert sensor_kind is not None
     assert sensor_kind.open_sensor is not None
     with plugin_errors(DEVICES.owner(drive_kind.name)):
-        opened = drive_kind.open_drive(rig)
+        opened_drive = drive_kind.open_drive(rig)
     with plugin_errors(DEVICES.owner(sensor_kind.name)):
-        sensor = sensor_kind.open_sensor(opened.rig, opened)
-    return Devices(opened.drive, sensor, opened.simulated, opened.renew_noise)
+        sensor = sensor_kind.open_sensor(opened_drive.rig, opened_drive)
+    return Devices(opened_drive.drive, sensor, opened_drive.simulated, opened_drive.renew_noise)

@@ -9,9 +9,9 @@ from rigd.devices.contracts import Devices, WrenchSensor
 from rigd.devices.declaration import DeviceKind, OpenedDrive
 from rigd.devices.parameters import AtiCan, AtiSerial, RigParameters, ServoDrive
 
-_MAX_TORQUE_RATIO = 32.767
+_MAX_RATIO_TO_RATED_TORQUE = 32.767
 """Largest ratio of torque to rated torque that the 16 bits of object 6071 can hold."""
-_DELAY_ROUNDING_S = 1e-9
+_MAX_DELAY_ROUNDING_S = 1e-9
 """Largest rounding error in seconds of a delay in a profile."""
 
 
@@ -31,10 +31,10 @@ def _open_simulated_drive(rig: RigParameters) -> OpenedDrive:
     )
 
 
-def _simulated_sensor(_rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
+def _simulated_sensor(_rig: RigParameters, opened_drive: OpenedDrive) -> WrenchSensor:
     """Return the sensor of the simulated rig."""
-    assert opened.simulated_sensor is not None
-    return opened.simulated_sensor
+    assert opened_drive.simulated_sensor is not None
+    return opened_drive.simulated_sensor
 
 
 # CiA 402 drive, and ATI sensors with it
@@ -47,18 +47,18 @@ def _open_wired_drive(rig: RigParameters) -> OpenedDrive:
     return open_wired_drive(rig)
 
 
-def _open_can_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
+def _open_can_sensor(rig: RigParameters, opened_drive: OpenedDrive) -> WrenchSensor:
     """Create the ATI sensor on the bus of the drive."""
     from rigd.devices.ati import AtiCanSensor
 
-    return AtiCanSensor(rig, opened.line.can_link)
+    return AtiCanSensor(rig, opened_drive.line.can_link)
 
 
-def _open_serial_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
+def _open_serial_sensor(rig: RigParameters, opened_drive: OpenedDrive) -> WrenchSensor:
     """Create the ATI sensor on the rig's serial line, or on that of the drive's simulator."""
     from rigd.devices.ati import AtiSerialSensor
 
-    return AtiSerialSensor(rig, opened.line.simulator)
+    return AtiSerialSensor(rig, opened_drive.line.simulator)
 
 
 def _drive_address(rig: RigParameters) -> str:
@@ -111,12 +111,14 @@ def _drive_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
             f"{speed_limit_rad_s:g} rad/s; the drive would limit torques that a session may need. "
             "Choose a quarter more than the limit, or 0 to leave the drive's own value."
         )
-    peak_ratio = profile_values["motor.peak_torque_nm"] / profile_values["motor.rated_torque_nm"]
-    if peak_ratio > _MAX_TORQUE_RATIO:
+    peak_to_rated_torque = (
+        profile_values["motor.peak_torque_nm"] / profile_values["motor.rated_torque_nm"]
+    )
+    if peak_to_rated_torque > _MAX_RATIO_TO_RATED_TORQUE:
         yield (
-            f"motor.peak_torque_nm is {peak_ratio:g} times motor.rated_torque_nm; the "
+            f"motor.peak_torque_nm is {peak_to_rated_torque:g} times motor.rated_torque_nm; the "
             "drive's target "
-            f"torque reaches {_MAX_TORQUE_RATIO:g} times."
+            f"torque reaches {_MAX_RATIO_TO_RATED_TORQUE:g} times."
         )
     for key_prefix in ("", "drive_"):
         period_text, timeout_text = (
@@ -177,7 +179,7 @@ def _serial_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     )
     delay_s = profile_values["sensor.delay_s"]
     min_delay_s = settings.filter_delay_s(profile_values["rig.rate_hz"])
-    if delay_s < min_delay_s - _DELAY_ROUNDING_S:
+    if delay_s < min_delay_s - _MAX_DELAY_ROUNDING_S:
         yield (
             f"sensor.delay_s = {delay_s:g} s is less than the filter of the sensor's records "
             f"alone: at least {min_delay_s:.6g} s."

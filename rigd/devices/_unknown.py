@@ -1,6 +1,6 @@
 """Values that a profile declares as unknown, and how the operator can find them.
 
-A profile writes such a value as ``{ source = "is_unknown" }``; the parameter is then NaN. Nothing
+A profile writes such a value as ``{ source = "unknown" }``; the parameter is then NaN. Nothing
 may be computed from it, and no device is opened with it.
 """
 
@@ -60,12 +60,12 @@ def unknown_values(rig: "RigParameters") -> tuple[str, ...]:
         Keys of `MAY_BE_UNKNOWN`, in its order.
     """
 
-    def is_unknown(key: str) -> bool:
-        section, _, key_name = key.partition(".")
+    def is_value_unknown(profile_key: str) -> bool:
+        section, _, key_name = profile_key.partition(".")
         section_parameters = getattr(rig, section)
         return section_parameters is not None and isnan(getattr(section_parameters, key_name))
 
-    return tuple(key for key in MAY_BE_UNKNOWN if is_unknown(key))
+    return tuple(key for key in MAY_BE_UNKNOWN if is_value_unknown(key))
 
 
 def describe_unknown_values(rig: "RigParameters") -> str:

@@ -37,19 +37,21 @@ def open_wired_drive(rig: RigParameters) -> OpenedDrive:
     Raise `DeviceError` if identifiers collide, the bus load is too high, or both hardware and a
     simulated rig are available.
     """
-    bus = rig.can
-    assert bus is not None
-    refusals = bus_conflicts(rig)
-    if refusals:
-        raise DeviceError("\n".join(refusals))
+    bus_settings = rig.can
+    assert bus_settings is not None
+    conflict_sentences = bus_conflicts(rig)
+    if conflict_sentences:
+        raise DeviceError("\n".join(conflict_sentences))
     running_simulator = find_simulator(rig.name)
     if running_simulator is not None:
-        _refuse_ambiguity(rig, running_simulator)
+        _refuse_simulator_and_hardware(rig, running_simulator)
         if running_simulator.lock_step:
             assert rig.acquisition is not None
-            long_deadline = replace(rig.acquisition, deadline_us=_LOCK_STEP_DEADLINE_US)
-            rig = replace(rig, acquisition=long_deadline)
-    can_link = CanLink(bus, running_simulator)
+            acquisition_with_long_deadline = replace(
+                rig.acquisition, deadline_us=_LOCK_STEP_DEADLINE_US
+            )
+            rig = replace(rig, acquisition=acquisition_with_long_deadline)
+    can_link = CanLink(bus_settings, running_simulator)
     return OpenedDrive(
         rig,
         Cia402Drive(rig, can_link),
@@ -66,17 +68,17 @@ def _restart_simulator_noise(simulator: SimulatorAddress, seed: int | None) -> i
     return int(ask_simulator(simulator, {"renew_noise": seed})["seed"])
 
 
-def _refuse_ambiguity(rig: RigParameters, simulator: SimulatorAddress) -> None:
+def _refuse_simulator_and_hardware(rig: RigParameters, simulator: SimulatorAddress) -> None:
     """Raise if both a simulated rig and the hardware that it replaces are available."""
     assert rig.can is not None
-    hardware_found = []
+    available_hardware = []
     if simulator.can_socket and (_NETWORK_INTERFACES_FOLDER / rig.can.channel).exists():
-        hardware_found.append(f"the CAN interface {rig.can.channel}")
+        available_hardware.append(f"the CAN interface {rig.can.channel}")
     if simulator.serial_port and rig.ati_serial is not None and Path(rig.ati_serial.port).exists():
-        hardware_found.append(f"the serial port {rig.ati_serial.port}")
-    if hardware_found:
+        available_hardware.append(f"the serial port {rig.ati_serial.port}")
+    if available_hardware:
         raise DeviceError(
             f"A simulated rig of {rig.name} is running (rigd simulate, process {simulator.pid}), "
-            f"and {' and '.join(hardware_found)} of the real one is here too; stop the simulated "
-            "rig, or unplug the real one."
+            f"and {' and '.join(available_hardware)} of the real one is here too; stop the "
+            "simulated rig, or unplug the real one."
         )

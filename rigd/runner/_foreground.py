@@ -10,7 +10,7 @@ from typing import Final, Self
 import typer
 
 from rigd.checks import run_offline_checks
-from rigd.devices import ActuationTarget, describe_actuation_target, simulated_differently
+from rigd.devices import ActuationTarget, describe_actuation_target, simulation_differences
 from rigd.engine.shared_state import LogEvent
 from rigd.errors import FailureError, RigdError
 from rigd.excitation import Excitation
@@ -148,7 +148,7 @@ def run_in_foreground(
             profile = with_tip_slope(profile, tip_slope_rad)
             specimen_profile = with_specimen(profile, specimen)
             _print(describe_actuation_target(profile.rig, target), to_stderr=True)
-            for difference in simulated_differently(profile.rig):
+            for difference in simulation_differences(profile.rig):
                 print_line(f"Warning: the simulated rig has {difference}.")
             is_exclusive = not (fast and target is ActuationTarget.SIMULATED)
             is_hardware = target is ActuationTarget.HARDWARE

@@ -25,7 +25,7 @@ from rigd.devices import (
     bus_conflicts,
     check_selection,
     describe_actuation_target,
-    simulated_differently,
+    simulation_differences,
 )
 from rigd.devices.kinds import DEVICES
 from rigd.devices.obstacles import with_obstacles
@@ -444,9 +444,9 @@ def _session_metadata(
     serial_number = connection.calibration.get("serial_number")
     if isinstance(serial_number, str):
         metadata["sensor_serial_number"] = serial_number
-    simulation_differences = simulated_differently(rig)
-    if simulation_differences:
-        metadata["simulated_differently"] = "; ".join(simulation_differences)
+    differences_from_simulator = simulation_differences(rig)
+    if differences_from_simulator:
+        metadata["simulated_differently"] = "; ".join(differences_from_simulator)
     if rig.acquisition is not None:
         metadata["acquisition_mode"] = rig.acquisition.mode
         metadata["acquisition_deadline_s"] = repr(rig.acquisition.deadline_us * 1e-6)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.devices import ActuationTarget, actuation_target, open_devices, simulated_differently
+from rigd.devices import ActuationTarget, actuation_target, open_devices, simulation_differences
 from rigd.devices.contracts import DeviceError
 from rigd.devices.running_simulator import SimulatorAddress, announce, described
 from rigd.profile import load_profile
@@ -95,15 +95,15 @@ def test_an_overloaded_bus_is_refused(rig, runtime_folder):
 
 
 def test_differences_of_a_simulated_rig_are_reported(rig, stand_in):
-    assert simulated_differently(rig) == []
+    assert simulation_differences(rig) == []
     stand_in(rig.name, rig=described(rig))
-    assert simulated_differently(rig) == []
+    assert simulation_differences(rig) == []
     other = replace(
         rig,
         beam=replace(rig.beam, length_m=0.7),
         acquisition=replace(rig.acquisition, mode="previous_tick"),
     )
-    assert simulated_differently(other) == [
+    assert simulation_differences(other) == [
         "beam.length_m = 0.98 instead of 0.7",
         'acquisition.mode = "same_tick" instead of "previous_tick"',
     ]

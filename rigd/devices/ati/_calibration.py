@@ -77,7 +77,7 @@ class Calibration:
         Counts per unit of force and per unit of torque.
     matrix
         Calibration matrix; rows Fx, Fy, Fz, Tx, Ty, Tz, columns gauges 0 to 5.
-    ratings
+    rated_loads
         Largest rated load of each axis in the calibration's units; None if not stated.
     """
 
@@ -90,7 +90,7 @@ class Calibration:
     part_number: str = ""
     date: str = ""
     family: str = ""
-    ratings: tuple[float, ...] | None = None
+    rated_loads: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError if no wrench can be computed with the calibration."""
@@ -105,14 +105,14 @@ class Calibration:
                 f"{self.counts_per_torque} per torque, but both must be positive. Choose another "
                 "calibration."
             )
-        self._check_matrix()
+        self._check_calibration_matrix()
 
-    def _check_matrix(self) -> None:
+    def _check_calibration_matrix(self) -> None:
         """Raise ValueError if the calibration matrix has an implausible entry or is singular."""
         for axis_index, (axis, row) in enumerate(zip(_AXES, self.matrix, strict=True)):
             axis_unit = self.force_unit_n if axis_index < 3 else self.torque_unit_nm
             counts_per_unit = self.counts_per_force if axis_index < 3 else self.counts_per_torque
-            full_scale_unit = axis_unit / counts_per_unit * _FULL_SCALE_COUNTS
+            full_scale_load = axis_unit / counts_per_unit * _FULL_SCALE_COUNTS
             unit_name = "N" if axis_index < 3 else "N·m"
             for gauge, matrix_entry in enumerate(row):
                 if not isfinite(matrix_entry):
@@ -120,10 +120,10 @@ class Calibration:
                         f"the entry {axis}, gauge {gauge} of its calibration matrix is "
                         f"{matrix_entry}, which is not a number. Choose another calibration."
                     )
-                if abs(matrix_entry) * full_scale_unit > _MAX_MATRIX_ENTRY:
+                if abs(matrix_entry) * full_scale_load > _MAX_MATRIX_ENTRY:
                     raise ValueError(
                         f"the entry {axis}, gauge {gauge} of its calibration matrix is "
-                        f"{matrix_entry:.4g} ({abs(matrix_entry) * full_scale_unit:.2g} "
+                        f"{matrix_entry:.4g} ({abs(matrix_entry) * full_scale_load:.2g} "
                         f"{unit_name} for a gauge at full scale), more than any sensor has "
                         f"({_MAX_MATRIX_ENTRY:g} {unit_name}): its memory is damaged. Choose "
                         "another calibration, or have the sensor repaired."
@@ -133,7 +133,7 @@ class Calibration:
                     f"the row {axis} of its calibration matrix is zero: that calibration is "
                     "empty. Choose another calibration."
                 )
-            if max(map(abs, row)) * full_scale_unit < _MIN_MATRIX_ENTRY:
+            if max(map(abs, row)) * full_scale_load < _MIN_MATRIX_ENTRY:
                 raise ValueError(
                     f"no entry of the row {axis} of its calibration matrix is beyond "
                     f"{max(map(abs, row)):.2g} (less than {_MIN_MATRIX_ENTRY:g} {unit_name} for a "
@@ -181,11 +181,11 @@ class Calibration:
 
     def as_dict(self) -> dict[str, object]:
         """Return the calibration as a dictionary for the session file, ranges in N and N·m."""
-        ranges: list[float] | str = "not stated by the sensor"
-        if self.ratings is not None and all(map(isfinite, self.ratings)):
-            ranges = [
+        axis_ranges: list[float] | str = "not stated by the sensor"
+        if self.rated_loads is not None and all(map(isfinite, self.rated_loads)):
+            axis_ranges = [
                 (self.force_unit_n if axis < 3 else self.torque_unit_nm) * rating
-                for axis, rating in enumerate(self.ratings)
+                for axis, rating in enumerate(self.rated_loads)
             ]
         return {
             "serial_number": self.serial_number,
@@ -197,11 +197,11 @@ class Calibration:
             "counts_per_force": self.counts_per_force,
             "counts_per_torque": self.counts_per_torque,
             "matrix": [list(row) for row in self.matrix],
-            "range_n_nm": ranges,
+            "range_n_nm": axis_ranges,
         }
 
 
-def wrench_function(
+def wrench_from_counts_function(
     matrix_rows: MatrixRows,
 ) -> Callable[[float, float, float, float, float, float], Wrench]:
     """Return a function that multiplies a 6x6 matrix by six gauge counts, its arguments.
@@ -248,10 +248,10 @@ def printable_text(raw_bytes: Sequence[int]) -> str:
 
 # Calibration block of a Digital F/T
 
-BLOCK_LENGTH_REGISTERS = 133
+BLOCK_REGISTER_COUNT = 133
 """Number of 16-bit registers of a calibration block that the driver reads."""
 
-_FIRST_BLOCK_REGISTER = 0x00E3
+_FIRST_BLOCK_ADDRESS = 0x00E3
 """Address of the first register of calibration block 1."""
 _BLOCK_SPACING_REGISTERS = 192
 """Number of registers from the beginning of one calibration block to the next."""
@@ -263,15 +263,15 @@ class CalibrationBlock:
 
     calibration: Calibration
     """Calibration matrix, units and identity."""
-    gains: tuple[int, ...]
+    amplifier_gains: tuple[int, ...]
     """Amplifier gains of gauges 0 to 5, as register values."""
-    offsets: tuple[int, ...]
+    amplifier_offsets: tuple[int, ...]
     """Amplifier offsets of gauges 0 to 5, as register values."""
 
 
-def first_block_register(block_number: int) -> int:
+def calibration_block_address(block_number: int) -> int:
     """Return the address of the first register of calibration block `block_number` (1 to 16)."""
-    return _FIRST_BLOCK_REGISTER + (block_number - 1) * _BLOCK_SPACING_REGISTERS
+    return _FIRST_BLOCK_ADDRESS + (block_number - 1) * _BLOCK_SPACING_REGISTERS
 
 
 def parse_block(registers: Sequence[int]) -> CalibrationBlock:
@@ -280,10 +280,10 @@ def parse_block(registers: Sequence[int]) -> CalibrationBlock:
     Raise `ValueError` if no wrench can be computed with the calibration; the message is for the
     operator.
     """
-    raw_bytes = pack(f">{BLOCK_LENGTH_REGISTERS}H", *registers)
+    raw_bytes = pack(f">{BLOCK_REGISTER_COUNT}H", *registers)
 
-    def register_bytes(first: int, count: int) -> bytes:
-        return raw_bytes[2 * first : 2 * (first + count)]
+    def register_bytes(first_register: int, register_count: int) -> bytes:
+        return raw_bytes[2 * first_register : 2 * (first_register + register_count)]
 
     matrix_entries = unpack(">36f", register_bytes(32, 72))
     counts_per_force, counts_per_torque = unpack(">ii", register_bytes(117, 4))
@@ -295,14 +295,14 @@ def parse_block(registers: Sequence[int]) -> CalibrationBlock:
         matrix=tuple(tuple(matrix_entries[6 * axis : 6 * axis + 6]) for axis in range(6)),
         force_unit=registers[104] >> 8,
         torque_unit=registers[104] & 0xFF,
-        ratings=unpack(">6f", register_bytes(105, 12)),
+        rated_loads=unpack(">6f", register_bytes(105, 12)),
         counts_per_force=counts_per_force,
         counts_per_torque=counts_per_torque,
     )
     return CalibrationBlock(
         calibration=calibration,
-        gains=unpack(">6H", register_bytes(121, 6)),
-        offsets=unpack(">6H", register_bytes(127, 6)),
+        amplifier_gains=unpack(">6H", register_bytes(121, 6)),
+        amplifier_offsets=unpack(">6H", register_bytes(127, 6)),
     )
 
 

@@ -15,9 +15,9 @@ from rigd.devices.ati._calibration import (
     MatrixRows,
     describe_can_status,
     same_serial_number,
-    wrench_function,
+    wrench_from_counts_function,
 )
-from rigd.devices.ati._netcanoem import REPLY_LENGTHS, GaugePolls, PollReply, identifier
+from rigd.devices.ati._netcanoem import REPLY_LENGTHS, GaugePolls, PollReply, can_identifier
 from rigd.devices.canbus import CanExchange, CanLink
 from rigd.devices.contracts import DeviceError, LineHealth, Wrench
 from rigd.devices.parameters import RigParameters
@@ -32,11 +32,11 @@ _LATE_REPLY_WAIT_S = 0.5
 A repeated request may be answered twice, and no reply states which row of the matrix it holds."""
 _POLL_TIMEOUT_S = 0.02
 """Time in seconds after which a poll of `measure` counts as lost."""
-_MIN_RESTART_S = 0.005
+_MIN_RESTART_DURATION_S = 0.005
 """Time in seconds without reply after which a box may have restarted; no box starts faster."""
 
 _ASSUMED_SCALE_TEXT = (
-    f"{netcanoem.COUNTS_OF_OLD_FIRMWARE} counts per N and per N·m: firmware before "
+    f"{netcanoem.OLD_FIRMWARE_COUNTS_PER_UNIT} counts per N and per N·m: firmware before "
     f"{'.'.join(map(str, netcanoem.FIRST_FIRMWARE_WITH_SCALE))} reports neither counts per unit "
     "nor units"
 )
@@ -91,7 +91,7 @@ class AtiCanSensor:
         self._is_connected = False
         self._subscribed_to: CanExchange | None = None
         self._inbox: dict[int, bytes] = {}
-        self._restart_ticks = max(1, ceil(_MIN_RESTART_S * rig.rate_hz))
+        self._restart_ticks = max(1, ceil(_MIN_RESTART_DURATION_S * rig.rate_hz))
         self._unanswered_ticks = 0
         self._calibration_in_doubt = False
         self._row_read_before = b""
@@ -99,7 +99,7 @@ class AtiCanSensor:
         self._firmware: tuple[int, int, int] = (0, 0, 0)
         self._status_texts: list[str] = []
         self._status_word = 0
-        self._wrench_from_counts = wrench_function(((0.0,) * 6,) * 6)
+        self._wrench_from_counts = wrench_from_counts_function(((0.0,) * 6,) * 6)
         self._previous_reply: PollReply | None = None
         self._previous_ns = 0
         self._reply_deadline_ns = 0
@@ -126,21 +126,23 @@ class AtiCanSensor:
         self.polls.open(exchange)
         try:
             self._subscribe(exchange)
-            self._firmware = netcanoem.firmware(
+            self._firmware = netcanoem.firmware_version(
                 self._request_reply("its firmware version", netcanoem.FIRMWARE_OPCODE)
             )
             self._select_calibration()
             serial_number = self._read_serial_number()  # belongs to the calibration, not to the box
-            calibration_matrix = self._read_matrix()
+            calibration_matrix = self._read_calibration_matrix()
             # A wrong entry would falsify every result, and the protocol has no checksum of its own.
-            if self._read_matrix() != calibration_matrix:
+            if self._read_calibration_matrix() != calibration_matrix:
                 raise DeviceError(
                     f"{self._name}: its calibration matrix read differently the second time; "
                     "check cable and termination."
                 )
-            self._calibration = self._read_scale(serial_number, calibration_matrix)
-            self._wrench_from_counts = wrench_function(self._calibration.wrench_per_wire_count())
-            self._evaluate(self._first_reading())
+            self._calibration = self._calibration_with_units(serial_number, calibration_matrix)
+            self._wrench_from_counts = wrench_from_counts_function(
+                self._calibration.wrench_per_wire_count()
+            )
+            self._wrench_of_reply(self._await_first_reading())
             self.polls.reset_pairing()
             self._previous_reply = None
             self._unanswered_ticks = 0
@@ -165,7 +167,7 @@ class AtiCanSensor:
             **self._calibration.as_dict(),
             "calibration": self._settings.calibration,
             "firmware": f"{major}.{minor}.{build}",
-            **({} if self._reports_scale else {"assumed": _ASSUMED_SCALE_TEXT}),
+            **({} if self._reports_counts_per_unit else {"assumed": _ASSUMED_SCALE_TEXT}),
             "status": self._status_texts,
             "base_id": self._settings.base_id,
         }
@@ -224,7 +226,7 @@ class AtiCanSensor:
             return self._wrench
         self.wrench_stale = False
         self.wrench_time_ns = sent_ns
-        return self._evaluate(poll_reply)
+        return self._wrench_of_reply(poll_reply)
 
     def health(self) -> LineHealth:
         """Return the number of errors on the bus to the sensor, and the sensor's status word."""
@@ -238,14 +240,14 @@ class AtiCanSensor:
         -------
         dict
             ``polls_hz`` (readings per second), ``turnaround_median_s`` and ``turnaround_p99_s``
-            (time from poll to reply; NaN without replies), ``lost_polls`` (polls without a reply).
+            (time from poll to reply; NaN without replies), ``lost`` (polls without a reply).
 
         Raises
         ------
         DeviceError
             If the bus has failed or the sensor reports an error.
         """
-        turnarounds_ns: list[int] = []
+        reply_times_ns: list[int] = []
         lost_polls = 0
         begin_ns = time.monotonic_ns()
         end_ns = begin_ns + int(duration_s * 1e9)
@@ -254,15 +256,15 @@ class AtiCanSensor:
             if poll_reply is None:
                 lost_polls += 1
                 continue
-            self._evaluate(poll_reply)
-            turnarounds_ns.append(self.polls.turnaround_ns)
+            self._wrench_of_reply(poll_reply)
+            reply_times_ns.append(self.polls.turnaround_ns)
         elapsed_s = (time.monotonic_ns() - begin_ns) * 1e-9
         self.polls.reset_pairing()
-        turnarounds_ns.sort()
+        reply_times_ns.sort()
         return {
-            "polls_hz": len(turnarounds_ns) / elapsed_s,
-            "turnaround_median_s": _quantile_s(turnarounds_ns, 0.5),
-            "turnaround_p99_s": _quantile_s(turnarounds_ns, 0.99),
+            "polls_hz": len(reply_times_ns) / elapsed_s,
+            "turnaround_median_s": _quantile_s(reply_times_ns, 0.5),
+            "turnaround_p99_s": _quantile_s(reply_times_ns, 0.99),
             "lost": float(lost_polls),
         }
 
@@ -279,20 +281,20 @@ class AtiCanSensor:
         if exchange is not self._subscribed_to:
             base_id = self._settings.base_id
             self.polls.subscribe(
-                identifier(base_id, netcanoem.GAUGES_OPCODE),
-                identifier(base_id, netcanoem.REMAINING_GAUGES_OPCODE),
+                can_identifier(base_id, netcanoem.GAUGES_OPCODE),
+                can_identifier(base_id, netcanoem.REMAINING_GAUGES_OPCODE),
             )
             for opcode in REPLY_LENGTHS:
                 if opcode not in (netcanoem.GAUGES_OPCODE, netcanoem.REMAINING_GAUGES_OPCODE):
                     store_reply = partial(self._inbox.__setitem__, opcode)
-                    exchange.subscribe(identifier(base_id, opcode), store_reply)
+                    exchange.subscribe(can_identifier(base_id, opcode), store_reply)
             self._subscribed_to = exchange
         exchange.start()
 
-    def _evaluate(self, poll_reply: PollReply) -> Wrench:
+    def _wrench_of_reply(self, poll_reply: PollReply) -> Wrench:
         """Store status word, gauge counts and wrench of a reply; return the wrench in N and N·m."""
         status_word, g0, g2, g4 = netcanoem.read_gauges(poll_reply[0])
-        g1, g3, g5 = netcanoem.read_gauges_rest(poll_reply[1])
+        g1, g3, g5 = netcanoem.read_remaining_gauges(poll_reply[1])
         previous_word, self._status_word = self._status_word, status_word
         if status_word:
             self._check_status(status_word, previous_word)
@@ -305,11 +307,11 @@ class AtiCanSensor:
         self._wrench = wrench = self._wrench_from_counts(g0, g2, g4, g1, g3, g5)
         return wrench
 
-    def _check_status(self, status_word: int, previous_word: int) -> None:
+    def _check_status(self, status_word: int, previous_status_word: int) -> None:
         """Count bus errors in a status word, and raise on a restart or a critical status bit."""
         if status_word & CAN_BUS_ERROR_BIT:
             self.bus_errors += 1
-        if status_word & ~previous_word & CAN_WATCHDOG_RESET_BIT:
+        if status_word & ~previous_status_word & CAN_WATCHDOG_RESET_BIT:
             raise self._restart_error(f"its watchdog has reset it (status word {status_word:#06x})")
         if status_word & CRITICAL_CAN_STATUS_BITS:
             remedy = (
@@ -339,11 +341,14 @@ class AtiCanSensor:
         short loss of power: bit 0 of its status means a restart by its watchdog only.
         """
         inbox, calibration = self._inbox, self._calibration
-        row_frames = [inbox.get(opcode, b"") for opcode in netcanoem.MATRIX_ROW_REPLY_OPCODES]
+        matrix_row_frames = [
+            inbox.get(opcode, b"") for opcode in netcanoem.MATRIX_ROW_REPLY_OPCODES
+        ]
         if all(
-            len(row_entry) == REPLY_LENGTHS[netcanoem.MATRIX_ROW_OPCODE] for row_entry in row_frames
+            len(row_entry) == REPLY_LENGTHS[netcanoem.MATRIX_ROW_OPCODE]
+            for row_entry in matrix_row_frames
         ):
-            row_read, earlier_row = b"".join(row_frames), self._row_read_before
+            row_read, earlier_row = b"".join(matrix_row_frames), self._row_read_before
             if calibration is None or netcanoem.matrix_row(row_read) == calibration.matrix[0]:
                 self._calibration_in_doubt = False
                 return True
@@ -367,7 +372,7 @@ class AtiCanSensor:
         gauge_polls.send()
         return gauge_polls.wait(gauge_polls.sent_ns + int(timeout_s * 1e9))
 
-    def _first_reading(self) -> PollReply:
+    def _await_first_reading(self) -> PollReply:
         """Poll the sensor repeatedly after set-up; return the first reply, or raise without one."""
         for _ in range(_REQUEST_ATTEMPTS):
             poll_reply = self._poll(_REPLY_TIMEOUT_S)
@@ -377,27 +382,27 @@ class AtiCanSensor:
         raise self._no_reply_error("a reading")
 
     def _request_reply(
-        self, requested_item: str, opcode: int, *arguments: int, replies: Sequence[int] = ()
+        self, requested_item: str, opcode: int, *arguments: int, reply_opcodes: Sequence[int] = ()
     ) -> bytes:
         """Send a request and return its reply frames, concatenated; repeat it if unanswered."""
         exchange, inbox = self.polls.exchange, self._inbox
-        reply_opcodes = replies or (opcode,)
+        expected_reply_opcodes = reply_opcodes or (opcode,)
         request_frame = netcanoem.request(self._settings.base_id, opcode, *arguments)
         for attempt in range(_REQUEST_ATTEMPTS):
             inbox.clear()
             exchange.send(request_frame)
             if exchange.wait_until(
-                lambda: all(reply_opcode in inbox for reply_opcode in reply_opcodes),
-                _ns_after(_REPLY_TIMEOUT_S),
+                lambda: all(reply_opcode in inbox for reply_opcode in expected_reply_opcodes),
+                _deadline_ns_after(_REPLY_TIMEOUT_S),
             ):
-                reply_frames = [inbox[reply_opcode] for reply_opcode in reply_opcodes]
+                reply_frames = [inbox[reply_opcode] for reply_opcode in expected_reply_opcodes]
                 if attempt:
                     # All frames that arrive are dropped.
-                    exchange.wait_until(lambda: False, _ns_after(_LATE_REPLY_WAIT_S))
+                    exchange.wait_until(lambda: False, _deadline_ns_after(_LATE_REPLY_WAIT_S))
                 break
         else:
             raise self._no_reply_error(requested_item)
-        for reply_opcode, reply_data in zip(reply_opcodes, reply_frames, strict=True):
+        for reply_opcode, reply_data in zip(expected_reply_opcodes, reply_frames, strict=True):
             if len(reply_data) != REPLY_LENGTHS[reply_opcode]:
                 raise DeviceError(
                     f"{self._name}: asked for {requested_item}, it sent {len(reply_data)} bytes "
@@ -429,7 +434,7 @@ class AtiCanSensor:
         return reported_number
 
     @property
-    def _reports_scale(self) -> bool:
+    def _reports_counts_per_unit(self) -> bool:
         """Whether the firmware reports counts per unit and unit codes."""
         return self._firmware[:2] >= netcanoem.FIRST_FIRMWARE_WITH_SCALE
 
@@ -446,11 +451,11 @@ class AtiCanSensor:
                 f"{selected_index}. Choose one that it has (ati_can.calibration)."
             )
         # The status shows whether the selected calibration is valid.
-        status_word = self._status_word = netcanoem.read_gauges(self._first_reading()[0])[0]
+        status_word = self._status_word = netcanoem.read_gauges(self._await_first_reading()[0])[0]
         if status_word & CAN_BAD_CALIBRATION_BIT:
             self._check_status(status_word, status_word)
 
-    def _read_matrix(self) -> MatrixRows:
+    def _read_calibration_matrix(self) -> MatrixRows:
         """Read the six rows of the calibration matrix."""
         return tuple(
             netcanoem.matrix_row(
@@ -458,17 +463,19 @@ class AtiCanSensor:
                     f"row {axis} of its calibration matrix",
                     netcanoem.MATRIX_ROW_OPCODE,
                     axis,
-                    replies=netcanoem.MATRIX_ROW_REPLY_OPCODES,
+                    reply_opcodes=netcanoem.MATRIX_ROW_REPLY_OPCODES,
                 )
             )
             for axis in range(6)
         )
 
-    def _read_scale(self, serial_number: str, calibration_matrix: MatrixRows) -> Calibration:
+    def _calibration_with_units(
+        self, serial_number: str, calibration_matrix: MatrixRows
+    ) -> Calibration:
         """Read counts per unit and unit codes, and return the complete calibration."""
-        counts_per_force = counts_per_torque = netcanoem.COUNTS_OF_OLD_FIRMWARE
+        counts_per_force = counts_per_torque = netcanoem.OLD_FIRMWARE_COUNTS_PER_UNIT
         force_unit, torque_unit = netcanoem.NEWTON_CODE, netcanoem.NEWTON_METRE_CODE
-        if self._reports_scale:
+        if self._reports_counts_per_unit:
             counts_per_force, counts_per_torque = netcanoem.counts_per_unit(
                 self._request_reply("its counts per unit", netcanoem.COUNTS_PER_UNIT_OPCODE)
             )
@@ -490,13 +497,13 @@ class AtiCanSensor:
             ) from None
 
 
-def _ns_after(duration_s: float) -> int:
+def _deadline_ns_after(duration_s: float) -> int:
     """Return the time in nanoseconds (``time.monotonic_ns``) at which a duration will be over."""
     return time.monotonic_ns() + int(duration_s * 1e9)
 
 
-def _quantile_s(sorted_ns: list[int], fraction: float) -> float:
+def _quantile_s(sorted_times_ns: list[int], fraction: float) -> float:
     """Return a quantile in seconds of sorted durations in nanoseconds; NaN if there are none."""
-    if not sorted_ns:
+    if not sorted_times_ns:
         return float("nan")
-    return sorted_ns[int(fraction * (len(sorted_ns) - 1))] * 1e-9
+    return sorted_times_ns[int(fraction * (len(sorted_times_ns) - 1))] * 1e-9

@@ -49,25 +49,25 @@ REPLY_LENGTHS = {
 
 FIRST_FIRMWARE_WITH_SCALE = (3, 7)
 """First firmware version (major, minor) that reports counts per unit and unit codes."""
-COUNTS_OF_OLD_FIRMWARE = 1_000_000
+OLD_FIRMWARE_COUNTS_PER_UNIT = 1_000_000
 """Counts per unit of force and of torque with older firmware, which does not report them."""
 NEWTON_CODE, NEWTON_METRE_CODE = 2, 3
 """Unit codes of force and torque assumed for older firmware, which does not report them."""
 
 read_gauges = Struct(">Hhhh").unpack
 """Unpack status word and gauges 0, 2, 4 from the first reply to a poll."""
-read_gauges_rest = Struct(">hhh").unpack
+read_remaining_gauges = Struct(">hhh").unpack
 """Unpack gauges 1, 3, 5 from the second reply to a poll."""
 
 
-def identifier(base_id: int, opcode: int) -> int:
+def can_identifier(base_id: int, opcode: int) -> int:
     """Return the CAN identifier of the box's messages with an opcode: 16 times base plus opcode."""
     return base_id << 4 | opcode
 
 
 def request(base_id: int, opcode: int, *arguments: int) -> bytes:
     """Return the raw CAN frame of a request."""
-    return pack_frame(identifier(base_id, opcode), bytes(arguments))
+    return pack_frame(can_identifier(base_id, opcode), bytes(arguments))
 
 
 def matrix_row(reply_bytes: bytes) -> tuple[float, ...]:
@@ -86,7 +86,7 @@ def counts_per_unit(reply: bytes) -> tuple[int, int]:
     return counts_per_force, counts_per_torque
 
 
-def firmware(reply: bytes) -> tuple[int, int, int]:
+def firmware_version(reply: bytes) -> tuple[int, int, int]:
     """Unpack major, minor and build number of the NETCANOEM box's firmware from a reply."""
     major_number, minor_number, build_number = unpack(">BBH", reply)
     return major_number, minor_number, build_number
@@ -101,23 +101,23 @@ PollReply = tuple[bytes, bytes]
 class _FrameReceiver:
     """Receiver of one of the two frames that answer a poll; stores the last one and counts all."""
 
-    __slots__ = ("_length", "data", "replies")
+    __slots__ = ("_expected_length", "data", "replies")
 
-    def __init__(self, length: int) -> None:
-        self._length = length
+    def __init__(self, expected_length: int) -> None:
+        self._expected_length = expected_length
         self.data = b""
         self.replies = 0
 
-    def store(self, data: bytes) -> None:
+    def store(self, frame_data: bytes) -> None:
         """Count a received frame and store its data, or no data if the length is wrong."""
         self.replies += 1
-        self.data = data if len(data) == self._length else b""
+        self.data = frame_data if len(frame_data) == self._expected_length else b""
 
 
 class GaugePolls:
     """Polls that the control loop sends to a NETCANOEM box, and the pairing of their replies.
 
-    `frame` is the raw CAN frame of a poll; the sensor's name is for messages.
+    `poll_frame` is the raw CAN frame of a poll; the sensor's name is for messages.
 
     Attributes
     ----------
@@ -140,9 +140,9 @@ class GaugePolls:
         "turnaround_ns",
     )
 
-    def __init__(self, frame: bytes, name: str) -> None:
-        self._frame = frame
-        self._name = name
+    def __init__(self, poll_frame: bytes, sensor_name: str) -> None:
+        self._frame = poll_frame
+        self._name = sensor_name
         self.turnaround_ns = 0
         self.sent_ns = 0
         self._exchange: CanExchange | None = None
@@ -174,10 +174,10 @@ class GaugePolls:
         """Number of polls whose reply counts as lost."""
         return max(self._first_pairing.lost, self._second_pairing.lost)
 
-    def subscribe(self, first_id: int, second_id: int) -> None:
+    def subscribe(self, first_reply_id: int, second_reply_id: int) -> None:
         """Subscribe to the two frames that answer a poll, by their CAN identifiers."""
-        self.exchange.subscribe(first_id, self._first_frame.store)
-        self.exchange.subscribe(second_id, self._second_frame.store)
+        self.exchange.subscribe(first_reply_id, self._first_frame.store)
+        self.exchange.subscribe(second_reply_id, self._second_frame.store)
 
     def drain(self) -> None:
         """Deliver all frames that have arrived on the CAN bus to their drivers."""

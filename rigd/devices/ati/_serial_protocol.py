@@ -18,7 +18,7 @@ from struct import pack, unpack
 
 MODBUS_ADDRESS = 0x0A
 """Modbus address of every Digital F/T sensor."""
-MAX_REGISTERS = 64
+MAX_REGISTERS_PER_REQUEST = 64
 """Largest number of registers in one read request."""
 
 STATUS_REGISTER = 0x001D
@@ -28,13 +28,13 @@ GAINS_REGISTER = 0x0000
 OFFSETS_REGISTER = 0x0006
 """Address of the first of six registers with the active amplifier offsets."""
 
-_READ_FUNCTION = 0x03
+_READ_FUNCTION_CODE = 0x03
 """Modbus function that reads registers."""
-_WRITE_FUNCTION = 0x10
+_WRITE_FUNCTION_CODE = 0x10
 """Modbus function that writes registers."""
-_START_FUNCTION = 0x46
+_START_STREAM_FUNCTION_CODE = 0x46
 """Modbus function that starts the stream."""
-_LOCK_FUNCTION = 0x6A
+_LOCK_FUNCTION_CODE = 0x6A
 """Modbus function that locks or unlocks the sensor's memory."""
 _STREAM_PARAMETER = 0x55
 """Parameter of the function that starts the stream."""
@@ -87,7 +87,7 @@ def crc16(data: bytes) -> int:
     return crc
 
 
-def frame(function_code: int, request_content: bytes) -> bytes:
+def request_frame(function_code: int, request_content: bytes) -> bytes:
     """Return the bytes of a Modbus request to the sensor, from function code and content.
 
     Address and checksum are added.
@@ -96,24 +96,24 @@ def frame(function_code: int, request_content: bytes) -> bytes:
     return address_and_content + crc16(address_and_content).to_bytes(2, "little")
 
 
-START_STREAM_REQUEST = frame(_START_FUNCTION, bytes((_STREAM_PARAMETER,)))
+START_STREAM_REQUEST = request_frame(_START_STREAM_FUNCTION_CODE, bytes((_STREAM_PARAMETER,)))
 """Request that starts the stream."""
-UNLOCK_REQUEST = frame(_LOCK_FUNCTION, bytes((_UNLOCK_CODE,)))
+UNLOCK_REQUEST = request_frame(_LOCK_FUNCTION_CODE, bytes((_UNLOCK_CODE,)))
 """Request that unlocks the sensor's memory."""
-LOCK_REQUEST = frame(_LOCK_FUNCTION, bytes((_LOCK_CODE,)))
+LOCK_REQUEST = request_frame(_LOCK_FUNCTION_CODE, bytes((_LOCK_CODE,)))
 """Request that locks the sensor's memory."""
 
 
 def read_registers(first_register: int, register_count: int) -> bytes:
-    """Return the request that reads `register_count` registers, at most `MAX_REGISTERS`."""
-    return frame(_READ_FUNCTION, pack(">HH", first_register, register_count))
+    """Return the request that reads registers, at most `MAX_REGISTERS_PER_REQUEST`."""
+    return request_frame(_READ_FUNCTION_CODE, pack(">HH", first_register, register_count))
 
 
 def write_registers(first_register: int, register_values: Sequence[int]) -> bytes:
     """Return the request that writes consecutive registers."""
     packed_values = pack(f">{len(register_values)}H", *register_values)
-    return frame(
-        _WRITE_FUNCTION,
+    return request_frame(
+        _WRITE_FUNCTION_CODE,
         pack(">HHB", first_register, len(register_values), len(packed_values)) + packed_values,
     )
 
@@ -121,10 +121,10 @@ def write_registers(first_register: int, register_values: Sequence[int]) -> byte
 def reply_length(request: bytes) -> int:
     """Return the length in bytes of the reply to a request, unless it is an exception response."""
     function_code = request[1]
-    if function_code == _READ_FUNCTION:
+    if function_code == _READ_FUNCTION_CODE:
         (register_count,) = unpack(">H", request[4:6])
         return 5 + 2 * int(register_count)
-    return 8 if function_code == _WRITE_FUNCTION else 5
+    return 8 if function_code == _WRITE_FUNCTION_CODE else 5
 
 
 REFUSAL_LENGTH = 5
@@ -161,15 +161,18 @@ def reply_content(request: bytes, reply: bytes) -> bytes:
             _EXCEPTION_MEANINGS.get(exception_code, f"it declined with code {exception_code}")
         )
     function_code = request[1]
-    if function_code == _READ_FUNCTION and reply_data[0] != expected_length - 5:
+    if function_code == _READ_FUNCTION_CODE and reply_data[0] != expected_length - 5:
         raise InvalidReplyError(
             f"{reply_data[0]} bytes of registers came instead of {expected_length - 5}"
         )
-    if function_code == _WRITE_FUNCTION and reply_data != request[2:6]:
+    if function_code == _WRITE_FUNCTION_CODE and reply_data != request[2:6]:
         raise InvalidReplyError("it confirmed other registers than were written")
-    if function_code in (_LOCK_FUNCTION, _START_FUNCTION) and reply_data[0] != _ACCEPTED_CODE:
+    if (
+        function_code in (_LOCK_FUNCTION_CODE, _START_STREAM_FUNCTION_CODE)
+        and reply_data[0] != _ACCEPTED_CODE
+    ):
         raise ModbusExceptionError(f"it declined with code {reply_data[0]}")
-    return reply_data[1:] if function_code == _READ_FUNCTION else reply_data
+    return reply_data[1:] if function_code == _READ_FUNCTION_CODE else reply_data
 
 
 def unpack_registers(reply_data: bytes) -> tuple[int, ...]:
@@ -183,19 +186,19 @@ RECORD_SIZE = 13
 """Size of a record in bytes."""
 RECORD_BITS = RECORD_SIZE * 11
 """Number of bits of a record on the line: each byte has a start, a parity and a stop bit."""
-SYNC_RECORDS = 6
+RECORDS_TO_SYNCHRONISE = 6
 """Number of consecutive records that must fit after a disturbance.
 
 It is less than the number of records in a tick of 1 ms, so that no tick is without a record because
 of one damaged record."""
-ERROR_BIT = 0x80
+RECORD_ERROR_BIT = 0x80
 """Bit in the last byte of a record: the sensor's status word reports an error."""
 
 _CHECKSUM_OFFSET = RECORD_SIZE - 1
 """Offset of the checksum in a record."""
 _CHECKSUM_MASK = 0x7F
 """Mask of the checksum in the last byte of a record."""
-_SYNC_SIZE = SYNC_RECORDS * RECORD_SIZE
+_BYTES_TO_SYNCHRONISE = RECORDS_TO_SYNCHRONISE * RECORD_SIZE
 """Number of bytes that must fit after a disturbance."""
 
 
@@ -212,7 +215,7 @@ class RecordStream:
         Number of records that did not fit at the expected offset.
     dropped_bytes : int
         Number of discarded bytes that belonged to no record.
-    pending : int
+    pending_byte_count : int
         Number of bytes that wait for more bytes to complete a record.
     """
 
@@ -229,19 +232,19 @@ class RecordStream:
         self.records = 0
         self.checksum_errors = 0
         self.dropped_bytes = 0
-        self.start(aligned=False)
+        self.start(starts_at_record=False)
 
-    def start(self, *, aligned: bool) -> None:
+    def start(self, *, starts_at_record: bool) -> None:
         """Discard the stored bytes and search for the first record; the counts continue.
 
-        With `aligned`, the next byte is probably the first byte of a record.
+        With `starts_at_record`, the next byte is probably the first byte of a record.
         """
         self._stored_bytes = b""
-        self._expected_offset = 0 if aligned else None
+        self._expected_offset = 0 if starts_at_record else None
         self.synchronised = False
 
     @property
-    def pending(self) -> int:
+    def pending_byte_count(self) -> int:
         """Number of bytes that wait for more bytes to complete a record."""
         return len(self._stored_bytes)
 
@@ -257,15 +260,15 @@ class RecordStream:
                 self.dropped_bytes += record_offset
                 pending_bytes = pending_bytes[record_offset:]
                 self.synchronised = True
-            whole_length = len(pending_bytes) - len(pending_bytes) % RECORD_SIZE
-            valid_length = _length_of_valid_records(pending_bytes, whole_length)
+            complete_records_length = len(pending_bytes) - len(pending_bytes) % RECORD_SIZE
+            valid_records_length = _length_of_valid_records(pending_bytes, complete_records_length)
             valid_records = (
-                valid_records + pending_bytes[:valid_length]
+                valid_records + pending_bytes[:valid_records_length]
                 if valid_records
-                else pending_bytes[:valid_length]
+                else pending_bytes[:valid_records_length]
             )
-            pending_bytes = pending_bytes[valid_length:]
-            if valid_length == whole_length:
+            pending_bytes = pending_bytes[valid_records_length:]
+            if valid_records_length == complete_records_length:
                 self._stored_bytes = pending_bytes
                 break
             self.checksum_errors += 1
@@ -274,45 +277,48 @@ class RecordStream:
         self.records += len(valid_records) // RECORD_SIZE
         return valid_records
 
-    def _find_first_record(self, data: bytes) -> int | None:
+    def _find_first_record(self, pending_bytes: bytes) -> int | None:
         """Return the offset in bytes of the first record, or None if more bytes are needed."""
-        last_offset = len(data) - _SYNC_SIZE
-        undecided_offset = max(0, last_offset + 1)
-        for record_offset in range(last_offset + 1):
-            if not _records_fit(data, record_offset):
+        last_searched_offset = len(pending_bytes) - _BYTES_TO_SYNCHRONISE
+        first_undecided_offset = max(0, last_searched_offset + 1)
+        for record_offset in range(last_searched_offset + 1):
+            if not _are_next_records_valid(pending_bytes, record_offset):
                 continue
             if (
                 self._expected_offset is not None
                 and (record_offset - self._expected_offset) % RECORD_SIZE == 0
             ):
                 return record_offset
-            if record_offset + _CHECKSUM_OFFSET > last_offset:
+            if record_offset + _CHECKSUM_OFFSET > last_searched_offset:
                 # Not all candidate offsets have arrived yet.
-                undecided_offset = min(undecided_offset, record_offset)
+                first_undecided_offset = min(first_undecided_offset, record_offset)
             elif not any(
-                _records_fit(data, record_offset + byte_shift)
+                _are_next_records_valid(pending_bytes, record_offset + byte_shift)
                 for byte_shift in range(1, RECORD_SIZE)
             ):
                 return record_offset
-        self.dropped_bytes += undecided_offset
-        self._stored_bytes = data[undecided_offset:]
+        self.dropped_bytes += first_undecided_offset
+        self._stored_bytes = pending_bytes[first_undecided_offset:]
         if self._expected_offset is not None:
-            self._expected_offset = (self._expected_offset - undecided_offset) % RECORD_SIZE
+            self._expected_offset = (self._expected_offset - first_undecided_offset) % RECORD_SIZE
         return None
 
 
-def _length_of_valid_records(data: bytes, whole_length: int) -> int:
-    """Return the number of bytes of ``data[:whole_length]`` before the first invalid record."""
-    for record_offset in range(0, whole_length, RECORD_SIZE):
+def _length_of_valid_records(record_bytes: bytes, complete_records_length: int) -> int:
+    """Return the number of bytes before the first invalid record.
+
+    Only the first `complete_records_length` bytes are checked.
+    """
+    for record_offset in range(0, complete_records_length, RECORD_SIZE):
         if (
-            sum(data[record_offset : record_offset + _CHECKSUM_OFFSET])
-            ^ data[record_offset + _CHECKSUM_OFFSET]
+            sum(record_bytes[record_offset : record_offset + _CHECKSUM_OFFSET])
+            ^ record_bytes[record_offset + _CHECKSUM_OFFSET]
         ) & _CHECKSUM_MASK:
             return record_offset
-    return whole_length
+    return complete_records_length
 
 
-def _records_fit(data: bytes, begin: int) -> bool:
-    """Return whether `SYNC_RECORDS` consecutive valid records begin at the offset `begin`."""
-    sync_bytes = data[begin : begin + _SYNC_SIZE]
-    return _length_of_valid_records(sync_bytes, _SYNC_SIZE) == _SYNC_SIZE
+def _are_next_records_valid(pending_bytes: bytes, record_offset: int) -> bool:
+    """Return whether `RECORDS_TO_SYNCHRONISE` valid records begin at `record_offset`."""
+    searched_bytes = pending_bytes[record_offset : record_offset + _BYTES_TO_SYNCHRONISE]
+    return _length_of_valid_records(searched_bytes, _BYTES_TO_SYNCHRONISE) == _BYTES_TO_SYNCHRONISE

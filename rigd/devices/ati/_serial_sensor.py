@@ -17,7 +17,12 @@ from rigd.devices.ati._calibration import (
     CalibrationBlock,
     describe_serial_status,
 )
-from rigd.devices.ati._serial_protocol import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
+from rigd.devices.ati._serial_protocol import (
+    RECORD_BITS,
+    RECORD_ERROR_BIT,
+    RECORD_SIZE,
+    RecordStream,
+)
 from rigd.devices.ati._serial_setup import (
     FRAME_SILENCE_S,
     SerialLine,
@@ -34,7 +39,7 @@ _MAX_ERROR_RECORDS = 7
 """Number of consecutive records with the error bit set that end a session.
 
 It is above 1 because the checksum does not protect this bit against errors of the line."""
-_MAX_IDLE_NS = 20_000_000
+_MAX_TIME_WITHOUT_READ_NS = 20_000_000
 """Time in nanoseconds without reading after which received bytes are discarded.
 
 After a longer time the kernel's buffer of 4 kB may overflow at 91 kB/s, and its content is old."""
@@ -47,7 +52,7 @@ _MAX_EQUAL_GAP_RATIO = 1.5
 """Largest ratio of a gap to the median gap for which gaps count as equal."""
 _MAX_GAP_AGE_NS = 500_000_000
 """Age in nanoseconds up to which a gap is evaluated."""
-_STEADY_TICKS = 3
+_STEADY_TICKS_BEFORE_LOSS = 3
 """Number of consecutive ticks that bring only their own records, before missing ones are lost."""
 
 _BITS_PER_BYTE = RECORD_BITS // RECORD_SIZE
@@ -105,9 +110,9 @@ class AtiSerialSensor:
         self._deadline_ns = int(acquisition.deadline_us * 1e3)
         # Waiting longer for a single missing record would let a sensor with a slow clock delay the
         # sampling instant of every tick, up to the deadline. In lock-step there is no clock.
-        self._patience_ns = self._deadline_ns
+        self._single_record_wait_ns = self._deadline_ns
         if not self._lock_step:
-            self._patience_ns = min(self._deadline_ns, int(1e9 / settings.stream_hz))
+            self._single_record_wait_ns = min(self._deadline_ns, int(1e9 / settings.stream_hz))
         self._line: SerialLine | None = None
         self._calibration_block: CalibrationBlock | None = None
         self._filter_matrix = np.zeros((6, 6 * len(self._weights)))
@@ -151,14 +156,14 @@ class AtiSerialSensor:
             sensor_setup = SerialSetup(self._line, self._settings, self._name)
             sensor_setup.stop_streaming()
             self._check_status(sensor_setup)
-            self._calibration_block = sensor_setup.read_block()
-            sensor_setup.load_amplifiers(self._calibration_block)
+            self._calibration_block = sensor_setup.read_calibration_block()
+            sensor_setup.load_amplifier_settings(self._calibration_block)
             self._check_status(sensor_setup)
             wire_count_matrix = self._calibration_block.calibration.wrench_per_wire_count()
             self._filter_matrix = np.kron(np.array(self._weights), np.array(wire_count_matrix))
             self._start_streaming(sensor_setup)
         except BaseException:
-            self._release()
+            self._close_port()
             raise
 
     def calibration(self) -> dict[str, object]:
@@ -175,8 +180,8 @@ class AtiSerialSensor:
             "sensor": "ATI Digital F/T",
             **self._calibration_block.calibration.as_dict(),
             "calibration": self._settings.calibration,
-            "gains": list(self._calibration_block.gains),
-            "offsets": list(self._calibration_block.offsets),
+            "gains": list(self._calibration_block.amplifier_gains),
+            "offsets": list(self._calibration_block.amplifier_offsets),
             "status": self.status,
             "port": self._port,
             "baud": self._settings.baud,
@@ -194,11 +199,11 @@ class AtiSerialSensor:
             elapsed_periods = max(1, round((due_ns - self._tick_ns) / self._period_ns))
         self._tick_ns = due_ns
         self._due_bytes += elapsed_periods * self._bytes_per_tick
-        if now_ns - self._last_read_ns > _MAX_IDLE_NS and not self._lock_step:
+        if now_ns - self._last_read_ns > _MAX_TIME_WITHOUT_READ_NS and not self._lock_step:
             # Queued bytes are old and may have gaps: only bytes that arrive from now on count.
             self._split_records(self._open_line().read())
             self._history = b""
-            self._due_bytes = self._arrived_bytes - self.stream.pending + RECORD_SIZE
+            self._due_bytes = self._arrived_bytes - self.stream.pending_byte_count + RECORD_SIZE
 
     def read_wrench(self) -> Wrench:
         """Return the wrench in N and N·m, filtered from the newest records.
@@ -212,8 +217,8 @@ class AtiSerialSensor:
         new_records = self._split_records(serial_line.read())
         while self._arrived_bytes < self._due_bytes:
             lacks_one_record = self._due_bytes - self._arrived_bytes <= RECORD_SIZE
-            patience_ns = self._patience_ns if lacks_one_record else self._deadline_ns
-            remaining_ns = self._requested_ns + patience_ns - time.monotonic_ns()
+            wait_limit_ns = self._single_record_wait_ns if lacks_one_record else self._deadline_ns
+            remaining_ns = self._requested_ns + wait_limit_ns - time.monotonic_ns()
             if remaining_ns <= 0:
                 break
             serial_line.wait(remaining_ns * 1e-9)
@@ -230,26 +235,29 @@ class AtiSerialSensor:
         )
         return self._filtered_wrench()
 
-    def _is_lagging(self, new_bytes: int) -> bool:
+    def _is_lagging(self, new_byte_count: int) -> bool:
         """Return whether the newest record is a tick or more late.
 
-        `new_bytes` is the number of bytes received in this tick. Late records arrive in addition to
-        those of later ticks, lost records do not. If some consecutive ticks bring only their own
-        records, the missing records count as lost. Since records have no counter, all later records
-        may instead be delayed, unless the loss left an incomplete record. This doubt is reported. A
-        lag below one tick is caused by the drift between two clocks, or by the sensor's phase.
+        `new_byte_count` is the number of bytes received in this tick. Late records arrive in
+        addition to those of later ticks, lost records do not. If some consecutive ticks bring only
+        their own records, the missing records count as lost. Since records have no counter, all
+        later records may instead be delayed, unless the loss left an incomplete record. This doubt
+        is reported. A lag below one tick is caused by the drift between two clocks, or by the
+        sensor's phase.
         """
-        complete_bytes = self._arrived_bytes - self.stream.pending
-        if self._due_bytes - complete_bytes >= self._bytes_per_tick:
-            is_in_step = abs(new_bytes - self._bytes_per_tick) <= RECORD_SIZE
-            self._steady_ticks = self._steady_ticks + 1 if is_in_step else 0
-            if self._steady_ticks < _STEADY_TICKS:
+        bytes_in_complete_records = self._arrived_bytes - self.stream.pending_byte_count
+        if self._due_bytes - bytes_in_complete_records >= self._bytes_per_tick:
+            has_only_own_records = abs(new_byte_count - self._bytes_per_tick) <= RECORD_SIZE
+            self._steady_ticks = self._steady_ticks + 1 if has_only_own_records else 0
+            if self._steady_ticks < _STEADY_TICKS_BEFORE_LOSS:
                 return True
             if self.stream.checksum_errors == self._known_checksum_errors:
-                self._missing_records += (self._due_bytes - complete_bytes) // RECORD_SIZE
+                self._missing_records += (
+                    self._due_bytes - bytes_in_complete_records
+                ) // RECORD_SIZE
         self._known_checksum_errors = self.stream.checksum_errors
         self._steady_ticks = 0
-        self._due_bytes = complete_bytes
+        self._due_bytes = bytes_in_complete_records
         return False
 
     def health(self) -> LineHealth:
@@ -262,13 +270,13 @@ class AtiSerialSensor:
             bit_rate_bit_s=self._settings.baud,
             errors=self.stream.checksum_errors,
             status=self._status_word,
-            doubt=self._doubt,
-            doubt_count=self._doubt_count(),
-            cause=self._describe_cause(),
+            doubt=self._age_doubt,
+            doubt_count=self._missing_records_sentence(),
+            cause=self._describe_adapter_delay_cause(),
         )
 
     @property
-    def _doubt(self) -> str:
+    def _age_doubt(self) -> str:
         """Reason why the wrench may be older than stated; empty text if no records are missing."""
         if not self._missing_records:
             return ""
@@ -278,18 +286,18 @@ class AtiSerialSensor:
             "adapter; reconnecting (rigd reset, or another rigd run) ends it."
         )
 
-    def _doubt_count(self) -> str:
+    def _missing_records_sentence(self) -> str:
         """Return a sentence with the number of missing records; empty if none are missing."""
-        missing_records = self._missing_records
-        if not missing_records:
+        missing_record_count = self._missing_records
+        if not missing_record_count:
             return ""
-        late_ms = 1e3 * missing_records / self._settings.stream_hz
+        possible_delay_ms = 1e3 * missing_record_count / self._settings.stream_hz
         return (
-            f"{self._name}: records that did not arrive since it was connected: {missing_records}; "
-            f"or the wrench is late by {late_ms:.2g} ms."
+            f"{self._name}: records that did not arrive since it was connected: "
+            f"{missing_record_count}; or the wrench is late by {possible_delay_ms:.2g} ms."
         )
 
-    def _describe_cause(self) -> str:
+    def _describe_adapter_delay_cause(self) -> str:
         """Return a message that a USB adapter delays the records, or an empty text.
 
         The adapter is recognised by records that arrive in blocks at regular intervals.
@@ -300,15 +308,15 @@ class AtiSerialSensor:
         )
         if len(gaps_ns) < _MIN_EVALUATED_GAPS:
             return ""
-        median_ns = gaps_ns[len(gaps_ns) // 2]
+        median_gap_ns = gaps_ns[len(gaps_ns) // 2]
         if (
             not 1 / _MAX_EQUAL_GAP_RATIO
-            < gaps_ns[0] / median_ns
-            <= gaps_ns[-1] / median_ns
+            < gaps_ns[0] / median_gap_ns
+            <= gaps_ns[-1] / median_gap_ns
             < _MAX_EQUAL_GAP_RATIO
         ):
             return ""
-        return describe_adapter_delay(median_ns * 1e-9, self._port)
+        return describe_adapter_delay(median_gap_ns * 1e-9, self._port)
 
     def measure(self, duration_s: float) -> dict[str, float]:
         """Receive the stream for a while and return statistics; call it before the first tick.
@@ -334,13 +342,13 @@ class AtiSerialSensor:
         )
         begin_ns = last_received_ns = now_ns = time.monotonic_ns()
         end_ns = begin_ns + int(duration_s * 1e9)
-        longest_ns = 0
+        longest_gap_ns = 0
         while now_ns < end_ns:
             serial_line.wait((end_ns - now_ns) * 1e-9)
             received_bytes = serial_line.read()
             now_ns = time.monotonic_ns()
             if received_bytes or now_ns >= end_ns:
-                longest_ns = max(longest_ns, now_ns - last_received_ns)
+                longest_gap_ns = max(longest_gap_ns, now_ns - last_received_ns)
                 last_received_ns = now_ns
                 self._split_records(received_bytes)
         self._last_read_ns = now_ns
@@ -348,7 +356,7 @@ class AtiSerialSensor:
             "records_hz": (record_stream.records - records_before) / ((now_ns - begin_ns) * 1e-9),
             "checksum_errors": float(record_stream.checksum_errors - errors_before),
             "dropped_bytes": float(record_stream.dropped_bytes - dropped_before),
-            "longest_gap_s": longest_ns * 1e-9,
+            "longest_gap_s": longest_gap_ns * 1e-9,
         }
 
     def close(self) -> None:
@@ -358,9 +366,9 @@ class AtiSerialSensor:
                 sensor_setup = SerialSetup(self._line, self._settings, self._name)
                 sensor_setup.stop_streaming()
                 self.status = describe_serial_status(sensor_setup.read_status())
-        self._release()
+        self._close_port()
 
-    def _release(self) -> None:
+    def _close_port(self) -> None:
         """Close the serial port."""
         if self._line is not None:
             self._line.close()
@@ -384,8 +392,8 @@ class AtiSerialSensor:
         self._arrived_ns = now_ns
         new_records = self.stream.feed(received_bytes)
         if new_records:
-            if max(new_records[RECORD_SIZE - 1 :: RECORD_SIZE]) & ERROR_BIT:
-                self._count_errors(new_records)
+            if max(new_records[RECORD_SIZE - 1 :: RECORD_SIZE]) & RECORD_ERROR_BIT:
+                self._count_error_records(new_records)
             else:
                 self._error_records = 0
             # Before a tick's worth of records has arrived, the oldest one is repeated.
@@ -401,10 +409,10 @@ class AtiSerialSensor:
         self.wrench_time_ns = self._arrived_ns
         return wrench
 
-    def _count_errors(self, records: bytes) -> None:
+    def _count_error_records(self, records: bytes) -> None:
         """Count consecutive records with the error bit, and raise if there are too many."""
         for check_byte in records[RECORD_SIZE - 1 :: RECORD_SIZE]:
-            self._error_records = self._error_records + 1 if check_byte & ERROR_BIT else 0
+            self._error_records = self._error_records + 1 if check_byte & RECORD_ERROR_BIT else 0
             if self._error_records >= _MAX_ERROR_RECORDS:
                 raise DeviceError(
                     f"{self._name}: its records report an error. Run rigd check to read its status "
@@ -413,10 +421,12 @@ class AtiSerialSensor:
 
     def _unpack_gauges(self, records: bytes) -> tuple[int, ...]:
         """Return the gauge counts in the given records, six per record, in wire order."""
-        n = len(records) // RECORD_SIZE
-        unpack_counts = self._unpackers.get(n)
+        record_count = len(records) // RECORD_SIZE
+        unpack_counts = self._unpackers.get(record_count)
         if unpack_counts is None:
-            unpack_counts = self._unpackers[n] = Struct(">" + "6hx" * n).unpack
+            unpack_counts = self._unpackers[record_count] = Struct(
+                ">" + "6hx" * record_count
+            ).unpack
         return unpack_counts(records)
 
     def _check_line_rate(self) -> None:
@@ -449,12 +459,12 @@ class AtiSerialSensor:
     def _start_streaming(self, sensor_setup: SerialSetup) -> None:
         """Start the stream and wait for the first valid records, or raise."""
         serial_line = self._open_line()
-        first_bytes = sensor_setup.start_streaming()
+        first_stream_bytes = sensor_setup.start_streaming()
         self._history = b""
         self._error_records = 0
-        self.stream.start(aligned=True)
+        self.stream.start(starts_at_record=True)
         bytes_before, records_before = self._arrived_bytes, self.stream.records
-        self._split_records(first_bytes)
+        self._split_records(first_stream_bytes)
         end_ns = time.monotonic_ns() + int(_FIRST_RECORDS_TIMEOUT_S * 1e9)
         # A simulated rig in lock-step sends the first records with the first tick.
         while not self._lock_step and self.stream.records - records_before < len(self._weights):
@@ -471,7 +481,7 @@ class AtiSerialSensor:
             # Value that is used if the first tick finds no new records.
             self._filtered_wrench()
         self._last_read_ns = time.monotonic_ns()
-        self._due_bytes = self._arrived_bytes - self.stream.pending
+        self._due_bytes = self._arrived_bytes - self.stream.pending_byte_count
         self._tick_ns = None
         self._steady_ticks = 0
         self._known_checksum_errors = self.stream.checksum_errors

@@ -16,30 +16,30 @@ import serial
 
 from rigd.devices.ati import _serial_protocol as modbus
 from rigd.devices.ati._calibration import (
-    BLOCK_LENGTH_REGISTERS,
+    BLOCK_REGISTER_COUNT,
     CalibrationBlock,
-    first_block_register,
+    calibration_block_address,
     parse_block,
     same_serial_number,
 )
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import AtiSerial
 
-_READ_SIZE = 65_536
+_MAX_READ_BYTES = 65_536
 """Largest number of bytes in one read from the port."""
 
 
-def describe_adapter_delay(gap_s: float, port: str) -> str:
+def describe_adapter_delay(block_interval_s: float, port: str) -> str:
     """Return the message that a USB adapter delays records, with the remedy.
 
-    `gap_s` is the time between two blocks of records.
+    `block_interval_s` is the time between two blocks of records.
     """
     adapter_name = Path(os.path.realpath(port)).name
     if not adapter_name.startswith("ttyUSB"):
         adapter_name = "ttyUSB…"
     return (
-        f"The records arrive in blocks every {1e3 * gap_s:.2g} ms: the latency timer of the USB "
-        "adapter holds them back. Set it to 1 ms (setserial low_latency, or write 1 to "
+        f"The records arrive in blocks every {1e3 * block_interval_s:.2g} ms: the latency timer of "
+        "the USB adapter holds them back. Set it to 1 ms (setserial low_latency, or write 1 to "
         f"/sys/bus/usb-serial/devices/{adapter_name}/latency_timer), or use an adapter without one."
     )
 
@@ -47,9 +47,9 @@ def describe_adapter_delay(gap_s: float, port: str) -> str:
 class SerialLine:
     """Open serial port: 8 data bits, even parity, one stop bit; locked against other processes.
 
-    `port` is a file name, and `baud` any bit rate in bit/s that the adapter supports. `device` is
-    the name of the device at the other end, for messages. The constructor raises `DeviceError` if
-    the port cannot be opened; the message states the remedy.
+    `port` is a file name, and `baud` any bit rate in bit/s that the adapter supports. `device_name`
+    is the name of the device at the other end, for messages. The constructor raises `DeviceError`
+    if the port cannot be opened; the message states the remedy.
 
     Attributes
     ----------
@@ -58,8 +58,8 @@ class SerialLine:
         adapter may delay records by 16 ms.
     """
 
-    def __init__(self, port: str, baud: int, device: str) -> None:
-        self._device = device
+    def __init__(self, port: str, baud: int, device_name: str) -> None:
+        self._device = device_name
         try:
             # vmin = 1 (by inter_byte_timeout): distinguishes an empty line from a dead one.
             self._serial = serial.Serial(
@@ -74,8 +74,8 @@ class SerialLine:
             )
         except (serial.SerialException, termios.error, OSError, ValueError) as error:
             raise DeviceError(
-                f"{device}: the serial port {port} cannot be opened at {baud} baud "
-                f"({_error_text(error)}); {_opening_remedy(error)}."
+                f"{device_name}: the serial port {port} cannot be opened at {baud} baud "
+                f"({_port_error_reason(error)}); {_opening_remedy(error)}."
             ) from None
         self._fd = self._serial.fileno()
         self._descriptors = [self._fd]
@@ -93,7 +93,7 @@ class SerialLine:
         arrived_bytes = b""
         while True:  # a short chunk need not be the last: the kernel moves bytes on with each read
             try:
-                read_bytes = os.read(self._fd, _READ_SIZE)
+                read_bytes = os.read(self._fd, _MAX_READ_BYTES)
             except BlockingIOError:
                 return arrived_bytes
             except OSError as error:
@@ -124,33 +124,37 @@ class SerialLine:
         except ValueError as error:  # a file descriptor too large for select
             raise self._failure_error(str(error)) from None
 
-    def transact(self, request: bytes, length: int, timeout_s: float) -> bytes:
-        """Send a request; return the received bytes, at least `length` unless `timeout_s` passes.
+    def transact(self, request: bytes, min_reply_length: int, timeout_s: float) -> bytes:
+        """Send a request; return the received bytes.
 
+        They are at least `min_reply_length` bytes, unless `timeout_s` passes.
         Bytes that arrived before the request are discarded.
         """
         self.read()
         self.write(request)
         received_bytes = b""
         end_ns = time.monotonic_ns() + int(timeout_s * 1e9)
-        while len(received_bytes) < length and (remaining_ns := end_ns - time.monotonic_ns()) > 0:
+        while (
+            len(received_bytes) < min_reply_length
+            and (remaining_ns := end_ns - time.monotonic_ns()) > 0
+        ):
             self.wait(remaining_ns * 1e-9)
             received_bytes += self.read()
         return received_bytes
 
-    def drain(self, quiet_s: float, limit_s: float) -> bool:
-        """Discard received bytes until the line has been silent for `quiet_s`.
+    def discard_until_silent(self, silence_s: float, time_limit_s: float) -> bool:
+        """Discard received bytes until the line has been silent for `silence_s`.
 
-        Return whether the line became silent before `limit_s` had passed.
+        Return whether the line became silent before `time_limit_s` had passed.
         """
         now_s = time.monotonic()
-        last_received_s, end_s = now_s, now_s + limit_s
+        last_received_s, end_s = now_s, now_s + time_limit_s
         while now_s < end_s:
             if self.read():
                 last_received_s = now_s
-            elif now_s - last_received_s >= quiet_s:
+            elif now_s - last_received_s >= silence_s:
                 return True
-            self.wait(quiet_s)
+            self.wait(silence_s)
             now_s = time.monotonic()
         return False
 
@@ -159,10 +163,10 @@ class SerialLine:
         with suppress(OSError, termios.error):
             self._serial.close()
 
-    def _failure_error(self, why: str | None) -> DeviceError:
+    def _failure_error(self, reason: str | None) -> DeviceError:
         """Return the error for a port that has failed."""
         return DeviceError(
-            f"{self._device}: the serial port {self._serial.port} has failed ({why}); check "
+            f"{self._device}: the serial port {self._serial.port} has failed ({reason}); check "
             "adapter and cable, then connect again."
         )
 
@@ -176,7 +180,7 @@ def _parity(port: str) -> str:
     return str(serial.PARITY_NONE if is_pseudo_terminal else serial.PARITY_EVEN)
 
 
-def _error_text(error: Exception) -> str:
+def _port_error_reason(error: Exception) -> str:
     """Return the reason of a serial port's error in words."""
     error_number = error.args[0] if error.args else None
     return os.strerror(error_number) if isinstance(error_number, int) else str(error)
@@ -205,7 +209,7 @@ _STOP_ATTEMPTS = 3
 """Number of attempts to stop the stream."""
 _STREAM_STOPPED_SILENCE_S = 0.05
 """Silence in seconds after which the stream counts as stopped."""
-_DRAIN_LIMIT_S = 0.5
+_DRAIN_TIME_LIMIT_S = 0.5
 """Time in seconds to wait for silence after one attempt to stop the stream."""
 _REPLY_TIMEOUT_S = 0.3
 """Time in seconds to wait for the reply to one request."""
@@ -224,16 +228,16 @@ class SerialSetup:
     answers wrongly.
     """
 
-    def __init__(self, line: SerialLine, settings: AtiSerial, name: str) -> None:
+    def __init__(self, line: SerialLine, settings: AtiSerial, device_name: str) -> None:
         self._line = line
         self._settings = settings
-        self._name = name
+        self._name = device_name
 
     def stop_streaming(self) -> None:
         """Stop the sensor's stream of records; harmless if the sensor does not stream."""
         for _ in range(_STOP_ATTEMPTS):
             self._line.write(_STOP_BYTES)
-            if self._line.drain(_STREAM_STOPPED_SILENCE_S, _DRAIN_LIMIT_S):
+            if self._line.discard_until_silent(_STREAM_STOPPED_SILENCE_S, _DRAIN_TIME_LIMIT_S):
                 return
         raise DeviceError(
             f"{self._name}: it continues to send although it was commanded to stop; switch it off "
@@ -244,7 +248,7 @@ class SerialSetup:
         """Read the status word of the Digital F/T sensor by Modbus, and return it."""
         return self._read_register_values(modbus.STATUS_REGISTER, 1, "report its status")[0]
 
-    def read_block(self) -> CalibrationBlock:
+    def read_calibration_block(self) -> CalibrationBlock:
         """Read the calibration block that the profile selects, and check its serial number."""
         calibration_number, profile_number = (
             self._settings.calibration,
@@ -252,7 +256,7 @@ class SerialSetup:
         )
         action_text = f"read out calibration {calibration_number}"
         registers = self._read_register_values(
-            first_block_register(calibration_number), BLOCK_LENGTH_REGISTERS, action_text
+            calibration_block_address(calibration_number), BLOCK_REGISTER_COUNT, action_text
         )
         try:
             calibration_block = parse_block(registers)
@@ -269,13 +273,13 @@ class SerialSetup:
             )
         return calibration_block
 
-    def load_amplifiers(self, block: CalibrationBlock) -> None:
+    def load_amplifier_settings(self, calibration_block: CalibrationBlock) -> None:
         """Write the calibration's amplifier gains and offsets, and read them back."""
         self._request_content(modbus.UNLOCK_REQUEST, "unlock its memory")
         try:
             for first_register, register_values in (
-                (modbus.GAINS_REGISTER, block.gains),
-                (modbus.OFFSETS_REGISTER, block.offsets),
+                (modbus.GAINS_REGISTER, calibration_block.amplifier_gains),
+                (modbus.OFFSETS_REGISTER, calibration_block.amplifier_offsets),
             ):
                 self._request_content(
                     modbus.write_registers(first_register, register_values),
@@ -283,14 +287,16 @@ class SerialSetup:
                 )
         finally:
             self._request_content(modbus.LOCK_REQUEST, "lock its memory")
-        written_values = tuple(chain(block.gains, block.offsets))
-        active_values = self._read_register_values(
-            modbus.GAINS_REGISTER, len(written_values), "report its gains and offsets"
+        written_amplifier_values = tuple(
+            chain(calibration_block.amplifier_gains, calibration_block.amplifier_offsets)
         )
-        if active_values != written_values:
+        active_amplifier_values = self._read_register_values(
+            modbus.GAINS_REGISTER, len(written_amplifier_values), "report its gains and offsets"
+        )
+        if active_amplifier_values != written_amplifier_values:
             raise DeviceError(
-                f"{self._name}: gains and offsets read back as {active_values}, where "
-                f"{written_values} were written. Switch it off and on; without them its "
+                f"{self._name}: gains and offsets read back as {active_amplifier_values}, where "
+                f"{written_amplifier_values} were written. Switch it off and on; without them its "
                 "calibration is not valid."
             )
 
@@ -314,7 +320,7 @@ class SerialSetup:
             reply_size = modbus.reply_length(request)
             reply = self._line.transact(request, reply_size, _REPLY_TIMEOUT_S)
             if attempt_number:
-                self._line.drain(_LATE_REPLY_WAIT_S, 2 * _LATE_REPLY_WAIT_S)
+                self._line.discard_until_silent(_LATE_REPLY_WAIT_S, 2 * _LATE_REPLY_WAIT_S)
             try:
                 return modbus.reply_content(request, reply)
             except modbus.ModbusExceptionError as error:
@@ -336,7 +342,9 @@ class SerialSetup:
         """Read consecutive registers, with several Modbus requests if necessary."""
         register_values: tuple[int, ...] = ()
         while len(register_values) < register_count:
-            chunk_size = min(modbus.MAX_REGISTERS, register_count - len(register_values))
+            chunk_size = min(
+                modbus.MAX_REGISTERS_PER_REQUEST, register_count - len(register_values)
+            )
             request = modbus.read_registers(first_register + len(register_values), chunk_size)
             register_values += modbus.unpack_registers(self._request_content(request, action_text))
         return register_values

@@ -62,7 +62,7 @@ def fuzz_stream(n, seed):
     rng = random.Random(seed)
     counts = dict.fromkeys(("chunks", "sent", "delivered", "wrong", "disturbed"), 0)
     stream = protocol.RecordStream()
-    stream.start(aligned=True)
+    stream.start(starts_at_record=True)
     while counts["chunks"] < n:
         records = noisy_records(rng, 400)
         data = bytearray(b"".join(records))
@@ -70,7 +70,7 @@ def fuzz_stream(n, seed):
             disturb(rng, data)
             counts["disturbed"] += 1
         # So that batches are independent: a sound end, long enough to synchronise again.
-        tail = noisy_records(rng, 4 * protocol.SYNC_RECORDS)
+        tail = noisy_records(rng, 4 * protocol.RECORDS_TO_SYNCHRONISE)
         data += b"".join(tail)
         counts["sent"] += len(records) + len(tail)
         delivered = []
@@ -91,7 +91,10 @@ def fuzz_stream(n, seed):
         # One damaged record in 128 has a sum that fits by chance, and passes as good.
         counts["wrong"] += len(wrong)
         assert len(wrong) <= 3, wrong
-        assert delivered[-protocol.SYNC_RECORDS :] == tail[-protocol.SYNC_RECORDS :]
+        assert (
+            delivered[-protocol.RECORDS_TO_SYNCHRONISE :]
+            == tail[-protocol.RECORDS_TO_SYNCHRONISE :]
+        )
         assert stream.synchronised
     return counts
 
@@ -102,7 +105,10 @@ def fuzz_rubbish_stream(n, seed):
     stream = protocol.RecordStream()
     for _ in range(n):
         stream.feed(rng.randbytes(rng.choice((1, 13, 40, 91))))
-        assert stream.pending <= (protocol.SYNC_RECORDS + 2) * protocol.RECORD_SIZE
+        assert (
+            stream.pending_byte_count
+            <= (protocol.RECORDS_TO_SYNCHRONISE + 2) * protocol.RECORD_SIZE
+        )
     return {"chunks": n, "records": stream.records}
 
 

@@ -14,13 +14,13 @@ from rigd.devices.ati._calibration import (
     CRITICAL_SERIAL_STATUS_BITS,
     WIRE_ORDER,
     Calibration,
+    calibration_block_address,
     describe_can_status,
     describe_serial_status,
-    first_block_register,
     parse_block,
     printable_text,
     same_serial_number,
-    wrench_function,
+    wrench_from_counts_function,
 )
 
 ONES = tuple(tuple(1.0 if axis == gauge else 0.0 for gauge in range(6)) for axis in range(6))
@@ -140,7 +140,7 @@ def test_axes_and_gauges_of_any_scale_and_order_are_accepted(sizes, order):
 
 
 def test_the_range_is_given_in_newtons():
-    found = calibration(force_unit=1, torque_unit=4, ratings=(5.0, 5.0, 15.0, 1e3, 1e3, 1e3))
+    found = calibration(force_unit=1, torque_unit=4, rated_loads=(5.0, 5.0, 15.0, 1e3, 1e3, 1e3))
     document = found.as_dict()
     assert document["range_n_nm"] == pytest.approx(
         [22.2411, 22.2411, 66.7233, 1.0, 1.0, 1.0], rel=1e-5
@@ -151,7 +151,7 @@ def test_the_range_is_given_in_newtons():
 
 def test_an_unknown_range_is_reported_as_unknown():
     assert calibration().as_dict()["range_n_nm"] == "not stated by the sensor"
-    unwritten = calibration(ratings=(math.nan,) * 6)
+    unwritten = calibration(rated_loads=(math.nan,) * 6)
     assert unwritten.as_dict()["range_n_nm"] == "not stated by the sensor"
 
 
@@ -173,8 +173,10 @@ def test_the_wrench_is_matrix_times_gauges_over_counts(matrix, counts, readings)
     )
     expected = np.array(matrix) @ np.array(readings) / np.repeat(counts, 3)
     scale = np.abs(matrix) @ np.abs(readings) / np.repeat(counts, 3) + 1e-300
-    natural = wrench_function(found.wrench_per_count())(*readings)
-    wired = wrench_function(found.wrench_per_wire_count())(*(readings[j] for j in WIRE_ORDER))
+    natural = wrench_from_counts_function(found.wrench_per_count())(*readings)
+    wired = wrench_from_counts_function(found.wrench_per_wire_count())(
+        *(readings[j] for j in WIRE_ORDER)
+    )
     assert np.all(np.abs(np.array(natural) - expected) <= 1e-13 * scale)
     assert np.all(np.abs(np.array(wired) - expected) <= 1e-13 * scale)
 
@@ -201,9 +203,9 @@ def test_text_is_always_printable(raw):
 
 
 def test_addresses_of_calibration_blocks():
-    assert first_block_register(1) == 0x00E3
-    assert first_block_register(2) == 0x01A3
-    assert first_block_register(16) == 0x0C23
+    assert calibration_block_address(1) == 0x00E3
+    assert calibration_block_address(2) == 0x01A3
+    assert calibration_block_address(16) == 0x0C23
 
 
 def test_a_calibration_block(fakes):
@@ -213,10 +215,10 @@ def test_a_calibration_block(fakes):
     assert (found.family, found.date) == ("DIG", "2021/03/04 12:00")
     assert (found.force_unit, found.torque_unit) == (2, 3)
     assert (found.counts_per_force, found.counts_per_torque) == (1_000_000, 2_000_000)
-    assert found.ratings == (20.0, 20.0, 60.0, 1.0, 1.0, 1.0)
+    assert found.rated_loads == (20.0, 20.0, 60.0, 1.0, 1.0, 1.0)
     assert found.matrix == fakes.MATRIX
-    assert block.gains == (541, 550, 560, 570, 575, 579)
-    assert block.offsets == (31842, 32000, 32768, 33000, 34000, 34927)
+    assert block.amplifier_gains == (541, 550, 560, 570, 575, 579)
+    assert block.amplifier_offsets == (31842, 32000, 32768, 33000, 34000, 34927)
 
 
 @pytest.mark.parametrize("fill", [0x0000, 0xFFFF])

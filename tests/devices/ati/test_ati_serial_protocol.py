@@ -147,7 +147,7 @@ def feed_all(stream, data, sizes=(91,)):
 
 def aligned_stream():
     stream = protocol.RecordStream()
-    stream.start(aligned=True)
+    stream.start(starts_at_record=True)
     return stream
 
 
@@ -164,7 +164,10 @@ def test_a_record_by_hand(fakes):
     record = bytes.fromhex("0001 FFFE 0003 0004 FFFB 0006 05")
     # 1 + 0xFF + 0xFE + 3 + 4 + 0xFF + 0xFB + 6 = 0x405
     assert fakes.record_of((1, 4, -2, -5, 3, 6)) == record
-    assert aligned_stream().feed(record * protocol.SYNC_RECORDS) == record * protocol.SYNC_RECORDS
+    assert (
+        aligned_stream().feed(record * protocol.RECORDS_TO_SYNCHRONISE)
+        == record * protocol.RECORDS_TO_SYNCHRONISE
+    )
 
 
 @settings(max_examples=30)
@@ -174,7 +177,7 @@ def test_every_record_of_a_sound_stream_comes_out_once(fakes, gauges, sizes):
     stream = aligned_stream()
     assert feed_all(stream, b"".join(records), sizes) == records
     assert stream.records == len(records)
-    assert stream.checksum_errors == stream.dropped_bytes == stream.pending == 0
+    assert stream.checksum_errors == stream.dropped_bytes == stream.pending_byte_count == 0
 
 
 @settings(max_examples=30)
@@ -192,7 +195,7 @@ def test_the_beginning_is_found_behind_rubbish(fuzz, seed, rubbish, sizes):
 @given(
     seed=seeds,
     kind=st.sampled_from(["flip", "drop", "insert"]),
-    at=st.integers(protocol.SYNC_RECORDS * 13, 40 * 13),
+    at=st.integers(protocol.RECORDS_TO_SYNCHRONISE * 13, 40 * 13),
     extra=st.binary(min_size=1, max_size=40),
     mask=st.integers(1, 127),
     sizes=sizes,
@@ -232,7 +235,7 @@ def test_one_damaged_record_costs_no_other(fuzz, seed, which, byte, mask, sizes)
     data[13 * which + byte] ^= mask
     stream = aligned_stream()
     found = feed_all(stream, bytes(data), sizes)
-    if which < protocol.SYNC_RECORDS:
+    if which < protocol.RECORDS_TO_SYNCHRONISE:
         # Not yet in sync: the beginning has to be found.
         assert found == records[len(records) - len(found) :]
     else:
@@ -291,9 +294,9 @@ def test_the_error_bit_is_not_part_of_the_sum(fakes):
 def test_records_are_not_delivered_before_enough_fit(fakes):
     record = fakes.record_of((1, -2, 300, 4, -500, 6))
     stream = aligned_stream()
-    for _ in range(protocol.SYNC_RECORDS - 1):
+    for _ in range(protocol.RECORDS_TO_SYNCHRONISE - 1):
         assert stream.feed(record) == b""
-    assert stream.feed(record) == record * protocol.SYNC_RECORDS
+    assert stream.feed(record) == record * protocol.RECORDS_TO_SYNCHRONISE
 
 
 @pytest.mark.parametrize("part", ["stream, disturbed", "stream, rubbish", "Modbus"])

@@ -43,7 +43,7 @@ def open_sensor(serial_rig, digital_ft):
 @pytest.fixture
 def unhurried(monkeypatch):
     """No tick comes after a pause that the driver distrusts, even if a test runs slowly."""
-    monkeypatch.setattr("rigd.devices.ati._serial_sensor._MAX_IDLE_NS", 10**12)
+    monkeypatch.setattr("rigd.devices.ati._serial_sensor._MAX_TIME_WITHOUT_READ_NS", 10**12)
 
 
 def refusal(sensor):
@@ -329,7 +329,7 @@ def test_a_different_clock_is_no_lag(follow, extra):
 def test_after_a_pause_only_new_records_count(
     open_sensor, digital_ft, fakes, monkeypatch, after_first_tick
 ):
-    monkeypatch.setattr("rigd.devices.ati._serial_sensor._MAX_IDLE_NS", 1_000_000)
+    monkeypatch.setattr("rigd.devices.ati._serial_sensor._MAX_TIME_WITHOUT_READ_NS", 1_000_000)
     sensor = open_sensor()
     sensor.connect()
     after_first_tick(sensor)
@@ -511,7 +511,7 @@ def test_a_start_without_sound_records(open_sensor, digital_ft, monkeypatch, fir
 
 
 def test_failure_to_stop_the_stream(open_sensor, digital_ft, monkeypatch, fakes):
-    monkeypatch.setattr("rigd.devices.ati._serial_setup._DRAIN_LIMIT_S", 0.1)
+    monkeypatch.setattr("rigd.devices.ati._serial_setup._DRAIN_TIME_LIMIT_S", 0.1)
     digital_ft.streaming = digital_ft.deaf_to_jam = True
     really_select = select.select
 
