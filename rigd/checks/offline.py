@@ -270,17 +270,22 @@ def _identifier_row(found_text: str, check_result: CheckResult) -> CheckRow:
 
 def _bus_row(bus_load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
     """Return the check result on the load of the CAN bus."""
-    from rigd.devices.canbus import MAX_LOAD
+    from rigd.devices.canbus import MAX_BUS_LOAD
 
     frames_text = ", ".join(
-        f"{t.what} ({t.can_id:#05x}, {t.length} bytes, {t.rate_hz:g} Hz)" for t in bus_load.traffic
+        f"{t.frame_name} ({t.can_id:#05x}, {t.data_length} bytes, {t.rate_hz:g} Hz)"
+        for t in bus_load.cyclic_frames
     )
     return CheckRow(
         "CAN bus",
         "load",
-        f"{100 * bus_load.worst:.1f} % at worst, {100 * bus_load.plain:.1f} % without stuffing",
-        f"at most {100 * MAX_LOAD:.0f} %",
-        grade(fail=bus_load.worst > MAX_LOAD, warn=bus_load.worst > HIGH_BUS_LOAD),
+        f"{100 * bus_load.worst_case_load:.1f} % at worst, "
+        f"{100 * bus_load.load_without_stuffing:.1f} % without stuffing",
+        f"at most {100 * MAX_BUS_LOAD:.0f} %",
+        grade(
+            fail=bus_load.worst_case_load > MAX_BUS_LOAD,
+            warn=bus_load.worst_case_load > HIGH_BUS_LOAD,
+        ),
         f"At {bitrate_bit_s / 1e3:g} kbit/s: {frames_text}.",
         CAN_LOAD_ROW,
     )
@@ -289,14 +294,14 @@ def _bus_row(bus_load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
 def _line_row(serial_settings: "AtiSerial") -> CheckRow:
     """Return the check result on the load of the serial line."""
     from rigd.devices.ati import RECORD_BITS
-    from rigd.devices.canbus import MAX_LOAD
+    from rigd.devices.canbus import MAX_BUS_LOAD
 
     line_load = RECORD_BITS * serial_settings.stream_hz / serial_settings.baud
     return CheckRow(
         "serial line",
         "load",
         f"{100 * line_load:.1f} % of {serial_settings.baud} bit/s",
-        f"at most {100 * MAX_LOAD:.0f} %",
-        grade(fail=line_load > MAX_LOAD),
+        f"at most {100 * MAX_BUS_LOAD:.0f} %",
+        grade(fail=line_load > MAX_BUS_LOAD),
         name=SERIAL_LOAD_ROW,
     )

@@ -113,7 +113,7 @@ def test_a_collision_fails(can_profile):
 )
 def test_bus_load_is_refused_above_90_percent(can_profile, worst, verdict):
     rig = can_profile.rig
-    bitrate = round(bus_load(rig).worst / worst * rig.can.bitrate_bit_s)
+    bitrate = round(bus_load(rig).worst_case_load / worst * rig.can.bitrate_bit_s)
     found = by_name(wiring_rows(replace(rig, can=replace(rig.can, bitrate_bit_s=bitrate))))["load"]
     assert found.verdict is verdict
     assert f"{100 * worst:.1f} %" in found.found

@@ -230,7 +230,7 @@ class AtiCanSensor:
 
     def health(self) -> LineHealth:
         """Return the number of errors on the bus to the sensor, and the sensor's status word."""
-        error_count = self.polls.lost + self.bus_errors
+        error_count = self.polls.lost_reply_count + self.bus_errors
         return LineHealth(errors=error_count, status=self._status_word)
 
     def measure(self, duration_s: float) -> dict[str, float]:
@@ -240,7 +240,8 @@ class AtiCanSensor:
         -------
         dict
             ``polls_hz`` (readings per second), ``turnaround_median_s`` and ``turnaround_p99_s``
-            (time from poll to reply; NaN without replies), ``lost`` (polls without a reply).
+            (time from poll to reply; NaN without replies), ``lost`` (polls without a
+            reply).
 
         Raises
         ------

@@ -101,16 +101,16 @@ PollReply = tuple[bytes, bytes]
 class _FrameReceiver:
     """Receiver of one of the two frames that answer a poll; stores the last one and counts all."""
 
-    __slots__ = ("_expected_length", "data", "replies")
+    __slots__ = ("_expected_length", "data", "reply_count")
 
     def __init__(self, expected_length: int) -> None:
         self._expected_length = expected_length
         self.data = b""
-        self.replies = 0
+        self.reply_count = 0
 
     def store(self, frame_data: bytes) -> None:
         """Count a received frame and store its data, or no data if the length is wrong."""
-        self.replies += 1
+        self.reply_count += 1
         self.data = frame_data if len(frame_data) == self._expected_length else b""
 
 
@@ -170,9 +170,9 @@ class GaugePolls:
         return self._exchange
 
     @property
-    def lost(self) -> int:
+    def lost_reply_count(self) -> int:
         """Number of polls whose reply counts as lost."""
-        return max(self._first_pairing.lost, self._second_pairing.lost)
+        return max(self._first_pairing.lost_reply_count, self._second_pairing.lost_reply_count)
 
     def subscribe(self, first_reply_id: int, second_reply_id: int) -> None:
         """Subscribe to the two frames that answer a poll, by their CAN identifiers."""
@@ -225,8 +225,8 @@ class GaugePolls:
 
     def reset_pairing(self) -> None:
         """Reset the pairing of polls and replies; from then on no reply is outstanding."""
-        self._first_pairing.start()
-        self._second_pairing.start()
+        self._first_pairing.reset()
+        self._second_pairing.reset()
         self.answer = None
 
     def _are_up_to_date(self) -> bool:

@@ -1,4 +1,4 @@
-from ._budget import MAX_LOAD as MAX_LOAD
+from ._budget import MAX_BUS_LOAD as MAX_BUS_LOAD
 from ._budget import BusLoad as BusLoad
 from ._budget import bus_load as bus_load
 from ._budget import check_identifiers as check_identifiers

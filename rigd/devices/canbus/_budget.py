@@ -15,11 +15,11 @@ from rigd.devices.parameters import AtiCan, RigParameters, ServoDrive
 
 # Identifiers
 
-_FREE_SENSOR_BASE = 0x68
+_FREE_SENSOR_BASE_ID = 0x68
 """Base of an ATI sensor whose identifiers no CANopen node uses."""
 
 # CiA 301 and, for the last, CiA 305: what every CANopen device listens to.
-_BROADCAST_SERVICES = {
+_BROADCAST_SERVICE_BY_ID = {
     0x000: "NMT",
     0x080: "SYNC",
     0x100: "TIME",
@@ -27,7 +27,7 @@ _BROADCAST_SERVICES = {
     0x7E5: "LSS",
 }
 """Services of CiA 301 (and CiA 305: LSS) that address all CANopen nodes, by identifier."""
-_NODE_SERVICES = {
+_NODE_SERVICE_BY_BASE_ID = {
     0x080: "EMCY",
     0x180: "TPDO1",
     0x200: "RPDO1",
@@ -56,10 +56,11 @@ def drive_identifiers(drive: ServoDrive) -> dict[int, str]:
     The services that address all nodes are included, and so are PDOs that are not configured: they
     may be enabled in the drive's factory settings.
     """
-    own_services = {
-        base_id + drive.node_id: service_name for base_id, service_name in _NODE_SERVICES.items()
+    drive_service_by_id = {
+        base_id + drive.node_id: service_name
+        for base_id, service_name in _NODE_SERVICE_BY_BASE_ID.items()
     }
-    return _BROADCAST_SERVICES | own_services
+    return _BROADCAST_SERVICE_BY_ID | drive_service_by_id
 
 
 def check_identifiers(rig: RigParameters) -> list[str]:
@@ -70,10 +71,10 @@ def check_identifiers(rig: RigParameters) -> list[str]:
     list of str
         One sentence per collision, with the remedy; empty if there is none.
     """
-    return list(_collisions(rig))
+    return list(_collision_sentences(rig))
 
 
-def _collisions(rig: RigParameters) -> Iterator[str]:
+def _collision_sentences(rig: RigParameters) -> Iterator[str]:
     """Yield a sentence with the remedy for each collision of CAN identifiers."""
     drive, sensor = rig.cia402, rig.ati_can
     if drive is not None and drive.node_id == drive.host_node_id:
@@ -84,22 +85,23 @@ def _collisions(rig: RigParameters) -> Iterator[str]:
         )
     if drive is None or sensor is None:
         return
-    used_identifiers = drive_identifiers(drive) | {0x700 + drive.host_node_id: "host's heartbeat"}
-    own_identifiers = sensor_identifiers(sensor)
-    collisions = {
+    used_service_by_id = drive_identifiers(drive) | {0x700 + drive.host_node_id: "host's heartbeat"}
+    sensor_ids = sensor_identifiers(sensor)
+    colliding_service_by_id = {
         can_id: service_name
-        for can_id, service_name in sorted(used_identifiers.items())
-        if can_id in own_identifiers
+        for can_id, service_name in sorted(used_service_by_id.items())
+        if can_id in sensor_ids
     }
-    if collisions:
-        collision_list = ", ".join(
-            f"{can_id:#05x} ({service_name})" for can_id, service_name in collisions.items()
+    if colliding_service_by_id:
+        collisions_text = ", ".join(
+            f"{can_id:#05x} ({service_name})"
+            for can_id, service_name in colliding_service_by_id.items()
         )
         yield (
             f"ati_can.base_id = {sensor.base_id:#04x} takes the identifiers "
-            f"{own_identifiers[0]:#05x} to {own_identifiers[-1]:#05x}, of which the drive's bus "
-            f"uses {collision_list} with cia402.node_id = {drive.node_id}; give the sensor a free "
-            f"base such as {_FREE_SENSOR_BASE:#04x}, or the drive another node id."
+            f"{sensor_ids[0]:#05x} to {sensor_ids[-1]:#05x}, of which the drive's bus "
+            f"uses {collisions_text} with cia402.node_id = {drive.node_id}; give the sensor a free "
+            f"base such as {_FREE_SENSOR_BASE_ID:#04x}, or the drive another node id."
         )
 
 
@@ -120,16 +122,16 @@ SENSOR_REPLY_LENGTHS = (8, 6)
 
 The first contains the status word and gauges 0, 2, 4, the second gauges 1, 3, 5."""
 
-FRAME_BITS = 47
+BITS_OF_EMPTY_FRAME = 47
 """Bits of a CAN frame with an 11-bit identifier and no data, without stuff bits.
 
 They are start, identifier, control, checksum, acknowledgement, end, and the interframe space of 3
 bits."""
-_STUFFABLE_BITS = 34
+_STUFFABLE_BITS_OF_EMPTY_FRAME = 34
 """Bits of a frame without data that are subject to bit stuffing: from the start to the checksum."""
 
 
-MAX_LOAD = 0.9
+MAX_BUS_LOAD = 0.9
 """Largest permitted load of a bus or line in the worst case of bit stuffing, 0 to 1.
 
 Above it a frame may miss its period."""
@@ -139,11 +141,11 @@ Above it a frame may miss its period."""
 class CyclicFrame:
     """Frame that is sent cyclically on the bus."""
 
-    what: str
+    frame_name: str
     """Name of the frame."""
     can_id: int
     """CAN identifier of the frame."""
-    length: int
+    data_length: int
     """Number of data bytes in the frame."""
     rate_hz: float
     """Number of these frames per second."""
@@ -153,11 +155,11 @@ class CyclicFrame:
 class BusLoad:
     """Cyclic frames of a CAN bus, and the fraction of time in which they keep the bus busy."""
 
-    traffic: tuple[CyclicFrame, ...]
+    cyclic_frames: tuple[CyclicFrame, ...]
     """Cyclic frames of the bus."""
-    plain: float
+    load_without_stuffing: float
     """Fraction of time in which the bus is busy without stuff bits; above 1 if overloaded."""
-    worst: float
+    worst_case_load: float
     """Fraction of time in which the bus is busy with the largest possible number of stuff bits."""
     frames_per_s: float
     """Total number of frames per second."""
@@ -168,24 +170,26 @@ def frame_bits(data_length: int) -> int:
 
     There are 0 to 8 bytes of data.
     """
-    return FRAME_BITS + 8 * data_length
+    return BITS_OF_EMPTY_FRAME + 8 * data_length
 
 
-def worst_frame_bits(data_length: int) -> int:
+def max_frame_bits(data_length: int) -> int:
     """Return the largest number of bits of a CAN frame with `data_length` bytes, with stuff bits.
 
     After five equal bits a bit of the opposite value is inserted, which counts as the first of the
     next five. So at most one bit is inserted per four bits, after the first bit.
     """
-    return frame_bits(data_length) + (_STUFFABLE_BITS + 8 * data_length - 1) // 4
+    return frame_bits(data_length) + (_STUFFABLE_BITS_OF_EMPTY_FRAME + 8 * data_length - 1) // 4
 
 
 def load_of_frames(cyclic_frames: tuple[CyclicFrame, ...], bitrate_bit_s: float) -> BusLoad:
     """Return the load that cyclic frames cause on a bus of the given bit rate, as a fraction."""
     return BusLoad(
-        traffic=cyclic_frames,
-        plain=sum(frame_bits(t.length) * t.rate_hz for t in cyclic_frames) / bitrate_bit_s,
-        worst=sum(worst_frame_bits(t.length) * t.rate_hz for t in cyclic_frames) / bitrate_bit_s,
+        cyclic_frames=cyclic_frames,
+        load_without_stuffing=sum(frame_bits(t.data_length) * t.rate_hz for t in cyclic_frames)
+        / bitrate_bit_s,
+        worst_case_load=sum(max_frame_bits(t.data_length) * t.rate_hz for t in cyclic_frames)
+        / bitrate_bit_s,
         frames_per_s=sum(t.rate_hz for t in cyclic_frames),
     )
 
@@ -203,13 +207,10 @@ def bus_load(rig: RigParameters) -> BusLoad:
     ValueError
         If the rig has no CAN bus.
 
-    Examples
-    --------
-    >>> from rigd.devices.canbus import bus_load
-    >>> from rigd.profile import load_profile
-    >>> load = bus_load(load_profile("antenna_can").rig)
-    >>> print(f"{load.frames_per_s:.0f} frames a second, {load.worst:.0%} of the bus at worst")
-    6150 frames a second, 60% of the bus at worst
+    Examples -------- >>> from rigd.devices.canbus import bus_load >>> from rigd.profile import
+    load_profile >>> load = bus_load(load_profile("antenna_can").rig) >>>
+    print(f"{load.frames_per_s:.0f} frames a second, {load.worst_case_load:.0%} of the bus at
+    worst") 6150 frames a second, 60% of the bus at worst
     """
     if rig.can is None:
         raise ValueError("The rig has no CAN bus.")

@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from rigd.devices.canbus._budget import FRAME_BITS
+from rigd.devices.canbus._budget import BITS_OF_EMPTY_FRAME
 from rigd.devices.canbus.adapters import open_port
 from rigd.devices.canbus.port import (
-    BUS_OFF,
-    ERROR_FLAG,
-    ERROR_MASK,
-    LENGTH_OFFSET,
+    BUS_OFF_ERROR_CLASS,
+    DATA_LENGTH_OFFSET,
+    ERROR_CLASS_MASK,
+    ERROR_FRAME_FLAG,
     CanPort,
     unpack_header,
 )
@@ -32,16 +32,16 @@ from rigd.runtime.locks import LockFile, LockHeldError
 
 # Pairing of replies
 
-_STEADY_PERIODS = 3
+_STEADY_PERIODS_BEFORE_LOSS = 3
 """Number of consecutive periods with one reply each after which missing replies count as lost.
 
 The rule applies only if no tick may be run without a request."""
 
 
 class ReplyCounter(Protocol):
-    """Object that counts received replies, in its attribute `replies`."""
+    """Object that counts received replies, in its attribute `reply_count`."""
 
-    replies: int
+    reply_count: int
     """Number of replies received since this was last set to zero, regardless of their content."""
 
 
@@ -50,9 +50,9 @@ class ReplyPairing:
 
     Parameters
     ----------
-    inbox
+    reply_counter
         Object that counts the received replies.
-    may_pause
+    may_omit_request
         Whether a tick may be run without a request. This is not possible with a device whose time
         advances with the requests; missing replies then finally count as lost without proof.
 
@@ -60,35 +60,35 @@ class ReplyPairing:
     ----------
     outstanding : int
         Number of replies that have not arrived yet, to the last request or to earlier ones.
-    lost : int
+    lost_reply_count : int
         Number of replies that count as lost.
-    lost_without_proof : int
+    presumed_lost_count : int
         Number of replies that count as lost without proof: instead, all later replies may be late
         by whole periods.
     """
 
     __slots__ = (
         "_has_request",
-        "_inbox",
         "_is_only_request",
-        "_may_pause",
+        "_may_omit_request",
         "_replies_in_period",
+        "_reply_counter",
         "_steady_periods",
-        "lost",
-        "lost_without_proof",
+        "lost_reply_count",
         "outstanding",
+        "presumed_lost_count",
     )
 
-    def __init__(self, inbox: ReplyCounter, *, may_pause: bool = True) -> None:
-        self._inbox = inbox
-        self._may_pause = may_pause
-        self.lost = 0
-        self.lost_without_proof = 0
-        self.start()
+    def __init__(self, reply_counter: ReplyCounter, *, may_omit_request: bool = True) -> None:
+        self._reply_counter = reply_counter
+        self._may_omit_request = may_omit_request
+        self.lost_reply_count = 0
+        self.presumed_lost_count = 0
+        self.reset()
 
-    def start(self) -> None:
+    def reset(self) -> None:
         """Reset the pairing: no reply is outstanding."""
-        self._inbox.replies = 0
+        self._reply_counter.reply_count = 0
         self._has_request = self._is_only_request = True
         self._replies_in_period = 0
         self._steady_periods = 0
@@ -99,7 +99,7 @@ class ReplyPairing:
 
         Call it after all received frames are delivered.
         """
-        if not (self.outstanding and self._may_pause):
+        if not (self.outstanding and self._may_omit_request):
             return False
         self._count_replies()
         # A pause with a reply continues until all replies have arrived, or none does.
@@ -124,7 +124,7 @@ class ReplyPairing:
 
     def is_up_to_date(self) -> bool:
         """Return whether all outstanding replies, up to that to the last request, have arrived."""
-        return 0 < self.outstanding <= self._inbox.replies
+        return 0 < self.outstanding <= self._reply_counter.reply_count
 
     def process_replies(self) -> bool:
         """Count the received replies; return whether this tick's request has been answered.
@@ -140,15 +140,15 @@ class ReplyPairing:
         if self.outstanding:
             if not self._has_request:
                 if not self._replies_in_period:
-                    self.lost += self.outstanding
+                    self.lost_reply_count += self.outstanding
                     self.outstanding = 0
-            elif not self._may_pause:
+            elif not self._may_omit_request:
                 self._steady_periods = (
                     self._steady_periods + 1 if self._replies_in_period == 1 else 0
                 )
-                if self._steady_periods >= _STEADY_PERIODS:
-                    self.lost += self.outstanding
-                    self.lost_without_proof += self.outstanding
+                if self._steady_periods >= _STEADY_PERIODS_BEFORE_LOSS:
+                    self.lost_reply_count += self.outstanding
+                    self.presumed_lost_count += self.outstanding
                     self.outstanding = self._steady_periods = 0
         else:
             self._steady_periods = 0
@@ -156,7 +156,7 @@ class ReplyPairing:
 
     def _count_replies(self) -> int:
         """Add the newly received replies to the counts, and return their number."""
-        new_replies, self._inbox.replies = self._inbox.replies, 0
+        new_replies, self._reply_counter.reply_count = self._reply_counter.reply_count, 0
         self._replies_in_period += new_replies
         self.outstanding = max(0, self.outstanding - new_replies)
         return new_replies
@@ -168,22 +168,22 @@ FrameHandler = Callable[[bytes], None]
 """Function that a driver registers for frames; it is called with the data bytes of a frame."""
 
 # linux/can/error.h: the identifier contains the class of the error, data[1] the controller's state.
-_CONTROLLER_STATE_CLASS = 0x04
+_CONTROLLER_STATE_ERROR_CLASS = 0x04
 """Class of an error frame about the controller's state."""
 _CONTROLLER_STATE_OFFSET = 1
 """Offset of the controller's state in the data of an error frame."""
 _ERROR_PASSIVE_BITS = 0x30
 """Bits of the controller's state that mean error-passive, in receiving or sending."""
-_NO_ACKNOWLEDGE_CLASS = 0x20
+_NO_ACKNOWLEDGE_ERROR_CLASS = 0x20
 """Class of an error frame: no device has acknowledged a sent frame."""
 
-_MAX_DRAIN_FAILURES = 10
+_MAX_DRAIN_ERRORS = 10
 """Largest number of receive errors, which an adapter may queue, that one `drain` ignores.
 
 The limit applies within `ignore_errors`."""
-_MAX_WAIT_FAILURES = 100
+_MAX_WAIT_ERRORS = 100
 """Number of receive errors that end one wait within `ignore_errors`."""
-_FAILURE_PAUSE_S = 0.001
+_RECEIVE_ERROR_PAUSE_S = 0.001
 """Pause in seconds after a receive error."""
 
 
@@ -219,7 +219,7 @@ class CanExchange:
         Raises the errors of :meth:`CanPort.send`.
         """
         self._send(frame)
-        self.bits += FRAME_BITS + 8 * frame[LENGTH_OFFSET]
+        self.bits += BITS_OF_EMPTY_FRAME + 8 * frame[DATA_LENGTH_OFFSET]
 
     def subscribe(self, can_id: int, handler: FrameHandler) -> None:
         """Register a function that receives the data of each frame with this identifier.
@@ -274,28 +274,28 @@ class CanExchange:
             cannot send; not within `ignore_errors`.
         """
         if not self._ignores_errors:
-            self._deliver()
+            self._deliver_received_frames()
             if self._bus_error:
                 raise DeviceError(self._bus_error)
             return
-        for _ in range(_MAX_DRAIN_FAILURES):
+        for _ in range(_MAX_DRAIN_ERRORS):
             try:
-                self._deliver()
+                self._deliver_received_frames()
             except Exception:  # an adapter's library may raise anything
                 continue
             return
 
-    def _deliver(self) -> None:
+    def _deliver_received_frames(self) -> None:
         """Deliver all frames that have arrived, and register error frames of the controller."""
         receive_frame, frame_handlers = self._receive, self._handlers
         while (raw_frame := receive_frame()) is not None:
             can_id, data_length = unpack_header(raw_frame)
             frame_handler = frame_handlers.get(can_id)
             if frame_handler is not None:
-                self.bits += FRAME_BITS + 8 * data_length
+                self.bits += BITS_OF_EMPTY_FRAME + 8 * data_length
                 frame_handler(raw_frame[8 : 8 + data_length])
-            elif can_id & ERROR_FLAG:
-                self._register_error(can_id & ERROR_MASK, raw_frame[8:16])
+            elif can_id & ERROR_FRAME_FLAG:
+                self._register_error(can_id & ERROR_CLASS_MASK, raw_frame[8:16])
 
     def wait_until(self, is_ready: Callable[[], bool], deadline_ns: int) -> bool:
         """Deliver frames until `is_ready` returns True, or the deadline passes.
@@ -312,7 +312,7 @@ class CanExchange:
         bool
             Whether the condition became true before the deadline.
         """
-        wait_failures = 0
+        wait_failure_count = 0
         self.drain()
         while not is_ready():
             remaining_ns = deadline_ns - time.monotonic_ns()
@@ -321,31 +321,31 @@ class CanExchange:
             try:
                 self.port.wait(remaining_ns * 1e-9)
             except Exception:
-                wait_failures += 1
+                wait_failure_count += 1
                 if not self._ignores_errors:
                     raise
-                if wait_failures > _MAX_WAIT_FAILURES:
+                if wait_failure_count > _MAX_WAIT_ERRORS:
                     return False  # the adapter has failed
-                time.sleep(min(_FAILURE_PAUSE_S, remaining_ns * 1e-9))
+                time.sleep(min(_RECEIVE_ERROR_PAUSE_S, remaining_ns * 1e-9))
             self.drain()
         return True
 
-    def _register_error(self, error_class: int, data: bytes) -> None:
+    def _register_error(self, error_class: int, error_data: bytes) -> None:
         """Count an error frame of the controller, and store a message if no frame can be sent."""
         self.error_frames += 1
-        if error_class & BUS_OFF:
+        if error_class & BUS_OFF_ERROR_CLASS:
             self._bus_error = (
                 f"CAN bus {self.port.name}: the controller is off the bus (bus-off) after too "
                 "many errors; check cable, termination and bit rate, then bring it up again."
             )
-        elif error_class & _NO_ACKNOWLEDGE_CLASS:
+        elif error_class & _NO_ACKNOWLEDGE_ERROR_CLASS:
             self._bus_error = (
                 f"CAN bus {self.port.name}: no device acknowledges the frames sent; check cable, "
                 "termination, power and bit rate."
             )
         elif (
-            error_class & _CONTROLLER_STATE_CLASS
-            and data[_CONTROLLER_STATE_OFFSET] & _ERROR_PASSIVE_BITS
+            error_class & _CONTROLLER_STATE_ERROR_CLASS
+            and error_data[_CONTROLLER_STATE_OFFSET] & _ERROR_PASSIVE_BITS
         ):
             self._bus_error = (
                 f"CAN bus {self.port.name}: the controller is error-passive, its frames are "
@@ -359,13 +359,13 @@ class CanExchange:
 class BusLock:
     """Lock that prevents other programs from using a CAN bus while this one has it open.
 
-    `bus` is the channel of the bus, or the socket of a simulated bus, whose lock concerns only
-    processes of the same user.
+    `bus_channel` is the channel of the bus, or the socket of a simulated bus, whose lock concerns
+    only processes of the same user.
     """
 
-    def __init__(self, bus: str, *, simulated: bool) -> None:
-        self._bus = bus
-        self._file = LockFile(f"bus-{bus}", for_all_users=not simulated)
+    def __init__(self, bus_channel: str, *, is_simulated: bool) -> None:
+        self._bus_channel = bus_channel
+        self._file = LockFile(f"bus-{bus_channel}", for_all_users=not is_simulated)
 
     def acquire(self) -> None:
         """Lock the bus.
@@ -376,12 +376,12 @@ class BusLock:
             self._file.acquire("rigd")
         except LockHeldError as holder:
             raise DeviceError(
-                f"CAN bus {self._bus}: another rigd is using it ({holder}); wait for it, or stop "
-                "it."
+                f"CAN bus {self._bus_channel}: another rigd is using it ({holder}); wait for it, "
+                "or stop it."
             ) from None
         except OSError as error:
             raise DeviceError(
-                f"CAN bus {self._bus}: it cannot be reserved in {self._file.path.parent} "
+                f"CAN bus {self._bus_channel}: it cannot be reserved in {self._file.path.parent} "
                 f"({error.strerror}); set XDG_RUNTIME_DIR to a folder that is yours."
             ) from None
 
@@ -406,8 +406,10 @@ class CanLink:
         self._simulator = simulator
         self._exchange: CanExchange | None = None
         self._users = 0
-        simulated_bus = "" if simulator is None else simulator.can_socket
-        self._lock = BusLock(simulated_bus or settings.channel, simulated=bool(simulated_bus))
+        simulated_bus_socket = "" if simulator is None else simulator.can_socket
+        self._lock = BusLock(
+            simulated_bus_socket or settings.channel, is_simulated=bool(simulated_bus_socket)
+        )
 
     @property
     def exchange(self) -> CanExchange:

@@ -6,10 +6,10 @@ import time
 import can
 
 from rigd.devices.canbus.port import (
-    ERROR_FLAG,
-    ERROR_MASK,
-    EXTENDED_FLAG,
-    REMOTE_FLAG,
+    ERROR_CLASS_MASK,
+    ERROR_FRAME_FLAG,
+    EXTENDED_ID_FLAG,
+    REMOTE_REQUEST_FLAG,
     STANDARD_ID_MASK,
     CanPort,
     pack_frame,
@@ -37,7 +37,9 @@ class SetupBus(can.BusABC):
             self._port.wait(1.0 if timeout is None else timeout)
             raw_frame = self._port.receive()
         # canopen ignores the flags of a frame and checks only its identifier.
-        if raw_frame is None or unpack_header(raw_frame)[0] & (EXTENDED_FLAG | REMOTE_FLAG):
+        if raw_frame is None or unpack_header(raw_frame)[0] & (
+            EXTENDED_ID_FLAG | REMOTE_REQUEST_FLAG
+        ):
             return None, False
         return to_message(raw_frame), False
 
@@ -45,13 +47,13 @@ class SetupBus(can.BusABC):
 def to_message(raw_frame: bytes) -> can.Message:
     """Convert a raw frame of 16 bytes to a python-can message."""
     can_id, data = unpack_frame(raw_frame)
-    is_standard_id = not can_id & (EXTENDED_FLAG | ERROR_FLAG)
+    is_standard_id = not can_id & (EXTENDED_ID_FLAG | ERROR_FRAME_FLAG)
     return can.Message(
         timestamp=time.time(),
-        arbitration_id=can_id & (STANDARD_ID_MASK if is_standard_id else ERROR_MASK),
-        is_extended_id=bool(can_id & EXTENDED_FLAG),
-        is_remote_frame=bool(can_id & REMOTE_FLAG),
-        is_error_frame=bool(can_id & ERROR_FLAG),
+        arbitration_id=can_id & (STANDARD_ID_MASK if is_standard_id else ERROR_CLASS_MASK),
+        is_extended_id=bool(can_id & EXTENDED_ID_FLAG),
+        is_remote_frame=bool(can_id & REMOTE_REQUEST_FLAG),
+        is_error_frame=bool(can_id & ERROR_FRAME_FLAG),
         data=data,
     )
 
@@ -64,9 +66,9 @@ def from_message(message: can.Message) -> bytes:
     """
     can_id = message.arbitration_id
     if message.is_error_frame:
-        can_id |= ERROR_FLAG
+        can_id |= ERROR_FRAME_FLAG
     if message.is_extended_id:
-        can_id |= EXTENDED_FLAG
+        can_id |= EXTENDED_ID_FLAG
     if message.is_remote_frame:
-        can_id |= REMOTE_FLAG
+        can_id |= REMOTE_REQUEST_FLAG
     return can_id.to_bytes(4, sys.byteorder) + pack_frame(0, bytes(message.data))[4:]

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from rigd.devices.canbus.port import (
     DAMAGED_FRAME,
-    ERROR_FLAG,
-    ERROR_MASK,
+    ERROR_CLASS_MASK,
+    ERROR_FRAME_FLAG,
     FRAME_SIZE,
     STANDARD_ID_MASK,
     CanPort,
@@ -41,7 +41,7 @@ class SocketPort:
 
     Parameters
     ----------
-    link
+    connected_socket
         Connected socket, which the port makes non-blocking.
     name
         Name of the bus, for messages.
@@ -50,13 +50,13 @@ class SocketPort:
     """
 
     def __init__(
-        self, link: socket.socket, name: str, remedy: str = "check cable and adapter"
+        self, connected_socket: socket.socket, name: str, remedy: str = "check cable and adapter"
     ) -> None:
-        link.setblocking(False)
-        self._link = link
-        self._send = link.send
-        self._recv = link.recv
-        self._fd = [link.fileno()]
+        connected_socket.setblocking(False)
+        self._socket = connected_socket
+        self._send = connected_socket.send
+        self._recv = connected_socket.recv
+        self._fd = [connected_socket.fileno()]
         self.name = name
         self._remedy = remedy
 
@@ -88,14 +88,14 @@ class SocketPort:
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
         """Let the kernel drop frames with other identifiers; a simulated bus drops none."""
-        if self._link.family == getattr(socket, "AF_CAN", None):
+        if self._socket.family == getattr(socket, "AF_CAN", None):
             filter_mask = STANDARD_ID_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
             id_filters = (
                 [(0, 0)] if can_ids is None else [(i, filter_mask) for i in sorted(set(can_ids))]
             )
             packed_filters = b"".join(struct.pack("=II", *id_filter) for id_filter in id_filters)
             try:
-                self._link.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, packed_filters)
+                self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, packed_filters)
             except OSError as error:
                 raise DeviceError(self._error_message("takes no filter", error)) from None
 
@@ -108,7 +108,7 @@ class SocketPort:
     def close(self) -> None:
         """Close the port's socket."""
         with suppress(OSError):
-            self._link.close()
+            self._socket.close()
 
     def _error_message(self, failed_action: str, error: OSError | ValueError) -> str:
         """Return the message of an error of the socket, with cause and remedy."""
@@ -157,8 +157,8 @@ class PythonCanPort:
             self._bus.send(self._to_message(frame), timeout=0.0)
         except Exception as error:
             raise DeviceError(
-                f"CAN bus {self.name}: it takes no more frames ({_error_text(error)}); check cable "
-                "and adapter."
+                f"CAN bus {self.name}: it takes no more frames ({_error_reason(error)}); check "
+                "cable and adapter."
             ) from None
 
     def receive(self) -> bytes | None:
@@ -197,7 +197,7 @@ class PythonCanPort:
             raw_frame = None if message is None else self._from_message(message)
         except (self._error, OSError) as error:
             raise DeviceError(
-                f"CAN bus {self.name}: it cannot be read ({_error_text(error)}); check cable and "
+                f"CAN bus {self.name}: it cannot be read ({_error_reason(error)}); check cable and "
                 "adapter."
             ) from None
         except Exception as error:
@@ -207,15 +207,15 @@ class PythonCanPort:
             self._consecutive_damaged_frames = 0
             raise DeviceError(
                 f"CAN bus {self.name}: the adapter sent {_MAX_DAMAGED_FRAMES} invalid CAN frames "
-                f"in a row ({_error_text(error)}); check the adapter, its cable and its "
+                f"in a row ({_error_reason(error)}); check the adapter, its cable and its "
                 "firmware."
             ) from None
-        if raw_frame is not None and not unpack_header(raw_frame)[0] & ERROR_FLAG:
+        if raw_frame is not None and not unpack_header(raw_frame)[0] & ERROR_FRAME_FLAG:
             self._consecutive_damaged_frames = 0
         return raw_frame
 
 
-def _error_text(error: Exception) -> str:
+def _error_reason(error: Exception) -> str:
     """Return type and text of an adapter's error, since some errors have no text."""
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
@@ -237,18 +237,20 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
     """
     bus_name = f"{settings.channel} ({settings.interface})"
     if simulator is not None and simulator.can_socket:
-        bus_socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        bus_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SIMULATOR_SEND_BUFFER_SIZE)
+        simulator_socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        simulator_socket.setsockopt(
+            socket.SOL_SOCKET, socket.SO_SNDBUF, _SIMULATOR_SEND_BUFFER_SIZE
+        )
         try:
-            bus_socket.connect(simulator.can_socket)
+            simulator_socket.connect(simulator.can_socket)
         except OSError as error:
-            bus_socket.close()
+            simulator_socket.close()
             raise DeviceError(
                 f"CAN bus {bus_name}: the simulated rig does not answer ({error.strerror}); start "
                 "rigd simulate again."
             ) from None
         return SocketPort(
-            bus_socket, f"{bus_name}, simulated", "check whether rigd simulate still runs"
+            simulator_socket, f"{bus_name}, simulated", "check whether rigd simulate still runs"
         )
     if settings.interface == "socketcan":
         return SocketPort(_open_socketcan(settings), bus_name)
@@ -260,8 +262,8 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
         )
     except Exception as error:
         raise DeviceError(
-            f"CAN bus {bus_name}: it cannot be opened ({_error_text(error)}); check can.interface "
-            "and can.channel."
+            f"CAN bus {bus_name}: it cannot be opened ({_error_reason(error)}); check "
+            "can.interface and can.channel."
         ) from None
     return PythonCanPort(bus, bus_name)
 
@@ -269,27 +271,27 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
 def _open_socketcan(settings: CanBus) -> socket.socket:
     """Open and bind a CAN socket of the kernel; raise with a remedy if that fails."""
     interface_name = settings.channel
-    simulation = "start the simulated rig: rigd simulate --profile PROFILE"
+    simulation_advice = "start the simulated rig: rigd simulate --profile PROFILE"
     remedy = (
         f"bring it up with: ip link set {interface_name} up type can bitrate "
-        f"{settings.bitrate_bit_s}; or {simulation}"
+        f"{settings.bitrate_bit_s}; or {simulation_advice}"
     )
     if not hasattr(socket, "AF_CAN"):
         raise DeviceError(
             f"CAN bus {interface_name}: this system has no CAN sockets; run the rig on Linux, or "
-            f"{simulation}."
+            f"{simulation_advice}."
         )
     try:
         can_socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:
         raise DeviceError(
             f"CAN bus {interface_name}: this kernel has no CAN sockets ({error.strerror}); load "
-            f"them with: modprobe can_raw; or, if it was built without them, {simulation}."
+            f"them with: modprobe can_raw; or, if it was built without them, {simulation_advice}."
         ) from None
     try:
         can_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_SIZE)
         can_socket.setsockopt(
-            socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", ERROR_MASK)
+            socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", ERROR_CLASS_MASK)
         )
         can_socket.bind((interface_name,))
     except OSError as error:

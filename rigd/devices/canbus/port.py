@@ -13,32 +13,32 @@ if TYPE_CHECKING:
 
 FRAME_SIZE = 16
 """Size of a raw CAN frame in bytes."""
-ERROR_FLAG = 0x2000_0000
+ERROR_FRAME_FLAG = 0x2000_0000
 """Flag in the identifier of an error frame, with which the controller reports its state.
 
 See linux/can/error.h."""
-EXTENDED_FLAG = 0x8000_0000
+EXTENDED_ID_FLAG = 0x8000_0000
 """Flag in the identifier of a frame with 29 identifier bits; no device of the rig sends such
 frames."""
-REMOTE_FLAG = 0x4000_0000
+REMOTE_REQUEST_FLAG = 0x4000_0000
 """Flag in the identifier of a remote request for data; no device of the rig sends such frames."""
-ERROR_MASK = 0x1FFF_FFFF
+ERROR_CLASS_MASK = 0x1FFF_FFFF
 """Mask of the error class in the identifier of an error frame."""
 STANDARD_ID_MASK = 0x7FF
 """Mask of an 11-bit identifier (standard frame format)."""
 
-BUS_OFF = 0x40
+BUS_OFF_ERROR_CLASS = 0x40
 """Class of an error frame: the controller has switched itself off after too many errors."""
-_PROTOCOL_VIOLATION = 0x08
+_PROTOCOL_ERROR_CLASS = 0x08
 """Class of an error frame: a frame violated the protocol."""
 
 _FRAME_LAYOUT = Struct("=IB3x8s")
 """Layout of a raw CAN frame: identifier with flags, length, data."""
-BUS_OFF_FRAME = _FRAME_LAYOUT.pack(ERROR_FLAG | BUS_OFF, 8, bytes(8))
+BUS_OFF_FRAME = _FRAME_LAYOUT.pack(ERROR_FRAME_FLAG | BUS_OFF_ERROR_CLASS, 8, bytes(8))
 """Error frame with which the kernel reports that the controller is off the bus."""
-DAMAGED_FRAME = _FRAME_LAYOUT.pack(ERROR_FLAG | _PROTOCOL_VIOLATION, 8, bytes(8))
+DAMAGED_FRAME = _FRAME_LAYOUT.pack(ERROR_FRAME_FLAG | _PROTOCOL_ERROR_CLASS, 8, bytes(8))
 """Error frame that replaces an unreadable frame; it is counted, and has no other effect."""
-LENGTH_OFFSET = 4
+DATA_LENGTH_OFFSET = 4
 """Offset of the number of data bytes in a raw frame."""
 unpack_header = Struct("=IB").unpack_from
 """Unpack identifier (with flags) and number of data bytes from a raw frame."""
@@ -76,9 +76,9 @@ def pack_frame(can_id: int, data: bytes = b"") -> bytes:
     return _FRAME_LAYOUT.pack(can_id, len(data), data)
 
 
-def unpack_frame(raw: bytes) -> tuple[int, bytes]:
+def unpack_frame(raw_frame: bytes) -> tuple[int, bytes]:
     """Return identifier (with flags) and data of a raw frame; a length above 8 counts as 8."""
-    can_id, data_length, frame_data = _FRAME_LAYOUT.unpack(raw)
+    can_id, data_length, frame_data = _FRAME_LAYOUT.unpack(raw_frame)
     return can_id, frame_data[: min(data_length, 8)]
 
 

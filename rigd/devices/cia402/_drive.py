@@ -330,9 +330,9 @@ class Cia402Drive:
             return LineHealth()
         exchange = self._node.exchange
         pairing = self._node.pairing
-        lost_without_proof = pairing.lost_without_proof
+        presumed_lost_count = pairing.presumed_lost_count
         doubt_text = lost_count_text = ""
-        if lost_without_proof:
+        if presumed_lost_count:
             doubt_reason = (
                 "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
             )
@@ -342,9 +342,11 @@ class Cia402Drive:
             )
             lost_count_text = (
                 f"{self._name}: TPDOs that did not arrive since it was connected: "
-                f"{lost_without_proof}."
+                f"{presumed_lost_count}."
             )
-        error_count = exchange.error_frames + pairing.lost + self._inbox.malformed_frames
+        error_count = (
+            exchange.error_frames + pairing.lost_reply_count + self._inbox.malformed_frames
+        )
         return LineHealth(
             exchange.bits,
             self._bit_rate_bit_s,

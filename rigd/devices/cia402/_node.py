@@ -45,7 +45,7 @@ class ReceivedFrames:
     unexpected_statusword : int or None
         First statusword that violated the requirement of :meth:`require_status`; None if there was
         none. It is stored even if a later TPDO shows the required state again.
-    replies : int
+    reply_count : int
         Number of TPDOs received since this was last set to zero, valid or not.
     is_last_tpdo_valid : bool
         Whether the last TPDO had the right length.
@@ -80,7 +80,7 @@ class ReceivedFrames:
         "name",
         "nmt_state",
         "position",
-        "replies",
+        "reply_count",
         "sdo_reply",
         "statusword",
         "sto_error_code",
@@ -102,7 +102,7 @@ class ReceivedFrames:
         self.require_status(0, 0)
         self.position = 0
         self.torque = 0
-        self.replies = 0
+        self.reply_count = 0
         self.is_last_tpdo_valid = False
         self.nmt_state: int | None = None
         self.heartbeat_received = False
@@ -120,7 +120,7 @@ class ReceivedFrames:
 
     def store_tpdo(self, data: bytes) -> None:
         """Store statusword, position and torque of a received TPDO."""
-        self.replies += 1
+        self.reply_count += 1
         try:
             if self.tpdo_has_torque:
                 self.statusword, self.position, self.torque = unpack_tpdo(data)
@@ -234,8 +234,8 @@ class Node:
         self.period_ns = round(1e9 / rig.rate_hz)
         self.deadline_ns = round(rig.acquisition.deadline_us * 1000)
         self.lock_step = self.deadline_ns > self.period_ns
-        may_pause = self.settings.sync_gaps and not self.lock_step
-        self.pairing = ReplyPairing(inbox, may_pause=may_pause)
+        may_omit_request = self.settings.sync_gaps and not self.lock_step
+        self.pairing = ReplyPairing(inbox, may_omit_request=may_omit_request)
         self.sync_ns = 0
         self.now_ns = 0
         self._reset_command = f"rigd reset --profile {rig.name}"
@@ -424,4 +424,4 @@ class Node:
 
     def _is_answered(self) -> bool:
         """Return whether a TPDO has arrived since the last SYNC."""
-        return self.inbox.replies > 0
+        return self.inbox.reply_count > 0

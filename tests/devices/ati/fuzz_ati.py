@@ -195,7 +195,7 @@ def fuzz_can(n, seed, mode="same_tick"):
             assert wrench == (float(wanted % 30000),) * 6, (wrench, wanted)
         before_last = fake.polls
     assert fresh > 0.2 * n
-    return {"ticks": n, "fresh": fresh, "stale": stale, "lost": sensor.polls.lost,
+    return {"ticks": n, "fresh": fresh, "stale": stale, "lost": sensor.polls.lost_reply_count,
             "late": sensor.late_replies}  # fmt: skip
 
 

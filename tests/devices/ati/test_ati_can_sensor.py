@@ -408,7 +408,7 @@ def test_a_lost_reply_leaves_the_last_value_and_a_flag(numbered):
     assert numbered.read() == (1, True)
     assert numbered.number == 3
     assert numbered.read() == (4, False)
-    assert numbered.sensor.polls.lost == 1
+    assert numbered.sensor.polls.lost_reply_count == 1
 
 
 @pytest.mark.parametrize("lost", [0, 1])
@@ -430,7 +430,7 @@ def test_a_reply_after_the_deadline_costs_one_tick(numbered):
     numbered.release()
     assert numbered.read() == (3, False)
     assert numbered.sensor.late_replies == 1
-    assert numbered.sensor.polls.lost == 0
+    assert numbered.sensor.polls.lost_reply_count == 0
 
 
 def test_a_reply_in_the_next_tick_is_dropped(numbered):

@@ -13,16 +13,16 @@ class Box:
     """Number of replies received, and number of the request that the last one answers."""
 
     def __init__(self):
-        self.replies = 0
+        self.reply_count = 0
         self.number = 0
 
 
 class Line:
     """A device that answers with the number of the request, and a line that loses or holds."""
 
-    def __init__(self, *, may_pause=True):
+    def __init__(self, *, may_omit_request=True):
         self.inbox = Box()
-        self.pairing = ReplyPairing(self.inbox, may_pause=may_pause)
+        self.pairing = ReplyPairing(self.inbox, may_omit_request=may_omit_request)
         self.waiting = deque()
         self.period = 0
         self.number = 0
@@ -32,7 +32,7 @@ class Line:
         """Let replies through that are due, all of them if no period is given."""
         while self.waiting and (until is None or self.waiting[0][0] <= until):
             self.inbox.number = self.waiting.popleft()[1]
-            self.inbox.replies += 1
+            self.inbox.reply_count += 1
 
     def tick(self, event="whole", *, late=0, before=False):
         """One period; returns whether the reading counts as fresh.
@@ -95,7 +95,7 @@ def test_replies_count_again_after_a_late_period(late, ticks):
     fresh = [line.tick() for _ in range(late + 6)]
     assert fresh[-1]
     assert line.right()
-    assert line.pairing.lost == 0
+    assert line.pairing.lost_reply_count == 0
 
 
 @pytest.mark.parametrize("losses", [1, 2, 3, 7])
@@ -104,7 +104,11 @@ def test_one_tick_without_request_resolves_a_loss(losses):
     line.tick()
     assert not any(line.tick("lost") for _ in range(losses))
     assert [line.tick() for _ in range(4)] == [False, False, True, True]
-    assert (line.paused, line.pairing.lost, line.pairing.lost_without_proof) == (1, losses, 0)
+    assert (line.paused, line.pairing.lost_reply_count, line.pairing.presumed_lost_count) == (
+        1,
+        losses,
+        0,
+    )
     assert line.right()
 
 
@@ -135,8 +139,12 @@ def test_several_periods_of_replies_at_once():
 
 
 def test_a_loss_stays_unproven_in_lock_step():
-    line = Line(may_pause=False)
+    line = Line(may_omit_request=False)
     line.tick()
     fresh = [line.tick(event) for event in ("lost", "lost", *["whole"] * 5)]
     assert fresh == [False] * 2 + [False] * 3 + [True] * 2
-    assert (line.paused, line.pairing.lost, line.pairing.lost_without_proof) == (0, 2, 2)
+    assert (line.paused, line.pairing.lost_reply_count, line.pairing.presumed_lost_count) == (
+        0,
+        2,
+        2,
+    )

@@ -56,17 +56,17 @@ def bits_per_second(frames, data_of):
 def test_the_load_of_any_data_lies_between_plain_and_worst(can_rig, data):
     load = bus_load(can_rig)
     load_of_data = bits_per_second(
-        load.traffic,
-        lambda frame: data.draw(st.binary(min_size=frame.length, max_size=frame.length)),
+        load.cyclic_frames,
+        lambda frame: data.draw(st.binary(min_size=frame.data_length, max_size=frame.data_length)),
     )
-    assert load.plain * 1e6 <= load_of_data <= load.worst * 1e6
+    assert load.load_without_stuffing * 1e6 <= load_of_data <= load.worst_case_load * 1e6
 
 
 def test_real_frames_come_near_the_worst(can_rig):
     """Data of 3C has a bit stuffed after every four; heads and checksums are typical."""
     load = bus_load(can_rig)
-    stuffed = bits_per_second(load.traffic, lambda frame: b"\x3c" * frame.length)
-    assert stuffed > load.worst * 1e6 - 9 * load.frames_per_s
+    stuffed = bits_per_second(load.cyclic_frames, lambda frame: b"\x3c" * frame.data_length)
+    assert stuffed > load.worst_case_load * 1e6 - 9 * load.frames_per_s
 
 
 def test_motor_and_sensor_at_1_mbit(can_rig):
@@ -74,13 +74,16 @@ def test_motor_and_sensor_at_1_mbit(can_rig):
     load = bus_load(can_rig)
     heartbeats_hz = 1 / can_rig.cia402.heartbeat_period_s
     heartbeats_hz += 1 / can_rig.cia402.drive_heartbeat_period_s
-    assert load.plain == pytest.approx((490e3 + 55 * heartbeats_hz) / 1e6)
-    assert load.worst == pytest.approx((590e3 + 65 * heartbeats_hz) / 1e6)
+    assert load.load_without_stuffing == pytest.approx((490e3 + 55 * heartbeats_hz) / 1e6)
+    assert load.worst_case_load == pytest.approx((590e3 + 65 * heartbeats_hz) / 1e6)
     assert load.frames_per_s == pytest.approx(6000 + heartbeats_hz)
 
 
 def test_half_the_bit_rate_does_not_fit(can_rig):
-    assert bus_load(replace(can_rig, can=replace(can_rig.can, bitrate_bit_s=500_000))).worst > 1.18
+    assert (
+        bus_load(replace(can_rig, can=replace(can_rig.can, bitrate_bit_s=500_000))).worst_case_load
+        > 1.18
+    )
 
 
 def test_load_of_the_motor_alone_with_a_serial_sensor(serial_rig):
@@ -88,19 +91,20 @@ def test_load_of_the_motor_alone_with_a_serial_sensor(serial_rig):
     slow = replace(
         serial_rig, cia402=replace(drive, heartbeat_period_s=1.0, drive_heartbeat_period_s=1.0)
     )
-    assert bus_load(slow).worst == pytest.approx(0.285 + 2 * 65e-6)
+    assert bus_load(slow).worst_case_load == pytest.approx(0.285 + 2 * 65e-6)
 
 
 def test_a_loop_sends_no_heartbeat_between_its_ticks(can_rig):
     often = replace(can_rig, cia402=replace(can_rig.cia402, heartbeat_period_s=1e-4))
-    host = next(t for t in bus_load(often).traffic if t.what == "host's heartbeat")
+    host = next(t for t in bus_load(often).cyclic_frames if t.frame_name == "host's heartbeat")
     assert host.rate_hz == 1000
 
 
 def test_frames_carry_the_identifiers_of_the_profile(can_rig):
     drive, sensor = replace(can_rig.cia402, node_id=5), replace(can_rig.ati_can, base_id=0x6A)
     found = {
-        t.what: t.can_id for t in bus_load(replace(can_rig, cia402=drive, ati_can=sensor)).traffic
+        t.frame_name: t.can_id
+        for t in bus_load(replace(can_rig, cia402=drive, ati_can=sensor)).cyclic_frames
     }
     assert found["drive's TPDO1"] == 0x185
     assert found["drive's RPDO1"] == 0x205

@@ -133,7 +133,7 @@ def test_the_measured_load_is_the_computed_one(simulated_profile):
     rig = simulated_profile("antenna_can", {})
     bus, none = loads(rig, 500)
     assert none is None  # the sensor is on the same bus
-    assert bus == pytest.approx(bus_load(rig).plain, rel=0.02)
+    assert bus == pytest.approx(bus_load(rig).load_without_stuffing, rel=0.02)
 
 
 def test_the_load_of_a_serial_line_is_its_stream(simulated_profile):
