@@ -107,7 +107,7 @@ def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRo
 
 def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[CheckRow]:
     """Yield check results on the drive's watchdog, missing objects, and objects that were set."""
-    watchdog, watchdog_s = capabilities.watchdog, capabilities.watchdog_s
+    watchdog, watchdog_s = capabilities.watchdog, capabilities.watchdog_timeout_s
     is_unproven = watchdog in (Watchdog.OWN, Watchdog.NONE)
     yield CheckRow(
         "drive",
@@ -117,26 +117,30 @@ def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[CheckRow]:
         CheckResult.WARNING if is_unproven else CheckResult.OK,
         _WATCHDOG_ADVICE.get(watchdog, ""),
     )
-    accepted_features = capabilities.accepted
-    for row in capabilities.lacks:
-        is_accepted = row.accept in accepted_features
+    accepted_features = capabilities.accepted_missing_functions
+    for row in capabilities.missing_objects:
+        is_accepted = row.acceptance_name in accepted_features
         substitute_text = (
-            f"in its place: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
+            f"in its place: {row.replacement}"
+            if row.replacement and row.acceptance_name != WATCHDOG
+            else ""
         )
-        if row.accept == WATCHDOG:
+        if row.acceptance_name == WATCHDOG:
             substitute_text = (
                 f"in its place: {watchdog.value}" if watchdog is not Watchdog.NONE else ""
             )
-        acceptance_text = f'accepted by cia402.accept_without "{row.accept}"' if is_accepted else ""
+        acceptance_text = (
+            f'accepted by cia402.accept_without "{row.acceptance_name}"' if is_accepted else ""
+        )
         yield CheckRow(
             "drive",
             f"object {row.address} ({row.name})",
             "; ".join(("absent or not usable", *filter(None, (acceptance_text, substitute_text)))),
             "",
             CheckResult.WARNING if is_accepted else CheckResult.OK,
-            f"{row.name}: {row.sentence}" if is_accepted else "",
+            f"{row.name}: {row.consequence}" if is_accepted else "",
         )
-    for safeguard_text in capabilities.assigned:
+    for safeguard_text in capabilities.assigned_objects:
         yield CheckRow("drive", "object set", safeguard_text, "read back", CheckResult.OK)
 
 

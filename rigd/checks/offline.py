@@ -62,11 +62,11 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[CheckRow]:
     for finding in check_suitability(eds, rig).findings:
         yield CheckRow(
             "EDS",
-            finding.what,
-            finding.found,
-            finding.wanted,
+            finding.checked_item,
+            finding.stated_text,
+            finding.required_text,
             result_by_grade[finding.grade],
-            finding.sentence,
+            finding.consequence,
             EDS_ROW,
         )
 

@@ -149,7 +149,7 @@ def new(
     for draft_remark in draft.remarks:
         typer.echo(f"Note: {draft_remark}", err=True)
     unanswered = draft.unanswered_questions()
-    missing_features = [finding.accept for finding in draft.unaccepted_findings()]
+    missing_features = [finding.acceptance_name for finding in draft.unaccepted_findings()]
     if unanswered or missing_features:
         typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
     for open_question in unanswered:
@@ -199,10 +199,12 @@ def _ask_for_acceptance(draft: "Draft") -> None:
     declined_names: set[str] = set()
     # One answer may imply another: without a watchdog its reaction is irrelevant.
     while missing_features := [
-        finding for finding in draft.unaccepted_findings() if finding.accept not in declined_names
+        finding
+        for finding in draft.unaccepted_findings()
+        if finding.acceptance_name not in declined_names
     ]:
-        typer.echo(missing_features[0].sentence, err=True)
-        feature_name = missing_features[0].accept
+        typer.echo(missing_features[0].consequence, err=True)
+        feature_name = missing_features[0].acceptance_name
         if typer.confirm(f"Run it without ({feature_name})?", default=False, err=True):
             draft.accept(feature_name)
         else:

@@ -92,7 +92,7 @@ def _serial_metadata(rig: RigParameters) -> dict[str, str]:
 def _drive_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for contradictions in the settings of a CiA 402 drive."""
     from rigd.devices.cia402 import parse_assignment
-    from rigd.devices.cia402.requirements import ACCEPTABLE
+    from rigd.devices.cia402.requirements import ACCEPTABLE_MISSING_FUNCTIONS
 
     if profile_values["cia402.direction"] == 0:
         yield "cia402.direction = 0 must be 1, or -1 where the drive turns the other way round."
@@ -144,11 +144,11 @@ def _drive_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
         except ValueError as error:
             yield f'cia402.set_objects[{entry_number}] = "{entry_text}" {error}.'
     for entry_number, key_name in enumerate(profile_values["cia402.accept_without"]):
-        if key_name not in ACCEPTABLE:
+        if key_name not in ACCEPTABLE_MISSING_FUNCTIONS:
             yield (
                 f'cia402.accept_without[{entry_number}] = "{key_name}" is not a '
                 "feature whose absence a profile can accept; "
-                f"choose {', '.join(ACCEPTABLE)}."
+                f"choose {', '.join(ACCEPTABLE_MISSING_FUNCTIONS)}."
             )
 
 

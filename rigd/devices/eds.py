@@ -75,7 +75,7 @@ class EdsEntry:
 
     index: int
     """Index of the object."""
-    sub: int
+    subindex: int
     """Sub-index; 0 for a plain variable."""
     name: str
     """Name of the object or sub-index in the file."""
@@ -130,19 +130,19 @@ class Eds:
     entries: Mapping[tuple[int, int], EdsEntry]
     """Entries by index and sub-index; a plain variable has the sub-index 0."""
 
-    def get(self, index: int, sub: int = 0) -> EdsEntry | None:
+    def get(self, index: int, subindex: int = 0) -> EdsEntry | None:
         """Return the entry of an object or sub-index, or None if the file does not contain it.
 
         Parameters
         ----------
-        index, sub
+        index, subindex
             Index and sub-index of the object.
         """
-        return self.entries.get((index, sub))
+        return self.entries.get((index, subindex))
 
     def has(self, index: int) -> bool:
         """Return whether the file contains an object, or any sub-index of it."""
-        return any((index, sub) in self.entries for sub in range(256))
+        return any((index, subindex) in self.entries for subindex in range(256))
 
 
 def read_eds(path: Path, node_id: int = 1) -> Eds:
@@ -168,7 +168,7 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
     sections = _parse_sections(_read_text(path), path)
     device_keys = sections.get("deviceinfo", {})
     eds_entries = {
-        (e.index, e.sub): e
+        (e.index, e.subindex): e
         for e in _parse_entries(_correct_sections(sections, path), sections, node_id)
     }
     if not eds_entries:
@@ -293,8 +293,8 @@ def _correct_sections(sections: Sections, path: Path) -> dict[tuple[int, int], M
     for index, sub_sections in sorted(objects_by_index.items()):
         section_title = f"{index:04x}"
         section_keys = _keys_with_values(sections.get(section_title, {}))
-        for sub, compact_keys in _compact_sub_indices(section_title, sections):
-            sub_sections.setdefault(sub, compact_keys)
+        for subindex, compact_keys in _compact_sub_indices(section_title, sections):
+            sub_sections.setdefault(subindex, compact_keys)
         # Sub-indices are kept even if the object's type is missing or wrong.
         object_kind = _parse_integer_or_zero(section_keys.get("objecttype", ""))
         if (
@@ -310,8 +310,10 @@ def _correct_sections(sections: Sections, path: Path) -> dict[tuple[int, int], M
         shared_keys |= {
             key: section_keys[key] for key in ("datatype", "accesstype") if key in section_keys
         }
-        for sub in sorted(sub_sections):
-            corrected_keys[index, sub] = shared_keys | _keys_with_values(sub_sections[sub])
+        for subindex in sorted(sub_sections):
+            corrected_keys[index, subindex] = shared_keys | _keys_with_values(
+                sub_sections[subindex]
+            )
         if len(corrected_keys) > MAX_ENTRIES:
             raise _too_many_entries_error(path)
     return corrected_keys
@@ -342,13 +344,13 @@ def _compact_sub_indices(
             "defaultvalue": str(sub_count),
         },
     )
-    for sub in range(1, sub_count + 1):
+    for subindex in range(1, sub_count + 1):
         own_keys = {
-            "parametername": names_by_sub.get(str(sub), ""),
-            "parametervalue": values_by_sub.get(str(sub), ""),
+            "parametername": names_by_sub.get(str(subindex), ""),
+            "parametervalue": values_by_sub.get(str(subindex), ""),
         }
         yield (
-            sub,
+            subindex,
             shared_keys | {key: value_text for key, value_text in own_keys.items() if value_text},
         )
 
@@ -357,7 +359,7 @@ def _parse_entries(
     corrected: Mapping[tuple[int, int], Mapping[str, str]], sections: Sections, node_id: int
 ) -> Iterator[EdsEntry]:
     """Yield the entries that corrected sections describe."""
-    for (index, sub), section_keys in corrected.items():
+    for (index, subindex), section_keys in corrected.items():
         data_type = _data_type(section_keys, sections)
         entry_value: int | bytes | None = None
         # A valid value that a DCF sets takes precedence over the default.
@@ -367,7 +369,7 @@ def _parse_entries(
         access_right = section_keys.get("accesstype", "").lower()
         yield EdsEntry(
             index=index,
-            sub=sub,
+            subindex=subindex,
             name=_printable_line(section_keys["parametername"]),
             data_type=data_type,
             access=access_right if access_right in _ACCESS_RIGHTS else "rw",
@@ -426,10 +428,10 @@ def _to_signed(integer_value: int | None, data_type: int) -> int | None:
 
 
 def _identity_number(
-    entries: Mapping[tuple[int, int], EdsEntry], sub: int, header_text: str
+    entries: Mapping[tuple[int, int], EdsEntry], subindex: int, header_text: str
 ) -> int:
     """Return a number of the drive's identity: from object 1018, or else from `header_text`."""
-    identity_entry = entries.get((0x1018, sub))
+    identity_entry = entries.get((0x1018, subindex))
     identity_value = (identity_entry.default if identity_entry else None) or _parse_integer_or_zero(
         header_text
     )

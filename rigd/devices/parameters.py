@@ -252,7 +252,7 @@ class ServoDrive:
     See `rigd.devices.cia402`."""
     accept_without: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
     """Functions that the drive may lack, by the names in
-    `rigd.devices.cia402.requirements.ACCEPTABLE`."""
+    `rigd.devices.cia402.requirements.ACCEPTABLE_MISSING_FUNCTIONS`."""
     own_watchdog_s: Annotated[float, Ge(0), Le(5)] = field(default=0.0, metadata=OPTIONAL)
     """Timeout in seconds of the drive's manufacturer-specific watchdog over SYNC and RPDO.
 

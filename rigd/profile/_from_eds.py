@@ -180,7 +180,7 @@ class Draft:
         return [
             finding
             for finding in drive_findings
-            if finding.accept and finding.grade is Grade.REFUSED
+            if finding.acceptance_name and finding.grade is Grade.REFUSED
         ]
 
     def accept(self, name: str) -> None:
@@ -199,12 +199,12 @@ class Draft:
         drive_findings = check_suitability(
             self._eds, profile_from_text(self._text_without_head(), self._path).rig
         ).findings
-        remarks = [f.sentence for f in drive_findings if f.sentence]
+        remarks = [f.consequence for f in drive_findings if f.consequence]
         return remarks + [
-            f"The file does not state the value of {f.what}, which has to be {f.wanted}: rigd "
-            "check reads it from the drive."
+            f"The file does not state the value of {f.checked_item}, which has to be "
+            f"{f.required_text}: rigd check reads it from the drive."
             for f in drive_findings
-            if f.grade is Grade.ASK and f.wanted
+            if f.grade is Grade.ASK and f.required_text
         ]
 
     def questions(self) -> list[Question]:
@@ -259,7 +259,7 @@ class Draft:
 
         If the operator has accepted none yet, the setting is written as a comment.
         """
-        undecided_names = [finding.accept for finding in self.unaccepted_findings()]
+        undecided_names = [finding.acceptance_name for finding in self.unaccepted_findings()]
         limit_objects = (
             self._manufacturer_limits()
             if TORQUE_LIMIT in (*undecided_names, *self._accepted)
@@ -299,7 +299,7 @@ class Draft:
 
     def _missing_feature_names(self) -> list[str]:
         """Return the names of the drive's missing features that a profile must accept."""
-        return [finding.accept for finding in self._findings if finding.accept]
+        return [finding.acceptance_name for finding in self._findings if finding.acceptance_name]
 
     def _eds_settings(self) -> Iterator[Setting]:
         """Yield the settings that follow from the EDS file and from missing features."""
@@ -364,7 +364,8 @@ class Draft:
         The text is empty if there are none.
         """
         object_names = [
-            f"{e.index:04X}:{e.sub:X} ({e.name}{'' if e.default is None else f', {e.default}'})"
+            f"{e.index:04X}:{e.subindex:X} "
+            f"({e.name}{'' if e.default is None else f', {e.default}'})"
             for e in self._eds.entries.values()
             if e.index in _MANUFACTURER_INDICES and e.writable and _TORQUE_LIMIT_NAME.search(e.name)
         ]

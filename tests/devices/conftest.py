@@ -23,7 +23,7 @@ def open_backend(request, start_simulator, monkeypatch):
     """Open drive and sensor: simulated directly, by wire in lock-step, or the real ones."""
     # The time that a simulated drive takes to answer during set-up depends on the computer.
     if request.param != "hardware":
-        for name in ("_SDO_TIMEOUT_S", "_HURRIED_TIMEOUT_S"):
+        for name in ("_SDO_TIMEOUT_S", "_SHORT_SDO_TIMEOUT_S"):
             monkeypatch.setattr(f"rigd.devices.cia402._sdo.{name}", 10.0)
     if request.param == "hardware":
         name = os.environ.get(HARDWARE)

@@ -295,7 +295,7 @@ def test_garbage_is_read_or_refused(tmp_path_factory, lines, encoding):
         assert str(path) in str(error)
         return
     for (index, sub), entry in found.entries.items():
-        assert (entry.index, entry.sub) == (index, sub)
+        assert (entry.index, entry.subindex) == (index, sub)
         assert entry.access in ("ro", "rw", "wo", "const", "rwr", "rww")
         assert entry.name.isprintable()
         assert all(type(v) is int or v is None for v in (entry.default, entry.low, entry.high))

@@ -29,10 +29,10 @@ _PDO_INDICES: Final = range(0x1400, 0x1C00)
 """Indices of PDO parameters and mappings, which a profile may not set."""
 _STORAGE_INDICES: Final = (0x1010, 0x1011, *range(0x1F50, 0x1F58))
 """Indices of objects that store or restore parameters or load firmware."""
-_SET_BY_RIGD: Final = {
-    (each.index, each.sub)
+_OBJECTS_SET_BY_RIGD: Final = {
+    (each.index, each.subindex)
     for each in REQUIREMENTS
-    if each.access & (ObjectAccess.WRITE | ObjectAccess.RECEIVED)
+    if each.access & (ObjectAccess.WRITTEN_BY_SDO | ObjectAccess.RECEIVED_IN_RPDO)
 }
 """Index and sub-index of each object that the driver itself writes."""
 
@@ -43,25 +43,25 @@ class Assignment:
 
     index: int
     """Index of the object."""
-    sub: int
+    subindex: int
     """Sub-index of the object."""
     integer_type: str
     """Integer type of the value, one of :data:`INTEGER_RANGES`."""
-    value: int
+    object_value: int
     """Value to write."""
 
     @property
     def address(self) -> str:
         """Index and sub-index of the object for messages, such as "6040:0"."""
-        return f"{self.index:04X}:{self.sub:X}"
+        return f"{self.index:04X}:{self.subindex:X}"
 
 
-def parse_assignment(text: str) -> Assignment:
+def parse_assignment(assignment_text: str) -> Assignment:
     """Parse one text of ``cia402.set_objects`` into an assignment.
 
     Parameters
     ----------
-    text
+    assignment_text
         ``index:sub type value``; index and sub-index in hexadecimal digits.
 
     Raises
@@ -74,10 +74,10 @@ def parse_assignment(text: str) -> Assignment:
     >>> parse_assignment("3001:2 u32 2500")
     Assignment(index=12289, sub=2, integer_type='u32', value=2500)
     """
-    pattern_match = _ASSIGNMENT_PATTERN.fullmatch(text.strip())
+    pattern_match = _ASSIGNMENT_PATTERN.fullmatch(assignment_text.strip())
     if pattern_match is None:
         raise ValueError('must be index:sub, type and value, such as "3001:2 u32 2500"')
-    index, sub = int(pattern_match[1], 16), int(pattern_match[2] or "0", 16)
+    index, subindex = int(pattern_match[1], 16), int(pattern_match[2] or "0", 16)
     integer_type = pattern_match[3]
     if integer_type not in INTEGER_RANGES:
         raise ValueError(
@@ -92,11 +92,11 @@ def parse_assignment(text: str) -> Assignment:
     low, high = INTEGER_RANGES[integer_type]
     if not low <= object_value <= high:
         raise ValueError(f"has a value that {integer_type} does not hold ({low} to {high})")
-    if (index, sub) in _SET_BY_RIGD or index in _PDO_INDICES:
+    if (index, subindex) in _OBJECTS_SET_BY_RIGD or index in _PDO_INDICES:
         raise ValueError("is an object that rigd sets itself; remove it")
     if index in _STORAGE_INDICES:
         raise ValueError(
             "would have the drive store or restore its memory at every start; do that once with "
             "the drive's own tool"
         )
-    return Assignment(index, sub, integer_type, object_value)
+    return Assignment(index, subindex, integer_type, object_value)

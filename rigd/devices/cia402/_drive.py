@@ -11,8 +11,8 @@ from math import isnan
 from rigd.devices.canbus import CanExchange, CanLink
 from rigd.devices.cia402._node import Node, ReceivedFrames
 from rigd.devices.cia402._protocol import (
-    DISABLE_VOLTAGE,
-    ENABLE_OPERATION,
+    DISABLE_VOLTAGE_COMMAND,
+    ENABLE_OPERATION_COMMAND,
     FAULT_BIT,
     FOLLOWS_TARGET_BIT,
     OPERATION_ENABLED_BITS,
@@ -35,9 +35,9 @@ from rigd.devices.cia402.requirements import Watchdog, torque_limit_per_mille
 from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.devices.parameters import RigParameters
 
-_HALF_COUNTER_RANGE = 1 << 31
+_HALF_POSITION_COUNTER_RANGE = 1 << 31
 """Half of the range of the drive's 32-bit position counter, in counts."""
-_COUNTER_MASK = (1 << 32) - 1
+_POSITION_COUNTER_MASK = (1 << 32) - 1
 """Mask with the 32 bits of the drive's position counter."""
 
 
@@ -75,13 +75,13 @@ class Cia402Drive:
         self._link = link
         self._name = f"Drive (CANopen node {settings.node_id})"
         self._frames = NodeFrames(settings.node_id, settings.host_node_id)
-        self._idle_rpdo = self._frames.rpdo(DISABLE_VOLTAGE, 0)
+        self._idle_rpdo = self._frames.rpdo_frame(DISABLE_VOLTAGE_COMMAND, 0)
         self._inbox = ReceivedFrames(self._name, settings.sto_error_code)
         self._replies_in_same_tick = rig.acquisition.mode == "same_tick"
         self._heartbeat_timeout_ns = round(settings.drive_heartbeat_timeout_s * 1e9)
         self._rad_per_count = rig.encoder.resolution_rad * settings.direction
         self._per_mille_per_nm = 1000 * settings.direction / rig.motor.rated_torque_nm
-        self._limit_per_mille = torque_limit_per_mille(rig)
+        self._max_torque_per_mille = torque_limit_per_mille(rig)
         self._torque_check = TorqueFollowingCheck(
             self._name,
             settings.torque_tolerance_percent,
@@ -128,11 +128,11 @@ class Cia402Drive:
         self._inbox.clear()
         self._inbox.require_status(FAULT_BIT, 0)
         capabilities = self._capabilities = set_up_drive(exchange.port, self._rig, self._name)
-        has_torque = capabilities.has(ACTUAL_TORQUE)
-        self._inbox.tpdo_has_torque = has_torque
-        self._torque_check.is_active = has_torque
+        reports_torque = capabilities.has_object(ACTUAL_TORQUE)
+        self._inbox.tpdo_has_torque = reports_torque
+        self._torque_check.is_active = reports_torque
         # Without a heartbeat of its own the drive is monitored by its TPDOs alone.
-        self._has_heartbeat = capabilities.has(HEARTBEAT_PRODUCER_MS)
+        self._has_heartbeat = capabilities.has_object(HEARTBEAT_PRODUCER_MS)
         self._has_rpdo_deadline = capabilities.watchdog is Watchdog.RPDO_DEADLINE
         self._subscribe(exchange)
         exchange.start()
@@ -145,7 +145,7 @@ class Cia402Drive:
         self.angle_time_ns = node.sync_ns
         node.pairing.process_replies()  # the first reply belongs to no tick
         self._awaits_reply = False
-        node.resume()
+        node.restart_heartbeat_timing()
 
     def identity(self) -> dict[str, object]:
         """Return the identity that the drive reported at :meth:`connect`.
@@ -189,13 +189,17 @@ class Cia402Drive:
                 for key in identity_keys
             ),
             "drive_watchdog": capabilities.watchdog.value,
-            "drive_watchdog_s": repr(capabilities.watchdog_s),
+            "drive_watchdog_s": repr(capabilities.watchdog_timeout_s),
         }
-        stand_ins = [f"{row.address}: {row.stand_in}" for row in capabilities.lacks if row.stand_in]
+        replacement_texts = [
+            f"{row.address}: {row.replacement}"
+            for row in capabilities.missing_objects
+            if row.replacement
+        ]
         for key, texts in (
-            ("drive_without", capabilities.accepted),
-            ("drive_stand_ins", stand_ins),
-            ("drive_objects_set", capabilities.assigned),
+            ("drive_without", capabilities.accepted_missing_functions),
+            ("drive_stand_ins", replacement_texts),
+            ("drive_objects_set", capabilities.assigned_objects),
         ):
             if texts:
                 metadata[key] = "; ".join(texts)
@@ -235,7 +239,7 @@ class Cia402Drive:
         self._inbox.require_status(
             STATE_BITS | follows_target_bit, OPERATION_ENABLED_BITS | follows_target_bit
         )
-        node.resume()
+        node.restart_heartbeat_timing()
 
     def latch(self, due_ns: int) -> None:
         """Send SYNC, on which the drive samples its angle.
@@ -314,15 +318,17 @@ class Cia402Drive:
             send_frame(self._idle_rpdo)
             return 0.0
         torque_per_mille = torque_nm * self._per_mille_per_nm
-        limit_per_mille = self._limit_per_mille
-        if not -limit_per_mille <= torque_per_mille <= limit_per_mille:
+        max_torque_per_mille = self._max_torque_per_mille
+        if not -max_torque_per_mille <= torque_per_mille <= max_torque_per_mille:
             if isnan(torque_per_mille):
                 raise DeviceError(f"{self._name}: the torque command is not a number.")
-            torque_per_mille = limit_per_mille if torque_per_mille > 0 else -limit_per_mille
-        sent_per_mille = round(torque_per_mille)
-        self._torque_check.command(sent_per_mille)
-        send_frame(self._frames.rpdo(ENABLE_OPERATION, sent_per_mille))
-        return sent_per_mille / self._per_mille_per_nm
+            torque_per_mille = (
+                max_torque_per_mille if torque_per_mille > 0 else -max_torque_per_mille
+            )
+        sent_torque_per_mille = round(torque_per_mille)
+        self._torque_check.command(sent_torque_per_mille)
+        send_frame(self._frames.rpdo_frame(ENABLE_OPERATION_COMMAND, sent_torque_per_mille))
+        return sent_torque_per_mille / self._per_mille_per_nm
 
     def health(self) -> LineHealth:
         """Return number of bits, bit rate and errors of the bus, as this driver sees them."""
@@ -331,7 +337,7 @@ class Cia402Drive:
         exchange = self._node.exchange
         pairing = self._node.pairing
         presumed_lost_count = pairing.presumed_lost_count
-        doubt_text = lost_count_text = ""
+        doubt_text = lost_tpdos_text = ""
         if presumed_lost_count:
             doubt_reason = (
                 "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
@@ -340,7 +346,7 @@ class Cia402Drive:
                 f"{self._name}: a TPDO did not arrive, or all have been delayed by a period since, "
                 f"which is unknown {doubt_reason}: angles may be older than the file states."
             )
-            lost_count_text = (
+            lost_tpdos_text = (
                 f"{self._name}: TPDOs that did not arrive since it was connected: "
                 f"{presumed_lost_count}."
             )
@@ -352,7 +358,7 @@ class Cia402Drive:
             self._bit_rate_bit_s,
             error_count,
             doubt=doubt_text,
-            doubt_count=lost_count_text,
+            doubt_count=lost_tpdos_text,
         )
 
     def disable(self) -> None:
@@ -378,7 +384,7 @@ class Cia402Drive:
                 f"0x{self._inbox.statusword:04X}); check that it is, by its STO if need be. "
                 f"{self._describe_watchdog()}"
             )
-        node.resume()
+        node.restart_heartbeat_timing()
 
     def reset_fault(self) -> str | None:
         """Switch the drive off and reset its fault; the drive must then be reconnected.
@@ -424,7 +430,7 @@ class Cia402Drive:
             return "It has no watchdog that would end it by itself."
         return (
             "Without the loop it has to switch itself off within "
-            f"{capabilities.watchdog_s:g} s, by its {capabilities.watchdog.value}."
+            f"{capabilities.watchdog_timeout_s:g} s, by its {capabilities.watchdog.value}."
         )
 
     def _require_node(self) -> Node:
@@ -463,16 +469,17 @@ class Cia402Drive:
 
         Otherwise the stored angle is registered as stale.
         """
-        is_fresh = node.pairing.process_replies() and self._inbox.is_last_tpdo_valid
-        self.angle_stale = not is_fresh
-        if self._enabled and is_fresh:
+        is_new_angle_valid = node.pairing.process_replies() and self._inbox.is_last_tpdo_valid
+        self.angle_stale = not is_new_angle_valid
+        if self._enabled and is_new_angle_valid:
             self._torque_check.compare(self._inbox.torque)
-        if is_fresh:
+        if is_new_angle_valid:
             position_counts = self._inbox.position
             # The 32-bit counter wraps around.
             self._relative_counts += (
-                position_counts - self._position + _HALF_COUNTER_RANGE & _COUNTER_MASK
-            ) - _HALF_COUNTER_RANGE
+                position_counts - self._position + _HALF_POSITION_COUNTER_RANGE
+                & _POSITION_COUNTER_MASK
+            ) - _HALF_POSITION_COUNTER_RANGE
             self._position = position_counts
             self.angle_rad = self._relative_counts * self._rad_per_count
             self.angle_time_ns = node.sync_ns
@@ -482,7 +489,7 @@ class Cia402Drive:
         node.raise_if_alarmed()
         statusword = self._inbox.unexpected_statusword
         if statusword is not None and drive_state(statusword) is not DriveState.OPERATION_ENABLED:
-            node.await_alarm()
+            node.await_emergency_message()
             node.raise_if_alarmed()
             raise operation_left_error(self._name, statusword)
         if statusword is not None:
@@ -491,9 +498,9 @@ class Cia402Drive:
                 f"0x{statusword:04X} is not set; check its own diagnosis, and if this drive has "
                 "no such bit: cia402.follows_target_bit = false."
             )
-        silence_s = (node.now_ns - self._last_received_ns) * 1e-9
+        heartbeat_silence_s = (node.now_ns - self._last_received_ns) * 1e-9
         raise DeviceError(
-            f"{self._name}: no heartbeat for {silence_s:.3g} s, more than "
+            f"{self._name}: no heartbeat for {heartbeat_silence_s:.3g} s, more than "
             f"cia402.drive_heartbeat_timeout_s = {node.settings.drive_heartbeat_timeout_s:g} s; "
             "check its supply and the cable."
         )

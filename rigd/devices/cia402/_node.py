@@ -13,9 +13,9 @@ from rigd.devices.cia402._protocol import (
     TORQUE_FREE_STATES,
     DriveState,
     NodeFrames,
+    confirms_write,
     describe_error,
     drive_state,
-    is_written,
     read_emergency,
     read_statusword,
     unpack_short_tpdo,
@@ -24,7 +24,7 @@ from rigd.devices.cia402._protocol import (
 from rigd.devices.contracts import DeviceError, wired_stop_dropped
 from rigd.devices.parameters import RigParameters
 
-_TOGGLE_BIT = 0x80
+_HEARTBEAT_TOGGLE_BIT = 0x80
 """Bit of a heartbeat's data that is not part of the NMT state (toggle bit of node guarding)."""
 
 
@@ -111,21 +111,21 @@ class ReceivedFrames:
         self.emergency_received = False
         self.sdo_reply = b""
 
-    def require_status(self, mask: int, value: int) -> None:
-        """Require that every statusword from now on has `value` in the bits of `mask`."""
-        self._required_mask, self._required_value = mask, value
+    def require_status(self, status_mask: int, required_bits: int) -> None:
+        """Require that every later statusword has `required_bits` in the bits of `status_mask`."""
+        self._required_mask, self._required_value = status_mask, required_bits
         self.unexpected_statusword: int | None = None
-        if self.statusword & mask != value:
+        if self.statusword & status_mask != required_bits:
             self.unexpected_statusword = self.statusword
 
-    def store_tpdo(self, data: bytes) -> None:
+    def store_tpdo(self, tpdo_data: bytes) -> None:
         """Store statusword, position and torque of a received TPDO."""
         self.reply_count += 1
         try:
             if self.tpdo_has_torque:
-                self.statusword, self.position, self.torque = unpack_tpdo(data)
+                self.statusword, self.position, self.torque = unpack_tpdo(tpdo_data)
             else:
-                self.statusword, self.position = unpack_short_tpdo(data)
+                self.statusword, self.position = unpack_short_tpdo(tpdo_data)
             self.is_last_tpdo_valid = True
             if (
                 self.statusword & self._required_mask != self._required_value
@@ -136,13 +136,13 @@ class ReceivedFrames:
             self.is_last_tpdo_valid = False
             self.malformed_frames += 1
 
-    def store_emergency(self, data: bytes) -> None:
+    def store_emergency(self, emergency_data: bytes) -> None:
         """Store a received emergency message as an alarm; error code zero means no error."""
-        emergency = read_emergency(data)
-        if emergency is None:
+        emergency_fields = read_emergency(emergency_data)
+        if emergency_fields is None:
             self.malformed_frames += 1
             return
-        error_code, _, vendor_bytes = emergency
+        error_code, _, vendor_bytes = emergency_fields
         if error_code >> 8 == 0:
             return
         self.emergency_received = True
@@ -157,12 +157,12 @@ class ReceivedFrames:
                 f"{self.name}: emergency message: {describe_error(error_code)}{vendor_text}."
             )
 
-    def store_heartbeat(self, data: bytes) -> None:
+    def store_heartbeat(self, heartbeat_data: bytes) -> None:
         """Store the NMT state of a received heartbeat; set an alarm if it is not operational."""
-        if not data:
+        if not heartbeat_data:
             self.malformed_frames += 1
             return
-        nmt_state = data[0] & ~_TOGGLE_BIT
+        nmt_state = heartbeat_data[0] & ~_HEARTBEAT_TOGGLE_BIT
         self.nmt_state = nmt_state
         self.heartbeat_received = True
         if self.must_stay_operational and nmt_state != OPERATIONAL_STATE and not self.alarm:
@@ -176,16 +176,16 @@ class ReceivedFrames:
                 )
             self.alarm = f"{self.name}: {event_text}."
 
-    def store_sdo_reply(self, data: bytes) -> None:
+    def store_sdo_reply(self, reply_data: bytes) -> None:
         """Store the data of a received SDO reply."""
-        self.sdo_reply = data
+        self.sdo_reply = reply_data
 
 
 # The node
 
-_BEFORE_ANY_TIME_NS = -(1 << 62)
+_EARLIEST_TIME_NS = -(1 << 62)
 """Time in nanoseconds before any clock reading: the next heartbeat is due at once."""
-_START_TIMEOUT_NS = 1_000_000_000
+_OPERATIONAL_TIMEOUT_NS = 1_000_000_000
 """Time in nanoseconds to become operational, in addition to three periods of the drive's
 heartbeat."""
 _FIRST_REPLY_TIMEOUT_NS = 100_000_000
@@ -240,7 +240,7 @@ class Node:
         self.now_ns = 0
         self._reset_command = f"rigd reset --profile {rig.name}"
         self._heartbeat_ns = round(self.settings.heartbeat_period_s * 1e9)
-        self._next_heartbeat_ns = _BEFORE_ANY_TIME_NS
+        self._next_heartbeat_ns = _EARLIEST_TIME_NS
 
     def go_operational(self, *, has_heartbeat: bool = True) -> None:
         """Start the drive's CANopen node and wait for the heartbeat that confirms it.
@@ -254,15 +254,15 @@ class Node:
         if not has_heartbeat:
             inbox.must_stay_operational = True
             return
-        period_s = self.settings.drive_heartbeat_period_s
+        heartbeat_period_s = self.settings.drive_heartbeat_period_s
         if self.lock_step:
             # Without SYNC the drive's time does not advance, not even to its next heartbeat.
-            remaining_syncs = ceil(3 * period_s * self.rate_hz)
+            remaining_syncs = ceil(3 * heartbeat_period_s * self.rate_hz)
             while not self._is_operational() and remaining_syncs > 0 and self.sync():
                 remaining_syncs -= 1
         else:
-            patience_ns = _START_TIMEOUT_NS + round(3e9 * period_s)
-            self.exchange.wait_until(self._is_operational, time.monotonic_ns() + patience_ns)
+            max_wait_ns = _OPERATIONAL_TIMEOUT_NS + round(3e9 * heartbeat_period_s)
+            self.exchange.wait_until(self._is_operational, time.monotonic_ns() + max_wait_ns)
         if not self._is_operational():
             heartbeat_text = (
                 "no heartbeat came"
@@ -280,26 +280,28 @@ class Node:
 
         Raise `DeviceError` if the drive does not answer within a period, or is in fault.
         """
-        shortest_delay_ns = None
+        shortest_reply_delay_ns = None
         for _ in range(_FIRST_REPLY_ATTEMPTS):
             if not self.sync(_FIRST_REPLY_TIMEOUT_NS):
                 break
-            delay_ns = time.monotonic_ns() - self.sync_ns
-            shortest_delay_ns = (
-                delay_ns if shortest_delay_ns is None else min(shortest_delay_ns, delay_ns)
+            reply_delay_ns = time.monotonic_ns() - self.sync_ns
+            shortest_reply_delay_ns = (
+                reply_delay_ns
+                if shortest_reply_delay_ns is None
+                else min(shortest_reply_delay_ns, reply_delay_ns)
             )
-            if delay_ns <= self.period_ns or self.lock_step:
+            if reply_delay_ns <= self.period_ns or self.lock_step:
                 self.raise_if_alarmed()
                 return
-        if shortest_delay_ns is None:
+        if shortest_reply_delay_ns is None:
             raise DeviceError(
                 f"{self.name}: it does not answer SYNC with its TPDO, although it is operational; "
                 "check its own diagnosis."
             )
         raise DeviceError(
-            f"{self.name}: it answers SYNC only after {shortest_delay_ns * 1e-6:.2g} ms, more than "
-            f"the period of {self.period_ns * 1e-6:g} ms; check bit rate and adapter, or choose a "
-            "lower rig.rate_hz."
+            f"{self.name}: it answers SYNC only after {shortest_reply_delay_ns * 1e-6:.2g} ms, "
+            f"more than the period of {self.period_ns * 1e-6:g} ms; check bit rate and adapter, or "
+            "choose a lower rig.rate_hz."
         )
 
     def send_sync(self) -> None:
@@ -324,23 +326,23 @@ class Node:
             self.exchange.send(self.frames.heartbeat)
             self._next_heartbeat_ns = self.now_ns + self._heartbeat_ns
 
-    def resume(self) -> None:
+    def restart_heartbeat_timing(self) -> None:
         """Restart the timing of the heartbeats of computer and drive after a time without ticks."""
-        self._next_heartbeat_ns = _BEFORE_ANY_TIME_NS
+        self._next_heartbeat_ns = _EARLIEST_TIME_NS
         self.inbox.heartbeat_received = True
 
-    def await_reply(self, patience_ns: int = 0) -> bool:
+    def await_reply(self, max_wait_ns: int = 0) -> bool:
         """Wait for a TPDO after the last SYNC, and return whether one has arrived in time.
 
-        The time is `patience_ns`, one period if that is 0, or in lock-step the profile's deadline.
+        The time is `max_wait_ns`, one period if that is 0, or in lock-step the profile's deadline.
         """
-        patience_ns = self.deadline_ns if self.lock_step else patience_ns or self.period_ns
-        return self.exchange.wait_until(self._is_answered, self.sync_ns + patience_ns)
+        max_wait_ns = self.deadline_ns if self.lock_step else max_wait_ns or self.period_ns
+        return self.exchange.wait_until(self._is_sync_answered, self.sync_ns + max_wait_ns)
 
-    def sync(self, patience_ns: int = 0) -> bool:
+    def sync(self, max_wait_ns: int = 0) -> bool:
         """Send SYNC, wait for its reply, and return whether a reply has arrived in time."""
         self.send_sync()
-        return self.await_reply(patience_ns)
+        return self.await_reply(max_wait_ns)
 
     def sync_if_possible(self) -> bool:
         """Send SYNC despite bus errors; return whether a TPDO answered it. Never raises."""
@@ -350,20 +352,22 @@ class Node:
             self.sync_ns = time.monotonic_ns()
             return self.send_if_possible(self.frames.sync) and self.await_reply()
 
-    def sleep_until_next_period(self, sync_grid_ns: int) -> None:
-        """Sleep until the next whole period after `sync_grid_ns`, when the next SYNC is due."""
+    def sleep_until_next_period(self, sync_grid_start_ns: int) -> None:
+        """Sleep until the next whole period after the given time, when the next SYNC is due."""
         if self.lock_step:
             return
-        wait_ns = self.period_ns - (time.monotonic_ns() - sync_grid_ns) % self.period_ns
+        wait_ns = self.period_ns - (time.monotonic_ns() - sync_grid_start_ns) % self.period_ns
         time.sleep(wait_ns * 1e-9)
 
-    def write(self, request: bytes, index: int, sub: int) -> bool:
+    def write(self, request: bytes, index: int, subindex: int) -> bool:
         """Send an SDO write request, and return whether the drive confirmed it in time."""
         inbox = self.inbox
         inbox.sdo_reply = b""
-        return self._request_if_possible(request, lambda: is_written(inbox.sdo_reply, index, sub))
+        return self._request_if_possible(
+            request, lambda: confirms_write(inbox.sdo_reply, index, subindex)
+        )
 
-    def is_off(self) -> bool:
+    def is_torque_off(self) -> bool:
         """Read the statusword by SDO; return whether it shows that the motor has no torque."""
         inbox = self.inbox
         inbox.sdo_reply = b""
@@ -382,7 +386,7 @@ class Node:
             return False
         return True
 
-    def await_alarm(self) -> None:
+    def await_emergency_message(self) -> None:
         """Wait briefly for the emergency message of a drive that has left operation enabled."""
         inbox = self.inbox
         if not inbox.alarm:
@@ -393,16 +397,16 @@ class Node:
     def raise_if_alarmed(self) -> None:
         """Raise if the drive sent an emergency message, has left operational, or is in fault."""
         inbox = self.inbox
-        in_fault = drive_state(inbox.statusword) in (DriveState.FAULT, DriveState.FAULT_REACTION)
-        if in_fault:
-            self.await_alarm()
-        if not (in_fault or inbox.alarm):
+        is_in_fault = drive_state(inbox.statusword) in (DriveState.FAULT, DriveState.FAULT_REACTION)
+        if is_in_fault:
+            self.await_emergency_message()
+        if not (is_in_fault or inbox.alarm):
             return
         alarm_reason = inbox.alarm or (
             f'{self.name}: it is in the state "{drive_state(inbox.statusword).value}" (statusword '
             f"0x{inbox.statusword:04X}) and names no cause."
         )
-        if in_fault:
+        if is_in_fault:
             alarm_reason += f" Remove the cause, then: {self._reset_command}"
         elif inbox.emergency_received:
             # The message may be from a drive that was off; one that was on reports its state later.
@@ -422,6 +426,6 @@ class Node:
         """Return whether the drive's last heartbeat shows the NMT state operational."""
         return self.inbox.nmt_state == OPERATIONAL_STATE
 
-    def _is_answered(self) -> bool:
+    def _is_sync_answered(self) -> bool:
         """Return whether a TPDO has arrived since the last SYNC."""
         return self.inbox.reply_count > 0

@@ -18,7 +18,7 @@ from rigd.devices.cia402.objects import (
     HEARTBEAT_CONSUMER,
     MODE_DISPLAY,
     STATUSWORD,
-    SYNC_ID,
+    SYNC_CAN_ID,
 )
 
 # States of CiA 402
@@ -38,15 +38,15 @@ class DriveState(Enum):
     UNKNOWN = "not a state of CiA 402"
 
 
-DISABLE_VOLTAGE: Final = 0x00
+DISABLE_VOLTAGE_COMMAND: Final = 0x00
 """Controlword that switches the drive off."""
-SHUTDOWN: Final = 0x06
+SHUTDOWN_COMMAND: Final = 0x06
 """Controlword that commands the drive to ready to switch on."""
-SWITCH_ON: Final = 0x07
+SWITCH_ON_COMMAND: Final = 0x07
 """Controlword that commands the drive to switched on."""
-ENABLE_OPERATION: Final = 0x0F
+ENABLE_OPERATION_COMMAND: Final = 0x0F
 """Controlword that commands the drive to operation enabled."""
-FAULT_RESET: Final = 0x80
+FAULT_RESET_COMMAND: Final = 0x80
 """Controlword that resets a fault, by the rise of its bit 7."""
 
 FAULT_BIT: Final = 0x0008
@@ -169,7 +169,7 @@ class NodeFrames:
         self.heartbeat_id = 0x700 + node_id
         self.reply_id = 0x580 + node_id
         request_id = 0x600 + node_id
-        self.sync = pack_frame(SYNC_ID)
+        self.sync = pack_frame(SYNC_CAN_ID)
         self.heartbeat = pack_frame(0x700 + host_node_id, bytes([OPERATIONAL_STATE]))
         self.start = pack_frame(0, bytes([NMT_START, node_id]))
         self.stop = pack_frame(0, bytes([NMT_STOP, node_id]))
@@ -188,45 +188,45 @@ class NodeFrames:
         )
         self._rpdo_header = pack_frame(self.rpdo_id, bytes(4))[: FRAME_SIZE // 2]
 
-    def rpdo(self, controlword: int, torque_per_mille: int) -> bytes:
+    def rpdo_frame(self, controlword: int, torque_per_mille: int) -> bytes:
         """Return the RPDO frame with controlword and torque in 1/1000 of the rated torque (i16)."""
         return self._rpdo_header + _pack_rpdo(controlword, torque_per_mille)
 
 
-def read_emergency(data: bytes) -> tuple[int, int, bytes] | None:
+def read_emergency(emergency_data: bytes) -> tuple[int, int, bytes] | None:
     """Return error code, error register and vendor's bytes of an emergency message, or None.
 
     The result is None if the message is too short.
     """
-    if len(data) < 3:
+    if len(emergency_data) < 3:
         return None
-    error_code, error_register = _unpack_emergency(data)
-    return error_code, error_register, data[3:]
+    error_code, error_register = _unpack_emergency(emergency_data)
+    return error_code, error_register, emergency_data[3:]
 
 
-def is_written(data: bytes, index: int, sub: int) -> bool:
+def confirms_write(sdo_reply: bytes, index: int, subindex: int) -> bool:
     """Return whether an SDO reply confirms that an object was written."""
-    return len(data) == 8 and _unpack_sdo(data)[:3] == (_SDO_WRITE_REPLY, index, sub)
+    return len(sdo_reply) == 8 and _unpack_sdo(sdo_reply)[:3] == (_SDO_WRITE_REPLY, index, subindex)
 
 
-def read_mode(data: bytes) -> int | None:
+def read_mode(sdo_reply: bytes) -> int | None:
     """Return the mode of operation in an SDO reply, or None if the reply is not for object 6061."""
-    mode_bytes = _read_reply_data(data, MODE_DISPLAY)
+    mode_bytes = _object_bytes_in_reply(sdo_reply, MODE_DISPLAY)
     return None if mode_bytes is None else int.from_bytes(mode_bytes[:1], "little", signed=True)
 
 
-def read_statusword(data: bytes) -> int | None:
+def read_statusword(sdo_reply: bytes) -> int | None:
     """Return the statusword in an SDO reply, or None if the reply is not for object 6041."""
-    status_bytes = _read_reply_data(data, STATUSWORD)
+    status_bytes = _object_bytes_in_reply(sdo_reply, STATUSWORD)
     return None if status_bytes is None else int.from_bytes(status_bytes[:2], "little")
 
 
-def _read_reply_data(data: bytes, expected_index: int) -> bytes | None:
+def _object_bytes_in_reply(sdo_reply: bytes, expected_index: int) -> bytes | None:
     """Return the data of an SDO reply to a read request, or None if it is for another object."""
-    if len(data) != 8:
+    if len(sdo_reply) != 8:
         return None
-    sdo_command, reply_index, sub, value_bytes = _unpack_sdo(data)
-    if (reply_index, sub) != (expected_index, 0) or sdo_command & 0xE0 != _SDO_READ_REPLY:
+    sdo_command, reply_index, subindex, value_bytes = _unpack_sdo(sdo_reply)
+    if (reply_index, subindex) != (expected_index, 0) or sdo_command & 0xE0 != _SDO_READ_REPLY:
         return None
     return bytes(value_bytes)
 

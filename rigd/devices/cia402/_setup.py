@@ -12,28 +12,28 @@ from rigd.devices.canbus.port import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402._assignments import parse_assignment
 from rigd.devices.cia402._sdo import (
-    EVERY_BIT,
+    ALL_BITS_MASK,
     SdoAbortError,
     SdoAccess,
     ValueNotStoredError,
-    show_value,
+    value_text,
 )
 from rigd.devices.cia402._switch_off import (
-    command_off,
+    command_voltage_off,
     describe_remaining_torque,
     wait_for,
     wait_until_disabled,
 )
 from rigd.devices.cia402.requirements import (
-    MAY_BE_WRITE_ONLY,
+    POSSIBLY_WRITE_ONLY_INDICES,
     TORQUE_LIMIT,
     WATCHDOG,
     ObjectAccess,
     Requirement,
     Watchdog,
+    most_reliable_watchdog,
     required_values,
     requirement,
-    watchdog,
 )
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters, ServoDrive
@@ -55,11 +55,11 @@ _ABORT_MEANINGS = {
 }
 """Short meanings of SDO abort codes, for messages."""
 
-_MODE_TIMEOUT_S = 0.3
+_MODE_DISPLAY_TIMEOUT_S = 0.3
 """Time in seconds to wait until the drive shows the commanded mode of operation."""
-_RATED_TORQUE_TOLERANCE = 0.02
+_MAX_RATED_TORQUE_DEVIATION = 0.02
 """Largest relative difference between the rated torques of the drive and of the profile."""
-_SCALE_TOLERANCE = 0.02
+_GEAR_AND_ENCODER_TOLERANCE = 0.02
 """Largest relative difference between the gear ratios, or encoder steps, of drive and profile."""
 _MAX_HEARTBEAT_CONSUMERS = 127
 """Largest number of heartbeat consumer entries in object 1016."""
@@ -73,38 +73,38 @@ class DriveCapabilities:
     ----------
     identity
         Identity that the drive reports.
-    watchdog, watchdog_s
+    watchdog, watchdog_timeout_s
         Watchdog that removes the torque if this computer stops communicating, and its timeout in
         seconds, which is infinite if there is no watchdog.
-    lacks
+    missing_objects
         Requirements that the drive does not meet: the object is absent or not usable.
-    assigned
+    assigned_objects
         Manufacturer-specific objects that the profile has set.
     """
 
     identity: dict[str, object]
     watchdog: Watchdog
-    watchdog_s: float
-    lacks: tuple[Requirement, ...]
-    assigned: tuple[str, ...]
+    watchdog_timeout_s: float
+    missing_objects: tuple[Requirement, ...]
+    assigned_objects: tuple[str, ...]
 
-    def has(self, index: int, sub: int = 0) -> bool:
+    def has_object(self, index: int, subindex: int = 0) -> bool:
         """Return whether the drive has a usable object of the table of requirements.
 
         Parameters
         ----------
-        index, sub
+        index, subindex
             Index and sub-index of the object.
         """
-        return requirement(index, sub) not in self.lacks
+        return requirement(index, subindex) not in self.missing_objects
 
     @property
-    def accepted(self) -> tuple[str, ...]:
+    def accepted_missing_functions(self) -> tuple[str, ...]:
         """Names in ``cia402.accept_without`` of functions that this drive lacks."""
         function_names = [
-            missing_object.accept
-            for missing_object in self.lacks
-            if missing_object.accept and missing_object.accept != WATCHDOG
+            missing_object.acceptance_name
+            for missing_object in self.missing_objects
+            if missing_object.acceptance_name and missing_object.acceptance_name != WATCHDOG
         ]
         if self.watchdog is Watchdog.NONE:
             function_names.insert(0, WATCHDOG)
@@ -120,12 +120,12 @@ def set_up_drive(port: CanPort, rig: RigParameters, drive_name: str) -> DriveCap
     """
     settings = rig.cia402
     assert settings is not None
-    required_objects = required_values(rig)
+    required_value_by_address = required_values(rig)
     with SdoAccess(port, settings.node_id, drive_name) as sdo:
         # First, before the identity is known: a killed session may have left the motor turning.
-        command_off(sdo)
+        command_voltage_off(sdo)
         sdo.enter_pre_operational()
-        command_off(sdo)
+        command_voltage_off(sdo)
         identity = _read_identity(sdo)
         try:
             eds_identity = sdo.load_eds(settings.eds) if settings.eds else (0, 0)
@@ -133,8 +133,8 @@ def set_up_drive(port: CanPort, rig: RigParameters, drive_name: str) -> DriveCap
         except DeviceError as error:
             raise DeviceError(f"{error}{describe_remaining_torque(sdo)}") from None
         wait_until_disabled(sdo, rig, drive_name)
-        configuration = _DriveConfiguration(sdo, settings, drive_name, required_objects)
-        configuration.assign()
+        configuration = _DriveConfiguration(sdo, settings, drive_name, required_value_by_address)
+        configuration.write_assigned_objects()
         configuration.check_rated_torque(identity, rig)
         configuration.check_gear_and_encoder(identity, rig)
         configuration.configure_torque()
@@ -146,7 +146,8 @@ def set_up_drive(port: CanPort, rig: RigParameters, drive_name: str) -> DriveCap
         configuration.set_object(requirement(objects.MODE))
         # Some drives show the mode only when enabled: it is checked again then.
         wait_for(
-            lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE_MODE, _MODE_TIMEOUT_S
+            lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE_MODE,
+            _MODE_DISPLAY_TIMEOUT_S,
         )
     return DriveCapabilities(
         identity,
@@ -155,7 +156,7 @@ def set_up_drive(port: CanPort, rig: RigParameters, drive_name: str) -> DriveCap
             Watchdog.OWN: settings.own_watchdog_s,
             Watchdog.NONE: float("inf"),
         }.get(active_watchdog, settings.heartbeat_timeout_s),
-        tuple(configuration.lacks),
+        tuple(configuration.missing_objects),
         settings.set_objects,
     )
 
@@ -166,8 +167,8 @@ def _read_identity(sdo: SdoAccess) -> dict[str, object]:
     A number that the drive lacks is None, and a name that it lacks is an empty text.
     """
     identity: dict[str, object] = {}
-    for sub, key in enumerate(("vendor_id", "product_code", "revision", "serial_number"), 1):
-        identity[key] = sdo.read_or_none(objects.IDENTITY, sub)
+    for subindex, key in enumerate(("vendor_id", "product_code", "revision", "serial_number"), 1):
+        identity[key] = sdo.read_or_none(objects.IDENTITY, subindex)
     identity["device_name"] = sdo.read_text(objects.DEVICE_NAME)
     identity["software_version"] = sdo.read_text(objects.SOFTWARE_VERSION)
     identity["supported_modes"] = sdo.read_or_none(objects.SUPPORTED_MODES)
@@ -199,76 +200,93 @@ def _check_identity(
                 f"0x{required_number:08X}, but it reports {reported_text}. Check cia402.node_id, "
                 "or enter the actual drive in the profile."
             )
-    mode_bits = identity["supported_modes"]
-    if not (isinstance(mode_bits, int) and mode_bits & objects.CYCLIC_TORQUE_MODE_BIT):
+    supported_mode_bits = identity["supported_modes"]
+    if not (
+        isinstance(supported_mode_bits, int)
+        and supported_mode_bits & objects.CYCLIC_TORQUE_MODE_BIT
+    ):
         raise DeviceError(
             f"{drive_name}: it has no cyclic synchronous torque mode over CANopen (object 6502 = "
-            f"{show_value(mode_bits)}, bit 9 is not set); this drive or its firmware cannot be "
-            "used."
+            f"{value_text(supported_mode_bits)}, bit 9 is not set); this drive or its firmware "
+            "cannot be used."
         )
 
 
 class _DriveConfiguration:
     """Set-up of one disabled drive by SDO, which collects the objects that the drive lacks.
 
-    `required` are the required values of the drive's objects, by index and sub-index.
+    `required_value_by_address` are the required values of the drive's objects, by index and
+    sub-index.
     """
 
     def __init__(
-        self, sdo: SdoAccess, settings: ServoDrive, name: str, required: dict[tuple[int, int], int]
+        self,
+        sdo: SdoAccess,
+        settings: ServoDrive,
+        drive_name: str,
+        required_value_by_address: dict[tuple[int, int], int],
     ) -> None:
         self._sdo = sdo
         self._settings = settings
-        self._name = name
-        self._required_values = required
-        self.lacks: list[Requirement] = []
+        self._name = drive_name
+        self._required_value_by_address = required_value_by_address
+        self.missing_objects: list[Requirement] = []
 
-    def set_object(self, row: Requirement, required: int | None = None) -> bool:
+    def set_object(self, required_object: Requirement, required_value: int | None = None) -> bool:
         """Set an object to a value, unless it has that value; return whether the object exists.
 
-        A write-only object is written and not read back, if `MAY_BE_WRITE_ONLY` lists it. If
-        `required` is None, the value is the one that the constructor was given for the object.
-        Raise `DeviceError` if the object is indispensable, or the drive stores a value that is not
-        acceptable.
+        A write-only object is written and not read back, if `POSSIBLY_WRITE_ONLY_INDICES` lists it.
+        If `required_value` is None, the value is the one that the constructor was given for the
+        object. Raise `DeviceError` if the object is indispensable, or the drive stores a value that
+        is not acceptable.
         """
-        if required is None:
-            required = self._required_values[row.index, row.sub]
+        if required_value is None:
+            required_value = self._required_value_by_address[
+                required_object.index, required_object.subindex
+            ]
         try:
-            present_value = self._sdo.read_or_none(row.index, row.sub)
+            present_value = self._sdo.read_or_none(required_object.index, required_object.subindex)
         except SdoAbortError as refusal:
-            if not (refusal.is_write_only and row.index in MAY_BE_WRITE_ONLY):
+            if not (
+                refusal.is_object_write_only
+                and required_object.index in POSSIBLY_WRITE_ONLY_INDICES
+            ):
                 raise
-            self._sdo.write(row.index, row.sub, required)
+            self._sdo.write(required_object.index, required_object.subindex, required_value)
             return True
-        if present_value == required:
+        if present_value == required_value:
             return True
         try:
-            self._sdo.configure(row.index, row.sub, required)
+            self._sdo.configure(required_object.index, required_object.subindex, required_value)
         except ValueNotStoredError as not_stored:
             present_value = not_stored.value_read
             readback_error: DeviceError = not_stored
         except SdoAbortError as refusal:
-            if present_value is None and refusal.is_absent:
-                self._record_missing_object(row)
+            if present_value is None and refusal.is_object_absent:
+                self._record_missing_object(required_object)
                 return False
             if present_value is None:
                 raise
             readback_error = DeviceError(
-                f"{self._name}: object {row.address} ({row.name}) is "
-                f"{show_value(present_value)} but must be {show_value(required)}, and the drive "
-                f"refuses to change it (abort code 0x{refusal.code:08X}: "
-                f"{_abort_meaning(refusal)}). {row.sentence}"
+                f"{self._name}: object {required_object.address} ({required_object.name}) is "
+                f"{value_text(present_value)} but must be {value_text(required_value)}, and the "
+                f"drive refuses to change it (abort code 0x{refusal.code:08X}: "
+                f"{_abort_meaning(refusal)}). {required_object.consequence}"
             )
         else:
             return True
-        if row.value_rule.allows(present_value, required):
+        if required_object.value_rule.allows(present_value, required_value):
             return True
-        if row.accept == TORQUE_LIMIT and present_value >= required and self._accepts(row):
-            self._record_missing_object(row)
+        if (
+            required_object.acceptance_name == TORQUE_LIMIT
+            and present_value >= required_value
+            and self._accepts_absence(required_object)
+        ):
+            self._record_missing_object(required_object)
             return False
         raise readback_error
 
-    def assign(self) -> None:
+    def write_assigned_objects(self) -> None:
         """Write the manufacturer-specific objects that ``cia402.set_objects`` names."""
         for text in self._settings.set_objects:
             try:
@@ -282,26 +300,32 @@ class _DriveConfiguration:
         The rated torque is added to `identity`.
         """
         settings = self._settings
-        torque_counts = self._sdo.read_or_none(objects.RATED_TORQUE)
-        identity["rated_torque_counts"] = torque_counts
-        row = requirement(objects.RATED_TORQUE)
-        if torque_counts is None:
-            self.lacks.append(row)
+        rated_torque_counts = self._sdo.read_or_none(objects.RATED_TORQUE)
+        identity["rated_torque_counts"] = rated_torque_counts
+        required_object = requirement(objects.RATED_TORQUE)
+        if rated_torque_counts is None:
+            self.missing_objects.append(required_object)
         if settings.rated_torque_unit_nm == 0:
             return
-        if torque_counts is None:
+        if rated_torque_counts is None:
             raise DeviceError(
-                f"{self._name}: it has no object {row.address} ({row.name}). {row.sentence}"
+                f"{self._name}: it has no object {required_object.address} "
+                f"({required_object.name}). {required_object.consequence}"
             )
-        reported_nm = torque_counts * settings.rated_torque_unit_nm * settings.gear_ratio
-        profile_nm = rig.motor.rated_torque_nm
-        identity["rated_torque_nm"] = reported_nm
-        if abs(reported_nm - profile_nm) > _RATED_TORQUE_TOLERANCE * profile_nm:
+        reported_torque_nm = (
+            rated_torque_counts * settings.rated_torque_unit_nm * settings.gear_ratio
+        )
+        profile_torque_nm = rig.motor.rated_torque_nm
+        identity["rated_torque_nm"] = reported_torque_nm
+        if (
+            abs(reported_torque_nm - profile_torque_nm)
+            > _MAX_RATED_TORQUE_DEVIATION * profile_torque_nm
+        ):
             raise DeviceError(
-                f"{self._name}: its rated torque (object 6076 = {torque_counts}) is "
-                f"{reported_nm:.4g} N·m at the output shaft, but motor.rated_torque_nm is "
-                f"{profile_nm:.4g} N·m; every torque would be wrong by that ratio. Correct the "
-                "profile or the drive."
+                f"{self._name}: its rated torque (object 6076 = {rated_torque_counts}) is "
+                f"{reported_torque_nm:.4g} N·m at the output shaft, but motor.rated_torque_nm is "
+                f"{profile_torque_nm:.4g} N·m; every torque would be wrong by that ratio. Correct "
+                "the profile or the drive."
             )
 
     def check_gear_and_encoder(self, identity: dict[str, object], rig: RigParameters) -> None:
@@ -309,43 +333,53 @@ class _DriveConfiguration:
 
         Only values that the drive states are compared. Both values are added to `identity`.
         """
-        drive_gear = self._read_ratio(objects.GEAR_RATIO)
+        drive_gear_ratio = self._read_ratio(objects.GEAR_RATIO)
         increments_per_turn = self._read_ratio(objects.ENCODER_RESOLUTION)
-        feed_units = self._read_ratio(objects.FEED_CONSTANT)
-        profile_gear = self._settings.gear_ratio
-        identity["gear_ratio"] = drive_gear
-        if drive_gear is not None and not _is_ratio_equal(drive_gear, profile_gear):
+        feed_units_per_turn = self._read_ratio(objects.FEED_CONSTANT)
+        profile_gear_ratio = self._settings.gear_ratio
+        identity["gear_ratio"] = drive_gear_ratio
+        if drive_gear_ratio is not None and not _is_ratio_equal(
+            drive_gear_ratio, profile_gear_ratio
+        ):
             raise DeviceError(
-                f"{self._name}: its gear (object 6091) is {drive_gear:.5g} turns of the motor in "
-                f"one of the output shaft, but cia402.gear_ratio is {profile_gear:.5g}. Correct "
-                "the profile or the drive."
+                f"{self._name}: its gear (object 6091) is {drive_gear_ratio:.5g} turns of the "
+                "motor in one of the output shaft, but cia402.gear_ratio is "
+                f"{profile_gear_ratio:.5g}. Correct the profile or the drive."
             )
         # Position units per revolution of the output shaft: encoder increments, unless the drive
         # has a feed constant that defines other units.
-        output_increments = (
+        increments_per_output_turn = (
             None
             if increments_per_turn is None
-            else increments_per_turn * (drive_gear or profile_gear)
+            else increments_per_turn * (drive_gear_ratio or profile_gear_ratio)
         )
-        turn_units = [
+        stated_units_per_turn = [
             units_per_turn
-            for units_per_turn in (feed_units, output_increments)
+            for units_per_turn in (feed_units_per_turn, increments_per_output_turn)
             if units_per_turn is not None
         ]
-        identity["encoder_step_rad"] = tau / turn_units[0] if turn_units else None
-        step_rad = rig.encoder.resolution_rad
-        if not turn_units or any(
-            _is_ratio_equal(tau / units_per_turn, step_rad) for units_per_turn in turn_units
+        identity["encoder_step_rad"] = (
+            tau / stated_units_per_turn[0] if stated_units_per_turn else None
+        )
+        profile_step_rad = rig.encoder.resolution_rad
+        if not stated_units_per_turn or any(
+            _is_ratio_equal(tau / units_per_turn, profile_step_rad)
+            for units_per_turn in stated_units_per_turn
         ):
             return
-        gear_objects = (
-            "6092" if feed_units is not None else "608F" if drive_gear is None else "608F and 6091"
+        step_objects_text = (
+            "6092"
+            if feed_units_per_turn is not None
+            else "608F"
+            if drive_gear_ratio is None
+            else "608F and 6091"
         )
         raise DeviceError(
-            f"{self._name}: its encoder step (object {gear_objects}) is {tau / turn_units[0]:.4g} "
-            f"rad at the output shaft ({turn_units[0]:.6g} steps a turn), but "
-            f"encoder.resolution_rad is {step_rad:.4g} rad; every angle, speed and limit would be "
-            f"wrong by the ratio {tau / turn_units[0] / step_rad:.3g}. Correct the profile or the "
+            f"{self._name}: its encoder step (object {step_objects_text}) is "
+            f"{tau / stated_units_per_turn[0]:.4g} rad at the output shaft "
+            f"({stated_units_per_turn[0]:.6g} steps a turn), but encoder.resolution_rad is "
+            f"{profile_step_rad:.4g} rad; every angle, speed and limit would be wrong by the ratio "
+            f"{tau / stated_units_per_turn[0] / profile_step_rad:.3g}. Correct the profile or the "
             "drive."
         )
 
@@ -383,22 +417,24 @@ class _DriveConfiguration:
         """Write the profile's limit of the motor speed, in rpm, to the drive, if there is one."""
         if self._settings.max_speed_rad_s == 0:
             return
-        row = requirement(objects.MAX_SPEED_RPM)
-        if not self.set_object(row):
+        required_object = requirement(objects.MAX_SPEED_RPM)
+        if not self.set_object(required_object):
             raise DeviceError(
-                f"{self._name}: it has no object {row.address} ({row.name}). {row.sentence}"
+                f"{self._name}: it has no object {required_object.address} "
+                f"({required_object.name}). {required_object.consequence}"
             )
 
     def configure_sync(self) -> None:
         """Set the SYNC period, and clear the SYNC window and counter."""
         sdo = self._sdo
         cob_id = sdo.read_or_none(objects.SYNC_COB_ID)
-        row = requirement(objects.SYNC_COB_ID)
+        required_object = requirement(objects.SYNC_COB_ID)
         if (
             cob_id is not None
-            and cob_id & ~objects.PDO_DISABLED_BIT != self._required_values[row.index, 0]
+            and cob_id & ~objects.PDO_DISABLED_BIT
+            != self._required_value_by_address[required_object.index, 0]
         ):
-            self.set_object(row)
+            self.set_object(required_object)
         if sdo.read_or_none(objects.SYNC_OVERFLOW):
             # It may be changed only while the period is 0 (CiA 301).
             if sdo.read_or_none(objects.SYNC_PERIOD_US):
@@ -406,8 +442,8 @@ class _DriveConfiguration:
             self._clear_object(requirement(objects.SYNC_OVERFLOW))
         self._clear_object(requirement(objects.SYNC_WINDOW_US))
         self.set_object(requirement(objects.SYNC_PERIOD_US))
-        for sub in (1, 2):
-            self.set_object(requirement(objects.INTERPOLATION_TIME, sub))
+        for subindex in (1, 2):
+            self.set_object(requirement(objects.INTERPOLATION_TIME, subindex))
 
     def configure_watchdog(self) -> Watchdog:
         """Set up the watchdog by which the drive monitors this computer, and the drive's heartbeat.
@@ -415,30 +451,38 @@ class _DriveConfiguration:
         Return the kind of watchdog that is active.
         """
         settings, sdo = self._settings, self._sdo
-        deadline_object = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
-        has_consumer = self._configure_heartbeat_consumer()
-        has_deadline = sdo.read_or_none(deadline_object.index, deadline_object.sub) is not None
-        active_watchdog = watchdog(
-            heartbeat=has_consumer, rpdo_deadline=has_deadline, own=settings.own_watchdog_s > 0
+        deadline_object = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER_SUBINDEX)
+        has_heartbeat_consumer = self._configure_heartbeat_consumer()
+        has_rpdo_deadline = (
+            sdo.read_or_none(deadline_object.index, deadline_object.subindex) is not None
         )
-        row = requirement(objects.HEARTBEAT_CONSUMER, 1)
-        if not has_consumer:
-            self.lacks.append(row)
-        if active_watchdog is Watchdog.NONE and not self._accepts(row):
-            raise DeviceError(f"{self._name}: {row.refusal_reason()}")
+        active_watchdog = most_reliable_watchdog(
+            has_heartbeat_consumer=has_heartbeat_consumer,
+            has_rpdo_deadline=has_rpdo_deadline,
+            has_own_watchdog=settings.own_watchdog_s > 0,
+        )
+        required_object = requirement(objects.HEARTBEAT_CONSUMER, 1)
+        if not has_heartbeat_consumer:
+            self.missing_objects.append(required_object)
+        if active_watchdog is Watchdog.NONE and not self._accepts_absence(required_object):
+            raise DeviceError(f"{self._name}: {required_object.refusal_reason()}")
         if active_watchdog in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
             # The drive's own watchdog acts as its manufacturer defines, whatever is set here.
             self.set_object(requirement(objects.ABORT_OPTION))
-        row = requirement(objects.COMMUNICATION_ERROR, 1)
-        if not self.set_object(row) and settings.communication_error_option:
+        required_object = requirement(objects.COMMUNICATION_ERROR, 1)
+        if not self.set_object(required_object) and settings.communication_error_option:
             raise DeviceError(
-                f"{self._name}: it has no object {row.address} ({row.name}), so that it goes "
-                "pre-operational on a lost connection; set cia402.communication_error_option = 0."
+                f"{self._name}: it has no object {required_object.address} "
+                f"({required_object.name}), so that it goes pre-operational on a lost connection; "
+                "set cia402.communication_error_option = 0."
             )
         self.set_object(requirement(objects.HEARTBEAT_PRODUCER_MS))
-        row = requirement(objects.EMERGENCY_COB_ID)
-        if sdo.read_or_none(row.index) not in (None, self._required_values[row.index, 0]):
-            self.set_object(row)
+        required_object = requirement(objects.EMERGENCY_COB_ID)
+        if sdo.read_or_none(required_object.index) not in (
+            None,
+            self._required_value_by_address[required_object.index, 0],
+        ):
+            self.set_object(required_object)
         return active_watchdog
 
     def configure_pdos(self, active_watchdog: Watchdog) -> None:
@@ -447,22 +491,26 @@ class _DriveConfiguration:
         for communication_index in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
             _disable_unused_pdos(sdo, communication_index)
         tpdo_entries: tuple[int, ...] = objects.TPDO_ENTRIES
-        row = requirement(objects.ACTUAL_TORQUE)
-        if sdo.read_or_none(objects.ACTUAL_TORQUE) is None and self._accepts(row):
-            self._record_missing_object(row)
+        required_object = requirement(objects.ACTUAL_TORQUE)
+        if sdo.read_or_none(objects.ACTUAL_TORQUE) is None and self._accepts_absence(
+            required_object
+        ):
+            self._record_missing_object(required_object)
             tpdo_entries = tpdo_entries[:-1]
         self._configure_pdo(
             objects.TPDO_COMMUNICATION,
             objects.NO_REMOTE_REQUEST_BIT,
             tpdo_entries,
-            {objects.INHIBIT_TIME: 0},
+            {objects.INHIBIT_TIME_SUBINDEX: 0},
         )
-        deadline_ms = round(settings.heartbeat_timeout_s * 1000)
+        rpdo_deadline_ms = round(settings.heartbeat_timeout_s * 1000)
         self._configure_pdo(
             objects.RPDO_COMMUNICATION,
             0,
             objects.RPDO_ENTRIES,
-            {objects.EVENT_TIMER: deadline_ms} if active_watchdog is Watchdog.RPDO_DEADLINE else {},
+            {objects.EVENT_TIMER_SUBINDEX: rpdo_deadline_ms}
+            if active_watchdog is Watchdog.RPDO_DEADLINE
+            else {},
         )
 
     def read_stop_options(self, identity: dict[str, object]) -> None:
@@ -475,28 +523,28 @@ class _DriveConfiguration:
             if option_value is not None:
                 identity[key] = option_value
 
-    def _accepts(self, row: Requirement) -> bool:
+    def _accepts_absence(self, required_object: Requirement) -> bool:
         """Return whether the profile accepts a drive that lacks an object."""
-        return row.accept in self._settings.accept_without
+        return required_object.acceptance_name in self._settings.accept_without
 
-    def _record_missing_object(self, row: Requirement) -> None:
+    def _record_missing_object(self, required_object: Requirement) -> None:
         """Record that the drive lacks an object, or raise if it is indispensable."""
-        refusal_reason = row.refusal_reason(self._settings.accept_without)
+        refusal_reason = required_object.refusal_reason(self._settings.accept_without)
         if refusal_reason:
             raise DeviceError(f"{self._name}: {refusal_reason}")
-        self.lacks.append(row)
+        self.missing_objects.append(required_object)
 
-    def _clear_object(self, row: Requirement) -> None:
+    def _clear_object(self, required_object: Requirement) -> None:
         """Set an object to 0 if the drive has it; raise if rigd may not write to it."""
-        present_value = self._sdo.read_or_none(row.index, row.sub)
+        present_value = self._sdo.read_or_none(required_object.index, required_object.subindex)
         if not present_value:
             return
-        if ObjectAccess.WRITE in row.access:
-            self.set_object(row, 0)
+        if ObjectAccess.WRITTEN_BY_SDO in required_object.access:
+            self.set_object(required_object, 0)
             return
         raise DeviceError(
-            f"{self._name}: object {row.address} ({row.name}) is 0x{present_value:02X}, not 0. "
-            f"{row.sentence}"
+            f"{self._name}: object {required_object.address} ({required_object.name}) is "
+            f"0x{present_value:02X}, not 0. {required_object.consequence}"
         )
 
     def _configure_heartbeat_consumer(self) -> bool:
@@ -507,103 +555,110 @@ class _DriveConfiguration:
         present_value = sdo.read_or_none(index, 1)
         if present_value != required_value:
             # A second entry for one node is refused (0x06040043): clear stored entries first.
-            for sub in range(2, min(sdo.read_or_none(index) or 0, _MAX_HEARTBEAT_CONSUMERS) + 1):
-                stored_value = sdo.read_or_none(index, sub)
+            for subindex in range(
+                2, min(sdo.read_or_none(index) or 0, _MAX_HEARTBEAT_CONSUMERS) + 1
+            ):
+                stored_value = sdo.read_or_none(index, subindex)
                 if stored_value is not None and stored_value >> 16 & 0x7F == host_id:
-                    sdo.configure(index, sub, 0)
+                    sdo.configure(index, subindex, 0)
             try:
                 sdo.configure(index, 1, required_value)
             except SdoAbortError as refusal:
-                if refusal.is_absent or refusal.code == _READ_ONLY_ABORT:
+                if refusal.is_object_absent or refusal.code == _READ_ONLY_ABORT:
                     return False
                 raise
         return True
 
     def _configure_pdo(
         self,
-        communication: int,
-        flags: int,
-        entries: tuple[int, ...],
-        parameters: dict[int, int],
+        communication_index: int,
+        cob_id_flags: int,
+        pdo_entries: tuple[int, ...],
+        value_by_subindex: dict[int, int],
     ) -> None:
         """Map objects into a PDO and enable it; nothing is written if the PDO already is as needed.
 
-        `communication` is the index of the PDO's communication parameters; the index of its mapping
-        is 0x200 higher. `flags` are additional bits of the PDO's COB-ID, and `entries` the mapping
-        entries of the objects that it carries. `parameters` are the required values of further
-        communication parameters by sub-index; a parameter that the drive does not have is skipped.
+        `communication_index` is the index of the PDO's communication parameters; the index of its
+        mapping is 0x200 higher. `cob_id_flags` are additional bits of the PDO's COB-ID, and
+        `pdo_entries` the mapping entries of the objects that it carries. `value_by_subindex` are
+        the required values of further communication parameters by sub-index; a parameter that the
+        drive does not have is skipped.
         """
-        sdo, mapping_index = self._sdo, communication + 0x200
-        can_id = self._required_values[communication, 1] | flags
-        transmission_type = self._required_values[communication, 2]
-        cob_id_bits = EVERY_BIT & ~objects.NO_REMOTE_REQUEST_BIT
-        is_mapped = self._holds_values(mapping_index, (len(entries), *entries))
-        has_transmission_type = sdo.read_or_none(communication, 2) == transmission_type
-        cob_id_found = sdo.read_or_none(communication, 1)
-        other_parameters = {
-            sub: parameter_value
-            for sub, parameter_value in parameters.items()
-            if sdo.read_or_none(communication, sub) not in (None, parameter_value)
+        sdo, mapping_index = self._sdo, communication_index + 0x200
+        required_cob_id = self._required_value_by_address[communication_index, 1] | cob_id_flags
+        transmission_type = self._required_value_by_address[communication_index, 2]
+        cob_id_mask = ALL_BITS_MASK & ~objects.NO_REMOTE_REQUEST_BIT
+        is_mapped = self._holds_values(mapping_index, (len(pdo_entries), *pdo_entries))
+        is_transmission_type_set = sdo.read_or_none(communication_index, 2) == transmission_type
+        present_cob_id = sdo.read_or_none(communication_index, 1)
+        wrong_parameters = {
+            subindex: parameter_value
+            for subindex, parameter_value in value_by_subindex.items()
+            if sdo.read_or_none(communication_index, subindex) not in (None, parameter_value)
         }
-        has_cob_id = cob_id_found is not None and not (cob_id_found ^ can_id) & cob_id_bits
-        if has_cob_id and is_mapped and has_transmission_type and not other_parameters:
+        is_cob_id_set = (
+            present_cob_id is not None and not (present_cob_id ^ required_cob_id) & cob_id_mask
+        )
+        if is_cob_id_set and is_mapped and is_transmission_type_set and not wrong_parameters:
             return
-        sdo.configure(communication, 1, can_id | objects.PDO_DISABLED_BIT, cob_id_bits)
+        sdo.configure(
+            communication_index, 1, required_cob_id | objects.PDO_DISABLED_BIT, cob_id_mask
+        )
         if not is_mapped:
-            self._write_mapping(communication, mapping_index, entries)
-        if not has_transmission_type:
-            sdo.configure(communication, 2, transmission_type)
-        for sub, parameter_value in other_parameters.items():
-            self.set_object(requirement(communication, sub), parameter_value)
-        sdo.configure(communication, 1, can_id, cob_id_bits)
+            self._write_mapping(communication_index, mapping_index, pdo_entries)
+        if not is_transmission_type_set:
+            sdo.configure(communication_index, 2, transmission_type)
+        for subindex, parameter_value in wrong_parameters.items():
+            self.set_object(requirement(communication_index, subindex), parameter_value)
+        sdo.configure(communication_index, 1, required_cob_id, cob_id_mask)
 
     def _write_mapping(
-        self, communication: int, mapping_index: int, entries: tuple[int, ...]
+        self, communication_index: int, mapping_index: int, pdo_entries: tuple[int, ...]
     ) -> None:
         """Write the mapping entries of a disabled PDO."""
         sdo = self._sdo
-        pdo_name = "RPDO1" if communication == objects.RPDO_COMMUNICATION else "TPDO1"
+        pdo_name = "RPDO1" if communication_index == objects.RPDO_COMMUNICATION else "TPDO1"
         try:
             sdo.configure(mapping_index, 0, 0)
         except SdoAbortError as refusal:
-            raise DeviceError(f"{refusal} {requirement(mapping_index).sentence}") from None
-        for sub, mapping_entry in enumerate(entries, 1):
+            raise DeviceError(f"{refusal} {requirement(mapping_index).consequence}") from None
+        for subindex, mapping_entry in enumerate(pdo_entries, 1):
             try:
-                sdo.configure(mapping_index, sub, mapping_entry)
+                sdo.configure(mapping_index, subindex, mapping_entry)
             except SdoAbortError as refusal:
-                row = requirement(mapping_entry >> 16)
-                if refusal.is_absent:
-                    raise DeviceError(f"{self._name}: {row.refusal_reason()}") from None
+                required_object = requirement(mapping_entry >> 16)
+                if refusal.is_object_absent:
+                    raise DeviceError(f"{self._name}: {required_object.refusal_reason()}") from None
                 raise DeviceError(
-                    f"{self._name}: it does not take object {row.address} ({row.name}) into "
-                    f"{pdo_name} (abort code 0x{refusal.code:08X}: {_abort_meaning(refusal)}). "
-                    f"{row.sentence}"
+                    f"{self._name}: it does not take object {required_object.address} "
+                    f"({required_object.name}) into {pdo_name} (abort code 0x{refusal.code:08X}: "
+                    f"{_abort_meaning(refusal)}). {required_object.consequence}"
                 ) from None
-        sdo.configure(mapping_index, 0, len(entries))
+        sdo.configure(mapping_index, 0, len(pdo_entries))
 
     def _holds_values(self, index: int, required_values: tuple[int, ...]) -> bool:
         """Return whether the sub-indices of an object, from 0 on, hold the given values."""
         return all(
-            self._sdo.read_or_none(index, sub) == held_value
-            for sub, held_value in enumerate(required_values)
+            self._sdo.read_or_none(index, subindex) == held_value
+            for subindex, held_value in enumerate(required_values)
         )
 
 
 def _is_ratio_equal(drive_value: float, profile_value: float) -> bool:
     """Return whether a drive's value agrees with the profile's value within 2 %."""
-    return abs(drive_value - profile_value) <= _SCALE_TOLERANCE * profile_value
+    return abs(drive_value - profile_value) <= _GEAR_AND_ENCODER_TOLERANCE * profile_value
 
 
-def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:
+def _disable_unused_pdos(sdo: SdoAccess, communication_index: int) -> None:
     """Disable all PDOs of the drive except the first, which the rig uses."""
     for pdo_offset in range(1, objects.MAX_PDO_COUNT):
-        cob_id = sdo.read_or_none(communication + pdo_offset, 1)
+        cob_id = sdo.read_or_none(communication_index + pdo_offset, 1)
         if cob_id is None:
             # Above the PDOs that CiA 301 predefines, indices are used without gaps.
             if pdo_offset >= objects.PREDEFINED_PDO_COUNT:
                 return
         elif not cob_id & objects.PDO_DISABLED_BIT:
-            sdo.configure(communication + pdo_offset, 1, cob_id | objects.PDO_DISABLED_BIT)
+            sdo.configure(communication_index + pdo_offset, 1, cob_id | objects.PDO_DISABLED_BIT)
 
 
 def _abort_meaning(refusal: SdoAbortError) -> str:

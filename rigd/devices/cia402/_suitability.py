@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Final
 
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402.requirements import (
-    MAY_BE_WRITE_ONLY,
+    POSSIBLY_WRITE_ONLY_INDICES,
     REQUIREMENTS,
     WATCHDOG,
     AllowedValue,
     ObjectAccess,
     Requirement,
     Watchdog,
+    most_reliable_watchdog,
     profile_independent_values,
     required_values,
     requirement,
-    watchdog,
 )
 from rigd.devices.eds import Eds, EdsEntry
 
@@ -50,17 +50,17 @@ class Grade(Enum):
 class SuitabilityFinding:
     """Finding about one object of a drive, or about the drive as a whole."""
 
-    what: str
+    checked_item: str
     """Object or property that was checked, such as ``6072 Max torque``."""
-    found: str
+    stated_text: str
     """What the EDS file states about it."""
-    wanted: str
+    required_text: str
     """Value that rigd needs; empty if every value is accepted or none is known."""
     grade: Grade
     """Result of the check."""
-    sentence: str = ""
+    consequence: str = ""
     """Consequence of a refusal or doubt, and the remedy, for the operator; else empty."""
-    accept: str = ""
+    acceptance_name: str = ""
     """Name in ``cia402.accept_without`` by which a profile may accept the finding; else empty."""
 
 
@@ -74,16 +74,18 @@ class SuitabilityReport:
     @property
     def refusals(self) -> tuple[str, ...]:
         """Reasons why no session is possible with this drive, one sentence each."""
-        return tuple(f.sentence for f in self.findings if f.grade is Grade.REFUSED)
+        return tuple(f.consequence for f in self.findings if f.grade is Grade.REFUSED)
 
 
-_PDO_ENTRIES: Final = {
+_REQUIRED_ENTRIES_BY_MAPPING: Final = {
     objects.RPDO_MAPPING: objects.RPDO_ENTRIES,
     objects.TPDO_MAPPING: objects.TPDO_ENTRIES,
 }
 """Required mapping entries by the index of the mapping."""
-_PDO_LENGTHS_BIT: Final = {
-    entry >> 16: entry & 0xFF for entries in _PDO_ENTRIES.values() for entry in entries
+_LENGTH_BIT_BY_MAPPED_INDEX: Final = {
+    entry >> 16: entry & 0xFF
+    for entries in _REQUIRED_ENTRIES_BY_MAPPING.values()
+    for entry in entries
 }
 """Length in bits of each mapped object, by its index."""
 _COB_ID_ADDRESSES: Final = (
@@ -120,7 +122,7 @@ class _SuitabilityCheck:
         self._eds = eds
         self._rig = rig if rig is not None and rig.cia402 is not None else None
         self._settings: ServoDrive | None = self._rig.cia402 if self._rig else None
-        self._required_values = (
+        self._required_value_by_address = (
             required_values(self._rig) if self._rig else profile_independent_values(eds.node_id)
         )
 
@@ -130,14 +132,17 @@ class _SuitabilityCheck:
         yield from self._bit_rate_findings()
         yield self._torque_mode_finding()
         yield self._watchdog_finding()
-        for row in REQUIREMENTS:
-            if row.index in _SEPARATELY_REPORTED_INDICES or row.accept == WATCHDOG:
+        for required_object in REQUIREMENTS:
+            if (
+                required_object.index in _SEPARATELY_REPORTED_INDICES
+                or required_object.acceptance_name == WATCHDOG
+            ):
                 continue
-            eds_entry = self._eds.get(row.index, row.sub)
+            eds_entry = self._eds.get(required_object.index, required_object.subindex)
             yield (
-                self._absent_object(row)
+                self._absent_object_finding(required_object)
                 if eds_entry is None
-                else self._present_object(row, eds_entry)
+                else self._present_object_finding(required_object, eds_entry)
             )
 
     def _identity_findings(self) -> Iterator[SuitabilityFinding]:
@@ -147,43 +152,49 @@ class _SuitabilityCheck:
             ("product_code", self._eds.product_code, self._eds.product_name),
         ):
             object_text = key.replace("_", " ")
-            wanted_text = getattr(self._settings, key) if self._settings else 0
+            wanted_number = getattr(self._settings, key) if self._settings else 0
             value_text = f"0x{stated_number:08X}" if stated_number else "not stated"
             found_text = f"{value_text} ({identity_key})" if identity_key else value_text
-            if not (stated_number and wanted_text and stated_number != wanted_text):
+            if not (stated_number and wanted_number and stated_number != wanted_number):
                 yield SuitabilityFinding(
                     object_text,
                     found_text,
-                    f"0x{wanted_text:08X}" if wanted_text else "any",
+                    f"0x{wanted_number:08X}" if wanted_number else "any",
                     Grade.FITS,
                 )
                 continue
-            sentence = (
+            consequence = (
                 f"The file describes another drive than the profile: cia402.{key} is "
-                f"0x{wanted_text:08X}, but the file states {value_text}."
+                f"0x{wanted_number:08X}, but the file states {value_text}."
             )
             yield SuitabilityFinding(
-                object_text, found_text, f"0x{wanted_text:08X}", Grade.REFUSED, sentence
+                object_text,
+                found_text,
+                f"0x{wanted_number:08X}",
+                Grade.REFUSED,
+                consequence,
             )
 
     def _bit_rate_findings(self) -> Iterator[SuitabilityFinding]:
         """Yield the finding on the bit rates that the drive supports."""
         supported_rates = self._eds.bit_rates_bit_s
-        found = ", ".join(f"{profile_rate // 1000}" for profile_rate in supported_rates)
-        found = f"{found} kbit/s" if supported_rates else "not stated"
+        bit_rates_text = ", ".join(f"{profile_rate // 1000}" for profile_rate in supported_rates)
+        bit_rates_text = f"{bit_rates_text} kbit/s" if supported_rates else "not stated"
         if self._rig is None or self._rig.can is None:
-            yield SuitabilityFinding("bit rates", found, "", Grade.FITS)
+            yield SuitabilityFinding("bit rates", bit_rates_text, "", Grade.FITS)
             return
         profile_rate = self._rig.can.bitrate_bit_s
         wanted_text = f"{profile_rate / 1000:g} kbit/s"
         if not supported_rates or profile_rate in supported_rates:
-            yield SuitabilityFinding("bit rates", found, wanted_text, Grade.FITS)
+            yield SuitabilityFinding("bit rates", bit_rates_text, wanted_text, Grade.FITS)
             return
-        sentence = (
+        consequence = (
             f"The drive has no bit rate of {wanted_text} (can.bitrate_bit_s); "
-            f"choose one of {found}."
+            f"choose one of {bit_rates_text}."
         )
-        yield SuitabilityFinding("bit rates", found, wanted_text, Grade.REFUSED, sentence)
+        yield SuitabilityFinding(
+            "bit rates", bit_rates_text, wanted_text, Grade.REFUSED, consequence
+        )
 
     def _torque_mode_finding(self) -> SuitabilityFinding:
         """Return the finding on the cyclic synchronous torque mode."""
@@ -194,17 +205,21 @@ class _SuitabilityCheck:
         modes_entry = self._eds.get(objects.SUPPORTED_MODES)
         object_address = f"object {objects.SUPPORTED_MODES:04X}"
         if modes_entry is None:
-            sentence = f"No cyclic synchronous torque mode: {object_address} is missing."
-            return SuitabilityFinding(object_text, "absent", wanted_text, Grade.REFUSED, sentence)
+            consequence = f"No cyclic synchronous torque mode: {object_address} is missing."
+            return SuitabilityFinding(
+                object_text, "absent", wanted_text, Grade.REFUSED, consequence
+            )
         if modes_entry.default:
             value_text = f"0x{modes_entry.default:X}"
             if modes_entry.default & objects.CYCLIC_TORQUE_MODE_BIT:
                 return SuitabilityFinding(object_text, value_text, wanted_text, Grade.FITS)
-            sentence = (
+            consequence = (
                 f"No cyclic synchronous torque mode: {object_address} = {value_text} lacks bit 9; "
                 "this drive or its firmware cannot be used."
             )
-            return SuitabilityFinding(object_text, value_text, wanted_text, Grade.REFUSED, sentence)
+            return SuitabilityFinding(
+                object_text, value_text, wanted_text, Grade.REFUSED, consequence
+            )
         return SuitabilityFinding(
             object_text,
             "the file does not state it; rigd reads it from the drive",
@@ -214,71 +229,101 @@ class _SuitabilityCheck:
 
     def _watchdog_finding(self) -> SuitabilityFinding:
         """Return the finding on the watchdog that removes the torque if the computer is silent."""
-        found_watchdog = self._expected_watchdog()
+        expected_watchdog = self._expected_watchdog()
         checked_item, wanted_text = "watchdog", "one of three"
-        if found_watchdog is Watchdog.HEARTBEAT:
-            return SuitabilityFinding(checked_item, found_watchdog.value, wanted_text, Grade.FITS)
-        if found_watchdog is not Watchdog.NONE:
+        if expected_watchdog is Watchdog.HEARTBEAT:
+            return SuitabilityFinding(
+                checked_item, expected_watchdog.value, wanted_text, Grade.FITS
+            )
+        if expected_watchdog is not Watchdog.NONE:
             return SuitabilityFinding(
                 checked_item,
-                f"1016:1 absent; {found_watchdog.value}",
+                f"1016:1 absent; {expected_watchdog.value}",
                 wanted_text,
                 Grade.SUBSTITUTED,
             )
-        return self._missing_unless_accepted(
+        return self._acceptable_absence_finding(
             requirement(objects.HEARTBEAT_CONSUMER, 1), checked_item, "absent", wanted_text
         )
 
     def _expected_watchdog(self) -> Watchdog:
         """Return the kind of watchdog that the drive will use, judging by EDS file and profile."""
         heartbeat_entry = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
-        deadline_entry = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
-        return watchdog(
-            heartbeat=heartbeat_entry is not None and heartbeat_entry.writable,
-            rpdo_deadline=deadline_entry is not None and deadline_entry.writable,
-            own=self._settings is not None and self._settings.own_watchdog_s > 0,
+        deadline_entry = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER_SUBINDEX)
+        return most_reliable_watchdog(
+            has_heartbeat_consumer=heartbeat_entry is not None and heartbeat_entry.writable,
+            has_rpdo_deadline=deadline_entry is not None and deadline_entry.writable,
+            has_own_watchdog=self._settings is not None and self._settings.own_watchdog_s > 0,
         )
 
-    def _absent_object(self, row: Requirement) -> SuitabilityFinding:
+    def _absent_object_finding(self, required_object: Requirement) -> SuitabilityFinding:
         """Return the finding on a required object that the EDS file does not contain."""
-        object_text = f"{row.address} {row.name}"
-        if row.core:
+        object_text = f"{required_object.address} {required_object.name}"
+        if required_object.is_core:
             return SuitabilityFinding(
-                object_text, "absent", "core", Grade.REFUSED, _capitalise(row.refusal_reason())
+                object_text,
+                "absent",
+                "core",
+                Grade.REFUSED,
+                _capitalise(required_object.refusal_reason()),
             )
         if (
-            row.index == objects.ABORT_OPTION
+            required_object.index == objects.ABORT_OPTION
             and self._expected_watchdog() in _UNCONFIGURED_WATCHDOGS
         ):
             found_text = "absent; in its place: the manufacturer's own watchdog"
             return SuitabilityFinding(object_text, found_text, "", Grade.SUBSTITUTED)
-        if row.accept:
-            return self._missing_unless_accepted(row, object_text, "absent", "")
-        if self._is_set_by_profile(row):
-            sentence = f"it has no object {row.address} ({row.name}). {row.sentence}"
-            return SuitabilityFinding(
-                object_text, "absent", "", Grade.REFUSED, _capitalise(sentence)
+        if required_object.acceptance_name:
+            return self._acceptable_absence_finding(required_object, object_text, "absent", "")
+        if self._is_set_by_profile(required_object):
+            consequence = (
+                f"it has no object {required_object.address} ({required_object.name}). "
+                f"{required_object.consequence}"
             )
-        stand_in = f"; in its place: {row.stand_in}" if row.stand_in.strip("–") else ""
-        return SuitabilityFinding(object_text, f"absent{stand_in}", "", Grade.SUBSTITUTED)
+            return SuitabilityFinding(
+                object_text, "absent", "", Grade.REFUSED, _capitalise(consequence)
+            )
+        replacement_text = (
+            f"; in its place: {required_object.replacement}"
+            if required_object.replacement.strip("–")
+            else ""
+        )
+        return SuitabilityFinding(object_text, f"absent{replacement_text}", "", Grade.SUBSTITUTED)
 
-    def _missing_unless_accepted(
-        self, row: Requirement, object_text: str, found_text: str, wanted_text: str
+    def _acceptable_absence_finding(
+        self, required_object: Requirement, object_text: str, found_text: str, wanted_text: str
     ) -> SuitabilityFinding:
         """Return the finding on a missing object that the profile may accept by name."""
-        stand_in = f" In its place: {row.stand_in}." if row.stand_in else ""
-        if self._settings is not None and row.accept in self._settings.accept_without:
+        replacement_text = (
+            f" In its place: {required_object.replacement}." if required_object.replacement else ""
+        )
+        if (
+            self._settings is not None
+            and required_object.acceptance_name in self._settings.accept_without
+        ):
             found_text = f"{found_text}, accepted by the profile"
-            sentence = f"{object_text}: {found_text}.{stand_in}"
+            consequence = f"{object_text}: {found_text}.{replacement_text}"
             return SuitabilityFinding(
-                object_text, found_text, wanted_text, Grade.ACCEPTED, sentence, row.accept
+                object_text,
+                found_text,
+                wanted_text,
+                Grade.ACCEPTED,
+                consequence,
+                required_object.acceptance_name,
             )
-        sentence = _capitalise(row.refusal_reason()) + stand_in
+        consequence = _capitalise(required_object.refusal_reason()) + replacement_text
         # Without a profile, nobody could accept the missing object yet.
         grade = Grade.DOUBT if self._settings is None else Grade.REFUSED
-        return SuitabilityFinding(object_text, found_text, wanted_text, grade, sentence, row.accept)
+        return SuitabilityFinding(
+            object_text,
+            found_text,
+            wanted_text,
+            grade,
+            consequence,
+            required_object.acceptance_name,
+        )
 
-    def _is_set_by_profile(self, row: Requirement) -> bool:
+    def _is_set_by_profile(self, required_object: Requirement) -> bool:
         """Return whether the profile sets a value that only this object can give the drive."""
         settings = self._settings
         if settings is None:
@@ -287,105 +332,135 @@ class _SuitabilityCheck:
             (objects.MAX_SPEED_RPM, 0): settings.max_speed_rad_s > 0,
             (objects.RATED_TORQUE, 0): settings.rated_torque_unit_nm > 0,
             (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option > 0,
-        }.get((row.index, row.sub), False)
+        }.get((required_object.index, required_object.subindex), False)
 
-    def _present_object(self, row: Requirement, eds_entry: EdsEntry) -> SuitabilityFinding:
+    def _present_object_finding(
+        self, required_object: Requirement, eds_entry: EdsEntry
+    ) -> SuitabilityFinding:
         """Return the finding on a required object that the EDS file contains."""
-        object_text = f"{row.address} {row.name}"
-        wanted_value = self._required_values.get((row.index, row.sub))
-        wanted_text = "" if wanted_value is None else _format_value(row, wanted_value)
+        object_text = f"{required_object.address} {required_object.name}"
+        wanted_value = self._required_value_by_address.get(
+            (required_object.index, required_object.subindex)
+        )
+        wanted_text = "" if wanted_value is None else _format_value(required_object, wanted_value)
         default_text = (
-            "" if eds_entry.default is None else f", {_format_value(row, eds_entry.default)}"
+            ""
+            if eds_entry.default is None
+            else f", {_format_value(required_object, eds_entry.default)}"
         )
         found_text = f"{eds_entry.access}{default_text}"
 
-        def objection(objection_text: str, *, doubt: bool = False) -> SuitabilityFinding:
-            sentence = _capitalise(f"its object {row.address} ({row.name}) {objection_text}")
-            grade = Grade.DOUBT if doubt else Grade.REFUSED
-            return SuitabilityFinding(object_text, found_text, wanted_text, grade, sentence)
+        def doubt_or_refusal(objection_text: str, *, is_doubt: bool = False) -> SuitabilityFinding:
+            consequence = _capitalise(
+                f"its object {required_object.address} ({required_object.name}) {objection_text}"
+            )
+            grade = Grade.DOUBT if is_doubt else Grade.REFUSED
+            return SuitabilityFinding(object_text, found_text, wanted_text, grade, consequence)
 
-        if row.access & (ObjectAccess.SENT | ObjectAccess.RECEIVED):
+        if required_object.access & (ObjectAccess.SENT_IN_TPDO | ObjectAccess.RECEIVED_IN_RPDO):
             mapping_obstacle = self._describe_mapping_obstacle(eds_entry)
-            if mapping_obstacle and row.accept:
-                return self._missing_unless_accepted(
-                    row, object_text, f"{found_text}, {mapping_obstacle}", wanted_text
+            if mapping_obstacle and required_object.acceptance_name:
+                return self._acceptable_absence_finding(
+                    required_object, object_text, f"{found_text}, {mapping_obstacle}", wanted_text
                 )
             if mapping_obstacle:
-                return objection(f"{mapping_obstacle}. {row.sentence}")
-        if ObjectAccess.WRITE in row.access and not eds_entry.writable:
-            return self._read_only_object(row, eds_entry, found_text, wanted_value)
-        if ObjectAccess.READ in row.access and eds_entry.access == "wo":
-            return objection(
-                f"is write-only: its value cannot be checked. {row.sentence}".rstrip(),
-                doubt=row.index in MAY_BE_WRITE_ONLY,
+                return doubt_or_refusal(f"{mapping_obstacle}. {required_object.consequence}")
+        if ObjectAccess.WRITTEN_BY_SDO in required_object.access and not eds_entry.writable:
+            return self._read_only_object_finding(
+                required_object, eds_entry, found_text, wanted_value
+            )
+        if ObjectAccess.READ_BY_SDO in required_object.access and eds_entry.access == "wo":
+            return doubt_or_refusal(
+                "is write-only: its value cannot be checked. "
+                f"{required_object.consequence}".rstrip(),
+                is_doubt=required_object.index in POSSIBLY_WRITE_ONLY_INDICES,
             )
         if wanted_value is not None and not _is_within_limits(eds_entry, wanted_value):
             limits_text = (
-                f"{_format_limit(row, eds_entry.low)} to {_format_limit(row, eds_entry.high)}"
+                f"{_format_limit(required_object, eds_entry.low)} to "
+                f"{_format_limit(required_object, eds_entry.high)}"
             )
-            return objection(
-                f"takes {limits_text}, not {wanted_text}. {row.sentence}", doubt=not row.core
+            return doubt_or_refusal(
+                f"takes {limits_text}, not {wanted_text}. {required_object.consequence}",
+                is_doubt=not required_object.is_core,
             )
         return SuitabilityFinding(object_text, found_text, wanted_text, Grade.FITS)
 
-    def _read_only_object(
-        self, row: Requirement, eds_entry: EdsEntry, found_text: str, wanted: int | None
+    def _read_only_object_finding(
+        self,
+        required_object: Requirement,
+        eds_entry: EdsEntry,
+        found_text: str,
+        required_value: int | None,
     ) -> SuitabilityFinding:
         """Return the finding on a read-only object, whose fixed value may be acceptable."""
-        object_text = f"{row.address} {row.name}"
-        if row.value_rule is AllowedValue.AT_LEAST:
-            wanted_text = f"at least {wanted or 'motor.peak_torque_nm'}"
+        object_text = f"{required_object.address} {required_object.name}"
+        if required_object.value_rule is AllowedValue.AT_LEAST:
+            wanted_text = f"at least {required_value or 'motor.peak_torque_nm'}"
         else:
-            wanted_text = "" if wanted is None else _format_value(row, wanted)
-        if row.index in _PDO_ENTRIES:
-            default_entries = self._default_mapping(row.index)
-            is_acceptable = (
-                None if None in default_entries else default_entries == _PDO_ENTRIES[row.index]
+            wanted_text = (
+                "" if required_value is None else _format_value(required_object, required_value)
             )
-        elif wanted is None or eds_entry.default is None:
+        if required_object.index in _REQUIRED_ENTRIES_BY_MAPPING:
+            default_entries = self._default_mapping(required_object.index)
+            is_acceptable = (
+                None
+                if None in default_entries
+                else default_entries == _REQUIRED_ENTRIES_BY_MAPPING[required_object.index]
+            )
+        elif required_value is None or eds_entry.default is None:
             is_acceptable = None
-        elif (row.index, row.sub) in _COB_ID_ADDRESSES:
+        elif (required_object.index, required_object.subindex) in _COB_ID_ADDRESSES:
             # Drives are free to set the bit that forbids remote requests.
-            is_acceptable = (eds_entry.default ^ wanted) & ~objects.NO_REMOTE_REQUEST_BIT == 0
-            mapping_index = row.index + 0x200
+            is_acceptable = (
+                eds_entry.default ^ required_value
+            ) & ~objects.NO_REMOTE_REQUEST_BIT == 0
+            mapping_index = required_object.index + 0x200
             if (
                 is_acceptable
-                and mapping_index in _PDO_ENTRIES
-                and self._default_mapping(mapping_index) != _PDO_ENTRIES[mapping_index]
+                and mapping_index in _REQUIRED_ENTRIES_BY_MAPPING
+                and self._default_mapping(mapping_index)
+                != _REQUIRED_ENTRIES_BY_MAPPING[mapping_index]
             ):
-                sentence = (
-                    f"its object {row.address} ({row.name}) is read-only, so that the PDO "
-                    f"cannot be switched off to be remapped. {row.sentence}"
+                consequence = (
+                    f"its object {required_object.address} ({required_object.name}) is read-only, "
+                    "so that the PDO cannot be switched off to be remapped. "
+                    f"{required_object.consequence}"
                 )
                 return SuitabilityFinding(
-                    object_text, found_text, wanted_text, Grade.REFUSED, _capitalise(sentence)
+                    object_text,
+                    found_text,
+                    wanted_text,
+                    Grade.REFUSED,
+                    _capitalise(consequence),
                 )
         else:
-            is_acceptable = row.value_rule.allows(eds_entry.default, wanted)
+            is_acceptable = required_object.value_rule.allows(eds_entry.default, required_value)
         if is_acceptable:
             return SuitabilityFinding(
                 object_text, f"{found_text}: it does", wanted_text, Grade.FITS
             )
-        if is_acceptable is None and row.index != objects.CONTROLWORD:
+        if is_acceptable is None and required_object.index != objects.CONTROLWORD:
             return SuitabilityFinding(
                 object_text, f"{found_text}: rigd reads it from the drive", wanted_text, Grade.ASK
             )
-        sentence = (
-            f"its object {row.address} ({row.name}) is read-only and does not have the required "
-            f"value{f' ({wanted_text})' if wanted_text else ''}. {row.sentence}"
+        consequence = (
+            f"its object {required_object.address} ({required_object.name}) is read-only and does "
+            f"not have the required value{f' ({wanted_text})' if wanted_text else ''}. "
+            f"{required_object.consequence}"
         )
         return SuitabilityFinding(
-            object_text, found_text, wanted_text, Grade.REFUSED, _capitalise(sentence)
+            object_text, found_text, wanted_text, Grade.REFUSED, _capitalise(consequence)
         )
 
     def _describe_mapping_obstacle(self, eds_entry: EdsEntry) -> str:
         """Return why an object cannot be mapped into its PDO, or an empty text if it can."""
-        length_bit = _PDO_LENGTHS_BIT[eds_entry.index]
-        if eds_entry.bits not in (None, length_bit):
-            return f"has {eds_entry.bits} bits, not {length_bit}"
+        required_length_bit = _LENGTH_BIT_BY_MAPPED_INDEX[eds_entry.index]
+        if eds_entry.bits not in (None, required_length_bit):
+            return f"has {eds_entry.bits} bits, not {required_length_bit}"
         mapped_indices = {
             mapping_entry >> 16
-            for index in _PDO_ENTRIES
+            for index in _REQUIRED_ENTRIES_BY_MAPPING
             for mapping_entry in self._default_mapping(index)
             if mapping_entry
         }
@@ -397,8 +472,8 @@ class _SuitabilityCheck:
         """Return a PDO's default mapping entries in the EDS file; None for an unstated entry."""
         count_entry = self._eds.get(mapping_index, 0)
         default_entries = [
-            self._eds.get(mapping_index, sub)
-            for sub in range(1, 1 + min(_default_value(count_entry) or 0, 64))
+            self._eds.get(mapping_index, subindex)
+            for subindex in range(1, 1 + min(_default_value(count_entry) or 0, 64))
         ]
         return (
             tuple(map(_default_value, default_entries))
@@ -412,27 +487,30 @@ def _default_value(eds_entry: EdsEntry | None) -> int | None:
     return None if eds_entry is None else eds_entry.default
 
 
-def _is_within_limits(eds_entry: EdsEntry, value: int) -> bool:
+def _is_within_limits(eds_entry: EdsEntry, required_value: int) -> bool:
     """Return whether a value is within the limits of an object; inconsistent limits are ignored."""
     lower_limit, upper_limit = eds_entry.low, eds_entry.high
     if lower_limit is not None and upper_limit is not None and lower_limit > upper_limit:
         return True
-    return (lower_limit is None or lower_limit <= value) and (
-        upper_limit is None or value <= upper_limit
+    return (lower_limit is None or lower_limit <= required_value) and (
+        upper_limit is None or required_value <= upper_limit
     )
 
 
-def _format_value(row: Requirement, value: int) -> str:
+def _format_value(required_object: Requirement, object_value: int) -> str:
     """Format a value for messages: CAN identifiers and large values in hexadecimal."""
-    in_hex = value > 0xFFFF or (row.index, row.sub) in _COB_ID_ADDRESSES
-    return f"0x{value:X}" if in_hex and value >= 0 else str(value)
+    is_shown_in_hex = (
+        object_value > 0xFFFF
+        or (required_object.index, required_object.subindex) in _COB_ID_ADDRESSES
+    )
+    return f"0x{object_value:X}" if is_shown_in_hex and object_value >= 0 else str(object_value)
 
 
-def _format_limit(row: Requirement, value: int | None) -> str:
+def _format_limit(required_object: Requirement, limit_value: int | None) -> str:
     """Format a limit of an object's value for messages."""
-    return "anything" if value is None else _format_value(row, value)
+    return "anything" if limit_value is None else _format_value(required_object, limit_value)
 
 
-def _capitalise(sentence: str) -> str:
+def _capitalise(consequence: str) -> str:
     """Return a text with a capital first letter, so that it can begin a sentence."""
-    return sentence[0].upper() + sentence[1:]
+    return consequence[0].upper() + consequence[1:]

@@ -11,10 +11,10 @@ from contextlib import suppress
 from rigd.devices.canbus.port import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402._protocol import (
-    DISABLE_VOLTAGE,
+    DISABLE_VOLTAGE_COMMAND,
     FAULT_BIT,
-    FAULT_RESET,
-    SHUTDOWN,
+    FAULT_RESET_COMMAND,
+    SHUTDOWN_COMMAND,
     TORQUE_FREE_STATES,
     VOLTAGE_ENABLED_BIT,
     DriveState,
@@ -25,7 +25,7 @@ from rigd.devices.cia402._sdo import SdoAbortError, SdoAccess
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 
-_STATE_POLL_S = 0.01
+_STATE_POLL_INTERVAL_S = 0.01
 """Interval in seconds between two readings of the drive's state."""
 _SWITCH_OFF_TIMEOUT_S = 0.2
 """Time in seconds within which a drive that answers has to report that it is off."""
@@ -58,17 +58,19 @@ def reset_fault(port: CanPort, rig: RigParameters, drive_name: str) -> str | Non
         with suppress(SdoAbortError):
             # No heartbeat is sent now, whose absence would be the next fault.
             sdo.write(objects.HEARTBEAT_CONSUMER, 1, 0)
-        patience_s = settings.enable_timeout_s
-        fault_text = _reset_reported_fault(sdo, drive_name, patience_s) if _in_fault(sdo) else None
-        _confirm_ready(sdo, drive_name, patience_s, fault_text, f"rigd reset --profile {rig.name}")
+        max_wait_s = settings.enable_timeout_s
+        fault_text = (
+            _reset_reported_fault(sdo, drive_name, max_wait_s) if _is_in_fault(sdo) else None
+        )
+        _confirm_ready(sdo, drive_name, max_wait_s, fault_text, f"rigd reset --profile {rig.name}")
     return fault_text
 
 
-def command_off(sdo: SdoAccess) -> None:
+def command_voltage_off(sdo: SdoAccess) -> None:
     """Command the drive to switch off (controlword 0) and ignore its answer; never raises."""
     # An adapter's library may raise anything; switching off must continue.
     with suppress(Exception), sdo.short_timeouts():
-        sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
+        sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE_COMMAND)
 
 
 def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, drive_name: str) -> None:
@@ -78,8 +80,8 @@ def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, drive_name: str) -> 
     """
     settings = rig.cia402
     assert settings is not None
-    end_states = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
-    wait_for(lambda: _read_state(sdo) in end_states, settings.enable_timeout_s)
+    disabled_states = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
+    wait_for(lambda: _read_state(sdo) in disabled_states, settings.enable_timeout_s)
     statusword = sdo.read(objects.STATUSWORD)
     present_state = drive_state(statusword)
     if present_state is DriveState.SWITCH_ON_DISABLED:
@@ -113,13 +115,13 @@ def describe_remaining_torque(sdo: SdoAccess) -> str:
     )
 
 
-def wait_for(is_fulfilled: Callable[[], bool], patience_s: float) -> bool:
+def wait_for(is_fulfilled: Callable[[], bool], max_wait_s: float) -> bool:
     """Poll a condition, at least twice, and return whether it became true in time."""
-    deadline_s = time.monotonic() + patience_s
+    deadline_s = time.monotonic() + max_wait_s
     while not is_fulfilled():
         if time.monotonic() > deadline_s:
             return is_fulfilled()
-        time.sleep(_STATE_POLL_S)
+        time.sleep(_STATE_POLL_INTERVAL_S)
     return True
 
 
@@ -131,27 +133,27 @@ def _confirm_off(sdo: SdoAccess, drive_name: str) -> None:
     """
     start_s = time.monotonic()
     statusword: int | None = None
-    is_requested = False
+    is_switch_off_requested = False
     with sdo.short_timeouts():
         while True:
-            command_off(sdo)
-            if not is_requested:
+            command_voltage_off(sdo)
+            if not is_switch_off_requested:
                 # A drive whose node was stopped answers again; another may ignore it.
                 with suppress(Exception):
                     sdo.request_pre_operational()
-                    is_requested = True
+                    is_switch_off_requested = True
             with suppress(Exception):
                 statusword = sdo.read(objects.STATUSWORD)
                 if drive_state(statusword) in TORQUE_FREE_STATES:
                     return
-            patience_s = _FIRST_ANSWER_TIMEOUT_S if statusword is None else _SWITCH_OFF_TIMEOUT_S
-            if time.monotonic() - start_s > patience_s:
+            max_wait_s = _FIRST_ANSWER_TIMEOUT_S if statusword is None else _SWITCH_OFF_TIMEOUT_S
+            if time.monotonic() - start_s > max_wait_s:
                 break
-            time.sleep(_STATE_POLL_S)
+            time.sleep(_STATE_POLL_INTERVAL_S)
     if statusword is None:
         try:
             sdo.enter_pre_operational()  # with the normal timeout; its error names other nodes
-            sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
+            sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE_COMMAND)
             statusword = sdo.read(objects.STATUSWORD)
         except Exception as error:
             failure_cause = (
@@ -171,14 +173,14 @@ def _confirm_off(sdo: SdoAccess, drive_name: str) -> None:
     )
 
 
-def _reset_reported_fault(sdo: SdoAccess, drive_name: str, patience_s: float) -> str:
+def _reset_reported_fault(sdo: SdoAccess, drive_name: str, max_wait_s: float) -> str:
     """Reset the drive's fault and return its description; raise if the fault persists."""
     fault_text = _describe_fault(sdo)
-    for controlword in (DISABLE_VOLTAGE, FAULT_RESET):
+    for controlword in (DISABLE_VOLTAGE_COMMAND, FAULT_RESET_COMMAND):
         sdo.write(objects.CONTROLWORD, 0, controlword)
-    is_reset = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
-    sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
-    if not is_reset:
+    is_fault_reset = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, max_wait_s)
+    sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE_COMMAND)
+    if not is_fault_reset:
         raise DeviceError(
             f"{drive_name}: the fault cannot be reset: {_describe_fault(sdo)}. It is in the state "
             f'"{_read_state(sdo).value}"; remove the cause, or switch the drive off and on.'
@@ -187,42 +189,45 @@ def _reset_reported_fault(sdo: SdoAccess, drive_name: str, patience_s: float) ->
 
 
 def _confirm_ready(
-    sdo: SdoAccess, name: str, patience_s: float, fault_text: str | None, command: str
+    sdo: SdoAccess, drive_name: str, max_wait_s: float, fault_text: str | None, reset_command: str
 ) -> None:
     """Check that the drive can get ready to switch on (without torque), and disable it again.
 
     Raise `DeviceError` if the drive does not get ready, so that no session could be started.
     """
     with suppress(SdoAbortError):
-        sdo.write(objects.CONTROLWORD, 0, SHUTDOWN)
-    is_ready = wait_for(lambda: _read_state(sdo) is DriveState.READY, patience_s)
+        sdo.write(objects.CONTROLWORD, 0, SHUTDOWN_COMMAND)
+    is_ready_to_switch_on = wait_for(lambda: _read_state(sdo) is DriveState.READY, max_wait_s)
     statusword = sdo.read(objects.STATUSWORD)
-    sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
-    is_disabled = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
-    if is_ready and is_disabled:
+    sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE_COMMAND)
+    is_disabled = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, max_wait_s)
+    if is_ready_to_switch_on and is_disabled:
         return
     progress_text = f"its fault is reset ({fault_text})" if fault_text else "it is not in fault"
-    state = drive_state(statusword)
-    if is_ready:
+    present_state = drive_state(statusword)
+    if is_ready_to_switch_on:
         raise DeviceError(
-            f'{name}: {progress_text}; it got ready and is now in "{_read_state(sdo).value}", not '
-            f'in "{DriveState.SWITCH_ON_DISABLED.value}"; switch it off and on.'
+            f"{drive_name}: {progress_text}; it got ready and is now in "
+            f'"{_read_state(sdo).value}", not in "{DriveState.SWITCH_ON_DISABLED.value}"; switch '
+            "it off and on."
         )
     if statusword & FAULT_BIT:
         raise DeviceError(
-            f"{name}: {progress_text}; when it was commanded to get ready it went to fault: "
-            f"{_describe_fault(sdo)}. Remove the cause, then: {command}"
+            f"{drive_name}: {progress_text}; when it was commanded to get ready it went to fault: "
+            f"{_describe_fault(sdo)}. Remove the cause, then: {reset_command}"
         )
     supply_text = "is there" if statusword & VOLTAGE_ENABLED_BIT else "is not there"
     raise DeviceError(
-        f"{name}: {progress_text}, and it is disabled, but it does not get ready: on that command "
-        f'it stays in "{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply '
+        f"{drive_name}: {progress_text}, and it is disabled, but it does not get ready: on that "
+        "command "
+        f'it stays in "{present_state.value}" (statusword 0x{statusword:04X}, bit 4: the motor '
+        "supply "
         f"{supply_text}). STO is open or the motor supply is off; release or switch it on, then: "
-        f"{command}"
+        f"{reset_command}"
     )
 
 
-def _in_fault(sdo: SdoAccess) -> bool:
+def _is_in_fault(sdo: SdoAccess) -> bool:
     """Return whether the drive's statusword, read by SDO, shows a fault."""
     return bool(sdo.read(objects.STATUSWORD) & FAULT_BIT)
 

@@ -8,11 +8,11 @@ from typing import Final
 
 from rigd.devices.cia402._node import Node
 from rigd.devices.cia402._protocol import (
-    DISABLE_VOLTAGE,
-    ENABLE_OPERATION,
+    DISABLE_VOLTAGE_COMMAND,
+    ENABLE_OPERATION_COMMAND,
     FOLLOWS_TARGET_BIT,
-    SHUTDOWN,
-    SWITCH_ON,
+    SHUTDOWN_COMMAND,
+    SWITCH_ON_COMMAND,
     TORQUE_FREE_STATES,
     VOLTAGE_ENABLED_BIT,
     DriveState,
@@ -81,8 +81,8 @@ class TorqueFollowingCheck:
     follows the command with a first-order lag; the commands are then filtered by the same lag.
 
     A tolerance of 0 disables the comparison; otherwise it is in percent of the rated torque.
-    `response_s` is the time constant of the lag; 0 for a drive that reports the commanded torque.
-    `period_s` is the time between two commands.
+    `torque_response_s` is the time constant of the lag; 0 for a drive that reports the commanded
+    torque. `tick_period_s` is the time between two commands.
 
     Attributes
     ----------
@@ -91,12 +91,18 @@ class TorqueFollowingCheck:
     """
 
     def __init__(
-        self, name: str, tolerance_percent: float, response_s: float = 0.0, period_s: float = 1e-3
+        self,
+        drive_name: str,
+        tolerance_percent: float,
+        torque_response_s: float = 0.0,
+        tick_period_s: float = 1e-3,
     ) -> None:
-        self._name = name
+        self._name = drive_name
         self._tolerance_per_mille = 10.0 * tolerance_percent
         # Fraction of a step that a command reaches after one period.
-        self._step_fraction = 1.0 - exp(-period_s / response_s) if response_s else 1.0
+        self._step_fraction = (
+            1.0 - exp(-tick_period_s / torque_response_s) if torque_response_s else 1.0
+        )
         self.is_active = True
         self.start()
 
@@ -115,15 +121,15 @@ class TorqueFollowingCheck:
             torque_per_mille - previous_per_mille
         )
 
-    def compare(self, actual_per_mille: int) -> None:
+    def compare(self, actual_torque_per_mille: int) -> None:
         """Compare the actual torque, in 1/1000 of the rated torque, with the commands.
 
         Raise `DeviceError` if the torque has differed for too many consecutive ticks.
         """
         tolerance_per_mille = self._tolerance_per_mille
         if (
-            abs(actual_per_mille - self._last_per_mille) <= tolerance_per_mille
-            or abs(actual_per_mille - self._previous_per_mille) <= tolerance_per_mille
+            abs(actual_torque_per_mille - self._last_per_mille) <= tolerance_per_mille
+            or abs(actual_torque_per_mille - self._previous_per_mille) <= tolerance_per_mille
             or not tolerance_per_mille
             or not self.is_active
         ):
@@ -132,8 +138,8 @@ class TorqueFollowingCheck:
         self._deviating_ticks += 1
         if self._deviating_ticks >= _MAX_DEVIATING_TICKS:
             raise DeviceError(
-                f"{self._name}: it exerts {actual_per_mille / 10:g} % of the rated torque (object "
-                f"6077) where {self._commanded_per_mille / 10:g} % were commanded, for "
+                f"{self._name}: it exerts {actual_torque_per_mille / 10:g} % of the rated torque "
+                f"(object 6077) where {self._commanded_per_mille / 10:g} % were commanded, for "
                 f"{_MAX_DEVIATING_TICKS} ticks; commands are lost, or the drive limits them. Check "
                 "its diagnosis and cia402.torque_tolerance_percent; if it measures this torque, "
                 "check cia402.torque_response_s."
@@ -143,9 +149,9 @@ class TorqueFollowingCheck:
 # Up and down
 
 _ENABLING_STEPS = (
-    (SHUTDOWN, DriveState.READY),
-    (SWITCH_ON, DriveState.SWITCHED_ON),
-    (ENABLE_OPERATION, DriveState.OPERATION_ENABLED),
+    (SHUTDOWN_COMMAND, DriveState.READY),
+    (SWITCH_ON_COMMAND, DriveState.SWITCHED_ON),
+    (ENABLE_OPERATION_COMMAND, DriveState.OPERATION_ENABLED),
 )
 """Controlwords that enable the drive in steps, each with the state that the drive then reaches."""
 _MAX_UNANSWERED_SYNCS = 10
@@ -160,16 +166,16 @@ class StopRequestedError(Exception):
     """Error: the operator requested a stop while the drive was being enabled."""
 
 
-def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
+def enable_operation(node: Node, is_stop_requested: Callable[[], bool]) -> None:
     """Bring the drive to operation enabled; send RPDO, SYNC and heartbeat once a period.
 
-    `stop` is called once a period; True aborts the transition. Raise `StopRequestedError` if `stop`
-    returned True. The drive may be enabled then. Raise `DeviceError` if a step takes longer than
-    ``cia402.enable_timeout_s``, or the enabled drive ignores the target torque or is in another
-    mode of operation. It may be enabled then.
+    `is_stop_requested` is called once a period; True aborts the transition. Raise
+    `StopRequestedError` if `is_stop_requested` returned True. The drive may be enabled then. Raise
+    `DeviceError` if a step takes longer than ``cia402.enable_timeout_s``, or the enabled drive
+    ignores the target torque or is in another mode of operation. It may be enabled then.
     """
     inbox = node.inbox
-    sync_grid_ns = node.sync_ns
+    sync_grid_start_ns = node.sync_ns
     for controlword, state in _ENABLING_STEPS:
 
         def describe_failure(state: DriveState = state) -> str:
@@ -182,21 +188,23 @@ def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
         def is_reached(state: DriveState = state) -> bool:
             return drive_state(inbox.statusword) is state
 
-        _send_controlword_until(node, controlword, sync_grid_ns, is_reached, describe_failure, stop)
+        _send_controlword_until(
+            node, controlword, sync_grid_start_ns, is_reached, describe_failure, is_stop_requested
+        )
     if node.settings.follows_target_bit:
         _send_controlword_until(
             node,
-            ENABLE_OPERATION,
-            sync_grid_ns,
+            ENABLE_OPERATION_COMMAND,
+            sync_grid_start_ns,
             lambda: inbox.statusword & FOLLOWS_TARGET_BIT != 0,
             lambda: (
                 "it is enabled and ignores the target torque: bit 12 of its statusword "
                 f"0x{inbox.statusword:04X} is not set; check its own diagnosis, and if this "
                 "drive has no such bit: cia402.follows_target_bit = false"
             ),
-            stop,
+            is_stop_requested,
         )
-    _check_mode(node, sync_grid_ns, stop)
+    _check_mode(node, sync_grid_start_ns, is_stop_requested)
 
 
 def switch_off(node: Node) -> bool:
@@ -211,60 +219,62 @@ def switch_off(node: Node) -> bool:
     if node.write(node.frames.disable_voltage, CONTROLWORD, 0):
         deadline_ns = time.monotonic_ns() + _SWITCH_OFF_TIMEOUT_NS
         while time.monotonic_ns() < deadline_ns:
-            if node.is_off():
+            if node.is_torque_off():
                 return True
     node.send_if_possible(node.frames.stop)
     return False
 
 
-def _check_mode(node: Node, sync_grid_ns: int, stop: Callable[[], bool]) -> None:
+def _check_mode(node: Node, sync_grid_start_ns: int, is_stop_requested: Callable[[], bool]) -> None:
     """Check that the enabled drive is in cyclic torque mode; some drives show it only then."""
     inbox, node_frames, send_frame = node.inbox, node.frames, node.exchange.send
-    mode: int | None = None
+    last_reported_mode: int | None = None
 
-    def in_cyclic_torque() -> bool:
-        nonlocal mode
-        mode_read = read_mode(inbox.sdo_reply)
-        if mode_read is None:
+    def is_in_cyclic_torque_mode() -> bool:
+        nonlocal last_reported_mode
+        reported_mode = read_mode(inbox.sdo_reply)
+        if reported_mode is None:
             return False
-        mode, inbox.sdo_reply = mode_read, b""
-        if mode != CYCLIC_TORQUE_MODE:
+        last_reported_mode, inbox.sdo_reply = reported_mode, b""
+        if last_reported_mode != CYCLIC_TORQUE_MODE:
             send_frame(node_frames.read_mode_request)
-        return mode == CYCLIC_TORQUE_MODE
+        return last_reported_mode == CYCLIC_TORQUE_MODE
 
     inbox.sdo_reply = b""
     send_frame(node_frames.read_mode_request)
     _send_controlword_until(
         node,
-        ENABLE_OPERATION,
-        sync_grid_ns,
-        in_cyclic_torque,
+        ENABLE_OPERATION_COMMAND,
+        sync_grid_start_ns,
+        is_in_cyclic_torque_mode,
         lambda: (
-            f"its mode of operation (object 6061) is {mode}, not {CYCLIC_TORQUE_MODE} (cyclic "
-            "synchronous torque)"
+            f"its mode of operation (object 6061) is {last_reported_mode}, not "
+            f"{CYCLIC_TORQUE_MODE} (cyclic synchronous torque)"
         ),
-        stop,
+        is_stop_requested,
     )
 
 
 def _send_controlword_until(
     node: Node,
     controlword: int,
-    sync_grid_ns: int,
+    sync_grid_start_ns: int,
     is_reached: Callable[[], bool],
     describe_failure: Callable[[], str],
-    stop: Callable[[], bool],
+    is_stop_requested: Callable[[], bool],
 ) -> None:
     """Send a controlword with zero torque once a period until `is_reached` returns True."""
-    rpdo_frame = node.frames.rpdo(controlword, 0)
+    rpdo_frame = node.frames.rpdo_frame(controlword, 0)
     timeout_s = node.settings.enable_timeout_s
-    max_unanswered = _MAX_UNANSWERED_SYNCS_IN_LOCK_STEP if node.lock_step else _MAX_UNANSWERED_SYNCS
+    max_unanswered_syncs = (
+        _MAX_UNANSWERED_SYNCS_IN_LOCK_STEP if node.lock_step else _MAX_UNANSWERED_SYNCS
+    )
     unanswered_syncs = 0
     for _ in range(ceil(timeout_s * node.rate_hz)):
-        if stop():
+        if is_stop_requested():
             raise StopRequestedError
         node.exchange.send(rpdo_frame)
-        node.sleep_until_next_period(sync_grid_ns)
+        node.sleep_until_next_period(sync_grid_start_ns)
         node.now_ns += node.period_ns
         node.send_sync()
         node.send_heartbeat()
@@ -273,7 +283,7 @@ def _send_controlword_until(
         if is_answered and is_reached():
             return
         unanswered_syncs = 0 if is_answered else unanswered_syncs + 1
-        if unanswered_syncs >= max_unanswered:
+        if unanswered_syncs >= max_unanswered_syncs:
             raise DeviceError(
                 f"{node.name}: it has stopped answering SYNC while being enabled; check its supply "
                 "and the cable."
@@ -285,11 +295,11 @@ def _send_controlword_until(
 
 def _switch_off_by_pdo(node: Node) -> bool:
     """Command the drive off by RPDO; return whether its statusword confirmed it; never raises."""
-    idle_rpdo = node.frames.rpdo(DISABLE_VOLTAGE, 0)
+    idle_rpdo = node.frames.rpdo_frame(DISABLE_VOLTAGE_COMMAND, 0)
     started_ns = time.monotonic_ns()
     while time.monotonic_ns() - started_ns <= _SWITCH_OFF_TIMEOUT_NS:
         # At SYNC the drive applies the torque of the RPDO, and samples its statusword.
-        is_sent = node.send_if_possible(idle_rpdo)
+        is_rpdo_sent = node.send_if_possible(idle_rpdo)
         is_answered = node.sync_if_possible()
         # The drive may need time for a ramp; meanwhile it must not miss this computer's heartbeat.
         node.now_ns += node.period_ns
@@ -297,7 +307,7 @@ def _switch_off_by_pdo(node: Node) -> bool:
             node.send_heartbeat()
         if is_answered and drive_state(node.inbox.statusword) in TORQUE_FREE_STATES:
             return True
-        if not is_sent:
+        if not is_rpdo_sent:
             break  # the bus has failed
         node.sleep_until_next_period(node.sync_ns)
     return False

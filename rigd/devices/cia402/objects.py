@@ -39,9 +39,9 @@ TPDO_COMMUNICATION: Final = 0x1800
 """Index of the communication parameters of TPDO1; the n-th TPDO has the index n - 1 higher."""
 TPDO_MAPPING: Final = 0x1A00
 """Index of the mapping of TPDO1; the n-th TPDO has the index n - 1 higher."""
-INHIBIT_TIME: Final = 3
+INHIBIT_TIME_SUBINDEX: Final = 3
 """Sub-index of a PDO's inhibit time, in units of 100 µs."""
-EVENT_TIMER: Final = 5
+EVENT_TIMER_SUBINDEX: Final = 5
 """Sub-index of a PDO's event timer in milliseconds; for an RPDO it is the deadline of the next
 RPDO."""
 ABORT_OPTION: Final = 0x6007
@@ -101,30 +101,30 @@ PDO_DISABLED_BIT: Final = 0x8000_0000
 """Bit in the COB-ID of a PDO that means that the PDO is disabled."""
 NO_REMOTE_REQUEST_BIT: Final = 0x4000_0000
 """Bit in the COB-ID of a TPDO that forbids remote requests; drives may set it by themselves."""
-SYNC_ID: Final = 0x080
+SYNC_CAN_ID: Final = 0x080
 """CAN identifier of SYNC."""
 PREDEFINED_PDO_COUNT: Final = 4
 """Number of RPDOs, and of TPDOs, whose CAN identifiers CiA 301 predefines."""
 MAX_PDO_COUNT: Final = 512
 """Largest number of RPDOs, and of TPDOs, that a drive can have."""
 
-AT_EVERY_SYNC: Final = 1
+TRANSMISSION_AT_EVERY_SYNC: Final = 1
 """Transmission type of a PDO that is sent or applied at every SYNC."""
-ON_ARRIVAL: Final = 255
+TRANSMISSION_ON_ARRIVAL: Final = 255
 """Transmission type of a PDO that is event-driven: an RPDO is applied when it arrives."""
 
 
-def mapping_entry(index: int, bits: int) -> int:
+def mapping_entry(index: int, length_bit: int) -> int:
     """Return the PDO mapping entry, an integer, of an object without sub-indices.
 
     Parameters
     ----------
     index
         Index of the object.
-    bits
+    length_bit
         Size of the object in bits.
     """
-    return index << 16 | bits
+    return index << 16 | length_bit
 
 
 TPDO_ENTRIES: Final[tuple[int, ...]] = (

@@ -28,22 +28,22 @@ ABORT_OPTION: Final = "abort_option"
 """Name in ``cia402.accept_without`` for a drive without a configurable abort connection option."""
 TORQUE_FEEDBACK: Final = "torque_feedback"
 """Name in ``cia402.accept_without`` for a drive that does not report its actual torque."""
-ACCEPTABLE: Final = (WATCHDOG, TORQUE_LIMIT, ABORT_OPTION, TORQUE_FEEDBACK)
+ACCEPTABLE_MISSING_FUNCTIONS: Final = (WATCHDOG, TORQUE_LIMIT, ABORT_OPTION, TORQUE_FEEDBACK)
 """Names in ``cia402.accept_without`` of the functions that a drive may lack."""
 
 
 class ObjectAccess(Flag):
     """Ways in which the driver accesses an object: by SDO or in a PDO."""
 
-    READ = auto()
+    READ_BY_SDO = auto()
     """The object is read by SDO."""
-    WRITE = auto()
+    WRITTEN_BY_SDO = auto()
     """The object is written by SDO in pre-operational, unless it already holds the required
     value."""
-    SENT = auto()
+    SENT_IN_TPDO = auto()
     """The object is mapped into the drive's TPDO (in an EDS: PDOMapping = 1, access ro, rw or
     rwr)."""
-    RECEIVED = auto()
+    RECEIVED_IN_RPDO = auto()
     """The object is mapped into the drive's RPDO (in an EDS: PDOMapping = 1, access rw, rww or
     wo)."""
 
@@ -57,21 +57,23 @@ class Watchdog(Enum):
     NONE = "none"
 
 
-def watchdog(*, heartbeat: bool, rpdo_deadline: bool, own: bool) -> Watchdog:
+def most_reliable_watchdog(
+    *, has_heartbeat_consumer: bool, has_rpdo_deadline: bool, has_own_watchdog: bool
+) -> Watchdog:
     """Return the kind of watchdog that a drive uses: the most reliable one that it has.
 
     Parameters
     ----------
-    heartbeat, rpdo_deadline
+    has_heartbeat_consumer, has_rpdo_deadline
         Whether the drive has the objects 1016:1 and 1400:5.
-    own
+    has_own_watchdog
         Whether the profile states the timeout of a manufacturer-specific watchdog.
     """
-    if heartbeat:
+    if has_heartbeat_consumer:
         return Watchdog.HEARTBEAT
-    if rpdo_deadline:
+    if has_rpdo_deadline:
         return Watchdog.RPDO_DEADLINE
-    return Watchdog.OWN if own else Watchdog.NONE
+    return Watchdog.OWN if has_own_watchdog else Watchdog.NONE
 
 
 class AllowedValue(Enum):
@@ -86,17 +88,19 @@ class AllowedValue(Enum):
     ANY = "any"
     """Every value is accepted, because the object is only read."""
 
-    def allows(self, value: int, required_value: int) -> bool:
+    def allows(self, present_value: int, required_value: int) -> bool:
         """Return whether this rule accepts the value that an object holds.
 
         Parameters
         ----------
-        value, required_value
+        present_value, required_value
             Value that the object holds, and value that is required.
         """
         if self in (AllowedValue.EQUAL, AllowedValue.EQUAL_OR_UNUSED):
-            return value == required_value or (self is AllowedValue.EQUAL_OR_UNUSED and value == 0)
-        return self is AllowedValue.ANY or value >= required_value
+            return present_value == required_value or (
+                self is AllowedValue.EQUAL_OR_UNUSED and present_value == 0
+            )
+        return self is AllowedValue.ANY or present_value >= required_value
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,21 +109,21 @@ class Requirement:
 
     Attributes
     ----------
-    index, sub
+    index, subindex
         Index and sub-index of the object.
     name
         Name in CiA 301 or 402.
-    core
+    is_core
         Whether no session is possible without the object.
     access
         How the driver accesses the object.
-    stand_in
+    replacement
         What replaces the object if it is absent; empty if nothing does.
-    sentence
+    consequence
         Consequence and remedy if the object is absent or unusable, for the operator.
     value_rule
         Rule for the value of the object if it is read-only.
-    accept
+    acceptance_name
         Name in ``cia402.accept_without`` that permits a drive without the object; empty if no
         permission is needed. (For 1016:1 only if no other :class:`Watchdog` is active.)
     must_be_zero
@@ -128,38 +132,42 @@ class Requirement:
     """
 
     index: int
-    sub: int
+    subindex: int
     name: str
-    core: bool
+    is_core: bool
     access: ObjectAccess
-    stand_in: str = ""
-    sentence: str = ""
+    replacement: str = ""
+    consequence: str = ""
     value_rule: AllowedValue = AllowedValue.EQUAL
-    accept: str = ""
+    acceptance_name: str = ""
     must_be_zero: bool = False
 
     @property
     def address(self) -> str:
         """Index and sub-index of the object as messages show them: ``6072`` or ``1016:1``."""
-        return f"{self.index:04X}:{self.sub}" if self.sub else f"{self.index:04X}"
+        return f"{self.index:04X}:{self.subindex}" if self.subindex else f"{self.index:04X}"
 
-    def refusal_reason(self, accepted: Collection[str] = ()) -> str:
+    def refusal_reason(self, accepted_names: Collection[str] = ()) -> str:
         """Return the reason to refuse a drive without this object; empty if it is accepted.
 
         Parameters
         ----------
-        accepted
+        accepted_names
             ``cia402.accept_without`` of the profile.
         """
-        if not self.core and (not self.accept or self.accept in accepted):
+        if not self.is_core and (
+            not self.acceptance_name or self.acceptance_name in accepted_names
+        ):
             return ""
         remedy = (
-            f' To run without it: cia402.accept_without = ["{self.accept}"].' if self.accept else ""
+            f' To run without it: cia402.accept_without = ["{self.acceptance_name}"].'
+            if self.acceptance_name
+            else ""
         )
-        return f"it has no object {self.address} ({self.name}). {self.sentence}{remedy}"
+        return f"it has no object {self.address} ({self.name}). {self.consequence}{remedy}"
 
 
-_READ_ACCESS, _WRITE_ACCESS = ObjectAccess.READ, ObjectAccess.WRITE
+_READ_ACCESS, _WRITE_ACCESS = ObjectAccess.READ_BY_SDO, ObjectAccess.WRITTEN_BY_SDO
 _DRIVE_NOT_USABLE: Final = (
     "Without it the drive cannot be used: check whether its firmware offers it."
 )
@@ -175,16 +183,16 @@ CORE_REQUIREMENTS: Final = (
         0,
         "Controlword",
         True,
-        _WRITE_ACCESS | ObjectAccess.RECEIVED,
-        sentence=_DRIVE_NOT_USABLE,
+        _WRITE_ACCESS | ObjectAccess.RECEIVED_IN_RPDO,
+        consequence=_DRIVE_NOT_USABLE,
     ),
     Requirement(
         objects.STATUSWORD,
         0,
         "Statusword",
         True,
-        _READ_ACCESS | ObjectAccess.SENT,
-        sentence=_DRIVE_NOT_USABLE,
+        _READ_ACCESS | ObjectAccess.SENT_IN_TPDO,
+        consequence=_DRIVE_NOT_USABLE,
     ),
     Requirement(
         objects.MODE,
@@ -192,7 +200,7 @@ CORE_REQUIREMENTS: Final = (
         "Modes of operation",
         True,
         _READ_ACCESS | _WRITE_ACCESS,
-        sentence="It must accept 10, cyclic synchronous torque mode.",
+        consequence="It must accept 10, cyclic synchronous torque mode.",
     ),
     Requirement(
         objects.MODE_DISPLAY,
@@ -200,23 +208,23 @@ CORE_REQUIREMENTS: Final = (
         "Modes of operation display",
         True,
         _READ_ACCESS,
-        sentence=_DRIVE_NOT_USABLE,
+        consequence=_DRIVE_NOT_USABLE,
     ),
     Requirement(
         objects.POSITION,
         0,
         "Position actual value",
         True,
-        _READ_ACCESS | ObjectAccess.SENT,
-        sentence="The loop runs on it.",
+        _READ_ACCESS | ObjectAccess.SENT_IN_TPDO,
+        consequence="The loop runs on it.",
     ),
     Requirement(
         objects.TARGET_TORQUE,
         0,
         "Target torque",
         True,
-        ObjectAccess.RECEIVED,
-        sentence="Without it the drive has no torque mode that rigd could use.",
+        ObjectAccess.RECEIVED_IN_RPDO,
+        consequence="Without it the drive has no torque mode that rigd could use.",
     ),
     Requirement(
         objects.SUPPORTED_MODES,
@@ -224,7 +232,7 @@ CORE_REQUIREMENTS: Final = (
         "Supported drive modes",
         True,
         _READ_ACCESS,
-        sentence="Its bit 9 must say that the drive has cyclic synchronous torque mode.",
+        consequence="Its bit 9 must say that the drive has cyclic synchronous torque mode.",
     ),
     Requirement(
         objects.RPDO_COMMUNICATION,
@@ -232,7 +240,7 @@ CORE_REQUIREMENTS: Final = (
         "COB-ID of RPDO1",
         True,
         _READ_ACCESS | _WRITE_ACCESS,
-        sentence=_PDO_MAPPING_NEEDED,
+        consequence=_PDO_MAPPING_NEEDED,
     ),
     Requirement(
         objects.RPDO_COMMUNICATION,
@@ -240,7 +248,7 @@ CORE_REQUIREMENTS: Final = (
         "Transmission type of RPDO1",
         True,
         _READ_ACCESS | _WRITE_ACCESS,
-        sentence="It must be 1 (at_sync) or 255 (on_arrival), as cia402.torque_delivery says.",
+        consequence="It must be 1 (at_sync) or 255 (on_arrival), as cia402.torque_delivery says.",
     ),
     Requirement(
         objects.RPDO_MAPPING,
@@ -248,7 +256,7 @@ CORE_REQUIREMENTS: Final = (
         "Mapping of RPDO1",
         True,
         _READ_ACCESS | _WRITE_ACCESS,
-        sentence=_PDO_MAPPING_NEEDED,
+        consequence=_PDO_MAPPING_NEEDED,
     ),
     Requirement(
         objects.TPDO_COMMUNICATION,
@@ -256,7 +264,7 @@ CORE_REQUIREMENTS: Final = (
         "COB-ID of TPDO1",
         True,
         _READ_ACCESS | _WRITE_ACCESS,
-        sentence=_PDO_MAPPING_NEEDED,
+        consequence=_PDO_MAPPING_NEEDED,
     ),
     Requirement(
         objects.TPDO_COMMUNICATION,
@@ -264,7 +272,7 @@ CORE_REQUIREMENTS: Final = (
         "Transmission type of TPDO1",
         True,
         _READ_ACCESS | _WRITE_ACCESS,
-        sentence="It must be 1: an angle at every SYNC.",
+        consequence="It must be 1: an angle at every SYNC.",
     ),
     Requirement(
         objects.TPDO_MAPPING,
@@ -272,7 +280,7 @@ CORE_REQUIREMENTS: Final = (
         "Mapping of TPDO1",
         True,
         _READ_ACCESS | _WRITE_ACCESS,
-        sentence=_PDO_MAPPING_NEEDED,
+        consequence=_PDO_MAPPING_NEEDED,
     ),
 )
 """Requirements on objects without which no session is possible.
@@ -385,11 +393,11 @@ OPTIONAL_REQUIREMENTS: Final = (
         "the deadline of the RPDO (1400:5), or the drive's own watchdog (cia402.own_watchdog_s)",
         "Nothing in the drive would remove the torque if this computer stops communicating. If the "
         "drive has its own watchdog, set that up and state its time: cia402.own_watchdog_s.",
-        accept=WATCHDOG,
+        acceptance_name=WATCHDOG,
     ),
     Requirement(
         objects.RPDO_COMMUNICATION,
-        objects.EVENT_TIMER,
+        objects.EVENT_TIMER_SUBINDEX,
         "Event timer of RPDO1",
         False,
         _READ_ACCESS | _WRITE_ACCESS,
@@ -405,7 +413,7 @@ OPTIONAL_REQUIREMENTS: Final = (
         "The drive's reaction to the loss of this computer is then manufacturer-specific: see its "
         "manual, and test it at a low torque by pulling the cable. If it has a suitable value, "
         "use that for cia402.abort_option.",
-        accept=ABORT_OPTION,
+        acceptance_name=ABORT_OPTION,
     ),
     Requirement(
         objects.COMMUNICATION_ERROR,
@@ -445,7 +453,7 @@ OPTIONAL_REQUIREMENTS: Final = (
         "limit 6080, and the cut to motor.peak_torque_nm in this program",
         "The drive then has no limit of its own for the torque that rigd could set. Set its "
         "manufacturer-specific limit with cia402.set_objects.",
-        accept=TORQUE_LIMIT,
+        acceptance_name=TORQUE_LIMIT,
     ),
     *(
         Requirement(
@@ -489,14 +497,14 @@ OPTIONAL_REQUIREMENTS: Final = (
     *(
         Requirement(
             index,
-            sub,
+            subindex,
             name,
             False,
             _READ_ACCESS,
             "the probing move before the first session (docs/safety.md)",
             value_rule=AllowedValue.ANY,
         )
-        for index, sub, name in (
+        for index, subindex, name in (
             (objects.ENCODER_RESOLUTION, 1, "Encoder increments"),
             (objects.ENCODER_RESOLUTION, 2, "Motor revolutions"),
             (objects.GEAR_RATIO, 1, "Motor shaft revolutions"),
@@ -510,11 +518,11 @@ OPTIONAL_REQUIREMENTS: Final = (
         0,
         "Torque actual value",
         False,
-        _READ_ACCESS | ObjectAccess.SENT,
+        _READ_ACCESS | ObjectAccess.SENT_IN_TPDO,
         "",
         "Torque commands that are lost, or limited by the drive, would not be noticed.",
         value_rule=AllowedValue.ANY,
-        accept=TORQUE_FEEDBACK,
+        acceptance_name=TORQUE_FEEDBACK,
     ),
     Requirement(
         objects.MAX_SPEED_RPM,
@@ -529,7 +537,7 @@ OPTIONAL_REQUIREMENTS: Final = (
     # Values that a drive may have stored in earlier use.
     Requirement(
         objects.TPDO_COMMUNICATION,
-        objects.INHIBIT_TIME,
+        objects.INHIBIT_TIME_SUBINDEX,
         "Inhibit time of TPDO1",
         False,
         _READ_ACCESS | _WRITE_ACCESS,
@@ -572,7 +580,7 @@ OPTIONAL_REQUIREMENTS: Final = (
 REQUIREMENTS: Final = CORE_REQUIREMENTS + OPTIONAL_REQUIREMENTS
 """All requirements on the drive's object dictionary."""
 
-MAY_BE_WRITE_ONLY: Final = (
+POSSIBLY_WRITE_ONLY_INDICES: Final = (
     objects.MODE,
     objects.INTERPOLATION_TIME,
     objects.ABORT_OPTION,
@@ -586,16 +594,16 @@ MAY_BE_WRITE_ONLY: Final = (
 They are written even if they may already hold the value. (6060 is write-only in the first editions
 of CiA 402; 6061 shows the mode.)"""
 
-_BY_ADDRESS: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
+_REQUIREMENT_BY_ADDRESS: Final = {(each.index, each.subindex): each for each in REQUIREMENTS}
 """Requirement by index and sub-index."""
 
 
-def requirement(index: int, sub: int = 0) -> Requirement:
+def requirement(index: int, subindex: int = 0) -> Requirement:
     """Return the requirement on the drive's object at an index and sub-index.
 
     Parameters
     ----------
-    index, sub
+    index, subindex
         Index and sub-index of the object.
 
     Raises
@@ -603,10 +611,10 @@ def requirement(index: int, sub: int = 0) -> Requirement:
     KeyError
         If there is no requirement on this object.
     """
-    return _BY_ADDRESS[index, sub]
+    return _REQUIREMENT_BY_ADDRESS[index, subindex]
 
 
-_ROUNDING_TOLERANCE = 1e-9
+_PERIOD_ROUNDING_TOLERANCE = 1e-9
 """Tolerance for rounding errors of floating-point numbers, relative."""
 
 
@@ -620,12 +628,12 @@ def profile_independent_values(node_id: int) -> dict[tuple[int, int], int]:
         of SYNC.
     """
     return {
-        **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.must_be_zero},
+        **{(row.index, row.subindex): 0 for row in REQUIREMENTS if row.must_be_zero},
         (objects.MODE, 0): objects.CYCLIC_TORQUE_MODE,
-        (objects.SYNC_COB_ID, 0): objects.SYNC_ID,
+        (objects.SYNC_COB_ID, 0): objects.SYNC_CAN_ID,
         (objects.EMERGENCY_COB_ID, 0): 0x080 + node_id,
         (objects.TPDO_COMMUNICATION, 1): 0x180 + node_id,
-        (objects.TPDO_COMMUNICATION, 2): objects.AT_EVERY_SYNC,
+        (objects.TPDO_COMMUNICATION, 2): objects.TRANSMISSION_AT_EVERY_SYNC,
         (objects.RPDO_COMMUNICATION, 1): 0x200 + node_id,
     }
 
@@ -648,12 +656,14 @@ def required_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     """
     settings = rig.cia402
     assert settings is not None
-    at_sync = settings.torque_delivery == "at_sync"
+    is_torque_delivered_at_sync = settings.torque_delivery == "at_sync"
     period_us = sync_period_us(rig.rate_hz)
     interpolation_value, exponent = interpolation_time(rig.rate_hz)
     unknown_keys = unknown_values(rig)
-    required_value = profile_independent_values(settings.node_id) | {
-        (objects.RPDO_COMMUNICATION, 2): objects.AT_EVERY_SYNC if at_sync else objects.ON_ARRIVAL,
+    required_value_by_address = profile_independent_values(settings.node_id) | {
+        (objects.RPDO_COMMUNICATION, 2): objects.TRANSMISSION_AT_EVERY_SYNC
+        if is_torque_delivered_at_sync
+        else objects.TRANSMISSION_ON_ARRIVAL,
         (objects.SYNC_PERIOD_US, 0): period_us,
         (objects.INTERPOLATION_TIME, 1): interpolation_value,
         (objects.INTERPOLATION_TIME, 2): exponent,
@@ -662,12 +672,14 @@ def required_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
         (objects.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
     }
     if not {"motor.peak_torque_nm", "motor.rated_torque_nm"}.intersection(unknown_keys):
-        limit_per_mille = torque_limit_per_mille(rig)
-        limit_indices = (objects.MAX_TORQUE, *objects.TORQUE_LIMITS)
-        required_value |= {(index, 0): limit_per_mille for index in limit_indices}
+        max_torque_per_mille = torque_limit_per_mille(rig)
+        torque_limit_indices = (objects.MAX_TORQUE, *objects.TORQUE_LIMITS)
+        required_value_by_address |= {
+            (index, 0): max_torque_per_mille for index in torque_limit_indices
+        }
     if settings.max_speed_rad_s > 0 and "cia402.gear_ratio" not in unknown_keys:
-        required_value[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
-    return required_value
+        required_value_by_address[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
+    return required_value_by_address
 
 
 def sync_period_us(rate_hz: float) -> int:
@@ -679,7 +691,7 @@ def sync_period_us(rate_hz: float) -> int:
         If the period is not a whole number of microseconds.
     """
     period_us = 1e6 / rate_hz
-    if abs(period_us - round(period_us)) > _ROUNDING_TOLERANCE * period_us:
+    if abs(period_us - round(period_us)) > _PERIOD_ROUNDING_TOLERANCE * period_us:
         from rigd.devices.contracts import DeviceError  # which loads numpy
 
         raise DeviceError(
@@ -703,7 +715,7 @@ def interpolation_time(rate_hz: float) -> tuple[int, int]:
         unit_count = 10.0**-exponent / rate_hz
         if (
             0.5 < unit_count < 255.5
-            and abs(unit_count - round(unit_count)) <= _ROUNDING_TOLERANCE * unit_count
+            and abs(unit_count - round(unit_count)) <= _PERIOD_ROUNDING_TOLERANCE * unit_count
         ):
             return round(unit_count), exponent
     from rigd.devices.contracts import DeviceError
@@ -718,10 +730,12 @@ def torque_limit_per_mille(rig: "RigParameters") -> int:
     """Return the motor's peak torque in 1/1000 of its rated torque, rounded down, at most 32767."""
     motor = rig.motor
     return min(
-        int(1000 * motor.peak_torque_nm / motor.rated_torque_nm + _ROUNDING_TOLERANCE), 32767
+        int(1000 * motor.peak_torque_nm / motor.rated_torque_nm + _PERIOD_ROUNDING_TOLERANCE), 32767
     )
 
 
 def max_speed_rpm(settings: "ServoDrive") -> int:
     """Return the motor's speed limit in revolutions per minute, rounded up, for object 6080."""
-    return ceil(settings.max_speed_rad_s * settings.gear_ratio * 60 / tau - _ROUNDING_TOLERANCE)
+    return ceil(
+        settings.max_speed_rad_s * settings.gear_ratio * 60 / tau - _PERIOD_ROUNDING_TOLERANCE
+    )

@@ -201,8 +201,8 @@ def test_read_only_limits_of_elmo(node, connect, rig):
         node.sdo[index].raw = 50_000
         entry.access_type = "ro"
     capabilities = connect()
-    assert capabilities.has(0x60E0)
-    assert capabilities.accepted == ()
+    assert capabilities.has_object(0x60E0)
+    assert capabilities.accepted_missing_functions == ()
 
 
 def test_a_read_only_limit_that_is_too_low(node, connect, rig):
@@ -225,8 +225,8 @@ def test_missing_objects_of_maxon(node, connect, rig):
     )
     capabilities = connect(replace(rig, cia402=settings))
     assert node.get_data(0x3001, 2).hex(" ") == "c4 09 00 00"
-    assert {row.address for row in capabilities.lacks} >= {"6072", "1006"}
-    assert capabilities.accepted == ("torque_limit",)
+    assert {row.address for row in capabilities.missing_objects} >= {"6072", "1006"}
+    assert capabilities.accepted_missing_functions == ("torque_limit",)
     assert node.get_data(0x1A00, 0) == b"\x03"
 
 

@@ -35,7 +35,7 @@ class TestRealDrives:
         scripted.read_only |= {(0x60E0, 0), (0x60E1, 0)}
         drive = make()
         drive.connect()
-        assert drive.capabilities().accepted == ()
+        assert drive.capabilities().accepted_missing_functions == ()
         drive.enable()
         assert scripted.state == "enabled"
 
@@ -45,7 +45,7 @@ class TestRealDrives:
         drive = make(accept_without=("torque_limit",), set_objects=("3001:2 u32 2500",))
         drive.connect()
         assert scripted.objects[0x3001, 2] == 2500
-        assert [row.address for row in drive.capabilities().lacks] == ["6072", "1006"]
+        assert [row.address for row in drive.capabilities().missing_objects] == ["6072", "1006"]
         statement = drive.statement()
         assert statement["drive_without"] == "torque_limit"
         assert statement["drive_objects_set"] == "3001:2 u32 2500"
@@ -88,7 +88,7 @@ def test_a_high_limit_may_be_accepted_by_name(make, scripted):
     scripted.read_only.add((0x6072, 0))
     drive = make(accept_without=("torque_limit",))
     drive.connect()
-    assert drive.capabilities().accepted == ("torque_limit",)
+    assert drive.capabilities().accepted_missing_functions == ("torque_limit",)
 
 
 def test_a_write_only_mode_is_written_and_read_from_6061(make, scripted):
@@ -119,7 +119,11 @@ def test_abort_codes_of_absent_objects(make, scripted, code):
     scripted.refuse |= dict.fromkeys([(0x1006, 0), (0x60C2, 1), (0x60C2, 2)], code)
     drive = make()
     drive.connect()
-    assert {row.address for row in drive.capabilities().lacks} == {"1006", "60C2:1", "60C2:2"}
+    assert {row.address for row in drive.capabilities().missing_objects} == {
+        "1006",
+        "60C2:1",
+        "60C2:2",
+    }
 
 
 class TestWatchdog:
@@ -180,7 +184,7 @@ class TestWatchdog:
         without(scripted, (0x6007, 0))
         drive = make(accept_without=("abort_option",))
         drive.connect()
-        assert drive.capabilities().accepted == ("abort_option",)
+        assert drive.capabilities().accepted_missing_functions == ("abort_option",)
 
     def test_the_old_entry_of_a_node_is_cleared_first(self, make, scripted):
         scripted.objects |= {(0x1016, 0): 3, (0x1016, 2): 100 << 16 | 70, (0x1016, 3): 9 << 16 | 5}

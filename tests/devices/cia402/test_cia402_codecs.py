@@ -30,12 +30,12 @@ EDS = Path(package.__file__).with_name("drive.eds")
         (FRAMES.disable_voltage, 0x605, "2B 40 60 00 00 00 00 00"),
         (FRAMES.end_heartbeat_monitoring, 0x605, "23 16 10 01 00 00 00 00"),
         (FRAMES.read_mode_request, 0x605, "40 61 60 00 00 00 00 00"),
-        (FRAMES.rpdo(0x00, 0), 0x205, "00 00 00 00"),
-        (FRAMES.rpdo(0x06, 0), 0x205, "06 00 00 00"),
-        (FRAMES.rpdo(0x0F, 1000), 0x205, "0F 00 E8 03"),
-        (FRAMES.rpdo(0x0F, -1), 0x205, "0F 00 FF FF"),
-        (FRAMES.rpdo(0x0F, 32767), 0x205, "0F 00 FF 7F"),
-        (FRAMES.rpdo(0x80, -32768), 0x205, "80 00 00 80"),
+        (FRAMES.rpdo_frame(0x00, 0), 0x205, "00 00 00 00"),
+        (FRAMES.rpdo_frame(0x06, 0), 0x205, "06 00 00 00"),
+        (FRAMES.rpdo_frame(0x0F, 1000), 0x205, "0F 00 E8 03"),
+        (FRAMES.rpdo_frame(0x0F, -1), 0x205, "0F 00 FF FF"),
+        (FRAMES.rpdo_frame(0x0F, 32767), 0x205, "0F 00 FF 7F"),
+        (FRAMES.rpdo_frame(0x80, -32768), 0x205, "80 00 00 80"),
     ],
 )
 def test_frames_sent(frame, can_id, data):
@@ -78,7 +78,10 @@ def test_tpdo_and_rpdo_round_trip(word, position, torque):
         position,
         torque,
     )
-    assert unpack_frame(FRAMES.rpdo(word, torque)) == (0x205, little(word, 2) + little(torque, 2))
+    assert unpack_frame(FRAMES.rpdo_frame(word, torque)) == (
+        0x205,
+        little(word, 2) + little(torque, 2),
+    )
 
 
 def test_emergency():
@@ -111,11 +114,11 @@ def test_reply_to_the_request_of_the_mode(data, mode):
 
 
 def test_confirmation_of_a_write():
-    assert protocol.is_written(bytes.fromhex("60 40 60 00 00 00 00 00"), 0x6040, 0)
-    assert protocol.is_written(bytes.fromhex("60 16 10 01 00 00 00 00"), 0x1016, 1)
-    assert not protocol.is_written(bytes.fromhex("80 40 60 00 22 00 00 08"), 0x6040, 0)
-    assert not protocol.is_written(bytes.fromhex("60 40 60 00"), 0x6040, 0)
-    assert not protocol.is_written(bytes.fromhex("60 41 60 00 00 00 00 00"), 0x6040, 0)
+    assert protocol.confirms_write(bytes.fromhex("60 40 60 00 00 00 00 00"), 0x6040, 0)
+    assert protocol.confirms_write(bytes.fromhex("60 16 10 01 00 00 00 00"), 0x1016, 1)
+    assert not protocol.confirms_write(bytes.fromhex("80 40 60 00 22 00 00 08"), 0x6040, 0)
+    assert not protocol.confirms_write(bytes.fromhex("60 40 60 00"), 0x6040, 0)
+    assert not protocol.confirms_write(bytes.fromhex("60 41 60 00 00 00 00 00"), 0x6040, 0)
 
 
 def test_the_state_of_every_statusword():

@@ -49,13 +49,13 @@ def check(tmp_path):
 
 
 def by_address(suitability):
-    return {finding.what.split()[0]: finding for finding in suitability.findings}
+    return {finding.checked_item.split()[0]: finding for finding in suitability.findings}
 
 
 def test_a_complete_drive_fits(check, rig):
     for suitability in (check(COMPLETE), check(COMPLETE, rig())):
         assert suitability.refusals == ()
-        grades = {f.what: f.grade for f in suitability.findings}
+        grades = {f.checked_item: f.grade for f in suitability.findings}
         assert set(grades.values()) == {Grade.FITS, Grade.SUBSTITUTED}
         # A finding for every object of the table, except the identity and those stated in words.
         assert len(grades) == len(CORE_REQUIREMENTS) + len(OPTIONAL_REQUIREMENTS) - 4 + 5
@@ -84,8 +84,8 @@ def test_deficiencies_of_the_two_real_drives(rig):
     elmo = by_address(check_suitability(read_eds(eds_path("elmo_gold")), rig()))
     for address in ("60E0", "60E1"):
         assert elmo[address].grade is Grade.FITS
-        assert elmo[address].found == "ro, 50000: it does"
-        assert elmo[address].wanted == "at least 1800"
+        assert elmo[address].stated_text == "ro, 50000: it does"
+        assert elmo[address].required_text == "at least 1800"
     assert not [f for f in elmo.values() if f.grade is Grade.REFUSED]
 
     epos = read_eds(eds_path("epos4_0170"))
@@ -100,7 +100,7 @@ def test_deficiencies_of_the_two_real_drives(rig):
 
 @pytest.mark.parametrize("needed", CORE_REQUIREMENTS, ids=lambda needed: needed.address)
 def test_a_missing_core_object_is_refused_by_name(check, needed):
-    address = f"{needed.index:04X}:{needed.sub}"
+    address = f"{needed.index:04X}:{needed.subindex}"
     found = check(without(address if f"{address} " in COMPLETE else needed.address))
     (refusal,) = found.refusals
     assert needed.address in refusal
@@ -115,7 +115,7 @@ def test_a_file_without_modes_leaves_the_question_to_the_drive(check, modes):
     found = check(changed("6502", f"u32 ro {modes}"))
     assert found.refusals == ()
     assert by_address(found)["6502"].grade is Grade.ASK
-    assert "rigd reads it from the drive" in by_address(found)["6502"].found
+    assert "rigd reads it from the drive" in by_address(found)["6502"].stated_text
 
 
 def test_a_mode_that_cannot_be_set_does_not_count(check):
@@ -164,7 +164,7 @@ def test_unusable_objects_are_refused(check, address, line, words):
 def test_read_only_objects_may_have_the_needed_value(check, address, line, found):
     suitability = check(changed(address, line))
     assert suitability.refusals == ()
-    assert by_address(suitability)[address].found == found
+    assert by_address(suitability)[address].stated_text == found
 
 
 def test_fixed_pdos_mapped_as_needed(check):
@@ -175,9 +175,9 @@ def test_fixed_pdos_mapped_as_needed(check):
     )
     suitability = check(fixed)
     assert suitability.refusals == ()
-    assert by_address(suitability)["1600"].found == "const, 2: it does"
+    assert by_address(suitability)["1600"].stated_text == "const, 2: it does"
     always_on = fixed.replace("1400:1 u32 rw", "1400:1 u32 const")
-    assert by_address(check(always_on))["1400:1"].found == "const, 0x201: it does"
+    assert by_address(check(always_on))["1400:1"].stated_text == "const, 0x201: it does"
     (refusal,) = check(changed("1400:1", "u32 const 0x201")).refusals
     assert "1400:1 (COB-ID of RPDO1) is read-only" in refusal
     (refusal,) = check(fixed.replace("0x60710010", "0x60FF0020")).refusals
@@ -192,7 +192,7 @@ def test_objects_of_an_existing_mapping_can_be_mapped(check):
 def test_write_only_objects_are_doubtful_or_refused(check, rig):
     mode = by_address(check(changed("6060", "i8 wo -"), rig()))["6060"]
     assert mode.grade is Grade.DOUBT
-    assert "write-only" in mode.sentence
+    assert "write-only" in mode.consequence
     (refusal,) = check(changed("60B2", "i16 wo -"), rig()).refusals
     assert "60B2" in refusal
     assert "write-only" in refusal
@@ -202,7 +202,7 @@ def test_a_missing_watchdog_is_reported(check, rig):
     unwatched = without("1016:1")
     warned = by_address(check(unwatched))["watchdog"]
     assert warned.grade is Grade.DOUBT
-    assert warned.accept == "watchdog"
+    assert warned.acceptance_name == "watchdog"
     (refusal,) = check(unwatched, rig()).refusals
     assert "1016:1" in refusal
     assert 'cia402.accept_without = ["watchdog"]' in refusal
@@ -215,7 +215,7 @@ def test_a_missing_watchdog_is_reported(check, rig):
     ):
         watchdog = by_address(check(table, rig(**values)))["watchdog"]
         assert watchdog.grade is Grade.SUBSTITUTED
-        assert words in watchdog.found
+        assert words in watchdog.stated_text
     # What the drive does on a lost connection is then its maker's choice anyway.
     for values in ({"own_watchdog_s": 0.1}, {"accept_without": ("watchdog",)}):
         assert check(without("1016:1", "6007"), rig(**values)).refusals == ()
@@ -269,15 +269,15 @@ def test_write_only_and_out_of_limits_is_doubtful(check, rig):
     found = check(text, rig())
     assert found.refusals == ()
     assert by_address(found)["6072"].grade is Grade.DOUBT
-    assert "takes anything to 1000, not 1800" in by_address(found)["6072"].sentence
+    assert "takes anything to 1000, not 1800" in by_address(found)["6072"].consequence
 
 
 def test_each_sentence_names_its_object_and_ends(check):
     suitability = check("6040 u16 rw 0")
     assert len(suitability.refusals) >= len(CORE_REQUIREMENTS) - 1
     for finding in suitability.findings:
-        assert finding.sentence == "" or finding.sentence.endswith(".")
-        assert bool(finding.sentence) or finding.grade in (
+        assert finding.consequence == "" or finding.consequence.endswith(".")
+        assert bool(finding.consequence) or finding.grade in (
             Grade.FITS,
             Grade.SUBSTITUTED,
             Grade.ASK,
