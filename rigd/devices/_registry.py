@@ -7,7 +7,7 @@ from types import ModuleType
 
 from rigd.devices._unknown import describe_unknown_values
 from rigd.devices.contracts import DeviceError, Devices
-from rigd.devices.kinds import DEVICES, fits, known_selections
+from rigd.devices.kinds import DEVICES, can_be_combined, known_selections
 from rigd.devices.parameters import DeviceSelection, RigParameters
 from rigd.devices.running_simulator import find_simulator, profile_differences
 from rigd.errors import UserError
@@ -57,7 +57,7 @@ def check_selection(selection: DeviceSelection, profile_path: Path | None = None
         If the package that adds one of the devices cannot be used.
     """
     drive, sensor = DEVICES.get(selection.drive), DEVICES.get(selection.sensor)
-    if drive is None or sensor is None or not fits(drive, sensor):
+    if drive is None or sensor is None or not can_be_combined(drive, sensor):
         known_pairs = "; ".join(known_selections())
         file_prefix = "" if profile_path is None else f"{profile_path}: "
         raise UnknownDeviceError(

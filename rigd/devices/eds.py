@@ -17,9 +17,9 @@ from typing import Final
 from rigd.errors import FailureError
 from rigd.printable import printable
 
-MAX_BYTES: Final = 4_000_000
+MAX_FILE_BYTES: Final = 4_000_000
 """Largest size of a file in bytes: four times the size of the largest that vendors publish."""
-MAX_ENTRIES: Final = 20_000
+MAX_EDS_ENTRIES: Final = 20_000
 """Largest number of objects and sub-indices in a file: five times that of the largest drives."""
 
 _MAX_SHOWN_CHARACTERS: Final = 80
@@ -29,7 +29,7 @@ _BIT_RATES_KBIT_S: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
 """Bit rates of CANopen in kbit/s, for which an EDS file states whether the drive supports them."""
 _ARRAY_OBJECT, _RECORD_OBJECT = 0x8, 0x9
 """Object types (CiA 301) of an array and of a record."""
-_TYPE_LENGTHS_BIT: Final = {
+_LENGTH_BIT_BY_TYPE: Final = {
     0x01: 1, 0x02: 8, 0x03: 16, 0x04: 32, 0x05: 8, 0x06: 16, 0x07: 32, 0x08: 32,
     0x10: 24, 0x11: 64, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64,
     0x16: 24, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64,
@@ -41,22 +41,22 @@ _TEXT_TYPES: Final = (0x09, 0x0B)
 """Data types (CiA 301) of texts."""
 _OCTET_STRING_TYPE, _DOMAIN_TYPE = 0x0A, 0x0F
 """Data types (CiA 301) of a string of bytes and of a block of data."""
-_FLOAT_LAYOUTS: Final = {0x08: "<f", 0x11: "<d"}
+_FLOAT_LAYOUT_BY_TYPE: Final = {0x08: "<f", 0x11: "<d"}
 """Layouts for :mod:`struct` of floating-point numbers, by data type (CiA 301)."""
 _LAST_BASIC_TYPE: Final = 0x1B
 """Largest number of a basic data type (CiA 301); larger numbers are types defined in the file."""
 _ACCESS_RIGHTS: Final = ("ro", "rw", "wo", "const", "rwr", "rww")
 """Access rights that an object can have."""
 
-_OBJECT_TITLE = re.compile(r"[0-9A-F]{4}", re.IGNORECASE)
+_OBJECT_TITLE_PATTERN = re.compile(r"[0-9A-F]{4}", re.IGNORECASE)
 """Pattern of the title of an object's section: its index."""
-_SUB_INDEX_TITLE = re.compile(r"([0-9A-F]{4})sub([0-9A-F]{1,2})", re.IGNORECASE)
+_SUB_INDEX_TITLE_PATTERN = re.compile(r"([0-9A-F]{4})sub([0-9A-F]{1,2})", re.IGNORECASE)
 """Pattern of the title of a sub-index's section: index and sub-index."""
-_QUOTED_VALUE = re.compile(r"""(?s)^(["'])(.*)\1$""")
+_QUOTED_VALUE_PATTERN = re.compile(r"""(?s)^(["'])(.*)\1$""")
 """Pattern of a value in quotation marks, which some editors write around every value."""
-_TRUE_WORDS: Final = ("true", "yes", "on")
+_WORDS_FOR_TRUE: Final = ("true", "yes", "on")
 """Words that some tools write for a flag that is set."""
-_NODE_ID_PLACEHOLDER = re.compile(r"\+?\$NODEID\+?", re.IGNORECASE)
+_NODE_ID_PLACEHOLDER_PATTERN = re.compile(r"\+?\$NODEID\+?", re.IGNORECASE)
 """Pattern of the placeholder for the node number in a value, with its plus sign."""
 _INTEGER_PATTERN = re.compile(r"[+-]?(0x[0-9a-f]{1,32}|[0-9]{1,32})", re.IGNORECASE)
 """Pattern of an integer in CiA 306's notation."""
@@ -81,28 +81,28 @@ class EdsEntry:
     """Name of the object or sub-index in the file."""
     data_type: int
     """Number of the data type by CiA 301, such as 0x0006 for UNSIGNED16; 0: not stated."""
-    access: str
+    access_right: str
     """Access right: ``ro``, ``rw``, ``wo``, ``const``, ``rwr`` or ``rww``."""
-    mappable: bool
+    is_mappable: bool
     """Whether the object can be mapped into a PDO."""
-    default: int | None
+    default_value: int | None
     """Value after power-up, or value that a DCF sets; None: not stated, or not an integer."""
-    low: int | None
+    lower_limit: int | None
     """Lower limit of the value; None: not stated."""
-    high: int | None
+    upper_limit: int | None
     """Upper limit of the value; None: not stated."""
-    content: bytes = b""
+    default_bytes: bytes = b""
     """Default value as the drive's bytes if it is a text, block or fraction; empty: not stated."""
 
     @property
-    def writable(self) -> bool:
+    def is_writable(self) -> bool:
         """Whether the object can be written."""
-        return "w" in self.access
+        return "w" in self.access_right
 
     @property
-    def bits(self) -> int | None:
+    def length_bit(self) -> int | None:
         """Length of the object's value in bits; None for a text or block, or if untyped."""
-        return _TYPE_LENGTHS_BIT.get(self.data_type)
+        return _LENGTH_BIT_BY_TYPE.get(self.data_type)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ class Eds:
         """
         return self.entries.get((index, subindex))
 
-    def has(self, index: int) -> bool:
+    def has_object(self, index: int) -> bool:
         """Return whether the file contains an object, or any sub-index of it."""
         return any((index, subindex) in self.entries for subindex in range(256))
 
@@ -184,7 +184,7 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
         bit_rates_bit_s=tuple(
             1000 * rate_kbit_s
             for rate_kbit_s in _BIT_RATES_KBIT_S
-            if _is_set(device_keys.get(f"baudrate_{rate_kbit_s}", ""))
+            if _is_flag_set(device_keys.get(f"baudrate_{rate_kbit_s}", ""))
         ),
         commissioned_node_id=_commissioned_node_id(sections),
         entries=eds_entries,
@@ -211,16 +211,16 @@ def _read_text(path: Path) -> str:
         if not stat.S_ISREG(file_status.st_mode):
             raise EdsError(f"{path}: is not an ordinary file; name the drive's EDS file.")
         with path.open("rb") as eds_file:
-            file_bytes = eds_file.read(MAX_BYTES + 1)
+            file_bytes = eds_file.read(MAX_FILE_BYTES + 1)
     except EdsError:  # a ValueError too
         raise
     except OSError as error:
         raise EdsError(f"{path}: cannot be read ({error.strerror}).") from error
     except ValueError as error:  # a NUL in the name
         raise EdsError(f"{str(path)!r}: cannot be read ({error}).") from error
-    if len(file_bytes) > MAX_BYTES:
+    if len(file_bytes) > MAX_FILE_BYTES:
         raise EdsError(
-            f"{path}: has more than {MAX_BYTES / 1e6:g} MB, which no EDS file of a drive has."
+            f"{path}: has more than {MAX_FILE_BYTES / 1e6:g} MB, which no EDS file of a drive has."
         )
     if file_bytes.startswith((b"\xff\xfe", b"\xfe\xff")):
         decoded_text = file_bytes.decode("utf-16", errors="replace")
@@ -239,14 +239,14 @@ def _read_text(path: Path) -> str:
     return decoded_text
 
 
-def _parse_sections(text: str, path: Path) -> Sections:
+def _parse_sections(file_text: str, path: Path) -> Sections:
     """Parse the text of a file into sections; ignore lines that are neither title nor key.
 
     If a section or key occurs twice, the first occurrence is used.
     """
     sections: Sections = {}
     section_keys: dict[str, str] = {}
-    for text_line in map(str.strip, text.splitlines()):
+    for text_line in map(str.strip, file_text.splitlines()):
         if not text_line or text_line[0] in ";#":
             continue
         if text_line[0] == "[":
@@ -255,13 +255,13 @@ def _parse_sections(text: str, path: Path) -> Sections:
             section_keys = (
                 sections.setdefault(section_title.strip().lower(), {}) if closing_bracket else {}
             )
-            if len(sections) > MAX_ENTRIES:
+            if len(sections) > MAX_EDS_ENTRIES:
                 raise _too_many_entries_error(path)
             continue
         key, equals_sign, value_text = text_line.partition("=")
         if equals_sign:
             # As in canopen, a comment may follow the value after white space.
-            unquoted_text = _QUOTED_VALUE.sub(
+            unquoted_text = _QUOTED_VALUE_PATTERN.sub(
                 r"\2", re.split(r"\s;", value_text, maxsplit=1)[0].strip()
             )
             section_keys.setdefault(key.strip().lower(), unquoted_text.strip())
@@ -269,9 +269,9 @@ def _parse_sections(text: str, path: Path) -> Sections:
 
 
 def _too_many_entries_error(path: Path) -> EdsError:
-    """Return the error for a file with more than `MAX_ENTRIES` sections or objects."""
+    """Return the error for a file with more than `MAX_EDS_ENTRIES` sections or objects."""
     return EdsError(
-        f"{path}: describes more than {MAX_ENTRIES} objects, which no EDS file of a drive does."
+        f"{path}: describes more than {MAX_EDS_ENTRIES} objects, which no EDS file of a drive does."
     )
 
 
@@ -281,16 +281,16 @@ def _correct_sections(sections: Sections, path: Path) -> dict[tuple[int, int], M
     Sub-indices that an array declares together (``CompactSubObj``) are included. A sub-index
     without name, type or access right gets that of the whole object.
     """
-    objects_by_index: dict[int, dict[int, dict[str, str]]] = {}
+    subsections_by_index: dict[int, dict[int, dict[str, str]]] = {}
     for section_title, section_keys in sections.items():
-        if title_match := _SUB_INDEX_TITLE.fullmatch(section_title):
-            objects_by_index.setdefault(int(title_match[1], 16), {}).setdefault(
+        if title_match := _SUB_INDEX_TITLE_PATTERN.fullmatch(section_title):
+            subsections_by_index.setdefault(int(title_match[1], 16), {}).setdefault(
                 int(title_match[2], 16), section_keys
             )
-        elif _OBJECT_TITLE.fullmatch(section_title):
-            objects_by_index.setdefault(int(section_title, 16), {})
-    corrected_keys: dict[tuple[int, int], Mapping[str, str]] = {}
-    for index, sub_sections in sorted(objects_by_index.items()):
+        elif _OBJECT_TITLE_PATTERN.fullmatch(section_title):
+            subsections_by_index.setdefault(int(section_title, 16), {})
+    corrected_keys_by_address: dict[tuple[int, int], Mapping[str, str]] = {}
+    for index, sub_sections in sorted(subsections_by_index.items()):
         section_title = f"{index:04x}"
         section_keys = _keys_with_values(sections.get(section_title, {}))
         for subindex, compact_keys in _compact_sub_indices(section_title, sections):
@@ -306,22 +306,22 @@ def _correct_sections(sections: Sections, path: Path) -> dict[tuple[int, int], M
         parameter_name = section_keys.get("parametername") or section_title.upper()
         shared_keys = {"parametername": parameter_name}
         if not sub_sections:
-            corrected_keys[index, 0] = shared_keys | section_keys
+            corrected_keys_by_address[index, 0] = shared_keys | section_keys
         shared_keys |= {
             key: section_keys[key] for key in ("datatype", "accesstype") if key in section_keys
         }
         for subindex in sorted(sub_sections):
-            corrected_keys[index, subindex] = shared_keys | _keys_with_values(
+            corrected_keys_by_address[index, subindex] = shared_keys | _keys_with_values(
                 sub_sections[subindex]
             )
-        if len(corrected_keys) > MAX_ENTRIES:
+        if len(corrected_keys_by_address) > MAX_EDS_ENTRIES:
             raise _too_many_entries_error(path)
-    return corrected_keys
+    return corrected_keys_by_address
 
 
-def _keys_with_values(keys: Mapping[str, str]) -> dict[str, str]:
+def _keys_with_values(section_keys: Mapping[str, str]) -> dict[str, str]:
     """Return the keys of a section that have a value."""
-    return {key: value_text for key, value_text in keys.items() if value_text}
+    return {key: value_text for key, value_text in section_keys.items() if value_text}
 
 
 def _compact_sub_indices(
@@ -329,8 +329,8 @@ def _compact_sub_indices(
 ) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield the sub-indices that an object declares together, with their keys."""
     shared_keys = dict(sections.get(section_title, {}))
-    sub_count = _parse_integer_or_zero(shared_keys.pop("compactsubobj", ""))
-    if not 0 < sub_count < 255:
+    subindex_count = _parse_integer_or_zero(shared_keys.pop("compactsubobj", ""))
+    if not 0 < subindex_count < 255:
         return
     names_by_sub, values_by_sub = (
         sections.get(section_title + section_suffix, {}) for section_suffix in ("name", "value")
@@ -341,49 +341,52 @@ def _compact_sub_indices(
             "parametername": "Number of entries",
             "datatype": "0x0005",
             "accesstype": "ro",
-            "defaultvalue": str(sub_count),
+            "defaultvalue": str(subindex_count),
         },
     )
-    for subindex in range(1, sub_count + 1):
-        own_keys = {
+    for subindex in range(1, subindex_count + 1):
+        subindex_keys = {
             "parametername": names_by_sub.get(str(subindex), ""),
             "parametervalue": values_by_sub.get(str(subindex), ""),
         }
         yield (
             subindex,
-            shared_keys | {key: value_text for key, value_text in own_keys.items() if value_text},
+            shared_keys
+            | {key: value_text for key, value_text in subindex_keys.items() if value_text},
         )
 
 
 def _parse_entries(
-    corrected: Mapping[tuple[int, int], Mapping[str, str]], sections: Sections, node_id: int
+    corrected_keys_by_address: Mapping[tuple[int, int], Mapping[str, str]],
+    sections: Sections,
+    node_id: int,
 ) -> Iterator[EdsEntry]:
     """Yield the entries that corrected sections describe."""
-    for (index, subindex), section_keys in corrected.items():
-        data_type = _data_type(section_keys, sections)
+    for (index, subindex), section_keys in corrected_keys_by_address.items():
+        data_type = _basic_data_type(section_keys, sections)
         entry_value: int | bytes | None = None
         # A valid value that a DCF sets takes precedence over the default.
         for key in ("parametervalue", "defaultvalue"):
             if entry_value is None and key in section_keys:
                 entry_value = _parse_value(section_keys[key], data_type, node_id)
-        access_right = section_keys.get("accesstype", "").lower()
+        stated_access_right = section_keys.get("accesstype", "").lower()
         yield EdsEntry(
             index=index,
             subindex=subindex,
             name=_printable_line(section_keys["parametername"]),
             data_type=data_type,
-            access=access_right if access_right in _ACCESS_RIGHTS else "rw",
-            mappable=_is_set(section_keys.get("pdomapping", "")),
-            default=entry_value if isinstance(entry_value, int) else None,
-            low=_to_signed(_parse_integer(section_keys.get("lowlimit", "")), data_type),
-            high=_to_signed(_parse_integer(section_keys.get("highlimit", "")), data_type),
-            content=entry_value if isinstance(entry_value, bytes) else b"",
+            access_right=stated_access_right if stated_access_right in _ACCESS_RIGHTS else "rw",
+            is_mappable=_is_flag_set(section_keys.get("pdomapping", "")),
+            default_value=entry_value if isinstance(entry_value, int) else None,
+            lower_limit=_to_signed(_parse_integer(section_keys.get("lowlimit", "")), data_type),
+            upper_limit=_to_signed(_parse_integer(section_keys.get("highlimit", "")), data_type),
+            default_bytes=entry_value if isinstance(entry_value, bytes) else b"",
         )
 
 
-def _data_type(keys: Mapping[str, str], sections: Sections) -> int:
+def _basic_data_type(section_keys: Mapping[str, str], sections: Sections) -> int:
     """Return the basic data type of an object; a type defined in the file is resolved."""
-    data_type = _parse_integer_or_zero(keys.get("datatype", ""))
+    data_type = _parse_integer_or_zero(section_keys.get("datatype", ""))
     if data_type > _LAST_BASIC_TYPE:
         # Tools define their own type for a number with limits, as an object whose sub-index 1
         # names the basic type.
@@ -394,22 +397,24 @@ def _data_type(keys: Mapping[str, str], sections: Sections) -> int:
     return max(data_type, 0)
 
 
-def _parse_value(text: str, data_type: int, node_id: int) -> int | bytes | None:
+def _parse_value(value_text: str, data_type: int, node_id: int) -> int | bytes | None:
     """Return a default value of an EDS file, or None if it is invalid.
 
     Integers are returned as int, other types as the bytes that the drive would send.
     """
     try:
         if data_type in _TEXT_TYPES:
-            return text.encode("utf-8", errors="replace")
+            return value_text.encode("utf-8", errors="replace")
         if data_type in (_OCTET_STRING_TYPE, _DOMAIN_TYPE):
-            return bytes.fromhex(text)
-        if data_type in _FLOAT_LAYOUTS:
-            return struct.pack(_FLOAT_LAYOUTS[data_type], float(text))
+            return bytes.fromhex(value_text)
+        if data_type in _FLOAT_LAYOUT_BY_TYPE:
+            return struct.pack(_FLOAT_LAYOUT_BY_TYPE[data_type], float(value_text))
     except (ValueError, OverflowError):
         return None
     # A CAN identifier may be written as $NODEID+0x180.
-    number_text, placeholder_count = _NODE_ID_PLACEHOLDER.subn("", text.replace(" ", ""))
+    number_text, placeholder_count = _NODE_ID_PLACEHOLDER_PATTERN.subn(
+        "", value_text.replace(" ", "")
+    )
     integer_value = 0 if placeholder_count and not number_text else _parse_integer(number_text)
     if integer_value is None:
         return None
@@ -421,9 +426,9 @@ def _to_signed(integer_value: int | None, data_type: int) -> int | None:
     if (
         integer_value is not None
         and data_type in _SIGNED_TYPES
-        and integer_value >> _TYPE_LENGTHS_BIT[data_type] - 1 == 1
+        and integer_value >> _LENGTH_BIT_BY_TYPE[data_type] - 1 == 1
     ):
-        return integer_value - (1 << _TYPE_LENGTHS_BIT[data_type])
+        return integer_value - (1 << _LENGTH_BIT_BY_TYPE[data_type])
     return integer_value
 
 
@@ -432,27 +437,27 @@ def _identity_number(
 ) -> int:
     """Return a number of the drive's identity: from object 1018, or else from `header_text`."""
     identity_entry = entries.get((0x1018, subindex))
-    identity_value = (identity_entry.default if identity_entry else None) or _parse_integer_or_zero(
-        header_text
-    )
+    identity_value = (
+        identity_entry.default_value if identity_entry else None
+    ) or _parse_integer_or_zero(header_text)
     return (
         identity_value if 0 <= identity_value < 0xFFFF_FFFF else 0
     )  # in some files, all bits set: not stated
 
 
-def _parse_integer_or_zero(text: str) -> int:
+def _parse_integer_or_zero(number_text: str) -> int:
     """Parse an integer in CiA 306's notation; return 0 if the text is not an integer."""
-    return _parse_integer(text) or 0
+    return _parse_integer(number_text) or 0
 
 
-def _is_set(text: str) -> bool:
+def _is_flag_set(flag_text: str) -> bool:
     """Return whether a flag is set: 1 in CiA 306's notation, TRUE in that of some tools."""
-    return text.lower() in _TRUE_WORDS or _parse_integer_or_zero(text) != 0
+    return flag_text.lower() in _WORDS_FOR_TRUE or _parse_integer_or_zero(flag_text) != 0
 
 
-def _parse_integer(text: str) -> int | None:
+def _parse_integer(number_text: str) -> int | None:
     """Parse an integer in CiA 306's notation: 0x1F, 31, or octal 037; return None if invalid."""
-    integer_match = _INTEGER_PATTERN.fullmatch(text.strip())
+    integer_match = _INTEGER_PATTERN.fullmatch(number_text.strip())
     if integer_match is None:
         return None
     digit_text = integer_match[0].lower()
@@ -462,6 +467,6 @@ def _parse_integer(text: str) -> int | None:
     return int(digit_text, 16) if "x" in digit_text else int(digit_text)
 
 
-def _printable_line(text: str) -> str:
+def _printable_line(file_text: str) -> str:
     """Return a text of the file as messages may show it: one line, printable, not too long."""
-    return printable(" ".join(text.split()), _MAX_SHOWN_CHARACTERS)
+    return printable(" ".join(file_text.split()), _MAX_SHOWN_CHARACTERS)

@@ -43,8 +43,11 @@ def failure_of_device(error: Exception, selection: DeviceSelection) -> str:
     if isinstance(error, DeviceError | OSError):
         return str(error)
     for name in (selection.drive, selection.sensor):
-        owner = DEVICES.owner(name)
-        if owner is not None and (package_error := error_of_package(error, owner)) is not None:
+        owner_plugin = DEVICES.owner(name)
+        if (
+            owner_plugin is not None
+            and (package_error := error_of_package(error, owner_plugin)) is not None
+        ):
             return str(package_error)
     raise error
 
@@ -59,8 +62,8 @@ def selected_kinds(selection: DeviceSelection) -> tuple[DeviceKind, ...]:
     PluginError
         If a package that adds one of these devices cannot be used.
     """
-    names = dict.fromkeys((selection.drive, selection.sensor))
-    return tuple(kind for name in names if (kind := DEVICES.get(name)) is not None)
+    device_names = dict.fromkeys((selection.drive, selection.sensor))
+    return tuple(kind for name in device_names if (kind := DEVICES.get(name)) is not None)
 
 
 def known_selections() -> list[str]:
@@ -68,17 +71,24 @@ def known_selections() -> list[str]:
 
     The last phrase names the devices that installed packages add.
     """
-    phrases = [
+    selection_phrases = [
         f'drive = "{drive.name}" with sensor = "{sensor.name}"'
         for drive in SHIPPED.values()
         for sensor in SHIPPED.values()
-        if drive.open_drive and sensor.open_sensor and fits(drive, sensor)
+        if drive.open_drive and sensor.open_sensor and can_be_combined(drive, sensor)
     ]
-    added = [plugin.name for plugin in DEVICES.added()]
-    return [*phrases, *([f"installed packages add {', '.join(added)}"] if added else [])]
+    added_device_names = [plugin.name for plugin in DEVICES.added()]
+    return [
+        *selection_phrases,
+        *(
+            [f"installed packages add {', '.join(added_device_names)}"]
+            if added_device_names
+            else []
+        ),
+    ]
 
 
-def fits(drive: DeviceKind, sensor: DeviceKind) -> bool:
+def can_be_combined(drive: DeviceKind, sensor: DeviceKind) -> bool:
     """Return whether a kind of drive and a kind of sensor can be combined.
 
     Parameters

@@ -67,7 +67,7 @@ Disturbance = Obstacle | ImpactSpecification
 class _ObstacleKey:
     """Key of the text form of an obstacle or impact."""
 
-    field: str
+    field_name: str
     """Name of the dataclass field that the key sets."""
     allowed_text: str
     """Description of the allowed values, for error messages."""
@@ -88,7 +88,7 @@ def _is_time_allowed(time_s: float) -> bool:
     return 0 <= time_s <= _LATEST_TIME_S
 
 
-_OBSTACLE_KEYS: dict[type[Disturbance], dict[str, _ObstacleKey]] = {
+_KEYS_BY_DISTURBANCE_TYPE: dict[type[Disturbance], dict[str, _ObstacleKey]] = {
     Obstacle: {
         "x": _ObstacleKey("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, is_required=True),
         "angle": _ObstacleKey(
@@ -121,7 +121,7 @@ _OBSTACLE_KEYS: dict[type[Disturbance], dict[str, _ObstacleKey]] = {
     },
 }
 """Keys of the text form of an obstacle and of an impact."""
-_NAMED_VALUES = {"rigid": inf}
+_NUMBER_BY_WORD = {"rigid": inf}
 """Numbers that can be written as a word."""
 INCOMPATIBLE_WITH_FORCES = (
     "clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz", "stiffness_drift_per_s",
@@ -134,12 +134,12 @@ INCOMPATIBLE_WITH_OBSTACLES = (
 """Keys of ``[simulation]`` that cannot be combined with an obstacle or impact."""
 
 
-def parse_obstacle(text: str) -> Disturbance:
+def parse_obstacle(obstacle_text: str) -> Disturbance:
     """Parse the text form of an obstacle or impact.
 
     Parameters
     ----------
-    text
+    obstacle_text
         ``key=value`` pairs, separated by commas. For an obstacle: ``x`` (m), ``angle`` (rad) and,
         optionally, ``stiffness`` (N/m, or ``rigid``, the default), ``damping`` (N·s/m), ``side`` (1
         or -1; by default the sign of the angle), ``rate`` (rad/s), ``from`` and ``until`` (s). For
@@ -156,45 +156,48 @@ def parse_obstacle(text: str) -> Disturbance:
     >>> parse_obstacle("x=0.62,angle=0.6,stiffness=3000").stiffness_n_per_m
     3000.0
     """
-    assignments = [assignment.strip() for assignment in text.split(",")]
+    assignments = [assignment.strip() for assignment in obstacle_text.split(",")]
     disturbance_type = (
         ImpactSpecification
         if any(assignment.partition("=")[0].strip() == "force" for assignment in assignments)
         else Obstacle
     )
-    allowed_keys = _OBSTACLE_KEYS[disturbance_type]
-    field_values: dict[str, float] = {}
+    allowed_key_by_name = _KEYS_BY_DISTURBANCE_TYPE[disturbance_type]
+    value_by_field: dict[str, float] = {}
     for assignment in assignments:
         key_name, _, value_text = (text_part.strip() for text_part in assignment.partition("="))
-        if key_name not in allowed_keys:
-            raise _obstacle_error(text, f"unknown key '{key_name}'; give {', '.join(allowed_keys)}")
-        key = allowed_keys[key_name]
-        if key.field in field_values:
-            raise _obstacle_error(text, f"'{key_name}' is given twice")
+        if key_name not in allowed_key_by_name:
+            raise _obstacle_error(
+                obstacle_text, f"unknown key '{key_name}'; give {', '.join(allowed_key_by_name)}"
+            )
+        obstacle_key = allowed_key_by_name[key_name]
+        if obstacle_key.field_name in value_by_field:
+            raise _obstacle_error(obstacle_text, f"'{key_name}' is given twice")
         try:
             field_value = (
-                _NAMED_VALUES[value_text]
-                if value_text in _NAMED_VALUES
+                _NUMBER_BY_WORD[value_text]
+                if value_text in _NUMBER_BY_WORD
                 else _parse_finite(value_text)
             )
-            if not key.is_allowed(field_value):
+            if not obstacle_key.is_allowed(field_value):
                 raise ValueError(value_text)
         except ValueError:
             raise _obstacle_error(
-                text, f"{key_name}={value_text}: give {key.allowed_text}"
+                obstacle_text, f"{key_name}={value_text}: give {obstacle_key.allowed_text}"
             ) from None
-        field_values[key.field] = field_value
-    for key_name, key in allowed_keys.items():
-        if key.is_required and key.field not in field_values:
+        value_by_field[obstacle_key.field_name] = field_value
+    for key_name, obstacle_key in allowed_key_by_name.items():
+        if obstacle_key.is_required and obstacle_key.field_name not in value_by_field:
             raise _obstacle_error(
-                text, f"'{key_name}' is missing; give {key_name}=…, {key.allowed_text}"
+                obstacle_text,
+                f"'{key_name}' is missing; give {key_name}=…, {obstacle_key.allowed_text}",
             )
     if disturbance_type is ImpactSpecification:
-        return ImpactSpecification(**field_values)
-    side = int(field_values.pop("side", _default_side(field_values["angle_rad"])))
-    obstacle = Obstacle(**field_values, side=side)
+        return ImpactSpecification(**value_by_field)
+    side = int(value_by_field.pop("side", _default_side(value_by_field["angle_rad"])))
+    obstacle = Obstacle(**value_by_field, side=side)
     if obstacle.until_s <= obstacle.from_s:
-        raise _obstacle_error(text, "until is not later than from")
+        raise _obstacle_error(obstacle_text, "until is not later than from")
     return obstacle
 
 
@@ -232,14 +235,14 @@ def check_obstacles(
                 )
 
 
-def with_obstacles(rig: RigParameters, added_texts: Iterable[str]) -> RigParameters:
+def with_obstacles(rig: RigParameters, added_obstacle_texts: Iterable[str]) -> RigParameters:
     """Return a rig's parameters with more obstacles and impacts on its simulated beam.
 
     Parameters
     ----------
     rig
         Parameters of the rig, with a section ``simulation``.
-    added_texts
+    added_obstacle_texts
         Obstacles and impacts in the syntax of `parse_obstacle`.
 
     Raises
@@ -253,13 +256,13 @@ def with_obstacles(rig: RigParameters, added_texts: Iterable[str]) -> RigParamet
             f"The profile {rig.name} has no section [simulation], so that its beam cannot have an "
             "obstacle; copy it from that of rigd profiles show sim."
         )
-    added_texts = tuple(added_texts)
+    added_obstacle_texts = tuple(added_obstacle_texts)
     simulated_effects = {
         effect_name: getattr(simulation, effect_name) for effect_name in INCOMPATIBLE_WITH_OBSTACLES
     }
-    check_obstacles(map(parse_obstacle, added_texts), rig.beam, simulated_effects)
+    check_obstacles(map(parse_obstacle, added_obstacle_texts), rig.beam, simulated_effects)
     return replace(
-        rig, simulation=replace(simulation, obstacles=simulation.obstacles + added_texts)
+        rig, simulation=replace(simulation, obstacles=simulation.obstacles + added_obstacle_texts)
     )
 
 
@@ -271,17 +274,18 @@ def describe_obstacle(disturbance: Disturbance) -> str:
     disturbance
         Obstacle or impact.
     """
-    default_values = {
+    default_value_by_field = {
         dataclass_field.name: dataclass_field.default for dataclass_field in fields(disturbance)
     }
     if isinstance(disturbance, Obstacle):
-        default_values["side"] = _default_side(disturbance.angle_rad)
+        default_value_by_field["side"] = _default_side(disturbance.angle_rad)
     return ",".join(
         f"{key_name}={field_value:g}"
         if float(f"{field_value:g}") == field_value
         else f"{key_name}={field_value!r}"
-        for key_name, key in _OBSTACLE_KEYS[type(disturbance)].items()
-        if (field_value := getattr(disturbance, key.field)) != default_values[key.field]
+        for key_name, key in _KEYS_BY_DISTURBANCE_TYPE[type(disturbance)].items()
+        if (field_value := getattr(disturbance, key.field_name))
+        != default_value_by_field[key.field_name]
     )
 
 
@@ -290,14 +294,14 @@ def _default_side(angle_rad: float) -> int:
     return -1 if angle_rad < 0 else 1
 
 
-def _parse_finite(text: str) -> float:
+def _parse_finite(number_text: str) -> float:
     """Parse a finite number, or raise ValueError."""
-    parsed_number = float(text)
+    parsed_number = float(number_text)
     if not isfinite(parsed_number):
-        raise ValueError(text)
+        raise ValueError(number_text)
     return parsed_number
 
 
-def _obstacle_error(text: str, reason: str) -> ObstacleError:
+def _obstacle_error(obstacle_text: str, reason: str) -> ObstacleError:
     """Return the error for a text that describes no valid obstacle or impact, with the reason."""
-    return ObstacleError(f"Obstacle '{text}': {reason}.")
+    return ObstacleError(f"Obstacle '{obstacle_text}': {reason}.")

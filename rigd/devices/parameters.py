@@ -321,14 +321,14 @@ class AtiSerial:
         """Return the number of records that the sensor streams per tick, rounded, at least 1."""
         return max(1, round(self.stream_hz / rate_hz))
 
-    def weights(self, rate_hz: float) -> tuple[float, ...]:
+    def filter_weights(self, rate_hz: float) -> tuple[float, ...]:
         """Return the weights of the decimating filter, oldest record first; their sum is 1.
 
         Examples
         --------
         >>> from rigd.devices.parameters import AtiSerial
         >>> sensor = AtiSerial("/dev/ttyUSB0", 1_250_000, 3000.0, "triangle", 1, "", 32767)
-        >>> [round(9 * weight) for weight in sensor.weights(rate_hz=1000)]
+        >>> [round(9 * weight) for weight in sensor.filter_weights(rate_hz=1000)]
         [1, 2, 3, 2, 1]
         >>> round(1e6 * sensor.filter_delay_s(1000))  # µs
         667
@@ -340,7 +340,7 @@ class AtiSerial:
 
     def filter_delay_s(self, rate_hz: float) -> float:
         """Return the group delay of the decimating filter in s, relative to the newest record."""
-        return 0.5 * (len(self.weights(rate_hz)) - 1) / self.stream_hz
+        return 0.5 * (len(self.filter_weights(rate_hz)) - 1) / self.stream_hz
 
 
 @dataclass(frozen=True, slots=True)

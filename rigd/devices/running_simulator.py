@@ -40,10 +40,10 @@ class SimulatorAddress:
     lock_step: bool = False
     """Whether the simulation advances by one period per SYNC instead of in real time."""
     rig: Mapping[str, object] = field(default_factory=dict)
-    """Parameters of the simulated rig by dotted key, as returned by `described`."""
+    """Parameters of the simulated rig by dotted key, as returned by `parameters_by_dotted_key`."""
 
 
-def described(rig: "RigParameters") -> dict[str, object]:
+def parameters_by_dotted_key(rig: "RigParameters") -> dict[str, object]:
     """Return a rig's parameters as a flat JSON object, by dotted key."""
     return json.loads(json.dumps(dict(_flatten(asdict(rig), ""))))  # type: ignore[no-any-return]
 
@@ -60,7 +60,7 @@ def profile_differences(rig: "RigParameters", simulator: SimulatorAddress) -> li
     simulator
         Address of the simulated rig.
     """
-    own_parameters, simulated_parameters = described(rig), simulator.rig
+    own_parameters, simulated_parameters = parameters_by_dotted_key(rig), simulator.rig
     return [
         f"{key} = {_format_value(simulated_parameters[key])} instead of "
         f"{_format_value(profile_value)}"
@@ -71,18 +71,18 @@ def profile_differences(rig: "RigParameters", simulator: SimulatorAddress) -> li
     ]
 
 
-def announce(rig_name: str, address: SimulatorAddress) -> Path:
+def write_address_file(rig_name: str, simulator_address: SimulatorAddress) -> Path:
     """Write the address file of a simulator, and return its path.
 
     Parameters
     ----------
     rig_name
         Name of the profile whose hardware the simulator replaces.
-    address
+    simulator_address
         Address of the simulator.
     """
     address_path = _address_file(rig_name)
-    write_address(address_path, asdict(address))
+    write_address(address_path, asdict(simulator_address))
     return address_path
 
 
@@ -103,12 +103,12 @@ def find_simulator(rig_name: str) -> SimulatorAddress | None:
     return simulator_address if is_running else None
 
 
-def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[str, Any]:
+def ask_simulator(simulator_address: SimulatorAddress, request: dict[str, Any]) -> dict[str, Any]:
     """Send a request to a running simulator, and return its reply.
 
     Parameters
     ----------
-    address
+    simulator_address
         Address of the simulator.
     request
         Request with one key: ``inject``, ``status`` or ``renew_noise``.
@@ -121,20 +121,21 @@ def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[st
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as control_link:
             control_link.settimeout(_REPLY_TIMEOUT_S)
-            control_link.connect(address.control_socket)
+            control_link.connect(simulator_address.control_socket)
             control_link.sendall(json.dumps(request).encode() + b"\n")
             with control_link.makefile("rb") as reply_lines:
                 reply = json.loads(reply_lines.readline(_MAX_REPLY_BYTES))
     except (OSError, ValueError) as error:
         raise DeviceError(
-            f"The simulated rig (process {address.pid}) does not answer ({error}); start it again."
+            f"The simulated rig (process {simulator_address.pid}) does not answer ({error}); start "
+            "it again."
         ) from None
     if not isinstance(reply, dict) or "error" in reply:
         raise DeviceError(str(reply["error"] if isinstance(reply, dict) else reply))
     return reply
 
 
-def unreachable_simulators(rig_name: str) -> list[Path]:
+def unreachable_simulator_sockets(rig_name: str) -> list[Path]:
     """Return the control sockets on which simulators of a rig listen on this computer.
 
     The kernel lists the sockets of all users, in every runtime folder. Call this function only if
@@ -150,10 +151,10 @@ def unreachable_simulators(rig_name: str) -> list[Path]:
         return []
 
 
-def _flatten(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, object]]:
+def _flatten(table: Mapping[str, object], key_prefix: str) -> Iterator[tuple[str, object]]:
     """Yield dotted key and value of each leaf of a nested table."""
     for key, leaf_value in table.items():
-        dotted_key = prefix + key.rstrip("_")
+        dotted_key = key_prefix + key.rstrip("_")
         if isinstance(leaf_value, dict):
             yield from _flatten(leaf_value, dotted_key + ".")
         else:

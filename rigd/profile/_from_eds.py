@@ -365,9 +365,11 @@ class Draft:
         """
         object_names = [
             f"{e.index:04X}:{e.subindex:X} "
-            f"({e.name}{'' if e.default is None else f', {e.default}'})"
+            f"({e.name}{'' if e.default_value is None else f', {e.default_value}'})"
             for e in self._eds.entries.values()
-            if e.index in _MANUFACTURER_INDICES and e.writable and _TORQUE_LIMIT_NAME.search(e.name)
+            if e.index in _MANUFACTURER_INDICES
+            and e.is_writable
+            and _TORQUE_LIMIT_NAME.search(e.name)
         ]
         return " or ".join(object_names[:_MAX_NAMED_OBJECTS])
 

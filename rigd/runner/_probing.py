@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from rigd.devices import ActuationTarget, describe_actuation_target, is_simulated_here
-from rigd.devices.running_simulator import described, find_simulator
+from rigd.devices.running_simulator import find_simulator, parameters_by_dotted_key
 from rigd.engine import probed_rig
 from rigd.errors import FailureError
 from rigd.profile import Profile
@@ -129,7 +129,7 @@ def _is_simulated_with_profile(profile: Profile) -> bool:
     simulator = find_simulator(profile.rig.name)
     if simulator is None:
         return False
-    profile_values = _verified_values(described(profile.rig))
+    profile_values = _verified_values(parameters_by_dotted_key(profile.rig))
     return all(
         simulator.rig.get(key) == profile_value for key, profile_value in profile_values.items()
     )
@@ -252,7 +252,7 @@ def _validity_key(profile: Profile, rig: Rig) -> str:
     simulator = find_simulator(profile.rig.name)
     limits = profile.limits
     dependencies = (
-        _verified_values(described(profile.rig)),
+        _verified_values(parameters_by_dotted_key(profile.rig)),
         (limits.angle_rad, limits.velocity_rad_s),
         dict(rig.drive_statement),
         dict(rig.calibration or {}),

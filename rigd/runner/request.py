@@ -30,7 +30,7 @@ from rigd.devices import (
 from rigd.devices.kinds import DEVICES
 from rigd.devices.obstacles import with_obstacles
 from rigd.devices.parameters import RigParameters
-from rigd.devices.running_simulator import unreachable_simulators
+from rigd.devices.running_simulator import unreachable_simulator_sockets
 from rigd.engine.messages import DevicesConnected, FileHeader, PostRecordPlan
 from rigd.excitation import Excitation, PrecisionExcitation, PrecisionSearch, find_excitation
 from rigd.plugins import plugin_errors
@@ -175,7 +175,7 @@ def load_rig(
 
 def _refuse_unreachable_simulators(profile: Profile) -> None:
     """Raise if a simulated rig of a profile is running but this process cannot reach it."""
-    for simulator_path in unreachable_simulators(profile.rig.name):
+    for simulator_path in unreachable_simulator_sockets(profile.rig.name):
         remedy, owner_name = "run this command as its user to use it", "by another user"
         with suppress(OSError, ValueError):
             uid = simulator_path.stat().st_uid

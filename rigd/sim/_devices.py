@@ -112,7 +112,7 @@ class SimulatedRig:
         filter_weights: tuple[float, ...] = (1.0,)
         self.records_per_period = 1
         if rig.ati_serial is not None:
-            filter_weights = rig.ati_serial.weights(rig.rate_hz)
+            filter_weights = rig.ati_serial.filter_weights(rig.rate_hz)
             self.records_per_period = rig.ati_serial.records_per_tick(rig.rate_hz)
             # The delay in the profile includes the filter's delay; the rest is the sensor's delay.
             remaining_delay_s = rig.sensor.delay_s - rig.ati_serial.filter_delay_s(rig.rate_hz)

@@ -101,7 +101,7 @@ def test_sensor_filters_come_from_the_profile(profile, kind, touch_file, tmp_pat
         }
     stated = _sensor_filter(replace(rig, sensor=sensor, ati_serial=serial))
     if serial is not None:
-        assert stated.weights == pytest.approx(serial.weights(rig.rate_hz), rel=1e-12)
+        assert stated.weights == pytest.approx(serial.filter_weights(rig.rate_hz), rel=1e-12)
     path = touch_file.write(tmp_path / "a.mcap", length=20, metadata=metadata)
     read = sensor_filter_of(read_session(path), rig.rate_hz)
     s = 2j * np.pi * np.array([1.0, 100.0, 400.0])

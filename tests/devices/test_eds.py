@@ -46,24 +46,24 @@ def test_objects_and_identity_of_a_file(read):
     assert (found.vendor_name, found.product_name) == ("Ä vendor", "One")
     assert (found.vendor_id, found.product_code) == (0x9A, 0x30923)
     assert found.bit_rates_bit_s == (500_000,)
-    assert found.get(0x1400, 1).default == 0x205
-    assert found.get(0x6502).default == 0o1007
+    assert found.get(0x1400, 1).default_value == 0x205
+    assert found.get(0x6502).default_value == 0o1007
     torque = found.get(0x6071)
-    assert (torque.default, torque.bits, torque.mappable, torque.writable) == (
+    assert (torque.default_value, torque.length_bit, torque.is_mappable, torque.is_writable) == (
         -1000,
         16,
         True,
         True,
     )
-    assert found.get(0x6060).default == -3
-    assert found.get(0x6064).default is None
-    assert not found.get(0x6064).writable
-    assert not found.get(0x6502).writable
-    assert not found.get(0x6502).mappable
+    assert found.get(0x6060).default_value == -3
+    assert found.get(0x6064).default_value is None
+    assert not found.get(0x6064).is_writable
+    assert not found.get(0x6502).is_writable
+    assert not found.get(0x6502).is_mappable
     assert found.get(0x6072) is None
-    assert found.has(0x1400)
+    assert found.has_object(0x1400)
     assert found.get(0x1400, 3) is None
-    assert not found.has(0x1401)
+    assert not found.has_object(0x1401)
 
 
 def test_the_head_has_the_identity_if_the_object_does_not(read):
@@ -124,7 +124,7 @@ AS_OTHERS_WRITE = {
 def test_equal_content_in_different_notations(read, change):
     def facts(found):
         return {
-            address: (e.bits, e.access, e.mappable, e.default)
+            address: (e.length_bit, e.access_right, e.is_mappable, e.default_value)
             for address, e in found.entries.items()
         }
 
@@ -149,38 +149,43 @@ def test_arrays_declared_at_once(read):
         node_id=5,
     )
     assert sorted(found.entries) == [(0x1016, sub) for sub in range(4)]
-    assert found.get(0x1016, 0).default == 3
-    assert [found.get(0x1016, sub).default for sub in (1, 2, 3)] == [15, 15, 7]
+    assert found.get(0x1016, 0).default_value == 3
+    assert [found.get(0x1016, sub).default_value for sub in (1, 2, 3)] == [15, 15, 7]
     assert found.get(0x1016, 2).name == "The second"
 
 
 def test_a_configured_drive_has_the_values_of_its_dcf(read):
     found = read("[6072]\nDataType=6\nAccessType=rw\nDefaultValue=5\nParameterValue=0x3E8\n")
-    assert found.get(0x6072).default == 1000
+    assert found.get(0x6072).default_value == 1000
 
 
 def test_a_type_of_its_own_for_a_number_with_limits(read):
     found = read(
         "[A0]\n[A0sub1]\nDefaultValue=0x06\n[6072]\nDataType=0xA0\n[6073]\nDataType=0xA1\n"
     )
-    assert found.get(0x6072).bits == 16
-    assert found.get(0x6073).bits is None
+    assert found.get(0x6072).length_bit == 16
+    assert found.get(0x6073).length_bit is None
 
 
 @pytest.mark.parametrize("type_name", ["", "DataType=\n", "DataType=x\n", "DataType=0\n"])
 def test_a_missing_type_is_none(read, type_name):
     entry = read(f"[6040]\n{type_name}AccessType=rw\nDefaultValue=0x10\nHighLimit=20\n").get(0x6040)
-    assert (entry.data_type, entry.bits, entry.default, entry.high) == (0, None, 16, 20)
+    assert (entry.data_type, entry.length_bit, entry.default_value, entry.upper_limit) == (
+        0,
+        None,
+        16,
+        20,
+    )
 
 
 def test_limits(read):
     found = read("[6060]\nDataType=2\nLowLimit=0xFF\nHighLimit=0x0A\n")
-    assert (found.get(0x6060).low, found.get(0x6060).high) == (-1, 10)
+    assert (found.get(0x6060).lower_limit, found.get(0x6060).upper_limit) == (-1, 10)
 
 
 def test_numbers_in_a_text_stay_as_they_are(read):
     found = read("[1009]\nDataType=9\nDefaultValue=V0.00.010 0x0F\n")
-    assert found.get(0x1009).content == b"V0.00.010 0x0F"
+    assert found.get(0x1009).default_bytes == b"V0.00.010 0x0F"
 
 
 @pytest.mark.parametrize(
@@ -188,7 +193,10 @@ def test_numbers_in_a_text_stay_as_they_are(read):
     [("$NODEID", 5), ("0x180 + $nodeid", 0x185), ("$NODEID+0600", 0x185), ("$NODEID+x", None)],
 )
 def test_an_identifier_relative_to_the_node_id(read, type_name, number):
-    assert read(f"[1014]\nDataType=7\nDefaultValue={type_name}\n", 5).get(0x1014).default == number
+    assert (
+        read(f"[1014]\nDataType=7\nDefaultValue={type_name}\n", 5).get(0x1014).default_value
+        == number
+    )
 
 
 @pytest.mark.parametrize("name", WITH_TORQUE + WITHOUT_TORQUE)
@@ -203,7 +211,15 @@ def test_values_agree_with_the_library(name):
             expected[v.index, v.subindex] = (v.name, v.data_type, v.access_type, v.pdo_mappable,
                                              v.default, v.min, v.max)  # fmt: skip
     assert expected == {
-        address: (e.name, e.data_type, e.access, e.mappable, e.default, e.low, e.high)
+        address: (
+            e.name,
+            e.data_type,
+            e.access_right,
+            e.is_mappable,
+            e.default_value,
+            e.lower_limit,
+            e.upper_limit,
+        )
         for address, e in found.entries.items()
     }
 
@@ -296,9 +312,12 @@ def test_garbage_is_read_or_refused(tmp_path_factory, lines, encoding):
         return
     for (index, sub), entry in found.entries.items():
         assert (entry.index, entry.subindex) == (index, sub)
-        assert entry.access in ("ro", "rw", "wo", "const", "rwr", "rww")
+        assert entry.access_right in ("ro", "rw", "wo", "const", "rwr", "rww")
         assert entry.name.isprintable()
-        assert all(type(v) is int or v is None for v in (entry.default, entry.low, entry.high))
+        assert all(
+            type(v) is int or v is None
+            for v in (entry.default_value, entry.lower_limit, entry.upper_limit)
+        )
     assert 0 <= found.vendor_id <= 0xFFFF_FFFF
 
 
@@ -340,4 +359,4 @@ def test_real_files_refused_by_the_library(read):
         file.name = "x.eds"
         with pytest.raises(error):
             canopen.import_od(file)
-    assert eds.MAX_BYTES > 1_000_000
+    assert eds.MAX_FILE_BYTES > 1_000_000

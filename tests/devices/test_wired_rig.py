@@ -8,7 +8,11 @@ import pytest
 
 from rigd.devices import ActuationTarget, actuation_target, open_devices, simulation_differences
 from rigd.devices.contracts import DeviceError
-from rigd.devices.running_simulator import SimulatorAddress, announce, described
+from rigd.devices.running_simulator import (
+    SimulatorAddress,
+    parameters_by_dotted_key,
+    write_address_file,
+)
 from rigd.profile import load_profile
 
 
@@ -24,7 +28,9 @@ def stand_in(runtime_folder):
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(path)
         listener.listen(8)
-        yield lambda name, **more: announce(name, SimulatorAddress(os.getpid(), path, **more))
+        yield lambda name, **more: write_address_file(
+            name, SimulatorAddress(os.getpid(), path, **more)
+        )
 
 
 def test_actuation_targets(rig, stand_in):
@@ -96,7 +102,7 @@ def test_an_overloaded_bus_is_refused(rig, runtime_folder):
 
 def test_differences_of_a_simulated_rig_are_reported(rig, stand_in):
     assert simulation_differences(rig) == []
-    stand_in(rig.name, rig=described(rig))
+    stand_in(rig.name, rig=parameters_by_dotted_key(rig))
     assert simulation_differences(rig) == []
     other = replace(
         rig,

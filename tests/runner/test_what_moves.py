@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import pytest
 
 from rigd.devices import ActuationTarget, describe_actuation_target
-from rigd.devices.running_simulator import unreachable_simulators
+from rigd.devices.running_simulator import unreachable_simulator_sockets
 from rigd.runner.planning import RefusedError
 from rigd.runner.request import load_rig
 
@@ -61,10 +61,10 @@ def test_no_hardware_motion_with_a_simulation_of_another_user(profile, runtime_f
         if os.getuid():
             pytest.skip("only root can give a socket away")
         os.chown(path, 12345, 12345)
-        assert unreachable_simulators(name) == [path]
+        assert unreachable_simulator_sockets(name) == [path]
         with pytest.raises(RefusedError, match=r"by user 12345 .*--hardware"):
             load_rig(profile)
-    assert unreachable_simulators(name) == []
+    assert unreachable_simulator_sockets(name) == []
 
 
 def test_sockets_with_control_characters_in_their_names(profile, runtime_folder):

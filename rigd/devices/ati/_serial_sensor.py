@@ -105,7 +105,7 @@ class AtiSerialSensor:
         self._rate_hz = rig.rate_hz
         self._period_ns = 1e9 / rig.rate_hz
         self._bytes_per_tick = settings.records_per_tick(rig.rate_hz) * RECORD_SIZE
-        self._weights = settings.weights(rig.rate_hz)
+        self._weights = settings.filter_weights(rig.rate_hz)
         self._saturation_counts = settings.saturation_counts
         self._deadline_ns = int(acquisition.deadline_us * 1e3)
         # Waiting longer for a single missing record would let a sensor with a slow clock delay the

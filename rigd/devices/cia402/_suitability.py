@@ -147,14 +147,14 @@ class _SuitabilityCheck:
 
     def _identity_findings(self) -> Iterator[SuitabilityFinding]:
         """Yield the findings on vendor and product code."""
-        for key, stated_number, identity_key in (
+        for key, stated_number, identity_name in (
             ("vendor_id", self._eds.vendor_id, self._eds.vendor_name),
             ("product_code", self._eds.product_code, self._eds.product_name),
         ):
             object_text = key.replace("_", " ")
             wanted_number = getattr(self._settings, key) if self._settings else 0
             value_text = f"0x{stated_number:08X}" if stated_number else "not stated"
-            found_text = f"{value_text} ({identity_key})" if identity_key else value_text
+            found_text = f"{value_text} ({identity_name})" if identity_name else value_text
             if not (stated_number and wanted_number and stated_number != wanted_number):
                 yield SuitabilityFinding(
                     object_text,
@@ -178,7 +178,9 @@ class _SuitabilityCheck:
     def _bit_rate_findings(self) -> Iterator[SuitabilityFinding]:
         """Yield the finding on the bit rates that the drive supports."""
         supported_rates = self._eds.bit_rates_bit_s
-        bit_rates_text = ", ".join(f"{profile_rate // 1000}" for profile_rate in supported_rates)
+        bit_rates_text = ", ".join(
+            f"{supported_rate // 1000}" for supported_rate in supported_rates
+        )
         bit_rates_text = f"{bit_rates_text} kbit/s" if supported_rates else "not stated"
         if self._rig is None or self._rig.can is None:
             yield SuitabilityFinding("bit rates", bit_rates_text, "", Grade.FITS)
@@ -209,9 +211,9 @@ class _SuitabilityCheck:
             return SuitabilityFinding(
                 object_text, "absent", wanted_text, Grade.REFUSED, consequence
             )
-        if modes_entry.default:
-            value_text = f"0x{modes_entry.default:X}"
-            if modes_entry.default & objects.CYCLIC_TORQUE_MODE_BIT:
+        if modes_entry.default_value:
+            value_text = f"0x{modes_entry.default_value:X}"
+            if modes_entry.default_value & objects.CYCLIC_TORQUE_MODE_BIT:
                 return SuitabilityFinding(object_text, value_text, wanted_text, Grade.FITS)
             consequence = (
                 f"No cyclic synchronous torque mode: {object_address} = {value_text} lacks bit 9; "
@@ -251,8 +253,8 @@ class _SuitabilityCheck:
         heartbeat_entry = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
         deadline_entry = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER_SUBINDEX)
         return most_reliable_watchdog(
-            has_heartbeat_consumer=heartbeat_entry is not None and heartbeat_entry.writable,
-            has_rpdo_deadline=deadline_entry is not None and deadline_entry.writable,
+            has_heartbeat_consumer=heartbeat_entry is not None and heartbeat_entry.is_writable,
+            has_rpdo_deadline=deadline_entry is not None and deadline_entry.is_writable,
             has_own_watchdog=self._settings is not None and self._settings.own_watchdog_s > 0,
         )
 
@@ -345,10 +347,10 @@ class _SuitabilityCheck:
         wanted_text = "" if wanted_value is None else _format_value(required_object, wanted_value)
         default_text = (
             ""
-            if eds_entry.default is None
-            else f", {_format_value(required_object, eds_entry.default)}"
+            if eds_entry.default_value is None
+            else f", {_format_value(required_object, eds_entry.default_value)}"
         )
-        found_text = f"{eds_entry.access}{default_text}"
+        found_text = f"{eds_entry.access_right}{default_text}"
 
         def doubt_or_refusal(objection_text: str, *, is_doubt: bool = False) -> SuitabilityFinding:
             consequence = _capitalise(
@@ -365,11 +367,11 @@ class _SuitabilityCheck:
                 )
             if mapping_obstacle:
                 return doubt_or_refusal(f"{mapping_obstacle}. {required_object.consequence}")
-        if ObjectAccess.WRITTEN_BY_SDO in required_object.access and not eds_entry.writable:
+        if ObjectAccess.WRITTEN_BY_SDO in required_object.access and not eds_entry.is_writable:
             return self._read_only_object_finding(
                 required_object, eds_entry, found_text, wanted_value
             )
-        if ObjectAccess.READ_BY_SDO in required_object.access and eds_entry.access == "wo":
+        if ObjectAccess.READ_BY_SDO in required_object.access and eds_entry.access_right == "wo":
             return doubt_or_refusal(
                 "is write-only: its value cannot be checked. "
                 f"{required_object.consequence}".rstrip(),
@@ -377,8 +379,8 @@ class _SuitabilityCheck:
             )
         if wanted_value is not None and not _is_within_limits(eds_entry, wanted_value):
             limits_text = (
-                f"{_format_limit(required_object, eds_entry.low)} to "
-                f"{_format_limit(required_object, eds_entry.high)}"
+                f"{_format_limit(required_object, eds_entry.lower_limit)} to "
+                f"{_format_limit(required_object, eds_entry.upper_limit)}"
             )
             return doubt_or_refusal(
                 f"takes {limits_text}, not {wanted_text}. {required_object.consequence}",
@@ -408,12 +410,12 @@ class _SuitabilityCheck:
                 if None in default_entries
                 else default_entries == _REQUIRED_ENTRIES_BY_MAPPING[required_object.index]
             )
-        elif required_value is None or eds_entry.default is None:
+        elif required_value is None or eds_entry.default_value is None:
             is_acceptable = None
         elif (required_object.index, required_object.subindex) in _COB_ID_ADDRESSES:
             # Drives are free to set the bit that forbids remote requests.
             is_acceptable = (
-                eds_entry.default ^ required_value
+                eds_entry.default_value ^ required_value
             ) & ~objects.NO_REMOTE_REQUEST_BIT == 0
             mapping_index = required_object.index + 0x200
             if (
@@ -435,7 +437,9 @@ class _SuitabilityCheck:
                     _capitalise(consequence),
                 )
         else:
-            is_acceptable = required_object.value_rule.allows(eds_entry.default, required_value)
+            is_acceptable = required_object.value_rule.allows(
+                eds_entry.default_value, required_value
+            )
         if is_acceptable:
             return SuitabilityFinding(
                 object_text, f"{found_text}: it does", wanted_text, Grade.FITS
@@ -456,15 +460,15 @@ class _SuitabilityCheck:
     def _describe_mapping_obstacle(self, eds_entry: EdsEntry) -> str:
         """Return why an object cannot be mapped into its PDO, or an empty text if it can."""
         required_length_bit = _LENGTH_BIT_BY_MAPPED_INDEX[eds_entry.index]
-        if eds_entry.bits not in (None, required_length_bit):
-            return f"has {eds_entry.bits} bits, not {required_length_bit}"
+        if eds_entry.length_bit not in (None, required_length_bit):
+            return f"has {eds_entry.length_bit} bits, not {required_length_bit}"
         mapped_indices = {
             mapping_entry >> 16
             for index in _REQUIRED_ENTRIES_BY_MAPPING
             for mapping_entry in self._default_mapping(index)
             if mapping_entry
         }
-        if not eds_entry.mappable and eds_entry.index not in mapped_indices:
+        if not eds_entry.is_mappable and eds_entry.index not in mapped_indices:
             return "cannot be mapped into a PDO"
         return ""
 
@@ -484,12 +488,12 @@ class _SuitabilityCheck:
 
 def _default_value(eds_entry: EdsEntry | None) -> int | None:
     """Return the default value of an EDS entry, or None if entry or default is missing."""
-    return None if eds_entry is None else eds_entry.default
+    return None if eds_entry is None else eds_entry.default_value
 
 
 def _is_within_limits(eds_entry: EdsEntry, required_value: int) -> bool:
     """Return whether a value is within the limits of an object; inconsistent limits are ignored."""
-    lower_limit, upper_limit = eds_entry.low, eds_entry.high
+    lower_limit, upper_limit = eds_entry.lower_limit, eds_entry.upper_limit
     if lower_limit is not None and upper_limit is not None and lower_limit > upper_limit:
         return True
     return (lower_limit is None or lower_limit <= required_value) and (

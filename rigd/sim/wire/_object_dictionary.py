@@ -586,10 +586,10 @@ def read_device(path: Path, node_id: int) -> DeviceFile:
 
 def _to_description(eds_entry: EdsEntry) -> EntryDescription:
     """Convert the entry of an EDS file to a description for a simulated node."""
-    sdo_access = _SDO_ACCESS_BY_FILE_ACCESS.get(eds_entry.access, eds_entry.access)
+    sdo_access = _SDO_ACCESS_BY_FILE_ACCESS.get(eds_entry.access_right, eds_entry.access_right)
     type_letter = _TYPE_LETTERS.get(eds_entry.data_type)
     if type_letter is None:
-        byte_count = _TIME_TYPE_LENGTHS.get(eds_entry.data_type) or (eds_entry.bits or 0) // 8
+        byte_count = _TIME_TYPE_LENGTHS.get(eds_entry.data_type) or (eds_entry.length_bit or 0) // 8
         return EntryDescription(
             "s",
             sdo_access,
@@ -599,9 +599,9 @@ def _to_description(eds_entry: EdsEntry) -> EntryDescription:
         )
     is_boolean = eds_entry.data_type == _BOOLEAN_TYPE
     # A boolean takes one bit in a PDO, which is not needed here.
-    is_mappable = eds_entry.mappable and not is_boolean
-    pdo_directions = _PDO_DIRECTIONS_BY_ACCESS.get(eds_entry.access, "rt") if is_mappable else ""
-    lower_limit, upper_limit = eds_entry.low, 1 if is_boolean else eds_entry.high
+    is_mappable = eds_entry.is_mappable and not is_boolean
+    pdo_directions = _PDO_DIRECTIONS_BY_ACCESS.get(eds_entry.access_right, "rt") if is_mappable else ""
+    lower_limit, upper_limit = eds_entry.lower_limit, 1 if is_boolean else eds_entry.upper_limit
     if (
         lower_limit is not None and upper_limit is not None and lower_limit >= upper_limit
     ):  # written by tools without limits
@@ -615,7 +615,9 @@ def _to_description(eds_entry: EdsEntry) -> EntryDescription:
             None  # some files limit only the time in the lower half, without the node
         )
     default_value = (
-        None if eds_entry.default is None else _to_type_range(eds_entry.default, type_letter)
+        None
+        if eds_entry.default_value is None
+        else _to_type_range(eds_entry.default_value, type_letter)
     )
     return EntryDescription(
         type_letter, sdo_access, pdo_directions, default_value, lower_limit, upper_limit
@@ -635,9 +637,9 @@ def _to_type_range(file_value: int, type_letter: str) -> int:
 
 def _default_bytes(eds_entry: EdsEntry, byte_count: int) -> bytes:
     """Return the default of an entry as `byte_count` bytes or, if that is 0, as its own bytes."""
-    default_bytes = eds_entry.content
-    if eds_entry.default is not None and byte_count:
-        default_bytes = (eds_entry.default & (1 << 8 * byte_count) - 1).to_bytes(
+    default_bytes = eds_entry.default_bytes
+    if eds_entry.default_value is not None and byte_count:
+        default_bytes = (eds_entry.default_value & (1 << 8 * byte_count) - 1).to_bytes(
             byte_count, "little"
         )
     return default_bytes[:byte_count].ljust(byte_count, b"\0") if byte_count else default_bytes

@@ -25,11 +25,11 @@ from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import (
     SimulatorAddress,
-    announce,
     ask_simulator,
-    described,
     find_simulator,
+    parameters_by_dotted_key,
     remove_address_file,
+    write_address_file,
 )
 from rigd.runtime.addresses import runtime_folder
 from rigd.sim import SimulatedRig
@@ -390,7 +390,7 @@ class _SimulatorProcess:
             can_socket=can_socket_path,
             serial_port=self._serial_port,
             lock_step=options.lock_step,
-            rig=described(rig),
+            rig=parameters_by_dotted_key(rig),
         )
 
     def start(self) -> None:
@@ -408,7 +408,7 @@ class _SimulatorProcess:
         )
         for start_line in self._start_messages():
             self._log.print_line(start_line)
-        announce(self._rig.name, self._address)
+        write_address_file(self._rig.name, self._address)
         self._exit_stack.callback(remove_address_file, self._rig.name)
         # Set-up leaves objects that are never freed: exclude them from garbage collection.
         gc.collect()
@@ -555,7 +555,7 @@ class _SimulatorProcess:
             self._serial_line.open()
             # The line may have a new name, which the next process has to find.
             self._address = replace(self._address, serial_port=self._serial_port)
-            announce(self._rig.name, self._address)
+            write_address_file(self._rig.name, self._address)
 
     @property
     def _serial_port(self) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rigd.devices.running_simulator import SimulatorAddress, announce, find_simulator
+from rigd.devices.running_simulator import SimulatorAddress, find_simulator, write_address_file
 from rigd.runtime.addresses import runtime_folder as current_folder
 
 
@@ -24,7 +24,7 @@ def alive(runtime_folder):
 
 def test_an_announced_simulator_is_found(alive):
     address = SimulatorAddress(4711, alive, "/run/can", "/dev/pts/7", lock_step=True)
-    path = announce("antenna", address)
+    path = write_address_file("antenna", address)
     assert find_simulator("antenna") == address
     assert find_simulator("sim") is None
     assert [entry.name for entry in path.parent.iterdir()] == ["antenna.json"]
@@ -32,8 +32,8 @@ def test_an_announced_simulator_is_found(alive):
 
 
 def test_announcing_again_replaces(alive):
-    announce("antenna", SimulatorAddress(1, alive))
-    announce("antenna", SimulatorAddress(2, alive))
+    write_address_file("antenna", SimulatorAddress(1, alive))
+    write_address_file("antenna", SimulatorAddress(2, alive))
     assert find_simulator("antenna").pid == 2
 
 
@@ -47,7 +47,7 @@ def test_the_address_of_a_dead_simulator_is_not_found(runtime_folder):
         listener.bind(str(path))
         listener.listen()
     assert path.exists()
-    announce("antenna", SimulatorAddress(1, str(path)))
+    write_address_file("antenna", SimulatorAddress(1, str(path)))
     assert find_simulator("antenna") is None
     path.unlink()
     assert find_simulator("antenna") is None
@@ -59,7 +59,7 @@ def test_a_busy_simulator_counts_as_running(runtime_folder):
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(path)
         listener.listen(0)
-        announce("antenna", SimulatorAddress(1, path))
+        write_address_file("antenna", SimulatorAddress(1, path))
         with ExitStack() as queued:
             with pytest.raises(BlockingIOError):
                 while True:
@@ -88,18 +88,18 @@ def test_a_busy_simulator_counts_as_running(runtime_folder):
     ],
 )
 def test_a_garbled_file_is_not_a_simulator(runtime_folder, text):
-    path = announce("antenna", SimulatorAddress(1, "x"))
+    path = write_address_file("antenna", SimulatorAddress(1, "x"))
     path.write_text(text, encoding="utf-8")
     assert find_simulator("antenna") is None
 
 
 def test_a_binary_file_is_not_a_simulator(runtime_folder):
-    announce("antenna", SimulatorAddress(1, "x")).write_bytes(b"\xff\xfe\x00")
+    write_address_file("antenna", SimulatorAddress(1, "x")).write_bytes(b"\xff\xfe\x00")
     assert find_simulator("antenna") is None
 
 
 def test_other_settings_of_the_file_remain(alive):
-    path = announce("antenna", SimulatorAddress(1, alive, can_socket="c"))
+    path = write_address_file("antenna", SimulatorAddress(1, alive, can_socket="c"))
     assert json.loads(path.read_text("utf-8"))["can_socket"] == "c"
 
 

@@ -287,7 +287,7 @@ def test_a_filtered_stream_is_the_direct_simulation(rig, make_serial_host, filte
     _, matrix, _ = host.calibration(2)
     host.load_gains(2)
     host.send(START)
-    weights = np.array(serial.weights(rig.rate_hz))
+    weights = np.array(serial.filter_weights(rig.rate_hz))
     stream = np.empty((0, 6))
     for _ in range(30):
         twin.advance(1)

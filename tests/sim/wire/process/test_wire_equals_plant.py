@@ -207,6 +207,8 @@ def test_a_hum_comes_over_the_wire(simulated_profile, name):
     assert np.abs(hum - columns @ found).max() < 2 * rig.sensor.resolution[5]
     gain = 1.0
     if rig.ati_serial is not None:
-        turns = 50.0 / rig.ati_serial.stream_hz * np.arange(len(rig.ati_serial.weights(1000.0)))
-        gain = abs(np.exp(2j * np.pi * turns) @ rig.ati_serial.weights(1000.0))
+        turns = (
+            50.0 / rig.ati_serial.stream_hz * np.arange(len(rig.ati_serial.filter_weights(1000.0)))
+        )
+        gain = abs(np.exp(2j * np.pi * turns) @ rig.ati_serial.filter_weights(1000.0))
     assert np.hypot(*found[:2]) == pytest.approx(0.02 * gain, abs=rig.sensor.resolution[5])
