@@ -154,7 +154,8 @@ def new(
         typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
     for open_question in unanswered:
         typer.echo(
-            f"  {open_question.key} = {draft.value_text(open_question.key)}: {open_question.text}",
+            f"  {open_question.profile_key} = {draft.value_text(open_question.profile_key)}: "
+            f"{open_question.question_text}",
             err=True,
         )
     if missing_features:
@@ -181,7 +182,7 @@ def _ask_for_values(draft: "Draft") -> str:
     try:
         while True:
             for open_question in draft.questions():
-                _ask_for_value(draft, open_question.key, open_question.text)
+                _ask_for_value(draft, open_question.profile_key, open_question.question_text)
             try:
                 draft.text()
             except ProfileError as error:

@@ -31,10 +31,10 @@ from rigd.devices.parameters import DeviceSelection
 from rigd.plugins import plugin_errors
 from rigd.printable import printable
 from rigd.profile._schema import (
+    NUMBER_SOURCES,
     SECTIONS,
-    SOURCES,
     TEXT_KEYS,
-    is_number,
+    is_number_type,
     key_types,
     optional_sections,
     section_fields,
@@ -43,7 +43,7 @@ from rigd.safety.limits import RECORDER_BUFFER_S
 from rigd.session.user_metadata import NOTES, MetadataError, check_name
 from rigd.units import UNITS, is_usable_size, suffix_of, unit_of
 
-_AXIS_UNITS = {  # Units of keys with six numbers, one for each axis of the sensor
+_AXIS_UNITS_BY_KEY = {  # Units of keys with six numbers, one for each axis of the sensor
     "sensor.resolution": "N, N, N, N·m, N·m, N·m",
     "sensor.range": "N, N, N, N·m, N·m, N·m",
     "sensor.projection": "m, m, m, 1, 1, 1",
@@ -51,95 +51,103 @@ _AXIS_UNITS = {  # Units of keys with six numbers, one for each axis of the sens
     "simulation.offset": "N, N, N, N·m, N·m, N·m",
 }
 
-_MAX_ACCELERATION_FACTOR = 100.0
+_MAX_LIMIT_TO_MOTOR_ACCELERATION = 100.0
 """Largest limit of the acceleration, relative to the motor's largest acceleration.
 
 With a higher limit no jump of the encoder would be detected."""
 
-_RIG_NAME = re.compile(r"[^\W_][\w .-]{0,63}")
+_RIG_NAME_PATTERN = re.compile(r"[^\W_][\w .-]{0,63}")
 """Pattern of valid names of a rig, which file names contain."""
 
 _FIRST_MODE_BAND_HZ = 0.1, 100.0
 """Plausible lowest and highest frequency in Hz of the undamped beam's first mode."""
 
 
-_ROUNDING_S = 1e-9
+_MAX_DELAY_ROUNDING_S = 1e-9
 """Largest rounding error in seconds of a stated delay."""
-_PARALLEL_TOLERANCE = 1e-6
+_PARALLEL_SQUARED_SINE = 1e-6
 """Squared sine of the angle between two projections below which they count as parallel."""
-_MAX_VALUE_CHARACTERS = 200
+_MAX_SHOWN_CHARACTERS = 200
 """Largest number of characters of a value in a message."""
-_MAX_ITEMS = 12
+_MAX_SHOWN_ITEMS = 12
 """Largest number of items of an array in a message."""
 
 
-def missing_source_message(key: str, source: object) -> str:
+def missing_source_message(profile_key: str, number_source: object) -> str:
     """Return the message for a number whose ``source``, its origin, is missing or invalid."""
-    if source is None:
-        return f"{key} has no source; add source = {_quoted_choice(SOURCES)}."
-    return f"{key} has source = {_text(source)}; choose {_quoted_choice(SOURCES)}."
+    if number_source is None:
+        return f"{profile_key} has no source; add source = {_quoted_choice(NUMBER_SOURCES)}."
+    return (
+        f"{profile_key} has source = {_shown_value(number_source)}; choose "
+        f"{_quoted_choice(NUMBER_SOURCES)}."
+    )
 
 
-def invalid_unknown_message(key: str, entry: Mapping[str, Any]) -> str:
+def invalid_unknown_source_message(profile_key: str, number_entry: Mapping[str, Any]) -> str:
     """Return the message for a key with source "unknown" that has a value or requires one."""
-    if key in MAY_BE_UNKNOWN:
+    if profile_key in MAY_BE_UNKNOWN:
         return (
-            f'{key} = {_text(entry["value"])}{_unit(key)} has a value, and source = "unknown"; '
-            f"remove the value, or choose {_quoted_choice(SOURCES)} as its source."
+            f"{profile_key} = {_shown_value(number_entry['value'])}{_unit_text(profile_key)} has a "
+            'value, and source = "unknown"; '
+            f"remove the value, or choose {_quoted_choice(NUMBER_SOURCES)} as its source."
         )
     return (
-        f'{key} has source = "unknown", but needs a value; only {", ".join(MAY_BE_UNKNOWN)} may be '
+        f'{profile_key} has source = "unknown", but needs a value; only '
+        f"{', '.join(MAY_BE_UNKNOWN)} may be "
         "unknown."
     )
 
 
-def bare_number_message(key: str, bare_value: object) -> str:
+def number_without_source_message(profile_key: str, stated_value: object) -> str:
     """Return the message for a profile's number whose origin (key ``source``) is not stated."""
     return (
-        f"{key} = {_text(bare_value)}{_unit(key)} does not state its source; write "
-        f'{{ value = {_text(bare_value)}, source = "…" }} with {_quoted_choice(SOURCES)}.'
+        f"{profile_key} = {_shown_value(stated_value)}{_unit_text(profile_key)} does not state its "
+        "source; write "
+        f'{{ value = {_shown_value(stated_value)}, source = "…" }} with '
+        f"{_quoted_choice(NUMBER_SOURCES)}."
     )
 
 
-def implausible_numbers(profile_values: Mapping[str, Any]) -> Iterator[str]:
+def implausible_number_messages(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for numbers that are within their range but impossible for any rig."""
     for key, key_value in profile_values.items():
         for number in key_value if isinstance(key_value, tuple) else (key_value,):
             if isinstance(number, int | float) and not is_usable_size(number):
                 yield (
-                    f"{key} = {_text(number)}{_unit(key)} is not plausible for a rig; check its "
-                    "unit."
+                    f"{key} = {_shown_value(number)}{_unit_text(key)} is not plausible for a rig; "
+                    "check its unit."
                 )
 
 
 def contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for values that are within their ranges but contradict each other."""
-    if not _RIG_NAME.fullmatch(profile_values["name"]):
+    if not _RIG_NAME_PATTERN.fullmatch(profile_values["name"]):
         yield (
-            f"name = {_text(profile_values['name'])} cannot be used in file names; use letters, "
-            "digits, spaces and . _ - only, at most 64, and begin with a letter or digit."
+            f"name = {_shown_value(profile_values['name'])} cannot be used in file names; use "
+            "letters, digits, spaces and . _ - only, at most 64, and begin with a letter or digit."
         )
-    rated_nm, peak_nm = (
+    rated_torque_nm, peak_torque_nm = (
         profile_values["motor.rated_torque_nm"],
         profile_values["motor.peak_torque_nm"],
     )
-    if peak_nm < rated_nm:
+    if peak_torque_nm < rated_torque_nm:
         yield (
-            f"motor.peak_torque_nm = {peak_nm:g} N·m is below motor.rated_torque_nm = "
-            f"{rated_nm:g} N·m; the peak is at least the rated torque."
+            f"motor.peak_torque_nm = {peak_torque_nm:g} N·m is below motor.rated_torque_nm = "
+            f"{rated_torque_nm:g} N·m; the peak is at least the rated torque."
         )
-    continuous_nm = profile_values["motor.continuous_torque_nm"]
-    if peak_nm >= rated_nm and continuous_nm > peak_nm:
+    continuous_torque_nm = profile_values["motor.continuous_torque_nm"]
+    if peak_torque_nm >= rated_torque_nm and continuous_torque_nm > peak_torque_nm:
         yield (
-            f"motor.continuous_torque_nm = {continuous_nm:g} N·m is above motor.peak_torque_nm = "
-            f"{peak_nm:g} N·m; continuous torque must not exceed peak torque."
+            f"motor.continuous_torque_nm = {continuous_torque_nm:g} N·m is above "
+            f"motor.peak_torque_nm = {peak_torque_nm:g} N·m; continuous torque must not exceed "
+            "peak torque."
         )
-    limit_nm = profile_values["limits.torque_command_nm"]
-    if limit_nm < peak_nm:
+    torque_command_limit_nm = profile_values["limits.torque_command_nm"]
+    if torque_command_limit_nm < peak_torque_nm:
         yield (
-            f"limits.torque_command_nm = {limit_nm:g} N·m is below motor.peak_torque_nm = "
-            f"{peak_nm:g} N·m, where commands saturate; the controller's command limit must be "
-            "higher."
+            f"limits.torque_command_nm = {torque_command_limit_nm:g} N·m is below "
+            f"motor.peak_torque_nm = {peak_torque_nm:g} N·m, where commands saturate; the "
+            "controller's command limit must be higher."
         )
     angle_limit_rad, stop_angle_rad = (
         profile_values["limits.angle_rad"],
@@ -151,7 +159,7 @@ def contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
             f"{angle_limit_rad:g} rad; "
             "the shaft could not come to rest before it is stopped by force."
         )
-    yield from _unreachable_limits(profile_values)
+    yield from _unreachable_limit_messages(profile_values)
     yield from _drag_contradictions(profile_values)
     yield from _hum_contradictions(profile_values)
     drift_warning_nm, drift_limit_nm = (
@@ -244,13 +252,18 @@ def _shear_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
         profile_values["sensor.projection"],
         profile_values["sensor.shear_projection"],
     )
-    projection_product = (
+    squared_scalar_product = (
         sum(a * b for a, b in zip(torque_projection, shear_projection, strict=True)) ** 2
     )
-    squared_lengths = sum(a * a for a in torque_projection) * sum(b * b for b in shear_projection)
-    if squared_lengths > 0 and projection_product > (1 - _PARALLEL_TOLERANCE) * squared_lengths:
+    product_of_squared_lengths = sum(a * a for a in torque_projection) * sum(
+        b * b for b in shear_projection
+    )
+    if (
+        product_of_squared_lengths > 0
+        and squared_scalar_product > (1 - _PARALLEL_SQUARED_SINE) * product_of_squared_lengths
+    ):
         yield (
-            f"sensor.shear_projection = {_text(shear_projection)} is a multiple of "
+            f"sensor.shear_projection = {_shown_value(shear_projection)} is a multiple of "
             "sensor.projection: shear and torque could not be distinguished; give the coefficients "
             "that turn a wrench into the force across the beam."
         )
@@ -274,14 +287,14 @@ def _obstacle_problems(profile_values: Mapping[str, Any]) -> Iterator[str]:
             yield f"simulation.obstacles: {error}"
 
 
-def _unreachable_limits(profile_values: Mapping[str, Any]) -> Iterator[str]:
+def _unreachable_limit_messages(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for limits so high that this rig cannot exceed them."""
     angle_rad, inertia_kg_m2 = (
         profile_values["limits.angle_rad"],
         profile_values["motor.inertia_kg_m2"],
     )
-    own_rad_s2 = profile_values["motor.peak_torque_nm"] / inertia_kg_m2
-    bounds_text = f"limits.angle_rad = {angle_rad:g} rad to either side"
+    motor_acceleration_rad_s2 = profile_values["motor.peak_torque_nm"] / inertia_kg_m2
+    angle_limits_text = f"limits.angle_rad = {angle_rad:g} rad to either side"
     error_limit_rad, speed_limit_rad_s = (
         profile_values["limits.tracking_error_rad"],
         profile_values["limits.velocity_rad_s"],
@@ -290,25 +303,26 @@ def _unreachable_limits(profile_values: Mapping[str, Any]) -> Iterator[str]:
         yield (
             f"limits.tracking_error_rad = {error_limit_rad:g} rad can never be exceeded: "
             "reference and angle "
-            f"are within {bounds_text}; choose less than {2 * angle_rad:g} rad, some three "
+            f"are within {angle_limits_text}; choose less than {2 * angle_rad:g} rad, some three "
             "times the "
             "error of your excitation."
         )
-    max_speed_rad_s = sqrt(2 * own_rad_s2 * 2 * angle_rad)
+    max_speed_rad_s = sqrt(2 * motor_acceleration_rad_s2 * 2 * angle_rad)
     if speed_limit_rad_s >= max_speed_rad_s:
         yield (
             f"limits.velocity_rad_s = {speed_limit_rad_s:g} rad/s can never be exceeded: the "
             "peak torque "
             f"accelerates the motor alone to {max_speed_rad_s:.4g} rad/s between "
-            f"{bounds_text}; choose "
+            f"{angle_limits_text}; choose "
             "less, some three times the speed of your excitation."
         )
-    jump_limit = profile_values["limits.acceleration_rad_s2"]
-    if jump_limit > _MAX_ACCELERATION_FACTOR * own_rad_s2:
+    acceleration_limit_rad_s2 = profile_values["limits.acceleration_rad_s2"]
+    if acceleration_limit_rad_s2 > _MAX_LIMIT_TO_MOTOR_ACCELERATION * motor_acceleration_rad_s2:
         yield (
-            f"limits.acceleration_rad_s2 = {jump_limit:g} rad/s² cannot detect a jump of the "
-            f"encoder: it is more than {_MAX_ACCELERATION_FACTOR:g} times the {own_rad_s2:.4g} "
-            "rad/s² that the peak torque gives the motor alone; choose two to five times that."
+            f"limits.acceleration_rad_s2 = {acceleration_limit_rad_s2:g} rad/s² cannot detect a "
+            f"jump of the encoder: it is more than {_MAX_LIMIT_TO_MOTOR_ACCELERATION:g} times the "
+            f"{motor_acceleration_rad_s2:.4g} rad/s² that the peak torque gives the motor alone; "
+            "choose two to five times that."
         )
     recorder_lag_s = profile_values["limits.recorder_lag_s"]
     if recorder_lag_s >= RECORDER_BUFFER_S:
@@ -336,46 +350,53 @@ def missing_key_messages(
         elif key in TEXT_KEYS:
             yield f'{key} is missing; add {key} = "…" at the top.'
         else:
-            yield f'{key} is missing; add it as {{ value = …, source = "…" }}{_unit(key, " in")}.'
+            yield (
+                f'{key} is missing; add it as {{ value = …, source = "…" }}'
+                f"{_unit_text(key, ' in')}."
+            )
 
 
-def unknown_key_message(key: str, profile_values: Mapping[str, Any]) -> str:
+def unknown_key_message(profile_key: str, profile_values: Mapping[str, Any]) -> str:
     """Return the message for an unknown key, with the key that was probably meant."""
-    if key in SECTIONS:
+    if profile_key in SECTIONS:
         return (
-            f"{key} = {_text(profile_values[key])} must be a section; write [{key}] and its keys "
-            "below."
+            f"{profile_key} = {_shown_value(profile_values[profile_key])} must be a section; write "
+            f"[{profile_key}] and its keys below."
         )
-    section = key.rpartition(".")[0]
+    section = profile_key.rpartition(".")[0]
     section_keys = [k for k in key_types() if k.rpartition(".")[0] == section]
     if not section_keys:
-        similar_names = difflib.get_close_matches(section or key, SECTIONS, 1)
+        similar_names = difflib.get_close_matches(section or profile_key, SECTIONS, 1)
         hint_text = (
             f"did you mean [{similar_names[0]}]?"
             if similar_names
             else f"sections are {', '.join(SECTIONS)}."
         )
-        return f"{key} is not a key of a profile; {hint_text}"
+        return f"{profile_key} is not a key of a profile; {hint_text}"
     for candidate_key in section_keys:
         unit_suffix = suffix_of(candidate_key)
         key_without_unit = candidate_key.removesuffix(unit_suffix)
-        if unit_suffix and key.startswith(key_without_unit + "_"):
+        if unit_suffix and profile_key.startswith(key_without_unit + "_"):
             return (
-                f"{key} = {_text(profile_values[key])} has the wrong unit "
-                f"('{key.removeprefix(key_without_unit + '_')}'); write {candidate_key}, the "
-                "value in "
+                f"{profile_key} = {_shown_value(profile_values[profile_key])} has the wrong unit "
+                f"('{profile_key.removeprefix(key_without_unit + '_')}'); write {candidate_key}, "
+                "the value in "
                 f"{UNITS[unit_suffix]}."
             )
-    similar_names = difflib.get_close_matches(key, section_keys, 1)
+    similar_names = difflib.get_close_matches(profile_key, section_keys, 1)
     if similar_names:
         return (
-            f"{key} is unknown; did you mean {similar_names[0]}{_unit(similar_names[0], ', in')}?"
+            f"{profile_key} is unknown; did you mean {similar_names[0]}"
+            f"{_unit_text(similar_names[0], ', in')}?"
         )
-    names_text = ", ".join(k.rpartition(".")[2] for k in section_keys)
-    return f"{key} is unknown; {f'[{section}]' if section else 'the top'} has {names_text}."
+    key_names_text = ", ".join(k.rpartition(".")[2] for k in section_keys)
+    return (
+        f"{profile_key} is unknown; {f'[{section}]' if section else 'the top'} has "
+        f"{key_names_text}."
+    )
 
 
-_REQUIRED_TYPES = {  # Required value, by the type of pydantic's error
+_REQUIREMENT_BY_ERROR_TYPE = {  # Required value, by the type of pydantic's error
     "float_type": "a number",
     "int_type": "a whole number",
     "string_type": "text in quotes",
@@ -386,7 +407,7 @@ _REQUIRED_TYPES = {  # Required value, by the type of pydantic's error
     "too_long": "an array of six numbers",
     "string_too_short": "text",
 }
-_BOUND_WORDS = {  # Name of the bound in pydantic's error, and its wording, by the type of the error
+_BOUND_WORDS_BY_ERROR_TYPE = {  # Name of the bound in pydantic's error, and its wording
     "greater_than": ("gt", "more than"),
     "greater_than_equal": ("ge", "at least"),
     "less_than": ("lt", "less than"),
@@ -400,40 +421,43 @@ def wrong_value_message(error_detail: ErrorDetails) -> str:
     if error_detail["type"] == "missing":  # one of the six
         item_position = []
     item_key = f"{key}[{item_position[0]}]" if item_position else str(key)
-    statement = f"{item_key} = {_text(error_detail['input'])}{_unit(str(key))}"
+    value_statement = f"{item_key} = {_shown_value(error_detail['input'])}{_unit_text(str(key))}"
     if error_detail["type"] == "literal_error":
         remedy_text = f"must be {error_detail['ctx']['expected']}".replace("'", '"')
-    elif error_detail["type"] in _BOUND_WORDS:
-        bound_name, bound_words = _BOUND_WORDS[error_detail["type"]]
+    elif error_detail["type"] in _BOUND_WORDS_BY_ERROR_TYPE:
+        bound_name, bound_words = _BOUND_WORDS_BY_ERROR_TYPE[error_detail["type"]]
         remedy_text = f"must be {bound_words} {error_detail['ctx'][bound_name]:g}"
         if str(key).startswith("beam.damping."):
             remedy_text += ": a negative coefficient or an order of 2 or more is an unstable beam"
-    elif error_detail["type"] == "tuple_type" and not is_number(key_types()[str(key)]):
+    elif error_detail["type"] == "tuple_type" and not is_number_type(key_types()[str(key)]):
         remedy_text = "must be an array of texts in quotes"
     else:
-        remedy_text = f"must be {_REQUIRED_TYPES.get(error_detail['type'], error_detail['msg'])}"
-    return f"{statement} {remedy_text}."
+        remedy_text = (
+            f"must be {_REQUIREMENT_BY_ERROR_TYPE.get(error_detail['type'], error_detail['msg'])}"
+        )
+    return f"{value_statement} {remedy_text}."
 
 
-def _unit(key: str, before: str = "") -> str:
-    """Return a profile key's unit after `before` and a space, or "" if it has no unit."""
-    unit_text = _AXIS_UNITS.get(key) or unit_of(key)
-    return f"{before} {unit_text}" if unit_text else ""
+def _unit_text(profile_key: str, preceding_text: str = "") -> str:
+    """Return a profile key's unit after `preceding_text` and a space, or "" if it has no unit."""
+    unit = _AXIS_UNITS_BY_KEY.get(profile_key) or unit_of(profile_key)
+    return f"{preceding_text} {unit}" if unit else ""
 
 
-def _text(value: object) -> str:
+def _shown_value(profile_value: object) -> str:
     """Return a value as printable text for a message, shortened if necessary."""
-    if value is None:
+    if profile_value is None:
         return "nothing"
-    if isinstance(value, str):
-        return f'"{printable(value, _MAX_VALUE_CHARACTERS)}"'
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple | list):
-        shown_items = [_text(list_item) for list_item in value[:_MAX_ITEMS]]
-        return f"[{', '.join(shown_items)}{', …' if len(value) > _MAX_ITEMS else ''}]"
+    if isinstance(profile_value, str):
+        return f'"{printable(profile_value, _MAX_SHOWN_CHARACTERS)}"'
+    if isinstance(profile_value, bool):
+        return str(profile_value).lower()
+    if isinstance(profile_value, tuple | list):
+        shown_items = [_shown_value(list_item) for list_item in profile_value[:_MAX_SHOWN_ITEMS]]
+        return f"[{', '.join(shown_items)}{', …' if len(profile_value) > _MAX_SHOWN_ITEMS else ''}]"
     return printable(
-        f"{value:g}" if isinstance(value, float) else str(value), _MAX_VALUE_CHARACTERS
+        f"{profile_value:g}" if isinstance(profile_value, float) else str(profile_value),
+        _MAX_SHOWN_CHARACTERS,
     )
 
 
@@ -497,8 +521,8 @@ def _section_problems(profile_values: Mapping[str, Any]) -> Iterator[str]:
             f'devices.sensor = "{sensor_name}" needs.'
         )
     # Any profile may have the noise and offset of a simulated rig.
-    not_needed = used_sections - required_sections - {"simulation", *controller_sections}
-    for section_name in sorted(not_needed):
+    unneeded_sections = used_sections - required_sections - {"simulation", *controller_sections}
+    for section_name in sorted(unneeded_sections):
         yield (
             f'section [{section_name}] belongs to none of devices.drive = "{drive_name}" and '
             f'devices.sensor = "{sensor_name}"; remove it.'
@@ -531,16 +555,20 @@ def _acquisition_contradictions(profile_values: Mapping[str, Any]) -> Iterator[s
 def _delay_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for delays that are shorter than their protocol allows."""
     period_s = 1 / profile_values["rig.rate_hz"]
-    reply_s = period_s if profile_values.get("acquisition.mode") == "previous_tick" else 0.0
-    delivery_s = period_s if profile_values.get("cia402.torque_delivery") == "at_sync" else 0.0
-    delay_causes = (
-        ("encoder.delay_s", reply_s, "the reply of the previous tick"),
-        ("sensor.delay_s", reply_s, "the reply of the previous tick"),
-        ("actuation.delay_s", delivery_s, "a torque that takes effect at the next SYNC"),
+    min_reading_delay_s = (
+        period_s if profile_values.get("acquisition.mode") == "previous_tick" else 0.0
     )
-    for key, least_s, delay_cause in delay_causes:
-        if profile_values[key] < least_s - _ROUNDING_S:
+    min_torque_delay_s = (
+        period_s if profile_values.get("cia402.torque_delivery") == "at_sync" else 0.0
+    )
+    delay_causes = (
+        ("encoder.delay_s", min_reading_delay_s, "the reply of the previous tick"),
+        ("sensor.delay_s", min_reading_delay_s, "the reply of the previous tick"),
+        ("actuation.delay_s", min_torque_delay_s, "a torque that takes effect at the next SYNC"),
+    )
+    for key, min_delay_s, delay_cause in delay_causes:
+        if profile_values[key] < min_delay_s - _MAX_DELAY_ROUNDING_S:
             yield (
                 f"{key} = {profile_values[key]:g} s is less than {delay_cause} alone: at least "
-                f"{least_s:.6g} s."
+                f"{min_delay_s:.6g} s."
             )

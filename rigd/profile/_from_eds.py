@@ -17,12 +17,12 @@ from rigd.devices.cia402.requirements import TORQUE_FEEDBACK, TORQUE_LIMIT, WATC
 from rigd.devices.eds import Eds
 from rigd.errors import FailureError
 from rigd.profile._load import ProfileError, profile_from_text
-from rigd.profile._schema import UNKNOWN, Profile, key_types
+from rigd.profile._schema import UNKNOWN_SOURCE, Profile, key_types
 from rigd.profile._write import Setting, SettingValue, with_head, with_settings
 
-_ACCEPT_KEY = "cia402.accept_without"
+_ACCEPT_WITHOUT_KEY = "cia402.accept_without"
 """Key of the profile with the missing features of the drive that the operator accepts."""
-_TORQUE_LIMIT_NAME = re.compile(
+_TORQUE_LIMIT_NAME_PATTERN = re.compile(
     r"(torque|current).*(limit|max)|(limit|max).*(torque|current)", re.IGNORECASE
 )
 """Pattern of names of objects that may limit the torque."""
@@ -40,9 +40,9 @@ class UnusableDriveError(FailureError, ValueError):
 class Question:
     """Question to the operator about a required setting that no EDS file states."""
 
-    key: str
+    profile_key: str
     """Dotted key of the setting in the profile."""
-    text: str
+    question_text: str
     """Question with the unit of the answer."""
 
 
@@ -89,10 +89,10 @@ class Draft:
         If the profile to start from has no CiA 402 drive.
     """
 
-    def __init__(self, base: Profile, eds: Eds, path: Path) -> None:
-        if base.rig.cia402 is None or base.rig.can is None:
+    def __init__(self, base_profile: Profile, eds: Eds, path: Path) -> None:
+        if base_profile.rig.cia402 is None or base_profile.rig.can is None:
             raise ProfileError(
-                f"{base.path}: has no CiA 402 drive that another can replace; start from "
+                f"{base_profile.path}: has no CiA 402 drive that another can replace; start from "
                 "antenna_can or antenna_serial."
             )
         suitability = check_suitability(eds)
@@ -101,34 +101,39 @@ class Draft:
                 f"{eds.path}: no session could be run with this drive, and no profile was "
                 f"written: {' '.join(suitability.refusals)}"
             )
-        self._base = base
+        self._base = base_profile
         self._eds = eds
         self._path = path
         self._findings = suitability.findings
         self._accepted: list[str] = []
         self._settings = {
-            reset_setting.key: reset_setting for reset_setting in self._eds_settings()
+            reset_setting.profile_key: reset_setting for reset_setting in self._eds_settings()
         }
         # The base profile has another motor, gear and encoder: none of their values is used.
         for open_question in self.questions():
-            if open_question.key in MAY_BE_UNKNOWN and open_question.key not in self._settings:
-                self._settings[open_question.key] = Setting(open_question.key, math.nan, UNKNOWN)
+            if (
+                open_question.profile_key in MAY_BE_UNKNOWN
+                and open_question.profile_key not in self._settings
+            ):
+                self._settings[open_question.profile_key] = Setting(
+                    open_question.profile_key, math.nan, UNKNOWN_SOURCE
+                )
 
-    def _draft_value(self, key: str) -> SettingValue:
+    def _draft_value(self, profile_key: str) -> SettingValue:
         """Return the value of a key in the draft."""
-        if key in self._settings:
-            return self._settings[key].value
-        section_name, _, field_name = key.rpartition(".")
+        if profile_key in self._settings:
+            return self._settings[profile_key].new_value
+        section_name, _, field_name = profile_key.rpartition(".")
         section_settings: object = getattr(self._base.rig, section_name)
         setting_value: SettingValue = getattr(section_settings, field_name)
         return setting_value
 
-    def answer(self, key: str, answer_text: str) -> None:
+    def answer(self, profile_key: str, answer_text: str) -> None:
         """Set the value of a key of the draft from the operator's answer.
 
         Parameters
         ----------
-        key
+        profile_key
             Dotted key of the profile.
         answer_text
             Answer of the operator. After ``unknown`` the value remains to be filled in, if the
@@ -139,30 +144,35 @@ class Draft:
         ValueError
             If the value is invalid; the message states the valid values.
         """
-        if answer_text == UNKNOWN and key in MAY_BE_UNKNOWN:
-            self._settings[key] = Setting(key, math.nan, UNKNOWN)
+        if answer_text == UNKNOWN_SOURCE and profile_key in MAY_BE_UNKNOWN:
+            self._settings[profile_key] = Setting(profile_key, math.nan, UNKNOWN_SOURCE)
             return
-        value_type: Any = key_types()[key]
+        value_type: Any = key_types()[profile_key]
         try:
             answered_value = TypeAdapter(value_type).validate_strings(answer_text)
         except ValidationError as error:
             raise ValueError(error.errors(include_url=False)[0]["msg"]) from None
-        if answered_value != self._draft_value(key):
-            self._settings[key] = Setting(key, answered_value, "datasheet")
+        if answered_value != self._draft_value(profile_key):
+            self._settings[profile_key] = Setting(profile_key, answered_value, "datasheet")
 
-    def value_text(self, key: str) -> str:
+    def value_text(self, profile_key: str) -> str:
         """Return the draft's value of a key as text, or ``unknown``.
 
         Parameters
         ----------
-        key
+        profile_key
             Dotted key of the profile.
         """
-        return UNKNOWN if self._is_unknown(key) else str(self._draft_value(key))
+        return (
+            UNKNOWN_SOURCE if self._is_unknown(profile_key) else str(self._draft_value(profile_key))
+        )
 
-    def _is_unknown(self, key: str) -> bool:
+    def _is_unknown(self, profile_key: str) -> bool:
         """Return whether the draft of the profile states a key's value as unknown."""
-        return key in self._settings and self._settings[key].source == UNKNOWN
+        return (
+            profile_key in self._settings
+            and self._settings[profile_key].value_source == UNKNOWN_SOURCE
+        )
 
     def unaccepted_findings(self) -> list[SuitabilityFinding]:
         """Return the missing features of the drive for which the draft would be refused.
@@ -172,7 +182,7 @@ class Draft:
         ProfileError
             If the values of the draft contradict one another.
         """
-        acceptance_setting = Setting(_ACCEPT_KEY, tuple(self._accepted))
+        acceptance_setting = Setting(_ACCEPT_WITHOUT_KEY, tuple(self._accepted))
         draft_text = with_settings(self._base.text, [*self._settings.values(), acceptance_setting])
         drive_findings = check_suitability(
             self._eds, profile_from_text(draft_text, self._path).rig
@@ -183,15 +193,16 @@ class Draft:
             if finding.acceptance_name and finding.grade is Grade.REFUSED
         ]
 
-    def accept(self, name: str) -> None:
+    def accept(self, feature_name: str) -> None:
         """Accept a missing feature of the drive in the draft, as decided by the operator.
 
         Parameters
         ----------
-        name
-            Name of the feature: `accept` of one of the findings that `unaccepted_findings` returns.
+        feature_name
+            Name of the feature: `acceptance_name` of one of the findings that `unaccepted_findings`
+            returns.
         """
-        self._accepted.append(name)
+        self._accepted.append(feature_name)
 
     @property
     def remarks(self) -> list[str]:
@@ -216,7 +227,7 @@ class Draft:
         return [
             question
             for question in (*QUESTIONS, *additional_questions)
-            if question.key not in unneeded_keys
+            if question.profile_key not in unneeded_keys
         ]
 
     def unanswered_questions(self) -> list[Question]:
@@ -224,9 +235,11 @@ class Draft:
         answered_keys = {
             key
             for key, setting in self._settings.items()
-            if setting.reason != _OTHER_DRIVE_COMMENT and setting.source != UNKNOWN
+            if setting.comment != _OTHER_DRIVE_COMMENT and setting.value_source != UNKNOWN_SOURCE
         }
-        return [question for question in self.questions() if question.key not in answered_keys]
+        return [
+            question for question in self.questions() if question.profile_key not in answered_keys
+        ]
 
     def text(self) -> str:
         """Return the text of the finished profile.
@@ -242,32 +255,38 @@ class Draft:
 
     def _text_without_head(self) -> str:
         """Return the text of the profile with its settings, but without the new head."""
-        marked_settings = [
+        settings_to_fill_in = [
             Setting(
-                question.key,
-                self._draft_value(question.key),
-                UNKNOWN if self._is_unknown(question.key) else "assumed",
-                reason="TO FILL IN: " + question.text,
+                question.profile_key,
+                self._draft_value(question.profile_key),
+                UNKNOWN_SOURCE if self._is_unknown(question.profile_key) else "assumed",
+                comment="TO FILL IN: " + question.question_text,
             )
             for question in self.unanswered_questions()
         ]
-        all_settings = [*self._settings.values(), *marked_settings, *self._acceptance()]
+        all_settings = [
+            *self._settings.values(),
+            *settings_to_fill_in,
+            *self._acceptance_settings(),
+        ]
         return with_settings(self._base.text, all_settings)
 
-    def _acceptance(self) -> Iterator[Setting]:
+    def _acceptance_settings(self) -> Iterator[Setting]:
         """Yield the setting that accepts missing features of the drive, if one is needed.
 
         If the operator has accepted none yet, the setting is written as a comment.
         """
-        undecided_names = [finding.acceptance_name for finding in self.unaccepted_findings()]
-        limit_objects = (
+        undecided_feature_names = [
+            finding.acceptance_name for finding in self.unaccepted_findings()
+        ]
+        limit_objects_text = (
             self._manufacturer_limits()
-            if TORQUE_LIMIT in (*undecided_names, *self._accepted)
+            if TORQUE_LIMIT in (*undecided_feature_names, *self._accepted)
             else ""
         )
         hint_text = (
-            f" For a torque limit of its own see {limit_objects}, set by cia402.set_objects."
-            if limit_objects
+            f" For a torque limit of its own see {limit_objects_text}, set by cia402.set_objects."
+            if limit_objects_text
             else ""
         )
         if self._accepted:
@@ -275,26 +294,30 @@ class Draft:
                 "According to its file, the drive lacks these features (docs/devices.md)."
             )
             acceptance_comment += (
-                f" Not accepted, so that rigd refuses it: {', '.join(undecided_names)}."
-                if undecided_names
+                f" Not accepted, so that rigd refuses it: {', '.join(undecided_feature_names)}."
+                if undecided_feature_names
                 else ""
             )
-            yield Setting(_ACCEPT_KEY, tuple(self._accepted), reason=acceptance_comment + hint_text)
-        elif undecided_names:
+            yield Setting(
+                _ACCEPT_WITHOUT_KEY, tuple(self._accepted), comment=acceptance_comment + hint_text
+            )
+        elif undecided_feature_names:
             acceptance_comment = (
                 "TO FILL IN: according to its file, the drive lacks these features "
                 "(docs/devices.md), and rigd refuses it. Remove the #, and from the list each "
                 "feature that must not be missing."
             )
             yield Setting(
-                _ACCEPT_KEY,
-                tuple(undecided_names),
-                reason=acceptance_comment + hint_text,
-                commented=True,
+                _ACCEPT_WITHOUT_KEY,
+                tuple(undecided_feature_names),
+                comment=acceptance_comment + hint_text,
+                is_commented_out=True,
             )
         elif self._base.rig.cia402 is not None and self._base.rig.cia402.accept_without:
             yield Setting(
-                _ACCEPT_KEY, (), reason="According to its file, the drive has all that is needed."
+                _ACCEPT_WITHOUT_KEY,
+                (),
+                comment="According to its file, the drive has all that is needed.",
             )
 
     def _missing_feature_names(self) -> list[str]:
@@ -311,18 +334,26 @@ class Draft:
         yield Setting("description", f"{product_name}, from {eds.path.name}")
         relative_path = os.path.relpath(eds.path.resolve(), path.resolve().parent)
         yield Setting(
-            "cia402.eds", relative_path, reason="The drive's file, relative to this folder."
+            "cia402.eds", relative_path, comment="The drive's file, relative to this folder."
         )
-        for key, eds_node_id in (("vendor_id", eds.vendor_id), ("product_code", eds.product_code)):
-            if eds_node_id:
-                yield Setting(f"cia402.{key}", eds_node_id, "datasheet", hexadecimal=True)
+        for key, identity_number in (
+            ("vendor_id", eds.vendor_id),
+            ("product_code", eds.product_code),
+        ):
+            if identity_number:
+                yield Setting(f"cia402.{key}", identity_number, "datasheet", is_hexadecimal=True)
         if eds.commissioned_node_id:
             setting_comment = "The node id that the file configures."
             yield Setting("cia402.node_id", eds.commissioned_node_id, "datasheet", setting_comment)
-        can = self._base.rig.can
-        if can is not None and eds.bit_rates_bit_s and can.bitrate_bit_s not in eds.bit_rates_bit_s:
+        can_settings = self._base.rig.can
+        if (
+            can_settings is not None
+            and eds.bit_rates_bit_s
+            and can_settings.bitrate_bit_s not in eds.bit_rates_bit_s
+        ):
             setting_comment = (
-                f"The drive has no {can.bitrate_bit_s / 1000:g} kbit/s; this is its highest."
+                f"The drive has no {can_settings.bitrate_bit_s / 1000:g} kbit/s; this is its "
+                "highest."
             )
             yield Setting(
                 "can.bitrate_bit_s", max(eds.bit_rates_bit_s), "datasheet", setting_comment
@@ -335,14 +366,14 @@ class Draft:
         drive_settings = self._base.rig.cia402
         assert drive_settings is not None
         if drive_settings.set_objects:
-            yield Setting("cia402.set_objects", (), reason=_OTHER_DRIVE_COMMENT)
+            yield Setting("cia402.set_objects", (), comment=_OTHER_DRIVE_COMMENT)
         if drive_settings.own_watchdog_s:
             yield Setting("cia402.own_watchdog_s", 0.0, "assumed", _OTHER_DRIVE_COMMENT)
 
     def _missing_object_settings(self) -> Iterator[Setting]:
         """Yield a setting of 0 for each optional object that the drive lacks."""
-        missing_names = self._missing_feature_names()
-        for object_missing, key, why in (
+        missing_feature_names = self._missing_feature_names()
+        for is_object_missing, key, object_description in (
             (
                 not self._eds.get(MAX_SPEED_RPM),
                 "max_speed_rad_s",
@@ -353,25 +384,34 @@ class Draft:
                 "rated_torque_unit_nm",
                 "6076 (rated torque)",
             ),
-            (TORQUE_FEEDBACK in missing_names, "torque_tolerance_percent", "6077 (actual torque)"),
+            (
+                TORQUE_FEEDBACK in missing_feature_names,
+                "torque_tolerance_percent",
+                "6077 (actual torque)",
+            ),
         ):
-            if object_missing:
-                yield Setting(f"cia402.{key}", 0.0, "datasheet", f"The drive has no object {why}.")
+            if is_object_missing:
+                yield Setting(
+                    f"cia402.{key}",
+                    0.0,
+                    "datasheet",
+                    f"The drive has no object {object_description}.",
+                )
 
     def _manufacturer_limits(self) -> str:
         """Return the manufacturer-specific objects that may limit the torque, as text.
 
         The text is empty if there are none.
         """
-        object_names = [
+        object_texts = [
             f"{e.index:04X}:{e.subindex:X} "
             f"({e.name}{'' if e.default_value is None else f', {e.default_value}'})"
             for e in self._eds.entries.values()
             if e.index in _MANUFACTURER_INDICES
             and e.is_writable
-            and _TORQUE_LIMIT_NAME.search(e.name)
+            and _TORQUE_LIMIT_NAME_PATTERN.search(e.name)
         ]
-        return " or ".join(object_names[:_MAX_NAMED_OBJECTS])
+        return " or ".join(object_texts[:_MAX_NAMED_OBJECTS])
 
     def _head_comment(self) -> list[str]:
         """Return the lines of the comment at the beginning of the profile."""

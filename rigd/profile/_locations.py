@@ -13,13 +13,13 @@ SPECIMEN_FOLDER: Final = Path("specimens")
 """Folder of specimen files, relative to the working folder."""
 _PACKAGE_FOLDER: Final = Path(__file__).resolve().parent
 """Folder of this package."""
-_WHEEL_FOLDER: Final = _PACKAGE_FOLDER / "shipped"
+_WHEEL_PROFILE_FOLDER: Final = _PACKAGE_FOLDER / "shipped"
 """Folder of the project's profiles in an installed wheel (see pyproject.toml)."""
-_CHECKOUT_FOLDER: Final = _PACKAGE_FOLDER.parents[1] / "hw_profiles"
+_CHECKOUT_PROFILE_FOLDER: Final = _PACKAGE_FOLDER.parents[1] / "hw_profiles"
 """Folder of the project's profiles in a checkout of the source tree."""
 
 
-class Origin(StrEnum):
+class ProfileOrigin(StrEnum):
     """Folder in which a profile file was found, in the search order."""
 
     HERE = "working folder"
@@ -43,7 +43,7 @@ class ProfileFile:
 
     name: str
     path: Path
-    origin: Origin
+    origin: ProfileOrigin
 
 
 def profile_files() -> dict[str, list[ProfileFile]]:
@@ -89,15 +89,17 @@ def user_folder() -> Path | None:
     return config_folder / "rigd" / "profiles"
 
 
-def _search_folders() -> Iterator[tuple[Origin, Path]]:
+def _search_folders() -> Iterator[tuple[ProfileOrigin, Path]]:
     """Yield the folders that are searched for profiles, in the search order."""
-    shipped_folder = _WHEEL_FOLDER if _WHEEL_FOLDER.is_dir() else _CHECKOUT_FOLDER
+    shipped_folder = (
+        _WHEEL_PROFILE_FOLDER if _WHEEL_PROFILE_FOLDER.is_dir() else _CHECKOUT_PROFILE_FOLDER
+    )
     try:
         is_checkout_folder = WORKING_FOLDER.samefile(shipped_folder)
     except OSError:  # usually the folder does not exist
         is_checkout_folder = False
     if not is_checkout_folder:
-        yield Origin.HERE, WORKING_FOLDER
+        yield ProfileOrigin.HERE, WORKING_FOLDER
     if own_folder := user_folder():
-        yield Origin.USER, own_folder
-    yield Origin.SHIPPED, shipped_folder
+        yield ProfileOrigin.USER, own_folder
+    yield ProfileOrigin.SHIPPED, shipped_folder

@@ -104,7 +104,7 @@ class ScaleUncertainty:
     """Standard deviation of each mode's frequency relative to that of a uniform beam."""
 
     @property
-    def stated(self) -> dict[str, float]:
+    def nonzero_percent_by_field(self) -> dict[str, float]:
         """Uncertainties in per cent that are not zero, by field name, without the uniformity."""
         return {
             scale_field.name: percent
@@ -142,7 +142,7 @@ class BeamSection(Beam):
     """Point mass at the beam's tip, or None if it is unknown."""
 
     @property
-    def uniform(self) -> Beam:
+    def uniform_beam(self) -> Beam:
         """Uniform beam without the tip mass."""
         return Beam(self.length_m, self.density_kg_per_m, self.bending_stiffness_n_m2)
 
@@ -170,7 +170,7 @@ SECTIONS: dict[str, type] = {
     "uncertainty": ScaleUncertainty,
 }
 """Map from a section's name to the dataclass of its keys."""
-_ADDED_SECTIONS: dict[str, str] = {}
+_GROUP_BY_ADDED_SECTION: dict[str, str] = {}
 """Map from each section that a part of an installed package has added, to the part's group."""
 
 
@@ -179,7 +179,7 @@ def optional_sections() -> tuple[str, ...]:
     built_in_sections = [
         name for kind in DEVICES.built_in.values() for name in kind.required_sections
     ]
-    return tuple(dict.fromkeys([*built_in_sections, *sorted(_ADDED_SECTIONS)]))
+    return tuple(dict.fromkeys([*built_in_sections, *sorted(_GROUP_BY_ADDED_SECTION)]))
 
 
 def add_section(kind: DeviceKind | ControllerKind, plugin: Plugin) -> None:
@@ -188,37 +188,41 @@ def add_section(kind: DeviceKind | ControllerKind, plugin: Plugin) -> None:
     Nothing changes if it was added before. Raise `PluginError` if the declaration of its settings
     is invalid, or if the section is one of rigd's own or of another part.
     """
-    settings = kind.settings
-    if settings is None or SECTIONS.get(kind.name) is settings:
+    settings_class = kind.settings
+    if settings_class is None or SECTIONS.get(kind.name) is settings_class:
         return
-    if kind.name in SECTIONS and _ADDED_SECTIONS.get(kind.name) != plugin.group:
-        owner_text = "another package's part" if kind.name in _ADDED_SECTIONS else "every profile"
+    if kind.name in SECTIONS and _GROUP_BY_ADDED_SECTION.get(kind.name) != plugin.group:
+        owner_text = (
+            "another package's part" if kind.name in _GROUP_BY_ADDED_SECTION else "every profile"
+        )
         raise plugin.error(f"[{kind.name}] is a section of {owner_text}; rename the {plugin.noun}.")
-    if problem := _settings_problem(settings):
-        raise plugin.error(f"its settings {settings.__name__} are invalid: {problem}")
+    if problem := _settings_problem(settings_class):
+        raise plugin.error(f"its settings {settings_class.__name__} are invalid: {problem}")
     if unknown := set(kind.required_sections) - {kind.name} - set(SECTIONS):
         raise plugin.error(f"it requires the unknown section [{min(unknown)}].")
-    SECTIONS[kind.name] = settings
-    _ADDED_SECTIONS[kind.name] = plugin.group
+    SECTIONS[kind.name] = settings_class
+    _GROUP_BY_ADDED_SECTION[kind.name] = plugin.group
     key_types.cache_clear()
     key_defaults.cache_clear()
 
 
-def _settings_problem(settings: type) -> str:
+def _settings_problem(settings_class: type) -> str:
     """Return the reason why a class cannot declare a section of a profile, or ""."""
-    parameters = getattr(settings, "__dataclass_params__", None)
-    if parameters is None or not parameters.frozen:
+    dataclass_parameters = getattr(settings_class, "__dataclass_params__", None)
+    if dataclass_parameters is None or not dataclass_parameters.frozen:
         return "they are not a frozen dataclass; declare them with @dataclass(frozen=True)."
     # Late: the processes of a session, which get a loaded profile, do not need it.
     from pydantic import ConfigDict, TypeAdapter, ValidationError
 
     try:
-        for key, value_type in get_type_hints(settings, include_extras=True).items():
-            default = next((f.default for f in fields(settings) if f.name == key), MISSING)
+        for key, value_type in get_type_hints(settings_class, include_extras=True).items():
+            default_value = next(
+                (f.default for f in fields(settings_class) if f.name == key), MISSING
+            )
             # Also builds the validator, which finds types and ranges that cannot be checked.
             validator = TypeAdapter(value_type, config=ConfigDict(strict=True))
-            if default is not MISSING:
-                validator.validate_python(default)
+            if default_value is not MISSING:
+                validator.validate_python(default_value)
     except ValidationError as error:
         return f"the default of {key} is not in its range ({error.errors()[0]['msg']})."
     except Exception as error:  # whatever a foreign declaration causes
@@ -242,9 +246,9 @@ def check_part_plugin(plugin: Plugin) -> str:
 
 TEXT_KEYS = ("name", "description")
 """Keys outside any section, whose values are texts."""
-SOURCES = ("paper", "datasheet", "measured", "assumed")
+NUMBER_SOURCES = ("paper", "datasheet", "measured", "assumed")
 """Valid sources of a number in a profile."""
-UNKNOWN = "unknown"
+UNKNOWN_SOURCE = "unknown"
 """Source of a number without a value, which is NaN in the parameters (see `MAY_BE_UNKNOWN`)."""
 
 
@@ -258,34 +262,43 @@ def section_text(kind: DeviceKind | ControllerKind) -> str:
     """
     if kind.settings is None:
         return ""
-    lines = [f"[{kind.name}]"]
-    type_hints = get_type_hints(kind.settings, include_extras=True)
+    section_lines = [f"[{kind.name}]"]
+    type_hint_by_field = get_type_hints(kind.settings, include_extras=True)
     for settings_field in fields(kind.settings):
-        hint = type_hints[settings_field.name]
-        extras = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
-        plain_type = get_args(hint)[0] if extras else hint
-        help_texts = [each.documentation for each in extras if isinstance(each, DocInfo)]
-        if get_origin(plain_type) is Literal:
-            help_texts.append("one of " + ", ".join(map(str, get_args(plain_type))))
-        for each in extras:
-            for bound_name, bound_words in _BOUND_WORDS.items():
+        field_type = type_hint_by_field[settings_field.name]
+        annotations = get_args(field_type)[1:] if get_origin(field_type) is Annotated else ()
+        type_without_annotations = get_args(field_type)[0] if annotations else field_type
+        help_texts = [each.documentation for each in annotations if isinstance(each, DocInfo)]
+        if get_origin(type_without_annotations) is Literal:
+            help_texts.append("one of " + ", ".join(map(str, get_args(type_without_annotations))))
+        for each in annotations:
+            for bound_name, bound_words in _BOUND_WORDS_BY_ATTRIBUTE.items():
                 if (bound := getattr(each, bound_name, None)) is not None:
                     help_texts.append(f"{bound_words} {bound}")
         if unit := unit_of(settings_field.name):
             help_texts.append(f"in {unit}")
         if help_texts:
-            lines.append(f"# {'; '.join(help_texts)}")
+            section_lines.append(f"# {'; '.join(help_texts)}")
         is_optional = settings_field.default is not MISSING
         if is_optional:
-            value = json.dumps(settings_field.default, ensure_ascii=False)
+            value_text = json.dumps(settings_field.default, ensure_ascii=False)
         else:
-            value = "…" if is_number(hint) else '"…"'
-        entry = f'{{ value = {value}, source = "assumed" }}' if is_number(hint) else value
-        lines.append(f"{'# ' if is_optional else ''}{settings_field.name} = {entry}")
-    return "\n".join(lines) + "\n"
+            value_text = "…" if is_number_type(field_type) else '"…"'
+        entry_text = (
+            f'{{ value = {value_text}, source = "assumed" }}'
+            if is_number_type(field_type)
+            else value_text
+        )
+        section_lines.append(f"{'# ' if is_optional else ''}{settings_field.name} = {entry_text}")
+    return "\n".join(section_lines) + "\n"
 
 
-_BOUND_WORDS = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
+_BOUND_WORDS_BY_ATTRIBUTE = {
+    "gt": "more than",
+    "ge": "at least",
+    "lt": "less than",
+    "le": "at most",
+}
 """Words for the bounds of a range, by the attributes of ``annotated_types``."""
 
 
@@ -297,9 +310,9 @@ def key_types() -> dict[str, Any]:
     """
     type_by_key: dict[str, Any] = dict.fromkeys(TEXT_KEYS, Annotated[str, MinLen(1)])
     for section_name, section_class in SECTIONS.items():
-        type_hints = get_type_hints(section_class, include_extras=True)
+        type_hint_by_field = get_type_hints(section_class, include_extras=True)
         type_by_key |= {
-            key: type_hints[field_name] for key, field_name in section_fields(section_name)
+            key: type_hint_by_field[field_name] for key, field_name in section_fields(section_name)
         }
     return type_by_key
 
@@ -316,11 +329,11 @@ def key_defaults() -> dict[str, Any]:
         for section_name, section_class in SECTIONS.items()
         for dataclass_field in fields(section_class)
         if dataclass_field.default is not MISSING
-        and (dataclass_field.metadata.get("optional") or section_name in _ADDED_SECTIONS)
+        and (dataclass_field.metadata.get("optional") or section_name in _GROUP_BY_ADDED_SECTION)
     }
 
 
-def is_number(value_type: Any) -> bool:  # noqa: ANN401
+def is_number_type(value_type: Any) -> bool:  # noqa: ANN401
     """Return whether values of a type are numbers, alone or as a tuple, which need a source."""
     if get_origin(value_type) is Annotated:
         value_type = get_args(value_type)[0]
@@ -329,11 +342,11 @@ def is_number(value_type: Any) -> bool:  # noqa: ANN401
     return value_type not in (str, bool) and get_origin(value_type) is not Literal
 
 
-def section_fields(section: str) -> list[tuple[str, str]]:
+def section_fields(section_name: str) -> list[tuple[str, str]]:
     """Return each dotted key of a section with the name of its dataclass field."""
     # A trailing underscore distinguishes the name of a field from a Python keyword.
-    field_names = [dataclass_field.name for dataclass_field in fields(SECTIONS[section])]
-    return [(f"{section}.{field_name.rstrip('_')}", field_name) for field_name in field_names]
+    field_names = [dataclass_field.name for dataclass_field in fields(SECTIONS[section_name])]
+    return [(f"{section_name}.{field_name.rstrip('_')}", field_name) for field_name in field_names]
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,7 +371,7 @@ class Specimen:
     """Point mass at the specimen's tip, or None if it is unknown."""
 
 
-_BREAKAWAY_TO_COULOMB = 5.0
+_BREAKAWAY_TO_COULOMB_RATIO = 5.0
 """Assumed ratio of breakaway torque to the stated Coulomb friction, for a cold gear."""
 _MIN_BREAKAWAY_FRACTION = 0.05
 """Smallest breakaway torque, as a fraction of the peak torque."""
@@ -416,7 +429,7 @@ class Profile:
         """Net torque in N·m on the shaft that exceeds its largest friction."""
         rig_motor, stated_nm = self.rig.motor, self.limits.standstill_torque_nm
         return stated_nm or max(
-            _BREAKAWAY_TO_COULOMB * rig_motor.coulomb_nm,
+            _BREAKAWAY_TO_COULOMB_RATIO * rig_motor.coulomb_nm,
             _MIN_BREAKAWAY_FRACTION * rig_motor.peak_torque_nm,
         )
 
@@ -443,9 +456,11 @@ class Profile:
 
         The PID replaces a controller of a package that states no matrices.
         """
-        name = self.control.controller
-        kind = None if name == SHIPPED_CONTROLLER else CONTROLLERS.get(name)
-        return kind is None or kind.linear is not None
+        controller_name = self.control.controller
+        controller_kind = (
+            None if controller_name == SHIPPED_CONTROLLER else CONTROLLERS.get(controller_name)
+        )
+        return controller_kind is None or controller_kind.linear is not None
 
     def loop_model(self) -> LoopModel:
         """Return the model of this rig's closed loop, for its design and prediction.
@@ -463,11 +478,11 @@ class Profile:
         controller = linear_controller(rig)
         if controller is None:
             return rig.loop
-        kind = CONTROLLERS.get(self.control.controller)
+        controller_kind = CONTROLLERS.get(self.control.controller)
         return replace(
             rig.loop,
             controller=controller,
-            shifts_reference=kind is not None and kind.shifts_reference,
+            shifts_reference=controller_kind is not None and controller_kind.shifts_reference,
         )
 
     def controlled_rig(self) -> ControlledRig:

@@ -38,7 +38,7 @@ _RIG_UNCERTAINTY_KEY: Final = "uncertainty.torque_scale_percent"
 """Key of the uncertainties that belongs to the rig and not to a specimen."""
 _NOTE_KEY: Final = "note"
 """Key of the free text."""
-_MAX_BYTES: Final = 16_384
+_MAX_FILE_BYTES: Final = 16_384
 """Largest size of a specimen file in bytes, which each session sends through a pipe."""
 
 
@@ -65,15 +65,15 @@ def load_specimen(specimen_path: Path) -> Specimen:
         unit and remedy.
     """
     file_text = read_text(specimen_path)
-    if len(file_text.encode()) > _MAX_BYTES:
+    if len(file_text.encode()) > _MAX_FILE_BYTES:
         raise ProfileError(
-            f"{specimen_path}: is longer than {_MAX_BYTES} bytes; shorten its notes."
+            f"{specimen_path}: is longer than {_MAX_FILE_BYTES} bytes; shorten its notes."
         )
-    problems: list[str] = []
-    values_by_key, _ = flatten_document(parse_document(file_text, specimen_path), problems)
+    problem_messages: list[str] = []
+    values_by_key, _ = flatten_document(parse_document(file_text, specimen_path), problem_messages)
     specimen_note = values_by_key.pop(_NOTE_KEY, "")
     if not isinstance(specimen_note, str):
-        problems.append(f"{_NOTE_KEY} = {specimen_note!r} must be text in quotes.")
+        problem_messages.append(f"{_NOTE_KEY} = {specimen_note!r} must be text in quotes.")
     valid_prefixes = (f"{_BEAM_SECTION}.", f"{_UNCERTAINTY_SECTION}.")
     for key in [
         key
@@ -81,7 +81,7 @@ def load_specimen(specimen_path: Path) -> Specimen:
         if not key.startswith(valid_prefixes) or key == _RIG_UNCERTAINTY_KEY
     ]:
         del values_by_key[key]
-        problems.append(
+        problem_messages.append(
             f"{key} does not belong to a specimen, which has [beam], [beam.damping], of "
             f"[uncertainty] all but {_RIG_UNCERTAINTY_KEY.partition('.')[2]}, and note; remove it."
         )
@@ -90,12 +90,12 @@ def load_specimen(specimen_path: Path) -> Specimen:
         _DAMPING_SECTION for key in values_by_key if key.startswith(f"{_DAMPING_SECTION}.")
     }
     values_by_key = validate_values(
-        values_by_key, problems, frozenset({"", *SECTIONS} - known_sections)
+        values_by_key, problem_messages, frozenset({"", *SECTIONS} - known_sections)
     )
-    if not problems:
-        problems.extend(diagnostics.first_mode_contradictions(values_by_key))
-    if problems:
-        raise problems_error(specimen_path, problems)
+    if not problem_messages:
+        problem_messages.extend(diagnostics.first_mode_contradictions(values_by_key))
+    if problem_messages:
+        raise problems_error(specimen_path, problem_messages)
     beam = BeamSection(
         **{field_name: values_by_key[key] for key, field_name in section_fields(_BEAM_SECTION)}
     )
@@ -117,7 +117,7 @@ def load_specimen(specimen_path: Path) -> Specimen:
         specimen_path.stem,
         specimen_path,
         file_text,
-        beam.uniform,
+        beam.uniform_beam,
         damping,
         uncertainty,
         specimen_note,
@@ -157,11 +157,11 @@ def with_specimen(profile: Profile, specimen_name: str) -> Profile:
         )
     specimen = load_specimen(specimen_path)
     rig = replace(profile.rig, beam=specimen.beam, damping=specimen.damping or profile.rig.damping)
-    scale_percent = profile.uncertainty.torque_scale_percent
+    torque_scale_percent = profile.uncertainty.torque_scale_percent
     return replace(
         profile,
         rig=rig,
-        uncertainty=replace(specimen.uncertainty, torque_scale_percent=scale_percent),
+        uncertainty=replace(specimen.uncertainty, torque_scale_percent=torque_scale_percent),
         tip_mass_kg=specimen.tip_mass_kg,
         specimen=specimen,
         specimen_in_words=_describe_specimen(profile, specimen),
@@ -183,10 +183,10 @@ def _describe_specimen(profile: Profile, specimen: Specimen) -> str:
     sentence_start = f"Specimen {specimen.name} ({specimen.path}): "
     difference_texts = [
         f"{field_name.removesuffix(suffix_of(field_name)).replace('_', ' ')} "
-        f"{specimen_value:g} {unit_of(field_name)} (profile: {its:g})"
+        f"{specimen_value:g} {unit_of(field_name)} (profile: {profile_value:g})"
         for field_name in (beam_field.name for beam_field in fields(Beam))
         if (specimen_value := getattr(specimen.beam, field_name))
-        != (its := getattr(profile.rig.beam, field_name))
+        != (profile_value := getattr(profile.rig.beam, field_name))
     ]
     if specimen.tip_mass_kg is not None:
         difference_texts.append(f"tip mass {1e3 * specimen.tip_mass_kg:g} g")
@@ -194,9 +194,9 @@ def _describe_specimen(profile: Profile, specimen: Specimen) -> str:
         difference_texts.append("nominal damping of its own")
     if not difference_texts:
         return f"{sentence_start}beam as in the profile."
-    sentence = (
+    specimen_sentence = (
         f"{sentence_start}{', '.join(difference_texts)}; for prediction, nominal model and file."
     )
     if actuation_target(profile.rig) is not ActuationTarget.HARDWARE:
-        sentence += " The simulated rig keeps the beam of the profile."
-    return sentence
+        specimen_sentence += " The simulated rig keeps the beam of the profile."
+    return specimen_sentence

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.profile._load import ProfileError, profile_from_text
-from rigd.profile._schema import UNKNOWN, Profile, is_number, key_types
+from rigd.profile._schema import UNKNOWN_SOURCE, Profile, is_number_type, key_types
 
 SettingValue = bool | int | float | str | tuple[str, ...]
 """Type of the value of a profile's key."""
@@ -16,7 +16,7 @@ SettingValue = bool | int | float | str | tuple[str, ...]
 _COMMENT_WIDTH = 100
 """Largest length of a comment's lines, in characters."""
 
-_NAMING_LINE = re.compile(r"\[([^\]]+)\]|(\w+)\s*=|# (\w+) = ")
+_NAMING_LINE_PATTERN = re.compile(r"\[([^\]]+)\]|(\w+)\s*=|# (\w+) = ")
 """Pattern for the beginning of a line that names a section, a key, or a key in a comment."""
 
 
@@ -24,51 +24,51 @@ _NAMING_LINE = re.compile(r"\[([^\]]+)\]|(\w+)\s*=|# (\w+) = ")
 class Setting:
     """Change of a profile: key, new value, its source, and a comment."""
 
-    key: str
+    profile_key: str
     """Dotted key, such as ``cia402.node_id``."""
-    value: SettingValue
+    new_value: SettingValue
     """New value of the key."""
-    source: str = "assumed"
+    value_source: str = "assumed"
     """Source of the value if it is a number; if the source is "unknown", no value is written."""
-    reason: str = ""
+    comment: str = ""
     """Text of the comment above the key, or an empty string for no comment."""
-    hexadecimal: bool = False
+    is_hexadecimal: bool = False
     """Whether an integer is written as a hexadecimal number."""
-    commented: bool = False
+    is_commented_out: bool = False
     """Whether the setting is only written as a comment, for a later decision."""
 
 
-def with_settings(text: str, settings: Iterable[Setting]) -> str:
+def with_settings(profile_text: str, settings: Iterable[Setting]) -> str:
     """Return the text of a valid profile after the values of some keys are replaced.
 
     Other comments and values are unchanged. A key that the profile does not have replaces the
     comment that shows it, or becomes the first key of its section; without the section it raises
     `KeyError`.
     """
-    text_lines = text.splitlines()
+    text_lines = profile_text.splitlines()
     for new_setting in settings:
-        line_indices = _line_indices(text_lines)
-        line_index = _setting_line(new_setting)
+        line_index_by_key = _line_index_by_key(text_lines)
+        setting_line = _setting_line(new_setting)
         new_lines = [
-            *_comment_lines(new_setting.reason),
-            f"# {line_index}" if new_setting.commented else line_index,
+            *_comment_lines(new_setting.comment),
+            f"# {setting_line}" if new_setting.is_commented_out else setting_line,
         ]
-        if new_setting.key in line_indices:
-            line_position = line_indices[new_setting.key]
+        if new_setting.profile_key in line_index_by_key:
+            line_position = line_index_by_key[new_setting.profile_key]
             text_lines[line_position : line_position + 1] = new_lines
         else:
-            line_position = line_indices[new_setting.key.rpartition(".")[0]] + 1
+            line_position = line_index_by_key[new_setting.profile_key.rpartition(".")[0]] + 1
             text_lines[line_position:line_position] = new_lines
     return "\n".join(text_lines) + "\n"
 
 
-def with_head(text: str, head: Sequence[str]) -> str:
+def with_head(profile_text: str, head_lines: Sequence[str]) -> str:
     """Return the text of a profile after the comments before its first key are replaced.
 
-    `head` contains the lines of the new comments.
+    `head_lines` contains the lines of the new comments.
     """
-    text_lines = text.splitlines()
-    first_key_line = next(
+    text_lines = profile_text.splitlines()
+    first_key_line_index = next(
         i for i, text_line in enumerate(text_lines) if text_line and not text_line.startswith("#")
     )
     return (
@@ -76,11 +76,11 @@ def with_head(text: str, head: Sequence[str]) -> str:
             [
                 *(
                     head_line
-                    for text_line in head
+                    for text_line in head_lines
                     for head_line in _comment_lines(text_line) or ["#"]
                 ),
                 "",
-                *text_lines[first_key_line:],
+                *text_lines[first_key_line_index:],
             ]
         )
         + "\n"
@@ -103,14 +103,14 @@ def check_new(path: Path) -> None:
         raise ProfileError(f"{path}: there is no folder {path.parent}; create it first.")
 
 
-def write_new(path: Path, text: str) -> None:
+def write_new(path: Path, file_text: str) -> None:
     """Write the text of a profile to a new file.
 
     Parameters
     ----------
     path
         Path of the new file.
-    text
+    file_text
         Text of the file.
 
     Raises
@@ -120,7 +120,7 @@ def write_new(path: Path, text: str) -> None:
     """
     try:
         with path.open("x", encoding="utf-8") as profile_file:
-            profile_file.write(text)
+            profile_file.write(file_text)
     except FileExistsError as error:
         raise _exists_error(path) from error
     except OSError as error:
@@ -144,14 +144,14 @@ def copy_profile(profile: Profile, path: Path, new_name: str | None = None) -> N
     ProfileError
         If the file exists or cannot be written, or the name is invalid for a profile.
     """
-    new_settings = [] if new_name is None else [Setting("name", new_name)]
+    changed_settings = [] if new_name is None else [Setting("name", new_name)]
     drive_settings = profile.rig.cia402
     if drive_settings is not None and drive_settings.eds:
-        new_settings.append(Setting("cia402.eds", drive_settings.eds))
+        changed_settings.append(Setting("cia402.eds", drive_settings.eds))
     profile_text = profile.text
-    if new_settings:
+    if changed_settings:
         try:
-            profile_text = with_settings(profile_text, new_settings)
+            profile_text = with_settings(profile_text, changed_settings)
         except KeyError:
             raise ProfileError(
                 f"{profile.path}: is not laid out as the shipped profiles are, one key a line "
@@ -172,26 +172,26 @@ def _exists_error(path: Path) -> ProfileError:
     return ProfileError(f"{path}: exists and is not overwritten; name another file.")
 
 
-def _line_indices(text_lines: Sequence[str]) -> dict[str, int]:
+def _line_index_by_key(text_lines: Sequence[str]) -> dict[str, int]:
     """Return the index of the line of each section and each key of a profile.
 
     If a key occurs only in a comment, it is the index of the comment.
     """
     index_by_key: dict[str, int] = {}
-    value_text: dict[str, int] = {}
-    section = ""
+    comment_index_by_key: dict[str, int] = {}
+    section_prefix = ""
     for line_index, text_line in enumerate(text_lines):
-        if not (found := _NAMING_LINE.match(text_line)):
+        if not (found := _NAMING_LINE_PATTERN.match(text_line)):
             continue
         title, key_name, commented_key = found.groups()
         if title:
             index_by_key[title] = line_index
-            section = f"{title}."
+            section_prefix = f"{title}."
         elif key_name:
-            index_by_key[section + key_name] = line_index
-        elif section + commented_key in key_types():
-            value_text[section + commented_key] = line_index
-    return value_text | index_by_key
+            index_by_key[section_prefix + key_name] = line_index
+        elif section_prefix + commented_key in key_types():
+            comment_index_by_key[section_prefix + commented_key] = line_index
+    return comment_index_by_key | index_by_key
 
 
 def _comment_lines(comment: str) -> list[str]:
@@ -201,14 +201,14 @@ def _comment_lines(comment: str) -> list[str]:
 
 def _setting_line(setting: Setting) -> str:
     """Return the line of a profile for a setting."""
-    key_name = setting.key.rpartition(".")[2]
-    setting_value = setting.value
+    key_name = setting.profile_key.rpartition(".")[2]
+    setting_value = setting.new_value
     # Texts and booleans have the same syntax in JSON and TOML.
     value_text = json.dumps(setting_value, ensure_ascii=False)
-    if not is_number(key_types()[setting.key]):
+    if not is_number_type(key_types()[setting.profile_key]):
         return f"{key_name} = {value_text}"
-    if setting.source == UNKNOWN:
-        return f'{key_name} = {{ source = "{UNKNOWN}" }}'
-    if setting.hexadecimal and isinstance(setting_value, int):
+    if setting.value_source == UNKNOWN_SOURCE:
+        return f'{key_name} = {{ source = "{UNKNOWN_SOURCE}" }}'
+    if setting.is_hexadecimal and isinstance(setting_value, int):
         value_text = f"0x{setting_value:08X}"
-    return f'{key_name} = {{ value = {value_text}, source = "{setting.source}" }}'
+    return f'{key_name} = {{ value = {value_text}, source = "{setting.value_source}" }}'

@@ -419,7 +419,10 @@ def _session_metadata(
         "angle_delay_s": repr(rig.encoder.delay_s),
         "torque_delay_s": repr(rig.sensor.delay_s),
         "actuation_delay_s": repr(rig.actuation.delay_s),
-        **{f"uncertainty_{k}": repr(v) for k, v in order.profile.uncertainty.stated.items()},
+        **{
+            f"uncertainty_{k}": repr(v)
+            for k, v in order.profile.uncertainty.nonzero_percent_by_field.items()
+        },
         "sensor_projection": ",".join(map(repr, rig.sensor.projection)),
         "drive": rig.devices.drive,
         "sensor": rig.devices.sensor,

@@ -15,7 +15,7 @@ from rigd.devices import MAY_BE_UNKNOWN
 from rigd.profile import load_profile
 from rigd.profile._from_eds import QUESTIONS
 
-QUESTION_KEYS = {question.key for question in QUESTIONS}
+QUESTION_KEYS = {question.profile_key for question in QUESTIONS}
 
 
 @pytest.fixture
@@ -80,11 +80,11 @@ def test_values_missing_in_the_file_are_marked_and_listed(new_profile, tmp_path)
     text = (tmp_path / "my_rig.toml").read_text()
     profile = load_profile(tmp_path / "my_rig.toml")
     for question in QUESTIONS:
-        unknown = question.key in MAY_BE_UNKNOWN
-        assert f"  {question.key} = {'unknown' if unknown else ''}" in done.stderr
+        unknown = question.profile_key in MAY_BE_UNKNOWN
+        assert f"  {question.profile_key} = {'unknown' if unknown else ''}" in done.stderr
         source = "unknown" if unknown else "assumed"
-        assert profile.sources.get(question.key, "assumed") == source
-        name = question.key.rpartition(".")[2]
+        assert profile.sources.get(question.profile_key, "assumed") == source
+        name = question.profile_key.rpartition(".")[2]
         assert not unknown or f'\n{name} = {{ source = "unknown" }}\n' in text
         assert re.search(rf"^# TO FILL IN: [^\n]*\n(# [^\n]*\n)*{name} = ", text, re.MULTILINE)
     shown = r'^# TO FILL IN: according[^\n]*\n(# [^\n]*\n)+# accept_without = \["torque_limit"\]$'

@@ -16,7 +16,7 @@ def shipped():
     [
         (Setting("description", 'a "b" \\ é'), 'description = "a \\"b\\" \\\\ é"'),
         (
-            Setting("cia402.vendor_id", 0x9A, "datasheet", hexadecimal=True),
+            Setting("cia402.vendor_id", 0x9A, "datasheet", is_hexadecimal=True),
             'vendor_id = { value = 0x0000009A, source = "datasheet" }',
         ),
         (
@@ -34,13 +34,13 @@ def test_a_value_replaces_that_of_its_key(loaded, shipped, setting, line):
     ((_, after),) = [pair for pair in zip(old, new, strict=True) if pair[0] != pair[1]]
     assert after == line
     profile = loaded(text)
-    section, _, key = setting.key.rpartition(".")
+    section, _, key = setting.profile_key.rpartition(".")
     found = getattr(getattr(profile.rig, section), key) if section else profile.description
-    assert found == setting.value
+    assert found == setting.new_value
 
 
 def test_reasons_become_comments_above(loaded, shipped):
-    text = with_settings(shipped.text, [Setting("cia402.node_id", 7, reason="Because. " * 20)])
+    text = with_settings(shipped.text, [Setting("cia402.node_id", 7, comment="Because. " * 20)])
     lines = text.splitlines()
     index = lines.index('node_id = { value = 7, source = "assumed" }')
     assert lines[index - 1].startswith("# Because.")

@@ -73,17 +73,17 @@ def test_uncertainty_of_its_beam_replaces_that_of_the_profile(write, tmp_path):
     numbers = re.sub(r"= ([\d.]+),?", r'= { value = \1, source = "measured" }\n', stated)
     path.write_text(f"{path.read_text()}\n[uncertainty]\n{numbers}\n")
     profile = load_profile(path)
-    assert profile.uncertainty.stated == {
+    assert profile.uncertainty.nonzero_percent_by_field == {
         "torque_scale_percent": 2.0, "length_percent": 0.3, "density_percent": 4.0
     }  # fmt: skip
     write(BEAM + '[uncertainty]\nlength_percent = { value = 0.1, source = "measured" }\n')
-    assert with_specimen(profile, "antenna 4").uncertainty.stated == {
+    assert with_specimen(profile, "antenna 4").uncertainty.nonzero_percent_by_field == {
         "torque_scale_percent": 2.0, "length_percent": 0.1
     }  # fmt: skip
     write(BEAM + '[uncertainty]\nuniformity_percent = { value = 0.5, source = "measured" }\n')
     uncertainty = with_specimen(profile, "antenna 4").uncertainty
     assert uncertainty.uniformity_percent == 0.5
-    assert uncertainty.stated == {"torque_scale_percent": 2.0}
+    assert uncertainty.nonzero_percent_by_field == {"torque_scale_percent": 2.0}
 
 
 def test_tip_mass_of_a_specimen(write):

@@ -28,10 +28,10 @@ def with_examples(name):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_profiles_have_uncertainty_in_comments(loaded, name):
     profile = load_profile(name)
-    assert profile.uncertainty.stated == {}
+    assert profile.uncertainty.nonzero_percent_by_field == {}
     assert (profile.tip_mass_kg, profile.axis_tilt_deg) == (None, None)
     profile = loaded(with_examples(name))
-    assert profile.uncertainty.stated == {
+    assert profile.uncertainty.nonzero_percent_by_field == {
         "torque_scale_percent": 0.5, "length_percent": 0.05, "density_percent": 0.3,
         "tip_mass_percent": 1.0,
     }  # fmt: skip

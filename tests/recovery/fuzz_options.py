@@ -335,7 +335,7 @@ def _with_value(text, key, value):
 def key_cases(seed, every):
     """Yield cases for each key of profile, specimen, EDS and JSON files."""
     from rigd.profile import load_profile
-    from rigd.profile._schema import is_number, key_types
+    from rigd.profile._schema import is_number_type, key_types
 
     turn = seed
     for base in ("sim", "antenna_can", "antenna_serial"):
@@ -343,7 +343,7 @@ def key_cases(seed, every):
         for key, annotation in key_types().items():
             if base != "sim" and not key.startswith(("can.", "cia402.", "ati_", "acquisition.")):
                 continue
-            values = TOML_NUMBERS if is_number(annotation) else TOML_TEXTS
+            values = TOML_NUMBERS if is_number_type(annotation) else TOML_TEXTS
             for value in values if every else [values[turn % len(values)]]:
                 hostile = _with_value(text, key, value).encode(errors="replace")
                 name = f"profile {base} {key} = {value[:40]}"
