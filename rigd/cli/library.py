@@ -216,7 +216,7 @@ def _validity_text(row: "SessionRow") -> str:
     """Return a short text on whether a session's linear model is valid; "" if it has no modes."""
     from rigd.session import Validity
 
-    return Validity.from_document(row.validity).short if row.modes else ""
+    return Validity.from_document(row.validity).short_text if row.modes else ""
 
 
 def _uniform_beam_text(row: "SessionRow") -> str:
@@ -224,7 +224,7 @@ def _uniform_beam_text(row: "SessionRow") -> str:
     from rigd.session import Validity
 
     check_result = Validity.from_document(row.validity).uniform_beam
-    return "" if check_result is None or not row.modes else check_result.short
+    return "" if check_result is None or not row.modes else check_result.short_text
 
 
 # Trend

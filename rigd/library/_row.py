@@ -146,7 +146,7 @@ def read_row(
         return row, not isinstance(error, SessionAccessError)
     file_metadata, outcome_document = file_summary.metadata, file_summary.outcome or {}
     outcome_text = _text_of_key(outcome_document, "outcome") or "unknown"
-    if file_summary.recording:
+    if file_summary.is_recording:
         outcome_text = "recording"
     elif file_summary.problem:
         outcome_text = "incomplete"

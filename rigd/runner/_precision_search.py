@@ -531,7 +531,7 @@ class ExcitationPlanner:
             heading_text = "".join(
                 f"{column_name:<{_COLUMN_WIDTH}}" for column_name in column_names
             )
-            heading_note = f"± one standard deviation; tip slope {validity.short}"
+            heading_note = f"± one standard deviation; tip slope {validity.short_text}"
             table_rows.append(f"  time  {heading_text}left   ({heading_note})")
         remaining_s = self._forecast.remaining_s
         row_text = "".join(

@@ -27,7 +27,7 @@ def load_contents(
     topics: Sequence[str] | None,
     *,
     on_block: OnBlock | None = None,
-    salvage: bool = False,
+    is_salvage: bool = False,
     on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
     """Return the contents of an MCAP file up to its end or its first damage.
@@ -41,7 +41,7 @@ def load_contents(
             memoryview(mapped_file),
             topics,
             on_block=on_block,
-            salvage=salvage,
+            is_salvage=is_salvage,
             on_progress=on_progress,
         )
 
@@ -115,41 +115,41 @@ def may_contain_samples(path: Path) -> bool:
     """
     try:
         with path.open("rb") as file:
-            beginning = file.read(_SEARCHED_BYTES)
-            is_longer = bool(file.read(1))
+            first_bytes = file.read(_SEARCHED_BYTES)
+            has_more_bytes = bool(file.read(1))
     except OSError:
         return True
     try:
-        mcap_contents = read_mcap(memoryview(beginning), (), salvage=True)
+        mcap_contents = read_mcap(memoryview(first_bytes), (), is_salvage=True)
     except McapError:
         return False
-    return is_longer or mcap_contents.count(SAMPLE_TOPIC) > 0
+    return has_more_bytes or mcap_contents.count(SAMPLE_TOPIC) > 0
 
 
-def recovery_advice(path: Path, *, was_whole: bool) -> str:
+def recovery_advice(path: Path, *, was_complete: bool) -> str:
     """Return the end of an error message on a damaged file: what is intact, and how to recover it.
 
     The text begins with the punctuation mark that follows the description of the damage.
-    `was_whole` states that the file was once complete, so that an intact copy may exist.
+    `was_complete` states that the file was once complete, so that an intact copy may exist.
     """
     try:
-        sample_count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)
+        sample_count = load_contents(path, (), is_salvage=True).count(SAMPLE_TOPIC)
     except SessionError:
         sample_count = 0
     copy_advice = ". Copy it again from where it was recorded"
-    readable_samples = f"; {sample_count} complete samples are readable before that"
+    readable_samples_text = f"; {sample_count} complete samples are readable before that"
     if not sample_count:
         no_samples_text = ", so there is nothing to recover"
-        if was_whole:
-            return f"{readable_samples}{no_samples_text}{copy_advice}."
+        if was_complete:
+            return f"{readable_samples_text}{no_samples_text}{copy_advice}."
         return (
-            f"{readable_samples}{no_samples_text}. Copy it again if there is a complete one, or "
-            "record it again."
+            f"{readable_samples_text}{no_samples_text}. Copy it again if there is a complete one, "
+            "or record it again."
         )
     recovered_file = recovered_path(path)
     recover_command = f"`rigd recover {shlex.quote(str(path))}`"
     if os.path.lexists(recovered_file):
         recover_command += f", once {recovered_file}, which may hold it already, is moved away"
-    if was_whole:
+    if was_complete:
         return f"{copy_advice}, or save what is intact with {recover_command}."
-    return f"{readable_samples}. Save them with {recover_command}."
+    return f"{readable_samples_text}. Save them with {recover_command}."

@@ -124,9 +124,9 @@ class SessionInfo:
         title_rows = [
             ("file", f"{self.path} ({self.size_bytes / 1e6:.2f} MB)"),
             ("started", _time_text(datetime.fromisoformat(self.start_utc))),
-            *_outcome_rows(self.outcome or {}, is_whole=not self.missing_samples_text),
+            *_outcome_rows(self.outcome or {}, is_complete=not self.missing_samples_text),
             *([("absent", self.missing_samples_text)] if self.missing_samples_text else []),
-            *(("recovered", f"{k}: {v}") for k, v in _recovery_items(self.outcome or {}).items()),
+            *(("recovered", f"{k}: {v}") for k, v in _recovery_entries(self.outcome or {}).items()),
             (
                 "samples",
                 f"{grouped(self.samples)} at {self.rate_hz:g} Hz, {self.duration_s:g} s, "
@@ -187,13 +187,13 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
             "Hz. The writing program must correct it."
         )
     ticks = session.samples["tick"]
-    spanned_ticks = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
+    spanned_tick_count = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
     omission_texts: list[str] = []
     # Ticks missing at the end leave no gap; only the outcome states them.
     scheduled_text = (session.outcome or {}).get("scheduled", "")
     if scheduled_text.isascii() and scheduled_text.isdigit():
         if _is_count(scheduled_text):
-            spanned_ticks = max(spanned_ticks, int(scheduled_text))
+            spanned_tick_count = max(spanned_tick_count, int(scheduled_text))
         else:
             omission_texts.append(
                 f"scheduled of the outcome, a number of {len(scheduled_text)} digits"
@@ -204,11 +204,13 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
         start_utc=_iso_text(session.start_utc_ns),
         rate_hz=rate_hz,
         samples=len(ticks),
-        ticks=spanned_ticks,
-        duration_s=spanned_ticks / rate_hz,
-        missing_ticks=spanned_ticks - len(ticks),
+        ticks=spanned_tick_count,
+        duration_s=spanned_tick_count / rate_hz,
+        missing_ticks=spanned_tick_count - len(ticks),
         status_counts=_status_counts(session),
-        segments=_EntryLimiter("segments", 50_000, omission_texts).mapping(session.segments),
+        segments=_EntryLimiter("segments", 50_000, omission_texts).limited_entries(
+            session.segments
+        ),
         metadata=_EntryLimiter("keys", _MAX_METADATA_CHARACTERS, omission_texts).texts(
             session.metadata
         ),
@@ -218,7 +220,7 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
         events=_EntryLimiter("messages of the log", 500_000, omission_texts).events(
             session.events, session.omitted_event_count
         ),
-        attachments=_EntryLimiter("attachments", 50_000, omission_texts).mapping(
+        attachments=_EntryLimiter("attachments", 50_000, omission_texts).limited_entries(
             {
                 attachment_name: len(attachment_bytes)
                 for attachment_name, attachment_bytes in session.attachments.items()
@@ -261,9 +263,9 @@ def _missing_samples_sentence(session: Session) -> str:
     return ""
 
 
-def _is_count(text: str) -> bool:
+def _is_count(number_text: str) -> bool:
     """Return whether a text is a whole number of at most twelve digits."""
-    return text.isascii() and text.isdigit() and len(text) <= _MAX_COUNT_DIGITS
+    return number_text.isascii() and number_text.isdigit() and len(number_text) <= _MAX_COUNT_DIGITS
 
 
 def _shortened(long_text: str, max_characters: int) -> str:
@@ -309,12 +311,12 @@ class _EntryLimiter:
         self._omission_texts = omission_texts
         self._remaining_characters = max_characters
 
-    def mapping(self, entries: Mapping[str, _Value]) -> dict[str, _Value]:
+    def limited_entries(self, entries: Mapping[str, _Value]) -> dict[str, _Value]:
         """Return the first entries of a mapping, up to the maximum, with long keys cut."""
         shown_entries: dict[str, _Value] = {}
         for entry_count, (key, entry_value) in enumerate(entries.items()):
             short_key = _shortened(key, _MAX_KEY_CHARACTERS)
-            if not self._fits(short_key, str(entry_value)):
+            if not self._reserve_characters(short_key, str(entry_value)):
                 self._report_omitted(len(entries) - entry_count)
                 break
             shown_entries[short_key] = entry_value
@@ -322,17 +324,17 @@ class _EntryLimiter:
 
     def texts(self, text_entries: Mapping[str, str]) -> dict[str, str]:
         """Return the first entries of a mapping of texts, with long keys and long texts cut."""
-        return self.mapping(
+        return self.limited_entries(
             {
                 key: _shortened(entry_text, _MAX_TEXT_CHARACTERS)
                 for key, entry_text in text_entries.items()
             }
         )
 
-    def events(self, events: Sequence[LoggedEvent], unread_count: int) -> list[LoggedEvent]:
+    def events(self, events: Sequence[LoggedEvent], unread_event_count: int) -> list[LoggedEvent]:
         """Return the first events, up to the maximum, with long texts cut.
 
-        `unread_count` is the number of further events in the file.
+        `unread_event_count` is the number of further events in the file.
         """
         shown_events: list[LoggedEvent] = []
         for logged_event in events:
@@ -341,13 +343,13 @@ class _EntryLimiter:
                 name=_shortened(logged_event.name, _MAX_KEY_CHARACTERS),
                 message=_shortened(logged_event.message, _MAX_TEXT_CHARACTERS),
             )
-            if not self._fits(shortened_event.name, shortened_event.message):
+            if not self._reserve_characters(shortened_event.name, shortened_event.message):
                 break
             shown_events.append(shortened_event)
-        self._report_omitted(len(events) - len(shown_events) + unread_count)
+        self._report_omitted(len(events) - len(shown_events) + unread_event_count)
         return shown_events
 
-    def _fits(self, *texts: str) -> bool:
+    def _reserve_characters(self, *texts: str) -> bool:
         """Return whether an entry with these texts fits, and count its characters."""
         # A character may take twelve characters in JSON, and both forms add some to a text.
         self._remaining_characters -= (
@@ -366,12 +368,12 @@ class _EntryLimiter:
 def _status_counts(session: Session) -> dict[str, int]:
     """Return the number of samples with each status flag that occurs: flag name → number."""
     status_flags = session.samples["status"]
-    flag_counts = {
+    sample_count_by_flag = {
         flag.name or "": int(np.count_nonzero(status_flags & flag.value)) for flag in Status
     }
     return {
         flag_name.lower(): sample_count
-        for flag_name, sample_count in flag_counts.items()
+        for flag_name, sample_count in sample_count_by_flag.items()
         if sample_count
     }
 
@@ -386,15 +388,15 @@ def _utc_datetime(utc_ns: int) -> datetime:
     return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
 
 
-def _outcome_rows(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[str, str]]:
+def _outcome_rows(outcome: dict[str, str], *, is_complete: bool) -> Iterator[tuple[str, str]]:
     """Yield the rows (title, text) for the record ``outcome``, with touches and fitted modes."""
-    shown_keys = {"outcome", "reason", "touches", "fit"}
-    shown_keys |= {_RECOVERY_KEY_PREFIX + key for key in _recovery_items(outcome)}
+    excluded_keys = {"outcome", "reason", "touches", "fit"}
+    excluded_keys |= {_RECOVERY_KEY_PREFIX + key for key in _recovery_entries(outcome)}
     outcome_text = outcome.get("outcome", "unknown")
-    outcome_text = outcome_text.capitalize() if is_whole else f"Recorded as {outcome_text}"
+    outcome_text = outcome_text.capitalize() if is_complete else f"Recorded as {outcome_text}"
     with suppress(KeyError, ValueError):  # outcome of another program, or of a recovery
         outcome_text += f": {counts_text(outcome)}"
-        shown_keys |= _COUNT_KEYS
+        excluded_keys |= _COUNT_KEYS
     reason_text = outcome.get("reason")
     yield "outcome", f"{outcome_text}. {reason_text}" if reason_text else outcome_text
     for touch in touches_of(outcome):
@@ -405,7 +407,7 @@ def _outcome_rows(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[
     yield from (
         _rounded_row(key, outcome_value)
         for key, outcome_value in outcome.items()
-        if key not in shown_keys and outcome_value
+        if key not in excluded_keys and outcome_value
     )
 
 
@@ -433,12 +435,12 @@ def _rounded_row(key: str, metadata_value: str) -> tuple[str, str]:
 
 def _time_text(time_utc: datetime) -> str:
     """Return the text of a time in UTC, and in the local time zone if that is another one."""
-    utc = f"{time_utc:%Y-%m-%d %H:%M:%S} UTC"
+    utc_text = f"{time_utc:%Y-%m-%d %H:%M:%S} UTC"
     local_time = time_utc.astimezone()
-    return f"{utc} ({local_time:%Y-%m-%d %H:%M:%S %Z})" if local_time.utcoffset() else utc
+    return f"{utc_text} ({local_time:%Y-%m-%d %H:%M:%S %Z})" if local_time.utcoffset() else utc_text
 
 
-def _recovery_items(outcome: dict[str, str]) -> dict[str, str]:
+def _recovery_entries(outcome: dict[str, str]) -> dict[str, str]:
     """Return the entries of the record ``outcome`` that a recovery added, without key prefix."""
     return {
         key.removeprefix(_RECOVERY_KEY_PREFIX): outcome_value

@@ -1,8 +1,8 @@
 """Decompression of MCAP chunks, and limits on memory and time for reading an MCAP file.
 
 A few bytes may decompress to any number of records. Therefore `MAX_CHUNK_BYTES` limits the stated
-size of a chunk, and `MAX_TOTAL_BYTES` the sum of these sizes over the file. A long chunk is
-decompressed in parts. Each record or run of messages counts as work against `MAX_STEPS`.
+size of a chunk, and `MAX_TOTAL_UNPACKED_BYTES` the sum of these sizes over the file. A long chunk
+is decompressed in parts. Each record or run of messages counts as work against `MAX_READING_STEPS`.
 """
 
 import struct
@@ -19,10 +19,10 @@ from rigd.session.layout import Buffer
 MAX_SKIPPED_TEXTS: Final = 20
 """Maximum number of damaged records that are described one by one."""
 
-CHUNK_STEPS: Final = 20
-"""Number of steps of work, out of `MAX_STEPS`, that reading a chunk costs."""
-DECLARATION_STEPS: Final = 15
-"""Number of steps of work, out of `MAX_STEPS`, that a schema, channel or attachment costs."""
+READING_STEPS_PER_CHUNK: Final = 20
+"""Number of steps of work, out of `MAX_READING_STEPS`, that reading a chunk costs."""
+READING_STEPS_PER_DECLARATION: Final = 15
+"""Number of steps, out of `MAX_READING_STEPS`, that a schema, channel or attachment costs."""
 
 _DECLARATION_MEMORY_BYTES: Final = 1000
 """Approximate memory in bytes of the Python object for a declaration of any length."""
@@ -66,30 +66,33 @@ class ReadingBudget:
         self._declared_text_bytes = 0
         self._key_count = 0
 
-    def count_steps(self, steps: int) -> None:
-        """Count steps of work; raise McapTooLargeError if the file exceeds `MAX_STEPS`."""
-        self._used_steps += steps
-        if self._used_steps > limits.MAX_STEPS:
+    def count_steps(self, step_count: int) -> None:
+        """Count steps of work; raise McapTooLargeError if the file exceeds `MAX_READING_STEPS`."""
+        self._used_steps += step_count
+        if self._used_steps > limits.MAX_READING_STEPS:
             raise McapTooLargeError(
                 "is made of so many small parts that reading it would take too long: more than "
-                f"{limits.MAX_STEPS} runs of messages, chunks and other records, each weighed by "
-                "its work"
+                f"{limits.MAX_READING_STEPS} runs of messages, chunks and other records, each "
+                "weighed by its work"
             )
 
-    def count_unpacked(self, chunk_bytes: int, location_text: str) -> None:
+    def count_unpacked_bytes(self, chunk_length: int, location_text: str) -> None:
         """Count the stated size of a chunk in bytes before the chunk is decompressed.
 
         Raises McapDamageError if the chunk, or all chunks of the file together, are too long.
         """
-        self._unpacked_bytes += chunk_bytes
-        if chunk_bytes > limits.MAX_CHUNK_BYTES or self._unpacked_bytes > limits.MAX_TOTAL_BYTES:
+        self._unpacked_bytes += chunk_length
+        if (
+            chunk_length > limits.MAX_CHUNK_BYTES
+            or self._unpacked_bytes > limits.MAX_TOTAL_UNPACKED_BYTES
+        ):
             raise McapDamageError(
-                f"claims {chunk_bytes} bytes{location_text}, which is more than the "
+                f"claims {chunk_length} bytes{location_text}, which is more than the "
                 f"{limits.MAX_CHUNK_BYTES >> 20} MiB for a chunk or the "
-                f"{limits.MAX_TOTAL_BYTES >> 20} MiB for a file that are accepted"
+                f"{limits.MAX_TOTAL_UNPACKED_BYTES >> 20} MiB for a file that are accepted"
             )
 
-    def count_declared(self, opcode: int, record_content: Buffer, location_text: str) -> None:
+    def count_declaration(self, opcode: int, record_content: Buffer, location_text: str) -> None:
         """Count the memory of a schema, channel, metadata record or attachment before parsing.
 
         `location_text` ends the error message. Raises McapError if the file has too many such
@@ -99,16 +102,16 @@ class ReadingBudget:
         if opcode != Opcode.ATTACHMENT:
             self._declared_text_bytes += len(record_content)
         if opcode in (Opcode.METADATA, Opcode.CHANNEL):
-            self._key_count += _count_keys(record_content, opcode, limits.MAX_ENTRIES)
+            self._key_count += _count_keys(record_content, opcode, limits.MAX_METADATA_KEYS)
         for used_bytes, max_bytes, unit_text in (
             (
                 self._declared_bytes,
-                limits.MAX_DECLARED_BYTES,
+                limits.MAX_DECLARATION_BYTES,
                 "MiB of channels, schemas, metadata and files",
             ),
             (
                 self._declared_text_bytes,
-                limits.MAX_TEXT_BYTES,
+                limits.MAX_DECLARATION_TEXT_BYTES,
                 "MiB of channels, schemas and metadata",
             ),
         ):
@@ -117,9 +120,9 @@ class ReadingBudget:
                     "declares channels, schemas, metadata and attachments without limit: more than "
                     f"{max_bytes >> 20} {unit_text}{location_text}"
                 )
-        if self._key_count > limits.MAX_ENTRIES:
+        if self._key_count > limits.MAX_METADATA_KEYS:
             raise McapError(
-                f"has more than {limits.MAX_ENTRIES} keys in its metadata{location_text}"
+                f"has more than {limits.MAX_METADATA_KEYS} keys in its metadata{location_text}"
             )
 
 
@@ -129,70 +132,72 @@ def zstd_decompressor() -> zstandard.ZstdDecompressor:
 
 
 def decompressed_chunk(
-    zstd: zstandard.ZstdDecompressor,
+    decompressor: zstandard.ZstdDecompressor,
     compression: bytes,
     packed_bytes: memoryview,
-    unpacked_bytes: int,
+    unpacked_length: int,
     location_text: str,
 ) -> bytes:
-    """Return the decompressed content of a chunk, which must have exactly `unpacked_bytes` bytes.
+    """Return the decompressed content of a chunk, which must have exactly `unpacked_length` bytes.
 
-    The compression is ``zstd``, ``lz4``, or empty for none. `zstd` is made by
+    The compression is ``zstd``, ``lz4``, or empty for none. `decompressor` is made by
     :func:`zstd_decompressor`. `location_text` is the position of the chunk, for error messages.
     Raise `McapDamageError` if the content cannot be decompressed, or has another length.
     """
     try:
         if compression == b"":
-            unpacked_records = bytes(packed_bytes[: unpacked_bytes + 1])
+            unpacked_records = bytes(packed_bytes[: unpacked_length + 1])
         elif compression == b"zstd":
-            _check_zstd_size(packed_bytes, unpacked_bytes, location_text)
-            unpacked_records = zstd.decompress(packed_bytes, max_output_size=unpacked_bytes)
+            _check_zstd_size(packed_bytes, unpacked_length, location_text)
+            unpacked_records = decompressor.decompress(
+                packed_bytes, max_output_size=unpacked_length
+            )
         elif compression == b"lz4":
             # One byte more than allowed, so that a longer chunk is detected.
             unpacked_records = lz4.frame.LZ4FrameDecompressor().decompress(
-                packed_bytes, max_length=unpacked_bytes + 1
+                packed_bytes, max_length=unpacked_length + 1
             )
         else:
             raise McapDamageError(f"uses the unknown compression {compression!r}{location_text}")
     except (zstandard.ZstdError, RuntimeError, ValueError):
         raise McapDamageError(f"does not decompress{location_text}") from None
-    if len(unpacked_records) != unpacked_bytes:
+    if len(unpacked_records) != unpacked_length:
         raise McapDamageError(f"decompresses to a wrong size{location_text}")
     return unpacked_records
 
 
 def decompressed_parts(
-    zstd: zstandard.ZstdDecompressor,
+    decompressor: zstandard.ZstdDecompressor,
     compression: bytes,
     packed_bytes: memoryview,
-    stated_bytes: int,
+    stated_length: int,
     location_text: str,
 ) -> Iterator[Buffer]:
     """Yield the decompressed content of a long chunk in parts.
 
-    All parts together may be longer than `stated_bytes` by one part, because the caller compares
+    All parts together may be longer than `stated_length` by one part, because the caller compares
     the length. Otherwise parameters and errors are those of :func:`decompressed_chunk`.
     """
-    unpacked_bytes = 0
+    unpacked_length = 0
     try:
         if compression == b"":
             for input_position in range(0, len(packed_bytes), MAX_UNPACKED_BYTES):
                 yield packed_bytes[input_position : input_position + MAX_UNPACKED_BYTES]
         elif compression == b"zstd":
-            _check_zstd_size(packed_bytes, stated_bytes, location_text)
-            zstd_stream = zstd.stream_reader(packed_bytes)
-            while unpacked_bytes <= stated_bytes and (
+            _check_zstd_size(packed_bytes, stated_length, location_text)
+            zstd_stream = decompressor.stream_reader(packed_bytes)
+            while unpacked_length <= stated_length and (
                 unpacked_part := zstd_stream.read(MAX_UNPACKED_BYTES)
             ):
-                unpacked_bytes += len(unpacked_part)
+                unpacked_length += len(unpacked_part)
                 yield unpacked_part
         elif compression == b"lz4":
             lz4_stream = lz4.frame.LZ4FrameDecompressor()
             for input_position in range(0, len(packed_bytes), _LZ4_INPUT_BYTES):
                 lz4_input: Buffer = packed_bytes[input_position : input_position + _LZ4_INPUT_BYTES]
-                while not lz4_stream.eof and unpacked_bytes <= stated_bytes:
+                while not lz4_stream.eof and unpacked_length <= stated_length:
                     unpacked_part = lz4_stream.decompress(lz4_input, max_length=MAX_UNPACKED_BYTES)
-                    unpacked_bytes += len(unpacked_part)
+                    unpacked_length += len(unpacked_part)
                     if unpacked_part:
                         yield unpacked_part
                     if lz4_stream.needs_input:
@@ -204,25 +209,25 @@ def decompressed_parts(
         raise McapDamageError(f"does not decompress{location_text}") from None
 
 
-def _check_zstd_size(packed_bytes: memoryview, chunk_bytes: int, location_text: str) -> None:
+def _check_zstd_size(packed_bytes: memoryview, chunk_length: int, location_text: str) -> None:
     """Raise if the Zstandard frame of a chunk states another size than the chunk.
 
     The decompressor would allocate the memory that the frame states.
     """
     stated_size = zstandard.get_frame_parameters(packed_bytes).content_size
-    if stated_size not in (chunk_bytes, zstandard.CONTENTSIZE_UNKNOWN):
+    if stated_size not in (chunk_length, zstandard.CONTENTSIZE_UNKNOWN):
         raise McapDamageError(f"states two different sizes{location_text}")
 
 
 def read_prefixed_bytes(
-    record_content: memoryview, position: int, length_format: str
+    record_content: memoryview, length_position: int, length_format: str
 ) -> tuple[memoryview, int]:
-    """Return the bytes after the length field at `position`, and the offset where they end.
+    """Return the bytes after the length field at `length_position`, and the offset where they end.
 
     `length_format` is the format of the length field for the module ``struct``.
     """
-    (byte_count,) = struct.unpack_from(length_format, record_content, position)
-    bytes_start = position + struct.calcsize(length_format)
+    (byte_count,) = struct.unpack_from(length_format, record_content, length_position)
+    bytes_start = length_position + struct.calcsize(length_format)
     if byte_count > len(record_content) - bytes_start:
         raise struct.error
     return record_content[bytes_start : bytes_start + byte_count], bytes_start + byte_count

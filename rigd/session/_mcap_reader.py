@@ -27,10 +27,10 @@ from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
 
 from rigd.session import limits
 from rigd.session._mcap_limits import (
-    CHUNK_STEPS,
-    DECLARATION_STEPS,
     MAX_SKIPPED_TEXTS,
     MAX_UNPACKED_BYTES,
+    READING_STEPS_PER_CHUNK,
+    READING_STEPS_PER_DECLARATION,
     McapDamageError,
     McapError,
     McapTooLargeError,
@@ -98,17 +98,17 @@ class McapContents:
     attachments: list[Attachment] = field(default_factory=list)
     message_counts: dict[int, int] = field(default_factory=lambda: defaultdict(int))
     """Channel number → number of messages read, including topics that were not requested."""
-    declared_in_chunks: set[int] = field(default_factory=set)
+    channels_declared_in_chunks: set[int] = field(default_factory=set)
     """Numbers of the channels that were declared in chunks, and are covered by a checksum there."""
     skipped: list[str] = field(default_factory=list)
     """Descriptions of the damaged records that were skipped, each the end of a sentence that begins
     with the file's name. The last one states how many more there are than `MAX_SKIPPED_TEXTS`."""
-    stated_counts: dict[int, int] = field(default_factory=dict)
+    stated_message_counts: dict[int, int] = field(default_factory=dict)
     """Channel number → number of messages that the file's statistics state, for a damaged file read
     in salvage mode. It is empty for a sound file and if the statistics are damaged."""
     intact_bytes: int = 0
     """Number of bytes at the start of the file that were read without error."""
-    verified: bool = False
+    has_correct_checksum: bool = False
     """Whether the file has a correct checksum over its whole data section."""
     complete: bool = False
     """Whether the file ends with the footer and the magic bytes of a complete MCAP file."""
@@ -118,19 +118,20 @@ class McapContents:
 
     def count(self, topic: str) -> int:
         """Return the number of messages of a topic that were read."""
-        topic_channels = [
+        topic_channel_ids = [
             channel.id for channel in self.channels.values() if channel.topic == topic
         ]
-        return sum(self.message_counts[channel] for channel in topic_channels)
+        return sum(self.message_counts[channel] for channel in topic_channel_ids)
 
 
-def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def message_starts(message_runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Return the byte offset of each message in a buffer that consists of consecutive runs.
 
-    `runs`, shape (n, 3), are the channel number, the length of a message record in bytes, and the
-    message count. The offsets, one for each message, count from the beginning of the first message.
+    `message_runs`, shape (n, 3), are the channel number, the length of a message record in bytes,
+    and the message count. The offsets, one for each message, count from the beginning of the first
+    message.
     """
-    _, message_sizes, run_message_counts = runs.T
+    _, message_sizes, run_message_counts = message_runs.T
     run_bytes = message_sizes * run_message_counts
     index_in_run = np.arange(run_message_counts.sum()) - np.repeat(
         np.cumsum(run_message_counts) - run_message_counts, run_message_counts
@@ -150,7 +151,7 @@ def read_mcap(
     topics: Collection[str] | None,
     *,
     on_block: OnBlock | None = None,
-    salvage: bool = False,
+    is_salvage: bool = False,
     on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
     """Read an MCAP file up to its end or its first damage.
@@ -160,11 +161,11 @@ def read_mcap(
     whether the rest of the file is damaged. `on_progress` is called repeatedly with the fraction of
     the file that was read, from 0 to 1.
 
-    With `salvage`, read as much as possible: skip damaged records outside of chunks on which no
+    With `is_salvage`, read as much as possible: skip damaged records outside of chunks on which no
     message depends, and read the statistics of a damaged file. `McapContents.damage` states
     whether, where and why reading stopped. Raise `McapError` if the file does not begin like an
     MCAP file, or its schemas, channels, metadata and attachments are longer than
-    `MAX_DECLARED_BYTES`. Raise `McapTooLargeError` if the file is too long, or contains too many
+    `MAX_DECLARATION_BYTES`. Raise `McapTooLargeError` if the file is too long, or contains too many
     records.
     """
     if bytes(file_data[: len(MAGIC)]) != MAGIC:
@@ -174,15 +175,15 @@ def read_mcap(
             f"has {len(file_data) >> 20} MiB, more than the {limits.MAX_FILE_BYTES >> 20} MiB "
             "that are read"
         )
-    container_reader = _ContainerReader(file_data, topics, on_block, salvage=salvage)
+    container_reader = _ContainerReader(file_data, topics, on_block, is_salvage=is_salvage)
     mcap_contents = container_reader.contents
     mcap_contents.complete = _has_footer(file_data)
     try:
         container_reader.read(on_progress)
     except McapDamageError as error:
         mcap_contents.damage = str(error)
-        if salvage and mcap_contents.complete:
-            mcap_contents.stated_counts = container_reader.stated_counts()
+        if is_salvage and mcap_contents.complete:
+            mcap_contents.stated_message_counts = container_reader.stated_message_counts()
     except MemoryError:
         mcap_contents.damage = "does not fit into the memory of this machine"
     return mcap_contents
@@ -199,31 +200,35 @@ def _has_footer(file_data: memoryview) -> bool:
     )
 
 
-def _locate_record(data: Buffer, position: int, location_text: str) -> tuple[int, int, int]:
-    """Return the opcode of the record at byte `position`, and start and end of its content.
+def _locate_record(
+    file_data: Buffer, record_start: int, location_text: str
+) -> tuple[int, int, int]:
+    """Return the opcode of the record at byte `record_start`, and start and end of its content.
 
     `location_text` ends the error message for a truncated record.
     """
-    content_start = position + RECORD_HEAD_FORMAT.size
-    if content_start > len(data):
-        raise _truncated_record_error(position, location_text)
-    opcode, content_length = RECORD_HEAD_FORMAT.unpack_from(data, position)
+    content_start = record_start + RECORD_HEAD_FORMAT.size
+    if content_start > len(file_data):
+        raise _truncated_record_error(record_start, location_text)
+    opcode, content_length = RECORD_HEAD_FORMAT.unpack_from(file_data, record_start)
     if opcode == 0:
-        raise _missing_record_error(position, location_text)
+        raise _missing_record_error(record_start, location_text)
     content_end = content_start + content_length
-    if content_end > len(data):
-        raise _truncated_record_error(position, location_text)
+    if content_end > len(file_data):
+        raise _truncated_record_error(record_start, location_text)
     return opcode, content_start, content_end
 
 
-def _truncated_record_error(position: int, location_text: str) -> McapDamageError:
+def _truncated_record_error(record_start: int, location_text: str) -> McapDamageError:
     """Return the error for a file that ends within a record."""
-    return McapDamageError(f"ends in the middle of a record, at byte {position}{location_text}")
+    return McapDamageError(f"ends in the middle of a record, at byte {record_start}{location_text}")
 
 
-def _missing_record_error(position: int, location_text: str) -> McapDamageError:
+def _missing_record_error(record_start: int, location_text: str) -> McapDamageError:
     """Return the error for a position at which a record must begin but does not."""
-    return McapDamageError(f"has no record where one must be, at byte {position}{location_text}")
+    return McapDamageError(
+        f"has no record where one must be, at byte {record_start}{location_text}"
+    )
 
 
 class _ContainerReader:
@@ -231,15 +236,15 @@ class _ContainerReader:
 
     def __init__(
         self,
-        data: memoryview,
+        file_data: memoryview,
         topics: Collection[str] | None,
         on_block: OnBlock | None,
         *,
-        salvage: bool,
+        is_salvage: bool,
     ) -> None:
         self.contents = McapContents(intact_bytes=len(MAGIC))
-        self._salvage = salvage
-        self._data = data
+        self._is_salvage = is_salvage
+        self._data = file_data
         self._topics = topics
         self._on_block = on_block
         self._wanted_by_channel: dict[int, bool] = {}  # channel → whether its messages are wanted
@@ -255,37 +260,39 @@ class _ContainerReader:
     def read(self, on_progress: Callable[[float], None] | None) -> None:
         """Read all records into `contents`; raise McapDamageError at the first damage."""
         data, contents = self._data, self.contents
-        end = len(MAGIC)
-        while end < len(data):
-            start = end
-            opcode, content_start, end = _locate_record(data, start, "")
+        record_end = len(MAGIC)
+        while record_end < len(data):
+            record_start = record_end
+            opcode, content_start, record_end = _locate_record(data, record_start, "")
             self._budget.count_steps(1)
             if opcode == Opcode.CHUNK:
-                self._read_chunk(data[content_start:end], start)
+                self._read_chunk(data[content_start:record_end], record_start)
                 if on_progress is not None:
-                    on_progress(end / len(data))
+                    on_progress(record_end / len(data))
             elif opcode == Opcode.MESSAGE:
-                end = self._read_unchunked_messages(start, end)
+                record_end = self._read_unchunked_messages(record_start, record_end)
                 if on_progress is not None:
-                    on_progress(end / len(data))
+                    on_progress(record_end / len(data))
             elif opcode == Opcode.DATA_END:
-                self._check_data_end(data[content_start:end], start)
-                contents.intact_bytes = end
-                self._check_summary(end)
+                self._check_data_end(data[content_start:record_end], record_start)
+                contents.intact_bytes = record_end
+                self._check_summary(record_end)
                 contents.intact_bytes = len(data)
                 return
             elif opcode == Opcode.FOOTER:
                 break
             else:
                 try:
-                    self._read_declaration(opcode, data[content_start:end], f" at byte {start}")
+                    self._read_declaration(
+                        opcode, data[content_start:record_end], f" at byte {record_start}"
+                    )
                 except McapDamageError as error:
-                    if not self._salvage:
+                    if not self._is_salvage:
                         raise
                     self._add_skipped(str(error))
-            contents.intact_bytes = end
-            if end - self._released_end > _RELEASE_INTERVAL_BYTES:
-                self._release_up_to(end)
+            contents.intact_bytes = record_end
+            if record_end - self._released_end > _RELEASE_INTERVAL_BYTES:
+                self._release_up_to(record_end)
         raise McapDamageError("has no end of its data section")
 
     def _add_skipped(self, damage_text: str) -> None:
@@ -297,16 +304,16 @@ class _ContainerReader:
             damage_text = f"has {self._skipped - MAX_SKIPPED_TEXTS} more damaged records"
         skipped_texts.append(damage_text)
 
-    def _release_up_to(self, end: int) -> None:
-        """Update the checksum of the data section up to `end`, and release the memory before it."""
-        self._crc = self._crc_of_range(self._released_end, end, self._crc)
-        self._released_end = end
+    def _release_up_to(self, read_end: int) -> None:
+        """Update the checksum of the data section up to an offset, and release memory before it."""
+        self._crc = self._crc_of_range(self._released_end, read_end, self._crc)
+        self._released_end = read_end
 
-    def _crc_of_range(self, start: int, end: int, crc: int = 0) -> int:
-        """Return the CRC-32 of the bytes from `start` to `end`, continuing from `crc`."""
-        for position in range(start, end, _RELEASE_INTERVAL_BYTES):
+    def _crc_of_range(self, range_start: int, range_end: int, crc: int = 0) -> int:
+        """Return the CRC-32 of a range of bytes, continuing from `crc`."""
+        for part_start in range(range_start, range_end, _RELEASE_INTERVAL_BYTES):
             crc = zlib.crc32(
-                self._data[position : min(position + _RELEASE_INTERVAL_BYTES, end)], crc
+                self._data[part_start : min(part_start + _RELEASE_INTERVAL_BYTES, range_end)], crc
             )
             self._release_pages()
         return crc
@@ -317,49 +324,54 @@ class _ContainerReader:
         if len(self._data) > _RELEASE_INTERVAL_BYTES and isinstance(mapped_file, mmap.mmap):
             mapped_file.madvise(mmap.MADV_DONTNEED)
 
-    def _read_unchunked_messages(self, start: int, first_end: int) -> int:
+    def _read_unchunked_messages(self, first_message_start: int, first_message_end: int) -> int:
         """Read consecutive messages outside of chunks, and return the offset where they end.
 
-        The first message is the record from `start` to `first_end`.
+        The first message is the record from `first_message_start` to `first_message_end`.
         """
-        location_text = f" at byte {start}"
-        if first_end - start < MESSAGE_HEAD_FORMAT.size:
+        location_text = f" at byte {first_message_start}"
+        if first_message_end - first_message_start < MESSAGE_HEAD_FORMAT.size:
             raise McapDamageError(f"has a message that is too short{location_text}")
-        if self._is_stray_message(_RUN_HEAD_FORMAT.unpack_from(self._data, start)[2]):
+        if self._is_stray_message(_RUN_HEAD_FORMAT.unpack_from(self._data, first_message_start)[2]):
             # The writing program uses chunks: this is another record, with a damaged opcode.
             raise McapDamageError(f"has a message outside of a chunk{location_text}")
         if self._remaining_group_messages == 0:
-            self._group_position, self._remaining_group_messages = start, _MAX_GROUP_MESSAGES
-        limit_position = min(len(self._data), max(first_end, start + MAX_UNPACKED_BYTES))
-        end, message_count = self._read_messages(
+            self._group_position, self._remaining_group_messages = (
+                first_message_start,
+                _MAX_GROUP_MESSAGES,
+            )
+        max_messages_end = min(
+            len(self._data), max(first_message_end, first_message_start + MAX_UNPACKED_BYTES)
+        )
+        messages_end, message_count = self._read_messages(
             self._data,
-            start,
-            limit_position,
+            first_message_start,
+            max_messages_end,
             self._group_position,
             location_text,
             self._remaining_group_messages,
         )
         self._remaining_group_messages -= message_count
-        return end
+        return messages_end
 
-    def _is_stray_message(self, channel: int) -> bool:
+    def _is_stray_message(self, channel_id: int) -> bool:
         """Return whether a message outside of chunks is treated as damage in salvage mode.
 
         It is if its channel was declared in chunks.
         """
-        return self._salvage and channel in self.contents.declared_in_chunks
+        return self._is_salvage and channel_id in self.contents.channels_declared_in_chunks
 
     def _read_declaration(self, opcode: int, record_content: Buffer, location_text: str) -> None:
         """Store a schema, channel, metadata record or attachment; ignore other kinds of record."""
         mcap_contents = self.contents
         if opcode not in _DECLARATION_OPCODES:
             return
-        self._budget.count_steps(DECLARATION_STEPS)
+        self._budget.count_steps(READING_STEPS_PER_DECLARATION)
         # Many writers repeat schemas and channels in every chunk; a repetition takes no memory.
         declaration_key = (opcode, bytes(record_content[: _CHANNEL_NUMBER_FORMAT.size]))
         if self._declarations.get(declaration_key) == record_content:
             return
-        self._budget.count_declared(opcode, record_content, location_text)
+        self._budget.count_declaration(opcode, record_content, location_text)
         if opcode == Opcode.SCHEMA:
             schema = parse_record(Schema.read, record_content, location_text)
             if mcap_contents.schemas.setdefault(schema.id, schema) != schema:
@@ -392,7 +404,7 @@ class _ContainerReader:
 
     def _read_chunk(self, chunk_content: memoryview, chunk_position: int) -> None:
         """Decompress a chunk, verify its checksum, and read the records in it."""
-        self._budget.count_steps(CHUNK_STEPS)
+        self._budget.count_steps(READING_STEPS_PER_CHUNK)
         location_text = f" in the chunk at byte {chunk_position}"
         try:
             *_, stated_size, stated_crc = _CHUNK_HEAD_FORMAT.unpack_from(chunk_content)
@@ -402,7 +414,7 @@ class _ContainerReader:
             packed_bytes, _ = read_prefixed_bytes(chunk_content, packed_position, "<Q")
         except struct.error:
             raise McapDamageError(f"has a malformed header{location_text}") from None
-        self._budget.count_unpacked(stated_size, location_text)
+        self._budget.count_unpacked_bytes(stated_size, location_text)
         compression = bytes(compression_name[:20])
         if stated_size <= MAX_UNPACKED_BYTES:
             unpacked_records = decompressed_chunk(
@@ -410,9 +422,9 @@ class _ContainerReader:
             )
             if stated_crc not in (0, zlib.crc32(unpacked_records)):
                 raise McapDamageError(f"has a wrong checksum{location_text}")
-            end = self._read_records(unpacked_records, 0, chunk_position, location_text)
-            if end < len(unpacked_records):
-                raise _truncated_record_error(end, location_text)
+            records_end = self._read_records(unpacked_records, 0, chunk_position, location_text)
+            if records_end < len(unpacked_records):
+                raise _truncated_record_error(records_end, location_text)
             return
         # Too long for memory: decompressed once to verify the checksum, and again to be read.
         unpacked_bytes, unpacked_crc = 0, 0
@@ -462,19 +474,19 @@ class _ContainerReader:
         if remainder or bytes_to_skip:
             raise _truncated_record_error(remainder_offset, location_text)
 
-    def _skippable_bytes(self, records: bytes, buffer_offset: int, location_text: str) -> int:
+    def _skippable_bytes(self, record_bytes: bytes, buffer_offset: int, location_text: str) -> int:
         """Return the length in bytes of a buffer's first record if it can be skipped, else 0."""
-        opcode, length, channel = _RUN_HEAD_FORMAT.unpack_from(records)
+        opcode, length, channel_id = _RUN_HEAD_FORMAT.unpack_from(record_bytes)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            if length > limits.MAX_TEXT_BYTES:
+            if length > limits.MAX_DECLARATION_TEXT_BYTES:
                 raise _truncated_record_error(buffer_offset, location_text)
             return 0
         if opcode == Opcode.MESSAGE:
-            if self._wanted_by_channel.get(channel, True) and self._is_accepted_length(
+            if self._wanted_by_channel.get(channel_id, True) and self._is_accepted_length(
                 length, location_text
             ):
                 return 0
-            self.contents.message_counts[channel] += 1
+            self.contents.message_counts[channel_id] += 1
         return int(length) + RECORD_HEAD_FORMAT.size
 
     def _is_accepted_length(self, message_length: int, location_text: str) -> bool:
@@ -488,54 +500,54 @@ class _ContainerReader:
             f"has a message of {message_length} bytes{location_text}, more than the "
             f"{limits.MAX_MESSAGE_BYTES >> 20} MiB that are accepted"
         )
-        if not self._salvage:
+        if not self._is_salvage:
             raise McapDamageError(damage_text)
         self._add_skipped(damage_text)
         return False
 
     def _read_records(
-        self, records: bytes, buffer_offset: int, chunk_position: int, location_text: str
+        self, record_bytes: bytes, buffer_offset: int, chunk_position: int, location_text: str
     ) -> int:
         """Read the complete records of a buffer, and return the offset where the last one ends.
 
         `buffer_offset` is the offset of the buffer in its chunk.
         """
-        end = 0
-        while end < len(records):
-            record_start = end
-            end, message_count = self._read_messages(
-                records, record_start, len(records), chunk_position, location_text
+        record_end = 0
+        while record_end < len(record_bytes):
+            record_start = record_end
+            record_end, message_count = self._read_messages(
+                record_bytes, record_start, len(record_bytes), chunk_position, location_text
             )
             if message_count:
                 continue
-            if record_start + RECORD_HEAD_FORMAT.size > len(records):
+            if record_start + RECORD_HEAD_FORMAT.size > len(record_bytes):
                 return record_start
-            opcode, length = RECORD_HEAD_FORMAT.unpack_from(records, record_start)
+            opcode, length = RECORD_HEAD_FORMAT.unpack_from(record_bytes, record_start)
             if opcode == 0:
                 raise _missing_record_error(buffer_offset + record_start, location_text)
             content_start = record_start + RECORD_HEAD_FORMAT.size
-            end = content_start + length
-            if end > len(records):
+            record_end = content_start + length
+            if record_end > len(record_bytes):
                 return record_start
             self._budget.count_steps(1)
             if opcode == Opcode.MESSAGE:
                 raise McapDamageError(f"has a message that is too short{location_text}")
-            self._read_declaration(opcode, records[content_start:end], location_text)
+            self._read_declaration(opcode, record_bytes[content_start:record_end], location_text)
             if opcode == Opcode.CHANNEL:
-                (channel,) = _CHANNEL_NUMBER_FORMAT.unpack_from(records, content_start)
-                self.contents.declared_in_chunks.add(channel)
-        return end
+                (channel_id,) = _CHANNEL_NUMBER_FORMAT.unpack_from(record_bytes, content_start)
+                self.contents.channels_declared_in_chunks.add(channel_id)
+        return record_end
 
     def _read_messages(
         self,
-        records: Buffer,
-        start: int,
-        limit_position: int,
+        record_bytes: Buffer,
+        first_message_start: int,
+        max_messages_end: int,
         chunk_position: int,
         location_text: str,
         max_messages: int | None = None,
     ) -> tuple[int, int]:
-        """Pass the messages from `start` on to the callback, at most up to `limit_position`.
+        """Pass messages from an offset on to the callback, at most up to `max_messages_end`.
 
         Reading stops before a record of another kind. `max_messages` limits the number of messages
         outside of chunks. Returns the offset after the last message, and the number of messages.
@@ -543,68 +555,70 @@ class _ContainerReader:
         unpack_run_head = _RUN_HEAD_FORMAT.unpack_from
         wanted_by_channel, message_counts = self._wanted_by_channel, self.contents.message_counts
         message_runs: list[MessageRun] = []
-        position = start
+        run_start = first_message_start
         message_count = run_count = 0  # number of messages, and number of runs of messages
         try:
             while (
-                position + MESSAGE_HEAD_FORMAT.size <= limit_position
+                run_start + MESSAGE_HEAD_FORMAT.size <= max_messages_end
                 and run_count < _MAX_BLOCK_RUNS
             ):
-                run_head = unpack_run_head(records, position)
-                opcode, length, channel = run_head
+                run_head = unpack_run_head(record_bytes, run_start)
+                opcode, length, channel_id = run_head
                 message_size = length + RECORD_HEAD_FORMAT.size
                 if (
                     opcode != Opcode.MESSAGE
                     or message_size < MESSAGE_HEAD_FORMAT.size
-                    or position + message_size > limit_position
+                    or run_start + message_size > max_messages_end
                 ):
                     break
-                is_wanted = wanted_by_channel.get(channel)
+                is_wanted = wanted_by_channel.get(channel_id)
                 if is_wanted is None:
                     raise McapDamageError(
-                        f"has a message of an undeclared channel {channel}{location_text}"
+                        f"has a message of an undeclared channel {channel_id}{location_text}"
                     )
                 if max_messages is not None and (
-                    message_count == max_messages or self._is_stray_message(channel)
+                    message_count == max_messages or self._is_stray_message(channel_id)
                 ):
                     break
-                end = position + message_size
+                message_end = run_start + message_size
                 run_message_count = 1
                 while (
-                    end + message_size <= limit_position
-                    and unpack_run_head(records, end) == run_head
+                    message_end + message_size <= max_messages_end
+                    and unpack_run_head(record_bytes, message_end) == run_head
                 ):
-                    end += message_size
+                    message_end += message_size
                     run_message_count += 1
                     if run_message_count == _MAX_SINGLE_COMPARISONS:
                         run_message_count = _run_length(
-                            records, position, message_size, limit_position
+                            record_bytes, run_start, message_size, max_messages_end
                         )
                         break
                 if max_messages is not None:
                     run_message_count = min(run_message_count, max_messages - message_count)
                 if is_wanted and self._is_accepted_length(length, location_text):
-                    message_runs.append((channel, message_size, position, run_message_count))
-                message_counts[channel] += run_message_count
-                position += message_size * run_message_count
+                    message_runs.append((channel_id, message_size, run_start, run_message_count))
+                message_counts[channel_id] += run_message_count
+                run_start += message_size * run_message_count
                 message_count += run_message_count
                 run_count += 1
         finally:
             if message_runs and self._on_block is not None:
-                self._on_block(self.contents, MessageBlock(records, message_runs, chunk_position))
+                self._on_block(
+                    self.contents, MessageBlock(record_bytes, message_runs, chunk_position)
+                )
         self._budget.count_steps(run_count)
-        return position, message_count
+        return run_start, message_count
 
-    def _check_data_end(self, content: memoryview, start: int) -> None:
-        """Verify the checksum over the data section; `content` is the record with the checksum."""
-        if len(content) < 4:
-            raise McapDamageError(f"has a malformed end of its data section at byte {start}")
-        (crc,) = struct.unpack_from("<I", content)
-        if crc != 0 and crc != self._crc_of_range(self._released_end, start, self._crc):
+    def _check_data_end(self, record_content: memoryview, record_start: int) -> None:
+        """Verify the checksum over the data section, which `record_content` states."""
+        if len(record_content) < 4:
+            raise McapDamageError(f"has a malformed end of its data section at byte {record_start}")
+        (crc,) = struct.unpack_from("<I", record_content)
+        if crc != 0 and crc != self._crc_of_range(self._released_end, record_start, self._crc):
             raise McapDamageError("has a wrong checksum over its data section")
-        self.contents.verified = crc != 0
+        self.contents.has_correct_checksum = crc != 0
 
-    def _check_summary(self, start: int) -> None:
+    def _check_summary(self, section_start: int) -> None:
         """Verify footer, checksum and message counts of the summary section, which may be empty."""
         data = self._data
         if not self.contents.complete:
@@ -613,31 +627,36 @@ class _ContainerReader:
             )
         footer_position = len(data) - len(MAGIC) - FOOTER_FORMAT.size
         *_, summary_start, _, crc = FOOTER_FORMAT.unpack_from(data, footer_position)
-        if summary_start not in (0, start) or (summary_start == 0 and footer_position != start):
+        if summary_start not in (0, section_start) or (
+            summary_start == 0 and footer_position != section_start
+        ):
             raise McapDamageError(
                 f"has a footer that contradicts its data section at byte {footer_position}"
             )
-        if crc not in (0, self._crc_of_range(start, footer_position + FOOTER_FORMAT.size - 4)):
+        if crc not in (
+            0,
+            self._crc_of_range(section_start, footer_position + FOOTER_FORMAT.size - 4),
+        ):
             raise McapDamageError("has a wrong checksum over its summary")
-        for opcode, record_content in self._summary_records(start, footer_position):
+        for opcode, record_content in self._summary_records(section_start, footer_position):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 # A channel without messages may be declared in the summary only.
                 self._read_declaration(opcode, record_content, " in the summary")
             elif opcode == Opcode.STATISTICS:
                 statistics = parse_record(Statistics.read, record_content, " in the summary")
-                read_counts = self.contents.message_counts
-                stated_counts = statistics.channel_message_counts
+                read_message_counts = self.contents.message_counts
+                stated_message_counts = statistics.channel_message_counts
                 if any(
-                    read_counts[channel] != channel_count
-                    for channel, channel_count in stated_counts.items()
+                    read_message_counts[channel] != channel_count
+                    for channel, channel_count in stated_message_counts.items()
                 ):
                     raise McapDamageError("does not contain the messages that its statistics count")
 
     def _summary_records(
-        self, start: int, footer_position: int
+        self, section_start: int, footer_position: int
     ) -> Iterator[tuple[int, memoryview]]:
-        """Yield opcode and content of each record between `start` and `footer_position`."""
-        data, end, released_end = self._data[:footer_position], start, start
+        """Yield opcode and content of each record between `section_start` and `footer_position`."""
+        data, end, released_end = self._data[:footer_position], section_start, section_start
         while end < footer_position:
             opcode, content_start, end = _locate_record(data, end, " of the summary")
             if end - released_end > _RELEASE_INTERVAL_BYTES:
@@ -648,7 +667,7 @@ class _ContainerReader:
             self._budget.count_steps(1 + (end - content_start) // 4 if is_statistics else 1)
             yield opcode, data[content_start:end]
 
-    def stated_counts(self) -> dict[int, int]:
+    def stated_message_counts(self) -> dict[int, int]:
         """Return the message count of each channel from the file's statistics.
 
         Returns an empty dictionary if the summary has no correct checksum.
@@ -684,30 +703,32 @@ def parse_record(
     return parsed_record
 
 
-def _run_length(records: Buffer, start: int, message_size: int, limit_position: int) -> int:
-    """Return the number of consecutive records from `start` with equal opcode, length and channel.
+def _run_length(
+    record_bytes: Buffer, run_start: int, message_size: int, max_messages_end: int
+) -> int:
+    """Return the number of consecutive records with equal opcode, length and channel.
 
-    All counted records end before the byte offset `limit_position`. The number of records that are
-    compared at once increases, so that a short run in a long chunk takes little time.
+    All counted records end before the byte offset `max_messages_end`. The number of records that
+    are compared at once increases, so that a short run in a long chunk takes little time.
     """
     (first_head, first_tail) = np.frombuffer(
-        records[start : start + _RUN_HEAD_DTYPE.itemsize], _RUN_HEAD_DTYPE
+        record_bytes[run_start : run_start + _RUN_HEAD_DTYPE.itemsize], _RUN_HEAD_DTYPE
     )[0]
-    max_count = (limit_position - start) // message_size
+    max_message_count = (max_messages_end - run_start) // message_size
     equal_count, messages_to_compare = 1, _FIRST_COMPARISON_MESSAGES
-    while equal_count < max_count:
-        compared_count = min(messages_to_compare, max_count - equal_count)
+    while equal_count < max_message_count:
+        compared_count = min(messages_to_compare, max_message_count - equal_count)
         run_heads = np.ndarray(
             compared_count,
             _RUN_HEAD_DTYPE,
-            records,
-            start + equal_count * message_size,
+            record_bytes,
+            run_start + equal_count * message_size,
             (message_size,),
         )
         is_equal = (run_heads["head"] == first_head) & (run_heads["tail"] == first_tail)
-        first_different = int(is_equal.argmin())
-        if not is_equal[first_different]:
-            return equal_count + first_different
+        first_different_index = int(is_equal.argmin())
+        if not is_equal[first_different_index]:
+            return equal_count + first_different_index
         equal_count += compared_count
         messages_to_compare *= 8
     return equal_count

@@ -72,12 +72,12 @@ class McapWriter:
         self._end_time = 0
         self._write(MAGIC + _record_bytes(Header(profile="", library=library)))
 
-    def _write(self, data: bytes) -> int:
+    def _write(self, record_bytes: bytes) -> int:
         """Append bytes to the data section, and return their offset in the file."""
         position = self._position
-        self._stream.write(data)
-        self._data_crc = zlib.crc32(data, self._data_crc)
-        self._position += len(data)
+        self._stream.write(record_bytes)
+        self._data_crc = zlib.crc32(record_bytes, self._data_crc)
+        self._position += len(record_bytes)
         return position
 
     def declare(self, schemas: Iterable[Schema], channels: Iterable[Channel]) -> None:
@@ -95,11 +95,17 @@ class McapWriter:
             MetadataIndex(offset=record_position, length=len(record_data), name=record_name)
         )
 
-    def add_attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
+    def add_attachment(
+        self, attachment_name: str, media_type: str, attachment_data: bytes, time_ns: int
+    ) -> None:
         """Append an attachment; `time_ns` becomes its creation time and log time."""
         attachment_record = _record_bytes(
             Attachment(
-                create_time=time_ns, log_time=time_ns, name=name, media_type=media_type, data=data
+                create_time=time_ns,
+                log_time=time_ns,
+                name=attachment_name,
+                media_type=media_type,
+                data=attachment_data,
             )
         )
         record_position = self._write(attachment_record)
@@ -109,33 +115,43 @@ class McapWriter:
                 length=len(attachment_record),
                 log_time=time_ns,
                 create_time=time_ns,
-                data_size=len(data),
-                name=name,
+                data_size=len(attachment_data),
+                name=attachment_name,
                 media_type=media_type,
             )
         )
 
-    def add_chunk(self, records: bytes, indexes: Mapping[int, npt.NDArray[np.void]]) -> None:
+    def add_chunk(
+        self, record_bytes: bytes, message_index_by_channel: Mapping[int, npt.NDArray[np.void]]
+    ) -> None:
         """Compress and append a chunk of records, with its message indexes.
 
-        The records follow one after another. `indexes` has for each channel number an array of
-        `INDEX_DTYPE`, which is not empty, in the order of the messages.
+        The records follow one after another. `message_index_by_channel` has for each channel number
+        an array of `INDEX_DTYPE`, which is not empty, in the order of the messages.
         """
         first_log_time = min(
-            (int(message_index["log_time"].min()) for message_index in indexes.values()), default=0
+            (
+                int(message_index["log_time"].min())
+                for message_index in message_index_by_channel.values()
+            ),
+            default=0,
         )
         last_log_time = max(
-            (int(message_index["log_time"].max()) for message_index in indexes.values()), default=0
+            (
+                int(message_index["log_time"].max())
+                for message_index in message_index_by_channel.values()
+            ),
+            default=0,
         )
-        compressed_records = lz4.frame.compress(records)
+        compressed_records = lz4.frame.compress(record_bytes)
         compression_name = COMPRESSION.encode()
         chunk_head = _CHUNK_HEAD_FORMAT.pack(
             Opcode.CHUNK,
             _CHUNK_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(compressed_records),
             first_log_time,
             last_log_time,
-            len(records),
-            zlib.crc32(records),
+            len(record_bytes),
+            zlib.crc32(record_bytes),
             len(compression_name),
             compression_name,
             len(compressed_records),
@@ -145,7 +161,7 @@ class McapWriter:
         index_position = self._position + chunk_length
         index_offsets: dict[int, int] = {}
         index_length = 0
-        for channel, message_index in indexes.items():
+        for channel, message_index in message_index_by_channel.items():
             index_offsets[channel] = index_position + index_length
             index_entries = message_index.tobytes()
             index_record_length = _INDEX_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(index_entries)
@@ -158,7 +174,7 @@ class McapWriter:
             index_length += _INDEX_HEAD_FORMAT.size + len(index_entries)
             self._message_counts[channel] += len(message_index)
         chunk_position = self._write(b"".join(chunk_and_indexes))
-        if indexes:
+        if message_index_by_channel:
             self._start_time = (
                 first_log_time
                 if self._start_time is None
@@ -175,7 +191,7 @@ class McapWriter:
                 message_index_length=index_length,
                 compression=COMPRESSION,
                 compressed_size=len(compressed_records),
-                uncompressed_size=len(records),
+                uncompressed_size=len(record_bytes),
             )
         )
 
@@ -193,7 +209,7 @@ class McapWriter:
             message_end_time=self._end_time,
             channel_message_counts=self._message_counts,
         )
-        record_groups: dict[Opcode, list[McapRecord]] = {
+        records_by_opcode: dict[Opcode, list[McapRecord]] = {
             Opcode.SCHEMA: [*self._schemas],
             Opcode.CHANNEL: [*self._channels],
             Opcode.STATISTICS: [statistics],
@@ -203,7 +219,7 @@ class McapWriter:
         }
         summary_builder = RecordBuilder()
         summary_offsets: list[SummaryOffset] = []
-        for opcode, records in record_groups.items():
+        for opcode, records in records_by_opcode.items():
             group_start = summary_builder.count
             for record in records:
                 record.write(summary_builder)

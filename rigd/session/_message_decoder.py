@@ -32,16 +32,16 @@ from rigd.session._schema import (
 )
 from rigd.session.layout import (
     CONTROL_DTYPE,
-    CONTROL_TYPES,
+    CONTROL_FIELD_TYPES,
     CONTROL_WIRE_DTYPE,
     SAMPLE_DTYPE,
-    SAMPLE_TYPES,
+    SAMPLE_FIELD_TYPES,
     SAMPLE_WIRE_DTYPE,
     TIMING_DTYPE,
-    TIMING_TYPES,
+    TIMING_FIELD_TYPES,
     TIMING_WIRE_DTYPE,
     TOUCH_DTYPE,
-    TOUCH_TYPES,
+    TOUCH_FIELD_TYPES,
     TOUCH_WIRE_DTYPE,
     Buffer,
     is_fixed_layout,
@@ -60,7 +60,7 @@ _MAX_BLOCK_RUNS: Final = 1 << 16
 """Maximum number of runs of messages that are decoded together."""
 _MIN_GROUP_MESSAGES: Final = 16
 """Minimum number of messages that are decoded together; fewer are decoded one by one."""
-_MAX_LAYOUTS: Final = 16
+_MAX_LAYOUTS_PER_CHANNEL: Final = 16
 """Maximum number of field layouts for messages of one channel and length. A program that omits
 zeros writes a few layouts."""
 _MAX_LAYOUT_COMPARISONS: Final = 100_000
@@ -84,8 +84,8 @@ class MessageLayout:
 
     topic: str
     schema_name: str
-    types: dict[str, str]
-    required: tuple[str, ...]
+    field_types: dict[str, str]
+    required_fields: tuple[str, ...]
     """Fields that a file's schema must have; any other field that it lacks is decoded as 0."""
     record_dtype: np.dtype[np.void]
     """Array type of a message record: its ``head``, then the encoded message as ``wire``."""
@@ -109,7 +109,7 @@ def _record_dtype(wire_dtype: np.dtype[np.void]) -> np.dtype[np.void]:
 SAMPLES: Final = MessageLayout(
     SAMPLE_TOPIC,
     SAMPLE_SCHEMA,
-    SAMPLE_TYPES,
+    SAMPLE_FIELD_TYPES,
     ("t_ns", "tick", "angle_rad", "coupling_torque_nm"),
     _record_dtype(SAMPLE_WIRE_DTYPE),
     SAMPLE_DTYPE,
@@ -117,7 +117,7 @@ SAMPLES: Final = MessageLayout(
 CONTROLS: Final = MessageLayout(
     CONTROL_TOPIC,
     CONTROL_SCHEMA,
-    CONTROL_TYPES,
+    CONTROL_FIELD_TYPES,
     ("t_ns", "tick"),
     _record_dtype(CONTROL_WIRE_DTYPE),
     CONTROL_DTYPE,
@@ -125,7 +125,7 @@ CONTROLS: Final = MessageLayout(
 TIMINGS: Final = MessageLayout(
     TIMING_TOPIC,
     TIMING_SCHEMA,
-    TIMING_TYPES,
+    TIMING_FIELD_TYPES,
     ("t_ns", "tick"),
     _record_dtype(TIMING_WIRE_DTYPE),
     TIMING_DTYPE,
@@ -134,7 +134,7 @@ TIMINGS: Final = MessageLayout(
 TOUCHES: Final = MessageLayout(
     TOUCH_TOPIC,
     TOUCH_SCHEMA,
-    TOUCH_TYPES,
+    TOUCH_FIELD_TYPES,
     ("t_ns", "tick"),
     _record_dtype(TOUCH_WIRE_DTYPE),
     TOUCH_DTYPE,
@@ -152,11 +152,11 @@ _LOSSLESS_CONVERSIONS: Final = {
 class _FieldOffsets:
     """Offsets of the fields in messages of one length whose tags are at the same bytes.
 
-    A message has these offsets if (bytes of the message) AND `mask` equals `pattern`.
+    A message has these offsets if (bytes of the message) AND `tag_mask` equals `tag_pattern`.
     """
 
-    mask: npt.NDArray[np.uint8]
-    pattern: npt.NDArray[np.uint8]
+    tag_mask: npt.NDArray[np.uint8]
+    tag_pattern: npt.NDArray[np.uint8]
     fields: tuple[tuple[str, int, int, str], ...]
     """For each field: name, offset of its first byte, length in bytes, and its NumPy type or
     "varint" or "varint32"."""
@@ -167,12 +167,12 @@ class _FieldOffsets:
 class MessageSink(Protocol):
     """Destination of decoded messages, which provides the arrays that the decoder fills."""
 
-    def array_for(self, count: int) -> npt.NDArray[np.void]:
+    def next_message_array(self, message_count: int) -> npt.NDArray[np.void]:
         """Return an array (count,) that the decoder fills with the next messages."""
         ...
 
     def store(self, messages: npt.NDArray[np.void]) -> None:
-        """Process the array from `array_for` after the decoder has filled it."""
+        """Process the array from `next_message_array` after the decoder has filled it."""
         ...
 
 
@@ -218,10 +218,10 @@ class MessageDecoder:
         self._contents = contents
         is_topic_channel = self._is_topic_channel
         block_records = memoryview(block.records)
-        for channel, message_size, run_start, message_count in block.runs:
-            is_of_topic = is_topic_channel.get(channel)
+        for channel_id, message_size, run_start, message_count in block.runs:
+            is_of_topic = is_topic_channel.get(channel_id)
             if is_of_topic is None:
-                is_of_topic = self.is_of_topic(contents, channel)
+                is_of_topic = self.is_of_topic(contents, channel_id)
             if not is_of_topic:
                 continue
             run_records = block_records[run_start : run_start + message_size * message_count]
@@ -229,7 +229,7 @@ class MessageDecoder:
             self._collected_records.append(
                 run_records if 2 * len(run_records) > len(block_records) else bytes(run_records)
             )
-            self._collected_runs.append((channel, message_size, message_count))
+            self._collected_runs.append((channel_id, message_size, message_count))
             self._collected_bytes += len(run_records)
             if (
                 self._collected_bytes >= _BLOCK_BYTES
@@ -239,12 +239,12 @@ class MessageDecoder:
                 if self.error is not None:
                     return
 
-    def is_of_topic(self, contents: McapContents, channel: int) -> bool:
+    def is_of_topic(self, contents: McapContents, channel_id: int) -> bool:
         """Return whether a channel belongs to the decoded topic."""
-        is_of_topic = self._is_topic_channel.get(channel)
+        is_of_topic = self._is_topic_channel.get(channel_id)
         if is_of_topic is None:
-            is_of_topic = contents.channels[channel].topic == self._layout.topic
-            self._is_topic_channel[channel] = is_of_topic
+            is_of_topic = contents.channels[channel_id].topic == self._layout.topic
+            self._is_topic_channel[channel_id] = is_of_topic
         return is_of_topic
 
     def flush(self) -> None:
@@ -271,32 +271,32 @@ class MessageDecoder:
         else:
             raise self.error
 
-    def _decode(self, record_parts: list[Buffer], runs: npt.NDArray[np.int64]) -> None:
+    def _decode(self, record_parts: list[Buffer], message_runs: npt.NDArray[np.int64]) -> None:
         """Decode the message records in `record_parts`.
 
-        A row of `runs` (n, 3) contains channel number, record length in bytes, and number of
-        records.
+        A row of `message_runs` (n, 3) contains channel number, record length in bytes, and number
+        of records.
         """
-        channel, message_size, _ = runs[0].tolist()
-        if (runs[:, :2] == runs[0, :2]).all():
+        channel_id, message_size, _ = message_runs[0].tolist()
+        if (message_runs[:, :2] == message_runs[0, :2]).all():
             joined_records = b"".join(record_parts)
             # A block is a little longer than `_BLOCK_BYTES`; a much longer one is cut.
-            is_long = len(joined_records) > 2 * _BLOCK_BYTES
-            part_bytes = (
+            is_cut_into_parts = len(joined_records) > 2 * _BLOCK_BYTES
+            part_length = (
                 max(_BLOCK_BYTES // message_size, 1) * message_size
-                if is_long
+                if is_cut_into_parts
                 else len(joined_records)
             )
-            for part_start in range(0, len(joined_records), part_bytes):
-                record_part = joined_records[part_start : part_start + part_bytes]
-                out = self._sink.array_for(len(record_part) // message_size)
-                self._decode_group(channel, message_size, record_part, out)
-                self._sink.store(out)
+            for part_start in range(0, len(joined_records), part_length):
+                record_part = joined_records[part_start : part_start + part_length]
+                output_messages = self._sink.next_message_array(len(record_part) // message_size)
+                self._decode_group(channel_id, message_size, record_part, output_messages)
+                self._sink.store(output_messages)
             return
         record_bytes = np.frombuffer(b"".join(record_parts), np.uint8)
-        message_offsets = message_starts(runs)
-        group_keys = np.repeat(runs[:, 0] << 40 | runs[:, 1], runs[:, 2])
-        out = self._sink.array_for(len(message_offsets))
+        message_offsets = message_starts(message_runs)
+        group_keys = np.repeat(message_runs[:, 0] << 40 | message_runs[:, 1], message_runs[:, 2])
+        output_messages = self._sink.next_message_array(len(message_offsets))
         for group_key in np.unique(group_keys).tolist():
             (message_indices,) = np.nonzero(group_keys == group_key)
             message_size = group_key & ((1 << 40) - 1)
@@ -306,115 +306,129 @@ class MessageDecoder:
             group_records = overlapping_records[message_offsets[message_indices]].tobytes()
             decoded_messages = np.empty(len(message_indices), self.dtype)
             self._decode_group(group_key >> 40, message_size, group_records, decoded_messages)
-            out[message_indices] = decoded_messages
-        self._sink.store(out)
+            output_messages[message_indices] = decoded_messages
+        self._sink.store(output_messages)
 
     def _decode_group(
-        self, channel: int, record_size: int, records: bytes, out: npt.NDArray[np.void]
+        self,
+        channel_id: int,
+        record_size: int,
+        record_bytes: bytes,
+        output_messages: npt.NDArray[np.void],
     ) -> None:
-        """Decode message records of one channel, of `record_size` bytes each, into `out` (n,)."""
+        """Decode message records of one channel, of equal size in bytes, into an array (n,)."""
         contents, fixed_layout = self._contents, self._layout
         assert contents is not None
-        if record_size > limits.MAX_DECODED_BYTES:
+        if record_size > limits.MAX_SAMPLE_MESSAGE_BYTES:
             raise SessionError(
                 f"{self._path}: a message of {fixed_layout.topic} has {record_size} bytes, more "
                 "than the "
-                f"{limits.MAX_DECODED_BYTES} that are read. The writing program must write one "
-                "sample per message."
+                f"{limits.MAX_SAMPLE_MESSAGE_BYTES} that are read. The writing program must write "
+                "one sample per message."
             )
         if (
-            self._has_fixed_schema(contents, channel)
+            self._has_fixed_schema(contents, channel_id)
             and record_size == fixed_layout.record_dtype.itemsize
         ):
-            wire_messages = np.frombuffer(records, fixed_layout.record_dtype)["wire"]
-            to_native(wire_messages, out.dtype.names or (), out)
-            is_fixed = is_fixed_layout(wire_messages, fixed_layout.types)
-            if is_fixed.all():
+            wire_messages = np.frombuffer(record_bytes, fixed_layout.record_dtype)["wire"]
+            to_native(wire_messages, output_messages.dtype.names or (), output_messages)
+            has_fixed_layout = is_fixed_layout(wire_messages, fixed_layout.field_types)
+            if has_fixed_layout.all():
                 return
-            (indices,) = np.nonzero(~is_fixed)
+            (message_indices,) = np.nonzero(~has_fixed_layout)
         else:
-            indices = np.arange(len(out))
-        message_bytes = np.frombuffer(records, np.uint8).reshape(len(out), record_size)[
-            :, MESSAGE_HEAD_FORMAT.size :
-        ]
-        self._decode_by_offsets(channel, message_bytes, indices, out)
+            message_indices = np.arange(len(output_messages))
+        message_bytes = np.frombuffer(record_bytes, np.uint8).reshape(
+            len(output_messages), record_size
+        )[:, MESSAGE_HEAD_FORMAT.size :]
+        self._decode_by_offsets(channel_id, message_bytes, message_indices, output_messages)
 
     def _decode_by_offsets(
         self,
-        channel: int,
+        channel_id: int,
         message_bytes: npt.NDArray[np.uint8],
-        indices: npt.NDArray[np.int64],
-        out: npt.NDArray[np.void],
+        message_indices: npt.NDArray[np.int64],
+        output_messages: npt.NDArray[np.void],
     ) -> None:
-        """Decode the messages `indices` of `message_bytes` (n, bytes) into the same rows of `out`.
+        """Decode some of the messages (n, bytes) into the same rows of `output_messages`.
 
         Messages whose fields have the same byte offsets are decoded together.
         """
-        known_layouts = self._offsets.setdefault((channel, message_bytes.shape[1]), [])
+        known_layouts = self._offsets.setdefault((channel_id, message_bytes.shape[1]), [])
         layout_index = 0
         while (
-            len(indices) >= _MIN_GROUP_MESSAGES
+            len(message_indices) >= _MIN_GROUP_MESSAGES
             and self._layout_comparisons < _MAX_LAYOUT_COMPARISONS
         ):
             matching_rows = (
-                message_bytes if len(indices) == len(message_bytes) else message_bytes[indices]
+                message_bytes
+                if len(message_indices) == len(message_bytes)
+                else message_bytes[message_indices]
             )
             if layout_index == len(known_layouts):
-                new_layout = self._find_offsets(channel, matching_rows[0].tobytes())
-                if new_layout is None or layout_index == _MAX_LAYOUTS:
+                new_layout = self._find_offsets(channel_id, matching_rows[0].tobytes())
+                if new_layout is None or layout_index == _MAX_LAYOUTS_PER_CHANNEL:
                     break
                 known_layouts.append(new_layout)
             field_layout = known_layouts[layout_index]
-            has_layout = ((matching_rows & field_layout.mask) == field_layout.pattern).all(axis=1)
+            has_layout = ((matching_rows & field_layout.tag_mask) == field_layout.tag_pattern).all(
+                axis=1
+            )
             self._layout_comparisons += 1
             layout_index += 1
             if has_layout.any():
                 _decode_at_offsets(
-                    field_layout, matching_rows[has_layout], indices[has_layout], out
+                    field_layout,
+                    matching_rows[has_layout],
+                    message_indices[has_layout],
+                    output_messages,
                 )
-                indices = indices[~has_layout]
-        if len(indices):
+                message_indices = message_indices[~has_layout]
+        if len(message_indices):
             self._decode_one_by_one(
-                channel, [message_bytes[i].tobytes() for i in indices], indices, out
+                channel_id,
+                [message_bytes[i].tobytes() for i in message_indices],
+                message_indices,
+                output_messages,
             )
 
-    def _find_offsets(self, channel: int, message: bytes) -> _FieldOffsets | None:
+    def _find_offsets(self, channel_id: int, message_bytes: bytes) -> _FieldOffsets | None:
         """Return the offsets of the fields in a message, also for messages with the same layout.
 
         Returns None if such messages must be decoded one by one with the protobuf package.
         """
-        decoding_class = self._message_class(channel)
+        decoding_class = self._message_class(channel_id)
         empty_message, message_descriptor = decoding_class(), decoding_class.DESCRIPTOR
         if not empty_message.IsInitialized() or any(
             len(oneof_group.fields) > 1 for oneof_group in message_descriptor.oneofs
         ):
             return None
-        tag_mask, found_fields = np.zeros(len(message), np.uint8), {}
+        tag_mask, found_fields = np.zeros(len(message_bytes), np.uint8), {}
         position = 0
-        while position < len(message):
-            start = position
-            tag, position = _read_varint(message, start)
+        while position < len(message_bytes):
+            field_start = position
+            tag, position = _read_varint(message_bytes, field_start)
             field_number, wire_type = tag >> 3, tag & 7
             value_start = position
             if wire_type == _VARINT_WIRE_TYPE:
-                _, position = _read_varint(message, value_start)
+                _, position = _read_varint(message_bytes, value_start)
                 tag_mask[value_start:position] = 0x80
             elif wire_type in (_FIXED64_WIRE_TYPE, _FIXED32_WIRE_TYPE):
                 position += 8 if wire_type == _FIXED64_WIRE_TYPE else 4
             elif wire_type == _BYTES_WIRE_TYPE:
-                field_length, position = _read_varint(message, value_start)
+                field_length, position = _read_varint(message_bytes, value_start)
                 tag_mask[value_start:position] = 0xFF
                 position += field_length
             else:
                 return None
             if (
                 not 1 <= field_number <= _MAX_FIELD_NUMBER
-                or position > len(message)
-                or value_start - start > _MAX_TAG_BYTES
+                or position > len(message_bytes)
+                or value_start - field_start > _MAX_TAG_BYTES
                 or (wire_type == _VARINT_WIRE_TYPE and position - value_start > _MAX_VARINT_BYTES)
             ):
                 return None
-            tag_mask[start:value_start] = 0xFF
+            tag_mask[field_start:value_start] = 0xFF
             field_descriptor = message_descriptor.fields_by_number.get(field_number)
             if field_descriptor is not None:
                 array_conversion = self._array_conversion(field_descriptor, wire_type)
@@ -436,7 +450,7 @@ class MessageDecoder:
             return None
         return _FieldOffsets(
             tag_mask,
-            np.frombuffer(message, np.uint8) & tag_mask,
+            np.frombuffer(message_bytes, np.uint8) & tag_mask,
             tuple(
                 found_field
                 for field_name, found_field in found_fields.items()
@@ -454,7 +468,7 @@ class MessageDecoder:
         the protobuf wire type in the messages.
         """
         lossless_conversions = _LOSSLESS_CONVERSIONS.get(
-            self._layout.types.get(field_descriptor.name, ""), {}
+            self._layout.field_types.get(field_descriptor.name, ""), {}
         )
         for type_name, array_type in lossless_conversions.items():
             if field_descriptor.type == getattr(field_descriptor, type_name):
@@ -473,27 +487,28 @@ class MessageDecoder:
 
     def _decode_one_by_one(
         self,
-        channel: int,
-        messages: list[bytes],
-        indices: npt.NDArray[np.int64],
-        out: npt.NDArray[np.void],
+        channel_id: int,
+        encoded_messages: list[bytes],
+        message_indices: npt.NDArray[np.int64],
+        output_messages: npt.NDArray[np.void],
     ) -> None:
         """Decode messages one by one with the protobuf package; absent fields become 0."""
-        self._single_messages += len(messages)
-        if self._single_messages > limits.MAX_SINGLE_MESSAGES:
+        self._single_messages += len(encoded_messages)
+        if self._single_messages > limits.MAX_SINGLY_DECODED_MESSAGES:
             raise SessionError(
-                f"{self._path}: more than {limits.MAX_SINGLE_MESSAGES} messages of "
+                f"{self._path}: more than {limits.MAX_SINGLY_DECODED_MESSAGES} messages of "
                 f"{self._layout.topic} differ so much from one another that they would have to be "
                 "decoded one by one, which would take too long. The writing program must write all "
                 "fields of every message, in one order."
             )
-        decode_message = self._message_class(channel).FromString
+        decode_message = self._message_class(channel_id).FromString
         decoded_messages = [
-            decoded_message(self._path, self._layout.topic, decode_message, m) for m in messages
+            decoded_message(self._path, self._layout.topic, decode_message, m)
+            for m in encoded_messages
         ]
         field_names = self.dtype.names or ()
         try:
-            out[indices] = np.array(
+            output_messages[message_indices] = np.array(
                 [
                     tuple([getattr(single_message, field_name, 0) for field_name in field_names])
                     for single_message in decoded_messages
@@ -507,21 +522,21 @@ class MessageDecoder:
                 "format."
             ) from None
 
-    def _message_class(self, channel: int) -> "type[Message]":
+    def _message_class(self, channel_id: int) -> "type[Message]":
         """Return the protobuf class that decodes the messages of a channel."""
-        decoding_class = self._classes.get(channel)
+        decoding_class = self._classes.get(channel_id)
         if decoding_class is None:
             assert self._contents is not None
-            decoding_class = class_of_channel(self._path, self._contents, channel)
-            self._classes[channel] = decoding_class
+            decoding_class = class_of_channel(self._path, self._contents, channel_id)
+            self._classes[channel_id] = decoding_class
         return decoding_class
 
-    def _has_fixed_schema(self, contents: McapContents, channel: int) -> bool:
+    def _has_fixed_schema(self, contents: McapContents, channel_id: int) -> bool:
         """Return whether a channel's schema is that of the fixed layout."""
-        is_fixed = self._is_fixed_schema.get(channel)
+        is_fixed = self._is_fixed_schema.get(channel_id)
         if is_fixed is None:
             self._contents = contents
-            is_fixed = self._is_fixed_schema[channel] = self._check_schema(contents, channel)
+            is_fixed = self._is_fixed_schema[channel_id] = self._check_schema(contents, channel_id)
         return is_fixed
 
     def _check_schema(self, contents: McapContents, channel_id: int) -> bool:
@@ -532,10 +547,10 @@ class MessageDecoder:
         fixed_layout, path = self._layout, self._path
         channel = contents.channels[channel_id]
         schema = contents.schemas.get(channel.schema_id)
-        if len(self._is_fixed_schema) >= limits.MAX_CHANNELS:
+        if len(self._is_fixed_schema) >= limits.MAX_CHANNELS_PER_TOPIC:
             raise SessionError(
-                f"{path} has more than {limits.MAX_CHANNELS} channels {fixed_layout.topic}. The "
-                "writing program must put all such messages into one."
+                f"{path} has more than {limits.MAX_CHANNELS_PER_TOPIC} channels "
+                f"{fixed_layout.topic}. The writing program must put all such messages into one."
             )
         if (
             channel.message_encoding == "protobuf"
@@ -548,11 +563,11 @@ class MessageDecoder:
         empty_message = decoding_class()
         is_fixed = True
         for field_number, (field_name, protobuf_type) in enumerate(
-            fixed_layout.types.items(), start=1
+            fixed_layout.field_types.items(), start=1
         ):
             field_descriptor = decoding_class.DESCRIPTOR.fields_by_name.get(field_name)
             if field_descriptor is None:
-                if field_name in fixed_layout.required:
+                if field_name in fixed_layout.required_fields:
                     raise SessionError(
                         f"{path}: the schema of {fixed_layout.topic} has no field {field_name}, "
                         f"which is required there, of type {protobuf_type}."
@@ -623,15 +638,15 @@ def quoted_excerpt(file_text: str) -> str:
 
 
 def _decode_at_offsets(
-    layout: _FieldOffsets,
+    field_offsets: _FieldOffsets,
     message_rows: npt.NDArray[np.uint8],
-    indices: npt.NDArray[np.int64],
-    out: npt.NDArray[np.void],
+    message_indices: npt.NDArray[np.int64],
+    output_messages: npt.NDArray[np.void],
 ) -> None:
-    """Decode messages (n, bytes) with equal field offsets into the elements `indices` of `out`."""
+    """Decode messages (n, bytes) with equal field offsets into elements of `output_messages`."""
     message_rows = np.ascontiguousarray(message_rows)
     message_count, message_size = message_rows.shape
-    for field_name, first_byte, field_length, array_conversion in layout.fields:
+    for field_name, first_byte, field_length, array_conversion in field_offsets.fields:
         if array_conversion.startswith("varint"):
             absent_value = np.zeros(message_count, np.uint64)
             for i in range(field_length):
@@ -640,23 +655,25 @@ def _decode_at_offsets(
                 ) << np.uint64(7 * i)
             if array_conversion == "varint32":
                 absent_value &= np.uint64(0xFFFFFFFF)
-            out[field_name][indices] = absent_value.astype(out.dtype[field_name])
+            output_messages[field_name][message_indices] = absent_value.astype(
+                output_messages.dtype[field_name]
+            )
         else:
-            out[field_name][indices] = np.ndarray(
+            output_messages[field_name][message_indices] = np.ndarray(
                 message_count, array_conversion, message_rows, first_byte, (message_size,)
             )
-    for field_name in layout.absent_fields:
-        out[field_name][indices] = 0
+    for field_name in field_offsets.absent_fields:
+        output_messages[field_name][message_indices] = 0
 
 
-def _read_varint(data: bytes, position: int) -> tuple[int, int]:
-    """Return the integer of the varint at `position`, and the offset where the varint ends.
+def _read_varint(message_bytes: bytes, varint_start: int) -> tuple[int, int]:
+    """Return the integer of the varint at `varint_start`, and the offset where the varint ends.
 
-    Returns -1 and an offset beyond `data` if there is no complete varint.
+    Returns -1 and an offset beyond `message_bytes` if there is no complete varint.
     """
-    varint = 0
-    for i, byte in enumerate(data[position : position + 10]):
-        varint |= (byte & 0x7F) << 7 * i
+    varint_value = 0
+    for i, byte in enumerate(message_bytes[varint_start : varint_start + 10]):
+        varint_value |= (byte & 0x7F) << 7 * i
         if byte < 0x80:
-            return varint, position + i + 1
-    return -1, len(data) + 1
+            return varint_value, varint_start + i + 1
+    return -1, len(message_bytes) + 1

@@ -45,7 +45,7 @@ MAX_LOG_BYTES: Final = 16 << 20
 
 _MIN_ARRAY_GROWTH: Final = 1 << 16
 """Minimum number of messages by which the array of decoded messages grows."""
-_MIN_SAMPLE_BYTES: Final = 60
+_MIN_SAMPLE_RECORD_BYTES: Final = 60
 """Assumed minimum size of a sample in the file, in bytes after compression."""
 _MAX_NUMBER_CHARACTERS: Final = 400
 """Maximum length of the text of a number; the longest finite number has 309 integer digits."""
@@ -111,18 +111,18 @@ class Session:
                 f"state it as a number{unit_text}."
             )
         try:
-            number = (
+            parsed_number = (
                 float(number_text) if len(number_text) <= _MAX_NUMBER_CHARACTERS else float("nan")
             )
         except ValueError:
-            number = float("nan")
-        if not isfinite(number):
+            parsed_number = float("nan")
+        if not isfinite(parsed_number):
             raise SessionError(
                 f"{self.path}: {key} in the metadata 'session' is {quoted_excerpt(number_text)}, "
                 "which is "
                 f"not a finite number. The writing program must state it as a number{unit_text}."
             )
-        return number
+        return parsed_number
 
 
 def read_session(
@@ -161,13 +161,17 @@ def read_session(
     undecoded_log = _UndecodedLog()
     sample_order = _SampleOrder(path)
 
-    def pass_on(samples: npt.NDArray[np.void]) -> None:
+    def check_and_forward_samples(sample_block: npt.NDArray[np.void]) -> None:
         assert on_samples is not None
-        sample_order.add(samples)
-        on_samples(samples)
+        sample_order.add(sample_block)
+        on_samples(sample_block)
 
     sample_buffer = TopicBuffer(
-        path, SAMPLES, fields, max_samples, None if on_samples is None else pass_on
+        path,
+        SAMPLES,
+        fields,
+        max_samples,
+        None if on_samples is None else check_and_forward_samples,
     )
 
     def add_block(mcap_contents: McapContents, block: MessageBlock) -> None:
@@ -277,29 +281,31 @@ class TopicBuffer:
         self._on_messages = on_messages
         # Unused memory of the array is never allocated, and most files need no more.
         expected_messages = (
-            0 if on_messages else min(_file_size(path) // _MIN_SAMPLE_BYTES, max_messages)
+            0 if on_messages else min(_file_size(path) // _MIN_SAMPLE_RECORD_BYTES, max_messages)
         )
         self._array = np.empty(expected_messages, layout.dtype_of(fields))
         self._message_count = 0
 
-    def array_for(self, count: int) -> npt.NDArray[np.void]:
-        """Return the elements of the array that the next `count` messages fill.
+    def next_message_array(self, message_count: int) -> npt.NDArray[np.void]:
+        """Return the elements of the array that the next `message_count` messages fill.
 
         Raises SessionError if there are more messages than `max_messages`.
         """
-        end = self._message_count + count
-        if end > self._max_messages:
+        messages_end = self._message_count + message_count
+        if messages_end > self._max_messages:
             raise SessionError(
                 f"{self._path} holds more than the {self._max_messages} messages of {self._topic} "
                 "that fit into the memory that reading a session may take. Give a shorter session."
             )
         if self._on_messages is not None:
-            return np.empty(count, self.decoder.dtype)
-        if end > len(self._array):
+            return np.empty(message_count, self.decoder.dtype)
+        if messages_end > len(self._array):
             # Resized without a copy, by a small fraction: two arrays would take too much memory.
-            new_length = max(end, len(self._array) + max(_MIN_ARRAY_GROWTH, len(self._array) // 8))
+            new_length = max(
+                messages_end, len(self._array) + max(_MIN_ARRAY_GROWTH, len(self._array) // 8)
+            )
             self._array.resize(min(new_length, self._max_messages), refcheck=False)
-        return self._array[self._message_count : end]
+        return self._array[self._message_count : messages_end]
 
     def store(self, messages: npt.NDArray[np.void]) -> None:
         """Count the decoded messages, and pass them to `on_messages` if they are not stored."""
@@ -389,10 +395,10 @@ class _UndecodedLog:
                 )
                 continue
             if channel not in decoder_by_channel:
-                if len(decoder_by_channel) == limits.MAX_CHANNELS:
+                if len(decoder_by_channel) == limits.MAX_CHANNELS_PER_TOPIC:
                     raise SessionError(
-                        f"{path} has more than {limits.MAX_CHANNELS} channels {EVENT_TOPIC}. The "
-                        "writing program must put all such messages into one."
+                        f"{path} has more than {limits.MAX_CHANNELS_PER_TOPIC} channels "
+                        f"{EVENT_TOPIC}. The writing program must put all such messages into one."
                     )
                 decoder_by_channel[channel] = class_of_channel(path, contents, channel).FromString
             log_message = decoded_message(
@@ -423,13 +429,13 @@ def no_samples_error(path: Path) -> SessionError:
 def _damage_message(path: Path, contents: McapContents) -> str:
     """Return the error message for an incomplete or damaged file, with the remedy."""
     if contents.complete:
-        return f"{path} is damaged: it {contents.damage}{recovery_advice(path, was_whole=True)}"
+        return f"{path} is damaged: it {contents.damage}{recovery_advice(path, was_complete=True)}"
     if is_being_written(path):
         return (
             f"{path} is incomplete, because it is still being recorded. Wait for the end of the "
             "session, or stop it."
         )
-    return f"{path} is incomplete: it {contents.damage}{recovery_advice(path, was_whole=False)}"
+    return f"{path} is incomplete: it {contents.damage}{recovery_advice(path, was_complete=False)}"
 
 
 def merged_metadata(contents: McapContents, record_name: str) -> dict[str, str] | None:
@@ -468,13 +474,13 @@ class _SampleOrder:
         if self.first_t_ns is None:
             self.first_t_ns = int(samples["t_ns"][0])
         if self._last_tick is not None and ticks[0] <= self._last_tick:
-            raise self._error(self._last_tick, int(ticks[0]))
+            raise self._order_error(self._last_tick, int(ticks[0]))
         self._last_tick = int(ticks[-1])
         backward_indices = np.flatnonzero(ticks[1:] <= ticks[:-1])
         if len(backward_indices):
-            raise self._error(*ticks[backward_indices[0] :][:2].tolist())
+            raise self._order_error(*ticks[backward_indices[0] :][:2].tolist())
 
-    def _error(self, tick: int, next_tick: int) -> SessionError:
+    def _order_error(self, tick: int, next_tick: int) -> SessionError:
         """Return the error for two consecutive samples whose ticks do not increase."""
         return SessionError(
             f"{self._path}: tick {next_tick} follows tick {tick} in {SAMPLE_TOPIC}, but "
@@ -484,7 +490,7 @@ class _SampleOrder:
 
 
 def _start_utc_ns(
-    path: Path, metadata: dict[str, str], log_time: int | None, first_t_ns: int | None
+    path: Path, metadata: dict[str, str], first_log_time_ns: int | None, first_t_ns: int | None
 ) -> int:
     """Return the wall-clock time of tick 0 in nanoseconds since the Unix epoch, or 0 if unknown.
 
@@ -500,8 +506,8 @@ def _start_utc_ns(
             f"{quoted_excerpt(start_time_text)}. The "
             "writing program must state it as a whole number of ns since 1970, or leave it out."
         )
-    if log_time is not None and first_t_ns is not None:
-        return log_time - first_t_ns
+    if first_log_time_ns is not None and first_t_ns is not None:
+        return first_log_time_ns - first_t_ns
     return 0
 
 

@@ -52,7 +52,7 @@ RECOVERED_FROM: Final = "recovered_from"
 """Key of the record ``outcome`` of a recovered file; its value is the damaged file's name."""
 
 _MIN_CHUNK_BYTES: Final = 1 << 14
-_LONG_CHUNK_BYTES: Final = 4 << 20
+_MAX_COLLECTED_BYTES: Final = 4 << 20
 """Maximum length in bytes of the collected messages, above which they are written as a chunk."""
 _CHUNKS_BEFORE_GROWTH: Final = 10_000
 """Number of chunks after which new chunks become longer, to limit the size of the chunk index."""
@@ -153,7 +153,7 @@ def recover(
         raise SessionError(f"{path} is still being recorded. Wait for the end of the session.")
     sample_selection = _SampleSelection(path)
     mcap_contents = load_contents(
-        path, None, on_block=sample_selection.add_block, salvage=True,
+        path, None, on_block=sample_selection.add_block, is_salvage=True,
         on_progress=_scaled_progress(on_progress, 0.0, _FIRST_READING_FRACTION),
     )  # fmt: skip
     sample_selection.finish(mcap_contents)
@@ -267,16 +267,17 @@ class _SampleSelection:
         """Return the file positions of chunks that contain samples, but none that is copied."""
         chunk_sample_counts = np.array(list(self._samples_per_chunk.values()), np.int64)
         # Number of copied samples up to each end of a chunk, and from it the number in each chunk.
-        copied_before = np.append(0, np.cumsum(self.is_copied))
-        chunk_ends = np.cumsum(chunk_sample_counts)
-        copied_in_chunk = (
-            copied_before[chunk_ends] - copied_before[chunk_ends - chunk_sample_counts]
+        copied_samples_before = np.append(0, np.cumsum(self.is_copied))
+        chunk_end_indices = np.cumsum(chunk_sample_counts)
+        copied_samples_in_chunk = (
+            copied_samples_before[chunk_end_indices]
+            - copied_samples_before[chunk_end_indices - chunk_sample_counts]
         )
-        is_duplicate = (chunk_sample_counts > 0) & (copied_in_chunk == 0)
+        has_no_copied_sample = (chunk_sample_counts > 0) & (copied_samples_in_chunk == 0)
         return {
             chunk_position
             for chunk_position, is_chunk_duplicate in zip(
-                self._samples_per_chunk, is_duplicate, strict=True
+                self._samples_per_chunk, has_no_copied_sample, strict=True
             )
             if is_chunk_duplicate
         }
@@ -310,14 +311,14 @@ def _copy_intact_file(path: Path, final_path: Path) -> Recovery:
     session = read_session(
         path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
     )
-    is_part = path.name.endswith(PART_SUFFIX)
-    if is_part:
+    is_part_file = path.name.endswith(PART_SUFFIX)
+    if is_part_file:
         _require_target_absent(path, final_path)
-        with _temporary_target(path, final_path, copied_file=path):
+        with _temporary_target(path, final_path, copied_path=path):
             pass
     return Recovery(
         source=path,
-        path=final_path if is_part else None,
+        path=final_path if is_part_file else None,
         samples=len(session.samples),
         outcome=session.outcome or {},
         damage=None,
@@ -336,25 +337,28 @@ def _require_target_absent(path: Path, recovered_file: Path) -> None:
 
 
 @contextlib.contextmanager
-def _temporary_target(path: Path, target: Path, copied_file: Path | None = None) -> Iterator[Path]:
-    """Yield the path of a temporary file, which becomes `target` if no error is raised.
+def _temporary_target(
+    path: Path, target_path: Path, copied_path: Path | None = None
+) -> Iterator[Path]:
+    """Yield the path of a temporary file, which becomes `target_path` if no error is raised.
 
-    The temporary file is in the folder of `target`, and starts as a copy of `copied_file` if given.
+    The temporary file is in the folder of `target_path`, and starts as a copy of `copied_path` if
+    given.
     """
-    temporary_path = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    temporary_path = target_path.with_name(f".{target_path.name}.{secrets.token_hex(4)}")
     try:
-        if copied_file is not None:
-            with copied_file.open("rb") as source:
+        if copied_path is not None:
+            with copied_path.open("rb") as source:
                 copy_new(source.fileno(), temporary_path)
         yield temporary_path
-        rename_without_replacing(temporary_path, target)
-        fsync_directory(target.parent)
+        rename_without_replacing(temporary_path, target_path)
+        fsync_directory(target_path.parent)
     except FileExistsError:
-        _require_target_absent(path, target)  # the target may have been created meanwhile
+        _require_target_absent(path, target_path)  # the target may have been created meanwhile
         raise
     except OSError as error:
         raise SessionError(
-            f"{target} cannot be written: {error.strerror or error}. Check that the folder is "
+            f"{target_path} cannot be written: {error.strerror or error}. Check that the folder is "
             f"writable and has space left, or copy {path} to one that is."
         ) from error
     finally:
@@ -363,26 +367,26 @@ def _temporary_target(path: Path, target: Path, copied_file: Path | None = None)
 
 def _planned_recovery(
     path: Path,
-    target: Path,
+    recovered_file: Path,
     contents: McapContents,
-    selection: _SampleSelection,
+    sample_selection: _SampleSelection,
     damage: str,
-    skipped: list[str],
+    skipped_record_texts: list[str],
 ) -> Recovery:
     """Return the result of a recovery before the new file is written."""
-    copied_samples = selection.samples
+    copied_samples = sample_selection.samples
     bytes_lost = path.stat().st_size - contents.intact_bytes
     # The recorded outcome describes all samples: it is used only if none is missing.
-    is_outcome_valid = contents.verified and selection.order_error is None
+    is_outcome_valid = contents.has_correct_checksum and sample_selection.order_error is None
     planned_recovery = Recovery(
         source=path,
-        path=target,
+        path=recovered_file,
         samples=len(copied_samples),
         outcome={},
         damage=damage,
         bytes_lost=bytes_lost,
-        skipped=tuple(skipped),
-        protected=contents.verified or bool(_metadata_from_chunk(contents)),
+        skipped=tuple(skipped_record_texts),
+        protected=contents.has_correct_checksum or bool(_metadata_from_chunk(contents)),
     )
     recovered_outcome: dict[str, str] = {}
     if is_outcome_valid:
@@ -392,7 +396,7 @@ def _planned_recovery(
         recovered_outcome["reason"] = (
             f"Recovered from {path.name}, which {damage}{_loss_text(bytes_lost)}."
         )
-        stated_sample_count = _sample_count(contents.stated_counts, contents)
+        stated_sample_count = _sample_count(contents.stated_message_counts, contents)
         recovered_outcome |= _tick_counts(
             copied_samples, max(stated_sample_count - len(copied_samples), 0)
         )
@@ -408,34 +412,38 @@ def _planned_recovery(
     return replace(planned_recovery, outcome=recovered_outcome)
 
 
-def _loss_text(lost_bytes: int) -> str:
+def _loss_text(lost_byte_count: int) -> str:
     """Return text for an error message that states the number of lost bytes, or "" for 0."""
-    return f"; {lost_bytes} bytes from there on were lost" if lost_bytes else ""
+    return f"; {lost_byte_count} bytes from there on were lost" if lost_byte_count else ""
 
 
-def _sample_count(counts: Mapping[int, int], contents: McapContents) -> int:
+def _sample_count(message_count_by_channel: Mapping[int, int], contents: McapContents) -> int:
     """Return the number of samples, given ``channel number → number of messages``."""
     return sum(
-        counts.get(channel.id, 0)
+        message_count_by_channel.get(channel.id, 0)
         for channel in contents.channels.values()
         if channel.topic == SAMPLE_TOPIC
     )
 
 
-def _tick_counts(samples: npt.NDArray[np.void], unrecovered_samples: int) -> dict[str, str]:
+def _tick_counts(samples: npt.NDArray[np.void], unrecovered_sample_count: int) -> dict[str, str]:
     """Return the tick counts for the record ``outcome`` of a recovered file.
 
     The ticks of a gap count as missed if the flags of the next sample state so, otherwise as lost.
-    `unrecovered_samples` is the number of samples that were in the file before it was damaged, and
-    could not be recovered.
+    `unrecovered_sample_count` is the number of samples that were in the file before it was damaged,
+    and could not be recovered.
     """
     status_flags = samples["status"]
-    missing_before = np.diff(samples["tick"].astype(np.int64), prepend=-1) - 1
-    was_lost = (status_flags & Status.AFTER_LOST) != 0
-    was_missed = ~was_lost & ((status_flags & Status.AFTER_MISSED) != 0)
-    missed_ticks = int(missing_before[was_missed].sum())
-    unexplained_ticks = int(missing_before[~was_lost & ~was_missed].sum())
-    lost_ticks = int(missing_before[was_lost].sum()) + max(unexplained_ticks, unrecovered_samples)
+    missing_ticks_before = np.diff(samples["tick"].astype(np.int64), prepend=-1) - 1
+    follows_lost_samples = (status_flags & Status.AFTER_LOST) != 0
+    follows_missed_ticks = ~follows_lost_samples & ((status_flags & Status.AFTER_MISSED) != 0)
+    missed_ticks = int(missing_ticks_before[follows_missed_ticks].sum())
+    unexplained_ticks = int(
+        missing_ticks_before[~follows_lost_samples & ~follows_missed_ticks].sum()
+    )
+    lost_ticks = int(missing_ticks_before[follows_lost_samples].sum()) + max(
+        unexplained_ticks, unrecovered_sample_count
+    )
     return {
         "scheduled": str(len(samples) + missed_ticks + lost_ticks),
         "recorded": str(len(samples)),
@@ -454,7 +462,7 @@ def _metadata_from_chunk(contents: McapContents) -> dict[str, dict[str, str]]:
     contains it.
     """
     for channel in contents.channels.values():
-        if channel.topic == SAMPLE_TOPIC and channel.id in contents.declared_in_chunks:
+        if channel.topic == SAMPLE_TOPIC and channel.id in contents.channels_declared_in_chunks:
             metadata_records = metadata_from_channel(channel.metadata)
             if "session" in metadata_records:
                 return metadata_records
@@ -464,7 +472,7 @@ def _metadata_from_chunk(contents: McapContents) -> dict[str, dict[str, str]]:
 def _metadata_records(contents: McapContents) -> dict[str, dict[str, str]]:
     """Return the metadata records to copy, except ``outcome``: name → keys and values."""
     protected_records = _metadata_from_chunk(contents)
-    if protected_records and not contents.verified:
+    if protected_records and not contents.has_correct_checksum:
         return protected_records
     record_names = dict.fromkeys(
         metadata_record.name
@@ -478,9 +486,9 @@ def _metadata_records(contents: McapContents) -> dict[str, dict[str, str]]:
 
 def _write_recovered_file(
     path: Path,
-    source: Path,
+    damaged_path: Path,
     contents: McapContents,
-    selection: _SampleSelection,
+    sample_selection: _SampleSelection,
     recovery: Recovery,
     on_progress: Callable[[float], None] | None,
 ) -> SampleDigest:
@@ -501,11 +509,15 @@ def _write_recovered_file(
             copied_channels,
         )
         message_copier = _MessageCopier(
-            source, mcap_writer, selection, {channel.id for channel in copied_channels}
+            damaged_path, mcap_writer, sample_selection, {channel.id for channel in copied_channels}
         )
         # Second reading, up to the same damage as the first one, which selected the samples.
         contents_read_again = load_contents(
-            source, None, on_block=message_copier.add_block, salvage=True, on_progress=on_progress
+            damaged_path,
+            None,
+            on_block=message_copier.add_block,
+            is_salvage=True,
+            on_progress=on_progress,
         )
         sample_digest = message_copier.finish(contents_read_again)
         if on_progress is not None:
@@ -524,15 +536,19 @@ class _MessageCopier:
     """
 
     def __init__(
-        self, source: Path, mcap_writer: McapWriter, selection: _SampleSelection, channels: set[int]
+        self,
+        damaged_path: Path,
+        mcap_writer: McapWriter,
+        sample_selection: _SampleSelection,
+        channel_ids: set[int],
     ) -> None:
-        self._source = source
+        self._source = damaged_path
         self._mcap = mcap_writer
-        self._is_copied = selection.is_copied
-        self._duplicate_chunks = selection.duplicate_chunks()
-        self._declared_channels = channels
+        self._is_copied = sample_selection.is_copied
+        self._duplicate_chunks = sample_selection.duplicate_chunks()
+        self._declared_channels = channel_ids
         self._digest = SampleDigest()
-        self._decoder = MessageDecoder(source, SAMPLES, self)
+        self._decoder = MessageDecoder(damaged_path, SAMPLES, self)
         self._samples_read = 0  # samples of the damaged file in the blocks so far
         self._samples_decoded = 0  # samples decoded so far
         self._collected_records: list[bytes] = []
@@ -541,30 +557,30 @@ class _MessageCopier:
         self._written_bytes = 0  # bytes in chunks so far
         self._chunk_position = 0  # position of the current chunk in the damaged file
 
-    def array_for(self, count: int) -> npt.NDArray[np.void]:
-        """Return an uninitialised array for the next `count` decoded samples."""
-        return np.empty(count, SAMPLE_DTYPE)
+    def next_message_array(self, message_count: int) -> npt.NDArray[np.void]:
+        """Return an uninitialised array for the next `message_count` decoded samples."""
+        return np.empty(message_count, SAMPLE_DTYPE)
 
     def store(self, messages: npt.NDArray[np.void]) -> None:
         """Add the samples that are copied to the checksum."""
-        decoded_end = self._samples_decoded + len(messages)
-        is_copied = self._is_copied[self._samples_decoded : decoded_end]
+        decoded_count = self._samples_decoded + len(messages)
+        is_copied = self._is_copied[self._samples_decoded : decoded_count]
         self._digest.add(messages if is_copied.all() else messages[: len(is_copied)][is_copied])
-        self._samples_decoded = decoded_end
+        self._samples_decoded = decoded_count
 
     def add_block(self, contents: McapContents, block: MessageBlock) -> None:
         """Collect the messages to copy from a block; write a chunk when enough are collected."""
         # Small chunks are merged, because each takes space in the index. They grow with the file.
-        min_bytes = max(_MIN_CHUNK_BYTES, self._written_bytes // _CHUNKS_BEFORE_GROWTH)
-        if self._collected_bytes >= min_bytes and (
+        min_chunk_bytes = max(_MIN_CHUNK_BYTES, self._written_bytes // _CHUNKS_BEFORE_GROWTH)
+        if self._collected_bytes >= min_chunk_bytes and (
             block.chunk_position != self._chunk_position
-            or self._collected_bytes > _LONG_CHUNK_BYTES
+            or self._collected_bytes > _MAX_COLLECTED_BYTES
         ):
             self._flush()
         self._chunk_position = block.chunk_position
         self._decoder.add_block(contents, block)
-        is_duplicate = block.chunk_position in self._duplicate_chunks
-        records = memoryview(block.records)
+        is_duplicate_chunk = block.chunk_position in self._duplicate_chunks
+        record_bytes = memoryview(block.records)
         for channel, message_size, start, message_count in block.runs:
             copied_ranges = [(start, message_count)]
             if self._decoder.is_of_topic(contents, channel):
@@ -578,13 +594,13 @@ class _MessageCopier:
                 elif not is_copied.all():
                     copied_ranges = [
                         (start + message_size * first_sample, sample_count)
-                        for first_sample, sample_count in _true_blocks(is_copied)
+                        for first_sample, sample_count in _blocks_of_true(is_copied)
                     ]
-            if is_duplicate or channel not in self._declared_channels:
+            if is_duplicate_chunk or channel not in self._declared_channels:
                 continue
             for range_start, range_length in copied_ranges:
                 self._collected_records.append(
-                    bytes(records[range_start : range_start + message_size * range_length])
+                    bytes(record_bytes[range_start : range_start + message_size * range_length])
                 )
                 self._collected_runs.append((channel, message_size, range_length))
                 self._collected_bytes += message_size * range_length
@@ -626,22 +642,28 @@ class _MessageCopier:
         )
 
 
-def _true_blocks(mask: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _blocks_of_true(boolean_mask: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return start index and length of each block of consecutive True values."""
-    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
-    return list(zip(edges[::2].tolist(), (edges[1::2] - edges[::2]).tolist(), strict=True))
+    block_edges = np.flatnonzero(np.diff(boolean_mask, prepend=False, append=False))
+    return list(
+        zip(block_edges[::2].tolist(), (block_edges[1::2] - block_edges[::2]).tolist(), strict=True)
+    )
 
 
 def _channels_to_copy(
-    contents: McapContents, records: Mapping[str, Mapping[str, str]]
+    contents: McapContents, metadata_records: Mapping[str, Mapping[str, str]]
 ) -> list[Channel]:
     """Return the channels to copy; the samples' channel gets a copy of the session's metadata."""
-    only_chunk_channels = bool(_metadata_from_chunk(contents)) and not contents.verified
-    channel_metadata = metadata_for_channel(records.get("session", {}), records.get("segments", {}))
+    excludes_unprotected_channels = (
+        bool(_metadata_from_chunk(contents)) and not contents.has_correct_checksum
+    )
+    channel_metadata = metadata_for_channel(
+        metadata_records.get("session", {}), metadata_records.get("segments", {})
+    )
     usable_channels = [
         channel
         for channel in contents.channels.values()
-        if channel.id in contents.declared_in_chunks or not only_chunk_channels
+        if channel.id in contents.channels_declared_in_chunks or not excludes_unprotected_channels
     ]
     own_channels = [channel for channel in usable_channels if channel.topic in OWN_TOPICS]
     other_channels = [channel for channel in usable_channels if channel.topic not in OWN_TOPICS]

@@ -9,7 +9,12 @@ from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Final
 
 from rigd.session import limits
-from rigd.session.layout import CONTROL_TYPES, SAMPLE_TYPES, TIMING_TYPES, TOUCH_TYPES
+from rigd.session.layout import (
+    CONTROL_FIELD_TYPES,
+    SAMPLE_FIELD_TYPES,
+    TIMING_FIELD_TYPES,
+    TOUCH_FIELD_TYPES,
+)
 
 if TYPE_CHECKING:
     from google.protobuf.descriptor_pb2 import FileDescriptorProto
@@ -106,22 +111,22 @@ def schema_data(schema_name: str) -> bytes:
         file_descriptors = [timestamp_file, _event_file()]
     else:
         field_types = {
-            SAMPLE_SCHEMA: SAMPLE_TYPES,
-            CONTROL_SCHEMA: CONTROL_TYPES,
-            TIMING_SCHEMA: TIMING_TYPES,
-            TOUCH_SCHEMA: TOUCH_TYPES,
+            SAMPLE_SCHEMA: SAMPLE_FIELD_TYPES,
+            CONTROL_SCHEMA: CONTROL_FIELD_TYPES,
+            TIMING_SCHEMA: TIMING_FIELD_TYPES,
+            TOUCH_SCHEMA: TOUCH_FIELD_TYPES,
         }[schema_name]
         file_descriptors = [_fixed_layout_file(schema_name, field_types)]
     return FileDescriptorSet(file=file_descriptors).SerializeToString(deterministic=True)
 
 
 @lru_cache(maxsize=16)
-def message_class(schema_name: str, data: bytes) -> "type[Message]":
+def message_class(schema_name: str, schema_bytes: bytes) -> "type[Message]":
     """Return the protobuf class that decodes the messages of a schema.
 
     Building a class takes as long as decoding dozens of messages, so the last few are cached.
-    `schema_name` is the full name of the message type, such as ``rigd.Sample``, and `data` a
-    serialised ``FileDescriptorSet``. Raise `ValueError` if `data` is not a consistent
+    `schema_name` is the full name of the message type, such as ``rigd.Sample``, and `schema_bytes`
+    a serialised ``FileDescriptorSet``. Raise `ValueError` if `schema_bytes` is not a consistent
     ``FileDescriptorSet`` that contains `schema_name`.
     """
     from google.protobuf import descriptor_pool, message_factory
@@ -129,57 +134,59 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
     from google.protobuf.message import DecodeError
 
     shown_name = repr(schema_name if len(schema_name) <= 40 else schema_name[:40] + "…")
-    if len(data) > limits.MAX_SCHEMA_BYTES:
+    if len(schema_bytes) > limits.MAX_SCHEMA_BYTES:
         raise ValueError(
-            f"schema {shown_name} has {len(data)} bytes, more than the {limits.MAX_SCHEMA_BYTES} "
-            "that are read"
+            f"schema {shown_name} has {len(schema_bytes)} bytes, more than the "
+            f"{limits.MAX_SCHEMA_BYTES} that are read"
         )
     try:
         files_to_add = {
             file_descriptor.name: file_descriptor
-            for file_descriptor in FileDescriptorSet.FromString(data).file
+            for file_descriptor in FileDescriptorSet.FromString(schema_bytes).file
         }
         protobuf_pool = descriptor_pool.DescriptorPool()
 
-        def add(name: str) -> None:
+        def add_file_with_imports(file_name: str) -> None:
             # A file must be added to the pool after the files that it imports.
-            file_descriptor = files_to_add.pop(name, None)
+            file_descriptor = files_to_add.pop(file_name, None)
             if file_descriptor is not None:
                 for dependency in file_descriptor.dependency:
-                    add(dependency)
+                    add_file_with_imports(dependency)
                 protobuf_pool.Add(file_descriptor)
 
         while files_to_add:
-            add(next(iter(files_to_add)))
+            add_file_with_imports(next(iter(files_to_add)))
         message_descriptor = protobuf_pool.FindMessageTypeByName(schema_name)
     except (DecodeError, TypeError, KeyError, RecursionError) as error:
         raise ValueError(f"schema {shown_name} is not a usable protobuf schema") from error
     return message_factory.GetMessageClass(message_descriptor)
 
 
-def metadata_for_channel(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
+def metadata_for_channel(
+    session_record: Mapping[str, str], segments_record: Mapping[str, str]
+) -> dict[str, str]:
     """Return the records ``session`` and ``segments`` as metadata of the samples' channel.
 
     The copy in the channel is protected by the checksum of its chunk. A metadata record of MCAP has
     no checksum, and the checksum of the whole file is missing if the file is truncated.
     """
     return {
-        **{f"session.{key}": metadata_value for key, metadata_value in session.items()},
-        **{f"segments.{key}": metadata_value for key, metadata_value in segments.items()},
+        **{f"session.{key}": metadata_value for key, metadata_value in session_record.items()},
+        **{f"segments.{key}": metadata_value for key, metadata_value in segments_record.items()},
     }
 
 
-def metadata_from_channel(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
+def metadata_from_channel(channel_metadata: Mapping[str, str]) -> dict[str, dict[str, str]]:
     """Return the records ``session`` and ``segments`` from the metadata of the samples' channel.
 
     This is the inverse of `metadata_for_channel`, except that empty records are missing.
     """
-    records: dict[str, dict[str, str]] = {}
-    for key, metadata_value in channel.items():
+    record_by_name: dict[str, dict[str, str]] = {}
+    for key, metadata_value in channel_metadata.items():
         record, separator, key_name = key.partition(".")
         if separator and record in ("session", "segments"):
-            records.setdefault(record, {})[key_name] = metadata_value
-    return records
+            record_by_name.setdefault(record, {})[key_name] = metadata_value
+    return record_by_name
 
 
 def event_class() -> "type[Message]":

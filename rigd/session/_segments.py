@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 
 
-def segments_until(segments: Mapping[str, tuple[int, int]], end: int) -> dict[str, tuple[int, int]]:
+def segments_until(
+    segments: Mapping[str, tuple[int, int]], first_excluded_tick: int
+) -> dict[str, tuple[int, int]]:
     """Return the segments of a record cut to the part before a tick.
 
     Segments that begin at the tick or later are omitted.
@@ -12,13 +14,13 @@ def segments_until(segments: Mapping[str, tuple[int, int]], end: int) -> dict[st
     ----------
     segments : mapping of str to (int, int)
         Segment name → first tick and end tick (exclusive).
-    end : int
+    first_excluded_tick : int
         First tick that no longer belongs to the record.
     """
     return {
-        segment_name: (first_tick, min(end_tick, end))
+        segment_name: (first_tick, min(end_tick, first_excluded_tick))
         for segment_name, (first_tick, end_tick) in segments.items()
-        if first_tick < end
+        if first_tick < first_excluded_tick
     }
 
 
@@ -45,9 +47,9 @@ def sweep_frequency_hz(
     [25.0, 25.0, None]
     """
     start_hz, stop_hz = start_and_end_hz
-    first_half = segments.get("there", segments["sweep"])
+    first_half_ticks = segments.get("there", segments["sweep"])
     for (first_tick, end), begin_hz, end_hz in (
-        (first_half, start_hz, stop_hz),
+        (first_half_ticks, start_hz, stop_hz),
         (segments.get("back", (0, 0)), stop_hz, start_hz),
     ):
         if first_tick <= tick < end:

@@ -54,7 +54,7 @@ class SessionSummary:
     """Number of recorded samples, or None for an incomplete or damaged file."""
     problem: str
     """Sentence on damage of the file and its remedy; empty for an intact file."""
-    recording: bool
+    is_recording: bool
     """Whether the session is still being recorded."""
 
 
@@ -105,7 +105,7 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
         outcome=merged_metadata(mcap_contents, "outcome"),
         samples=None if problem_text else mcap_contents.count(SAMPLE_TOPIC),
         problem=problem_text,
-        recording=is_recording,
+        is_recording=is_recording,
     )
 
 
@@ -137,8 +137,11 @@ def _read_by_summary(file: BinaryIO, file_size: int) -> McapContents | None:
         return None
     file.seek(summary_start)
     summary_bytes = file.read(footer_start - summary_start)
-    checked_length = FOOTER_FORMAT.size - _CHECKSUM_SIZE
-    if crc == 0 or zlib.crc32(footer_and_magic[:checked_length], zlib.crc32(summary_bytes)) != crc:
+    crc_covered_length = FOOTER_FORMAT.size - _CHECKSUM_SIZE
+    if (
+        crc == 0
+        or zlib.crc32(footer_and_magic[:crc_covered_length], zlib.crc32(summary_bytes)) != crc
+    ):
         return None
     try:
         return _contents_from_summary(file, summary_bytes)
@@ -157,9 +160,9 @@ def _contents_from_summary(file: BinaryIO, summary_bytes: bytes) -> McapContents
     record_position = 0
     while record_position < len(summary_bytes):
         opcode, record_length = RECORD_HEAD_FORMAT.unpack_from(summary_bytes, record_position)
-        record_content = record_position + RECORD_HEAD_FORMAT.size
-        record_position = record_content + record_length
-        record = summary_bytes[record_content:record_position]
+        content_start = record_position + RECORD_HEAD_FORMAT.size
+        record_position = content_start + record_length
+        record = summary_bytes[content_start:record_position]
         if opcode == Opcode.CHANNEL:
             channel = parse_record(Channel.read, record, "")
             mcap_contents.channels[channel.id] = channel

@@ -37,7 +37,7 @@ class BeamUniformity:
     >>> from rigd.session import BeamUniformity
     >>> print(BeamUniformity("passed", 0.44).sentence)
     A uniform beam predicts the modes (p = 0.44).
-    >>> print(BeamUniformity("refused", 0.0).short)
+    >>> print(BeamUniformity("refused", 0.0).short_text)
     no (p < 1e-300)
     """
 
@@ -75,7 +75,7 @@ class BeamUniformity:
         return "Whether a uniform beam predicts the modes was not tested: too few modes show."
 
     @property
-    def short(self) -> str:
+    def short_text(self) -> str:
         """Test result for a cell of a table: "yes", "no" or "not tested", with the p-value."""
         is_uniform = _UNIFORM_BY_STATUS[self.status]
         return is_uniform if self.p_value is None else f"{is_uniform} ({self.chance})"
@@ -112,7 +112,7 @@ class Validity:
     >>> from rigd.session import Validity
     >>> print(Validity(0.6, 0.12).sentence)
     Tip slopes up to 0.6 rad; error of the linear model at most 12 %.
-    >>> print(Validity().short)
+    >>> print(Validity().short_text)
     unknown
     """
 
@@ -132,11 +132,11 @@ class Validity:
         if not isinstance(document, Mapping):
             return cls()
         beam_uniformity = BeamUniformity.from_document(document.get("uniform_beam"))
-        slope_rad = finite_number(document.get("predicted_peak_tip_slope_rad"))
+        tip_slope_rad = finite_number(document.get("predicted_peak_tip_slope_rad"))
         model_error = finite_number(document.get("linear_model_error"))
-        if slope_rad is None or model_error is None or slope_rad < 0.0 or model_error < 0.0:
-            slope_rad = model_error = None
-        return cls(slope_rad, model_error, beam_uniformity)
+        if tip_slope_rad is None or model_error is None or tip_slope_rad < 0.0 or model_error < 0.0:
+            tip_slope_rad = model_error = None
+        return cls(tip_slope_rad, model_error, beam_uniformity)
 
     @property
     def sentence(self) -> str:
@@ -152,7 +152,7 @@ class Validity:
         )
 
     @property
-    def short(self) -> str:
+    def short_text(self) -> str:
         """Peak tip slope and error of the linear model as text for a cell of a table."""
         if self.predicted_peak_tip_slope_rad is None or self.linear_model_error is None:
             return "unknown"

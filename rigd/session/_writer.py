@@ -62,9 +62,9 @@ except ImportError:  # sessions are recorded on Linux, but read anywhere
 PART_SUFFIX: Final = ".part"
 """Suffix that a session file has after its name until it is complete."""
 
-CHUNK_SAMPLES: Final = 250
+MAX_CHUNK_SAMPLES: Final = 250
 """Maximum number of samples in a chunk, and thus of samples that a killed recorder loses."""
-CHUNK_S: Final = 0.25
+MAX_CHUNK_DURATION_S: Final = 0.25
 """Maximum time span of a chunk in seconds, and thus of what a killed recorder loses."""
 SYNC_INTERVAL_S: Final = 1.0
 """Time in seconds between two syncs of the file to the disk, which a power failure may lose."""
@@ -89,19 +89,19 @@ _CHANNEL_NUMBERS_AND_SCHEMAS: Final = {
 """Topic → channel number in the file, and name of the channel's schema."""
 
 _MEDIA_TYPES: Final = {".toml": "application/toml", ".json": "application/json"}
-_URGENT_LEVELS: Final = ("error", "fatal")
+_LEVELS_SYNCED_AT_ONCE: Final = ("error", "fatal")
 
 
 class _CountedFile(io.FileIO):
     """Binary file that counts the bytes written to it."""
 
-    written = 0
+    written_byte_count = 0
     """Number of bytes written so far."""
 
     def write(self, data: Any, /) -> int:  # noqa: ANN401 - any bytes-like object
-        """Write bytes, and add their number to `written`."""
+        """Write bytes, and add their number to `written_byte_count`."""
         byte_count = super().write(data)
-        self.written += byte_count
+        self.written_byte_count += byte_count
         return byte_count
 
 
@@ -131,7 +131,7 @@ class SessionWriter:
         self._controls = bytearray()
         self._timings = bytearray()
         self._touches = bytearray()
-        self._chunk_samples = CHUNK_SAMPLES
+        self._samples_per_chunk = MAX_CHUNK_SAMPLES
         self._events: list[tuple[int, bytes]] = []  # log_time, message
         self._event_count = 0
         self._start_utc_ns = 0
@@ -193,7 +193,7 @@ class SessionWriter:
         if self._mcap is not None:
             raise RuntimeError("begin() was called twice")
         self._start_utc_ns = start_utc_ns
-        self._chunk_samples = _chunk_samples(metadata)
+        self._samples_per_chunk = _samples_per_chunk(metadata)
         with self._io_errors_explained():
             mcap_writer = McapWriter(self._stream, library=f"rigd {rigd.__version__}")
             session_record = {
@@ -218,42 +218,42 @@ class SessionWriter:
             self._sync()
             fsync_directory(self.part.parent)
 
-    def write_samples(self, block: Buffer) -> None:
+    def write_samples(self, packed_samples: Buffer) -> None:
         """Append packed samples: a multiple of ``SAMPLE_SIZE`` bytes, possibly 0."""
-        remaining_bytes = self._checked_view(block, SAMPLE_SIZE)
-        chunk_bytes = self._chunk_samples * SAMPLE_SIZE
+        remaining_bytes = self._checked_view(packed_samples, SAMPLE_SIZE)
+        chunk_bytes = self._samples_per_chunk * SAMPLE_SIZE
         with self._io_errors_explained():
             while remaining_bytes:
-                chunk_room_bytes = chunk_bytes - len(self._samples)
-                self._samples += remaining_bytes[:chunk_room_bytes]
-                remaining_bytes = remaining_bytes[chunk_room_bytes:]
+                free_chunk_bytes = chunk_bytes - len(self._samples)
+                self._samples += remaining_bytes[:free_chunk_bytes]
+                remaining_bytes = remaining_bytes[free_chunk_bytes:]
                 if len(self._samples) == chunk_bytes:
                     self._write_chunk(include_later_messages=False)
             self._sync_when_due()
 
-    def write_controls(self, block: Buffer) -> None:
+    def write_controls(self, packed_controls: Buffer) -> None:
         """Append packed controller terms: a multiple of ``CONTROL_SIZE`` bytes, possibly 0.
 
         Call this before `write_samples` with the samples of the same time, so that both are written
         to the same chunk.
         """
-        self._controls += self._checked_view(block, CONTROL_SIZE)
+        self._controls += self._checked_view(packed_controls, CONTROL_SIZE)
         with self._io_errors_explained():
             self._sync_when_due()
 
-    def write_timings(self, block: Buffer) -> None:
+    def write_timings(self, packed_timings: Buffer) -> None:
         """Append packed ages of readings: a multiple of ``TIMING_SIZE`` bytes, possibly 0.
 
         Call this before `write_samples` with the samples of the same time, so that both are written
         to the same chunk.
         """
-        self._timings += self._checked_view(block, TIMING_SIZE)
+        self._timings += self._checked_view(packed_timings, TIMING_SIZE)
         with self._io_errors_explained():
             self._sync_when_due()
 
-    def write_touches(self, block: Buffer) -> None:
+    def write_touches(self, packed_touches: Buffer) -> None:
         """Append packed touches, a multiple of ``TOUCH_SIZE`` bytes, to the current chunk."""
-        self._touches += self._checked_view(block, TOUCH_SIZE)
+        self._touches += self._checked_view(packed_touches, TOUCH_SIZE)
 
     def log(self, t_ns: int, level: str, message: str, name: str = "rigd") -> None:
         """Record an event in the log of the session file.
@@ -278,7 +278,7 @@ class SessionWriter:
             name=name,
         )
         self._events.append((log_time, event_message.SerializeToString()))
-        if level in _URGENT_LEVELS:
+        if level in _LEVELS_SYNCED_AT_ONCE:
             with self._io_errors_explained():
                 self._write_chunk(include_later_messages=True)
 
@@ -372,7 +372,7 @@ class SessionWriter:
                 f"{self.part} was removed or moved while it was recorded. Do not change the folder "
                 "of a running session."
             )
-        if os.fstat(self._stream.fileno()).st_size != self._counted_file.written:
+        if os.fstat(self._stream.fileno()).st_size != self._counted_file.written_byte_count:
             raise SessionError(
                 f"{self.part} was shortened or written to by another program while it was "
                 "recorded. Do not change the files of a running session."
@@ -413,10 +413,10 @@ class SessionWriter:
             raise SessionError(f"{self.part}: writing failed before, the recording ends there.")
         return self._mcap
 
-    def _checked_view(self, block: Buffer, message_size: int) -> memoryview:
+    def _checked_view(self, packed_messages: Buffer, message_size: int) -> memoryview:
         """Return a view of encoded messages; raise if the last message is incomplete."""
         self._require_writer()
-        block_view = memoryview(block).cast("B")
+        block_view = memoryview(packed_messages).cast("B")
         if len(block_view) % message_size:
             raise ValueError(
                 f"a block of {len(block_view)} bytes is not a whole number of "
@@ -486,7 +486,7 @@ class SessionWriter:
 
 
 def _message_records(
-    wire_messages: npt.NDArray[np.void], channel: int, start_utc_ns: int
+    wire_messages: npt.NDArray[np.void], channel_id: int, start_utc_ns: int
 ) -> npt.NDArray[np.void]:
     """Return the MCAP message records (n,) that contain the encoded messages (n,)."""
     message_records = np.empty(
@@ -494,7 +494,7 @@ def _message_records(
     )
     message_records["opcode"] = Opcode.MESSAGE
     message_records["length"] = message_records.dtype.itemsize - RECORD_HEAD_SIZE
-    message_records["channel"] = channel
+    message_records["channel"] = channel_id
     message_records["sequence"] = wire_messages["tick"]
     message_records["log_time"] = wire_messages["t_ns"] + start_utc_ns
     message_records["publish_time"] = message_records["log_time"]
@@ -502,25 +502,29 @@ def _message_records(
     return message_records
 
 
-def _message_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
-    """Return the message index of equally long records that begin at `offset` in a chunk."""
-    message_index = np.empty(records.shape, INDEX_DTYPE)
-    message_index["log_time"] = records["log_time"]
-    message_index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
+def _message_index(
+    message_records: npt.NDArray[np.void], chunk_offset: int
+) -> npt.NDArray[np.void]:
+    """Return the message index of equally long records that begin at `chunk_offset` in a chunk."""
+    message_index = np.empty(message_records.shape, INDEX_DTYPE)
+    message_index["log_time"] = message_records["log_time"]
+    message_index["offset"] = chunk_offset + message_records.dtype.itemsize * np.arange(
+        len(message_records)
+    )
     return message_index
 
 
 def _event_records(
-    events: Sequence[tuple[int, bytes]], channel: int, first_sequence: int, offset: int
+    events: Sequence[tuple[int, bytes]], channel_id: int, first_sequence: int, chunk_offset: int
 ) -> tuple[bytes, npt.NDArray[np.void]]:
     """Return the message records of events (log time in ns, message), and their message index."""
     event_records = b""
     message_index = np.empty(len(events), INDEX_DTYPE)
     for i, (log_time, message_data) in enumerate(events):
-        message_index[i] = (log_time, offset + len(event_records))
+        message_index[i] = (log_time, chunk_offset + len(event_records))
         record_length = MESSAGE_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(message_data)
         event_records += MESSAGE_HEAD_FORMAT.pack(
-            Opcode.MESSAGE, record_length, channel, first_sequence + i, log_time, log_time
+            Opcode.MESSAGE, record_length, channel_id, first_sequence + i, log_time, log_time
         )
         event_records += message_data
     return event_records, message_index
@@ -533,13 +537,13 @@ def _segments_record(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
     }
 
 
-def _chunk_samples(metadata: Mapping[str, str]) -> int:
-    """Return the number of samples per chunk: `CHUNK_SAMPLES`, or fewer at a low sample rate."""
+def _samples_per_chunk(metadata: Mapping[str, str]) -> int:
+    """Return the number of samples per chunk: fewer than the maximum at a low sample rate."""
     try:
-        samples_in_interval = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
+        samples_in_interval = int(float(metadata.get("rate_hz", "inf")) * MAX_CHUNK_DURATION_S)
     except (ValueError, OverflowError):
-        return CHUNK_SAMPLES
-    return min(max(samples_in_interval, 1), CHUNK_SAMPLES)
+        return MAX_CHUNK_SAMPLES
+    return min(max(samples_in_interval, 1), MAX_CHUNK_SAMPLES)
 
 
 def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
@@ -579,28 +583,28 @@ def fsync_directory(path: Path) -> None:
     """
     if not hasattr(os, "O_DIRECTORY"):
         return
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    folder_descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        os.fsync(descriptor)
+        os.fsync(folder_descriptor)
     finally:
-        os.close(descriptor)
+        os.close(folder_descriptor)
 
 
-def copy_new(descriptor: int, target: Path) -> None:
+def copy_new(source_descriptor: int, target_path: Path) -> None:
     """Copy the contents of an open file to a new file, and sync the new file to the disk.
 
-    Raises FileExistsError if `target` exists.
+    Raises FileExistsError if `target_path` exists.
     """
-    with target.open("xb") as target_descriptor:
+    with target_path.open("xb") as target_descriptor:
         try:
-            copied_bytes = 0
-            while block_bytes := os.pread(descriptor, _COPY_BLOCK_BYTES, copied_bytes):
+            copied_byte_count = 0
+            while block_bytes := os.pread(source_descriptor, _COPY_BLOCK_BYTES, copied_byte_count):
                 target_descriptor.write(block_bytes)
-                copied_bytes += len(block_bytes)
+                copied_byte_count += len(block_bytes)
             target_descriptor.flush()
             os.fsync(target_descriptor.fileno())
         except OSError:
-            target.unlink()
+            target_path.unlink()
             raise
 
 
@@ -637,7 +641,7 @@ def rename_without_replacing(source: Path, target: Path) -> None:
         source.unlink()
 
 
-def mark_as_being_written(descriptor: int) -> None:
+def mark_as_being_written(file_descriptor: int) -> None:
     """Lock an open file, which states that it is being written until it is closed.
 
     The lock is advisory, and ends with this process. On a file system without locks this does
@@ -645,7 +649,7 @@ def mark_as_being_written(descriptor: int) -> None:
     """
     if fcntl is not None:
         with contextlib.suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file_descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_being_written(path: Path) -> bool:
@@ -653,11 +657,11 @@ def is_being_written(path: Path) -> bool:
     if fcntl is None:
         return False
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # opening a pipe would block
+        file_descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # opening a pipe would block
     except OSError:
         return False
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        fcntl.flock(file_descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     except OSError:
@@ -665,4 +669,4 @@ def is_being_written(path: Path) -> bool:
     else:
         return False
     finally:
-        os.close(descriptor)
+        os.close(file_descriptor)

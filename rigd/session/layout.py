@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 Buffer = bytes | bytearray | memoryview
 
-SAMPLE_TYPES: Final[dict[str, str]] = {
+SAMPLE_FIELD_TYPES: Final[dict[str, str]] = {
     "t_ns": "sfixed64",
     "tick": "fixed32",
     "angle_reference_rad": "double",
@@ -43,7 +43,7 @@ SAMPLE_TYPES: Final[dict[str, str]] = {
 WRENCH_FIELDS: Final = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
 """Fields of ``rigd.Sample`` with the three forces and three torques of the sensor."""
 
-CONTROL_TYPES: Final[dict[str, str]] = {
+CONTROL_FIELD_TYPES: Final[dict[str, str]] = {
     "t_ns": "sfixed64",
     "tick": "fixed32",
     "proportional_nm": "double",
@@ -55,7 +55,7 @@ CONTROL_TYPES: Final[dict[str, str]] = {
 }
 """Field name → protobuf type, for the message ``rigd.Control``, in the order of field numbers."""
 
-TIMING_TYPES: Final[dict[str, str]] = {
+TIMING_FIELD_TYPES: Final[dict[str, str]] = {
     "t_ns": "sfixed64",
     "tick": "fixed32",
     "angle_age_s": "double",
@@ -63,7 +63,7 @@ TIMING_TYPES: Final[dict[str, str]] = {
 }
 """Field name → protobuf type, for the message ``rigd.Timing``, in the order of field numbers."""
 
-TOUCH_TYPES: Final[dict[str, str]] = {
+TOUCH_FIELD_TYPES: Final[dict[str, str]] = {
     "t_ns": "sfixed64",
     "tick": "fixed32",
     "x_m": "double",
@@ -79,8 +79,12 @@ TOUCH_TYPES: Final[dict[str, str]] = {
 TOUCH_KINDS: Final = ("unknown", "rigid", "yielding", "moving", "knock")
 """Kinds of obstacle that the beam touched: names of the values 0…4 of the field ``kind``."""
 
-_NUMPY_TYPES: Final = {"sfixed64": "<i8", "fixed32": "<u4", "double": "<f8"}
-_WIRE_TYPES: Final = {"sfixed64": 1, "fixed32": 5, "double": 1}  # of the protobuf encoding
+_NUMPY_TYPE_BY_PROTOBUF_TYPE: Final = {"sfixed64": "<i8", "fixed32": "<u4", "double": "<f8"}
+_WIRE_TYPE_BY_PROTOBUF_TYPE: Final = {
+    "sfixed64": 1,
+    "fixed32": 5,
+    "double": 1,
+}  # of the protobuf encoding
 
 
 class Status(IntFlag):
@@ -124,7 +128,7 @@ def field_tag(field_number: int, protobuf_type: str) -> int:
     >>> hex(field_tag(2, "fixed32"))
     '0x15'
     """
-    return field_number << 3 | _WIRE_TYPES[protobuf_type]
+    return field_number << 3 | _WIRE_TYPE_BY_PROTOBUF_TYPE[protobuf_type]
 
 
 def _native_dtype(field_types: dict[str, str]) -> np.dtype[np.void]:
@@ -132,7 +136,7 @@ def _native_dtype(field_types: dict[str, str]) -> np.dtype[np.void]:
     # Aligned: NumPy's loops over one field are then as fast as over any strided array.
     return np.dtype(
         [
-            (field_name, _NUMPY_TYPES[protobuf_type])
+            (field_name, _NUMPY_TYPE_BY_PROTOBUF_TYPE[protobuf_type])
             for field_name, protobuf_type in field_types.items()
         ],
         align=True,
@@ -143,35 +147,38 @@ def _wire_dtype(field_types: dict[str, str]) -> np.dtype[np.void]:
     """Return the array type of an encoded message: each field after its tag byte ``tag_NAME``."""
     dtype_fields: list[tuple[str, str]] = []
     for field_name, protobuf_type in field_types.items():
-        dtype_fields += [(f"tag_{field_name}", "u1"), (field_name, _NUMPY_TYPES[protobuf_type])]
+        dtype_fields += [
+            (f"tag_{field_name}", "u1"),
+            (field_name, _NUMPY_TYPE_BY_PROTOBUF_TYPE[protobuf_type]),
+        ]
     return np.dtype(dtype_fields)
 
 
-SAMPLE_FIELDS: Final = tuple(SAMPLE_TYPES)
-SAMPLE_DTYPE: Final = _native_dtype(SAMPLE_TYPES)
+SAMPLE_FIELDS: Final = tuple(SAMPLE_FIELD_TYPES)
+SAMPLE_DTYPE: Final = _native_dtype(SAMPLE_FIELD_TYPES)
 """Array type of a decoded sample."""
-SAMPLE_WIRE_DTYPE: Final = _wire_dtype(SAMPLE_TYPES)
+SAMPLE_WIRE_DTYPE: Final = _wire_dtype(SAMPLE_FIELD_TYPES)
 """Array type of an encoded sample in the file: each field after its tag byte ``tag_NAME``."""
 SAMPLE_SIZE: Final = SAMPLE_WIRE_DTYPE.itemsize
 """Length of an encoded sample in bytes."""
 
-CONTROL_DTYPE: Final = _native_dtype(CONTROL_TYPES)
+CONTROL_DTYPE: Final = _native_dtype(CONTROL_FIELD_TYPES)
 """Array type of a decoded message with the controller's terms."""
-CONTROL_WIRE_DTYPE: Final = _wire_dtype(CONTROL_TYPES)
+CONTROL_WIRE_DTYPE: Final = _wire_dtype(CONTROL_FIELD_TYPES)
 """Array type of an encoded message with the controller's terms: each field after its tag byte."""
 CONTROL_SIZE: Final = CONTROL_WIRE_DTYPE.itemsize
 """Length of an encoded message with the controller's terms in bytes."""
 
-TIMING_DTYPE: Final = _native_dtype(TIMING_TYPES)
+TIMING_DTYPE: Final = _native_dtype(TIMING_FIELD_TYPES)
 """Array type of a decoded message with the ages of the angle and wrench readings."""
-TIMING_WIRE_DTYPE: Final = _wire_dtype(TIMING_TYPES)
+TIMING_WIRE_DTYPE: Final = _wire_dtype(TIMING_FIELD_TYPES)
 """Array type of an encoded message with the readings' ages: each field after its tag byte."""
 TIMING_SIZE: Final = TIMING_WIRE_DTYPE.itemsize
 """Length of an encoded message with the readings' ages in bytes."""
 
-TOUCH_DTYPE: Final = _native_dtype(TOUCH_TYPES)
+TOUCH_DTYPE: Final = _native_dtype(TOUCH_FIELD_TYPES)
 """Array type of a decoded message with an estimated touch."""
-TOUCH_WIRE_DTYPE: Final = _wire_dtype(TOUCH_TYPES)
+TOUCH_WIRE_DTYPE: Final = _wire_dtype(TOUCH_FIELD_TYPES)
 """Array type of an encoded message with an estimated touch: each field after its tag byte."""
 TOUCH_SIZE: Final = TOUCH_WIRE_DTYPE.itemsize
 """Length of an encoded message with an estimated touch in bytes."""
@@ -352,7 +359,7 @@ def pack_touch(
         TOUCH_KINDS.index(kind) if kind in TOUCH_KINDS else 0,
     )  # fmt: skip
     return _encode_messages(
-        dict(zip(TOUCH_TYPES, touch_values, strict=True)), TOUCH_TYPES, TOUCH_WIRE_DTYPE
+        dict(zip(TOUCH_FIELD_TYPES, touch_values, strict=True)), TOUCH_FIELD_TYPES, TOUCH_WIRE_DTYPE
     )
 
 
@@ -370,7 +377,7 @@ def encode_samples(field_values: Mapping[str, npt.ArrayLike]) -> bytes:
     >>> decode_samples(encode_samples({"tick": [0, 1], "angle_rad": [0.1, 0.2]}))["angle_rad"]
     array([0.1, 0.2])
     """
-    return _encode_messages(field_values, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE)
+    return _encode_messages(field_values, SAMPLE_FIELD_TYPES, SAMPLE_WIRE_DTYPE)
 
 
 def _encode_messages(
@@ -387,24 +394,32 @@ def _encode_messages(
     return wire_messages.tobytes()
 
 
-def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.NDArray[np.bool_]:
+def is_fixed_layout(
+    wire_messages: npt.NDArray[np.void], field_types: dict[str, str]
+) -> npt.NDArray[np.bool_]:
     """Return a mask of the encoded messages whose tag bytes are all those of the fixed layout.
 
     Parameters
     ----------
-    wire : array (n,) of encoded messages, such as of ``SAMPLE_WIRE_DTYPE``
-    types : protobuf types of the fields, such as ``SAMPLE_TYPES``
+    wire_messages : array (n,) of encoded messages, such as of ``SAMPLE_WIRE_DTYPE``
+    field_types : protobuf types of the fields, such as ``SAMPLE_FIELD_TYPES``
 
     Returns
     -------
     array (n,) of bool
     """
-    tag_offsets, tag_values = _tag_offsets_and_values(wire.dtype, tuple(types.items()))
-    message_bytes = (
-        np.ascontiguousarray(wire).view(np.uint8).reshape(wire.size, wire.dtype.itemsize)
+    tag_offsets, tag_values = _tag_offsets_and_values(
+        wire_messages.dtype, tuple(field_types.items())
     )
-    is_fixed: npt.NDArray[np.bool_] = (message_bytes[:, tag_offsets] == tag_values).all(axis=1)
-    return is_fixed
+    message_bytes = (
+        np.ascontiguousarray(wire_messages)
+        .view(np.uint8)
+        .reshape(wire_messages.size, wire_messages.dtype.itemsize)
+    )
+    has_fixed_layout: npt.NDArray[np.bool_] = (message_bytes[:, tag_offsets] == tag_values).all(
+        axis=1
+    )
+    return has_fixed_layout
 
 
 @cache
@@ -440,35 +455,35 @@ def to_native(
 
 
 def _decode_messages(
-    block: Buffer,
+    packed_messages: Buffer,
     field_types: dict[str, str],
     wire_dtype: np.dtype[np.void],
     dtype: np.dtype[np.void],
 ) -> npt.NDArray[np.void]:
     """Return the decoded messages of a block of bytes; raise ValueError if a tag byte is wrong."""
-    block_bytes = memoryview(block).nbytes
-    if block_bytes % wire_dtype.itemsize:
+    packed_length = memoryview(packed_messages).nbytes
+    if packed_length % wire_dtype.itemsize:
         raise ValueError(
-            f"a block of {block_bytes} bytes is not a whole number of {wire_dtype.itemsize}-byte "
+            f"a block of {packed_length} bytes is not a whole number of {wire_dtype.itemsize}-byte "
             "messages"
         )
-    wire_messages = np.frombuffer(block, wire_dtype)
-    is_fixed = is_fixed_layout(wire_messages, field_types)
-    if not is_fixed.all():
+    wire_messages = np.frombuffer(packed_messages, wire_dtype)
+    has_fixed_layout = is_fixed_layout(wire_messages, field_types)
+    if not has_fixed_layout.all():
         raise ValueError(
-            f"message {int(np.argmin(is_fixed))} of the block is not of the fixed layout"
+            f"message {int(np.argmin(has_fixed_layout))} of the block is not of the fixed layout"
         )
     decoded_messages = np.empty(wire_messages.shape, dtype)
     to_native(wire_messages, field_types, decoded_messages)
     return decoded_messages
 
 
-def decode_samples(block: Buffer) -> npt.NDArray[np.void]:
+def decode_samples(packed_samples: Buffer) -> npt.NDArray[np.void]:
     """Return the samples that a block of bytes encodes in the fixed layout.
 
     Parameters
     ----------
-    block : n × ``SAMPLE_SIZE`` bytes
+    packed_samples : n × ``SAMPLE_SIZE`` bytes
 
     Returns
     -------
@@ -479,19 +494,19 @@ def decode_samples(block: Buffer) -> npt.NDArray[np.void]:
     ValueError
         If the length is not a multiple of ``SAMPLE_SIZE``, or a tag byte is wrong.
     """
-    return _decode_messages(block, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, SAMPLE_DTYPE)
+    return _decode_messages(packed_samples, SAMPLE_FIELD_TYPES, SAMPLE_WIRE_DTYPE, SAMPLE_DTYPE)
 
 
-def decode_controls(block: Buffer) -> npt.NDArray[np.void]:
+def decode_controls(packed_controls: Buffer) -> npt.NDArray[np.void]:
     """Return the controller terms (n,) of ``CONTROL_DTYPE`` that a block of bytes encodes."""
-    return _decode_messages(block, CONTROL_TYPES, CONTROL_WIRE_DTYPE, CONTROL_DTYPE)
+    return _decode_messages(packed_controls, CONTROL_FIELD_TYPES, CONTROL_WIRE_DTYPE, CONTROL_DTYPE)
 
 
-def decode_timings(block: Buffer) -> npt.NDArray[np.void]:
+def decode_timings(packed_timings: Buffer) -> npt.NDArray[np.void]:
     """Return the ages of readings (n,) of ``TIMING_DTYPE`` that a block of bytes encodes."""
-    return _decode_messages(block, TIMING_TYPES, TIMING_WIRE_DTYPE, TIMING_DTYPE)
+    return _decode_messages(packed_timings, TIMING_FIELD_TYPES, TIMING_WIRE_DTYPE, TIMING_DTYPE)
 
 
-def decode_touches(block: Buffer) -> npt.NDArray[np.void]:
+def decode_touches(packed_touches: Buffer) -> npt.NDArray[np.void]:
     """Return the estimated touches (n,) of ``TOUCH_DTYPE`` that a block of bytes encodes."""
-    return _decode_messages(block, TOUCH_TYPES, TOUCH_WIRE_DTYPE, TOUCH_DTYPE)
+    return _decode_messages(packed_touches, TOUCH_FIELD_TYPES, TOUCH_WIRE_DTYPE, TOUCH_DTYPE)

@@ -17,26 +17,26 @@ MAX_FILE_BYTES: Final = 2 << 30
 """Maximum length of a session file in bytes."""
 MAX_CHUNK_BYTES: Final = 256 << 20
 """Maximum length of a decompressed chunk in bytes."""
-MAX_TOTAL_BYTES: Final = 2 << 30
+MAX_TOTAL_UNPACKED_BYTES: Final = 2 << 30
 """Maximum length of all decompressed chunks of a file in bytes: 2.5 hours at 1 kHz."""
-MAX_DECLARED_BYTES: Final = 64 << 20
+MAX_DECLARATION_BYTES: Final = 64 << 20
 """Maximum memory in bytes for schemas, channels, metadata and attachments of a file together."""
-MAX_TEXT_BYTES: Final = 32 << 20
+MAX_DECLARATION_TEXT_BYTES: Final = 32 << 20
 """Maximum length in bytes of schemas, channels and metadata of a file together. Their texts take up
 to four times as much memory."""
-MAX_ENTRIES: Final = 100_000
+MAX_METADATA_KEYS: Final = 100_000
 """Maximum number of keys in all metadata of a file."""
 MAX_MESSAGE_BYTES: Final = 16 << 20
 """Maximum length of a message in bytes."""
-MAX_STEPS: Final = 6_000_000
+MAX_READING_STEPS: Final = 6_000_000
 """Maximum work for reading a file, in steps of about a microsecond; a run of messages is a step."""
 
 MAX_SCHEMA_BYTES: Final = 1 << 17
 """Maximum length in bytes of a schema that is parsed; a schema of this package takes some hundred
 bytes."""
-MAX_CHANNELS: Final = 16
+MAX_CHANNELS_PER_TOPIC: Final = 16
 """Maximum number of channels of one topic."""
-MAX_DECODED_BYTES: Final = 1 << 14
+MAX_SAMPLE_MESSAGE_BYTES: Final = 1 << 14
 """Maximum length in bytes of a sample message that is decoded; the fixed layout takes 119 bytes."""
-MAX_SINGLE_MESSAGES: Final = 200_000
+MAX_SINGLY_DECODED_MESSAGES: Final = 200_000
 """Maximum number of messages of a topic that are decoded one by one, which takes 20 µs each."""

@@ -23,8 +23,8 @@ def estimate_lines(
     findings = [f"  {finding_sentence}" for finding_sentence in fit_document["findings"]]
     if fit_document["problem"]:
         return [f"After {fit_document['duration_s']:.1f} s: {fit_document['problem']}", *findings]
-    validity = Validity.from_document(fit_document.get("validity")).short
-    heading = f"± 95 %, statistical only; tip slope {validity}"
+    validity_text = Validity.from_document(fit_document.get("validity")).short_text
+    heading = f"± 95 %, statistical only; tip slope {validity_text}"
     report_lines = [f"After {fit_document['duration_s']:.1f} s ({heading}):"]
     modes = modes_from_json(fit_document["modes"])
     earlier_modes = {

@@ -261,12 +261,12 @@ def _valid_curves(curves_document: object, curve_keys: tuple[str, ...]) -> Docum
 
 def _finite_numbers(json_values: object) -> list[float]:
     """Return a JSON list if it contains only finite numbers, otherwise an empty list."""
-    numbers = (
+    finite_values = (
         [finite_number(json_value) for json_value in json_values]
         if isinstance(json_values, list)
         else []
     )
-    return [] if None in numbers else numbers  # type: ignore[return-value]
+    return [] if None in finite_values else finite_values  # type: ignore[return-value]
 
 
 def _finite_or_none(number_text: str) -> float | None:

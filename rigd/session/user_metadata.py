@@ -15,9 +15,9 @@ NOTES: Final = ("operator", "specimen", "note")
 META_PREFIX: Final = "meta_"
 """Prefix that user metadata have in their keys in the record ``session``."""
 
-_NAME_PATTERN: Final = re.compile(r"[a-z][a-z0-9_]{0,39}")
+_METADATA_NAME_PATTERN: Final = re.compile(r"[a-z][a-z0-9_]{0,39}")
 """Regular expression that an allowed name of user metadata matches."""
-_MAX_NAMES: Final = 32
+_MAX_METADATA_NAMES: Final = 32
 """Maximum number of user metadata of a session."""
 _MAX_TEXT_CHARACTERS: Final = 200
 """Maximum number of characters of a text that is a value of user metadata."""
@@ -37,7 +37,7 @@ def check_name(metadata_name: str) -> None:
     MetadataError
         If the name has forbidden characters, is too long, or has an option of its own.
     """
-    if not _NAME_PATTERN.fullmatch(metadata_name):
+    if not _METADATA_NAME_PATTERN.fullmatch(metadata_name):
         raise MetadataError(
             f"metadata {_shown_value(metadata_name)}: a name has lower-case letters, digits and "
             "_ only, begins with a letter, and has at most 40 characters, such as temperature_c."
@@ -72,8 +72,10 @@ def metadata_keys(metadata_values: Mapping[str, object]) -> dict[str, str]:
     >>> metadata_keys({"temperature_c": "21.40", "batch": "B 7"})
     {'meta_temperature_c': '21.4', 'meta_batch': 'B 7'}
     """
-    if len(metadata_values) > _MAX_NAMES:
-        raise MetadataError(f"metadata: {len(metadata_values)} names are more than {_MAX_NAMES}.")
+    if len(metadata_values) > _MAX_METADATA_NAMES:
+        raise MetadataError(
+            f"metadata: {len(metadata_values)} names are more than {_MAX_METADATA_NAMES}."
+        )
     text_by_key = {}
     for metadata_name, metadata_value in metadata_values.items():
         check_name(metadata_name)

@@ -24,7 +24,7 @@ def peak():
     print(int(status["VmHWM"].split()[0]) // 1024)
 atexit.register(peak)
 from rigd.session import limits
-limits.MAX_STEPS //= {divisor}
+limits.MAX_READING_STEPS //= {divisor}
 from analysis.cli.app import main
 main()
 """

@@ -16,8 +16,8 @@ from session_schemas import schemas
 
 from rigd.session import SessionWriter
 from rigd.session.layout import (
+    CONTROL_FIELD_TYPES,
     CONTROL_SIZE,
-    CONTROL_TYPES,
     SAMPLE_DTYPE,
     SAMPLE_FIELDS,
     SAMPLE_SIZE,
@@ -74,7 +74,7 @@ def packed_controls(ticks, seed=0):
     rng = np.random.default_rng(seed)
     block = bytearray(len(ticks) * CONTROL_SIZE)
     for i, tick in enumerate(ticks):
-        terms = rng.normal(size=len(CONTROL_TYPES) - 2).tolist()
+        terms = rng.normal(size=len(CONTROL_FIELD_TYPES) - 2).tolist()
         pack_control_into(block, i * CONTROL_SIZE, tick * 1_000_000, tick, *terms)
     return bytes(block)
 

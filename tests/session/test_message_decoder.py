@@ -70,12 +70,12 @@ def test_samples_of_another_order_are_decoded_together(kit, tmp_path, monkeypatc
     samples = kit.make_samples(5000)
     messages = [m[9:14] + m[:9] + m[14:] for m in kit.fixed_messages(samples)]
     path = kit.write_third_party(tmp_path / "f.mcap", messages)
-    monkeypatch.setattr(limits, "MAX_SINGLE_MESSAGES", 0)
+    monkeypatch.setattr(limits, "MAX_SINGLY_DECODED_MESSAGES", 0)
     np.testing.assert_array_equal(read_session(path).samples, samples)
 
 
 def test_too_many_differing_messages_are_refused(kit, tmp_path, monkeypatch):
-    monkeypatch.setattr(limits, "MAX_SINGLE_MESSAGES", 100)
+    monkeypatch.setattr(limits, "MAX_SINGLY_DECODED_MESSAGES", 100)
     whole = kit.fixed_messages(kit.make_samples(300))
     messages = [m + b"\xa2\x01" + bytes([i % 100]) + bytes(i % 100) for i, m in enumerate(whole)]
     path = kit.write_third_party(tmp_path / "f.mcap", messages)

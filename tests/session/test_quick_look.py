@@ -93,7 +93,7 @@ def test_an_invalid_test_of_uniformity_is_unknown(tmp_path, stated):
     ],
 )  # fmt: skip
 def test_a_test_of_uniformity_is_stated_in_words(found, sentence, short):
-    assert (found.sentence, found.short) == (sentence, short)
+    assert (found.sentence, found.short_text) == (sentence, short)
     assert BeamUniformity.from_document(found.as_json()) == found
 
 

@@ -218,7 +218,7 @@ def test_many_chunks_of_excessive_total_size_are_refused(kit, tmp_path, monkeypa
         tmp_path / "a.mcap", kit.fixed_messages(kit.make_samples(100)), chunk_size=3000
     )
     assert len(read_session(path).samples) == 100  # 15 000 bytes and a schema
-    monkeypatch.setattr(limits, "MAX_TOTAL_BYTES", 10_000)
+    monkeypatch.setattr(limits, "MAX_TOTAL_UNPACKED_BYTES", 10_000)
     refused(path, "claims .* which is more than")
 
 

@@ -10,12 +10,12 @@ import pytest
 
 from rigd.session import limits, read_session
 from rigd.session.layout import (
-    CONTROL_TYPES,
-    SAMPLE_TYPES,
+    CONTROL_FIELD_TYPES,
+    SAMPLE_FIELD_TYPES,
     SAMPLE_WIRE_DTYPE,
+    TOUCH_FIELD_TYPES,
     TOUCH_KINDS,
     TOUCH_SIZE,
-    TOUCH_TYPES,
     Status,
     field_tag,
 )
@@ -25,7 +25,11 @@ DOCUMENT = (Path(__file__).parents[2] / "docs" / "session_format.md").read_text(
 
 @pytest.mark.parametrize(
     ("message", "types"),
-    [("Sample", SAMPLE_TYPES), ("Control", CONTROL_TYPES), ("Touch", TOUCH_TYPES)],
+    [
+        ("Sample", SAMPLE_FIELD_TYPES),
+        ("Control", CONTROL_FIELD_TYPES),
+        ("Touch", TOUCH_FIELD_TYPES),
+    ],
 )
 def test_the_proto_text_is_the_layout(message, types):
     (body,) = re.findall(rf"message {message} {{(.*?)}}", DOCUMENT, re.DOTALL)
@@ -42,7 +46,7 @@ def test_kinds_of_a_touch_are_those_of_the_code():
 
 
 def test_the_tags_and_sizes_are_those_of_the_layout():
-    tags = [field_tag(n, kind) for n, kind in enumerate(SAMPLE_TYPES.values(), start=1)]
+    tags = [field_tag(n, kind) for n, kind in enumerate(SAMPLE_FIELD_TYPES.values(), start=1)]
     assert " ".join(f"{tag:02x}" for tag in tags) in DOCUMENT
     assert f"always {SAMPLE_WIRE_DTYPE.itemsize} bytes" in DOCUMENT
 
@@ -58,17 +62,17 @@ def test_the_status_bits_are_those_of_the_code():
 
 def test_the_limits_are_those_of_the_code():
     assert f"more than {limits.MAX_CHUNK_BYTES >> 20} MiB" in DOCUMENT
-    assert f"more than {limits.MAX_TOTAL_BYTES >> 30} GiB" in DOCUMENT
-    assert limits.MAX_FILE_BYTES == limits.MAX_TOTAL_BYTES
-    assert f"more than {limits.MAX_DECLARED_BYTES >> 20} MiB of schemas" in DOCUMENT
-    assert f"more than {limits.MAX_TEXT_BYTES >> 20} MiB of them" in DOCUMENT
-    assert f"more than {limits.MAX_ENTRIES // 1000} 000 keys" in DOCUMENT
+    assert f"more than {limits.MAX_TOTAL_UNPACKED_BYTES >> 30} GiB" in DOCUMENT
+    assert limits.MAX_FILE_BYTES == limits.MAX_TOTAL_UNPACKED_BYTES
+    assert f"more than {limits.MAX_DECLARATION_BYTES >> 20} MiB of schemas" in DOCUMENT
+    assert f"more than {limits.MAX_DECLARATION_TEXT_BYTES >> 20} MiB of them" in DOCUMENT
+    assert f"more than {limits.MAX_METADATA_KEYS // 1000} 000 keys" in DOCUMENT
     assert f"schema of more than {limits.MAX_SCHEMA_BYTES >> 10} KiB" in DOCUMENT
-    assert f"more than {limits.MAX_CHANNELS} channels" in DOCUMENT
+    assert f"more than {limits.MAX_CHANNELS_PER_TOPIC} channels" in DOCUMENT
     assert f"message of more than {limits.MAX_MESSAGE_BYTES >> 20} MiB" in DOCUMENT
-    assert f"of more than {limits.MAX_DECODED_BYTES >> 10} KiB" in DOCUMENT
-    assert f"more than {limits.MAX_STEPS // 10**6} million runs" in DOCUMENT
-    assert f"more than {limits.MAX_SINGLE_MESSAGES // 1000} 000 samples" in DOCUMENT
+    assert f"of more than {limits.MAX_SAMPLE_MESSAGE_BYTES >> 10} KiB" in DOCUMENT
+    assert f"more than {limits.MAX_READING_STEPS // 10**6} million runs" in DOCUMENT
+    assert f"more than {limits.MAX_SINGLY_DECODED_MESSAGES // 1000} 000 samples" in DOCUMENT
     assert f"up to {limits.MAX_SAMPLES_WITHOUT_SIGNALS / 1e6:g} million samples" in DOCUMENT
     assert f"up to {limits.MAX_SAMPLES / 1e6:g} million samples" in DOCUMENT
 

@@ -10,18 +10,18 @@ from hypothesis import strategies as st
 from session_schemas import message_class
 
 from rigd.session.layout import (
+    CONTROL_FIELD_TYPES,
     CONTROL_SIZE,
-    CONTROL_TYPES,
     SAMPLE_DTYPE,
+    SAMPLE_FIELD_TYPES,
     SAMPLE_FIELDS,
     SAMPLE_SIZE,
-    SAMPLE_TYPES,
     SAMPLE_WIRE_DTYPE,
+    TIMING_FIELD_TYPES,
     TIMING_SIZE,
-    TIMING_TYPES,
+    TOUCH_FIELD_TYPES,
     TOUCH_KINDS,
     TOUCH_SIZE,
-    TOUCH_TYPES,
     Status,
     decode_controls,
     decode_samples,
@@ -75,7 +75,7 @@ def test_a_packed_touch_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack_touch(*values)
     expected = (*values[:-1], TOUCH_KINDS.index(values[-1]))
     assert len(data) == TOUCH_SIZE
-    assert all(map(same, protobuf_fields("rigd.Touch", data, TOUCH_TYPES), expected))
+    assert all(map(same, protobuf_fields("rigd.Touch", data, TOUCH_FIELD_TYPES), expected))
     assert all(map(same, decode_touches(data)[0].item(), expected))
 
 
@@ -93,14 +93,14 @@ def test_a_packed_sample_is_decoded_by_protobuf_and_by_numpy(values):
 @given(CONTROLS)
 def test_a_packed_control_message_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack(pack_control_into, CONTROL_SIZE, values)
-    assert all(map(same, protobuf_fields("rigd.Control", data, CONTROL_TYPES), values))
+    assert all(map(same, protobuf_fields("rigd.Control", data, CONTROL_FIELD_TYPES), values))
     assert all(map(same, decode_controls(data)[0].item(), values))
 
 
 @given(TIMINGS)
 def test_a_packed_timing_message_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack(pack_timing_into, TIMING_SIZE, values)
-    assert all(map(same, protobuf_fields("rigd.Timing", data, TIMING_TYPES), values))
+    assert all(map(same, protobuf_fields("rigd.Timing", data, TIMING_FIELD_TYPES), values))
     assert all(map(same, decode_timings(data)[0].item(), values))
 
 
@@ -133,7 +133,7 @@ def test_a_status_of_flags_is_packed():
 def test_a_wrong_tag_is_refused(values, number, difference):
     data = bytearray(pack(pack_sample_into, SAMPLE_SIZE, values))
     data[SAMPLE_WIRE_DTYPE.fields[f"tag_{SAMPLE_FIELDS[number - 1]}"][1]] ^= difference
-    assert not is_fixed_layout(np.frombuffer(data, SAMPLE_WIRE_DTYPE), SAMPLE_TYPES).any()
+    assert not is_fixed_layout(np.frombuffer(data, SAMPLE_WIRE_DTYPE), SAMPLE_FIELD_TYPES).any()
     with pytest.raises(ValueError, match="message 0 of the block"):
         decode_samples(data)
 

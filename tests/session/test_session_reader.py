@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from session_schemas import message_class, schemas
 
 from rigd.session import SessionError, read_controls, read_session
-from rigd.session.layout import SAMPLE_FIELDS, SAMPLE_TYPES, decode_controls
+from rigd.session.layout import SAMPLE_FIELD_TYPES, SAMPLE_FIELDS, decode_controls
 
 
 def encoded(samples, cls=None):
@@ -238,7 +238,7 @@ def test_a_schema_with_unreadable_types_is_refused(kit, tmp_path, field, kind, l
         message.field[SAMPLE_FIELDS.index(field)].label = label
 
     path = kit.write_third_party(tmp_path / "f.mcap", [b""], schema=changed_schema(change))
-    with pytest.raises(SessionError, match=rf"field {field} .*{SAMPLE_TYPES[field]}"):
+    with pytest.raises(SessionError, match=rf"field {field} .*{SAMPLE_FIELD_TYPES[field]}"):
         read_session(path)
 
 

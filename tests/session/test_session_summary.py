@@ -41,7 +41,7 @@ def test_the_summary_equals_the_whole_file(short_chirps):
     assert summary.metadata == session.metadata
     assert summary.outcome == session.outcome
     assert summary.samples == len(session.samples)
-    assert (summary.problem, summary.recording) == ("", False)
+    assert (summary.problem, summary.is_recording) == ("", False)
 
 
 @pytest.mark.process
