@@ -145,7 +145,7 @@ def new(
     base_profile = profile_named(start_from)
     check_new(output)
     draft = Draft(base_profile, read_eds(eds), output)
-    write_new(output, _ask_for_values(draft) if is_terminal() else draft.text())
+    write_new(output, _ask_for_values(draft) if is_terminal() else draft.profile_text())
     for draft_remark in draft.remarks:
         typer.echo(f"Note: {draft_remark}", err=True)
     unanswered = draft.unanswered_questions()
@@ -184,12 +184,12 @@ def _ask_for_values(draft: "Draft") -> str:
             for open_question in draft.questions():
                 _ask_for_value(draft, open_question.profile_key, open_question.question_text)
             try:
-                draft.text()
+                draft.profile_text()
             except ProfileError as error:
                 typer.echo(f"{error}\nTry again:", err=True)
                 continue
             _ask_for_acceptance(draft)
-            return draft.text()
+            return draft.profile_text()
     except typer.Abort:
         typer.echo("Stopped; no profile was written.", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None

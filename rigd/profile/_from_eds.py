@@ -241,7 +241,7 @@ class Draft:
             question for question in self.questions() if question.profile_key not in answered_keys
         ]
 
-    def text(self) -> str:
+    def profile_text(self) -> str:
         """Return the text of the finished profile.
 
         Raises

@@ -123,7 +123,7 @@ def may_contain_samples(path: Path) -> bool:
         mcap_contents = read_mcap(memoryview(first_bytes), (), is_salvage=True)
     except McapError:
         return False
-    return has_more_bytes or mcap_contents.count(SAMPLE_TOPIC) > 0
+    return has_more_bytes or mcap_contents.message_count(SAMPLE_TOPIC) > 0
 
 
 def recovery_advice(path: Path, *, was_complete: bool) -> str:
@@ -133,7 +133,7 @@ def recovery_advice(path: Path, *, was_complete: bool) -> str:
     `was_complete` states that the file was once complete, so that an intact copy may exist.
     """
     try:
-        sample_count = load_contents(path, (), is_salvage=True).count(SAMPLE_TOPIC)
+        sample_count = load_contents(path, (), is_salvage=True).message_count(SAMPLE_TOPIC)
     except SessionError:
         sample_count = 0
     copy_advice = ". Copy it again from where it was recorded"

@@ -211,13 +211,15 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
         segments=_EntryLimiter("segments", 50_000, omission_texts).limited_entries(
             session.segments
         ),
-        metadata=_EntryLimiter("keys", _MAX_METADATA_CHARACTERS, omission_texts).texts(
+        metadata=_EntryLimiter("keys", _MAX_METADATA_CHARACTERS, omission_texts).limited_texts(
             session.metadata
         ),
         outcome=None
         if session.outcome is None
-        else _EntryLimiter("keys of the outcome", 100_000, omission_texts).texts(session.outcome),
-        events=_EntryLimiter("messages of the log", 500_000, omission_texts).events(
+        else _EntryLimiter("keys of the outcome", 100_000, omission_texts).limited_texts(
+            session.outcome
+        ),
+        events=_EntryLimiter("messages of the log", 500_000, omission_texts).limited_events(
             session.events, session.omitted_event_count
         ),
         attachments=_EntryLimiter("attachments", 50_000, omission_texts).limited_entries(
@@ -290,9 +292,9 @@ def readable_texts(
     The first texts (key → text), and a list with a line on the omitted texts, if there are any.
     """
     omission_texts: list[str] = []
-    shown_texts = _EntryLimiter(entries_noun, _MAX_METADATA_CHARACTERS, omission_texts).texts(
-        file_texts
-    )
+    shown_texts = _EntryLimiter(
+        entries_noun, _MAX_METADATA_CHARACTERS, omission_texts
+    ).limited_texts(file_texts)
     return {
         printable(key): printable(shown_text) for key, shown_text in shown_texts.items()
     }, omission_texts
@@ -322,7 +324,7 @@ class _EntryLimiter:
             shown_entries[short_key] = entry_value
         return shown_entries
 
-    def texts(self, text_entries: Mapping[str, str]) -> dict[str, str]:
+    def limited_texts(self, text_entries: Mapping[str, str]) -> dict[str, str]:
         """Return the first entries of a mapping of texts, with long keys and long texts cut."""
         return self.limited_entries(
             {
@@ -331,7 +333,9 @@ class _EntryLimiter:
             }
         )
 
-    def events(self, events: Sequence[LoggedEvent], unread_event_count: int) -> list[LoggedEvent]:
+    def limited_events(
+        self, events: Sequence[LoggedEvent], unread_event_count: int
+    ) -> list[LoggedEvent]:
         """Return the first events, up to the maximum, with long texts cut.
 
         `unread_event_count` is the number of further events in the file.

@@ -100,7 +100,7 @@ class McapContents:
     """Channel number → number of messages read, including topics that were not requested."""
     channels_declared_in_chunks: set[int] = field(default_factory=set)
     """Numbers of the channels that were declared in chunks, and are covered by a checksum there."""
-    skipped: list[str] = field(default_factory=list)
+    skipped_record_texts: list[str] = field(default_factory=list)
     """Descriptions of the damaged records that were skipped, each the end of a sentence that begins
     with the file's name. The last one states how many more there are than `MAX_SKIPPED_TEXTS`."""
     stated_message_counts: dict[int, int] = field(default_factory=dict)
@@ -110,13 +110,13 @@ class McapContents:
     """Number of bytes at the start of the file that were read without error."""
     has_correct_checksum: bool = False
     """Whether the file has a correct checksum over its whole data section."""
-    complete: bool = False
+    is_complete: bool = False
     """Whether the file ends with the footer and the magic bytes of a complete MCAP file."""
     damage: str | None = None
     """Description of the damage at which reading stopped, as the end of a sentence that begins with
     the file's name. None if the whole file was read."""
 
-    def count(self, topic: str) -> int:
+    def message_count(self, topic: str) -> int:
         """Return the number of messages of a topic that were read."""
         topic_channel_ids = [
             channel.id for channel in self.channels.values() if channel.topic == topic
@@ -177,12 +177,12 @@ def read_mcap(
         )
     container_reader = _ContainerReader(file_data, topics, on_block, is_salvage=is_salvage)
     mcap_contents = container_reader.contents
-    mcap_contents.complete = _has_footer(file_data)
+    mcap_contents.is_complete = _has_footer(file_data)
     try:
         container_reader.read(on_progress)
     except McapDamageError as error:
         mcap_contents.damage = str(error)
-        if is_salvage and mcap_contents.complete:
+        if is_salvage and mcap_contents.is_complete:
             mcap_contents.stated_message_counts = container_reader.stated_message_counts()
     except MemoryError:
         mcap_contents.damage = "does not fit into the memory of this machine"
@@ -298,7 +298,7 @@ class _ContainerReader:
     def _add_skipped(self, damage_text: str) -> None:
         """Store the description of a skipped record, or count it beyond `MAX_SKIPPED_TEXTS`."""
         self._skipped += 1
-        skipped_texts = self.contents.skipped
+        skipped_texts = self.contents.skipped_record_texts
         if self._skipped > MAX_SKIPPED_TEXTS:
             del skipped_texts[MAX_SKIPPED_TEXTS:]
             damage_text = f"has {self._skipped - MAX_SKIPPED_TEXTS} more damaged records"
@@ -621,7 +621,7 @@ class _ContainerReader:
     def _check_summary(self, section_start: int) -> None:
         """Verify footer, checksum and message counts of the summary section, which may be empty."""
         data = self._data
-        if not self.contents.complete:
+        if not self.contents.is_complete:
             raise McapDamageError(
                 "ends in the middle of its summary, or something was appended to it"
             )

@@ -163,7 +163,7 @@ def read_session(
 
     def check_and_forward_samples(sample_block: npt.NDArray[np.void]) -> None:
         assert on_samples is not None
-        sample_order.add(sample_block)
+        sample_order.check_samples(sample_block)
         on_samples(sample_block)
 
     sample_buffer = TopicBuffer(
@@ -187,7 +187,7 @@ def read_session(
             f"program reads version {FORMAT_VERSION}. Use a newer version of it."
         )
     sample_array = sample_buffer.finish(mcap_contents)
-    sample_order.add(sample_array)
+    sample_order.check_samples(sample_array)
     start_utc_ns = _start_utc_ns(
         path, metadata, undecoded_log.first_log_time, sample_order.first_t_ns
     )
@@ -428,7 +428,7 @@ def no_samples_error(path: Path) -> SessionError:
 
 def _damage_message(path: Path, contents: McapContents) -> str:
     """Return the error message for an incomplete or damaged file, with the remedy."""
-    if contents.complete:
+    if contents.is_complete:
         return f"{path} is damaged: it {contents.damage}{recovery_advice(path, was_complete=True)}"
     if is_being_written(path):
         return (
@@ -466,7 +466,7 @@ class _SampleOrder:
         self._path = path
         self._last_tick: int | None = None
 
-    def add(self, samples: npt.NDArray[np.void]) -> None:
+    def check_samples(self, samples: npt.NDArray[np.void]) -> None:
         """Check the next samples; raise SessionError if their ticks do not increase."""
         ticks = samples["tick"]
         if not len(ticks):

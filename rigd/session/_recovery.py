@@ -159,11 +159,15 @@ def recover(
     sample_selection.finish(mcap_contents)
     if (
         mcap_contents.damage is None
-        and not mcap_contents.skipped
+        and not mcap_contents.skipped_record_texts
         and sample_selection.order_error is None
     ):
         return _copy_intact_file(path, recovered_file)
-    damage_texts = [mcap_contents.damage, *mcap_contents.skipped, sample_selection.order_error]
+    damage_texts = [
+        mcap_contents.damage,
+        *mcap_contents.skipped_record_texts,
+        sample_selection.order_error,
+    ]
     first_damage, *further_damages = [
         damage_text for damage_text in damage_texts if damage_text is not None
     ]
@@ -190,7 +194,7 @@ def recover(
             read_session(
                 temporary_path,
                 max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
-                on_samples=read_back_digest.add,
+                on_samples=read_back_digest.add_samples,
             )
         except SessionError as error:
             failure_reason = str(error).replace(str(temporary_path), str(path))
@@ -211,7 +215,7 @@ class SampleDigest:
     def __init__(self) -> None:
         self._sums = {field_name: hashlib.blake2b() for field_name in SAMPLE_FIELDS}
 
-    def add(self, samples: npt.NDArray[np.void]) -> None:
+    def add_samples(self, samples: npt.NDArray[np.void]) -> None:
         """Include further samples, an array of ``SAMPLE_DTYPE``, in the checksum."""
         for field_name, field_checksum in self._sums.items():
             field_checksum.update(samples[field_name].tobytes())
@@ -565,7 +569,9 @@ class _MessageCopier:
         """Add the samples that are copied to the checksum."""
         decoded_count = self._samples_decoded + len(messages)
         is_copied = self._is_copied[self._samples_decoded : decoded_count]
-        self._digest.add(messages if is_copied.all() else messages[: len(is_copied)][is_copied])
+        self._digest.add_samples(
+            messages if is_copied.all() else messages[: len(is_copied)][is_copied]
+        )
         self._samples_decoded = decoded_count
 
     def add_block(self, contents: McapContents, block: MessageBlock) -> None:

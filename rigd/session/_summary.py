@@ -103,7 +103,7 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
     return SessionSummary(
         metadata=merged_metadata(mcap_contents, "session") or {},
         outcome=merged_metadata(mcap_contents, "outcome"),
-        samples=None if problem_text else mcap_contents.count(SAMPLE_TOPIC),
+        samples=None if problem_text else mcap_contents.message_count(SAMPLE_TOPIC),
         problem=problem_text,
         is_recording=is_recording,
     )

@@ -184,7 +184,7 @@ class AtiCanSensor:
         if self._lock_step and not self._waits_for_reply:
             # No time passes between two ticks: the reply to the last poll is still in preparation.
             gauge_polls.wait(time.monotonic_ns() + self._deadline_ns)
-        gauge_polls.drain()
+        gauge_polls.deliver_frames()
         if not self._waits_for_reply:
             self._previous_reply, self._previous_ns = (
                 gauge_polls.process_replies(),
@@ -368,7 +368,7 @@ class AtiCanSensor:
     def _poll(self, timeout_s: float) -> PollReply | None:
         """Poll the sensor once outside the control loop; return the reply, or None on timeout."""
         gauge_polls = self.polls
-        gauge_polls.drain()
+        gauge_polls.deliver_frames()
         gauge_polls.reset_pairing()
         gauge_polls.send()
         return gauge_polls.wait(gauge_polls.sent_ns + int(timeout_s * 1e9))

@@ -179,9 +179,9 @@ class GaugePolls:
         self.exchange.subscribe(first_reply_id, self._first_frame.store)
         self.exchange.subscribe(second_reply_id, self._second_frame.store)
 
-    def drain(self) -> None:
+    def deliver_frames(self) -> None:
         """Deliver all frames that have arrived on the CAN bus to their drivers."""
-        self.exchange.drain()
+        self.exchange.deliver_frames()
 
     def send(self) -> None:
         """Send a poll to the sensor."""

@@ -177,8 +177,8 @@ _ERROR_PASSIVE_BITS = 0x30
 _NO_ACKNOWLEDGE_ERROR_CLASS = 0x20
 """Class of an error frame: no device has acknowledged a sent frame."""
 
-_MAX_DRAIN_ERRORS = 10
-"""Largest number of receive errors, which an adapter may queue, that one `drain` ignores.
+_MAX_DELIVERY_ERRORS = 10
+"""Largest number of receive errors, which an adapter may queue, that one `deliver_frames` ignores.
 
 The limit applies within `ignore_errors`."""
 _MAX_WAIT_ERRORS = 100
@@ -264,7 +264,7 @@ class CanExchange:
         finally:
             self._ignores_errors = previous_setting
 
-    def drain(self) -> None:
+    def deliver_frames(self) -> None:
         """Deliver all frames that have arrived to their drivers, without waiting.
 
         Raises
@@ -278,7 +278,7 @@ class CanExchange:
             if self._bus_error:
                 raise DeviceError(self._bus_error)
             return
-        for _ in range(_MAX_DRAIN_ERRORS):
+        for _ in range(_MAX_DELIVERY_ERRORS):
             try:
                 self._deliver_received_frames()
             except Exception:  # an adapter's library may raise anything
@@ -313,7 +313,7 @@ class CanExchange:
             Whether the condition became true before the deadline.
         """
         wait_failure_count = 0
-        self.drain()
+        self.deliver_frames()
         while not is_ready():
             remaining_ns = deadline_ns - time.monotonic_ns()
             if remaining_ns <= 0:
@@ -327,7 +327,7 @@ class CanExchange:
                 if wait_failure_count > _MAX_WAIT_ERRORS:
                     return False  # the adapter has failed
                 time.sleep(min(_RECEIVE_ERROR_PAUSE_S, remaining_ns * 1e-9))
-            self.drain()
+            self.deliver_frames()
         return True
 
     def _register_error(self, error_class: int, error_data: bytes) -> None:

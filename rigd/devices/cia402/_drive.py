@@ -234,7 +234,7 @@ class Cia402Drive:
             self.disable()
             raise
         self._enabled = True
-        self._torque_check.start()
+        self._torque_check.reset()
         follows_target_bit = FOLLOWS_TARGET_BIT if node.settings.follows_target_bit else 0
         self._inbox.require_status(
             STATE_BITS | follows_target_bit, OPERATION_ENABLED_BITS | follows_target_bit
@@ -326,7 +326,7 @@ class Cia402Drive:
                 max_torque_per_mille if torque_per_mille > 0 else -max_torque_per_mille
             )
         sent_torque_per_mille = round(torque_per_mille)
-        self._torque_check.command(sent_torque_per_mille)
+        self._torque_check.register_command(sent_torque_per_mille)
         send_frame(self._frames.rpdo_frame(ENABLE_OPERATION_COMMAND, sent_torque_per_mille))
         return sent_torque_per_mille / self._per_mille_per_nm
 
@@ -418,7 +418,9 @@ class Cia402Drive:
         if node is not None and not self._may_be_on:
             node.send_if_possible(self._frames.pre_operational)
             if self._capabilities is not None and self._capabilities.watchdog is Watchdog.HEARTBEAT:
-                node.write(self._frames.end_heartbeat_monitoring, HEARTBEAT_CONSUMER, 1)
+                node.send_write_request(
+                    self._frames.end_heartbeat_monitoring, HEARTBEAT_CONSUMER, 1
+                )
         if self._is_open:
             self._is_open = False
             self._link.close()
@@ -461,7 +463,7 @@ class Cia402Drive:
         if node.lock_step and node.pairing.outstanding:
             node.exchange.wait_until(node.pairing.is_up_to_date, node.sync_ns + node.deadline_ns)
         else:
-            node.exchange.drain()
+            node.exchange.deliver_frames()
         self._store_reply(node)
 
     def _store_reply(self, node: Node) -> None:
@@ -472,7 +474,7 @@ class Cia402Drive:
         is_new_angle_valid = node.pairing.process_replies() and self._inbox.is_last_tpdo_valid
         self.angle_stale = not is_new_angle_valid
         if self._enabled and is_new_angle_valid:
-            self._torque_check.compare(self._inbox.torque)
+            self._torque_check.check_torque(self._inbox.torque)
         if is_new_angle_valid:
             position_counts = self._inbox.position
             # The 32-bit counter wraps around.

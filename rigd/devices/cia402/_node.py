@@ -258,7 +258,9 @@ class Node:
         if self.lock_step:
             # Without SYNC the drive's time does not advance, not even to its next heartbeat.
             remaining_syncs = ceil(3 * heartbeat_period_s * self.rate_hz)
-            while not self._is_operational() and remaining_syncs > 0 and self.sync():
+            while (
+                not self._is_operational() and remaining_syncs > 0 and self.sync_and_await_reply()
+            ):
                 remaining_syncs -= 1
         else:
             max_wait_ns = _OPERATIONAL_TIMEOUT_NS + round(3e9 * heartbeat_period_s)
@@ -282,7 +284,7 @@ class Node:
         """
         shortest_reply_delay_ns = None
         for _ in range(_FIRST_REPLY_ATTEMPTS):
-            if not self.sync(_FIRST_REPLY_TIMEOUT_NS):
+            if not self.sync_and_await_reply(_FIRST_REPLY_TIMEOUT_NS):
                 break
             reply_delay_ns = time.monotonic_ns() - self.sync_ns
             shortest_reply_delay_ns = (
@@ -306,7 +308,7 @@ class Node:
 
     def send_sync(self) -> None:
         """Send SYNC; frames that have arrived before do not count as its reply."""
-        self.exchange.drain()
+        self.exchange.deliver_frames()
         self.pairing.register_request()
         self.sync_ns = time.monotonic_ns()
         self.exchange.send(self.frames.sync)
@@ -314,7 +316,7 @@ class Node:
     def send_sync_or_pause(self) -> None:
         """Send SYNC, or omit it in this tick to find out if a missing reply is late or lost."""
         if self.pairing.outstanding:
-            self.exchange.drain()
+            self.exchange.deliver_frames()
             if self.pairing.needs_pause():
                 self.pairing.register_pause()
                 return
@@ -339,7 +341,7 @@ class Node:
         max_wait_ns = self.deadline_ns if self.lock_step else max_wait_ns or self.period_ns
         return self.exchange.wait_until(self._is_sync_answered, self.sync_ns + max_wait_ns)
 
-    def sync(self, max_wait_ns: int = 0) -> bool:
+    def sync_and_await_reply(self, max_wait_ns: int = 0) -> bool:
         """Send SYNC, wait for its reply, and return whether a reply has arrived in time."""
         self.send_sync()
         return self.await_reply(max_wait_ns)
@@ -347,7 +349,7 @@ class Node:
     def sync_if_possible(self) -> bool:
         """Send SYNC despite bus errors; return whether a TPDO answered it. Never raises."""
         with self.exchange.ignore_errors():
-            self.exchange.drain()  # frames that have already arrived are no reply to this SYNC
+            self.exchange.deliver_frames()  # frames that have already arrived are no reply
             self.pairing.register_request()
             self.sync_ns = time.monotonic_ns()
             return self.send_if_possible(self.frames.sync) and self.await_reply()
@@ -359,7 +361,7 @@ class Node:
         wait_ns = self.period_ns - (time.monotonic_ns() - sync_grid_start_ns) % self.period_ns
         time.sleep(wait_ns * 1e-9)
 
-    def write(self, request: bytes, index: int, subindex: int) -> bool:
+    def send_write_request(self, request: bytes, index: int, subindex: int) -> bool:
         """Send an SDO write request, and return whether the drive confirmed it in time."""
         inbox = self.inbox
         inbox.sdo_reply = b""

@@ -515,6 +515,6 @@ def _format_limit(required_object: Requirement, limit_value: int | None) -> str:
     return "anything" if limit_value is None else _format_value(required_object, limit_value)
 
 
-def _capitalise(consequence: str) -> str:
+def _capitalise(sentence: str) -> str:
     """Return a text with a capital first letter, so that it can begin a sentence."""
-    return consequence[0].upper() + consequence[1:]
+    return sentence[0].upper() + sentence[1:]

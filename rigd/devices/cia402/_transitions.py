@@ -104,16 +104,16 @@ class TorqueFollowingCheck:
             1.0 - exp(-tick_period_s / torque_response_s) if torque_response_s else 1.0
         )
         self.is_active = True
-        self.start()
+        self.reset()
 
-    def start(self) -> None:
+    def reset(self) -> None:
         """Restart the check of the torque, for a drive whose commanded torque is zero."""
         self._commanded_per_mille = 0
         self._last_per_mille = 0.0
         self._previous_per_mille = 0.0
         self._deviating_ticks = 0
 
-    def command(self, torque_per_mille: int) -> None:
+    def register_command(self, torque_per_mille: int) -> None:
         """Register the commanded torque of this tick, in 1/1000 of the rated torque."""
         self._commanded_per_mille = torque_per_mille
         previous_per_mille = self._previous_per_mille = self._last_per_mille
@@ -121,7 +121,7 @@ class TorqueFollowingCheck:
             torque_per_mille - previous_per_mille
         )
 
-    def compare(self, actual_torque_per_mille: int) -> None:
+    def check_torque(self, actual_torque_per_mille: int) -> None:
         """Compare the actual torque, in 1/1000 of the rated torque, with the commands.
 
         Raise `DeviceError` if the torque has differed for too many consecutive ticks.
@@ -216,7 +216,7 @@ def switch_off(node: Node) -> bool:
     if _switch_off_by_pdo(node):
         return True
     # A confirmed SDO request does not mean that the drive has executed the command.
-    if node.write(node.frames.disable_voltage, CONTROLWORD, 0):
+    if node.send_write_request(node.frames.disable_voltage, CONTROLWORD, 0):
         deadline_ns = time.monotonic_ns() + _SWITCH_OFF_TIMEOUT_NS
         while time.monotonic_ns() < deadline_ns:
             if node.is_torque_off():

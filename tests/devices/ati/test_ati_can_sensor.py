@@ -441,7 +441,7 @@ def test_a_reply_in_the_next_tick_is_dropped(numbered):
     numbered.sensor.request(0)
     numbered.release()
     # As the drive on the same bus does.
-    numbered.link.open().drain()
+    numbered.link.open().deliver_frames()
     assert numbered.sensor.read_wrench()[0] == 1
     assert numbered.sensor.wrench_stale
     assert numbered.read() == (4, False)

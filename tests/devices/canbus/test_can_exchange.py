@@ -26,7 +26,7 @@ def test_each_frame_goes_to_its_subscriber(ends, exchange):
     far.send(0x3FF, b"nobody's")
     far.send(0x181, b"12345678")
     far.send(0x110)
-    exchange.drain()
+    exchange.deliver_frames()
     assert received == [("sensor", b"abc"), ("drive", b"12345678"), ("sensor", b"")]
 
 
@@ -35,7 +35,7 @@ def test_long_identifiers_and_remote_frames_are_dropped(ends, exchange, flag):
     _, far = ends
     exchange.subscribe(0x181, lambda data: pytest.fail("not ours"))
     far.send(0x181 | flag)
-    exchange.drain()
+    exchange.deliver_frames()
 
 
 def test_one_identifier_has_one_subscriber(exchange):
@@ -51,7 +51,7 @@ def test_starting_drops_queued_frames_but_no_subscriptions(ends, exchange):
     far.send(0x181, b"old")
     exchange.start()
     far.send(0x181, b"new")
-    exchange.drain()
+    exchange.deliver_frames()
     assert received == [b"new"]
 
 
@@ -111,7 +111,7 @@ def test_a_disturbed_bus_is_reported_each_time(ends, exchange, kind, data, messa
     far.send(ERROR | kind, data)
     for _ in range(2):
         with pytest.raises(DeviceError, match=message):
-            exchange.drain()
+            exchange.deliver_frames()
     assert exchange.error_frames == 1
 
 
@@ -122,7 +122,7 @@ def test_a_warning_of_the_controller_is_only_counted(ends, exchange, kind, data)
     _, far = ends
     for _ in range(3):
         far.send(ERROR | kind, data)
-    exchange.drain()
+    exchange.deliver_frames()
     assert exchange.error_frames == 3
 
 
@@ -133,7 +133,7 @@ def test_frames_before_a_cut_are_delivered(ends, exchange):
     far.send(0x181, b"x")
     far.socket.close()
     with pytest.raises(DeviceError, match="cut off"):
-        exchange.drain()
+        exchange.deliver_frames()
     assert received == [b"x"]
 
 
@@ -156,27 +156,27 @@ def test_frames_pass_regardless_of_a_disturbed_bus(ends, exchange, kind, data):
     far.send(ERROR | kind, data)
     far.send(0x181, b"x")
     with exchange.ignore_errors():
-        exchange.drain()
+        exchange.deliver_frames()
         exchange.send(pack_frame(0x80))
         far.send(0x181, b"y")
         assert exchange.wait_until(lambda: len(received) == 2, time.monotonic_ns() + 10_000_000_000)
     assert received == [b"x", b"y"]
     assert far.receive() == (0x80, b"")
     with pytest.raises(DeviceError):  # reported to the caller that continues the loop
-        exchange.drain()
+        exchange.deliver_frames()
 
 
 def test_waiting_ends_in_time_on_a_lost_line(ends, exchange):
     _, far = ends
     far.socket.close()
     with exchange.ignore_errors():
-        exchange.drain()
+        exchange.deliver_frames()
         before = time.monotonic_ns()
         assert not exchange.wait_until(lambda: False, before + 20_000_000)
         with pytest.raises(DeviceError, match="takes no more frames"):
             exchange.send(pack_frame(0x80))
     with pytest.raises(DeviceError, match="cut off"):
-        exchange.drain()
+        exchange.deliver_frames()
 
 
 def test_no_busy_wait_on_a_port_without_wait(ends):
@@ -200,4 +200,4 @@ def test_no_busy_wait_on_a_port_without_wait(ends):
         assert not exchange.wait_until(lambda: False, time.monotonic_ns() + 50_000_000)
     assert 0 < tries <= 10 * 52  # ten a drain, a drain a millisecond
     with pytest.raises(DeviceError, match="cannot be read"):
-        exchange.drain()
+        exchange.deliver_frames()

@@ -290,7 +290,7 @@ def test_one_poll_of_an_adapter_gets_past_frames_of_others(adapter):
     for _ in range(5):
         peer.send(message(0x3FF))
     peer.send(message(0x181, b"x"))
-    exchange.drain()
+    exchange.deliver_frames()
     assert payloads == [b"x"]
 
 
@@ -301,7 +301,7 @@ def test_error_frames_of_an_adapter_pass_the_filters(adapter):
     exchange.start()
     peer.send(message(0x40, bytes(8), is_error_frame=True))
     with pytest.raises(DeviceError, match="bus-off"):
-        exchange.drain()
+        exchange.deliver_frames()
 
 
 @pytest.mark.parametrize(
@@ -319,11 +319,11 @@ def test_frames_of_another_kind_are_dropped(adapter, unrelated):
     exchange = CanExchange(port)
     exchange.subscribe(0x181, payloads.append)
     peer.send(unrelated)
-    exchange.drain()
+    exchange.deliver_frames()
     assert payloads == []
     exchange.start()
     peer.send(unrelated)
-    exchange.drain()
+    exchange.deliver_frames()
     assert payloads == []
 
 
@@ -376,7 +376,7 @@ def test_a_damaged_line_is_an_error_frame(scripted_port, failure):
         scripted_port(failure, message(0x181, b"a"), failure, message(0x181, b"b"))
     )
     exchange.subscribe(0x181, payloads.append)
-    exchange.drain()
+    exchange.deliver_frames()
     assert payloads == [b"a", b"b"]
     assert exchange.error_frames == 2
 
@@ -384,7 +384,7 @@ def test_a_damaged_line_is_an_error_frame(scripted_port, failure):
 def test_nineteen_damaged_lines_between_sound_ones_are_tolerated(scripted_port):
     script = [ValueError()] * 19 + [message(0x181)] + [ValueError()] * 19
     exchange = CanExchange(scripted_port(*script))
-    exchange.drain()
+    exchange.deliver_frames()
     assert exchange.error_frames == 38
 
 
@@ -395,7 +395,7 @@ def test_silence_and_reports_do_not_reset_damaged_lines(scripted_port):
         DeviceError, match=r"slcan0 \(slcan\).*20 invalid CAN frames in a row.*ValueError: odd"
     ):
         for _ in range(60):
-            exchange.drain()
+            exchange.deliver_frames()
 
 
 def test_a_frame_of_can_fd_is_dropped(scripted_port):

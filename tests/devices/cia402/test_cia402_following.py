@@ -20,8 +20,8 @@ def following():
 
 def run(following, commands, actuals):
     for command, actual in zip(commands, actuals, strict=True):
-        following.compare(actual)
-        following.command(command)
+        following.check_torque(actual)
+        following.register_command(command)
 
 
 @pytest.mark.parametrize("lag", [1, 2])
@@ -47,7 +47,7 @@ def test_no_comparison_at_zero():
 
 def test_enabling_resets_the_comparison(following):
     run(following, [500] * 9, [0] * 9)
-    following.start()
+    following.reset()
     run(following, [0] * 9, [0] * 9)
 
 
@@ -81,12 +81,12 @@ class TestMeasuredTorque:
         actual = 0.0
         for tick, command in enumerate(commands):
             try:
-                following.compare(round(actual))
+                following.check_torque(round(actual))
             except DeviceError:
                 return tick
             held = pending  # at SYNC
             actual += fraction * (held - actual)
-            following.command(command)
+            following.register_command(command)
             if lost_from is None or tick < lost_from:
                 pending = command
         return None
