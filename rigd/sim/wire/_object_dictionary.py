@@ -600,7 +600,9 @@ def _to_description(eds_entry: EdsEntry) -> EntryDescription:
     is_boolean = eds_entry.data_type == _BOOLEAN_TYPE
     # A boolean takes one bit in a PDO, which is not needed here.
     is_mappable = eds_entry.is_mappable and not is_boolean
-    pdo_directions = _PDO_DIRECTIONS_BY_ACCESS.get(eds_entry.access_right, "rt") if is_mappable else ""
+    pdo_directions = (
+        _PDO_DIRECTIONS_BY_ACCESS.get(eds_entry.access_right, "rt") if is_mappable else ""
+    )
     lower_limit, upper_limit = eds_entry.lower_limit, 1 if is_boolean else eds_entry.upper_limit
     if (
         lower_limit is not None and upper_limit is not None and lower_limit >= upper_limit
