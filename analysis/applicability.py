@@ -44,31 +44,31 @@ _TWO_SWEEPS_REMARK: Final = (
 )
 """Remark on a session with a sweep in both directions."""
 
-_COMPLETE_FRACTION: Final = 0.99
+_COMPLETE_SWEEP_FRACTION: Final = 0.99
 """Fraction of the planned sweep from which it counts as complete, as samples may be missing at the
 end."""
 
-_BOUNDED_EXCITATIONS: Final = ("chirp", "multisine", "modes")
+_BAND_LIMITED_EXCITATIONS: Final = ("chirp", "multisine", "modes")
 """Excitations that stay between the `start_hz` and `stop_hz` of their session file. A step, a move
 or a touch has neither, and the sweeps of a search are planned while it runs."""
 
-_EXCITED_MARGIN: Final = 1.1
+_EXCITED_BAND_MARGIN_FACTOR: Final = 1.1
 """Highest frequency of a requested band, relative to that of the excitation. The end of a sweep
 excites a little beyond."""
 
 
-def highest_frequency_hz(requested_hz: Band | None = None) -> float:
+def highest_frequency_hz(requested_band_hz: Band | None = None) -> float:
     """Return the highest frequency in Hz that any analysis of a record uses.
 
     Parameters
     ----------
-    requested_hz : tuple of float, optional
+    requested_band_hz : tuple of float, optional
         Requested band in Hz.
     """
-    return (requested_hz or RECORD_BAND_HZ)[1]
+    return (requested_band_hz or RECORD_BAND_HZ)[1]
 
 
-def record_band_hz(record: Record, requested_hz: Band | None = None) -> Band:
+def record_band_hz(record: Record, requested_band_hz: Band | None = None) -> Band:
     """Return the frequency band in Hz of the whole-record fits.
 
     It is the requested band, or else the default band limited by the record's sampling rate and by
@@ -78,20 +78,20 @@ def record_band_hz(record: Record, requested_hz: Band | None = None) -> Band:
     ----------
     record : Record
         Record of a session.
-    requested_hz : tuple of float, optional
+    requested_band_hz : tuple of float, optional
         Requested band in Hz; used unchanged (see `check_excited_band`).
     """
-    return requested_hz or _limit_band(RECORD_BAND_HZ, record)
+    return requested_band_hz or _limit_band(RECORD_BAND_HZ, record)
 
 
-def check_record_band(record: Record, requested_hz: Band | None) -> None:
+def check_record_band(record: Record, requested_band_hz: Band | None) -> None:
     """Raise if a record's sampling rate is too low for a band.
 
     Parameters
     ----------
     record : Record
         Record of a session.
-    requested_hz : tuple of float or None
+    requested_band_hz : tuple of float or None
         Requested band, in Hz.
 
     Raises
@@ -102,15 +102,16 @@ def check_record_band(record: Record, requested_hz: Band | None) -> None:
     from analysis.paper import SettingsError
 
     limit_hz = LARGEST_FRACTION_OF_RATE * record.rate_hz
-    if requested_hz is not None and requested_hz[1] > limit_hz:
+    if requested_band_hz is not None and requested_band_hz[1] > limit_hz:
         raise SettingsError(
-            f"{record.path}: the band reaches {requested_hz[1]:g} Hz, but whole-record fits end at "
+            f"{record.path}: the band reaches {requested_band_hz[1]:g} Hz, but whole-record fits "
+            "end at "
             f"{limit_hz:g} Hz, {LARGEST_FRACTION_OF_RATE:g} of the rate of {record.rate_hz:g} Hz; "
             "lower --band."
         )
 
 
-def check_excited_band(record: Record, requested_hz: Band | None) -> None:
+def check_excited_band(record: Record, requested_band_hz: Band | None) -> None:
     """Raise if a requested band of the whole-record fits reaches far beyond the excitation.
 
     The angle there is noise of its sensor, which the beam does not feel. Nothing is checked if the
@@ -120,7 +121,7 @@ def check_excited_band(record: Record, requested_hz: Band | None) -> None:
     ----------
     record : Record
         Record of a session.
-    requested_hz : tuple of float or None
+    requested_band_hz : tuple of float or None
         Requested band, in Hz.
 
     Raises
@@ -130,22 +131,23 @@ def check_excited_band(record: Record, requested_hz: Band | None) -> None:
     """
     from analysis.identify import MeasurementError
 
-    is_bounded = record.swept_hz is not None or (
-        record.metadata.get("excitation") in _BOUNDED_EXCITATIONS
+    is_band_limited = record.swept_hz is not None or (
+        record.metadata.get("excitation") in _BAND_LIMITED_EXCITATIONS
     )
-    excited_hz = record.excited_hz if is_bounded else None
-    if requested_hz is None or excited_hz is None:
+    excited_hz = record.excited_hz if is_band_limited else None
+    if requested_band_hz is None or excited_hz is None:
         return
-    if requested_hz[1] > _EXCITED_MARGIN * excited_hz[1]:
+    if requested_band_hz[1] > _EXCITED_BAND_MARGIN_FACTOR * excited_hz[1]:
         raise MeasurementError(
-            f"{record.path}: the band reaches {requested_hz[1]:g} Hz, but the excitation covers "
+            f"{record.path}: the band reaches {requested_band_hz[1]:g} Hz, but the excitation "
+            "covers "
             f"{excited_hz[0]:.4g} to {excited_hz[1]:.4g} Hz, and beyond there is noise alone; "
             f"whole-record fits need a --band that ends at {excited_hz[1]:.4g} Hz or lower."
         )
 
 
 def welch_settings(
-    record: Record, settings: WelchSettings, requested_hz: Band | None = None
+    record: Record, settings: WelchSettings, requested_band_hz: Band | None = None
 ) -> WelchSettings:
     """Return the settings of the Welch fits with the requested band or the default one.
 
@@ -159,12 +161,12 @@ def welch_settings(
         Record of a session.
     settings : WelchSettings
         Requested settings.
-    requested_hz : tuple of float, optional
+    requested_band_hz : tuple of float, optional
         Requested band, in Hz.
     """
-    if requested_hz is None and settings.band_hz != PAPER_BAND_HZ:
-        requested_hz = settings.band_hz
-    first_hz, last_hz = requested_hz or _limit_band(PAPER_BAND_HZ, record)
+    if requested_band_hz is None and settings.band_hz != PAPER_BAND_HZ:
+        requested_band_hz = settings.band_hz
+    first_hz, last_hz = requested_band_hz or _limit_band(PAPER_BAND_HZ, record)
     settings = _scale_to_decimated_rate(settings, record)
     if first_hz == 0.0:
         first_hz = record.rate_hz / settings.segmentation(record.rate_hz).nfft
@@ -176,24 +178,24 @@ def _scale_to_decimated_rate(settings: WelchSettings, record: Record) -> WelchSe
 
     They differ if the record was decimated while it was read.
     """
-    ratio = record.rate_hz / record.full_rate.rate_hz
-    if ratio == 1:
+    rate_ratio = record.rate_hz / record.full_rate.rate_hz
+    if rate_ratio == 1:
         return settings
     segment_length, overlap, nfft = (
-        None if length is None else round(length * ratio)
+        None if length is None else round(length * rate_ratio)
         for length in (settings.segment_length, settings.overlap, settings.nfft)
     )
     return replace(settings, segment_length=segment_length, overlap=overlap, nfft=nfft)
 
 
-def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]:
+def remarks(record: Record, requested_band_hz: Band | None = None) -> tuple[str, ...]:
     """Return sentences on adaptations of the analysis to a record, such as a lower band.
 
     Parameters
     ----------
     record : Record
         Record of a session.
-    requested_hz : tuple of float, optional
+    requested_band_hz : tuple of float, optional
         Requested band, in Hz.
     """
     remark_sentences = (_TOUCH_REMARK,) if record.metadata.get("excitation") == "touch" else ()
@@ -207,8 +209,8 @@ def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]
             f"while it was read, which preserves frequencies up to "
             f"{LARGEST_FRACTION_OF_RATE * record.rate_hz:g} Hz.",
         )
-    first_hz, last_hz = record_band_hz(record, requested_hz)
-    if requested_hz is not None or (first_hz, last_hz) == RECORD_BAND_HZ:
+    first_hz, last_hz = record_band_hz(record, requested_band_hz)
+    if requested_band_hz is not None or (first_hz, last_hz) == RECORD_BAND_HZ:
         return remark_sentences
     if record.swept_hz is not None:
         return (
@@ -226,9 +228,9 @@ def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]
 def welch_analysis(
     record: Record,
     settings: WelchSettings,
-    requested_hz: Band | None = None,
+    requested_band_hz: Band | None = None,
     *,
-    optional: bool,
+    is_optional: bool,
 ) -> tuple[WelchAnalysis | None, str | None]:
     """Run the Welch fits if they are applicable to a record.
 
@@ -238,9 +240,9 @@ def welch_analysis(
         Record of a session.
     settings : WelchSettings
         Requested settings.
-    requested_hz : tuple of float, optional
+    requested_band_hz : tuple of float, optional
         Requested band, in Hz.
-    optional : bool
+    is_optional : bool
         Whether the Welch fits may be omitted. Fits with a chosen estimator or chosen segments are
         not omitted.
 
@@ -259,19 +261,19 @@ def welch_analysis(
     from analysis.paper import FrequencyResponseError, SettingsError
     from analysis.paper.welch_analysis import analyse
 
-    optional = optional and settings.are_from_paper
-    exclusion_reason = welch_exclusion_reason(record, requested_hz) if optional else None
+    is_optional = is_optional and settings.are_from_paper
+    exclusion_reason = welch_exclusion_reason(record, requested_band_hz) if is_optional else None
     if exclusion_reason is None:
         try:
-            return analyse(record, welch_settings(record, settings, requested_hz)), None
+            return analyse(record, welch_settings(record, settings, requested_band_hz)), None
         except FrequencyResponseError as error:
-            if not optional or isinstance(error, SettingsError):
+            if not is_optional or isinstance(error, SettingsError):
                 raise
             exclusion_reason = str(error).removeprefix(f"{record.path}: ").removesuffix(".")
     return None, f"{WELCH_OMITTED_TEXT}{exclusion_reason}."
 
 
-def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> str | None:
+def welch_exclusion_reason(record: Record, requested_band_hz: Band | None = None) -> str | None:
     """Return why Welch's method is not applicable to a record, or None if it is.
 
     The reason is the end of a sentence.
@@ -280,7 +282,7 @@ def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> 
     ----------
     record : Record
         Record of a session.
-    requested_hz : tuple of float, optional
+    requested_band_hz : tuple of float, optional
         Requested band, in Hz.
     """
     excitation = record.metadata.get("excitation", "")
@@ -293,16 +295,21 @@ def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> 
         return f"{exclusion} ({method_options} computes them nevertheless)"
     if record.part_s is not None:
         return None  # the default band is that of the part
-    planned_s = _metadata_number(record, "duration_s")
-    swept_s = record.first_sweep_samples / record.rate_hz
-    if requested_hz is not None or planned_s is None or swept_s >= _COMPLETE_FRACTION * planned_s:
+    planned_duration_s = _metadata_number(record, "duration_s")
+    swept_duration_s = record.first_sweep_samples / record.rate_hz
+    if (
+        requested_band_hz is not None
+        or planned_duration_s is None
+        or swept_duration_s >= _COMPLETE_SWEEP_FRACTION * planned_duration_s
+    ):
         return None
-    reached_hz = _reached_frequency_hz(record, swept_s / planned_s)
+    reached_hz = _reached_frequency_hz(record, swept_duration_s / planned_duration_s)
     first_hz, last_hz = _limit_band(PAPER_BAND_HZ, record)
     if reached_hz is None or not first_hz < reached_hz < last_hz:
         return None
     return (
-        f"the sweep ended after {swept_s:.4g} of {planned_s:g} s, at {reached_hz:.3g} Hz, and "
+        f"the sweep ended after {swept_duration_s:.4g} of {planned_duration_s:g} s, at "
+        f"{reached_hz:.3g} Hz, and "
         f"there is only noise beyond; --band {first_hz:g},{reached_hz:.3g} computes them up to "
         "there"
     )
@@ -319,10 +326,10 @@ def _reached_frequency_hz(record: Record, duration_fraction: float) -> float | N
     return start_hz + duration_fraction * (stop_hz - start_hz)
 
 
-def _metadata_number(record: Record, key: str) -> float | None:
+def _metadata_number(record: Record, metadata_key: str) -> float | None:
     """Return a number in the metadata of a record; None if it is not stated."""
     try:
-        return float(record.metadata[key])
+        return float(record.metadata[metadata_key])
     except (KeyError, ValueError):
         return None
 

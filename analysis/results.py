@@ -379,7 +379,7 @@ def record_result(
         on_step("whole record")
         return RecordResult(record, _fit_whole_record(record, options, warn))
     fit_welch = partial(
-        welch_analysis, record, options.settings, options.band_hz, optional=options.whole_record
+        welch_analysis, record, options.settings, options.band_hz, is_optional=options.whole_record
     )
     if not options.whole_record:
         on_step("Welch fits")

@@ -82,13 +82,13 @@ def line(case: Case, found: CampaignResult) -> str:
     if verdict is None:
         return f"| {case.name} | no verdict |"
     alone = ", ".join(f"{name} {count}" for name, count in verdict.alone.items())
-    least = min(each.chance for each in alike.quantities)
+    least = min(each.p_value for each in alike.quantities)
     mixed = "no"
-    if (leading := alike.leading) is not None:
+    if (leading := alike.leading_scatter) is not None:
         sizes = " and ".join(str(len(group)) for group in leading.groups)
-        stds = f"{leading.between_std_in_own_stds:.0f} std"
+        stds = f"{leading.relative_between_session_std:.0f} std"
         mixed = f"yes, {sizes or 'no groups'}, by {leading.quantity} ({stds})"
-    worst = "" if alike.mixed else f"{worst_error(case, found):.1f}"
+    worst = "" if alike.is_mixture else f"{worst_error(case, found):.1f}"
     lost = len(found.failures) + len(found.failed_predictions)
     return (
         f"| {case.name} | {alone} | {mixed} | {least:.2g} of {len(alike.quantities)} "
@@ -138,13 +138,13 @@ def main() -> None:
             found = campaign(paths, jobs=given.jobs)
         print(line(case, found), f"{time.perf_counter() - begun:.0f} s", flush=True)
         results.append(found)
-    *ones, mixed = (each.homogeneity.mixed for each in results)
+    *ones, mixed = (each.homogeneity.is_mixture for each in results)
     gate.measured("campaigns of one beam called mixed", percent(sum(ones), len(ones)))
     gate.measured("campaigns of two beams called mixed", percent(mixed, 1))
     worst = [
         worst_error(case, each)
         for case, each in zip(cases, results, strict=True)
-        if not each.homogeneity.mixed
+        if not each.homogeneity.is_mixture
     ]
     gate.measured("worst error of pooled numbers", max(worst, default=math.nan))
     lost = sum(len(each.failures) + len(each.failed_predictions) for each in results)

@@ -11,13 +11,13 @@ import numpy as np
 from analysis.campaigns._experiment import (
     CampaignError,
     SessionFailure,
-    complete_facts,
+    add_missing_facts,
     distinct_names,
     most_common_index,
     stated_specimens,
 )
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
-from analysis.campaigns._modal import PooledModalModel, pooled_modal
+from analysis.campaigns._modal import PooledModalModel, pooled_modal_model
 from analysis.campaigns._session import (
     SessionAnalysis,
     SessionTask,
@@ -32,7 +32,7 @@ from analysis.campaigns._statistics import (
     ranked_structures,
 )
 from analysis.campaigns._validation import (
-    MIN_SESSIONS,
+    MIN_VALIDATED_SESSIONS,
     FailedPrediction,
     LeaveOneOutResult,
     validate,
@@ -117,7 +117,7 @@ class CampaignResult:
     @property
     def modes(self) -> tuple[PooledMode, ...]:
         """Modes pooled over all sessions, of the modal model or of an exactly uniform beam."""
-        if self.modal is not None and self.modal.leads:
+        if self.modal is not None and self.modal.replaces_beam_modes:
             return self.modal.modes
         return self.headline.modes if self.headline else ()
 
@@ -129,7 +129,7 @@ class CampaignResult:
     @property
     def trials(self) -> int:
         """Number of sessions that were to be predicted from the others, failures included."""
-        return len(self.sessions) if len(self.sessions) >= MIN_SESSIONS else 0
+        return len(self.sessions) if len(self.sessions) >= MIN_VALIDATED_SESSIONS else 0
 
 
 def campaign(
@@ -143,7 +143,9 @@ def campaign(
     dask: str | None = None,
     uniformity: float | None = None,
     workers: Workers | None = None,
-    on_progress: Callable[[int, int, str], None] = lambda _done, _total, _what: None,
+    on_progress: Callable[[int, int, str], None] = lambda _done_steps, _total_steps, _step_name: (
+        None
+    ),
 ) -> CampaignResult:
     """Analyse a campaign of sessions of one specimen on one rig.
 
@@ -196,11 +198,11 @@ def campaign(
     session_task = SessionTask(settings, tuple(structures), tuple(fixed), band_hz, uniformity)
     done_steps, total_steps = 0, 2 * len(paths)
 
-    def report_step(name: str) -> None:
+    def report_step(file_name: str) -> None:
         """Report the completion of a step for a file."""
         nonlocal done_steps
         done_steps += 1
-        on_progress(done_steps, total_steps, name)
+        on_progress(done_steps, total_steps, file_name)
 
     workers_manager: AbstractContextManager[Workers]
     if workers is not None:
@@ -229,26 +231,27 @@ def campaign(
                 + "\n".join(failure.message for failure in failures)
             )
         validation: tuple[LeaveOneOutResult, ...] = ()
-        lost_sessions: tuple[FailedPrediction, ...] = ()
-        if len(sessions) >= MIN_SESSIONS:
+        failed_predictions: tuple[FailedPrediction, ...] = ()
+        if len(sessions) >= MIN_VALIDATED_SESSIONS:
             total_steps = len(paths) + len(sessions)
             session_names = [session.path.name for session in sessions]
-            validation, lost_sessions = validate(
+            validation, failed_predictions = validate(
                 ready_workers, sessions, band_hz, lambda i: report_step(session_names[i])
             )
-    return campaign_result(sessions, failures, validation, lost_sessions)
+    return campaign_result(sessions, failures, validation, failed_predictions)
 
 
 def campaign_result(
     sessions: Sequence[SessionAnalysis],
     failures: Sequence[SessionFailure] = (),
     validation: Sequence[LeaveOneOutResult] = (),
-    lost: Sequence[FailedPrediction] = (),
+    failed_predictions: Sequence[FailedPrediction] = (),
 ) -> CampaignResult:
     """Return the combined result of sessions of one experiment.
 
     There is at least one session. Those in `failures` are not used. `validation` are the errors of
-    the sessions that were predicted from the others, and `lost` the sessions that could not be.
+    the sessions that were predicted from the others, and `failed_predictions` the sessions that
+    could not be.
     """
     session_names = distinct_names(
         [*(session.path for session in sessions), *(session.path for session in failures)]
@@ -266,8 +269,8 @@ def campaign_result(
     unused_experiments = [(session.name, session.experiment) for session in failures]
     specimens = stated_specimens([*used_experiments, *unused_experiments], sessions[0].experiment)
     homogeneity_test = homogeneity(sessions, pooled_fits, specimens)
-    all_biases = welch_biases(sessions, pooled_fits)
-    modal_model = pooled_modal(sessions)
+    all_welch_biases = welch_biases(sessions, pooled_fits)
+    modal_model = pooled_modal_model(sessions)
     return CampaignResult(
         settings=sessions[0].settings,
         record_band_hz=sessions[0].record_band_hz,
@@ -275,16 +278,22 @@ def campaign_result(
         failures=tuple(failures),
         statistics=parameter_statistics(sessions),
         nominal=nominal_models(sessions),
-        welch_biases=all_biases,
+        welch_biases=all_welch_biases,
         homogeneity=homogeneity_test,
         structures=ranked_structures(sessions, pooled_fits),
         pooled=pooled_fits,
         modal=modal_model,
         verdict=campaign_verdict(
-            sessions, pooled_fits, homogeneity_test, validation, lost, all_biases, modal_model
+            sessions,
+            pooled_fits,
+            homogeneity_test,
+            validation,
+            failed_predictions,
+            all_welch_biases,
+            modal_model,
         ),
         validation=tuple(validation),
-        failed_predictions=tuple(lost),
+        failed_predictions=tuple(failed_predictions),
     )
 
 
@@ -303,7 +312,7 @@ def _separate_experiments(
             for session_result in session_results
             if isinstance(session_result, SessionFailure)
         ]
-    session_results = _complete_facts(session_results)
+    session_results = _add_missing_facts(session_results)
     usable_sessions = [
         session_result
         for session_result in session_results
@@ -315,11 +324,13 @@ def _separate_experiments(
     stated_experiments = [
         session_result.experiment for session_result in session_results if session_result.experiment
     ]
-    agreeing_count = sum(
+    agreeing_experiment_count = sum(
         common_session.experiment.difference(experiment) is None
         for experiment in stated_experiments
     )
-    majority_text = ", as in most" if 2 * agreeing_count > len(stated_experiments) else ""
+    majority_text = (
+        ", as in most" if 2 * agreeing_experiment_count > len(stated_experiments) else ""
+    )
     sessions: list[SessionAnalysis] = []
     failures: list[SessionFailure] = []
     for session_result in session_results:
@@ -336,10 +347,10 @@ def _separate_experiments(
                     session_result.experiment,
                 )
             )
-    return _equalize_welch_fits(sessions, failures)
+    return _unify_welch_fits(sessions, failures)
 
 
-def _equalize_welch_fits(
+def _unify_welch_fits(
     sessions: list[SessionAnalysis], failures: list[SessionFailure]
 ) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
     """Make all used sessions have Welch fits, or none of them.
@@ -348,35 +359,35 @@ def _equalize_welch_fits(
     the Welch fits of all sessions are dropped. A session that planned its own excitation is never
     excluded, because its record is as informative as any other.
     """
-    without_fits = [session for session in sessions if not session.frequency_hz.size]
-    if not without_fits:
+    sessions_without_fits = [session for session in sessions if not session.frequency_hz.size]
+    if not sessions_without_fits:
         return sessions, failures
-    any_planned_during_session = any(
-        session.experiment.is_planned_during_session for session in without_fits
+    is_any_planned_during_session = any(
+        session.experiment.is_planned_during_session for session in sessions_without_fits
     )
-    if any_planned_during_session or 2 * len(without_fits) >= len(sessions):
+    if is_any_planned_during_session or 2 * len(sessions_without_fits) >= len(sessions):
         return [session.without_welch() for session in sessions], failures
-    new_failures = [
+    excluded_sessions = [
         SessionFailure(
             session.path,
             f"{session.path}: {session.warnings[-1]} Most others have them: analyse this one by "
             "itself.",
             session.experiment,
         )
-        for session in without_fits
+        for session in sessions_without_fits
     ]
     return [session for session in sessions if session.frequency_hz.size], [
         *failures,
-        *new_failures,
+        *excluded_sessions,
     ]
 
 
-def _complete_facts(
+def _add_missing_facts(
     session_results: Sequence[SessionAnalysis | SessionFailure],
 ) -> list[SessionAnalysis | SessionFailure]:
-    """Return the results with the facts of their experiments completed by `complete_facts`."""
+    """Return the results with the facts of their experiments completed by `add_missing_facts`."""
     completed_experiments = iter(
-        complete_facts(
+        add_missing_facts(
             [
                 session_result.experiment
                 for session_result in session_results
@@ -396,13 +407,13 @@ def _exclusion_reason(
     session_result: SessionAnalysis | SessionFailure,
     common_session: SessionAnalysis,
     majority_text: str,
-    accepted: Sequence[SessionAnalysis],
+    accepted_sessions: Sequence[SessionAnalysis],
 ) -> str | None:
     """Return why a session does not belong to the campaign, or None if it does.
 
-    `common_session` is a session of the most common experiment, `accepted` are the sessions
-    accepted so far. The reason contains `majority_text`, which says so if most sessions agree with
-    `common_session`.
+    `common_session` is a session of the most common experiment, `accepted_sessions` are the
+    sessions accepted so far. The reason contains `majority_text`, which says so if most sessions
+    agree with `common_session`.
     """
     experiment = session_result.experiment
     difference = experiment and common_session.experiment.difference(experiment)
@@ -413,7 +424,7 @@ def _exclusion_reason(
         )
     if isinstance(session_result, SessionFailure):
         return None
-    for other_session in accepted:
+    for other_session in accepted_sessions:
         if session_result.path == other_session.path:
             return "the file is given more than once, and counts once."
         if session_result.experiment.identity == other_session.experiment.identity:
@@ -424,8 +435,8 @@ def _exclusion_reason(
                 "a copy or a part of that file, or a simulation with the same seed; analyse this "
                 "one by itself."
             )
-    both_have_welch = common_session.frequency_hz.size and session_result.frequency_hz.size
-    if both_have_welch and not np.array_equal(
+    both_have_welch_fits = common_session.frequency_hz.size and session_result.frequency_hz.size
+    if both_have_welch_fits and not np.array_equal(
         common_session.frequency_hz, session_result.frequency_hz
     ):
         return (

@@ -24,7 +24,7 @@ class RecordEstimate:
         ``-2 ln`` likelihood, up to a constant common to all estimates of the session.
     bic : float
         Bayesian information criterion of this session alone.
-    values : int
+    compared_values : int
         Number of real values of the record that the fit is compared with.
     indices : FitIndices
         Fit indices relative to the session's response by Welch's method, on the same bins as for
@@ -34,7 +34,7 @@ class RecordEstimate:
     fit: RecordFit
     deviance: float
     bic: float
-    values: int
+    compared_values: int
     indices: FitIndices
 
     @property
@@ -57,6 +57,6 @@ class RecordEstimate:
             fit=replace(candidate.fit, residual=np.empty(0, np.complex128)),
             deviance=candidate.deviance,
             bic=candidate.bic,
-            values=candidate.values,
+            compared_values=candidate.values,
             indices=indices,
         )

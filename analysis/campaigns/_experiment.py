@@ -59,24 +59,24 @@ def session_error_types() -> tuple[type[Exception], ...]:
 _EXCITATION_KEYS: Final = ("excitation", "amplitude_rad", "start_hz", "stop_hz", "duration_s",
                            "taper_s", "there_and_back")  # fmt: skip
 """Keys of the excitation in a session file that must agree over a campaign."""
-LABEL_KEY: Final = "specimen"
+_SPECIMEN_LABEL_KEY: Final = "specimen"
 """Key of the operator's label of the specimen in a session file."""
 
-_SPECIMEN_KEYS: Final = (LABEL_KEY, "beam_length_m", "beam_density_kg_per_m",
+_SPECIMEN_KEYS: Final = (_SPECIMEN_LABEL_KEY, "beam_length_m", "beam_density_kg_per_m",
                          "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
 """Keys of the specimen in a session file that must agree over a campaign."""
 _TILT_KEY: Final = "axis_tilt_deg"
 """Key of the tilt of the axis in a session file. Where it is stated it must agree over a campaign,
 because it changes the modes."""
-_SWEEP_END_KEYS: Final = ("start_hz", "stop_hz")
+_SWEEP_FREQUENCY_KEYS: Final = ("start_hz", "stop_hz")
 """Keys of a sweep's start and stop frequency; sweeps that differ in their order count as equal."""
 
-_SWEEP_NAME: Final = "chirp"
+_SWEEP_EXCITATION: Final = "chirp"
 """Name of the excitation by a sweep."""
-_SEARCH_NAME: Final = "until"
+_SEARCH_EXCITATION: Final = "until"
 """Name of the excitation that is planned while it runs, and so differs in each session."""
 
-_COMPLETE_FRACTION: Final = 0.99
+_COMPLETE_SWEEP_FRACTION: Final = 0.99
 """Smallest recorded fraction of a sweep that counts as complete: the last samples may be lost."""
 
 
@@ -115,10 +115,10 @@ class Experiment:
         excitation_facts = {
             key: _parse_number(metadata[key]) for key in _EXCITATION_KEYS if key in metadata
         }
-        specimen_label = metadata.get(LABEL_KEY, "").strip()
+        specimen_label = metadata.get(_SPECIMEN_LABEL_KEY, "").strip()
         return cls(
             facts={
-                **({LABEL_KEY: specimen_label} if specimen_label else {}),
+                **({_SPECIMEN_LABEL_KEY: specimen_label} if specimen_label else {}),
                 "beam_length_m": beam.length_m,
                 "beam_density_kg_per_m": beam.density_kg_per_m,
                 "beam_bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
@@ -141,7 +141,7 @@ class Experiment:
     @property
     def label(self) -> str:
         """Label of the specimen stated in the file; empty if the file states none."""
-        return str(self.facts.get(LABEL_KEY, ""))
+        return str(self.facts.get(_SPECIMEN_LABEL_KEY, ""))
 
     @property
     def axis_tilt_deg(self) -> float | None:
@@ -155,19 +155,20 @@ class Experiment:
 
         In comparisons of experiments, such an excitation counts as equal to any other.
         """
-        return self.facts.get("excitation") == _SEARCH_NAME
+        return self.facts.get("excitation") == _SEARCH_EXCITATION
 
-    def unfinished_sweep_reason(self, outcome: str) -> str:
+    def unfinished_sweep_reason(self, session_outcome: str) -> str:
         """Return why a sweep that ended early is not used; an empty text if it was complete."""
-        planned_s = self.facts.get("duration_s")
-        if not isinstance(planned_s, float):
+        planned_duration_s = self.facts.get("duration_s")
+        if not isinstance(planned_duration_s, float):
             return ""
         if self.facts.get("there_and_back") == 1.0:
-            planned_s *= 2
-        if self.sweep_s >= _COMPLETE_FRACTION * planned_s:
+            planned_duration_s *= 2
+        if self.sweep_s >= _COMPLETE_SWEEP_FRACTION * planned_duration_s:
             return ""
         return (
-            f"its sweep ended after {self.sweep_s:.4g} s of {planned_s:g} s (outcome: {outcome}), "
+            f"its sweep ended after {self.sweep_s:.4g} s of {planned_duration_s:g} s (outcome: "
+            f"{session_outcome}), "
             "and is not averaged with whole ones; analyse it by itself."
         )
 
@@ -177,8 +178,8 @@ class Experiment:
             self.is_planned_during_session or other_experiment.is_planned_during_session
         )
         other_facts = dict(other_experiment.facts)
-        if {self.rising, other_experiment.rising} == {True, False}:
-            start_key, stop_key = _SWEEP_END_KEYS
+        if {self.is_rising, other_experiment.is_rising} == {True, False}:
+            start_key, stop_key = _SWEEP_FREQUENCY_KEYS
             other_facts[start_key], other_facts[stop_key] = (
                 other_facts[stop_key],
                 other_facts[start_key],
@@ -189,16 +190,16 @@ class Experiment:
                 if ignores_excitation and key in _EXCITATION_KEYS
                 else other_facts.get(key, own_value)
             )
-            if not _equal_values(other_value, own_value):
+            if not _are_values_equal(other_value, own_value):
                 return f"{key} is {fact_text(key, other_value)}, but {fact_text(key, own_value)}"
         return None
 
     @property
-    def rising(self) -> bool | None:
+    def is_rising(self) -> bool | None:
         """Whether the frequency of the sweep rises; None if it also falls, or without a sweep."""
-        if self.facts.get("excitation") != _SWEEP_NAME or "there_and_back" in self.facts:
+        if self.facts.get("excitation") != _SWEEP_EXCITATION or "there_and_back" in self.facts:
             return None
-        start_hz, stop_hz = (self.facts.get(key) for key in _SWEEP_END_KEYS)
+        start_hz, stop_hz = (self.facts.get(key) for key in _SWEEP_FREQUENCY_KEYS)
         if not isinstance(start_hz, float) or not isinstance(stop_hz, float) or start_hz == stop_hz:
             return None
         return start_hz < stop_hz
@@ -207,7 +208,9 @@ class Experiment:
         """Return whether another experiment states the same beam and the same tool inertia."""
         return not any(
             key in self.facts
-            and not _equal_values(other_experiment.facts.get(key, self.facts[key]), self.facts[key])
+            and not _are_values_equal(
+                other_experiment.facts.get(key, self.facts[key]), self.facts[key]
+            )
             for key in _SPECIMEN_KEYS
         )
 
@@ -284,34 +287,35 @@ def stated_specimens(
     )
 
 
-def complete_facts(experiments: Sequence[Experiment]) -> list[Experiment]:
+def add_missing_facts(experiments: Sequence[Experiment]) -> list[Experiment]:
     """Return the experiments; if their labels or tilts differ, add an empty one to those without.
 
     The specimen of an experiment without a label is then unknown, and the empty label differs from
     every other. If all stated labels are equal, it is taken to be the same specimen. The same holds
     of the tilt of the axis.
     """
-    completed_keys = [
+    missing_fact_keys = [
         key
-        for key in (LABEL_KEY, _TILT_KEY)
+        for key in (_SPECIMEN_LABEL_KEY, _TILT_KEY)
         if len({experiment.facts[key] for experiment in experiments if key in experiment.facts}) > 1
     ]
-    if not completed_keys:
+    if not missing_fact_keys:
         return list(experiments)
     return [
-        replace(experiment, facts={**dict.fromkeys(completed_keys, ""), **experiment.facts})
+        replace(experiment, facts={**dict.fromkeys(missing_fact_keys, ""), **experiment.facts})
         for experiment in experiments
     ]
 
 
 def differing_fact_keys(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
     """Return the keys of the stated properties, such as the length, in which specimens differ."""
-    first_facts = specimens[0].facts
+    first_specimen_facts = specimens[0].facts
     return tuple(
         key
-        for key, fact_value in first_facts.items()
+        for key, fact_value in first_specimen_facts.items()
         if not all(
-            _equal_values(specimen.facts.get(key, fact_value), fact_value) for specimen in specimens
+            _are_values_equal(specimen.facts.get(key, fact_value), fact_value)
+            for specimen in specimens
         )
     )
 
@@ -332,19 +336,19 @@ def most_common_index(experiments: Sequence[Experiment]) -> int:
     )
 
 
-def _equal_values(first_value: str | float, second_value: str | float) -> bool:
+def _are_values_equal(first_value: str | float, second_value: str | float) -> bool:
     """Return whether two stated values are equal, numbers up to rounding."""
     if isinstance(first_value, str) or isinstance(second_value, str):
         return first_value == second_value
     return math.isclose(first_value, second_value, rel_tol=1e-9)
 
 
-def fact_text(key: str, fact_value: str | float) -> str:
+def fact_text(fact_key: str, fact_value: str | float) -> str:
     """Format a value of a session file with its unit.
 
     Parameters
     ----------
-    key : str
+    fact_key : str
         Key of the value, with the unit as a suffix.
     fact_value : str or float
         The value.
@@ -352,8 +356,8 @@ def fact_text(key: str, fact_value: str | float) -> str:
     if isinstance(fact_value, str):
         if not fact_value:
             return "not stated"
-        return f"“{fact_value}”" if key == LABEL_KEY else fact_value
-    return f"{fact_value:g} {unit_of(key)}".rstrip()
+        return f"“{fact_value}”" if fact_key == _SPECIMEN_LABEL_KEY else fact_value
+    return f"{fact_value:g} {unit_of(fact_key)}".rstrip()
 
 
 def _utc_text(utc_ns: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns.labels import probability
+from analysis.campaigns.labels import format_p_value
 from analysis.campaigns.sentences import describe_single_sessions
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.identify.sentences import LOSS_NAMES, loss_slope_sentence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify.tolerant_estimate import TolerantEstimate
 
-_FREQUENCY_FREE_BASES: Final = {
+_ESTIMATE_BASIS_TEXTS: Final = {
     "losses": "damping ratios and residue phases alone",
     "none": "no beam with one order of each damping, which do not explain the losses",
 }
@@ -30,20 +30,21 @@ _FREQUENCY_FREE_BASES: Final = {
 
 def p_value_text(p_value: float) -> str:
     """Format a p-value as an equation or inequality."""
-    probability_text = probability(p_value)
-    return (
-        f"p {probability_text}" if probability_text.startswith("<") else f"p = {probability_text}"
-    )
+    p_value_number = format_p_value(p_value)
+    return f"p {p_value_number}" if p_value_number.startswith("<") else f"p = {p_value_number}"
 
 
 def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate) -> str:
     """Describe from what the parameters are estimated, and the tolerated unevenness of the beam."""
-    largest_stated = modal_model.stated[-1]
-    tolerance_text = f"{100 * largest_stated:g} % as the files state it"
-    if len(modal_model.stated) > 1:
-        stated_texts = listed([f"{100 * uniformity:g}" for uniformity in modal_model.stated])
+    largest_stated_uniformity = modal_model.stated_uniformities[-1]
+    tolerance_text = f"{100 * largest_stated_uniformity:g} % as the files state it"
+    if len(modal_model.stated_uniformities) > 1:
+        stated_percentages = listed(
+            [f"{100 * uniformity:g}" for uniformity in modal_model.stated_uniformities]
+        )
         tolerance_text = (
-            f"{100 * largest_stated:g} %, the largest of the {stated_texts} % that the files state"
+            f"{100 * largest_stated_uniformity:g} %, the largest of the {stated_percentages} % "
+            "that the files state"
         )
     basis_sentence = (
         f"Parameters are those of a beam with both dampings, from the modal constants of "
@@ -51,19 +52,20 @@ def describe_tolerance(modal_model: PooledModalModel, estimate: TolerantEstimate
     )
     if estimate.basis != "geometry":
         return (
-            f"{basis_sentence}, by {_FREQUENCY_FREE_BASES[estimate.basis]}: the frequencies are "
+            f"{basis_sentence}, by {_ESTIMATE_BASIS_TEXTS[estimate.basis]}: the frequencies are "
             f"not those of a uniform beam to {tolerance_text}, nor with a wider tolerance."
         )
-    used_text = tolerance_text
-    if estimate.uniformity > largest_stated:
-        used_text = f"{100 * estimate.uniformity:g} % ({tolerance_text} does not suffice)"
+    used_tolerance_text = tolerance_text
+    if estimate.uniformity > largest_stated_uniformity:
+        used_tolerance_text = f"{100 * estimate.uniformity:g} % ({tolerance_text} does not suffice)"
     return (
-        f"{basis_sentence}; the mode frequencies are those of a uniform beam to {used_text}. A "
+        f"{basis_sentence}; the mode frequencies are those of a uniform beam to "
+        f"{used_tolerance_text}. A "
         "non-uniformity of the specimen is common to all sessions and does not average out."
     )
 
 
-def describe_slope(pooled_order: PooledOrder, modal_model: PooledModalModel) -> str:
+def describe_loss_slope(pooled_order: PooledOrder, modal_model: PooledModalModel) -> str:
     """Describe an order of the damping as the slope of a loss against frequency.
 
     The order is estimated for a beam that may be uneven; the modal model has the estimate
@@ -103,7 +105,7 @@ def describe_orders_if_exact(
     """
     if modal_model is None or modal_model.uniform_beam.status == "refused":
         return []
-    orders_shown = []
+    order_texts = []
     for order in orders:
         exact_order = order.exact
         if (
@@ -117,21 +119,21 @@ def describe_orders_if_exact(
         value_text, low_text, high_text = to_uncertainty(
             (exact_order.value, *exact_order.interval), exact_order.std or half_width
         )
-        conclusions = {
+        conclusion_by_status = {
             "compatible": "consistent with 1",
             "fractional": "which would exclude 1",
             "open": "1 would be doubtful",
         }
-        orders_shown.append(
+        order_texts.append(
             f"{order.order} {value_text} (95 %: {low_text} to {high_text}; "
-            f"{conclusions[exact_order.status]})"
+            f"{conclusion_by_status[exact_order.status]})"
         )
     return (
         [
             f"{EXACTLY_UNIFORM_CONDITION.capitalize()} (type {freest_fit.name}): "
-            f"{'; '.join(orders_shown)}."
+            f"{'; '.join(order_texts)}."
         ]
-        if orders_shown
+        if order_texts
         else []
     )
 
@@ -170,10 +172,12 @@ def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
 def _describe_mode_change(mode_change: ModeInSweeps) -> str:
     """Describe how one mode differs between falling and rising sweeps."""
 
-    def change_text(value: float, std: float) -> str:
+    def change_text(relative_change: float, std: float) -> str:
         """Format a relative change in per cent, with its 95 % interval and direction."""
-        change_size, interval_text = to_uncertainty((abs(value), NORMAL_95 * std), std, 100.0)
-        return f"{change_size} ± {interval_text} % {'higher' if value > 0 else 'lower'}"
+        change_size, interval_text = to_uncertainty(
+            (abs(relative_change), NORMAL_95 * std), std, 100.0
+        )
+        return f"{change_size} ± {interval_text} % {'higher' if relative_change > 0 else 'lower'}"
 
     return (
         f"mode {mode_change.mode} (falling: frequency "
@@ -196,7 +200,7 @@ def recommend_sweeps(
             f"the amplitude: a difference in mode {modes_text} that stays is a change in time. "
             "Then check clamp and temperature."
         ]
-    sweep_directions = {session.experiment.rising for session in sessions}
+    sweep_directions = {session.experiment.is_rising for session in sessions}
     is_beam_refused = modal_model is not None and modal_model.uniform_beam.status == "refused"
     if sweeps is None and is_beam_refused and sweep_directions in ({True}, {False}):
         missing_direction = "falling" if True in sweep_directions else "rising"

@@ -31,7 +31,7 @@ _ON_BOUND_FLAG: Final = "the unweighted mean: at its bound in at least one sessi
 """Flag of a parameter that is at a bound in at least one session."""
 _NOT_SHOWN_FLAG: Final = "computed from the model: too few records show this mode"
 """Flag of a mode that too few records show."""
-_ADEQUATE_FRACTION: Final = 0.9
+_MIN_ADEQUATE_FRACTION: Final = 0.9
 """Smallest fraction of sessions with a residual of mere noise at which estimates get no flag."""
 
 
@@ -49,18 +49,20 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
         Headlines as for single files. The last one, with ``file`` null, is that of all sessions
         together. Without whole-record fits the list is empty.
     """
-    documents = [dict(session.headline) for session in campaign.sessions if session.headline]
+    headline_documents = [
+        dict(session.headline) for session in campaign.sessions if session.headline
+    ]
     common_estimates, verdict = campaign_estimates(campaign), campaign.verdict
     if common_estimates is not None and verdict is not None:
         pooled_orders = (verdict.alpha, verdict.lambda_)
-        named_findings = (
+        shown_findings = (
             replace(finding.example, sentence=finding.sentence, interval=None)
             for finding in verdict.findings
         )
-        documents.append(
-            headline_json(None, common_estimates, pooled_orders, named_findings, campaign.validity)
+        headline_documents.append(
+            headline_json(None, common_estimates, pooled_orders, shown_findings, campaign.validity)
         )
-    return documents
+    return headline_documents
 
 
 def campaign_estimates(campaign: CampaignResult) -> Estimates | None:
@@ -90,7 +92,7 @@ def campaign_estimates(campaign: CampaignResult) -> Estimates | None:
             (structure.name, _structure_status(structure, pooled_estimate))
             for structure in campaign.structures
         ),
-        simpler=_simpler_estimate(campaign, pooled_estimate),
+        simpler=_lowest_bic_conditional_estimate(campaign, pooled_estimate),
         drag_speed_m_s=None,
     )
     if modal_model is None:
@@ -102,7 +104,7 @@ def campaign_estimates(campaign: CampaignResult) -> Estimates | None:
         modal_model.tolerant,
         common_flag,
         common_flag,
-        half_width=modal_model.half_width,
+        half_width=modal_model.half_width_in_stds,
     )
     return _add_flags(reported_estimates, campaign, pooled_orders)
 
@@ -120,14 +122,14 @@ def pooled_flags(campaign: CampaignResult, pooled_estimate: PooledEstimate) -> d
     verdict, modal_model = campaign.verdict, campaign.modal
     if verdict is None:
         return {}
-    refusal = uniform_beam_refusal_reason(modal_model.uniform_beam) if modal_model else None
+    refusal_reason = uniform_beam_refusal_reason(modal_model.uniform_beam) if modal_model else None
     reported_parameters = _reported_parameters(
         campaign, pooled_estimate, _exact_orders(verdict), _common_flag(verdict)
     )
     return {
         parameter_name: flag
         for parameter_name, parameter in reported_parameters.items()
-        if (flag := parameter.flag or refusal) is not None
+        if (flag := parameter.flag or refusal_reason) is not None
     }
 
 
@@ -138,8 +140,8 @@ def _exact_orders(verdict: CampaignVerdict) -> tuple[PooledOrder, ...]:
 
 def _common_flag(verdict: CampaignVerdict) -> str | None:
     """Return the flag of all estimates, or None if the residual of enough sessions is noise."""
-    are_explained = verdict.adequate >= _ADEQUATE_FRACTION * verdict.sessions
-    return None if are_explained else _UNEXPLAINED_FLAG
+    are_records_explained = verdict.adequate >= _MIN_ADEQUATE_FRACTION * verdict.sessions
+    return None if are_records_explained else _UNEXPLAINED_FLAG
 
 
 def _add_flags(
@@ -175,19 +177,19 @@ def _add_flags(
     )
 
 
-def _simpler_estimate(
+def _lowest_bic_conditional_estimate(
     campaign: CampaignResult, reported_estimate: PooledEstimate
 ) -> ConditionalEstimate | None:
     """Return the estimate of the lowest BIC, which is valid if the orders that it fixes are true.
 
     Return None if that estimate is the reported one.
     """
-    simpler_estimate = campaign.pooled[0]
-    if simpler_estimate is reported_estimate:
+    lowest_bic_estimate = campaign.pooled[0]
+    if lowest_bic_estimate is reported_estimate:
         return None
-    fixed_orders = STRUCTURES[simpler_estimate.structure].fixed
+    fixed_orders = STRUCTURES[lowest_bic_estimate.structure].fixed
     return ConditionalEstimate(
-        name=simpler_estimate.name,
+        name=lowest_bic_estimate.name,
         fixed={
             order_name: order_value
             for order_name, order_value in fixed_orders.items()
@@ -195,7 +197,7 @@ def _simpler_estimate(
         },
         parameters={
             parameter.name: Estimate(parameter.value, parameter.std, parameter.interval)
-            for parameter in simpler_estimate.parameters
+            for parameter in lowest_bic_estimate.parameters
         },
     )
 
@@ -219,10 +221,10 @@ def _reported_parameters(
         )
         for parameter in pooled_estimate.parameters
     }
-    free_names = STRUCTURES[pooled_estimate.structure].free
+    free_parameter_names = STRUCTURES[pooled_estimate.structure].free
     for parameter_name, fixed_value in pooled_estimate.plant.parameters.items():
         if parameter_name not in reported_parameters and (
-            parameter_name not in DAMPING_PARAMETERS or parameter_name in free_names
+            parameter_name not in DAMPING_PARAMETERS or parameter_name in free_parameter_names
         ):
             reported_parameters[parameter_name] = Estimate(
                 fixed_value, None, None, common_flag or _ON_BOUND_FLAG

@@ -31,21 +31,21 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
 
-SessionValues = tuple[tuple[str, float, float], ...]
+SessionEstimates = tuple[tuple[str, float, float], ...]
 """File, estimate, and standard deviation of the estimate; one entry for each session."""
 
 SIGNIFICANCE_LEVEL: Final = 0.01
 """Significance level of all quantities together: one false alarm in a hundred campaigns of one
 specimen."""
 
-_MIXTURE_I_SQUARED: Final = 0.9
+_MIN_MIXTURE_I_SQUARED: Final = 0.9
 """Smallest I² at which sessions count as a mixture: they scatter by three times a session's own
 standard deviation."""
 
-_CLEAR_GAP_STDS: Final = 5.0
+_MIN_GROUP_GAP_STDS: Final = 5.0
 """Smallest gap that separates two groups, in units of the standard deviation within a group."""
 
-_MIN_SESSIONS: Final = 2
+_MIN_COMPARED_SESSIONS: Final = 2
 """Smallest number of sessions that can be compared."""
 _MODE_QUANTITIES: Final = {"frequency_hz": "frequency_std_hz", "damping_ratio": "damping_ratio_std"}
 """Quantities of a mode that are tested, with the names of their standard deviations."""
@@ -65,25 +65,25 @@ class Heterogeneity:
         File, estimate and its standard deviation, one entry for each session.
     mean : float
         Pooled mean; the geometric mean of a positive parameter.
-    between_std : float
+    between_session_std : float
         Standard deviation between sessions that their own uncertainties do not explain, tau.
     cochran_q : float
         Cochran's Q; about `degrees_of_freedom` if tau is 0.
-    chance : float
+    p_value : float
         p-value of `cochran_q`.
-    mixed : bool
+    is_mixture : bool
         Whether the sessions differ so much that the mean is that of a mixture of specimens.
     groups : tuple of tuple of str
         Files of each group of sessions, by increasing value; empty without clear gaps.
     """
 
     quantity: str
-    values: SessionValues
+    values: SessionEstimates
     mean: float
-    between_std: float
+    between_session_std: float
     cochran_q: float
-    chance: float
-    mixed: bool
+    p_value: float
+    is_mixture: bool
     groups: tuple[tuple[str, ...], ...]
 
     @property
@@ -92,14 +92,14 @@ class Heterogeneity:
         return len(self.values) - 1
 
     @property
-    def between_std_in_own_stds(self) -> float:
+    def relative_between_session_std(self) -> float:
         """Scatter between sessions, tau, divided by the standard deviation of a typical session."""
         return math.sqrt(max(self.cochran_q / self.degrees_of_freedom - 1, 0.0))
 
     @property
     def i_squared(self) -> float:
         """Fraction of the variance between sessions that their uncertainties do not explain."""
-        return self.between_std_in_own_stds**2 / (1 + self.between_std_in_own_stds**2)
+        return self.relative_between_session_std**2 / (1 + self.relative_between_session_std**2)
 
     @property
     def is_of_rig(self) -> bool:
@@ -127,13 +127,13 @@ class Homogeneity:
     structure: str | None = None
 
     @property
-    def leading(self) -> Heterogeneity | None:
+    def leading_scatter(self) -> Heterogeneity | None:
         """Quantity that shows most clearly that the sessions differ; None if they do not differ.
 
         Modes take precedence over parameters.
         """
         mixed_scatters = [
-            scatter for scatter in self.quantities if scatter.mixed and not scatter.is_of_rig
+            scatter for scatter in self.quantities if scatter.is_mixture and not scatter.is_of_rig
         ]
         mode_scatters = [
             scatter
@@ -142,19 +142,19 @@ class Homogeneity:
         ]
         return max(
             mode_scatters or mixed_scatters,
-            key=lambda scatter: scatter.between_std_in_own_stds,
+            key=lambda scatter: scatter.relative_between_session_std,
             default=None,
         )
 
     @property
-    def mixed(self) -> bool:
+    def is_mixture(self) -> bool:
         """Whether the pooled values are means of a mixture of specimens."""
-        return self.leading is not None
+        return self.leading_scatter is not None
 
     @property
     def is_one_specimen(self) -> bool:
         """Whether neither the files nor the estimates contradict a single specimen."""
-        return len(self.specimens) < _MIN_SESSIONS and not self.mixed
+        return len(self.specimens) < _MIN_COMPARED_SESSIONS and not self.is_mixture
 
     def scatter_of(self, quantity: str) -> Heterogeneity | None:
         """Return the between-session scatter of a quantity, or None if it was not tested."""
@@ -163,7 +163,7 @@ class Homogeneity:
     def is_mixed(self, quantity: str) -> bool:
         """Return whether the pooled value of a quantity is the mean of a mixture."""
         scatter = self.scatter_of(quantity)
-        return scatter is not None and scatter.mixed
+        return scatter is not None and scatter.is_mixture
 
 
 def homogeneity(
@@ -190,7 +190,7 @@ def homogeneity(
     values_by_quantity = {
         quantity: quantity_values
         for quantity, quantity_values in values_by_quantity.items()
-        if len(quantity_values) >= _MIN_SESSIONS
+        if len(quantity_values) >= _MIN_COMPARED_SESSIONS
     }
     significance_level = SIGNIFICANCE_LEVEL / max(len(values_by_quantity), 1)
     return Homogeneity(
@@ -205,12 +205,12 @@ def homogeneity(
 
 def _mode_values(
     estimates: Sequence[tuple[str, RecordEstimate]],
-) -> Iterator[tuple[str, SessionValues]]:
+) -> Iterator[tuple[str, SessionEstimates]]:
     """Yield name and session values of each quantity of the modes that all sessions have."""
     mode_count = min((len(estimate.fit.modes) for _, estimate in estimates), default=0)
     for quantity, std in _MODE_QUANTITIES.items():
         for mode_index in range(mode_count):
-            session_values = (
+            session_estimates = (
                 (
                     file_name,
                     getattr(estimate.fit.modes[mode_index], quantity),
@@ -218,16 +218,16 @@ def _mode_values(
                 )
                 for file_name, estimate in estimates
             )
-            yield f"{quantity}_{mode_index + 1}", _with_known_std(session_values)
+            yield f"{quantity}_{mode_index + 1}", _drop_unknown_std(session_estimates)
 
 
 def _parameter_values(
     sessions: Sequence[SessionAnalysis], freest_fit: PooledEstimate
-) -> Iterator[tuple[str, SessionValues]]:
+) -> Iterator[tuple[str, SessionEstimates]]:
     """Yield name and session values of each pooled parameter."""
     for parameter in freest_fit.parameters:
         parameter_name = parameter.name
-        session_values = (
+        session_estimates = (
             (
                 session.name,
                 estimate.fit.parameters[parameter_name],
@@ -237,39 +237,42 @@ def _parameter_values(
             for estimate in session.record_estimates
             if estimate.name == freest_fit.name and parameter_name in estimate.fit.determined
         )
-        yield parameter_name, _with_known_std(session_values)
+        yield parameter_name, _drop_unknown_std(session_estimates)
 
 
-def _with_known_std(session_values: Iterator[tuple[str, float, float]]) -> SessionValues:
+def _drop_unknown_std(session_estimates: Iterator[tuple[str, float, float]]) -> SessionEstimates:
     """Return the entries whose standard deviation is finite and positive."""
-    return tuple(entry for entry in session_values if math.isfinite(entry[2]) and entry[2] > 0)
+    return tuple(entry for entry in session_estimates if math.isfinite(entry[2]) and entry[2] > 0)
 
 
 def _test_heterogeneity(
-    quantity: str, session_values: SessionValues, significance_level: float
+    quantity: str, session_estimates: SessionEstimates, significance_level: float
 ) -> Heterogeneity:
     """Return the between-session scatter of a quantity, tested at a significance level."""
-    estimates, std = np.array([entry[1:] for entry in session_values]).T
+    estimates, std = np.array([entry[1:] for entry in session_estimates]).T
     is_logarithmic = quantity in LOGARITHMIC_PARAMETERS
     if is_logarithmic:
         estimates, std = np.log(estimates), std / estimates
     pooled_effects = random_effects(estimates[:, None], (std**2)[:, None, None])
-    p_value = float(chi_square_p_value(pooled_effects.cochran_q[0], len(session_values) - 1))
+    p_value = float(chi_square_p_value(pooled_effects.cochran_q[0], len(session_estimates) - 1))
     mean = math.exp(pooled_effects.mean[0]) if is_logarithmic else float(pooled_effects.mean[0])
     is_significant = p_value < significance_level
     session_groups = split_groups(estimates, std) if is_significant else ()
     q = float(pooled_effects.cochran_q[0])
     return Heterogeneity(
         quantity=quantity,
-        values=session_values,
+        values=session_estimates,
         mean=mean,
-        between_std=float(pooled_effects.between_std[0]) * (mean if is_logarithmic else 1.0),
+        between_session_std=float(pooled_effects.between_session_std[0])
+        * (mean if is_logarithmic else 1.0),
         cochran_q=q,
-        chance=p_value,
-        mixed=is_significant
-        and (bool(session_groups) or q * (1 - _MIXTURE_I_SQUARED) >= len(session_values) - 1),
+        p_value=p_value,
+        is_mixture=is_significant
+        and (
+            bool(session_groups) or q * (1 - _MIN_MIXTURE_I_SQUARED) >= len(session_estimates) - 1
+        ),
         groups=tuple(
-            tuple(session_values[session_index][0] for session_index in sorted(group))
+            tuple(session_estimates[session_index][0] for session_index in sorted(group))
             for group in session_groups
         ),
     )
@@ -282,15 +285,15 @@ def split_groups(
 
     The estimates of the sessions and their standard deviations have the shape (K,). There are at
     most half as many groups as sessions, rounded up, so that one group or more has two members. A
-    gap is clear if it exceeds `_CLEAR_GAP_STDS` times the standard deviation within the groups, or
-    the standard deviation of a single session if this is larger. Without clear gaps, there are no
-    groups.
+    gap is clear if it exceeds `_MIN_GROUP_GAP_STDS` times the standard deviation within the groups,
+    or the standard deviation of a single session if this is larger. Without clear gaps, there are
+    no groups.
     """
     sorted_indices = np.argsort(estimates)
     value_gaps = np.diff(estimates[sorted_indices])
-    session_std = math.sqrt(float(np.mean(std**2)))
+    rms_session_std = math.sqrt(float(np.mean(std**2)))
     best_groups: tuple[tuple[int, ...], ...] = ()
-    largest_ratio = _CLEAR_GAP_STDS
+    largest_relative_gap = _MIN_GROUP_GAP_STDS
     for group_count in range(2, (sorted_indices.size + 1) // 2 + 1):
         cut_indices = np.sort(np.argsort(value_gaps)[1 - group_count :]) + 1
         candidate_groups = np.split(sorted_indices, cut_indices)
@@ -299,12 +302,12 @@ def split_groups(
             for group in candidate_groups
         )
         group_std = max(
-            math.sqrt(squared_deviations / (sorted_indices.size - group_count)), session_std
+            math.sqrt(squared_deviations / (sorted_indices.size - group_count)), rms_session_std
         )
-        smallest_gap = float(value_gaps[cut_indices - 1].min()) / group_std
-        if smallest_gap > largest_ratio:
-            largest_ratio, best_groups = (
-                smallest_gap,
+        smallest_relative_gap = float(value_gaps[cut_indices - 1].min()) / group_std
+        if smallest_relative_gap > largest_relative_gap:
+            largest_relative_gap, best_groups = (
+                smallest_relative_gap,
                 tuple(tuple(group.tolist()) for group in candidate_groups),
             )
     return best_groups

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import RandomEffects
 
-_MIN_SESSIONS: Final = 2
+_MIN_POOLED_SESSIONS: Final = 2
 """Smallest number of sessions that can be pooled."""
-_COMMON_MODE_FRACTION: Final = 0.9
+_MIN_COMMON_MODE_FRACTION: Final = 0.9
 """Smallest fraction of the sessions that must show a mode for the mode to be pooled."""
 
 _SIGNIFICANCE_LEVEL: Final = 0.01
@@ -53,31 +53,31 @@ class PooledModalModel(ModalEstimate):
     ----------
     sessions : int
         Number of sessions used: those that show all modes of the model.
-    between_std : ndarray, shape (4 n,)
+    between_session_std : ndarray, shape (4 n,)
         Scatter of each modal constant between sessions beyond their own uncertainties.
-    stated : tuple of float
+    stated_uniformities : tuple of float
         Distinct values stated in the files for the relative deviation of mode frequencies from
         those of a uniform beam, in increasing order.
     uniform_beam : UniformBeamTest
         Test of whether a uniform beam predicts the pooled constants.
     tolerant : TolerantEstimate or None
-        Parameters estimated with the largest value of `stated` as tolerance. None if all files
-        state 0 and no tilt of the axis, or if there is a single mode.
+        Parameters estimated with the largest value of `stated_uniformities` as tolerance. None if
+        all files state 0 and no tilt of the axis, or if there is a single mode.
     """
 
     sessions: int
-    between_std: NDArray[np.float64]
-    stated: tuple[float, ...]
+    between_session_std: NDArray[np.float64]
+    stated_uniformities: tuple[float, ...]
     uniform_beam: UniformBeamTest
     tolerant: TolerantEstimate | None
 
     @property
-    def half_width(self) -> float:
+    def half_width_in_stds(self) -> float:
         """Ratio of the half width of a 95 % interval to the standard deviation, by Student's t."""
         return student_t_quantile(0.95, self.sessions - 1)
 
     @property
-    def leads(self) -> bool:
+    def replaces_beam_modes(self) -> bool:
         """Whether the report shows the modes of this model instead of those of a uniform beam."""
         return self.tolerant is not None or self.uniform_beam.status == "refused"
 
@@ -87,7 +87,7 @@ class PooledModalModel(ModalEstimate):
         pooled_modes = []
         for mode_number in self.numbers:
             mode, (inertia, relative_std) = self.mode(mode_number), self.inertia(mode_number)
-            scatter_std = self.between_std[self.rows([mode_number])]
+            scatter_std = self.between_session_std[self.rows([mode_number])]
             pooled_modes.append(
                 PooledMode(
                     number=mode_number,
@@ -107,7 +107,7 @@ class PooledModalModel(ModalEstimate):
         return tuple(pooled_modes)
 
 
-def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None:
+def pooled_modal_model(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None:
     """Return the modal model of all sessions, or None if no two sessions show a common mode."""
     modal_sessions = [
         session for session in sessions if session.modal is not None and session.nominal is not None
@@ -120,7 +120,7 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None
         for session in modal_sessions
         if session.modal and set(common_modes) <= set(session.modal.visible)
     ]
-    if not common_modes or len(used_sessions) < _MIN_SESSIONS:
+    if not common_modes or len(used_sessions) < _MIN_POOLED_SESSIONS:
         return None
     pooled_constants = _pooled_constants(
         [session.modal for session in used_sessions if session.modal is not None], common_modes
@@ -132,7 +132,9 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None
     assert nominal_plant is not None
     # The tilts of the sessions agree where they are stated (`Experiment.difference`).
     tilts_deg = [session.experiment.axis_tilt_deg for session in used_sessions]
-    tilt_deg = next((each_deg for each_deg in tilts_deg if each_deg is not None), None)
+    tilt_deg = next(
+        (session_tilt_deg for session_tilt_deg in tilts_deg if session_tilt_deg is not None), None
+    )
     beam_test = uniform_beam_test(modal_estimate, nominal_plant, tilt_deg)
     stated_uniformities = tuple(sorted({session.uniformity for session in used_sessions}))
     tolerant_fit = None
@@ -155,20 +157,24 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None
         constants=modal_estimate.constants,
         joint_covariance=pooled_constants.covariance,
         sessions=len(used_sessions),
-        between_std=pooled_constants.between_std[: modal_estimate.constants.size],
-        stated=stated_uniformities,
+        between_session_std=pooled_constants.between_session_std[: modal_estimate.constants.size],
+        stated_uniformities=stated_uniformities,
         uniform_beam=beam_test,
         tolerant=tolerant_fit,
     )
 
 
 def _modal_estimate(
-    modes: tuple[int, ...], joint_values: NDArray[np.float64], joint_covariance: NDArray[np.float64]
+    mode_numbers: tuple[int, ...],
+    constants_and_background: NDArray[np.float64],
+    joint_covariance: NDArray[np.float64],
 ) -> ModalEstimate:
     """Return the modal estimate of some modes, whose constants and background are one vector."""
-    constants, background = np.split(joint_values, [len(modes) * len(MODE_CONSTANT_NAMES)])
+    constants, background = np.split(
+        constants_and_background, [len(mode_numbers) * len(MODE_CONSTANT_NAMES)]
+    )
     modal_model = ModalModel.from_constants(constants, background.tolist())
-    return ModalEstimate(modal_model, modes, constants, joint_covariance)
+    return ModalEstimate(modal_model, mode_numbers, constants, joint_covariance)
 
 
 def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
@@ -177,7 +183,7 @@ def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
     Such a mode is visible in at least 90 % of the sessions, and in at least two.
     """
     mode_counts = Counter(mode_number for estimate in estimates for mode_number in estimate.visible)
-    min_sessions = max(_COMMON_MODE_FRACTION * len(estimates), _MIN_SESSIONS)
+    min_sessions = max(_MIN_COMMON_MODE_FRACTION * len(estimates), _MIN_POOLED_SESSIONS)
     return tuple(
         sorted(
             mode_number
@@ -187,31 +193,38 @@ def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
     )
 
 
-def _pooled_constants(estimates: Sequence[ModalEstimate], modes: Sequence[int]) -> RandomEffects:
+def _pooled_constants(
+    estimates: Sequence[ModalEstimate], mode_numbers: Sequence[int]
+) -> RandomEffects:
     """Pool the constants of some modes, and the background, over the estimates of all sessions.
 
     Residue phases are first shifted by whole turns to be nearest to those of the first estimate.
     """
     session_values, session_covariances = map(
-        np.array, zip(*(_constants_and_background(e, modes) for e in estimates), strict=True)
+        np.array, zip(*(_constants_and_background(e, mode_numbers) for e in estimates), strict=True)
     )
     residue_phases = session_values[
-        :, _RESIDUE_PHASE_INDEX : len(modes) * len(MODE_CONSTANT_NAMES) : len(MODE_CONSTANT_NAMES)
+        :,
+        _RESIDUE_PHASE_INDEX : len(mode_numbers) * len(MODE_CONSTANT_NAMES) : len(
+            MODE_CONSTANT_NAMES
+        ),
     ]
     residue_phases -= 2 * math.pi * np.round((residue_phases - residue_phases[0]) / (2 * math.pi))
     return random_effects(session_values, session_covariances)
 
 
 def _constants_and_background(
-    estimate: ModalEstimate, modes: Sequence[int]
+    estimate: ModalEstimate, mode_numbers: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the modal constants and the background of a session in one vector, with covariance."""
-    constant_indices = estimate.rows(modes)
+    constant_indices = estimate.rows(mode_numbers)
     indices = np.concatenate(
         [constant_indices, np.arange(estimate.constants.size, len(estimate.joint_covariance))]
     )
-    joint_values = np.concatenate([estimate.constants[constant_indices], estimate.model.background])
-    return joint_values, estimate.joint_covariance[np.ix_(indices, indices)]
+    constants_and_background = np.concatenate(
+        [estimate.constants[constant_indices], estimate.model.background]
+    )
+    return constants_and_background, estimate.joint_covariance[np.ix_(indices, indices)]
 
 
 # Rising and falling sweeps
@@ -269,34 +282,38 @@ class OppositeSweeps:
 def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | None:
     """Compare rising with falling sweeps by the modes of both; None if they have none in common."""
     rising_estimates = [
-        session.modal for session in sessions if session.modal and session.experiment.rising is True
+        session.modal
+        for session in sessions
+        if session.modal and session.experiment.is_rising is True
     ]
     falling_estimates = [
         session.modal
         for session in sessions
-        if session.modal and session.experiment.rising is False
+        if session.modal and session.experiment.is_rising is False
     ]
     if not rising_estimates or not falling_estimates:
         return None
     common_modes = set.intersection(
         *(set(estimate.visible) for estimate in (*rising_estimates, *falling_estimates))
     )
-    modes = tuple(sorted(common_modes))
-    if not modes:
+    mode_numbers = tuple(sorted(common_modes))
+    if not mode_numbers:
         return None
     pooled_values, covariances = zip(
-        *_pool_groups((rising_estimates, falling_estimates), modes), strict=True
+        *_pool_groups((rising_estimates, falling_estimates), mode_numbers), strict=True
     )
     value_difference, covariance = (
         pooled_values[1] - pooled_values[0],
         covariances[0] + covariances[1],
     )
-    phases = value_difference[
-        _RESIDUE_PHASE_INDEX : len(modes) * len(MODE_CONSTANT_NAMES) : len(MODE_CONSTANT_NAMES)
+    phase_differences = value_difference[
+        _RESIDUE_PHASE_INDEX : len(mode_numbers) * len(MODE_CONSTANT_NAMES) : len(
+            MODE_CONSTANT_NAMES
+        )
     ]  # a view into `value_difference`
-    phases -= 2 * math.pi * np.round(phases / (2 * math.pi))
+    phase_differences -= 2 * math.pi * np.round(phase_differences / (2 * math.pi))
     mode_changes = []
-    for mode_index, mode in enumerate(modes):
+    for mode_index, mode_number in enumerate(mode_numbers):
         mode_slice = slice(
             len(MODE_CONSTANT_NAMES) * mode_index, len(MODE_CONSTANT_NAMES) * (mode_index + 1)
         )
@@ -313,24 +330,24 @@ def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | Non
         std = np.sqrt(np.diag(mode_covariance))
         mode_changes.append(
             ModeInSweeps(
-                mode,
+                mode_number,
                 float(mode_difference[_LN_FREQUENCY_INDEX]),
                 float(std[_LN_FREQUENCY_INDEX]),
                 float(mode_difference[_LN_DAMPING_RATIO_INDEX]),
                 float(std[_LN_DAMPING_RATIO_INDEX]),
-                p_value, p_value < _SIGNIFICANCE_LEVEL / len(modes),
+                p_value, p_value < _SIGNIFICANCE_LEVEL / len(mode_numbers),
             )
         )  # fmt: skip
     return OppositeSweeps(len(rising_estimates), len(falling_estimates), tuple(mode_changes))
 
 
 def _pool_groups(
-    groups: Iterable[Sequence[ModalEstimate]], modes: Sequence[int]
+    estimate_groups: Iterable[Sequence[ModalEstimate]], mode_numbers: Sequence[int]
 ) -> Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Yield pooled constants and background of each group of estimates, with their covariance."""
-    for group_estimates in groups:
-        if len(group_estimates) < _MIN_SESSIONS:
-            yield _constants_and_background(group_estimates[0], modes)
+    for group_estimates in estimate_groups:
+        if len(group_estimates) < _MIN_POOLED_SESSIONS:
+            yield _constants_and_background(group_estimates[0], mode_numbers)
         else:
-            pooled_effects = _pooled_constants(group_estimates, modes)
+            pooled_effects = _pooled_constants(group_estimates, mode_numbers)
             yield pooled_effects.mean, pooled_effects.covariance

@@ -28,10 +28,10 @@ PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "
 
 _UNEXPLAINED_REASON: Final = "part of the records is unexplained"
 """Reason for doubt in an order if too many sessions have a residual that is not noise."""
-_ADEQUATE_FRACTION: Final = 0.9
+_MIN_ADEQUATE_FRACTION: Final = 0.9
 """Smallest fraction of sessions with a residual of mere noise at which an order is reported."""
 
-_EXCLUSION_LEVEL: Final = 0.999
+_EXCLUSION_CONFIDENCE: Final = 0.999
 """Confidence level at which an order of 1 is excluded: one false exclusion in 1000 campaigns."""
 
 
@@ -100,18 +100,19 @@ def pooled_order(
     session_orders = [
         verdict.alpha if order == "alpha" else verdict.lambda_ for verdict in verdicts
     ]
-    single_statuses: dict[str, int] = dict(
+    session_counts_by_status: dict[str, int] = dict(
         Counter(str(session_order.status) for session_order in session_orders).most_common()
     )
     freest_fit = freest_estimate(ranked_estimates)
     assert freest_fit is not None
-    parameter = freest_fit.by_name.get(order)
+    parameter = freest_fit.parameters_by_name.get(order)
     order_status, doubt_reason = _status_and_reason(
-        order, ranked_estimates, freest_fit, verdicts, single_statuses
+        order, ranked_estimates, freest_fit, verdicts, session_counts_by_status
     )
     is_estimated = parameter is not None and order_status not in ("not identifiable", "absent")
     is_mixture = is_estimated and (
-        homogeneity.is_mixed(order) or (homogeneity.mixed and freest_fit.sessions < len(verdicts))
+        homogeneity.is_mixed(order)
+        or (homogeneity.is_mixture and freest_fit.sessions < len(verdicts))
     )
     if is_mixture:
         order_status = "open"
@@ -126,7 +127,7 @@ def pooled_order(
         else None,
         interval=parameter.interval if parameter and is_estimated else None,
         reason=doubt_reason,
-        alone=single_statuses,
+        alone=session_counts_by_status,
         mixture=is_mixture,
         std=parameter.std if parameter and is_estimated else None,
     )
@@ -137,17 +138,17 @@ def tolerant_pooled_order(
     estimate: TolerantEstimate,
     verdicts: Sequence[Verdict],
     *,
-    refused: bool,
+    is_beam_refused: bool,
 ) -> PooledOrder:
     """Assess one order of the damping, with a tolerance for deviations from a uniform beam.
 
     `exact_order` is the same order on an exactly uniform beam, and `estimate` is from the modal
-    constants of all sessions. `refused` states whether a uniform beam does not predict the pooled
-    constants.
+    constants of all sessions. `is_beam_refused` states whether a uniform beam does not predict the
+    pooled constants.
     """
     order = exact_order.order
     order_status, doubt_reason = order_status_with_geometry_tolerance(
-        order, estimate, refused=refused
+        order, estimate, refused=is_beam_refused
     )
     tolerant_order = PooledOrder(
         order=order,
@@ -163,13 +164,13 @@ def tolerant_pooled_order(
         return replace(tolerant_order.with_doubt(exact_order.reason), mixture=True)
     if not _nearly_all_adequate(verdicts):
         return tolerant_order.with_doubt(_UNEXPLAINED_REASON)
-    final_reason = effective_reason(estimate, order, refused=refused)
+    final_reason = effective_reason(estimate, order, refused=is_beam_refused)
     return tolerant_order if final_reason is None else tolerant_order.with_doubt(final_reason)
 
 
 def _nearly_all_adequate(verdicts: Sequence[Verdict]) -> bool:
     """Return whether the residual is noise in at least 90 % of the sessions."""
-    return sum(verdict.adequate for verdict in verdicts) >= _ADEQUATE_FRACTION * len(verdicts)
+    return sum(verdict.adequate for verdict in verdicts) >= _MIN_ADEQUATE_FRACTION * len(verdicts)
 
 
 def rival_estimates(
@@ -191,33 +192,36 @@ def _status_and_reason(
     ranked_estimates: Sequence[PooledEstimate],
     freest_fit: PooledEstimate,
     verdicts: Sequence[Verdict],
-    single_statuses: Mapping[str, int],
+    session_counts_by_status: Mapping[str, int],
 ) -> tuple[PooledStatus, str | None]:
     """Return the status of an order of the damping, and the reason to doubt the order or None."""
     structure = STRUCTURES[freest_fit.structure]
     usual_mode_count = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[
         0
     ][0]
-    several_modes = 2 * sum(len(v.visible_modes) > 1 for v in verdicts) > len(verdicts)
+    most_show_several_modes = 2 * sum(len(v.visible_modes) > 1 for v in verdicts) > len(verdicts)
     if few_modes_reason := too_few_modes(
-        structure, max(usual_mode_count, 2) if several_modes else 1
+        structure, max(usual_mode_count, 2) if most_show_several_modes else 1
     ):
         return "not identifiable", few_modes_reason
     if not structure.has(order):
         return "absent", "no such damping is visible"
-    parameter = freest_fit.by_name.get(order)
+    parameter = freest_fit.parameters_by_name.get(order)
     if (
         parameter is None
         and structure.fixed.get(order) == 1.0
-        and next(iter(single_statuses)) == "compatible"
+        and next(iter(session_counts_by_status)) == "compatible"
     ):
         # The order is free in no fitted structure, so only the sessions' verdicts are available.
         return "compatible", None
-    if parameter is None or _relative_width(parameter.interval) > MAX_IDENTIFIABLE_FRACTION:
+    if (
+        parameter is None
+        or _relative_interval_width(parameter.interval) > MAX_IDENTIFIABLE_FRACTION
+    ):
         return "not identifiable", "the sessions do not determine the order"
     if not _nearly_all_adequate(verdicts):
         return "open", _UNEXPLAINED_REASON
-    integer_rivals = [
+    rivals_with_order_one = [
         estimate
         for estimate in (ranked_estimates[0], *rival_estimates(ranked_estimates, BIC_DECISIVE))
         if _has_order_one(estimate, order)
@@ -225,7 +229,9 @@ def _status_and_reason(
     lower_limit, upper_limit = parameter.interval
     if lower_limit <= 1 <= upper_limit:
         return "compatible", None
-    is_one_excluded = not integer_rivals and _excludes_one(parameter, freest_fit.sessions)
+    is_one_excluded = not rivals_with_order_one and _excludes_order_one(
+        parameter, freest_fit.sessions
+    )
     return ("fractional" if is_one_excluded else "open"), None
 
 
@@ -234,13 +240,14 @@ def _has_order_one(estimate: PooledEstimate, order: OrderName) -> bool:
     return STRUCTURES[estimate.structure].fixed.get(order) == 1.0
 
 
-def _excludes_one(order: PooledParameter, session_count: int) -> bool:
-    """Return whether an order differs from 1 at the level `_EXCLUSION_LEVEL`."""
+def _excludes_order_one(order: PooledParameter, session_count: int) -> bool:
+    """Return whether an order differs from 1 at the level `_EXCLUSION_CONFIDENCE`."""
     return (
-        abs(order.value - 1) > student_t_quantile(_EXCLUSION_LEVEL, session_count - 1) * order.std
+        abs(order.value - 1)
+        > student_t_quantile(_EXCLUSION_CONFIDENCE, session_count - 1) * order.std
     )
 
 
-def _relative_width(order_interval: tuple[float, float]) -> float:
+def _relative_interval_width(order_interval: tuple[float, float]) -> float:
     """Return the width of an interval as a fraction of the range searched for orders."""
     return (order_interval[1] - order_interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])

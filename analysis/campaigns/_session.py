@@ -38,7 +38,7 @@ _NO_RESPONSE: Final = FrequencyResponse(
 """Empty frequency response, for a session without Welch's method."""
 _PAPER_SETTINGS: Final = WelchSettings()
 """Welch settings of the paper."""
-_NO_INDICES: Final = FitIndices(math.nan, math.nan, math.nan)
+_NO_FIT_INDICES: Final = FitIndices(math.nan, math.nan, math.nan)
 """Fit indices (NaN) of a model if there is no measured response to compare it with."""
 
 
@@ -132,7 +132,7 @@ class SessionAnalysis:
         )
 
     @property
-    def selected(self) -> str | None:
+    def selected_structure(self) -> str | None:
         """Name of the damping structure that this session selects; None if it has no verdict."""
         if self.verdict is None:
             return None
@@ -195,7 +195,7 @@ def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | 
             record,
             session_task.settings,
             session_task.band_hz,
-            optional=bool(session_task.structures),
+            is_optional=bool(session_task.structures),
         )
     except session_errors as error:
         return SessionFailure(path, str(error), experiment)
@@ -294,13 +294,13 @@ def _record_estimates(
     omega = 2 * np.pi * measured_response.frequency_hz
     response_grid = ResponseGrid(1j * omega)
 
-    def estimate_of(candidate: Candidate) -> RecordEstimate:
+    def record_estimate(candidate: Candidate) -> RecordEstimate:
         """Return the results of a fit that the campaign stores, with their fit indices."""
         # The delay stated in the file is removed from the measured response.
         plant = candidate.fit.plant
         plant = replace(plant, delay_s=plant.delay_s - delay_s)
         if not omega.size:
-            return RecordEstimate.from_candidate(candidate, _NO_INDICES)
+            return RecordEstimate.from_candidate(candidate, _NO_FIT_INDICES)
         model_response = response_grid.evaluate(plant)[0]
         return RecordEstimate.from_candidate(
             candidate, fit_indices(omega, measured_response.response, model_response)
@@ -308,7 +308,7 @@ def _record_estimates(
 
     structure_order = list(STRUCTURES)
     requested_estimates = [
-        estimate_of(candidate)
+        record_estimate(candidate)
         for candidate in whole_record.selection.candidates
         if candidate.fit.structure.name in structure_names or candidate.fit is whole_record.fit
     ]

@@ -182,7 +182,7 @@ def best_models(models: Sequence[NominalModel]) -> tuple[NominalModel, ...]:
     return (
         paper_models
         if len(paper_models) == len(PAPER_BEST_MODELS)
-        else tuple(sorted(models, key=_wmse_key)[:2])
+        else tuple(sorted(models, key=_mean_wmse_sort_key)[:2])
     )
 
 
@@ -257,7 +257,7 @@ def _mean_parameters(welch_models: Sequence[FittedModel]) -> dict[str, float]:
     }
 
 
-def _wmse_key(model: NominalModel) -> float:
+def _mean_wmse_sort_key(model: NominalModel) -> float:
     """Return the sorting key of a model: its weighted mean square error, averaged over sessions."""
     return model.mean_wmse
 
@@ -278,11 +278,11 @@ class RankedStructure:
     ----------
     structure : str
         Name of the structure.
-    fitted : int
+    fitted_sessions : int
         Number of sessions to which the structure was fitted.
-    determined : int
+    determining_sessions : int
         Number of the sessions fitted that determine the structure's damping.
-    selected_alone : int
+    selecting_sessions : int
         Number of sessions that select the structure by themselves.
     misfit : float
         Misfit of the pooled estimate (see `PooledEstimate`). If the structure is not pooled, the
@@ -291,17 +291,17 @@ class RankedStructure:
         BIC of all sessions together less the lowest BIC of a pooled structure; None if the
         structure was fitted to some sessions only. Negative if the structure fits better, but too
         few sessions determine it.
-    pooled : bool
+    is_pooled : bool
         Whether the structure was fitted to all sessions, and at least two determine it.
     """
 
     structure: str
-    fitted: int
-    determined: int
-    selected_alone: int
+    fitted_sessions: int
+    determining_sessions: int
+    selecting_sessions: int
     misfit: float
     bic_above_lowest: float | None
-    pooled: bool
+    is_pooled: bool
 
     @property
     def name(self) -> str:
@@ -318,37 +318,39 @@ def ranked_structures(
     """
     estimates_by_name = estimates_by_structure(sessions)
     fitted_sessions = max(map(len, estimates_by_name.values()), default=0)
-    bic = {
+    bic_by_name = {
         structure_name: pooled_bic(estimates)
         for structure_name, estimates in estimates_by_name.items()
         if len(estimates) == fitted_sessions
     }
-    single_selections = Counter(session.selected for session in sessions)
+    selections_by_structure = Counter(session.selected_structure for session in sessions)
     misfit_by_name = {
         pooled_estimate.name: pooled_estimate.misfit for pooled_estimate in pooled_fits
     }
-    lowest_bic = pooled_fits[0].bic if pooled_fits else min(bic.values(), default=0.0)
+    lowest_bic = pooled_fits[0].bic if pooled_fits else min(bic_by_name.values(), default=0.0)
     ranked_list = [
         RankedStructure(
             structure=structure_name,
-            fitted=len(estimates),
-            determined=sum(map(determines_damping, estimates)),
-            selected_alone=single_selections[structure_name],
+            fitted_sessions=len(estimates),
+            determining_sessions=sum(map(determines_damping, estimates)),
+            selecting_sessions=selections_by_structure[structure_name],
             misfit=misfit_by_name.get(structure_name)
             or float(
                 np.median(
                     [estimate.fit.cost / estimate.fit.degrees_of_freedom for estimate in estimates]
                 )
             ),
-            bic_above_lowest=bic[structure_name] - lowest_bic if structure_name in bic else None,
-            pooled=structure_name in misfit_by_name,
+            bic_above_lowest=bic_by_name[structure_name] - lowest_bic
+            if structure_name in bic_by_name
+            else None,
+            is_pooled=structure_name in misfit_by_name,
         )
         for structure_name, estimates in estimates_by_name.items()
     ]
-    return tuple(sorted(ranked_list, key=_rank_key))
+    return tuple(sorted(ranked_list, key=_rank_sort_key))
 
 
-def _rank_key(structure: RankedStructure) -> tuple[bool, bool, float]:
+def _rank_sort_key(structure: RankedStructure) -> tuple[bool, bool, float]:
     """Return the sorting key of a damping structure: pooled ones first, then by BIC."""
     bic = structure.bic_above_lowest
-    return not structure.pooled, bic is None, bic or 0.0
+    return not structure.is_pooled, bic is None, bic or 0.0

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.workers import Workers
 
-MIN_SESSIONS: Final = 3
+MIN_VALIDATED_SESSIONS: Final = 3
 """Smallest number of sessions for which each can be predicted from the others, as pooling needs
 two."""
 
@@ -120,15 +120,15 @@ def validate(
     except CampaignError as error:
         return (), tuple(FailedPrediction(session.path, str(error)) for session in sessions)
     prediction_errors: list[LeaveOneOutResult] = []
-    lost_sessions: list[FailedPrediction] = []
+    failed_predictions: list[FailedPrediction] = []
     for session, task_result in zip(sessions, task_results, strict=True):
         if isinstance(task_result, FailedTask):
-            lost_sessions.append(FailedPrediction(session.path, task_result.reason))
+            failed_predictions.append(FailedPrediction(session.path, task_result.reason))
         elif isinstance(task_result, FailedPrediction):
-            lost_sessions.append(task_result)
+            failed_predictions.append(task_result)
         else:
             prediction_errors.extend(task_result)
-    return tuple(prediction_errors), tuple(lost_sessions)
+    return tuple(prediction_errors), tuple(failed_predictions)
 
 
 def leave_one_out_results(
@@ -191,7 +191,7 @@ def group_errors_by_model(
     error_groups = [(*key, tuple(group_errors)) for key, group_errors in errors_by_model.items()]
     return sorted(
         error_groups,
-        key=lambda group_errors: float(
-            np.mean([left_out_error.error for left_out_error in group_errors[3]])
+        key=lambda error_group: float(
+            np.mean([left_out_error.error for left_out_error in error_group[3]])
         ),
     )

@@ -103,7 +103,7 @@ def common_findings(sessions: Sequence[SessionAnalysis]) -> tuple[CommonFinding,
         _common_finding(effect_findings, len(examined_sessions))
         for effect_findings in findings_by_effect.values()
     ]
-    return tuple(sorted(counted_findings, key=lambda effect: -len(effect.files)))
+    return tuple(sorted(counted_findings, key=lambda finding: -len(finding.files)))
 
 
 def _common_finding(
@@ -201,14 +201,14 @@ def campaign_verdict(
     pooled: Sequence[PooledEstimate],
     homogeneity: Homogeneity,
     validation: Sequence[LeaveOneOutResult],
-    lost_sessions: Sequence[FailedPrediction],
+    failed_predictions: Sequence[FailedPrediction],
     biases: Sequence[WelchBias] = (),
     modal_model: PooledModalModel | None = None,
 ) -> CampaignVerdict | None:
     """Return the verdict on a campaign, or None if no damping structure could be pooled.
 
     The pooled estimates are in the order of rising BIC. `validation` are the errors of the sessions
-    that were predicted from the others, and `lost_sessions` the sessions that could not be.
+    that were predicted from the others, and `failed_predictions` the sessions that could not be.
     `biases` are differences of the Welch fits from the pooled estimates.
     """
     verdicts = [session.verdict for session in sessions if session.verdict is not None]
@@ -228,17 +228,19 @@ def campaign_verdict(
     is_beam_refused = modal_model is not None and modal_model.uniform_beam.status == "refused"
     findings = common_findings(sessions)
     close_rivals = rival_estimates(pooled, BIC_TIE)
-    single_selections = dict(
-        Counter(session.selected for session in sessions if session.selected).most_common()
+    selections_by_structure = dict(
+        Counter(
+            session.selected_structure for session in sessions if session.selected_structure
+        ).most_common()
     )
-    adequate_count = sum(verdict.adequate for verdict in verdicts)
+    adequate_session_count = sum(verdict.adequate for verdict in verdicts)
     dissenting_sessions = _dissenting_sessions(sessions, lowest_bic_estimate)
-    advice_counts = Counter(
+    recommendation_counts = Counter(
         experiment for verdict in verdicts for experiment in verdict.experiments
     )
-    common_advice = [
+    common_recommendations = [
         experiment
-        for experiment, advice_count in advice_counts.most_common()
+        for experiment, advice_count in recommendation_counts.most_common()
         if 2 * advice_count > len(verdicts)
     ]
     return CampaignVerdict(
@@ -246,30 +248,32 @@ def campaign_verdict(
         structure=lowest_bic_estimate.structure,
         rivals=tuple(rival.name for rival in close_rivals),
         sessions=len(verdicts),
-        alone=single_selections,
-        adequate=adequate_count,
+        alone=selections_by_structure,
+        adequate=adequate_session_count,
         alpha=alpha,
         lambda_=lambda_,
         findings=findings,
         dissent=dissenting_sessions,
         sweeps=sweep_comparison,
         sentences=(
-            *specimen_sentences.specimens(homogeneity),
+            *specimen_sentences.describe_specimens(homogeneity),
             sentences.describe_orders(freest_fit, alpha, lambda_, validation),
             *_describe_parameters(
-                freest_fit, lowest_bic_estimate, modal_model, adequate_count, len(verdicts)
+                freest_fit, lowest_bic_estimate, modal_model, adequate_session_count, len(verdicts)
             ),
-            *_describe_modes(freest_fit, modal_model, mixed=homogeneity.mixed),
-            *_describe_slopes(alpha, lambda_, modal_model),
+            *_describe_modes(freest_fit, modal_model, is_mixture=homogeneity.is_mixture),
+            *_describe_loss_slopes(alpha, lambda_, modal_model),
             *geometry.describe_sweeps(sweep_comparison),
             *geometry.describe_orders_if_exact(freest_fit, (alpha, lambda_), modal_model),
             *sentences.describe_welch_bias(
                 freest_fit,
                 biases,
                 _withheld_orders(alpha, lambda_),
-                comparable=not (homogeneity.mixed or is_beam_refused),
+                has_reference=not (homogeneity.is_mixture or is_beam_refused),
             ),
-            sentences.describe_selection(pooled, close_rivals, single_selections, len(verdicts)),
+            sentences.describe_selection(
+                pooled, close_rivals, selections_by_structure, len(verdicts)
+            ),
             *(finding.sentence for finding in findings),
             *sentences.describe_dissent(
                 [
@@ -278,13 +282,13 @@ def campaign_verdict(
                 ],
                 lowest_bic_estimate,
             ),
-            *([] if homogeneity.mixed else [sentences.describe_scatter(freest_fit)]),
+            *([] if homogeneity.is_mixture else [sentences.describe_scatter(freest_fit)]),
             *sentences.describe_prediction_errors(freest_fit, validation, len(sessions)),
-            *sentences.failed_predictions(lost_sessions, len(sessions)),
+            *sentences.describe_failed_predictions(failed_predictions, len(sessions)),
         ),
         experiments=(
             *geometry.recommend_sweeps(sweep_comparison, modal_model, sessions),
-            *common_advice,
+            *common_recommendations,
         ),
     )
 
@@ -305,7 +309,7 @@ def _final_order(
     if modal_model.tolerant is not None:
         is_beam_refused = modal_model.uniform_beam.status == "refused"
         return tolerant_pooled_order(
-            exact_order, modal_model.tolerant, verdicts, refused=is_beam_refused
+            exact_order, modal_model.tolerant, verdicts, is_beam_refused=is_beam_refused
         )
     refusal_reason = uniform_beam_refusal_reason(modal_model.uniform_beam)
     return exact_order if refusal_reason is None else exact_order.with_doubt(refusal_reason)
@@ -315,20 +319,22 @@ def _describe_parameters(
     freest_fit: PooledEstimate,
     lowest_bic_estimate: PooledEstimate,
     modal_model: PooledModalModel | None,
-    adequate_count: int,
+    adequate_session_count: int,
     session_count: int,
 ) -> tuple[str, ...]:
     """Describe the model of the reported parameters, how well it fits, and the loss factors."""
     uniformity_sentences = uniformity(modal_model.uniform_beam if modal_model else None)
     if modal_model is None or modal_model.tolerant is None:
-        residual_sentence = sentences.describe_residual(freest_fit, adequate_count, session_count)
+        residual_sentence = sentences.describe_residual(
+            freest_fit, adequate_session_count, session_count
+        )
         return (
             sentences.describe_structure(freest_fit, lowest_bic_estimate),
             *uniformity_sentences,
             residual_sentence,
             *sentences.describe_loss_factors(freest_fit.sizes),
         )
-    residual_sentence = sentences.describe_noise_sessions(adequate_count, session_count)
+    residual_sentence = sentences.describe_noise_sessions(adequate_session_count, session_count)
     return (
         geometry.describe_tolerance(modal_model, modal_model.tolerant),
         *uniformity_sentences,
@@ -340,21 +346,25 @@ def _describe_parameters(
 
 
 def _describe_modes(
-    freest_fit: PooledEstimate, modal_model: PooledModalModel | None, *, mixed: bool
+    freest_fit: PooledEstimate, modal_model: PooledModalModel | None, *, is_mixture: bool
 ) -> list[str]:
     """Describe the modes of the modal model if these are reported, else of the uniform beam."""
-    if modal_model is not None and modal_model.leads:
-        return sentences.describe_modes(modal_model.modes, modal_model.sessions, mixed=mixed)
-    return sentences.describe_modes(freest_fit.modes, freest_fit.sessions, mixed=mixed)
+    if modal_model is not None and modal_model.replaces_beam_modes:
+        return sentences.describe_modes(
+            modal_model.modes, modal_model.sessions, is_mixture=is_mixture
+        )
+    return sentences.describe_modes(freest_fit.modes, freest_fit.sessions, is_mixture=is_mixture)
 
 
-def _describe_slopes(
-    alpha: PooledOrder, lambda_: PooledOrder, modal: PooledModalModel | None
+def _describe_loss_slopes(
+    alpha: PooledOrder, lambda_: PooledOrder, modal_model: PooledModalModel | None
 ) -> tuple[str, str]:
     """Describe both orders of the damping, as slopes of the losses if the beam may be uneven."""
-    if modal is None or modal.tolerant is None:
+    if modal_model is None or modal_model.tolerant is None:
         return sentences.describe_order(alpha), sentences.describe_order(lambda_)
-    return geometry.describe_slope(alpha, modal), geometry.describe_slope(lambda_, modal)
+    return geometry.describe_loss_slope(alpha, modal_model), geometry.describe_loss_slope(
+        lambda_, modal_model
+    )
 
 
 def _withheld_orders(*orders: PooledOrder) -> frozenset[str]:
@@ -366,12 +376,16 @@ def _dissenting_sessions(
     sessions: Sequence[SessionAnalysis], lowest_bic_estimate: PooledEstimate
 ) -> tuple[DissentingSession, ...]:
     """Return the sessions that alone exclude the structure of the lowest BIC over all sessions."""
-    dissents = []
+    dissenting_sessions = []
     for session in sessions:
         estimates_by_name = {estimate.name: estimate for estimate in session.record_estimates}
         if estimates_by_name:
             own_estimate = min(estimates_by_name.values(), key=lambda estimate: estimate.bic)
             bic_margin = estimates_by_name[lowest_bic_estimate.name].bic - own_estimate.bic
             if bic_margin > BIC_DECISIVE:
-                dissents.append(DissentingSession(session.name, own_estimate.name, bic_margin))
-    return tuple(sorted(dissents, key=lambda dissenter: -dissenter.margin))
+                dissenting_sessions.append(
+                    DissentingSession(session.name, own_estimate.name, bic_margin)
+                )
+    return tuple(
+        sorted(dissenting_sessions, key=lambda dissenting_session: -dissenting_session.margin)
+    )

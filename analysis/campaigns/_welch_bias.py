@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
 
-LARGEST_MISFIT: Final = 1.5
+MAX_REFERENCE_MISFIT: Final = 1.5
 """Largest misfit (residual power relative to the noise) of a structure that describes the
 records."""
 
 _CONFIDENCE_LEVEL: Final = 0.999
 """Confidence level at which a bias is significant."""
-_MIN_SESSIONS: Final = 2
+_MIN_WELCH_SESSIONS: Final = 2
 """Smallest number of sessions with Welch fits for which a bias is estimated."""
 
 
@@ -107,33 +107,33 @@ def welch_biases(
     pooled_by_name = {
         pooled_estimate.name: pooled_estimate
         for pooled_estimate in pooled
-        if pooled_estimate.misfit <= LARGEST_MISFIT
+        if pooled_estimate.misfit <= MAX_REFERENCE_MISFIT
     }
     for (structure, weighting), welch_models in fits_by_model(sessions).items():
         pooled_estimate = pooled_by_name.get(structure)
-        if pooled_estimate is None or len(welch_models) < _MIN_SESSIONS:
+        if pooled_estimate is None or len(welch_models) < _MIN_WELCH_SESSIONS:
             continue
         significance_limit = student_t_quantile(_CONFIDENCE_LEVEL, len(welch_models) - 1)
-        parameters = []
+        parameter_biases = []
         for parameter_name in STRUCTURES[structure].free:
-            if parameter_name not in pooled_estimate.by_name:
+            if parameter_name not in pooled_estimate.parameters_by_name:
                 continue
-            record_value = pooled_estimate.by_name[parameter_name]
+            pooled_parameter = pooled_estimate.parameters_by_name[parameter_name]
             welch_values = np.array(
                 [model.fit.parameters[parameter_name] for model in welch_models]
             )
             welch_mean, std = float(welch_values.mean()), float(welch_values.std(ddof=1))
             bias, bias_std = (
-                welch_mean - record_value.value,
-                math.hypot(std / len(welch_models) ** 0.5, record_value.std),
+                welch_mean - pooled_parameter.value,
+                math.hypot(std / len(welch_models) ** 0.5, pooled_parameter.std),
             )
-            parameters.append(
+            parameter_biases.append(
                 ParameterBias(
                     parameter=parameter_name,
                     welch=welch_mean,
                     welch_std=std,
-                    record=record_value.value,
-                    record_std=record_value.std,
+                    record=pooled_parameter.value,
+                    record_std=pooled_parameter.std,
                     bias=bias,
                     bias_std=bias_std,
                     significant=abs(bias) > significance_limit * bias_std,
@@ -144,7 +144,7 @@ def welch_biases(
             WelchBias(
                 structure,
                 weighting,
-                tuple(parameters),
+                tuple(parameter_biases),
                 _mean_or_nan([model.indices.wmse for model in welch_models]),
                 _mean_or_nan(
                     [

@@ -9,16 +9,19 @@ from rigd.beam import PARAMETERS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_CLEARER_NAMES: Final = {"delay_s": "delay of the torque", "tool_inertia_kg_m2": "tool inertia"}
+_SHOWN_PARAMETER_NAMES: Final = {
+    "delay_s": "delay of the torque",
+    "tool_inertia_kg_m2": "tool inertia",
+}
 """Names shown for parameters whose symbol alone is not clear."""
-_FINER_UNITS: Final = {"bending_stiffness_n_m2": ("1e-3 N·m²", 1e3)}
+_FINER_DISPLAY_UNITS: Final = {"bending_stiffness_n_m2": ("1e-3 N·m²", 1e3)}
 """Display unit and factor of parameters that need more digits here than for a single session."""
 _SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 """Translation of the digits and the minus sign of an exponent to superscripts."""
 
-_SMALLEST_P_VALUE: Final = 1e-99
+_SMALLEST_SHOWN_P_VALUE: Final = 1e-99
 """Smallest p-value that is shown as a number."""
-_MAX_LISTED: Final = 5
+_MAX_LISTED_TEXTS: Final = 5
 """Largest number of texts that a sentence lists."""
 _MODE_QUANTITIES: Final = {
     "frequency_hz": ("frequency", 1.0, "Hz"),
@@ -27,22 +30,22 @@ _MODE_QUANTITIES: Final = {
 """Name, display factor and display unit of each quantity of a mode."""
 
 
-def label(quantity: str) -> tuple[str, float, str]:
+def label_and_unit(quantity: str) -> tuple[str, float, str]:
     """Return the symbol or name, the display factor and the display unit of a quantity.
 
     The quantity is a parameter, or ``frequency_hz_N`` or ``damping_ratio_N`` of mode N. A value
     times the factor is in the display unit.
     """
     if quantity in PARAMETERS:
-        definition = PARAMETERS[quantity]
-        display_unit, display_factor = _FINER_UNITS.get(
-            quantity, (definition.display_unit, definition.display_factor)
+        parameter_definition = PARAMETERS[quantity]
+        display_unit, display_factor = _FINER_DISPLAY_UNITS.get(
+            quantity, (parameter_definition.display_unit, parameter_definition.display_factor)
         )
         power_text, _, unit_rest = display_unit.partition(" ")
         if power_text.startswith("1e"):
             display_unit = f"10{power_text.removeprefix('1e').translate(_SUPERSCRIPTS)} {unit_rest}"
         return (
-            _CLEARER_NAMES.get(quantity, definition.symbol),
+            _SHOWN_PARAMETER_NAMES.get(quantity, parameter_definition.symbol),
             display_factor,
             "" if display_unit == "1" else display_unit,
         )
@@ -60,35 +63,37 @@ def symbol_with_unit(quantity: str) -> str:
     >>> symbol_with_unit("zeta"), symbol_with_unit("frequency_hz_2")
     ('ζ (10⁻⁵ s^α)', 'frequency of mode 2 (Hz)')
     """
-    symbol, _, display_unit = label(quantity)
+    symbol, _, display_unit = label_and_unit(quantity)
     return f"{symbol} ({display_unit})" if display_unit else symbol
 
 
-def probability(p_value: float) -> str:
+def format_p_value(p_value: float) -> str:
     """Format a p-value; "< 1e-99" for values that are too small to be shown.
 
     Examples
     --------
-    >>> from analysis.campaigns.labels import probability
-    >>> probability(0.0312), probability(0.0)
+    >>> from analysis.campaigns.labels import format_p_value
+    >>> format_p_value(0.0312), format_p_value(0.0)
     ('0.031', '< 1e-99')
     """
-    return f"{p_value:.2g}" if p_value > _SMALLEST_P_VALUE else f"< {_SMALLEST_P_VALUE:g}"
+    return (
+        f"{p_value:.2g}" if p_value > _SMALLEST_SHOWN_P_VALUE else f"< {_SMALLEST_SHOWN_P_VALUE:g}"
+    )
 
 
-def percent(fraction: float) -> str:
+def format_percent(fraction: float) -> str:
     """Format a fraction as a percentage; a fraction above 99.9 % is not rounded up to 100 %.
 
     Examples
     --------
-    >>> from analysis.campaigns.labels import percent
-    >>> percent(0.4321), percent(0.99999)
+    >>> from analysis.campaigns.labels import format_percent
+    >>> format_percent(0.4321), format_percent(0.99999)
     ('43.2 %', '> 99.9 %')
     """
     return "> 99.9 %" if fraction > 0.999 else f"{100 * fraction:.3g} %"
 
 
-def first_few(texts: Sequence[str], separator: str = ", ") -> str:
+def join_first_texts(texts: Sequence[str], separator: str = ", ") -> str:
     """List the first five texts and the number of the others.
 
     Parameters
@@ -100,11 +105,14 @@ def first_few(texts: Sequence[str], separator: str = ", ") -> str:
 
     Examples
     --------
-    >>> from analysis.campaigns.labels import first_few
-    >>> first_few(["a.mcap", "b.mcap"]), first_few("abcdefg")
+    >>> from analysis.campaigns.labels import join_first_texts
+    >>> join_first_texts(["a.mcap", "b.mcap"]), join_first_texts("abcdefg")
     ('a.mcap, b.mcap', 'a, b, c, d, e and 2 more')
     """
-    listed_texts, unlisted_count = separator.join(texts[:_MAX_LISTED]), len(texts) - _MAX_LISTED
+    listed_texts, unlisted_count = (
+        separator.join(texts[:_MAX_LISTED_TEXTS]),
+        len(texts) - _MAX_LISTED_TEXTS,
+    )
     return (
         f"{listed_texts}{separator.strip(', ')} and {unlisted_count} more"
         if unlisted_count > 0

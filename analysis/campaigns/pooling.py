@@ -51,7 +51,7 @@ class RandomEffects:
     mean : ndarray, shape (k,)
     covariance : ndarray, shape (k, k)
         Covariance of the mean.
-    between_std : ndarray, shape (k,)
+    between_session_std : ndarray, shape (k,)
         Standard deviation of each parameter between sessions, tau; 0 where the sessions' own
         uncertainties explain the whole scatter.
     cochran_q : ndarray, shape (k,)
@@ -67,7 +67,7 @@ class RandomEffects:
 
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    between_std: NDArray[np.float64]
+    between_session_std: NDArray[np.float64]
     cochran_q: NDArray[np.float64]
     deviance: float
 
@@ -94,22 +94,22 @@ def random_effects(
 
     # Values are in units of a typical standard deviation, as parameters differ by orders of
     # magnitude.
-    scale_unit = 1 / np.sqrt(weights.mean(axis=0))
-    unit_products = np.outer(scale_unit, scale_unit)
+    parameter_scales = 1 / np.sqrt(weights.mean(axis=0))
+    scale_products = np.outer(parameter_scales, parameter_scales)
     mean_estimate = estimates.mean(axis=0)
     own_covariances, total_covariances = (
-        covariances / unit_products,
-        covariances / unit_products + np.diag(between_variance / scale_unit**2),
+        covariances / scale_products,
+        covariances / scale_products + np.diag(between_variance / parameter_scales**2),
     )
-    deviations = (estimates - mean_estimate) / scale_unit
+    deviations = (estimates - mean_estimate) / parameter_scales
     mean_shift, mean_covariance, squared_deviations = _weighted_mean(deviations, total_covariances)
     log_determinants = float(
         (np.linalg.slogdet(total_covariances)[1] - np.linalg.slogdet(own_covariances)[1]).sum()
     )
     return RandomEffects(
-        mean=mean_estimate + scale_unit * mean_shift,
-        covariance=unit_products * mean_covariance,
-        between_std=np.sqrt(between_variance),
+        mean=mean_estimate + parameter_scales * mean_shift,
+        covariance=scale_products * mean_covariance,
+        between_session_std=np.sqrt(between_variance),
         cochran_q=q,
         deviance=min(
             log_determinants + squared_deviations, _weighted_mean(deviations, own_covariances)[2]
@@ -173,7 +173,7 @@ class PooledMode:
 
 def pool_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
     """Pool the frequency and, separately, the damping ratio of each mode that all sessions have."""
-    pooled_list = []
+    pooled_modes = []
     for session_modes in zip(*(estimate.fit.modes for estimate in estimates), strict=False):
         pooled_frequency = _pool_quantity(
             [(mode.frequency_hz, mode.frequency_std_hz) for mode in session_modes]
@@ -182,10 +182,10 @@ def pool_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
             [(mode.damping_ratio, mode.damping_ratio_std) for mode in session_modes]
         )
         if pooled_frequency is not None and pooled_ratio is not None:
-            pooled_list.append(
+            pooled_modes.append(
                 PooledMode(session_modes[0].number, *pooled_frequency, *pooled_ratio)
             )
-    return tuple(pooled_list)
+    return tuple(pooled_modes)
 
 
 def _pool_quantity(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, float] | None:
@@ -200,14 +200,14 @@ def _pool_quantity(estimates: Sequence[tuple[float, float]]) -> tuple[float, flo
     pooled_mean, mean_variance, between_std = (
         pooled_effects.mean[0],
         pooled_effects.covariance[0, 0],
-        pooled_effects.between_std[0],
+        pooled_effects.between_session_std[0],
     )
     return float(pooled_mean), math.sqrt(mean_variance), float(between_std)
 
 
 # Structures
 
-_MIN_SESSIONS: Final = 2
+_MIN_POOLED_SESSIONS: Final = 2
 """Smallest number of sessions that can be pooled."""
 _DAMPING_PARAMETERS: Final[tuple[tuple[Damping, str, OrderName], ...]] = (
     ("internal", "zeta", "alpha"),
@@ -230,14 +230,15 @@ class PooledParameter:
         Standard deviation of `value`.
     interval : (float, float)
         95 % confidence interval of the value, by Student's t with K − 1 degrees of freedom.
-    within_std : float
+    within_session_std : float
         Root mean square of the standard deviations that the sessions state for their estimates.
-    between_std : float
-        Scatter between sessions beyond `within_std`; 0 if `within_std` explains all of it.
-    chance : float
+    between_session_std : float
+        Scatter between sessions beyond `within_session_std`; 0 if `within_session_std` explains all
+        of it.
+    heterogeneity_p_value : float
         p-value of the scatter between sessions, for this parameter by itself (W. G. Cochran,
         Biometrics 10 (1954) 101-129).
-    next_interval : (float, float)
+    next_session_interval : (float, float)
         95 % prediction interval for the true value in one more session (J. P. T. Higgins et al.,
         J. R. Stat. Soc. A 172 (2009) 137-159), without the noise of that session's estimate.
     """
@@ -246,10 +247,10 @@ class PooledParameter:
     value: float
     std: float
     interval: tuple[float, float]
-    within_std: float
-    between_std: float
-    chance: float
-    next_interval: tuple[float, float]
+    within_session_std: float
+    between_session_std: float
+    heterogeneity_p_value: float
+    next_session_interval: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,10 +298,15 @@ class PooledEstimate:
         parameter_names = tuple(parameter.name for parameter in self.parameters)
         t, loss_factors = student_t_quantile(0.95, self.sessions - 1), []
         plant_values = self.plant.parameters
-        first_rad_s = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
+        first_frequency_rad_s = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
         for damping, coefficient, order in _DAMPING_PARAMETERS:
             loss_factor = pivot_loss_factor(
-                coefficient, order, plant_values, parameter_names, self.covariance, first_rad_s
+                coefficient,
+                order,
+                plant_values,
+                parameter_names,
+                self.covariance,
+                first_frequency_rad_s,
             )
             if loss_factor is not None:
                 interval_factor = math.exp(t * loss_factor.std / loss_factor.value)
@@ -310,7 +316,7 @@ class PooledEstimate:
         return tuple(loss_factors)
 
     @property
-    def by_name(self) -> dict[str, PooledParameter]:
+    def parameters_by_name(self) -> dict[str, PooledParameter]:
         """Pooled parameters by their names."""
         return {parameter.name: parameter for parameter in self.parameters}
 
@@ -323,15 +329,15 @@ def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimat
     The estimates are sorted by BIC, the lowest first.
     """
     estimates_by_name = estimates_by_structure(sessions)
-    fitted_sessions = max(map(len, estimates_by_name.values()), default=0)
-    pooled_list = [
+    fitted_session_count = max(map(len, estimates_by_name.values()), default=0)
+    all_pooled_estimates = [
         pool_estimates(estimates)
         for estimates in estimates_by_name.values()
-        if len(estimates) == fitted_sessions
+        if len(estimates) == fitted_session_count
     ]
     return tuple(
         sorted(
-            (estimate for estimate in pooled_list if estimate is not None),
+            (estimate for estimate in all_pooled_estimates if estimate is not None),
             key=lambda estimate: estimate.bic,
         )
     )
@@ -358,24 +364,30 @@ def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None
     not in the common covariance. The pooled plant has the unweighted mean of such a parameter.
     """
     used_estimates = list(filter(determines_damping, estimates))
-    if len(used_estimates) < _MIN_SESSIONS:
+    if len(used_estimates) < _MIN_POOLED_SESSIONS:
         return None
-    determined_names = [
+    common_parameters = [
         parameter_name
         for parameter_name in used_estimates[0].fit.determined
         if all(parameter_name in e.fit.determined for e in used_estimates)
     ]
-    parameter_values, covariances = _stack_estimates(used_estimates, determined_names)
+    parameter_values, covariances = _stack_estimates(used_estimates, common_parameters)
     pooled_effects = random_effects(parameter_values, covariances)
     std = np.sqrt(np.diag(pooled_effects.covariance))
-    within_std = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
+    within_session_std = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
     t = student_t_quantile(0.95, len(used_estimates) - 1)
     p_values = chi_square_p_value(pooled_effects.cochran_q, len(used_estimates) - 1)
-    pooled_statistics = (pooled_effects.mean, std, within_std, pooled_effects.between_std, p_values)
+    pooled_statistics = (
+        pooled_effects.mean,
+        std,
+        within_session_std,
+        pooled_effects.between_session_std,
+        p_values,
+    )
     parameters = tuple(
         _pooled_parameter(parameter_name, t, *statistics)
         for parameter_name, statistics in zip(
-            determined_names, np.transpose(pooled_statistics).tolist(), strict=True
+            common_parameters, np.transpose(pooled_statistics).tolist(), strict=True
         )
     )
     mean_settings = {
@@ -409,21 +421,21 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
     each session. A single session loses no likelihood.
     """
     damping_parameters = estimates[0].fit.structure.free
-    common_names = [
+    common_parameters = [
         parameter_name
         for parameter_name in damping_parameters
         if all(parameter_name in e.fit.determined for e in estimates)
     ]
     common_deviance = sum(e.deviance for e in estimates)
-    if common_names and len(estimates) >= _MIN_SESSIONS:
-        common_deviance += random_effects(*_stack_estimates(estimates, common_names)).deviance
-    separate_cost = (len(damping_parameters) - len(common_names)) * sum(
-        math.log(e.values) for e in estimates
+    if common_parameters and len(estimates) >= _MIN_POOLED_SESSIONS:
+        common_deviance += random_effects(*_stack_estimates(estimates, common_parameters)).deviance
+    separate_parameter_penalty = (len(damping_parameters) - len(common_parameters)) * sum(
+        math.log(e.compared_values) for e in estimates
     )
     return (
         common_deviance
-        + len(common_names) * math.log(sum(e.values for e in estimates))
-        + separate_cost
+        + len(common_parameters) * math.log(sum(e.compared_values for e in estimates))
+        + separate_parameter_penalty
     )
 
 
@@ -433,7 +445,7 @@ def _stack_estimates(
     """Return the estimates, shape (K, k), and their covariances, shape (K, k, k)."""
     coordinates = [
         [
-            _coordinate(parameter_name, e.fit.parameters[parameter_name])
+            _parameter_coordinate(parameter_name, e.fit.parameters[parameter_name])
             for parameter_name in parameter_names
         ]
         for e in estimates
@@ -448,8 +460,8 @@ def _pooled_parameter(
     t_quantile: float,
     mean: float,
     std: float,
-    within_std: float,
-    between_std: float,
+    within_session_std: float,
+    between_session_std: float,
     p_value: float,
 ) -> PooledParameter:
     """Return a pooled parameter from the statistics of its value or of its logarithm."""
@@ -460,28 +472,30 @@ def _pooled_parameter(
         value=pooled_value,
         std=std_factor * std,
         interval=_parameter_interval(parameter_name, mean, t_quantile * std),
-        within_std=std_factor * within_std,
-        between_std=std_factor * between_std,
-        chance=p_value,
-        next_interval=_parameter_interval(
-            parameter_name, mean, t_quantile * math.hypot(std, between_std)
+        within_session_std=std_factor * within_session_std,
+        between_session_std=std_factor * between_session_std,
+        heterogeneity_p_value=p_value,
+        next_session_interval=_parameter_interval(
+            parameter_name, mean, t_quantile * math.hypot(std, between_session_std)
         ),
     )
 
 
-def _parameter_interval(name: str, mean: float, half_width: float) -> tuple[float, float]:
+def _parameter_interval(parameter_name: str, mean: float, half_width: float) -> tuple[float, float]:
     """Return an interval of a parameter from the mean and half width of its coordinate.
 
-    The coordinate is the parameter or its logarithm (see `_coordinate`).
+    The coordinate is the parameter or its logarithm (see `_parameter_coordinate`).
     """
-    if name in LOGARITHMIC_PARAMETERS:
+    if parameter_name in LOGARITHMIC_PARAMETERS:
         return math.exp(mean - half_width), math.exp(mean + half_width)
     return mean - half_width, mean + half_width
 
 
-def _coordinate(parameter_name: str, value: float) -> float:
+def _parameter_coordinate(parameter_name: str, parameter_value: float) -> float:
     """Return the value of a parameter, or its logarithm if the logarithm is estimated."""
-    return math.log(value) if parameter_name in LOGARITHMIC_PARAMETERS else value
+    return (
+        math.log(parameter_value) if parameter_name in LOGARITHMIC_PARAMETERS else parameter_value
+    )
 
 
 def _covariance_block(
@@ -495,9 +509,9 @@ def _covariance_block(
 def _pooled_plant(estimate: RecordEstimate, parameter_values: dict[str, float]) -> Plant:
     """Return a plant with given parameters and all other properties of a session's plant."""
     structure = estimate.fit.structure
-    values: dict[str, float] = dict(structure.fixed.items())
-    values |= {name: parameter_values[name] for name in (*structure.free, *SETTINGS)}
-    return estimate.fit.plant.with_parameters(values)
+    plant_parameters: dict[str, float] = dict(structure.fixed.items())
+    plant_parameters |= {name: parameter_values[name] for name in (*structure.free, *SETTINGS)}
+    return estimate.fit.plant.with_parameters(plant_parameters)
 
 
 # Freest structure that all sessions support
@@ -507,7 +521,7 @@ def _pooled_plant(estimate: RecordEstimate, parameter_values: dict[str, float]) 
 # difference between structures, and forty sessions of one beam would seem to be of two beams. The
 # intervals of the freest structure are valid for any simpler structure, too.
 
-_DETERMINING_FRACTION: Final = 0.9
+_MIN_DETERMINING_FRACTION: Final = 0.9
 """Smallest number of sessions that must determine the reported structure, as a fraction of those
 that determine the structure of the lowest BIC."""
 
@@ -516,7 +530,8 @@ def freest_estimate(pooled_estimates: Sequence[PooledEstimate]) -> PooledEstimat
     """Return the estimate of the freest damping structure that at least 90 % of sessions determine.
 
     The freest structure has the largest number of free parameters. The 90 %
-    (`_DETERMINING_FRACTION`) are of the sessions that determine the structure of the lowest BIC.
+    (`_MIN_DETERMINING_FRACTION`) are of the sessions that determine the structure of the lowest
+    BIC.
 
     Parameters
     ----------
@@ -530,7 +545,7 @@ def freest_estimate(pooled_estimates: Sequence[PooledEstimate]) -> PooledEstimat
         (
             estimate
             for estimate in pooled_estimates
-            if estimate.sessions >= _DETERMINING_FRACTION * lowest_bic_estimate.sessions
+            if estimate.sessions >= _MIN_DETERMINING_FRACTION * lowest_bic_estimate.sessions
         ),
         key=lambda estimate: len(STRUCTURES[estimate.structure].free),
     )
@@ -550,11 +565,11 @@ def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
         The freest structure that was fitted to every session. None without whole-record fits.
     """
     estimates_by_name = estimates_by_structure(sessions)
-    fitted_sessions = max(map(len, estimates_by_name.values()), default=0)
+    fitted_session_count = max(map(len, estimates_by_name.values()), default=0)
     structure_estimates = [
         estimates[0]
         for estimates in estimates_by_name.values()
-        if len(estimates) == fitted_sessions
+        if len(estimates) == fitted_session_count
     ]
     return max(structure_estimates, key=_free_parameter_count).name if structure_estimates else None
 

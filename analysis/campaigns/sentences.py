@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._statistics import PAPER_BEST_MODELS
-from analysis.campaigns._welch_bias import LARGEST_MISFIT
-from analysis.campaigns.labels import first_few, label, probability
+from analysis.campaigns._welch_bias import MAX_REFERENCE_MISFIT
+from analysis.campaigns.labels import format_p_value, join_first_texts, label_and_unit
 from analysis.identify.sentences import LOSS_NAMES
 from analysis.models import STRUCTURES
 from analysis.statistics import student_t_quantile
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from analysis.identify.profile_likelihood import OrderName
 
 
-_DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
+_DAMPING_NAME_BY_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
 """Name of the damping that has each order."""
 _ORDER_NAMES: Final[tuple[OrderName, ...]] = ("alpha", "lambda")
 """Names of the orders of internal and of external damping."""
@@ -35,7 +35,7 @@ _CLASSICAL_STRUCTURE: Final = "III"
 """Structure with internal and external damping, both of order 1."""
 _SIGNIFICANCE_LEVEL: Final = 0.01
 """Significance level, for all parameters together, of a test for between-session variance."""
-_EQUAL_ERROR_RATIO: Final = 1.01
+_MAX_EQUAL_ERROR_RATIO: Final = 1.01
 """Largest ratio of prediction error to in-sample error that counts as equally good."""
 
 
@@ -63,31 +63,31 @@ def describe_orders(
         Errors of sessions predicted from the others.
     """
     conjunction = " and " if alpha.exact is None else "; "
-    dampings = f"{_order_clause(alpha)}{conjunction}{_order_clause(lambda_)}"
-    sentence = f"{dampings[0].upper()}{dampings[1:]}."
+    order_clauses = f"{_order_clause(alpha)}{conjunction}{_order_clause(lambda_)}"
+    sentence = f"{order_clauses[0].upper()}{order_clauses[1:]}."
     names_by_error: dict[str, list[str]] = {}
     for structure_name in dict.fromkeys((_CLASSICAL_STRUCTURE, freest_fit.name)):
-        type_errors = [
+        structure_errors = [
             e.error for e in validation if e.method == "record" and e.name == structure_name
         ]
-        if type_errors:
-            names_by_error.setdefault(f"{100 * float(np.mean(type_errors)):.2g} %", []).append(
+        if structure_errors:
+            names_by_error.setdefault(f"{100 * float(np.mean(structure_errors)):.2g} %", []).append(
                 structure_name
             )
     if not names_by_error:
         return sentence
-    error_texts = ", ".join(
+    types_by_error_text = ", ".join(
         f"type{'s' if len(names) > 1 else ''} {listed(names)} with {error_text}"
         for error_text, names in names_by_error.items()
     )
-    return f"{sentence} Error of the torque predicted for an unseen session: {error_texts}."
+    return f"{sentence} Error of the torque predicted for an unseen session: {types_by_error_text}."
 
 
 def _order_clause(pooled_order: PooledOrder) -> str:
     """Describe the order of one damping as the clause of a sentence."""
     if pooled_order.exact is not None:
-        return _slope_clause(pooled_order)
-    damping_name = _DAMPING_OF_ORDER[pooled_order.order]
+        return _loss_slope_clause(pooled_order)
+    damping_name = _DAMPING_NAME_BY_ORDER[pooled_order.order]
     if pooled_order.status == "absent":
         return f"no {damping_name}"
     if pooled_order.status == "compatible" and pooled_order.interval is None:
@@ -115,18 +115,18 @@ def _value_and_half_width(pooled_order: PooledOrder) -> str | None:
     return " ± ".join(to_uncertainty((value, half_width), pooled_order.std or half_width))
 
 
-def _slope_clause(pooled_order: PooledOrder) -> str:
+def _loss_slope_clause(pooled_order: PooledOrder) -> str:
     """Describe how fast one loss grows with frequency, as a clause of a sentence."""
     loss_name = LOSS_NAMES[pooled_order.order]
-    slope_text = _value_and_half_width(pooled_order)
-    if slope_text is None:
+    loss_slope_text = _value_and_half_width(pooled_order)
+    if loss_slope_text is None:
         return f"{loss_name} with a slope that is not established"
     conclusion = {
         "compatible": "consistent with order 1",
         "fractional": "which excludes order 1",
         "open": "which alone does not exclude order 1",
     }
-    return f"{loss_name} growing as f^({slope_text}), {conclusion[pooled_order.status]}"
+    return f"{loss_name} growing as f^({loss_slope_text}), {conclusion[pooled_order.status]}"
 
 
 def describe_structure(freest_fit: PooledEstimate, lowest_bic_estimate: PooledEstimate) -> str:
@@ -166,7 +166,7 @@ def describe_structure(freest_fit: PooledEstimate, lowest_bic_estimate: PooledEs
 
 def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[str]:
     """Describe each loss factor at the frequency where it depends least on the order."""
-    factor_texts = []
+    loss_factor_texts = []
     for loss_factor in loss_factors:
         if loss_factor.omega_rad_s is None or not (
             loss_factor.size.std and loss_factor.size.interval_95
@@ -176,13 +176,13 @@ def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[st
             (loss_factor.size.value, *loss_factor.size.interval_95), loss_factor.size.std
         )
         remark = f", {loss_factor.size.flag}" if loss_factor.size.flag else ""
-        factor_texts.append(
+        loss_factor_texts.append(
             f"{loss_factor.damping} {value_text} (95 %: {low_text} to {high_text}) at "
             f"{loss_factor.omega_rad_s / (2 * np.pi):.3g} Hz{remark}"
         )
     return (
-        [f"Loss factors at the pivot frequencies: {'; '.join(factor_texts)}."]
-        if factor_texts
+        [f"Loss factors at the pivot frequencies: {'; '.join(loss_factor_texts)}."]
+        if loss_factor_texts
         else []
     )
 
@@ -190,7 +190,7 @@ def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[st
 def describe_selection(
     ranked_estimates: Sequence[PooledEstimate],
     rival_estimates: Sequence[PooledEstimate],
-    single_selections: Mapping[str, int],
+    selections_by_structure: Mapping[str, int],
     session_count: int,
 ) -> str:
     """Describe which damping structure all sessions together, and single sessions, select.
@@ -201,7 +201,7 @@ def describe_selection(
         Estimates of all structures, the lowest BIC first.
     rival_estimates : sequence of PooledEstimate
         Estimates whose BIC is not distinguishable from the lowest.
-    single_selections : mapping of str to int
+    selections_by_structure : mapping of str to int
         Number of sessions that select each structure by themselves.
     session_count : int
         Number of sessions.
@@ -221,13 +221,13 @@ def describe_selection(
         )
     selection_counts = {
         f"type {structure_name}": selection_count
-        for structure_name, selection_count in single_selections.items()
+        for structure_name, selection_count in selections_by_structure.items()
     }
     return f"{bic_sentence} {describe_single_sessions(selection_counts, session_count)}"
 
 
 def describe_residual(
-    pooled_estimate: PooledEstimate, adequate_count: int, session_count: int
+    pooled_estimate: PooledEstimate, adequate_session_count: int, session_count: int
 ) -> str:
     """Describe whether the residual of a damping structure's fit is noise.
 
@@ -235,39 +235,40 @@ def describe_residual(
     ----------
     pooled_estimate : PooledEstimate
         Pooled estimate of the structure.
-    adequate_count : int
+    adequate_session_count : int
         Number of sessions whose residual is noise.
     session_count : int
         Number of sessions.
     """
-    if pooled_estimate.misfit > LARGEST_MISFIT:
+    if pooled_estimate.misfit > MAX_REFERENCE_MISFIT:
         return (
             f"Its residual is {pooled_estimate.misfit:.3g} times the noise: no structure fitted "
             "describes the beam, and standard deviations are meaningless."
         )
-    return describe_noise_sessions(adequate_count, session_count)
+    return describe_noise_sessions(adequate_session_count, session_count)
 
 
-def describe_noise_sessions(adequate_count: int, session_count: int) -> str:
+def describe_noise_sessions(adequate_session_count: int, session_count: int) -> str:
     """State in how many sessions the residual of the fit is noise.
 
     Parameters
     ----------
-    adequate_count : int
+    adequate_session_count : int
         Number of sessions whose residual is noise.
     session_count : int
         Number of sessions.
     """
-    if adequate_count == session_count:
+    if adequate_session_count == session_count:
         return "The residual is noise in every session: the model suffices for these records."
     return (
-        f"The residual is noise in {adequate_count} of {session_count} sessions; in the others "
+        f"The residual is noise in {adequate_session_count} of {session_count} sessions; in the "
+        "others "
         "something is unexplained."
     )
 
 
 def describe_modes(
-    pooled_modes: Sequence[PooledMode], session_count: int, *, mixed: bool
+    pooled_modes: Sequence[PooledMode], session_count: int, *, is_mixture: bool
 ) -> list[str]:
     """Describe frequency and damping ratio of each mode.
 
@@ -277,20 +278,20 @@ def describe_modes(
         Modes pooled over the sessions.
     session_count : int
         Number of sessions.
-    mixed : bool
+    is_mixture : bool
         Whether the sessions are of several specimens.
     """
     if not pooled_modes:
         return []
     t = student_t_quantile(0.95, session_count - 1)
     mode_clauses = "; ".join(_mode_clause(mode, t) for mode in pooled_modes)
-    sessions_text = "the sessions, a mixture" if mixed else "the sessions"
+    sessions_text = "the sessions, a mixture" if is_mixture else "the sessions"
     return [f"Modes: {mode_clauses} (± 95 % of the mean over {sessions_text})."]
 
 
 def describe_order(pooled_order: PooledOrder) -> str:
     """Describe the pooled estimate of one order of the damping."""
-    order_name, damping_name = pooled_order.order, _DAMPING_OF_ORDER[pooled_order.order]
+    order_name, damping_name = pooled_order.order, _DAMPING_NAME_BY_ORDER[pooled_order.order]
     status_counts = {
         f"“{status}”": session_count for status, session_count in pooled_order.alone.items()
     }
@@ -329,29 +330,29 @@ def describe_order(pooled_order: PooledOrder) -> str:
 
 
 def describe_welch_bias(
-    freest: PooledEstimate,
+    freest_fit: PooledEstimate,
     biases: Sequence[WelchBias],
     withheld_orders: Collection[str],
     *,
-    comparable: bool,
+    has_reference: bool,
 ) -> list[str]:
     """Describe the bias of the Welch fits of the reported damping structure.
 
     Parameters
     ----------
-    freest : PooledEstimate
+    freest_fit : PooledEstimate
         Estimate of the reported structure.
     biases : sequence of WelchBias
         Biases of the Welch fits of all structures and weightings.
     withheld_orders : collection of str
         Orders that are not reported; their coefficients are not reported either.
-    comparable : bool
+    has_reference : bool
         Whether the sessions are of one specimen whose modes a uniform beam predicts. If not, there
         is no reference for the Welch fits.
     """
-    if not comparable:
+    if not has_reference:
         return []
-    type_biases = [bias for bias in biases if bias.structure == freest.name]
+    type_biases = [bias for bias in biases if bias.structure == freest_fit.name]
     best_model_biases = [
         bias for bias in type_biases if (bias.structure, bias.weighting) in PAPER_BEST_MODELS
     ]
@@ -382,7 +383,7 @@ def describe_welch_bias(
 
 def _bias_clause(parameter_bias: ParameterBias) -> str:
     """Describe the value of one parameter of a Welch fit and its bias."""
-    symbol, display_factor, display_unit = label(parameter_bias.parameter)
+    symbol, display_factor, display_unit = label_and_unit(parameter_bias.parameter)
     value_text, scatter_text = to_uncertainty(
         (parameter_bias.welch, parameter_bias.welch_std), parameter_bias.welch_std, display_factor
     )
@@ -427,7 +428,8 @@ def describe_dissent(
     return [
         f"Type {lowest_bic_estimate.name} is excluded by {len(dissenting_sessions)} single "
         f"session{'s' if len(dissenting_sessions) > 1 else ''}: "
-        f"{first_few(session_texts)}. Check their reports (analyze --each) before relying on the "
+        f"{join_first_texts(session_texts)}. Check their reports (analyze --each) before relying "
+        "on the "
         "mean."
     ]
 
@@ -439,22 +441,23 @@ def describe_scatter(pooled_estimate: PooledEstimate) -> str:
     """
     significance_level = _SIGNIFICANCE_LEVEL / max(len(pooled_estimate.parameters), 1)
     varying_labels = [
-        label(parameter.name)[0]
+        label_and_unit(parameter.name)[0]
         for parameter in pooled_estimate.parameters
-        if parameter.chance < significance_level
+        if parameter.heterogeneity_p_value < significance_level
     ]
     if not varying_labels:
         lowest_p_value = min(
-            (parameter.chance for parameter in pooled_estimate.parameters), default=1.0
+            (parameter.heterogeneity_p_value for parameter in pooled_estimate.parameters),
+            default=1.0,
         )
         tau_remark = (
             "; the τ above zero are within chance"
-            if any(parameter.between_std > 0 for parameter in pooled_estimate.parameters)
+            if any(parameter.between_session_std > 0 for parameter in pooled_estimate.parameters)
             else ""
         )
         return (
             "No significant between-session variance (Cochran's Q, lowest p of "
-            f"{len(pooled_estimate.parameters)}: {probability(lowest_p_value)}{tau_remark})."
+            f"{len(pooled_estimate.parameters)}: {format_p_value(lowest_p_value)}{tau_remark})."
         )
     return (
         f"Between-session variance in {', '.join(varying_labels)} (Cochran's Q): something changes "
@@ -494,7 +497,7 @@ def describe_prediction_errors(
     )
     comparison_text = (
         "the others predict a session as well as its own fit"
-        if mean_error <= _EQUAL_ERROR_RATIO * mean_own_error
+        if mean_error <= _MAX_EQUAL_ERROR_RATIO * mean_own_error
         else "the others predict a session worse than its own fit, because the parameters vary"
     )
     sessions_remark = (
@@ -508,27 +511,31 @@ def describe_prediction_errors(
     ]
 
 
-def failed_predictions(
-    lost_sessions: Sequence[FailedPrediction], requested_count: int
+def describe_failed_predictions(
+    failed_predictions: Sequence[FailedPrediction], requested_session_count: int
 ) -> list[str]:
     """List the sessions that could not be predicted from the others, with the reasons.
 
     Parameters
     ----------
-    lost_sessions : sequence of FailedPrediction
+    failed_predictions : sequence of FailedPrediction
         Sessions that were not predicted.
-    requested_count : int
+    requested_session_count : int
         Number of sessions that were to be predicted.
     """
-    if not lost_sessions:
+    if not failed_predictions:
         return []
-    reasons = [f"{lost_trial.path.name}: {lost_trial.reason}" for lost_trial in lost_sessions]
+    reason_texts = [
+        f"{failed_prediction.path.name}: {failed_prediction.reason}"
+        for failed_prediction in failed_predictions
+    ]
     return [
-        f"Of {requested_count} sessions to be predicted from the others, "
-        f"{requested_count - len(lost_sessions)} "
-        f"{'was' if requested_count - len(lost_sessions) == 1 else 'were'} and "
-        f"{len(lost_sessions)} "
-        f"{'was' if len(lost_sessions) == 1 else 'were'} not ({first_few(reasons, '; ')}). "
+        f"Of {requested_session_count} sessions to be predicted from the others, "
+        f"{requested_session_count - len(failed_predictions)} "
+        f"{'was' if requested_session_count - len(failed_predictions) == 1 else 'were'} and "
+        f"{len(failed_predictions)} "
+        f"{'was' if len(failed_predictions) == 1 else 'were'} not "
+        f"({join_first_texts(reason_texts, '; ')}). "
         "Prediction errors are averaged over those predicted."
     ]
 
@@ -544,8 +551,13 @@ def describe_single_sessions(conclusion_counts: Mapping[str, int], session_count
         Number of sessions.
     """
     (first_conclusion, first_count), *other_conclusions = conclusion_counts.items()
-    other_texts = "".join(f", {conclusion} in {n}" for conclusion, n in other_conclusions)
-    return f"Single sessions: {first_conclusion} in {first_count} of {session_count}{other_texts}."
+    other_conclusions_text = "".join(
+        f", {conclusion} in {n}" for conclusion, n in other_conclusions
+    )
+    return (
+        f"Single sessions: {first_conclusion} in {first_count} of {session_count}"
+        f"{other_conclusions_text}."
+    )
 
 
 def _describe_damping(structure: str) -> str:

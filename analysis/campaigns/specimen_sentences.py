@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._experiment import differing_fact_keys, fact_text
-from analysis.campaigns.labels import first_few, label, percent
+from analysis.campaigns.labels import format_percent, join_first_texts, label_and_unit
 from rigd.units import decimals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from analysis.campaigns._experiment import StatedSpecimen
-    from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, SessionValues
+    from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, SessionEstimates
 
 MIXTURE_MARK: Final = "‡"
 """Mark of values in tables and figures that are pooled over different specimens."""
@@ -30,12 +30,12 @@ _SLIGHT_FREQUENCY_SCATTER: Final = 2e-3
 stiffness of steel by 0.3 %."""
 
 
-def specimens(homogeneity: Homogeneity) -> list[str]:
+def describe_specimens(homogeneity: Homogeneity) -> list[str]:
     """Return sentences about different specimens; an empty list if the sessions agree."""
     sentences = (
         _describe_stated_specimens(homogeneity.specimens) if len(homogeneity.specimens) > 1 else []
     )
-    leading_scatter = homogeneity.leading
+    leading_scatter = homogeneity.leading_scatter
     return (
         sentences
         if leading_scatter is None
@@ -43,17 +43,17 @@ def specimens(homogeneity: Homogeneity) -> list[str]:
     )
 
 
-def title(text: str, homogeneity: Homogeneity) -> str:
+def pooled_title(title_text: str, homogeneity: Homogeneity) -> str:
     """Return the title of a table or figure, with an addition for values of several specimens.
 
     Parameters
     ----------
-    text : str
+    title_text : str
         Title without the addition.
     homogeneity : Homogeneity
         Whether the sessions are of one specimen.
     """
-    return f"{text}, {_MIXTURE_TITLE}" if homogeneity.mixed else text
+    return f"{title_text}, {_MIXTURE_TITLE}" if homogeneity.is_mixture else title_text
 
 
 def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]:
@@ -85,14 +85,16 @@ def _describe_different_specimens(
 ) -> list[str]:
     """Describe how the estimates show that the sessions are of different specimens."""
     other_labels = [
-        label(scatter.quantity)[0]
+        label_and_unit(scatter.quantity)[0]
         for scatter in homogeneity.quantities
-        if scatter.mixed and not scatter.is_of_rig and scatter is not leading_scatter
+        if scatter.is_mixture and not scatter.is_of_rig and scatter is not leading_scatter
     ]
-    others_sentence = f" The same holds for {', '.join(other_labels)}." if other_labels else ""
+    other_quantities_sentence = (
+        f" The same holds for {', '.join(other_labels)}." if other_labels else ""
+    )
     return [
         "The sessions are not of one specimen in one state: "
-        f"{_describe_heterogeneity(leading_scatter)}.{others_sentence}",
+        f"{_describe_heterogeneity(leading_scatter)}.{other_quantities_sentence}",
         f"{_describe_groups(leading_scatter)} Pooled values are then means of a mixture (marked "
         f"{MIXTURE_MARK}) that "
         "may hold for none of the specimens: analyse the sessions of each specimen separately, or "
@@ -106,9 +108,10 @@ def _small_scatter_remark(homogeneity: Homogeneity) -> str:
     frequency_scatters = [
         scatter for scatter in homogeneity.quantities if scatter.quantity.startswith("frequency_hz")
     ]
-    mixed_scatters = [scatter for scatter in frequency_scatters if scatter.mixed]
+    mixed_scatters = [scatter for scatter in frequency_scatters if scatter.is_mixture]
     if not mixed_scatters or any(
-        scatter.between_std > _SLIGHT_FREQUENCY_SCATTER * scatter.mean for scatter in mixed_scatters
+        scatter.between_session_std > _SLIGHT_FREQUENCY_SCATTER * scatter.mean
+        for scatter in mixed_scatters
     ):
         return ""
     return (
@@ -120,17 +123,17 @@ def _small_scatter_remark(homogeneity: Homogeneity) -> str:
 
 def _describe_heterogeneity(scatter: Heterogeneity) -> str:
     """Describe the between-session scatter of a quantity, relative to its uncertainty and size."""
-    i_squared_text = percent(scatter.i_squared)
+    i_squared_text = format_percent(scatter.i_squared)
     equals_sign = "" if i_squared_text.startswith(">") else "= "
-    between_text = _mean_text([scatter.between_std], scatter)
+    between_std_text = _mean_text([scatter.between_session_std], scatter)
     scatter_text = (
-        f"{between_text}, {100 * scatter.between_std / abs(scatter.mean):.2g} %; "
+        f"{between_std_text}, {100 * scatter.between_session_std / abs(scatter.mean):.2g} %; "
         if scatter.mean
         else ""
     )
     return (
-        f"{label(scatter.quantity)[0]} varies between sessions by "
-        f"{scatter.between_std_in_own_stds:.3g} of its own "
+        f"{label_and_unit(scatter.quantity)[0]} varies between sessions by "
+        f"{scatter.relative_between_session_std:.3g} of its own "
         f"standard deviations ({scatter_text}Cochran's Q = {scatter.cochran_q:.3g} where "
         f"{scatter.degrees_of_freedom} is expected, I² {equals_sign}{i_squared_text})"
     )
@@ -138,7 +141,7 @@ def _describe_heterogeneity(scatter: Heterogeneity) -> str:
 
 def _describe_groups(scatter: Heterogeneity) -> str:
     """Describe the groups of sessions or, if there are none, the sessions with extreme values."""
-    quantity_label, _, _ = label(scatter.quantity)
+    quantity_label, _, _ = label_and_unit(scatter.quantity)
     values_by_file = {
         file_name: (session_value, std) for file_name, session_value, std in scatter.values
     }
@@ -158,21 +161,26 @@ def _describe_groups(scatter: Heterogeneity) -> str:
 
 
 def _extreme_sessions(
-    session_values: SessionValues,
+    session_estimates: SessionEstimates,
 ) -> tuple[tuple[str, float, float], tuple[str, float, float]]:
     """Return the entries of the sessions with the lowest and the highest value."""
-    sorted_entries = sorted(session_values, key=lambda entry: entry[1])
-    return sorted_entries[0], sorted_entries[-1]
+    sorted_estimates = sorted(session_estimates, key=lambda session_estimate: session_estimate[1])
+    return sorted_estimates[0], sorted_estimates[-1]
 
 
 def _mean_text(session_values: Sequence[float], scatter: Heterogeneity) -> str:
     """Format the mean of values with its unit, and enough digits to distinguish the groups."""
-    _, factor, display_unit = label(scatter.quantity)
-    digits = min(decimals(factor * max(scatter.between_std, 1e-300)), 9)
+    _, factor, display_unit = label_and_unit(scatter.quantity)
+    decimal_digits = min(decimals(factor * max(scatter.between_session_std, 1e-300)), 9)
     separator = "·" if display_unit.startswith("10") else " "
-    return f"{factor * float(np.mean(session_values)):.{digits}f}{separator}{display_unit}".rstrip()
+    return (
+        f"{factor * float(np.mean(session_values)):.{decimal_digits}f}{separator}{display_unit}"
+    ).rstrip()
 
 
 def _list_files(file_names: Sequence[str]) -> str:
     """Return the number of files and the names of the first few."""
-    return f"{len(file_names)} file{'' if len(file_names) == 1 else 's'} ({first_few(file_names)})"
+    return (
+        f"{len(file_names)} file{'' if len(file_names) == 1 else 's'} "
+        f"({join_first_texts(file_names)})"
+    )

@@ -39,7 +39,7 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
         completed and lost; ``fits`` and ``modes`` of single sessions; and the tables by the names
         of their CSV files. All numbers are finite.
     """
-    leading_quantity = campaign.homogeneity.leading
+    leading_quantity = campaign.homogeneity.leading_scatter
     document_content: dict[str, Any] = finite(
         {
             "versions": versions(),
@@ -92,7 +92,7 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
                 _mode_json(session_analysis, estimate, mode)
                 for session_analysis in campaign.sessions
                 for estimate in session_analysis.record_estimates
-                if estimate.name == session_analysis.selected
+                if estimate.name == session_analysis.selected_structure
                 for mode in estimate.fit.modes
             ],
             **{

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from analysis.campaigns import best_models, group_errors_by_model
-from analysis.campaigns.labels import label, probability, symbol_with_unit
-from analysis.campaigns.specimen_sentences import MIXTURE_MARK, title
+from analysis.campaigns.labels import format_p_value, label_and_unit, symbol_with_unit
+from analysis.campaigns.specimen_sentences import MIXTURE_MARK, pooled_title
 from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._frf_figure import line_styles
@@ -133,7 +133,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
     width_in, height_in = 13.0, 2.6 * row_count + 1.35
     figure = style.new_figure(
         width_in, height_in,
-        title(
+        pooled_title(
             f"{session_count_text(estimate, campaign)} — pooled whole-record estimate, type "
             f"{estimate.name}",
             campaign.homogeneity,
@@ -183,7 +183,7 @@ def _draw_parameter_panel(
     In the background are the interval of the pooled value and the interval in which the next
     session's estimate is expected. `is_reported`: whether the parameter is a reported result.
     """
-    parameter_symbol, display_factor, _ = label(parameter.name)
+    parameter_symbol, display_factor, _ = label_and_unit(parameter.name)
     session_positions, session_values, half_widths = [], [], []
     for session_number, session in enumerate(campaign.sessions, start=1):
         for estimate in session.record_estimates:
@@ -193,7 +193,7 @@ def _draw_parameter_panel(
                 session_values.append(display_factor * estimate.fit.parameters[parameter.name])
                 half_widths.append(NORMAL_95 * display_factor * std)
     panel_axes.axhspan(
-        *(display_factor * end for end in parameter.next_interval),
+        *(display_factor * end for end in parameter.next_session_interval),
         color=style.SHADE_COLOR,
         zorder=0.5,
     )
@@ -217,7 +217,7 @@ def _draw_parameter_panel(
     )
     mark_text = "" if is_reported else NOT_REPORTED_MARK
     mark_text += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
-    p_value_text = f"p = {probability(parameter.chance)}".replace("= <", "<")
+    p_value_text = f"p = {format_p_value(parameter.heterogeneity_p_value)}".replace("= <", "<")
     panel_axes.set_title(f"{parameter_symbol}{mark_text}   {p_value_text}")
     panel_axes.set_ylabel(symbol_with_unit(parameter.name))
     panel_axes.set_xlim(0.3, len(campaign.sessions) + 0.7)

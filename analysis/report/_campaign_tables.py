@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.campaigns import group_errors_by_model
-from analysis.campaigns.labels import label
-from analysis.campaigns.sentences import failed_predictions
+from analysis.campaigns.labels import label_and_unit
+from analysis.campaigns.sentences import describe_failed_predictions
 from analysis.report._paper_tables import FIT_NAME_COLUMNS, paper_tables
 from analysis.report._pooled_tables import (
     homogeneity_table,
@@ -37,13 +37,13 @@ def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     return (
         session_list_table(campaign),
         *([specimens_table(campaign)] if len(homogeneity.specimens) > 1 else []),
-        *(scatter_tables if homogeneity.mixed else []),
+        *(scatter_tables if homogeneity.is_mixture else []),
         *headline_tables(campaign),
         *([uniform_beam_table(campaign)] if campaign.modal else []),
         *(pooled_table(campaign, estimate) for estimate in estimates[1:]),
         *([structures_table(campaign)] if campaign.structures else []),
         *([validation_summary(campaign)] if campaign.validation else []),
-        *([] if homogeneity.mixed else scatter_tables),
+        *([] if homogeneity.is_mixture else scatter_tables),
     )
 
 
@@ -271,14 +271,14 @@ def validation_summary(campaign: CampaignResult) -> Table:
         (
             "Fit: 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖), each session by its own whole-record fit: "
             "100 % less the in-sample error. Both errors include the noise of the torque.",
-            *failed_predictions(campaign.failed_predictions, campaign.trials),
+            *describe_failed_predictions(campaign.failed_predictions, campaign.trials),
         ),
     )  # fmt: skip
 
 
 def sessions_table(campaign: CampaignResult) -> Table:
     """Return the table with one row for each session's verdict and for each excluded file."""
-    leading_quantity = campaign.homogeneity.leading
+    leading_quantity = campaign.homogeneity.leading_scatter
     session_groups = leading_quantity.groups if leading_quantity else ()
     group_by_file = {
         file_name: f"{group_number}"
@@ -298,7 +298,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         finding_kinds = [finding.kind for finding in verdict.findings] if verdict else []
         return (
             session.name,
-            f"type {session.selected}" if session.selected else ABSENT_TEXT,
+            f"type {session.selected_structure}" if session.selected_structure else ABSENT_TEXT,
             None if own_error is None else 100 * (1 - own_error),
             trial.error if trial else None,
             ABSENT_TEXT if verdict is None else "noise" if verdict.adequate else "more than noise",
@@ -327,7 +327,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         (
             *((f"Fit and error: of type {structure_name}.",) if trials_by_path else ()),
             *(
-                (f"Group: by the {label(leading_quantity.quantity)[0]}.",)
+                (f"Group: by the {label_and_unit(leading_quantity.quantity)[0]}.",)
                 if leading_quantity and session_groups
                 else ()
             ),

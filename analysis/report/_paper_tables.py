@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns import best_models
-from analysis.campaigns.specimen_sentences import title
+from analysis.campaigns.specimen_sentences import pooled_title
 from analysis.models import STRUCTURES, estimate_text
 from analysis.report.table import (
     NOT_REPORTED_MARK,
@@ -116,12 +116,12 @@ def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
                 **_cells_with_paper_values(statistic_cells, paper_values, ".4g", display_factor),
                 "at_bounds": statistics.at_bounds,
                 **_paper_entries(paper_values),
-                "mixture": campaign.homogeneity.mixed,
+                "mixture": campaign.homogeneity.is_mixture,
             }
         )
     return Table(
         "table3",
-        title(
+        pooled_title(
             f"Parameters over {len(campaign.sessions)} sessions (Table 3)",
             campaign.homogeneity,
         ),
@@ -186,12 +186,12 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
                 "weighting": weighting,
                 **_cells_with_paper_values(deviation_cells, paper_values, ".3f"),
                 **_paper_entries(paper_values),
-                "mixture": campaign.homogeneity.mixed,
+                "mixture": campaign.homogeneity.is_mixture,
             }
         )
     return Table(
         "table4",
-        title(
+        pooled_title(
             "Mean deviation of the resonant peaks from the nominal model's (MDR, Table 4)",
             campaign.homogeneity,
         ),
@@ -247,12 +247,12 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
                     )
                 },
                 **_paper_entries(paper_values),
-                "mixture": campaign.homogeneity.mixed,
+                "mixture": campaign.homogeneity.is_mixture,
             }
         )
     return Table(
         "table5",
-        title(
+        pooled_title(
             "The two best nominal models (Table 5; their peaks are in Table 4)",
             campaign.homogeneity,
         ),
@@ -286,10 +286,10 @@ def indices_table(campaign: CampaignResult) -> Table:
                 (float(index_values.mean()), std), std
             )
             row[f"{index_name}_median"] = float(np.median(index_values))
-        table_rows.append({**row, "mixture": campaign.homogeneity.mixed})
+        table_rows.append({**row, "mixture": campaign.homogeneity.is_mixture})
     return Table(
         "nominal_indices",
-        title("Distance of the nominal models from the sessions", campaign.homogeneity),
+        pooled_title("Distance of the nominal models from the sessions", campaign.homogeneity),
         (
             *FIT_NAME_COLUMNS,
             *(
@@ -346,12 +346,12 @@ def bias_table(campaign: CampaignResult) -> Table:
                     "reported": parameter.parameter not in not_reported,
                     "wmse": fit_bias.wmse,
                     "record_wmse": fit_bias.record_wmse,
-                    "mixture": campaign.homogeneity.mixed,
+                    "mixture": campaign.homogeneity.is_mixture,
                 }
             )
     return Table(
         "welch_bias",
-        title("Bias of the Welch fits against the whole records", campaign.homogeneity),
+        pooled_title("Bias of the Welch fits against the whole records", campaign.homogeneity),
         (
             *FIT_NAME_COLUMNS, Column("parameter", "parameter", TEXT_FORMAT),
             Column("Welch, mean", "welch"), Column("std", "welch_std", std_of_previous=True),

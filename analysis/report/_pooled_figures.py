@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns.specimen_sentences import title
+from analysis.campaigns.specimen_sentences import pooled_title
 from analysis.models import ESTIMATOR_NAMES, STRUCTURES
 from analysis.report import _style as style
 from analysis.report._campaign_figures import (
@@ -110,7 +110,7 @@ def damping_figure(campaign: CampaignResult) -> Figure:
     width_in, height_in = 11.0, 6.6
     figure = style.new_figure(
         width_in, height_in,
-        title(
+        pooled_title(
             f"Damping against frequency, {session_count_text(pooled_estimate, campaign)}",
             campaign.homogeneity,
         ),
@@ -159,7 +159,7 @@ def damping_figure(campaign: CampaignResult) -> Figure:
 
 def _source_of_modes(campaign: CampaignResult, pooled_estimate: PooledEstimate) -> str:
     """Return the name of the model from which the modes are computed."""
-    is_modal = campaign.modal is not None and campaign.modal.leads
+    is_modal = campaign.modal is not None and campaign.modal.replaces_beam_modes
     return "modal model" if is_modal else f"type {pooled_estimate.name}"
 
 
@@ -168,7 +168,7 @@ def _session_count_of_modes(campaign: CampaignResult, pooled_estimate: PooledEst
     modal_result = campaign.modal
     return (
         modal_result.sessions
-        if modal_result is not None and modal_result.leads
+        if modal_result is not None and modal_result.replaces_beam_modes
         else pooled_estimate.sessions
     )
 
@@ -275,7 +275,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
     width_in, height_in = 11.0, 6.6
     figure = style.new_figure(
         width_in, height_in,
-        title(
+        pooled_title(
             f"Pooled frequency response, {session_count_text(pooled_estimate, campaign)}",
             campaign.homogeneity,
         ),

@@ -6,8 +6,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.campaigns import campaign_estimates, differing_fact_keys, fact_text, pooled_flags
-from analysis.campaigns.labels import label, percent, probability, symbol_with_unit
-from analysis.campaigns.specimen_sentences import MIXTURE_MARK, MIXTURE_NOTE, title
+from analysis.campaigns.labels import (
+    format_p_value,
+    format_percent,
+    label_and_unit,
+    symbol_with_unit,
+)
+from analysis.campaigns.specimen_sentences import MIXTURE_MARK, MIXTURE_NOTE, pooled_title
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.models import STRUCTURES
 from analysis.report.table import (
@@ -55,21 +60,21 @@ def structures_table(campaign: CampaignResult) -> Table:
 
     def row(ranked_structure: RankedStructure) -> Row:
         as_grey: Callable[[Cell], Cell] = (
-            (lambda cell: cell) if ranked_structure.pooled else grey_cell
+            (lambda cell: cell) if ranked_structure.is_pooled else grey_cell
         )
         return {
             "type": Cell(ranked_structure.structure, ranked_structure.name),
-            "fitted": as_grey(count_cell(ranked_structure.fitted)),
-            "sessions": as_grey(count_cell(ranked_structure.determined)),
+            "fitted": as_grey(count_cell(ranked_structure.fitted_sessions)),
+            "sessions": as_grey(count_cell(ranked_structure.determining_sessions)),
             "bic_above_lowest": as_grey(number_cell(ranked_structure.bic_above_lowest, ".1f")),
             "misfit": as_grey(number_cell(ranked_structure.misfit)),
-            "selected_alone": as_grey(count_cell(ranked_structure.selected_alone)),
-            "pooled": ranked_structure.pooled,
+            "selected_alone": as_grey(count_cell(ranked_structure.selecting_sessions)),
+            "pooled": ranked_structure.is_pooled,
         }
 
     return Table(
         "structures",
-        title("Structures, whole records of all sessions together", campaign.homogeneity),
+        pooled_title("Structures, whole records of all sessions together", campaign.homogeneity),
         (
             Column("type", "type", TEXT_FORMAT),
             Column("sessions fitted", "fitted"),
@@ -85,7 +90,7 @@ def structures_table(campaign: CampaignResult) -> Table:
             "it; delay, tool inertia, ρ/EI and EI have one per session.",
             *(
                 ()
-                if all(ranked_structure.pooled for ranked_structure in campaign.structures)
+                if all(ranked_structure.is_pooled for ranked_structure in campaign.structures)
                 else (NOT_POOLED_NOTE,)
             ),
         ),
@@ -120,7 +125,11 @@ def exact_condition_text(campaign: CampaignResult) -> str:
 
     It is empty if the pooled estimate does not depend on this assumption.
     """
-    return f", {EXACTLY_UNIFORM_CONDITION}" if campaign.modal and campaign.modal.leads else ""
+    return (
+        f", {EXACTLY_UNIFORM_CONDITION}"
+        if campaign.modal and campaign.modal.replaces_beam_modes
+        else ""
+    )
 
 
 def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None = None) -> Table:
@@ -152,13 +161,13 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
                 "type": structure.structure,
                 "name": structure.name,
                 "headline": False,
-                "sessions": structure.determined,
+                "sessions": structure.determining_sessions,
                 "misfit": structure.misfit,
                 "parameter": parameter,
                 "reported": False,
             }
             for structure in campaign.structures
-            if not structure.pooled
+            if not structure.is_pooled
             for parameter in STRUCTURES[structure.structure].free
         ]
         return Table("pooled", "Pooled whole-record estimates", table_columns, tuple(table_rows))
@@ -180,7 +189,7 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
     table_notes += flag_notes(
         flag
         for parameter_name, flag in flags.items()
-        if parameter_name in only_estimate.by_name
+        if parameter_name in only_estimate.parameters_by_name
         and parameter_name not in unreported_names
         and not homogeneity.is_mixed(parameter_name)
     )
@@ -188,7 +197,7 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
         table_notes.append(MIXTURE_NOTE)
     return Table(
         f"pooled_{only_estimate.name.replace(', ', '_').replace(' ', '_')}",
-        title(
+        pooled_title(
             f"Pooled over {session_count_text(only_estimate, campaign)}: "
             f"type {only_estimate.name} ({estimate_role})",
             homogeneity,
@@ -221,7 +230,7 @@ def _pooled_row(
 ) -> Row:
     """Return the row of a parameter in the table of pooled estimates."""
     homogeneity = campaign.homogeneity
-    _, display_factor, _ = label(parameter.name)
+    _, display_factor, _ = label_and_unit(parameter.name)
     value_cell, std_cell, low_cell, high_cell = estimate_cells(
         (parameter.value, parameter.std, *parameter.interval), parameter.std, display_factor
     )
@@ -252,11 +261,11 @@ def _pooled_row(
         "std": std_cell,
         "low_95": low_cell,
         "high_95": high_cell,
-        "within_std": number_cell(parameter.within_std, ".2g", display_factor),
-        "between_std": number_cell(parameter.between_std, ".2g", display_factor),
-        "p_value": p_value_cell(parameter.chance),
-        "next_low_95": parameter.next_interval[0],
-        "next_high_95": parameter.next_interval[1],
+        "within_std": number_cell(parameter.within_session_std, ".2g", display_factor),
+        "between_std": number_cell(parameter.between_session_std, ".2g", display_factor),
+        "p_value": p_value_cell(parameter.heterogeneity_p_value),
+        "next_low_95": parameter.next_session_interval[0],
+        "next_high_95": parameter.next_session_interval[1],
         "reported": is_reported,
         "mixture": homogeneity.is_mixed(parameter.name),
         "flag": flag,
@@ -288,7 +297,7 @@ def tolerance_table(campaign: CampaignResult) -> Table:
     ]
     table_rows: list[Row] = []
     for parameter_name, reported_value in reported_numbers.parameters.items():
-        _, display_factor, _ = label(parameter_name)
+        _, display_factor, _ = label_and_unit(parameter_name)
         lower_limit, upper_limit = reported_value.interval_95 or (None, None)
         value_cell, *further_cells = estimate_cells(
             (reported_value.value, reported_value.std, lower_limit, upper_limit),
@@ -328,7 +337,7 @@ def tolerance_table(campaign: CampaignResult) -> Table:
         )
     return Table(
         "parameters",
-        title(
+        pooled_title(
             f"Parameters from the modal constants of {modal_result.sessions} sessions"
             + (
                 f", uniform to {100 * tolerant_estimate.uniformity:g} %"
@@ -371,7 +380,7 @@ def uniform_beam_table(campaign: CampaignResult) -> Table:
         )
     return Table(
         "uniform_beam",
-        title("Modal constants, and those of the uniform beam that fits best", homogeneity),
+        pooled_title("Modal constants, and those of the uniform beam that fits best", homogeneity),
         (
             Column("mode", "mode"), Column("constant", "constant", TEXT_FORMAT),
             Column("measured", "measured"), Column("std", "std", std_of_previous=True),
@@ -433,7 +442,7 @@ def modes_table(campaign: CampaignResult) -> Table:
     )
     return Table(
         "pooled_modes",
-        title("Modes with locked hub (clamped–free), mean of the sessions", homogeneity),
+        pooled_title("Modes with locked hub (clamped–free), mean of the sessions", homogeneity),
         (
             Column("mode", "mode"),
             Column("frequency (Hz)", "frequency_hz"),
@@ -485,7 +494,7 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
     homogeneity = campaign.homogeneity
 
     def row(scatter: Heterogeneity) -> Row:
-        _, display_factor, _ = label(scatter.quantity)
+        _, display_factor, _ = label_and_unit(scatter.quantity)
         return {
             "quantity": Cell(
                 scatter.quantity,
@@ -495,12 +504,14 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
             ),
             "sessions": len(scatter.values),
             "mean": number_cell(scatter.mean, f".{_decimals_of_scatter(scatter)}f", display_factor),
-            "between_std": number_cell(scatter.between_std, ".2g", display_factor),
-            "between_in_own_std": scatter.between_std_in_own_stds,
+            "between_std": number_cell(scatter.between_session_std, ".2g", display_factor),
+            "between_in_own_std": scatter.relative_between_session_std,
             "cochran_q": scatter.cochran_q,
-            "i_squared": replace(number_cell(scatter.i_squared), text=percent(scatter.i_squared)),
-            "p_value": p_value_cell(scatter.chance),
-            "mixture": scatter.mixed,
+            "i_squared": replace(
+                number_cell(scatter.i_squared), text=format_percent(scatter.i_squared)
+            ),
+            "p_value": p_value_cell(scatter.p_value),
+            "mixture": scatter.is_mixture,
         }
 
     return Table(
@@ -519,7 +530,7 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
             "Between sessions: standard deviation beyond the sessions' own uncertainties (τ). τ/s: "
             "the same over a typical session's own. I²: its share of the variance. p: p-value of "
             "Cochran's Q.",
-            *([MIXTURE_NOTE] if homogeneity.mixed else []),
+            *([MIXTURE_NOTE] if homogeneity.is_mixture else []),
         ),
     )  # fmt: skip
 
@@ -530,14 +541,16 @@ def _decimals_of_scatter(scatter: Heterogeneity) -> int:
     It follows from the scatter between the sessions, or from the smallest standard deviation of a
     session if that is larger.
     """
-    _, display_factor, _ = label(scatter.quantity)
-    shown_std = display_factor * max(scatter.between_std, min(std for _, _, std in scatter.values))
+    _, display_factor, _ = label_and_unit(scatter.quantity)
+    shown_std = display_factor * max(
+        scatter.between_session_std, min(std for _, _, std in scatter.values)
+    )
     return min(decimals(shown_std), 9)
 
 
 def p_value_cell(p_value: float) -> Cell:
     """Return a cell with a p-value; a very small one is displayed as a bound, such as "< 1e-99"."""
-    return replace(number_cell(p_value), text=probability(p_value))
+    return replace(number_cell(p_value), text=format_p_value(p_value))
 
 
 def with_mixture_mark(cell_text: str, quantity_name: str, homogeneity: Homogeneity) -> str:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 from rich.console import Group
 from rich.text import Text
 
-from analysis.campaigns.sentences import failed_predictions
-from analysis.campaigns.specimen_sentences import specimens
+from analysis.campaigns.sentences import describe_failed_predictions
+from analysis.campaigns.specimen_sentences import describe_specimens
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
@@ -59,9 +59,9 @@ def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
         return campaign.verdict.sentences
     has_estimates = any(session.record_estimates for session in campaign.sessions)
     return (
-        *specimens(campaign.homogeneity),
+        *describe_specimens(campaign.homogeneity),
         *([_NO_VERDICT_SENTENCE] if has_estimates else []),
-        *failed_predictions(campaign.failed_predictions, campaign.trials),
+        *describe_failed_predictions(campaign.failed_predictions, campaign.trials),
     )
 
 
@@ -237,7 +237,7 @@ def _collect_facts(campaign: CampaignResult) -> list[Facts]:
 
 def _geometry_facts(campaign: CampaignResult) -> list[tuple[str, str]]:
     """Return facts (name, text) on the tolerance of the beam's geometry, if one is stated."""
-    if campaign.modal is None or not campaign.modal.leads:
+    if campaign.modal is None or not campaign.modal.replaces_beam_modes:
         return []
     return [
         (

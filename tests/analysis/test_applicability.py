@@ -124,11 +124,11 @@ def test_any_band_is_accepted_if_the_excited_one_is_not_stated(record_of, metada
 def test_welch_method_is_for_sweeps(record_of, kind):
     record = record_of(excitation=kind, duration_s="4.0")
     assert kind in f"{welch_exclusion_reason(record)} modes"
-    found, left_out = welch_analysis(record, WelchSettings(), optional=True)
+    found, left_out = welch_analysis(record, WelchSettings(), is_optional=True)
     assert found is None
     assert left_out.startswith("Welch fits left out: ")
     chosen = WelchSettings(segment_length=1000, types=("I",), weightings=("const",))
-    assert welch_analysis(record, chosen, optional=True)[0] is not None
+    assert welch_analysis(record, chosen, is_optional=True)[0] is not None
 
 
 def test_suggested_option_makes_the_fits(record_of):
@@ -136,9 +136,9 @@ def test_suggested_option_makes_the_fits(record_of):
     record = record_of(excitation="step")
     assert "(--method welch --frf fft computes them nevertheless)" in welch_exclusion_reason(record)
     with pytest.raises(FrequencyResponseError):
-        welch_analysis(record, WelchSettings(), optional=False)
+        welch_analysis(record, WelchSettings(), is_optional=False)
     chosen = WelchSettings(estimator="fft", types=("I",), weightings=("const",))
-    assert welch_analysis(record, chosen, optional=False)[0] is not None
+    assert welch_analysis(record, chosen, is_optional=False)[0] is not None
     longer = replace(record, sweep=slice(0, 17266))
     assert "(--method welch computes them nevertheless)" in welch_exclusion_reason(longer)
 
@@ -164,14 +164,14 @@ def test_stopped_sweep_is_fitted_up_to_its_end(record_of):
 
 
 def test_short_sweep_is_reported_with_fitting_settings(record_of):
-    found, left_out = welch_analysis(record_of(), WelchSettings(), optional=True)
+    found, left_out = welch_analysis(record_of(), WelchSettings(), is_optional=True)
     assert found is None
     assert "--segment 575 --overlap 86" in left_out
     with pytest.raises(FrequencyResponseError):
-        welch_analysis(record_of(), WelchSettings(), optional=False)
+        welch_analysis(record_of(), WelchSettings(), is_optional=False)
     wrong = WelchSettings(types=("I",), band_hz=(1.0, 900.0))
     with pytest.raises(SettingsError):
-        welch_analysis(record_of(), wrong, optional=True)
+        welch_analysis(record_of(), wrong, is_optional=True)
 
 
 @pytest.fixture

@@ -207,7 +207,7 @@ def record_estimate(structure, values, covariance, determined, at_bounds=(), cos
         degrees_of_freedom=100, residual=np.empty(0, complex),
     )  # fmt: skip
     return RecordEstimate(
-        fit, deviance=cost, bic=bic, values=100, indices=FitIndices(1.0, 1.0, 1.0)
+        fit, deviance=cost, bic=bic, compared_values=100, indices=FitIndices(1.0, 1.0, 1.0)
     )
 
 

@@ -65,7 +65,7 @@ def test_the_pooled_estimate_is_the_truth_within_its_interval(done, truth):
     assert abs(values["gamma"].value - damping.gamma) < 4 * values["gamma"].std
     assert three.misfit == pytest.approx(1.0, abs=0.1)
     assert estimates["I"].misfit > 2
-    assert values["zeta"].chance > 1e-3
+    assert values["zeta"].heterogeneity_p_value > 1e-3
 
 
 def test_left_out_sessions_are_predicted_to_within_noise(done):
@@ -276,7 +276,7 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     (condition,) = (each for each in verdict.sentences if each.startswith("If the beam is"))
     assert condition.startswith("If the beam is uniform to 1e-5 (type VI): alpha ")
     assert condition.count("consistent with 1") == 2
-    assert not found.homogeneity.mixed
+    assert not found.homogeneity.is_mixture
     assert any(
         "No significant between-session variance" in sentence for sentence in verdict.sentences
     )
@@ -295,7 +295,7 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     assert exact["condition"] == "if the beam is uniform to 1e-5"
     for name, quantity in exact["parameters"].items():
         if quantity["interval_95"] is not None:
-            own = found.headline.by_name[name]
+            own = found.headline.parameters_by_name[name]
             assert quantity["interval_95"] == list(own.interval)
             assert shared["parameters"][name]["std"] >= 0.9 * quantity["std"]
     assert shared["covariance"]["names"][0] == "ln_zeta"

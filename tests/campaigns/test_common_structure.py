@@ -46,8 +46,8 @@ def test_forty_sessions_with_different_noise_are_of_one_specimen(sessions, campa
     selected = {min(each.record_estimates, key=lambda one: one.bic).name for each in sessions}
     assert selected == {"VI", "VII"}
     found = campaign_of(sessions).homogeneity
-    assert (found.structure, found.mixed) == ("VI", False)
-    assert found.scatter_of("frequency_hz_1").chance > 0.01
+    assert (found.structure, found.is_mixture) == ("VI", False)
+    assert found.scatter_of("frequency_hz_1").p_value > 0.01
 
 
 def test_another_beam_is_still_distinguished(sessions, campaign_of):
@@ -60,8 +60,8 @@ def test_another_beam_is_still_distinguished(sessions, campaign_of):
         )
         moved.append(replace(session, record_estimates=estimates))
     found = campaign_of(moved).homogeneity
-    assert found.mixed
-    assert sorted(map(len, found.leading.groups)) == [20, 20]
+    assert found.is_mixture
+    assert sorted(map(len, found.leading_scatter.groups)) == [20, 20]
 
 
 def test_structure_missing_from_some_sessions_is_not_compared(sessions, make_session, campaign_of):

@@ -41,17 +41,17 @@ def of_frequencies(make_session, make_estimate, campaign_of):
 def test_scatter_by_hand(of_frequencies):
     """Two at -5 and two at 5 standard deviations: Q is 100 of 3, tau² = (100 - 3) / 3."""
     found = of_frequencies([2.45, 2.55, 2.45, 2.55], 0.01)
-    frequency = found.leading
+    frequency = found.leading_scatter
     assert frequency.quantity == "frequency_hz_1"
     assert frequency.cochran_q == pytest.approx(100.0)
-    assert frequency.between_std_in_own_stds == pytest.approx(math.sqrt(97 / 3))
-    assert frequency.between_std == pytest.approx(0.01 * math.sqrt(97 / 3))
+    assert frequency.relative_between_session_std == pytest.approx(math.sqrt(97 / 3))
+    assert frequency.between_session_std == pytest.approx(0.01 * math.sqrt(97 / 3))
     assert frequency.i_squared == pytest.approx(0.97)
     assert frequency.groups == (("0.mcap", "2.mcap"), ("1.mcap", "3.mcap"))
-    assert found.mixed
+    assert found.is_mixture
     assert not found.is_mixed("damping_ratio_1")  # the same of all
-    assert not found.scatter_of("damping_ratio_1").mixed
-    sentence, where = specimen_sentences.specimens(found)
+    assert not found.scatter_of("damping_ratio_1").is_mixture
+    sentence, where = specimen_sentences.describe_specimens(found)
     assert sentence.startswith(
         "The sessions are not of one specimen in one state: frequency of mode 1"
     )
@@ -62,7 +62,7 @@ def test_scatter_by_hand(of_frequencies):
 def test_repeatable_sessions_are_of_one_specimen(of_frequencies):
     """Of 100 campaigns of five: one false alarm in a hundred, and as many more as chance has it."""
     rng = np.random.default_rng(3)
-    alarms = sum(of_frequencies(rng.normal(2.5, 0.01, 5), 0.01).mixed for _ in range(100))
+    alarms = sum(of_frequencies(rng.normal(2.5, 0.01, 5), 0.01).is_mixture for _ in range(100))
     assert alarms <= 3
 
 
@@ -70,8 +70,8 @@ def test_scatter_within_uncertainty_is_no_mixture(of_frequencies):
     """The case of the random-effects model: significant in many, but no other specimen."""
     rng = np.random.default_rng(4)
     found = [of_frequencies(rng.normal(2.5, 0.015, 20), 0.01) for _ in range(20)]
-    assert sum(each.scatter_of("frequency_hz_1").chance < 0.01 for each in found) > 10
-    assert not any(each.mixed for each in found)
+    assert sum(each.scatter_of("frequency_hz_1").p_value < 0.01 for each in found) > 10
+    assert not any(each.is_mixture for each in found)
 
 
 def test_one_different_session_of_twenty_is_reported(of_frequencies):
@@ -79,9 +79,9 @@ def test_one_different_session_of_twenty_is_reported(of_frequencies):
     values = np.random.default_rng(5).normal(2.5, 0.01, 20)
     values[7] = 2.62
     found = of_frequencies(values, 0.01)
-    assert found.leading.i_squared < 0.9
-    assert found.leading.groups[1] == ("7.mcap",)
-    assert "1 file (7.mcap)" in specimen_sentences.specimens(found)[1]
+    assert found.leading_scatter.i_squared < 0.9
+    assert found.leading_scatter.groups[1] == ("7.mcap",)
+    assert "1 file (7.mcap)" in specimen_sentences.describe_specimens(found)[1]
 
 
 @pytest.mark.parametrize(("distance_hz", "slight"), [(0.002, True), (0.02, False)])
@@ -89,8 +89,8 @@ def test_many_standard_deviations_may_be_a_slight_change(of_frequencies, distanc
     """Both differ by 20 standard deviations, but by 0.08 % and 0.8 % of the frequency."""
     values = [2.5, 2.5, 2.5 + distance_hz, 2.5 + distance_hz]
     found = of_frequencies(values, distance_hz / 20)
-    assert found.mixed
-    sentences = " ".join(specimen_sentences.specimens(found))
+    assert found.is_mixture
+    sentences = " ".join(specimen_sentences.describe_specimens(found))
     assert ("temperature or clamp changes" in sentences) == slight
 
 
@@ -116,7 +116,7 @@ def test_files_of_one_name_in_two_folders_are_distinct(make_session, make_estima
         mode = replace(estimate.fit.modes[0], frequency_hz=value, frequency_std_hz=1e-3)
         sessions.append(make_session(f"/{folder}/x.mcap", estimates=[with_modes(estimate, mode)]))
     found = campaign_of(sessions).homogeneity
-    _, where, *_ = specimen_sentences.specimens(found)
+    _, where, *_ = specimen_sentences.describe_specimens(found)
     assert "2.500 Hz in 2 files (a/x.mcap, c/x.mcap); 2.600 Hz in 2 files" in where
 
 
@@ -129,7 +129,7 @@ def test_files_are_grouped_by_stated_specimen(make_session, make_experiment, cam
     found = campaign_of([*results[:2], torn, results[2]]).homogeneity
     first, second = found.specimens
     assert (first.files, second.files) == (("a", "c"), ("b",))
-    (sentences,) = specimen_sentences.specimens(found)
+    (sentences,) = specimen_sentences.describe_specimens(found)
     assert (
         "2 different specimens: tool_inertia_kg_m2 0 kg·m² in 2 files (a, c); tool_inertia_kg_m2 "
         in sentences
@@ -188,8 +188,8 @@ def test_distance_of_groups_is_that_of_their_frequencies(mixture, truth):
     own_hz = math.sqrt(np.mean([std**2 for _, _, std in frequency.values]))
     assert stiff - soft == pytest.approx(distance_hz, abs=3 * own_hz)
     # Of two equal groups at a distance d the variance of four is d²/3, nearly all between sessions.
-    assert frequency.between_std == pytest.approx((stiff - soft) / math.sqrt(3), rel=0.01)
-    assert frequency.between_std_in_own_stds > 10
+    assert frequency.between_session_std == pytest.approx((stiff - soft) / math.sqrt(3), rel=0.01)
+    assert frequency.relative_between_session_std > 10
 
 
 @pytest.mark.further  # as made by hand above
@@ -230,10 +230,10 @@ def test_unselected_structure_has_its_row(mixture):
     """Type IV has no external damping: the internal one is driven to the edge of its range."""
     rows = {each.name: each for each in mixture.structures}
     four = rows["IV"]
-    assert (four.fitted, four.selected_alone, four.pooled) == (4, 0, False)
-    assert four.determined < 2
+    assert (four.fitted_sessions, four.selecting_sessions, four.is_pooled) == (4, 0, False)
+    assert four.determining_sessions < 2
     assert four.bic_above_lowest > 1000
-    assert sum(each.selected_alone for each in mixture.structures) == 4
+    assert sum(each.selecting_sessions for each in mixture.structures) == 4
     tables = campaign_document(mixture)
     (written,) = (row for row in tables["structures"] if row["type"] == "IV")
     assert (written["fitted"], written["selected_alone"]) == (4, 0)
@@ -241,4 +241,4 @@ def test_unselected_structure_has_its_row(mixture):
     assert [row["parameter"] for row in pooled] == ["zeta", "alpha"]
     assert {(row.get("value"), row["reported"]) for row in pooled} == {(None, False)}
     (line,) = (each for each in campaign_text(mixture).splitlines() if each.startswith("IV "))
-    assert line.split()[1:3] == ["4", str(four.determined)]
+    assert line.split()[1:3] == ["4", str(four.determining_sessions)]

@@ -72,5 +72,5 @@ def test_single_whole_record_is_ranked_alone(make_estimate, make_session, campai
     assert pooled_bic([one]) == pytest.approx(90.0 + 2 * math.log(100), abs=1e-9)
     sessions = [make_session("a.mcap", estimates=[one]), make_session("b.mcap")]
     (ranked,) = campaign_of(sessions).structures
-    assert (ranked.name, ranked.fitted, ranked.pooled) == ("III", 1, False)
+    assert (ranked.name, ranked.fitted_sessions, ranked.is_pooled) == ("III", 1, False)
     assert ranked.bic_above_lowest == 0.0

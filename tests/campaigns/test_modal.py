@@ -28,7 +28,7 @@ UNEVEN[:: len(MODE_CONSTANT_NAMES)] = 0.7e-3, -0.3e-3, -0.4e-3
 
 
 @pytest.fixture
-def pooled_modal(campaign_of):
+def pooled_modal_model(campaign_of):
     """Return the modal model of all sessions."""
     return lambda sessions: campaign_of(sessions).modal
 
@@ -59,8 +59,8 @@ def sessions_of(make_session, make_experiment):
     return make
 
 
-def test_noise_averages_out_but_nonuniformity_does_not(sessions_of, pooled_modal):
-    five, forty = (pooled_modal(sessions_of(count, uniformity=3e-3)) for count in (5, 40))
+def test_noise_averages_out_but_nonuniformity_does_not(sessions_of, pooled_modal_model):
+    five, forty = (pooled_modal_model(sessions_of(count, uniformity=3e-3)) for count in (5, 40))
     for few, many in zip(five.modes, forty.modes, strict=True):
         assert many.frequency_std_hz < 0.5 * few.frequency_std_hz
     stiffness = [each.tolerant.std["bending_stiffness_n_m2"] for each in (five, forty)]
@@ -69,8 +69,8 @@ def test_noise_averages_out_but_nonuniformity_does_not(sessions_of, pooled_modal
     assert stiffness[1] > 2e-3 * PAPER_BEAM.bending_stiffness_n_m2
 
 
-def test_modes_are_those_of_the_sessions(sessions_of, pooled_modal):
-    found = pooled_modal(sessions_of(20, TRUE + UNEVEN, uniformity=0.0))
+def test_modes_are_those_of_the_sessions(sessions_of, pooled_modal_model):
+    found = pooled_modal_model(sessions_of(20, TRUE + UNEVEN, uniformity=0.0))
     rows = (TRUE + UNEVEN).reshape(-1, len(MODE_CONSTANT_NAMES))
     for mode, (ln_frequency, ln_ratio, *_) in zip(found.modes, rows, strict=True):
         assert mode.source == "modal"
@@ -79,10 +79,10 @@ def test_modes_are_those_of_the_sessions(sessions_of, pooled_modal):
         assert 0 < mode.participation_std_kg_m2 < 0.01 * mode.participation_kg_m2
 
 
-def test_only_a_uniform_beam_passes(sessions_of, pooled_modal):
-    even, uneven = (pooled_modal(sessions_of(12, each)) for each in (TRUE, TRUE + UNEVEN))
+def test_only_a_uniform_beam_passes(sessions_of, pooled_modal_model):
+    even, uneven = (pooled_modal_model(sessions_of(12, each)) for each in (TRUE, TRUE + UNEVEN))
     assert even.uniform_beam.status == "passed"
-    assert even.leads
+    assert even.replaces_beam_modes
     assert "A uniform beam predicts" in uniformity(even.uniform_beam)[0]
     assert uneven.uniform_beam.status == "refused"
     assert uneven.uniform_beam.p_value < 1e-10
@@ -94,18 +94,20 @@ def test_only_a_uniform_beam_passes(sessions_of, pooled_modal):
             assert low < true < high
 
 
-def test_largest_stated_uniformity_is_used_and_reported(sessions_of, pooled_modal, verdict_of):
-    zero = pooled_modal(sessions_of(4, uniformity=0.0))
+def test_largest_stated_uniformity_is_used_and_reported(
+    sessions_of, pooled_modal_model, verdict_of
+):
+    zero = pooled_modal_model(sessions_of(4, uniformity=0.0))
     assert zero.tolerant is None
-    assert not zero.leads
+    assert not zero.replaces_beam_modes
     every = [*sessions_of(3, uniformity=0.0), *sessions_of(3, first=3)]
-    assert pooled_modal(every).tolerant.uniformity == 1e-3
+    assert pooled_modal_model(every).tolerant.uniformity == 1e-3
     sentences = " ".join(verdict_of(every).sentences)
     assert "to 0.1 %, the largest of the 0 and 0.1 % that the files state" in sentences
     # An uneven beam stated to be exact: no order is reported on that condition.
-    uneven = pooled_modal(sessions_of(4, TRUE + UNEVEN, uniformity=0.0))
+    uneven = pooled_modal_model(sessions_of(4, TRUE + UNEVEN, uniformity=0.0))
     assert uneven.tolerant is None
-    assert uneven.leads
+    assert uneven.replaces_beam_modes
 
 
 TILT_DEG = 5.0
@@ -120,47 +122,47 @@ def tilted():
     return problem.constants(UniformBeamProblem(estimate, MODES, PLANT).minima()[0].x)
 
 
-def test_stated_tilt_is_part_of_the_beam(sessions_of, pooled_modal):
+def test_stated_tilt_is_part_of_the_beam(sessions_of, pooled_modal_model):
     unknown, stated, zero = (
-        pooled_modal(sessions_of(8, tilted(), **facts)).uniform_beam
+        pooled_modal_model(sessions_of(8, tilted(), **facts)).uniform_beam
         for facts in ({}, {"axis_tilt_deg": TILT_DEG}, {"axis_tilt_deg": 0.0})
     )
     assert stated.status == "passed"
     assert (unknown.status, zero.status) == ("refused", "refused")
 
 
-def test_parameters_include_the_stated_tilt(sessions_of, pooled_modal):
+def test_parameters_include_the_stated_tilt(sessions_of, pooled_modal_model):
     """If only some of the files state it, too; and a tolerance of 0 does not omit gravity."""
     some = [*sessions_of(4, tilted()), *sessions_of(4, tilted(), first=4, axis_tilt_deg=TILT_DEG)]
     exact = sessions_of(8, tilted(), uniformity=0.0, axis_tilt_deg=TILT_DEG)
     for sessions in (some, exact):
-        found = pooled_modal(sessions)
+        found = pooled_modal_model(sessions)
         assert found.uniform_beam.status == "passed"
         key = "density_over_stiffness"
         value, std = found.tolerant.values[key], found.tolerant.std[key]
         assert abs(value - PLANT.parameters[key]) < 4 * std
 
 
-def test_mode_visible_in_few_sessions_is_left_out(sessions_of, pooled_modal):
+def test_mode_visible_in_few_sessions_is_left_out(sessions_of, pooled_modal_model):
     first, *others = sessions_of(4, uniformity=0.0)
     two = replace(first, modal=replace(first.modal, numbers=(1, 2, 0)).restrict_to_visible_modes())
     assert two.modal.constants.size == 2 * len(MODE_CONSTANT_NAMES)
     assert two.modal.joint_covariance.shape == (13, 13)
-    found = pooled_modal([two, *others])
+    found = pooled_modal_model([two, *others])
     assert found.visible == (1, 2)
-    many = pooled_modal([two, *sessions_of(12, first=1, uniformity=0.0)])
+    many = pooled_modal_model([two, *sessions_of(12, first=1, uniformity=0.0)])
     assert (many.visible, many.sessions) == (MODES, 12)
-    assert pooled_modal([first]) is None
-    assert pooled_modal([replace(first, modal=None), others[0]]) is None
+    assert pooled_modal_model([first]) is None
+    assert pooled_modal_model([replace(first, modal=None), others[0]]) is None
 
 
-def test_phases_are_pooled_modulo_whole_turns(sessions_of, pooled_modal):
+def test_phases_are_pooled_modulo_whole_turns(sessions_of, pooled_modal_model):
     plain = sessions_of(4, uniformity=0.0)
     turn = np.zeros(TRUE.size)
     turn[MODE_CONSTANT_NAMES.index("residue_phase_rad")] = 2 * np.pi
     modal = plain[2].modal
     turned = replace(plain[2], modal=replace(modal, constants=modal.constants - turn))
-    one, other = pooled_modal(plain), pooled_modal([*plain[:2], turned, plain[3]])
+    one, other = pooled_modal_model(plain), pooled_modal_model([*plain[:2], turned, plain[3]])
     assert other.constants == pytest.approx(one.constants, abs=1e-9)
     assert other.uniform_beam.chi_square == pytest.approx(one.uniform_beam.chi_square, rel=1e-6)
 
@@ -173,12 +175,12 @@ DOWN = {"excitation": "chirp", "start_hz": 50.0, "stop_hz": 0.05}
 
 def test_a_falling_sweep_is_the_same_experiment(make_experiment):
     up, down = make_experiment(**UP), make_experiment(**DOWN)
-    assert (up.rising, down.rising, make_experiment().rising) == (True, False, None)
+    assert (up.is_rising, down.is_rising, make_experiment().is_rising) == (True, False, None)
     assert up.difference(down) is None
     assert down.difference(up) is None
     assert "start_hz" in up.difference(make_experiment(**{**DOWN, "stop_hz": 0.5}))
-    assert make_experiment(**{**UP, "excitation": "multisine"}).rising is None
-    assert make_experiment(**UP, there_and_back=1.0).rising is None
+    assert make_experiment(**{**UP, "excitation": "multisine"}).is_rising is None
+    assert make_experiment(**UP, there_and_back=1.0).is_rising is None
 
 
 @pytest.mark.parametrize("count", [further(1), 3])

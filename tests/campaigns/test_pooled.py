@@ -21,14 +21,16 @@ def estimates_of(make_estimate, count, between, seed):
 def test_scatter_between_sessions_is_recovered(make_estimate):
     found = pool_estimates(list(estimates_of(make_estimate, 60, 0.05, seed=2)))
     zeta, alpha = found.parameters
-    assert zeta.between_std == pytest.approx(0.05 * 2e-4, rel=0.25)
-    assert zeta.within_std == pytest.approx(0.02 * 2e-4, rel=0.02)
-    assert zeta.chance < 1e-6
-    assert alpha.chance > 0.01
-    assert alpha.between_std < 0.5 * alpha.within_std
+    assert zeta.between_session_std == pytest.approx(0.05 * 2e-4, rel=0.25)
+    assert zeta.within_session_std == pytest.approx(0.02 * 2e-4, rel=0.02)
+    assert zeta.heterogeneity_p_value < 1e-6
+    assert alpha.heterogeneity_p_value > 0.01
+    assert alpha.between_session_std < 0.5 * alpha.within_session_std
     assert abs(zeta.value / 2e-4 - 1) < 3 * zeta.std / zeta.value
     # Of the next session all that is not its own noise: the pooled value and the scatter.
-    assert math.log(zeta.next_interval[1] / zeta.value) == pytest.approx(2.0 * 0.05, rel=0.25)
+    assert math.log(zeta.next_session_interval[1] / zeta.value) == pytest.approx(
+        2.0 * 0.05, rel=0.25
+    )
 
 
 def test_intervals_have_their_nominal_coverage(make_estimate):
@@ -42,7 +44,7 @@ def test_intervals_have_their_nominal_coverage(make_estimate):
 
 def test_sessions_with_different_noise_are_repeatable(make_estimate):
     chances = [
-        each.chance
+        each.heterogeneity_p_value
         for seed in range(40)
         for each in pool_estimates(list(estimates_of(make_estimate, 10, 0.0, seed))).parameters
     ]

@@ -13,7 +13,7 @@ def test_equal_variances_by_hand():
     found = one_dimension([1.0, 2.0, 3.0, 6.0], [0.5] * 4)
     assert found.mean == pytest.approx([3.0])
     assert found.cochran_q == pytest.approx([28.0])
-    assert found.between_std**2 == pytest.approx([14 / 3 - 0.5])
+    assert found.between_session_std**2 == pytest.approx([14 / 3 - 0.5])
     assert found.covariance[0, 0] == pytest.approx(14 / 3 / 4)
 
 
@@ -21,7 +21,7 @@ def test_unequal_variances_by_hand():
     """Weights 1, 1/2, 1/2: fixed mean 1, Q = 1 + 12.5 + 4.5; tau² = 16 / 1.25."""
     found = one_dimension([0.0, 6.0, -2.0], [1.0, 2.0, 2.0])
     assert found.cochran_q == pytest.approx([18.0])
-    assert found.between_std**2 == pytest.approx([12.8])
+    assert found.between_session_std**2 == pytest.approx([12.8])
     w = 1 / (np.array([1.0, 2.0, 2.0]) + 12.8)
     assert found.mean == pytest.approx([(6 * w[1] - 2 * w[2]) / w.sum()])
     assert found.covariance[0, 0] == pytest.approx(1 / w.sum())
@@ -29,7 +29,7 @@ def test_unequal_variances_by_hand():
 
 def test_agreeing_sessions_are_weighted_by_precision():
     found = one_dimension([2.0, 2.01, 1.99], [1.0, 2.0, 4.0])
-    assert found.between_std == 0
+    assert found.between_session_std == 0
     assert found.mean == pytest.approx([(2.0 + 2.01 / 2 + 1.99 / 4) / 1.75])
     assert found.covariance[0, 0] == pytest.approx(1 / 1.75)
 
@@ -42,7 +42,7 @@ def test_correlated_estimates_are_weighted_by_full_covariance():
     weights = [np.linalg.inv(each) for each in covariances]
     spread = np.linalg.inv(weights[0] + weights[1])
     found = random_effects(values, covariances)
-    assert np.all(found.between_std == 0)
+    assert np.all(found.between_session_std == 0)
     assert found.mean == pytest.approx(spread @ weights[1] @ values[1])
     assert found.covariance == pytest.approx(spread)
 
@@ -56,7 +56,7 @@ def test_units_do_not_matter():
     plain = random_effects(values, covariances)
     scaled = random_effects(values * unit, covariances * np.outer(unit, unit))
     assert scaled.mean == pytest.approx(plain.mean * unit)
-    assert scaled.between_std == pytest.approx(plain.between_std * unit)
+    assert scaled.between_session_std == pytest.approx(plain.between_session_std * unit)
 
 
 def test_scatter_between_sessions_is_recovered_from_correlated_estimates():
@@ -69,7 +69,7 @@ def test_scatter_between_sessions_is_recovered_from_correlated_estimates():
         rng = np.random.default_rng(seed)
         values = rng.multivariate_normal(mean, within + between, size=150)
         campaign = random_effects(values, np.broadcast_to(within, (150, 2, 2)))
-        found.append(campaign.between_std**2)
+        found.append(campaign.between_session_std**2)
         error = campaign.mean - mean
         squares.append(error @ np.linalg.solve(campaign.covariance, error))
     assert np.mean(found, axis=0) == pytest.approx(np.diag(between), rel=0.12)

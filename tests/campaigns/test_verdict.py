@@ -53,7 +53,7 @@ def test_modes_have_the_student_interval_of_the_figure(estimates_of):
     """Of four sessions it is 3.18 standard deviations to either side, and not 1.96."""
     found = pool_estimates(estimates_of("VI", 100.0))
     std = found.modes[0].damping_ratio_std
-    (sentence,) = sentences.describe_modes(found.modes, found.sessions, mixed=False)
+    (sentence,) = sentences.describe_modes(found.modes, found.sessions, is_mixture=False)
     half = float(sentence.split("± ")[1].split(" %")[0]) / 100
     assert half == pytest.approx(student_t_quantile(0.95, 3) * std, rel=0.05)
 
@@ -231,11 +231,16 @@ def test_sentences_on_scatter_and_misfit(estimates_of):
     (best,) = ranked(estimates_of("VI", 100.0))
     assert "No significant between-session variance" in sentences.describe_scatter(best)
     assert "τ" not in sentences.describe_scatter(best)
-    some = replace(best, parameters=(replace(best.parameters[0], between_std=0.1, chance=0.2),))
+    some = replace(
+        best,
+        parameters=(
+            replace(best.parameters[0], between_session_std=0.1, heterogeneity_p_value=0.2),
+        ),
+    )
     assert "lowest p of 1: 0.2; the τ above zero are within chance" in sentences.describe_scatter(
         some
     )
-    shaken = replace(best, parameters=(replace(best.parameters[0], chance=1e-4),))
+    shaken = replace(best, parameters=(replace(best.parameters[0], heterogeneity_p_value=1e-4),))
     assert "Between-session variance in ζ" in sentences.describe_scatter(shaken)
     assert "no structure fitted" in sentences.describe_residual(replace(best, misfit=9.0), 4, 4)
     assert "noise in 3 of 4 sessions" in sentences.describe_residual(best, 3, 4)

@@ -56,19 +56,19 @@ def test_bias_is_the_difference_of_means(make_sessions, biases_of):
     assert bias.welch_std == pytest.approx(0.001 * np.std([-1, -0.5, 0, 0.5, 1], ddof=1))
     assert bias.bias_std == pytest.approx(np.hypot(bias.welch_std, RECORD_STD) / 5**0.5)
     assert [each.parameter for each in found.significant_parameters] == ["lambda"]
-    first, second = sentences.describe_welch_bias(freest, (found,), (), comparable=True)
+    first, second = sentences.describe_welch_bias(freest, (found,), (), has_reference=True)
     assert "Welch's lambda (1.06800 ± 0.00079 between sessions) is 0.06800 above" in first
     assert "1.00000 (type VI, weights omega, as in Table 3): bias, not scatter" in first
     assert "lower WMSE of the Welch fits (0.5 against 1 (N·m/rad)²) is no evidence" in second
     # Of an order that is not reported, and of a mixture, nothing is compared.
-    assert sentences.describe_welch_bias(freest, (found,), ("lambda",), comparable=True) == []
-    assert sentences.describe_welch_bias(freest, (found,), (), comparable=False) == []
+    assert sentences.describe_welch_bias(freest, (found,), ("lambda",), has_reference=True) == []
+    assert sentences.describe_welch_bias(freest, (found,), (), has_reference=False) == []
 
 
 def test_a_difference_within_the_scatter_is_no_bias(make_sessions, biases_of):
     freest, (found,) = biases_of(make_sessions(0.02, 0.1))
     assert found.significant_parameters == ()
-    assert sentences.describe_welch_bias(freest, (found,), (), comparable=True) == []
+    assert sentences.describe_welch_bias(freest, (found,), (), has_reference=True) == []
 
 
 def test_inadequate_structure_is_no_reference(make_sessions, biases_of):

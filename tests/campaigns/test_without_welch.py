@@ -35,7 +35,7 @@ def test_only_whole_records_are_pooled(found, truth):
     assert (found.nominal, found.statistics) == ((), ())
     assert found.headline.name == "VI"
     _, damping = truth
-    zeta = found.headline.by_name["zeta"]
+    zeta = found.headline.parameters_by_name["zeta"]
     assert zeta.interval[0] < damping.zeta < zeta.interval[1]
     for session in found.sessions:
         assert session.warnings[-1].startswith("Welch fits left out: a multisine")
