@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.models import (
-    LARGEST_FRACTION_OF_RATE,
+    MAX_FREQUENCY_TO_RATE_RATIO,
     PAPER_BAND_HZ,
     RECORD_BAND_HZ,
     WelchSettings,
@@ -101,12 +101,13 @@ def check_record_band(record: Record, requested_band_hz: Band | None) -> None:
     """
     from analysis.paper import SettingsError
 
-    limit_hz = LARGEST_FRACTION_OF_RATE * record.rate_hz
+    limit_hz = MAX_FREQUENCY_TO_RATE_RATIO * record.rate_hz
     if requested_band_hz is not None and requested_band_hz[1] > limit_hz:
         raise SettingsError(
             f"{record.path}: the band reaches {requested_band_hz[1]:g} Hz, but whole-record fits "
             "end at "
-            f"{limit_hz:g} Hz, {LARGEST_FRACTION_OF_RATE:g} of the rate of {record.rate_hz:g} Hz; "
+            f"{limit_hz:g} Hz, {MAX_FREQUENCY_TO_RATE_RATIO:g} of the rate of {record.rate_hz:g} "
+            "Hz; "
             "lower --band."
         )
 
@@ -199,7 +200,7 @@ def remarks(record: Record, requested_band_hz: Band | None = None) -> tuple[str,
         Requested band, in Hz.
     """
     remark_sentences = (_TOUCH_REMARK,) if record.metadata.get("excitation") == "touch" else ()
-    if record.there is not None:
+    if record.outward_sweep is not None:
         remark_sentences = (*remark_sentences, _TWO_SWEEPS_REMARK)
     if record.decimated_from is not None:
         remark_sentences = (
@@ -207,7 +208,7 @@ def remarks(record: Record, requested_band_hz: Band | None = None) -> tuple[str,
             f"The record is long ({record.decimated_from.samples / record.full_rate.rate_hz:.0f} "
             f"s): it was decimated from {record.full_rate.rate_hz:g} to {record.rate_hz:g} Hz "
             f"while it was read, which preserves frequencies up to "
-            f"{LARGEST_FRACTION_OF_RATE * record.rate_hz:g} Hz.",
+            f"{MAX_FREQUENCY_TO_RATE_RATIO * record.rate_hz:g} Hz.",
         )
     first_hz, last_hz = record_band_hz(record, requested_band_hz)
     if requested_band_hz is not None or (first_hz, last_hz) == RECORD_BAND_HZ:
@@ -220,7 +221,7 @@ def remarks(record: Record, requested_band_hz: Band | None = None) -> tuple[str,
         )
     return (
         *remark_sentences,
-        f"Fits end at {last_hz:g} Hz, {LARGEST_FRACTION_OF_RATE:g} of the record's rate of "
+        f"Fits end at {last_hz:g} Hz, {MAX_FREQUENCY_TO_RATE_RATIO:g} of the record's rate of "
         f"{record.rate_hz:g} Hz, instead of {RECORD_BAND_HZ[1]:g} Hz.",
     )
 
@@ -340,7 +341,7 @@ def _limit_band(band_hz: Band, record: Record) -> Band:
     The whole band is returned if nothing remains.
     """
     first_hz, last_hz = band_hz
-    limit_hz = min(last_hz, LARGEST_FRACTION_OF_RATE * record.rate_hz)
+    limit_hz = min(last_hz, MAX_FREQUENCY_TO_RATE_RATIO * record.rate_hz)
     if record.swept_hz is not None:
         lowest_hz, highest_hz = record.swept_hz
         limit_hz = min(limit_hz, highest_hz)

@@ -30,7 +30,7 @@ NEIGHBOUR_REACH_PERIODS: Final = 2.0
 """Duration to either side of a gap from which values are used to interpolate the gap, in periods of
 the highest frequency."""
 
-_BANDWIDTH_MARGIN: Final = 1.2
+_ASSUMED_BANDWIDTH_RATIO: Final = 1.2
 """Bandwidth that the interpolation of gaps assumes, relative to the signal's highest frequency."""
 
 _RELATIVE_NOISE_POWER: Final = 1e-6
@@ -63,22 +63,22 @@ def interpolate_gaps(
         The given values where known, the estimates elsewhere.
     """
     filled_values = np.where(known_mask, signal_values, 0.0)
-    reach_samples = int(np.ceil(NEIGHBOUR_REACH_PERIODS / cycles_per_sample))
+    neighbour_reach_samples = int(np.ceil(NEIGHBOUR_REACH_PERIODS / cycles_per_sample))
     for gap_start, gap_end in zip(*runs_of_true(~known_mask), strict=True):
-        first_neighbour = max(gap_start - reach_samples, 0)
-        neighbours = first_neighbour + np.flatnonzero(
-            known_mask[first_neighbour : gap_end + reach_samples]
+        first_neighbour = max(gap_start - neighbour_reach_samples, 0)
+        neighbour_indices = first_neighbour + np.flatnonzero(
+            known_mask[first_neighbour : gap_end + neighbour_reach_samples]
         )
-        if neighbours.size == 0:
+        if neighbour_indices.size == 0:
             continue
         weights = _interpolation_weights(
-            tuple(neighbours - gap_start),
+            tuple(neighbour_indices - gap_start),
             int(gap_end - gap_start),
-            _BANDWIDTH_MARGIN * cycles_per_sample,
+            _ASSUMED_BANDWIDTH_RATIO * cycles_per_sample,
         )
-        mean_value = float(signal_values[neighbours].mean())
+        mean_value = float(signal_values[neighbour_indices].mean())
         filled_values[gap_start:gap_end] = mean_value + weights @ (
-            signal_values[neighbours] - mean_value
+            signal_values[neighbour_indices] - mean_value
         )
     return filled_values
 
@@ -114,10 +114,10 @@ def runs_of_true(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.
 _STOP_BAND_ATTENUATION_DB: Final = 100.0
 """Attenuation of the decimation filter in its stop band, in decibels."""
 
-_FACTOR_TOLERANCE: Final = 1e-9
+_RATE_RATIO_TOLERANCE: Final = 1e-9
 """Tolerance for the rounding error of the ratio of two sampling rates."""
 
-_MIN_RATE_OVER_BAND: Final = 2.4
+_MIN_RATE_TO_BAND_RATIO: Final = 2.4
 """Minimum decimated sampling rate relative to the highest frequency: at lower rates the decimation
 filter becomes long."""
 
@@ -131,25 +131,28 @@ class Decimation:
 
     Attributes
     ----------
-    factor : int
-        One sample in `factor` is retained.
-    kernel : ndarray, shape (2 * reach * factor + 1,)
+    downsampling_factor : int
+        One sample in `downsampling_factor` is retained.
+    kernel : ndarray, shape (2 * half_length_samples * downsampling_factor + 1,)
         Impulse response of the filter: it passes `highest_hz`, and attenuates by 100 dB from half
         the new rate on.
-    reach : int
+    half_length_samples : int
         Half length of the filter, in samples of the new rate.
     rate_hz : float
         Sampling rate after decimation.
     """
 
-    factor: int
+    downsampling_factor: int
     kernel: NDArray[np.float64]
-    reach: int
+    half_length_samples: int
     rate_hz: float
 
     @classmethod
     def to_band(
-        cls, rate_hz: float, highest_hz: float, rate_over_band: float = _MIN_RATE_OVER_BAND
+        cls,
+        rate_hz: float,
+        highest_hz: float,
+        min_rate_to_band_ratio: float = _MIN_RATE_TO_BAND_RATIO,
     ) -> Decimation:
         """Return the decimation to the lowest rate that preserves the band from 0 to `highest_hz`.
 
@@ -159,21 +162,28 @@ class Decimation:
             Rate of the record.
         highest_hz : float
             Highest frequency that is preserved, at most 0.4 `rate_hz`.
-        rate_over_band : float
+        min_rate_to_band_ratio : float
             Minimum rate after decimation relative to `highest_hz`.
         """
-        factor = max(int(rate_hz / (rate_over_band * highest_hz) + _FACTOR_TOLERANCE), 1)
-        new_rate_hz = rate_hz / factor
-        stop_hz = new_rate_hz / 2
+        downsampling_factor = max(
+            int(rate_hz / (min_rate_to_band_ratio * highest_hz) + _RATE_RATIO_TOLERANCE), 1
+        )
+        new_rate_hz = rate_hz / downsampling_factor
+        stop_band_hz = new_rate_hz / 2
         # Kaiser's formulas for the length of the filter and the shape of its window.
-        transition_width = 2 * np.pi * (stop_hz - highest_hz) / rate_hz
+        transition_width = 2 * np.pi * (stop_band_hz - highest_hz) / rate_hz
         half_length = (_STOP_BAND_ATTENUATION_DB - 7.95) / (2 * 2.285 * transition_width)
-        reach_samples = int(np.ceil(half_length / factor))
-        kernel_ticks = np.arange(-reach_samples * factor, reach_samples * factor + 1)
-        relative_cutoff = (stop_hz + highest_hz) / rate_hz  # twice the middle of the transition
+        half_length_samples = int(np.ceil(half_length / downsampling_factor))
+        kernel_ticks = np.arange(
+            -half_length_samples * downsampling_factor,
+            half_length_samples * downsampling_factor + 1,
+        )
+        relative_cutoff = (
+            stop_band_hz + highest_hz
+        ) / rate_hz  # twice the middle of the transition
         kernel = relative_cutoff * np.sinc(relative_cutoff * kernel_ticks)
         kernel *= np.kaiser(kernel_ticks.size, 0.1102 * (_STOP_BAND_ATTENUATION_DB - 8.7))
-        return cls(factor, kernel / kernel.sum(), reach_samples, new_rate_hz)
+        return cls(downsampling_factor, kernel / kernel.sum(), half_length_samples, new_rate_hz)
 
     def apply(self, signal_values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Low-pass filter a signal and downsample it.
@@ -186,25 +196,27 @@ class Decimation:
         Returns
         -------
         ndarray, shape (m,)
-            Filtered samples. Sample `reach` has the time of the first value.
+            Filtered samples. Sample `half_length_samples` has the time of the first value.
         """
         filtered_length = signal_values.size + self.kernel.size - 1
-        padded_length = fast_length(filtered_length)
+        padded_length = fast_fft_length(filtered_length)
         spectrum = np.fft.rfft(signal_values, padded_length) * np.fft.rfft(
             self.kernel, padded_length
         )
-        return np.fft.irfft(spectrum, padded_length)[: filtered_length : self.factor].copy()
+        return np.fft.irfft(spectrum, padded_length)[
+            : filtered_length : self.downsampling_factor
+        ].copy()
 
     def samples_inside_record(self, tick_count: int) -> slice:
         """Return the slice of decimated samples whose filter window lies within the record.
 
         `tick_count` is the number of ticks of the record.
         """
-        return slice(2 * self.reach, (tick_count - 1) // self.factor + 1)
+        return slice(2 * self.half_length_samples, (tick_count - 1) // self.downsampling_factor + 1)
 
 
-def fast_length(at_least: int) -> int:
-    """Return the smallest integer from `at_least` (1 or more) on with prime factors up to 11.
+def fast_fft_length(min_length: int) -> int:
+    """Return the smallest integer from `min_length` (1 or more) on with prime factors up to 11.
 
     Fourier transforms of such a length are fast. With prime factors up to 5 (``real=True`` in
     SciPy), transforms of real values would be a fifth faster, but no fit. The length determines the
@@ -212,20 +224,20 @@ def fast_length(at_least: int) -> int:
 
     Examples
     --------
-    >>> from analysis.decimation import fast_length
-    >>> fast_length(1013)
+    >>> from analysis.decimation import fast_fft_length
+    >>> fast_fft_length(1013)
     1024
     """
     from scipy.fft import next_fast_len
 
-    return int(next_fast_len(at_least))
+    return int(next_fast_len(min_length))
 
 
-def fast_length_below(at_most: int) -> int:
-    """Return the largest integer up to `at_most` (1 or more) with prime factors up to 11.
+def fast_fft_length_below(max_length: int) -> int:
+    """Return the largest integer up to `max_length` (1 or more) with prime factors up to 11.
 
     Fourier transforms of such a length are fast.
     """
     from scipy.fft import prev_fast_len
 
-    return int(prev_fast_len(at_most))
+    return int(prev_fast_len(max_length))

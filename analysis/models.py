@@ -53,10 +53,10 @@ if TYPE_CHECKING:
 
 # Structures
 
-Factors = tuple[NDArray[np.complex128], NDArray[np.complex128]]
+ElasticAndExternalFactors = tuple[NDArray[np.complex128], NDArray[np.complex128]]
 """Factor of the bending stiffness, and external damping in 1/m⁴, each of the shape of s."""
-DampingFactors = Callable[[NDArray[np.complex128], Mapping[str, float]], Factors]
-"""Function of s in rad/s and of the parameters by name that returns the `Factors`."""
+DampingFunction = Callable[[NDArray[np.complex128], Mapping[str, float]], ElasticAndExternalFactors]
+"""Function of s in rad/s and of the parameters by name that returns both factors of the damping."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,25 +96,27 @@ class Structure:
     name: str
     description: str
     parameters: tuple[Parameter, ...]
-    factors: DampingFactors
+    factors: DampingFunction
     fixed: Mapping[str, float] = field(default_factory=dict)
     free: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        names = (parameter.name for parameter in self.parameters)
-        object.__setattr__(self, "free", tuple(name for name in names if name not in self.fixed))
+        parameter_names = (parameter.name for parameter in self.parameters)
+        object.__setattr__(
+            self, "free", tuple(name for name in parameter_names if name not in self.fixed)
+        )
 
     @property
-    def internal(self) -> bool:
+    def has_internal_damping(self) -> bool:
         """Whether the structure has internal damping (of the material)."""
         return "zeta" in self.free
 
     @property
-    def external(self) -> bool:
+    def has_external_damping(self) -> bool:
         """Whether the structure has external damping (of the environment)."""
         return "gamma" in self.free
 
-    def has(self, parameter_name: str) -> bool:
+    def has_damping_of(self, parameter_name: str) -> bool:
         """Return whether the structure has the kind of damping to which a parameter belongs.
 
         The kinds are internal and external damping. The result is True for a parameter of beam or
@@ -126,9 +128,9 @@ class Structure:
             Name of a parameter of damping, beam or rig.
         """
         if parameter_name in ("zeta", "alpha"):
-            return self.internal
+            return self.has_internal_damping
         if parameter_name in ("gamma", "lambda"):
-            return self.external
+            return self.has_external_damping
         return True
 
     def damping(self, free_values: Mapping[str, float]) -> Damping:
@@ -142,42 +144,48 @@ class Structure:
 
     def start_values(self) -> list[dict[str, float]]:
         """Return all combinations of the parameters' start values, each with the fixed values."""
-        free_starts = [each.starts for each in self.parameters if each.name not in self.fixed]
+        start_values_of_free = [
+            parameter.starts for parameter in self.parameters if parameter.name not in self.fixed
+        ]
         return [
             {**self.fixed, **dict(zip(self.free, combination, strict=True))}
-            for combination in product(*free_starts)
+            for combination in product(*start_values_of_free)
         ]
 
-    def finite_factors(self, s: NDArray[np.complex128], values: Mapping[str, float]) -> Factors:
+    def finite_factors(
+        self, s: NDArray[np.complex128], parameter_values: Mapping[str, float]
+    ) -> ElasticAndExternalFactors:
         """Return the factors c and e at `s`; raise ValueError unless they are finite numbers.
 
         Parameters
         ----------
         s : ndarray of complex, shape (n,)
             Laplace variable in rad/s, not 0.
-        values : mapping of str to float
+        parameter_values : mapping of str to float
             Values of all parameters.
         """
         with np.errstate(all="ignore"):
             elastic, external = (
                 np.broadcast_to(np.asarray(factor, dtype=np.complex128), s.shape)
-                for factor in self.factors(s, values)
+                for factor in self.factors(s, parameter_values)
             )
         if not (np.isfinite(elastic).all() and np.isfinite(external).all()):
-            raise ValueError(f"its damping is not finite at {parameters_text(values)}.")
+            raise ValueError(f"its damping is not finite at {parameters_text(parameter_values)}.")
         return elastic, external
 
 
-def parameters_text(values: Mapping[str, float]) -> str:
+def parameters_text(parameter_values: Mapping[str, float]) -> str:
     """Return parameters as a text, such as ``zeta = 7e-05, alpha = 1``."""
-    return ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
+    return ", ".join(f"{name} = {value:.4g}" for name, value in parameter_values.items())
 
 
-def _fractional_factors(s: NDArray[np.complex128], values: Mapping[str, float]) -> Factors:
+def _fractional_factors(
+    s: NDArray[np.complex128], parameter_values: Mapping[str, float]
+) -> ElasticAndExternalFactors:
     """Return the factors of fractional internal and external damping, as in the reference paper."""
     return (
-        1 + values["zeta"] * s ** values["alpha"],
-        (values["gamma"] * s ** values["lambda"]).astype(np.complex128),
+        1 + parameter_values["zeta"] * s ** parameter_values["alpha"],
+        (parameter_values["gamma"] * s ** parameter_values["lambda"]).astype(np.complex128),
     )
 
 
@@ -232,7 +240,7 @@ WeightingFunction = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 Weighting = str | WeightingFunction
 """Name of a weighting, or its function."""
 
-_LARGEST_EXPONENT = 10
+_LARGEST_WEIGHTING_EXPONENT = 10
 """Largest exponent K of a weighting omega^K; with a larger one, few points have all the weight."""
 
 
@@ -272,21 +280,21 @@ def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[n
     """
     shown_name = weighting_name(weighting)
     if callable(weighting):
-        p = np.asarray(weighting(omega_rad_s), dtype=np.float64)
-        if p.shape != omega_rad_s.shape:
+        unscaled_weights = np.asarray(weighting(omega_rad_s), dtype=np.float64)
+        if unscaled_weights.shape != omega_rad_s.shape:
             raise WeightingError(
-                f"The weighting {shown_name} gave values of shape {p.shape} for "
+                f"The weighting {shown_name} gave values of shape {unscaled_weights.shape} for "
                 f"{omega_rad_s.shape} frequencies; it must give one value for each."
             )
     else:
-        p = omega_rad_s ** _weighting_exponent(weighting)
-    weight_sum = float(p.sum())
-    if not (math.isfinite(weight_sum) and weight_sum > 0 and float(p.min()) >= 0):
+        unscaled_weights = omega_rad_s ** _weighting_exponent(weighting)
+    weight_sum = float(unscaled_weights.sum())
+    if not (math.isfinite(weight_sum) and weight_sum > 0 and float(unscaled_weights.min()) >= 0):
         raise WeightingError(
             f"The weighting {shown_name} must be finite, not negative and not all zero over "
             f"{float(omega_rad_s.min()):g} to {float(omega_rad_s.max()):g} rad/s."
         )
-    return p / weight_sum
+    return unscaled_weights / weight_sum
 
 
 def weighting_name(weighting: Weighting) -> str:
@@ -320,10 +328,11 @@ def _weighting_exponent(weighting: str) -> float:
         exponent = float(power_text)
     except ValueError:
         exponent = math.nan
-    if base_name != "omega" or not separator or not abs(exponent) <= _LARGEST_EXPONENT:
+    if base_name != "omega" or not separator or not abs(exponent) <= _LARGEST_WEIGHTING_EXPONENT:
         raise WeightingError(
             f"There is no weighting {weighting!r}; choose const, omega (which is 1/omega) or "
-            f"omega^K with a number K from -{_LARGEST_EXPONENT} to {_LARGEST_EXPONENT}, such as "
+            f"omega^K with a number K from -{_LARGEST_WEIGHTING_EXPONENT} to "
+            f"{_LARGEST_WEIGHTING_EXPONENT}, such as "
             "omega^-0.5."
         )
     return exponent
@@ -334,7 +343,7 @@ def _weighting_exponent(weighting: str) -> float:
 RECORD_BAND_HZ: Final = (0.0, 50.0)
 """Default frequency band of the whole-record fits, if the sampling rate is high enough."""
 
-LARGEST_FRACTION_OF_RATE: Final = 0.4
+MAX_FREQUENCY_TO_RATE_RATIO: Final = 0.4
 """Highest frequency of a fit relative to the sampling rate; filters roll off above it."""
 
 PAPER_BAND_HZ: Final = (0.5875, 50.0)
@@ -354,7 +363,9 @@ ESTIMATOR_NAMES: Final[Mapping[Estimator, str]] = {
 """Names of the estimators in reports and figures."""
 
 
-def estimate_text(estimator: Estimator, segmentation: Segmentation, segments: int | str) -> str:
+def estimator_text(
+    estimator: Estimator, segmentation: Segmentation, segment_count: int | str
+) -> str:
     """Describe the estimator and the segments of a frequency response.
 
     Parameters
@@ -363,19 +374,19 @@ def estimate_text(estimator: Estimator, segmentation: Segmentation, segments: in
         Estimator as in `WelchSettings`.
     segmentation : Segmentation
         Segment length, overlap and FFT length in samples.
-    segments : int or str
+    segment_count : int or str
         Number of segments.
 
     Examples
     --------
-    >>> from analysis.models import WelchSettings, estimate_text
-    >>> estimate_text("h1", WelchSettings().segmentation(1000.0), 8)
+    >>> from analysis.models import WelchSettings, estimator_text
+    >>> estimator_text("h1", WelchSettings().segmentation(1000.0), 8)
     "Welch's H1, 8 Hamming segments of 17266, overlap 2590, nfft 160000"
     """
     if estimator == "fft":
         return ESTIMATOR_NAMES[estimator]
     return (
-        f"{ESTIMATOR_NAMES[estimator]}, {segments} {WINDOW.name} segments of "
+        f"{ESTIMATOR_NAMES[estimator]}, {segment_count} {WINDOW.name} segments of "
         f"{segmentation.segment_length}, overlap {segmentation.overlap}, nfft {segmentation.nfft}"
     )
 
@@ -446,7 +457,7 @@ class WelchSettings:
 ORDER_RANGE: Final = (0.001, 1.999)
 """Range of the orders alpha and lambda, as in the reference paper."""
 
-SIZE_RANGE: Final = (1e-9, 1e3)
+RELATIVE_DAMPING_RANGE: Final = (1e-9, 1e3)
 """Range of damping relative to stiffness or inertia, from too small to be visible to too large
 for a vibration. It is much wider than the range of the reference paper, which its own results
 exceed (type IV with 1/omega weights has zeta = 2.4e-3, but the range ends at 3.05e-4)."""
@@ -461,9 +472,9 @@ class DampingUnknowns:
 
     structure: Structure
     """Damping structure, which defines the free parameters."""
-    ln_internal_rad_s: float
+    ln_internal_reference_rad_s: float
     """Logarithm of the undamped second mode's frequency, at which internal damping is stated."""
-    ln_external_rad_s: float
+    ln_external_reference_rad_s: float
     """Logarithm of the undamped first mode's frequency, at which external damping is stated."""
     ln_external_unit: float
     """Logarithm of ``rho/EI omega²`` at the first mode, the unit of external damping."""
@@ -482,8 +493,8 @@ class DampingUnknowns:
         first_rad_s, second_rad_s = (float(w) for w in undamped_frequencies_rad_s(beam, 2))
         return cls(
             structure=structure,
-            ln_internal_rad_s=math.log(second_rad_s),
-            ln_external_rad_s=math.log(first_rad_s),
+            ln_internal_reference_rad_s=math.log(second_rad_s),
+            ln_external_reference_rad_s=math.log(first_rad_s),
             ln_external_unit=math.log(beam.density_over_stiffness * first_rad_s**2),
         )
 
@@ -493,7 +504,7 @@ class DampingUnknowns:
         unknown_ranges = [
             ORDER_RANGE
             if parameter_name in ("alpha", "lambda")
-            else tuple(map(math.log, SIZE_RANGE))
+            else tuple(map(math.log, RELATIVE_DAMPING_RANGE))
             for parameter_name in self.structure.free
         ]
         return np.array([low for low, _ in unknown_ranges]), np.array(
@@ -504,15 +515,15 @@ class DampingUnknowns:
         """Return the four damping parameters for unknowns `x`, shape (k,)."""
         free_unknowns: dict[str, float] = dict(zip(self.structure.free, map(float, x), strict=True))
         parameters = {**self.structure.fixed, **free_unknowns}
-        if self.structure.internal:
+        if self.structure.has_internal_damping:
             parameters["zeta"] = math.exp(
-                free_unknowns["zeta"] - parameters["alpha"] * self.ln_internal_rad_s
+                free_unknowns["zeta"] - parameters["alpha"] * self.ln_internal_reference_rad_s
             )
-        if self.structure.external:
+        if self.structure.has_external_damping:
             parameters["gamma"] = math.exp(
                 free_unknowns["gamma"]
                 + self.ln_external_unit
-                - parameters["lambda"] * self.ln_external_rad_s
+                - parameters["lambda"] * self.ln_external_reference_rad_s
             )
         return parameters
 
@@ -529,14 +540,19 @@ class DampingUnknowns:
         parameters = self.parameters(x)
         unknown_indices = {name: i for i, name in enumerate(self.structure.free)}
         derivative_matrix = np.eye(len(unknown_indices))
-        ln_rad_s = {"alpha": self.ln_internal_rad_s, "lambda": self.ln_external_rad_s}
+        ln_reference_rad_s_by_order = {
+            "alpha": self.ln_internal_reference_rad_s,
+            "lambda": self.ln_external_reference_rad_s,
+        }
         for order, coefficient in COEFFICIENT_OF.items():
             if coefficient in unknown_indices:
                 derivative_matrix[unknown_indices[coefficient], unknown_indices[coefficient]] = (
                     parameters[coefficient]
                 )
                 if order in unknown_indices:
-                    coefficient_slope = -parameters[coefficient] * ln_rad_s[order]
+                    coefficient_slope = (
+                        -parameters[coefficient] * ln_reference_rad_s_by_order[order]
+                    )
                     derivative_matrix[unknown_indices[coefficient], unknown_indices[order]] = (
                         coefficient_slope
                     )

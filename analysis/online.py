@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from analysis.record import Record
     from rigd.beam import Plant
 
-_NOISE_POINTS: Final = 40
+_NOISE_SPECTRUM_POINTS: Final = 40
 """Number of frequencies at which the noise spectrum is reported."""
 _FINDINGS_WITHOUT_MODES: Final = frozenset(
     {"sign", "unit", "clipping", "stop", "hum", "sensor drift"}
@@ -47,7 +47,7 @@ class OnlineEstimate:
     whole : bool
         Whether every structure was tested, as in `analysis.select`. If not, only the freest
         structure was fitted, with the same tests of its residual.
-    took_s : float
+    computing_time_s : float
         Computing time in seconds.
     headline : Headline or None
         Reported estimates with flags; None without a fit.
@@ -71,7 +71,7 @@ class OnlineEstimate:
     tick: int
     duration_s: float
     whole: bool
-    took_s: float
+    computing_time_s: float
     headline: Headline | None = None
     orders: tuple[OrderVerdict, ...] = ()
     findings: tuple[Finding, ...] = ()
@@ -155,7 +155,7 @@ class OnlineEstimate:
             "tick": self.tick,
             "duration_s": self.duration_s,
             "whole": self.whole,
-            "took_s": round(self.took_s, 3),
+            "took_s": round(self.computing_time_s, 3),
             "problem": self.problem,
             "doubt": self.doubt,
             "warnings": self.warnings,
@@ -180,9 +180,9 @@ def _noise_spectrum(analysis: RecordAnalysis) -> dict[str, Any]:
     """Return frequencies in Hz and the noise spectrum in (N·m)²/Hz there, as a JSON document."""
     import numpy as np
 
-    hz = analysis.frequency_hz
-    points_hz = np.geomspace(hz[0], hz[-1], _NOISE_POINTS)
-    noise_levels = np.exp(np.interp(points_hz, hz, np.log(analysis.noise_nm2_per_hz)))
+    frequency_hz = analysis.frequency_hz
+    points_hz = np.geomspace(frequency_hz[0], frequency_hz[-1], _NOISE_SPECTRUM_POINTS)
+    noise_levels = np.exp(np.interp(points_hz, frequency_hz, np.log(analysis.noise_nm2_per_hz)))
     return {"frequency_hz": points_hz.tolist(), "nm2_per_hz": noise_levels.tolist()}
 
 
@@ -266,10 +266,10 @@ class OnlineEstimator:
         past_samples = self._blocks[0] if self._blocks else np.zeros(0, [("tick", "<u4")])
         if up_to_tick is not None:
             past_samples = past_samples[: np.searchsorted(past_samples["tick"], max(up_to_tick, 0))]
-        end = int(past_samples["tick"][-1]) + 1 if len(past_samples) else 0
+        end_tick = int(past_samples["tick"][-1]) + 1 if len(past_samples) else 0
         # Segments after the last sample are still to come, and do not count as cut short.
-        past_segments = segments_until(self._segments, end)
-        if not end or ("sweep" in self._segments and "sweep" not in past_segments):
+        past_segments = segments_until(self._segments, end_tick)
+        if not end_tick or ("sweep" in self._segments and "sweep" not in past_segments):
             raise RecordError("Nothing is excited yet.")
         return record_of(
             Session(
@@ -347,15 +347,17 @@ class OnlineEstimator:
             problem_text = (
                 str(error).removeprefix(f"{self._path}: ") if is_expected else problem_text
             )
-            took_s = time.monotonic() - started_s
-            return OnlineEstimate(end_tick, duration_s, whole, took_s, problem=problem_text)
+            computing_time_s = time.monotonic() - started_s
+            return OnlineEstimate(
+                end_tick, duration_s, whole, computing_time_s, problem=problem_text
+            )
         has_modes = bool(headline.visible_modes)
         plant = headline.fit.plant
         return OnlineEstimate(
             tick=end_tick,
             duration_s=duration_s,
             whole=whole,
-            took_s=time.monotonic() - started_s,
+            computing_time_s=time.monotonic() - started_s,
             headline=headline if has_modes else None,
             orders=order_verdicts if has_modes else (),
             findings=findings

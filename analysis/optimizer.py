@@ -59,7 +59,7 @@ class NormalEquations:
         scales = np.sqrt(np.maximum(np.diag(self.hessian), np.finfo(float).tiny))
         return self.hessian / np.outer(scales, scales), scales
 
-    def held(
+    def is_held_at_bound(
         self, x: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
         """Return whether each unknown is at a bound beyond which the cost would decrease, (k,).
@@ -112,10 +112,12 @@ class Region(Protocol):
     def upper(self) -> NDArray[np.float64]:
         """Upper bounds of the unknowns."""
 
-    def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def step_limits(
+        self, x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lower and upper limits of a step from `x`, for each unknown, (k,) each."""
 
-    def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def end_point(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the end point of a step within the bounds, shape (k,).
 
         Parameters
@@ -140,11 +142,13 @@ class ConstantBounds:
     upper: NDArray[np.float64]
     """Upper bounds, shape (k,)."""
 
-    def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return infinite limits of a step for each unknown, because `end` clips the step."""
+    def step_limits(
+        self, x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return infinite limits of a step for each unknown, because `end_point` clips the step."""
         return np.full(x.size, -np.inf), np.full(x.size, np.inf)
 
-    def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def end_point(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the end point of a step, clipped to the bounds, shape (k,).
 
         Parameters
@@ -159,29 +163,29 @@ class ConstantBounds:
 
 # Descent
 
-_FIRST_DAMPING: Final = 1e-3
+_INITIAL_STEP_DAMPING: Final = 1e-3
 """Damping of the first step, relative to the curvature."""
-_LARGEST_DAMPING: Final = 1e16
+_LARGEST_STEP_DAMPING: Final = 1e16
 """Damping above which a descent ends, because even tiny steps do not reduce the cost."""
-_SMALLEST_DAMPING_FACTOR: Final = 0.1
+_SMALLEST_STEP_DAMPING_FACTOR: Final = 0.1
 """Smallest factor by which the damping is multiplied after a successful step."""
 
-_SHORTEST_STEP: Final = 1e-13
+_SHORTEST_RELATIVE_STEP: Final = 1e-13
 """Length of a step relative to the unknowns, below which rounding errors dominate the step."""
-_SMALLEST_CURVATURE: Final = 1e-14
+_SMALLEST_RELATIVE_CURVATURE: Final = 1e-14
 """Smallest curvature used in the damping, relative to the largest one. It prevents huge steps of an
 unknown without effect."""
 
 
 def descend(
     problem: Callable[[NDArray[np.float64]], NormalEquations],
-    start: NDArray[np.float64],
+    start_point: NDArray[np.float64],
     region: Region,
     *,
     relative_tolerance: float,
     max_evaluations: int = 200,
     second_part: NDArray[np.float64] | None = None,
-    hopeless: tuple[int, float] | None = None,
+    early_stop_limits: tuple[int, float] | None = None,
 ) -> Minimum:
     """Find a local minimum of a sum of squares within bounds, by damped Gauss-Newton steps.
 
@@ -189,7 +193,7 @@ def descend(
     ----------
     problem : callable
         Function that returns the normal equations at a point of shape (k,).
-    start : ndarray, shape (k,)
+    start_point : ndarray, shape (k,)
         Starting point, in unknowns scaled so that a change of 1 is large.
     region : Region
         Bounds and rule for steps; a `ConstantBounds` for constant bounds.
@@ -202,45 +206,49 @@ def descend(
         Estimate of the second part of the Hessian for the first step, from a descent on a similar
         problem. With an estimate from a few points of a frequency response, fits to all points
         need 39 evaluations instead of 57.
-    hopeless : tuple of int and float, optional
+    early_stop_limits : tuple of int and float, optional
         Number of evaluations, and a cost. The descent ends if its cost is still higher after this
         number of evaluations, because other descents explain the data better.
     """
-    x = np.clip(start, region.lower, region.upper)
+    x = np.clip(start_point, region.lower, region.upper)
     current_equations = problem(x)
     evaluation_count = 1
     has_second_part = second_part is not None
-    second_estimate = (
+    second_part_estimate = (
         np.zeros_like(current_equations.hessian) if second_part is None else second_part
     )
-    damping, damping_growth = _FIRST_DAMPING, 2.0
+    damping, damping_growth = _INITIAL_STEP_DAMPING, 2.0
     while evaluation_count < max_evaluations:
-        is_held = current_equations.held(x, region.lower, region.upper)
-        is_free = ~is_held & (current_equations.hessian.diagonal() > 0)
-        if not is_free.any():
+        is_unknown_held = current_equations.is_held_at_bound(x, region.lower, region.upper)
+        is_unknown_free = ~is_unknown_held & (current_equations.hessian.diagonal() > 0)
+        if not is_unknown_free.any():
             break
         if (
-            hopeless is not None
-            and evaluation_count >= hopeless[0]
-            and current_equations.cost > hopeless[1]
+            early_stop_limits is not None
+            and evaluation_count >= early_stop_limits[0]
+            and current_equations.cost > early_stop_limits[1]
         ):
             break
-        step_limits = region.limits(x)
+        step_limits = region.step_limits(x)
         model_hessian = (
-            current_equations.hessian + second_estimate
+            current_equations.hessian + second_part_estimate
             if has_second_part
             else current_equations.hessian
         )
-        step = _compute_step(model_hessian, current_equations, is_free, damping, step_limits)
+        step = _compute_step(
+            model_hessian, current_equations, is_unknown_free, damping, step_limits
+        )
         if step is None:  # not convex
             has_second_part, model_hessian = False, current_equations.hessian
-            step = _compute_step(model_hessian, current_equations, is_free, damping, step_limits)
+            step = _compute_step(
+                model_hessian, current_equations, is_unknown_free, damping, step_limits
+            )
         if step is None:
             break
-        trial_point = region.end(x, step)
+        trial_point = region.end_point(x, step)
         step = trial_point - x  # the prediction is for the step after clipping
         predicted_reduction = -float(step @ (2 * current_equations.gradient + model_hessian @ step))
-        if float(np.abs(step).max()) < _SHORTEST_STEP * (1 + float(np.abs(x).max())):
+        if float(np.abs(step).max()) < _SHORTEST_RELATIVE_STEP * (1 + float(np.abs(x).max())):
             break
         if 0 <= predicted_reduction < relative_tolerance * current_equations.cost and damping < 1:
             break
@@ -251,17 +259,17 @@ def descend(
             gauss_newton_prediction = -float(
                 step @ (2 * current_equations.gradient + current_equations.hessian @ step)
             )
-            second_part_effect = float(step @ second_estimate @ step)
+            second_part_effect = float(step @ second_part_estimate @ step)
             has_second_part = abs(
                 cost_reduction - (gauss_newton_prediction - second_part_effect)
             ) <= abs(cost_reduction - gauss_newton_prediction)
-            second_estimate = _update_second_part(
-                second_estimate, step, current_equations, next_equations
+            second_part_estimate = _update_second_part(
+                second_part_estimate, step, current_equations, next_equations
             )
             prediction_ratio = (
                 cost_reduction / predicted_reduction if predicted_reduction > 0 else 0.0
             )
-            damping *= max(_SMALLEST_DAMPING_FACTOR, 1 - (2 * prediction_ratio - 1) ** 3)
+            damping *= max(_SMALLEST_STEP_DAMPING_FACTOR, 1 - (2 * prediction_ratio - 1) ** 3)
             damping_growth = 2.0
             x, current_equations = trial_point, next_equations
         elif has_second_part:
@@ -269,15 +277,15 @@ def descend(
         else:
             damping *= damping_growth
             damping_growth *= 2
-            if damping > _LARGEST_DAMPING:
+            if damping > _LARGEST_STEP_DAMPING:
                 break
-    return Minimum(x, current_equations, evaluation_count, second_estimate)
+    return Minimum(x, current_equations, evaluation_count, second_part_estimate)
 
 
 def _compute_step(
     model_hessian: NDArray[np.float64],
     current_equations: NormalEquations,
-    is_free: NDArray[np.bool_],
+    is_unknown_free: NDArray[np.bool_],
     damping: float,
     step_limits: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64] | None:
@@ -287,16 +295,16 @@ def _compute_step(
     Return None if the model is not convex.
     """
     smallest_step, largest_step = step_limits
-    step = np.zeros(is_free.size)
+    step = np.zeros(is_unknown_free.size)
     curvatures = current_equations.hessian.diagonal()
-    damped_model = model_hessian.copy()
-    damped_model.flat[:: step.size + 1] += damping * np.maximum(
-        curvatures, _SMALLEST_CURVATURE * curvatures[is_free].max()
+    damped_hessian = model_hessian.copy()
+    damped_hessian.flat[:: step.size + 1] += damping * np.maximum(
+        curvatures, _SMALLEST_RELATIVE_CURVATURE * curvatures[is_unknown_free].max()
     )
     gradient = current_equations.gradient
-    free_indices = np.flatnonzero(is_free)
+    free_indices = np.flatnonzero(is_unknown_free)
     while free_indices.size:
-        hessian_block = damped_model[free_indices[:, None], free_indices]
+        hessian_block = damped_hessian[free_indices[:, None], free_indices]
         try:
             np.linalg.cholesky(hessian_block)
             free_step = np.linalg.solve(hessian_block, -gradient[free_indices])
@@ -315,7 +323,7 @@ def _compute_step(
 
 
 def _update_second_part(
-    second_estimate: NDArray[np.float64],
+    second_part_estimate: NDArray[np.float64],
     step: NDArray[np.float64],
     current_equations: NormalEquations,
     next_equations: NormalEquations,
@@ -324,74 +332,76 @@ def _update_second_part(
     gradient_change = next_equations.gradient - current_equations.gradient
     step_curvature = float(gradient_change @ step)
     if step_curvature <= 0:
-        return second_estimate
-    second_change = (
+        return second_part_estimate
+    second_part_gradient_change = (
         gradient_change - (current_equations.hessian + next_equations.hessian) @ step / 2
     )
-    predicted_change = second_estimate @ step
-    change_size = abs(float(step @ predicted_change))
-    if change_size > 0:  # an estimate from a higher cost may be too large here
-        overlap_factor = min(1.0, abs(float(step @ second_change)) / change_size)
-        second_estimate, predicted_change = (
-            overlap_factor * second_estimate,
-            overlap_factor * predicted_change,
+    predicted_gradient_change = second_part_estimate @ step
+    predicted_change_size = abs(float(step @ predicted_gradient_change))
+    if predicted_change_size > 0:  # an estimate from a higher cost may be too large here
+        sizing_factor = min(
+            1.0, abs(float(step @ second_part_gradient_change)) / predicted_change_size
         )
-    change_error = second_change - predicted_change
-    outer_update = change_error[:, None] * gradient_change
+        second_part_estimate, predicted_gradient_change = (
+            sizing_factor * second_part_estimate,
+            sizing_factor * predicted_gradient_change,
+        )
+    gradient_change_error = second_part_gradient_change - predicted_gradient_change
+    outer_update = gradient_change_error[:, None] * gradient_change
     return (
-        second_estimate
+        second_part_estimate
         + (outer_update + outer_update.T) / step_curvature
-        - (float(change_error @ step) / step_curvature**2)
+        - (float(gradient_change_error @ step) / step_curvature**2)
         * (gradient_change[:, None] * gradient_change)
     )
 
 
 # Values at the last points
 
-_Value = TypeVar("_Value")
+_CachedValue = TypeVar("_CachedValue")
 """Type of the cached values."""
 
 
-class RecentValues(Generic[_Value]):
+class RecentValues(Generic[_CachedValue]):
     """Cache of a function's values at the last points of a descent.
 
     Covariances are evaluated at the last point of a descent, and the next descent begins there.
 
     Parameters
     ----------
-    points : int
+    stored_points : int
         Number of stored points. One is not enough, because a descent may reject its last step.
     """
 
     __slots__ = ("_points", "_values")
 
-    def __init__(self, points: int = 2) -> None:
-        self._points = points
-        self._values: dict[tuple[object, bytes], _Value] = {}
+    def __init__(self, stored_points: int = 2) -> None:
+        self._points = stored_points
+        self._values: dict[tuple[object, bytes], _CachedValue] = {}
 
-    def at(
+    def value_at(
         self,
         x: NDArray[np.float64],
-        compute: Callable[[NDArray[np.float64]], _Value],
+        compute_value: Callable[[NDArray[np.float64]], _CachedValue],
         owner: object = None,
-    ) -> _Value:
+    ) -> _CachedValue:
         """Return the value at `x` from the cache, or compute and store it.
 
         Parameters
         ----------
         x : ndarray, shape (k,)
             Point at which the function is evaluated.
-        compute : callable
+        compute_value : callable
             Function that returns the value at a point.
         owner : object, optional
-            Object to which `compute` belongs, if several objects use the same cache.
+            Object to which `compute_value` belongs, if several objects use the same cache.
         """
-        key = owner, x.tobytes()
-        if key not in self._values:
+        cache_key = owner, x.tobytes()
+        if cache_key not in self._values:
             if len(self._values) == self._points:
                 del self._values[next(iter(self._values))]
-            self._values[key] = compute(x)
-        return self._values[key]
+            self._values[cache_key] = compute_value(x)
+        return self._values[cache_key]
 
     def clear(self) -> None:
         """Forget all values."""

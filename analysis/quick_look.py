@@ -50,7 +50,7 @@ _LONGEST_FULL_ANALYSIS_S: Final = 300.0
 """Longest record to which every structure is fitted, in seconds. Per second of record at 1 kHz, all
 structures take 15 ms, the freest structure alone 4 ms."""
 
-_JOIN_DISTANCE: Final = 0.1
+_MAX_JOINED_GAP_RATIO: Final = 0.1
 """Largest gap between two bands of low coherence, relative to their frequency, across which they
 are joined to one band."""
 
@@ -62,14 +62,14 @@ class QuickLookError(ValueError):
 # The quick look
 
 
-def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
+def make_quick_look(path: Path, last_session_path: Path | None = None) -> dict[str, Any]:
     """Return the quick look at a session.
 
     Parameters
     ----------
     path : Path
         Session file.
-    last : Path, optional
+    last_session_path : Path, optional
         Session file whose quick look is compared. The default is the last session of the same
         specimen in the folder of the file.
 
@@ -81,7 +81,8 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
     Raises
     ------
     rigd.session.SessionError, QuickLookError
-        The session file does not exist, or there is no quick look of the session `last`.
+        The session file does not exist, or there is no quick look of the session
+        `last_session_path`.
     """
     from analysis.record import RecordError, load_record
     from analysis.results import finite
@@ -111,8 +112,8 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
         if headline is not None and response_document is not None:
             model_document = _model_document(headline, record, response_document["frequency_hz"])
     last_quick_look_document = (
-        _stored_quick_look(last)
-        if last is not None
+        _stored_quick_look(last_session_path)
+        if last_session_path is not None
         else _last_quick_look(path, specimen, start_utc_ns)
     )
     if last_quick_look_document is not None and any(mode.shown for mode in modes):
@@ -148,7 +149,7 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
     from analysis.results import whole_record
     from analysis.validity import record_validity, stated_validity
 
-    sentences = []
+    remark_sentences = []
     duration_s = record.time_s.size / record.rate_hz
     headline: Headline
     findings: tuple[Finding, ...]
@@ -167,24 +168,24 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
             validity = record_validity(
                 record.metadata, record.angle_rad, record.rate_hz, headline.fit.plant
             )
-            sentences.append(
+            remark_sentences.append(
                 f"The record is long ({duration_s:.0f} s): type {headline.name} alone was fitted; "
                 "non-uniform beams, air drag, nonlinear forces and changes along the record were "
                 "not tried. analyze tries them."
             )
     except MeasurementError as error:
-        no_modes = f"No modes: {_remove_file_name(str(error), record.path)}"
-        return None, stated_validity(record.metadata), [no_modes]
+        no_modes_sentence = f"No modes: {_remove_file_name(str(error), record.path)}"
+        return None, stated_validity(record.metadata), [no_modes_sentence]
     if headline.uniform_beam is not None:
         validity = replace(validity, uniform_beam=headline.uniform_beam.summary)
-    sentences += [finding.sentence for finding in findings]
+    remark_sentences += [finding.sentence for finding in findings]
     if not headline.modes:
-        sentences.append("No modes: none lies in the excited band.")
-    return headline, validity, sentences
+        remark_sentences.append("No modes: none lies in the excited band.")
+    return headline, validity, remark_sentences
 
 
 def _model_document(
-    headline: Headline, record: Record, shown_hz: Sequence[float]
+    headline: Headline, record: Record, shown_frequencies_hz: Sequence[float]
 ) -> dict[str, Any] | None:
     """Return the model's frequency response with its 95 % band, at the excited frequencies.
 
@@ -197,11 +198,17 @@ def _model_document(
     from analysis.report.bands import dense_grid
     from rigd.sweep_response import response_decimation
 
-    if not headline.explained or headline.drag_speed_m_s is not None or len(shown_hz) == 0:
+    if (
+        not headline.explained
+        or headline.drag_speed_m_s is not None
+        or len(shown_frequencies_hz) == 0
+    ):
         return None
     shown_model = ShownModel.from_headline(headline, record)
     peaks_hz = [mode.frequency_hz for mode in shown_model.modes]
-    response_band = shown_model.band(dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
+    response_band = shown_model.band(
+        dense_grid(min(shown_frequencies_hz), max(shown_frequencies_hz), peaks_hz)
+    )
     magnitude, magnitude_limits = np.abs(response_band.response), response_band.magnitude_limits()
     selected_bins = response_decimation(response_band.frequency_hz).extremes(magnitude)
     return {
@@ -222,19 +229,21 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
     import numpy as np
 
     from analysis.applicability import welch_exclusion_reason
-    from analysis.models import LARGEST_FRACTION_OF_RATE
+    from analysis.models import MAX_FREQUENCY_TO_RATE_RATIO
     from rigd.spectral import SpectralError, segmentation_of
     from rigd.sweep_response import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_decimation
 
-    last_hz = min(LAST_HZ, LARGEST_FRACTION_OF_RATE * record.rate_hz)
-    segments = segmentation_of(record.first_sweep_samples, record.rate_hz)
-    resolution_hz = WINDOW.half_power_bins * record.rate_hz / segments.segment_length
+    last_hz = min(LAST_HZ, MAX_FREQUENCY_TO_RATE_RATIO * record.rate_hz)
+    segmentation = segmentation_of(record.first_sweep_samples, record.rate_hz)
+    resolution_hz = WINDOW.half_power_bins * record.rate_hz / segmentation.segment_length
     try:
-        estimate = _estimate_response(record, segments, last_hz)
+        estimate = _estimate_response(record, segmentation, last_hz)
         # For steps, multisines and narrow sweeps, the coherence would depend on the segments.
         coherence_values = None
         if estimate is not None and welch_exclusion_reason(record, (FIRST_HZ, last_hz)) is None:
-            coherence_values, segments = _estimate_coherence(record, estimate, segments, last_hz)
+            coherence_values, segmentation = _estimate_coherence(
+                record, estimate, segmentation, last_hz
+            )
     except SpectralError as error:
         return None, _empty_coherence(), [str(error)]
     if estimate is None:
@@ -247,25 +256,27 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
         & (undelayed_response.frequency_hz >= FIRST_HZ)
         & np.isfinite(undelayed_response.response)
     )
-    hz, shown_values = (
+    shown_frequency_hz, shown_response = (
         undelayed_response.frequency_hz[is_shown],
         undelayed_response.response[is_shown],
     )
-    selected_bins = response_decimation(hz).extremes(np.abs(shown_values))
+    selected_bins = response_decimation(shown_frequency_hz).extremes(np.abs(shown_response))
     response_document = {
-        "frequency_hz": _round_digits(hz[selected_bins]),
-        "magnitude": _round_digits(np.abs(shown_values[selected_bins])),
-        "phase_rad": _round_digits(np.angle(shown_values[selected_bins])),
+        "frequency_hz": _round_digits(shown_frequency_hz[selected_bins]),
+        "magnitude": _round_digits(np.abs(shown_response[selected_bins])),
+        "phase_rad": _round_digits(np.angle(shown_response[selected_bins])),
         "coherence": None
         if coherence_values is None
         else _round_digits(coherence_values[is_shown][selected_bins]),
         "resolution_hz": round(resolution_hz, 4),
     }
-    if coherence_values is None or hz.size == 0:
+    if coherence_values is None or shown_frequency_hz.size == 0:
         return response_document, _empty_coherence(), []
     shown_coherence = coherence_values[is_shown]
     incoherent_bands = _join_bins(
-        hz, shown_coherence < LOW_COHERENCE, record.rate_hz / segments.segment_length
+        shown_frequency_hz,
+        shown_coherence < LOW_COHERENCE,
+        record.rate_hz / segmentation.segment_length,
     )
     low_bands = [[round(band_edge, 3) for band_edge in band] for band in incoherent_bands]
     return (
@@ -276,7 +287,7 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
 
 
 def _estimate_response(
-    record: Record, segments: Segmentation, last_hz: float
+    record: Record, segmentation: Segmentation, last_hz: float
 ) -> RunningEstimate | None:
     """Return the estimate of the frequency response from a record's sweep."""
     import numpy as np
@@ -285,7 +296,7 @@ def _estimate_response(
 
     sweep_range, rest_rad = record.first_sweep, record.rest_angle_rad or 0.0
     running_response = RunningResponse(
-        record.rate_hz, record.first_sweep_samples, last_hz=last_hz, segmentation=segments
+        record.rate_hz, record.first_sweep_samples, last_hz=last_hz, segmentation=segmentation
     )
     running_response.feed(
         np.arange(record.first_sweep_samples),
@@ -297,11 +308,11 @@ def _estimate_response(
 
 
 def _estimate_coherence(
-    record: Record, estimate: RunningEstimate, segments: Segmentation, last_hz: float
+    record: Record, estimate: RunningEstimate, segmentation: Segmentation, last_hz: float
 ) -> tuple[RealArray | None, Segmentation]:
     """Return the coherence of a record, and the segments by which it is estimated.
 
-    If `segments` give only one segment, which has no coherence, shorter ones are used. The
+    If `segmentation` give only one segment, which has no coherence, shorter ones are used. The
     coherence is None if these do not give an estimate either.
     """
     from rigd.spectral import PAPER_OVERLAP_FRACTION, PAPER_SEGMENTS, segment_lengths
@@ -310,10 +321,13 @@ def _estimate_coherence(
         segment_length, overlap_samples = segment_lengths(
             record.first_sweep_samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION
         )
-        segments = replace(segments, segment_length=segment_length, overlap=overlap_samples)
-        shorter_estimate = _estimate_response(record, segments, last_hz)
-        return None if shorter_estimate is None else shorter_estimate.response.coherence, segments
-    return estimate.response.coherence, segments
+        segmentation = replace(segmentation, segment_length=segment_length, overlap=overlap_samples)
+        shorter_estimate = _estimate_response(record, segmentation, last_hz)
+        return (
+            None if shorter_estimate is None else shorter_estimate.response.coherence,
+            segmentation,
+        )
+    return estimate.response.coherence, segmentation
 
 
 def _join_bins(
@@ -326,13 +340,20 @@ def _join_bins(
     """
     import numpy as np
 
-    hz = frequency_hz[is_selected]
-    band_starts = (
-        np.flatnonzero(np.diff(hz) > np.maximum(_JOIN_DISTANCE * hz[:-1], resolution_hz)) + 1
+    selected_hz = frequency_hz[is_selected]
+    band_start_indices = (
+        np.flatnonzero(
+            np.diff(selected_hz)
+            > np.maximum(_MAX_JOINED_GAP_RATIO * selected_hz[:-1], resolution_hz)
+        )
+        + 1
     )
-    for start, end in pairwise([0, *band_starts, hz.size]):
-        if end > start and hz[end - 1] - hz[start] >= resolution_hz:
-            yield float(hz[start]), float(hz[end - 1])
+    for start_index, end_index in pairwise([0, *band_start_indices, selected_hz.size]):
+        if (
+            end_index > start_index
+            and selected_hz[end_index - 1] - selected_hz[start_index] >= resolution_hz
+        ):
+            yield float(selected_hz[start_index]), float(selected_hz[end_index - 1])
 
 
 def _empty_coherence() -> dict[str, Any]:
@@ -390,7 +411,7 @@ def _compare_modes(modes: list[ReportedMode], other_document: Mapping[str, Any])
             change_between(other_mode.damping_ratio, mode.damping_ratio),
         )
         change_percent = mode.damping_ratio.percent_above(other_mode.damping_ratio)
-        is_significant = [
+        are_significant = [
             change.significant is True for change in (frequency_change, damping_change)
         ]
         compared_modes.append(
@@ -398,7 +419,7 @@ def _compare_modes(modes: list[ReportedMode], other_document: Mapping[str, Any])
                 "mode": mode.number,
                 "frequency_hz_change": frequency_change.difference,
                 "damping_ratio_change_percent": change_percent,
-                "significant": any(is_significant),
+                "significant": any(are_significant),
             }
         )
         change_texts = (
@@ -407,23 +428,23 @@ def _compare_modes(modes: list[ReportedMode], other_document: Mapping[str, Any])
         )
         significant_texts = [
             change_text
-            for change_text, is_different in zip(change_texts, is_significant, strict=True)
+            for change_text, is_different in zip(change_texts, are_significant, strict=True)
             if is_different
         ]
         if significant_texts:
             changed_modes.append(f"mode {mode.number} {', '.join(significant_texts)}")
         else:
             unchanged_modes.append(f"mode {mode.number} {', '.join(change_texts)}")
-    other_name = Path(other_document["file"]).stem
+    other_session_name = Path(other_document["file"]).stem
     if not compared_modes:
-        comparison_sentence = f"No mode can be compared with {other_name}."
+        comparison_sentence = f"No mode can be compared with {other_session_name}."
     elif changed_modes:
         comparison_sentence = (
-            f"Significant change against {other_name}: {'; '.join(changed_modes)}."
+            f"Significant change against {other_session_name}: {'; '.join(changed_modes)}."
         )
     else:
         comparison_sentence = (
-            f"No significant change against {other_name} ({'; '.join(unchanged_modes)})."
+            f"No significant change against {other_session_name} ({'; '.join(unchanged_modes)})."
         )
     return {
         "file": other_document["file"],
@@ -435,41 +456,46 @@ def _compare_modes(modes: list[ReportedMode], other_document: Mapping[str, Any])
 # Text
 
 
-def _text_lines(document: Mapping[str, Any]) -> Iterator[str]:
+def _text_lines(quick_look_document: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines of text that show a quick look in a terminal."""
     from rigd.sweep_response import LOW_COHERENCE
 
-    specimen_text = f" ({document['specimen']})" if document["specimen"] else ""
+    specimen_text = (
+        f" ({quick_look_document['specimen']})" if quick_look_document["specimen"] else ""
+    )
     # The intervals do not include scale of the torque, length and density of the beam.
-    yield f"Quick look at {document['session_id']}{specimen_text}; ± 95 %, statistical only:"
-    modes = modes_from_json(document["modes"])
+    yield (
+        f"Quick look at {quick_look_document['session_id']}{specimen_text}; ± 95 %, "
+        "statistical only:"
+    )
+    modes = modes_from_json(quick_look_document["modes"])
     shown_modes = [mode for mode in modes if mode.shown]
     for mode in shown_modes:
         yield f"  {mode.line()}"
     if shown_modes:
-        validity = Validity.from_document(document.get("validity"))
+        validity = Validity.from_document(quick_look_document.get("validity"))
         yield f"  {validity.sentence}"
         if validity.uniform_beam is not None:
             yield f"  {validity.uniform_beam.sentence}"
-    doubts = dict.fromkeys(
+    doubt_texts = dict.fromkeys(
         estimate.flag
         for mode in shown_modes
         for estimate in (mode.frequency_hz, mode.damping_ratio)
         if estimate.flag
     )
-    yield from (f"  doubtful: {doubt_text}" for doubt_text in doubts)
+    yield from (f"  doubtful: {doubt_text}" for doubt_text in doubt_texts)
     if hidden_modes := unseen_modes(modes):
         yield f"  not visible in this record: {hidden_modes}"
-    coherence = document["coherence"]
+    coherence = quick_look_document["coherence"]
     if coherence["mean"] is not None:
         bands_text = ", ".join(
             f"{first_hz:.3g} to {last_hz:.3g}" for first_hz, last_hz in coherence["low_bands"]
         )
-        low_text = f", below {LOW_COHERENCE:g} from {bands_text} Hz" if bands_text else ""
-        yield f"  mean coherence {coherence['mean']:.2f}{low_text}"
-    yield from (f"  {value_flag}" for value_flag in document["flags"])
-    if document["against_last"] is not None:
-        yield f"  {document['against_last']['sentence']}"
+        low_coherence_text = f", below {LOW_COHERENCE:g} from {bands_text} Hz" if bands_text else ""
+        yield f"  mean coherence {coherence['mean']:.2f}{low_coherence_text}"
+    yield from (f"  {value_flag}" for value_flag in quick_look_document["flags"])
+    if quick_look_document["against_last"] is not None:
+        yield f"  {quick_look_document['against_last']['sentence']}"
 
 
 def _round_digits(numbers: RealArray) -> list[float]:
@@ -490,16 +516,16 @@ def _remove_file_name(sentence: str, path: Path) -> str:
 # The file
 
 
-def write_quick_look(document: Mapping[str, Any], path: Path) -> Path:
+def write_quick_look(quick_look_document: Mapping[str, Any], session_path: Path) -> Path:
     """Write a quick look to a file next to its session file, completely or not at all.
 
     An older quick look of the same session is replaced, a newer one is retained.
 
     Parameters
     ----------
-    document : mapping
+    quick_look_document : mapping
         Result of `make_quick_look`.
-    path : Path
+    session_path : Path
         Session file.
 
     Returns
@@ -512,9 +538,12 @@ def write_quick_look(document: Mapping[str, Any], path: Path) -> Path:
     QuickLookError
         The file cannot be written, or a file of that name is no quick look.
     """
-    quick_look_file = quick_look_path(path)
+    quick_look_file = quick_look_path(session_path)
     existing_document = read_quick_look(quick_look_file)
-    if existing_document is not None and existing_document["made_utc_ns"] > document["made_utc_ns"]:
+    if (
+        existing_document is not None
+        and existing_document["made_utc_ns"] > quick_look_document["made_utc_ns"]
+    ):
         return quick_look_file
     temporary_file = quick_look_file.with_name(f".{quick_look_file.name}.{os.getpid()}")
     try:
@@ -526,7 +555,7 @@ def write_quick_look(document: Mapping[str, Any], path: Path) -> Path:
             raise QuickLookError(
                 f"{quick_look_file} is not a quick look of this version; move it away."
             )
-        temporary_file.write_text(json.dumps(document, allow_nan=False), "utf-8")
+        temporary_file.write_text(json.dumps(quick_look_document, allow_nan=False), "utf-8")
         temporary_file.replace(quick_look_file)
     except OSError as error:
         raise QuickLookError(f"{quick_look_file} cannot be written ({error.strerror}).") from None

@@ -134,7 +134,7 @@ class Record:
         the motor's axis; None if not stated.
     sweep
         Range of samples with the excitation.
-    there
+    outward_sweep
         Range of samples of the first sweep of a chirp there and back; None if there is one sweep.
     rest_angle_rad
         Angle held before the sweep; None if the file has no segment ``rest``.
@@ -179,7 +179,7 @@ class Record:
     tip_mass_kg: float | None
     axis_tilt_deg: float | None
     sweep: slice
-    there: slice | None
+    outward_sweep: slice | None
     rest_angle_rad: float | None
     gaps: Gaps
     flags: Mapping[str, int]
@@ -230,7 +230,7 @@ class Record:
     @property
     def first_sweep(self) -> slice:
         """Range of samples for Welch's method: the single sweep, or the first of two sweeps."""
-        return self.sweep if self.there is None else self.there
+        return self.sweep if self.outward_sweep is None else self.outward_sweep
 
     @property
     def first_sweep_samples(self) -> int:
@@ -287,18 +287,24 @@ def load_record(
     session = read_session(
         path, fields=_TICK_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
     )
-    grid, covered_s = _grid_of(session, part_s)
+    grid, covered_interval_s = _tick_grid_of(session, part_s)
     # The grid replaces the ticks, of which a long record has many.
     session = replace(session, samples=session.samples[:0].copy())
     rest_angles_rad: list[NDArray[np.float64]] = []
-    collector = _collector_of_signals(grid, highest_hz, longest_samples)
+    signal_collector = _collector_of_signals(grid, highest_hz, longest_samples)
 
     def add_samples(samples: NDArray[np.void]) -> None:
         rest_angles_rad.append(_rest_angles_rad(session, samples))
-        collector.add(samples)
+        signal_collector.add(samples)
 
     read_session(path, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS, on_samples=add_samples)
-    return _record(session, grid, collector.finish(), covered_s, _median_rad(rest_angles_rad))
+    return _make_record(
+        session,
+        grid,
+        signal_collector.finish(),
+        covered_interval_s,
+        _median_angle_rad(rest_angles_rad),
+    )
 
 
 def _may_be_longer(path: Path, sample_count: int) -> bool:
@@ -335,23 +341,25 @@ def record_of(
     RecordError
         The samples cannot be analysed.
     """
-    grid, covered_s = _grid_of(session, part_s)
-    collector = _collector_of_signals(grid, highest_hz, longest_samples)
-    collector.add(session.samples)
-    rest_angle_rad = _median_rad([_rest_angles_rad(session, session.samples)])
-    return _record(session, grid, collector.finish(), covered_s, rest_angle_rad)
+    grid, covered_interval_s = _tick_grid_of(session, part_s)
+    signal_collector = _collector_of_signals(grid, highest_hz, longest_samples)
+    signal_collector.add(session.samples)
+    rest_angle_rad = _median_angle_rad([_rest_angles_rad(session, session.samples)])
+    return _make_record(
+        session, grid, signal_collector.finish(), covered_interval_s, rest_angle_rad
+    )
 
 
 def _collector_of_signals(
     grid: TickGrid, highest_hz: float, longest_samples: int
 ) -> FullRateSignals | SignalDecimation:
     """Return the collector for the signals of a record: decimated if the record is long."""
-    if grid.count <= longest_samples:
+    if grid.tick_count <= longest_samples:
         return FullRateSignals(grid)
     from analysis.signal_decimation import SignalDecimation  # late: for a long record only
 
     decimation = SignalDecimation(grid, highest_hz)
-    return decimation if decimation.factor > 1 else FullRateSignals(grid)
+    return decimation if decimation.downsampling_factor > 1 else FullRateSignals(grid)
 
 
 def _rest_angles_rad(session: Session, samples: NDArray[np.void]) -> NDArray[np.float64]:
@@ -362,13 +370,13 @@ def _rest_angles_rad(session: Session, samples: NDArray[np.void]) -> NDArray[np.
     return rest_angles_rad
 
 
-def _median_rad(angles_rad: list[NDArray[np.float64]]) -> float | None:
+def _median_angle_rad(angle_blocks_rad: list[NDArray[np.float64]]) -> float | None:
     """Return the median of blocks of angles; None if there is no angle."""
-    all_angles_rad = np.concatenate(angles_rad) if angles_rad else np.zeros(0)
+    all_angles_rad = np.concatenate(angle_blocks_rad) if angle_blocks_rad else np.zeros(0)
     return float(np.median(all_angles_rad)) if all_angles_rad.size else None
 
 
-def _grid_of(
+def _tick_grid_of(
     session: Session, part_s: PartOption | None
 ) -> tuple[TickGrid, tuple[float, float] | None]:
     """Return the ticks of a session or of a part of it, and beginning and end of the part in s."""
@@ -378,18 +386,18 @@ def _grid_of(
         )
     rate_hz = stated_rate_hz(session)
     if part_s is None:
-        return TickGrid.of(session, rate_hz), None
+        return TickGrid.from_session(session, rate_hz), None
     from analysis.record_part import part_of_session
 
-    part, covered_s = part_of_session(session, part_s, rate_hz)
-    return TickGrid.of(part, rate_hz), covered_s
+    part, covered_interval_s = part_of_session(session, part_s, rate_hz)
+    return TickGrid.from_session(part, rate_hz), covered_interval_s
 
 
-def _record(
+def _make_record(
     session: Session,
     grid: TickGrid,
     signals: RecordSignals,
-    covered_s: tuple[float, float] | None,
+    covered_interval_s: tuple[float, float] | None,
     rest_angle_rad: float | None,
 ) -> Record:
     """Return the record of a session, or of the part of it to which `grid` belongs.
@@ -398,15 +406,17 @@ def _record(
     """
     metadata, unread_metadata = readable_texts(session.metadata, "keys of the metadata")
     outcome, unread_outcome = readable_texts(session.outcome or {}, "keys of the outcome")
-    reference_rad, angle_rad, torque_nm = signals.values
-    ticks = grid.first_tick + signals.first_tick + signals.factor * np.arange(torque_nm.size)
-    beam = stated_beam(session, grid.rate_hz, grid.count)
+    reference_rad, angle_rad, torque_nm = signals.signal_values
+    ticks = (
+        grid.first_tick + signals.first_tick + signals.ticks_per_sample * np.arange(torque_nm.size)
+    )
+    beam = stated_beam(session, grid.rate_hz, grid.tick_count)
     swept_hz = None
-    if covered_s is not None:
+    if covered_interval_s is not None:
         from analysis.record_part import check_part_length, swept_frequencies_hz
 
-        check_part_length(session.path, covered_s, beam)
-        first_sweep = grid.there or grid.sweep
+        check_part_length(session.path, covered_interval_s, beam)
+        first_sweep = grid.outward_sweep or grid.sweep
         swept_hz = swept_frequencies_hz(
             session, grid.first_tick + first_sweep.start, grid.first_tick + first_sweep.stop
         )
@@ -421,7 +431,7 @@ def _record(
         torque_nm=torque_nm,
         angle_known=signals.angle_known,
         torque_known=signals.torque_known,
-        rate_hz=grid.rate_hz / signals.factor,
+        rate_hz=grid.rate_hz / signals.ticks_per_sample,
         beam=beam,
         angle_delay_s=stated_delay_s(session, "angle_delay_s"),
         torque_delay_s=stated_delay_s(session, "torque_delay_s"),
@@ -432,7 +442,9 @@ def _record(
         tip_mass_kg=stated_tip_mass_kg(session),
         axis_tilt_deg=stated_axis_tilt_deg(session),
         sweep=signals.samples_in(grid.sweep),
-        there=None if grid.there is None else signals.samples_in(grid.there),
+        outward_sweep=None
+        if grid.outward_sweep is None
+        else signals.samples_in(grid.outward_sweep),
         rest_angle_rad=rest_angle_rad,
         gaps=grid.gaps(),
         flags=grid.flag_counts(),
@@ -445,10 +457,10 @@ def _record(
         ),
         metadata=metadata,
         outcome=outcome.get("outcome", "unknown"),
-        part_s=covered_s,
+        part_s=covered_interval_s,
         swept_hz=swept_hz,
         decimated_from=None
-        if signals.factor == 1
-        else FullRate(grid.rate_hz, grid.count, grid.sweep),
+        if signals.ticks_per_sample == 1
+        else FullRate(grid.rate_hz, grid.tick_count, grid.sweep),
         torque_extremes=signals.torque_extremes,
     )

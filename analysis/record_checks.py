@@ -52,10 +52,10 @@ MAX_UNIFORMITY_PERCENT: Final = 10.0
 """Largest deviation of mode frequencies from a uniform beam's for which its model is used."""
 _DEFAULT_UNIFORMITY_PERCENT: Final = 0.1
 """Deviation of mode frequencies of a carefully made antenna."""
-_FIRST_EIGENVALUE: Final = 1.8751040687119611
+_FIRST_CLAMPED_FREE_EIGENVALUE: Final = 1.8751040687119611
 """First root of 1 + cos z cosh z: mode 1 is at (root / length)² √(EI/rho) rad/s."""
 
-_LEAST_MODE_PERIODS: Final = 0.1
+_MIN_PERIODS_OF_FIRST_MODE: Final = 0.1
 """Least number of periods of the stated beam's first mode in a record. It is so small because the
 stated beam's frequency may be wrong by a factor of ten."""
 
@@ -74,7 +74,7 @@ def stated_rate_hz(session: Session) -> float:
     return rate_hz
 
 
-def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
+def stated_beam(session: Session, rate_hz: float, tick_count: int) -> Beam:
     """Return the beam that a session states, after checking that its first mode can be measured.
 
     Parameters
@@ -83,7 +83,7 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
         Session as read.
     rate_hz : float
         Sampling rate.
-    ticks : int
+    tick_count : int
         Length of the record in ticks.
 
     Raises
@@ -105,13 +105,14 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
     beam = Beam(
         length_m=length_m, density_kg_per_m=density_kg_per_m, bending_stiffness_n_m2=stiffness_n_m2
     )
-    first_hz, lowest_hz = first_mode_hz(beam), _LEAST_MODE_PERIODS * rate_hz / ticks
+    first_hz, lowest_hz = first_mode_hz(beam), _MIN_PERIODS_OF_FIRST_MODE * rate_hz / tick_count
     if not lowest_hz < first_hz < rate_hz / 2:
         raise RecordError(
             f"{session.path}: with beam_length_m {length_m:g} m, beam_density_kg_per_m "
             f"{density_kg_per_m:g} "
             f"kg/m and beam_bending_stiffness_n_m2 {stiffness_n_m2:g} N·m² the first mode would be "
-            f"at {first_hz:.3g} Hz, which {ticks / rate_hz:.3g} s at {rate_hz:g} Hz cannot show; "
+            f"at {first_hz:.3g} Hz, which {tick_count / rate_hz:.3g} s at {rate_hz:g} Hz cannot "
+            "show; "
             + (
                 "record longer, or correct the file's metadata if these are wrong."
                 if first_hz <= lowest_hz
@@ -131,7 +132,9 @@ def first_mode_hz(beam: Beam) -> float:
         Beam with a locked hub.
     """
     return (
-        (_FIRST_EIGENVALUE / beam.length_m) ** 2 / math.sqrt(beam.density_over_stiffness) / math.tau
+        (_FIRST_CLAMPED_FREE_EIGENVALUE / beam.length_m) ** 2
+        / math.sqrt(beam.density_over_stiffness)
+        / math.tau
     )
 
 
@@ -179,26 +182,26 @@ def stated_axis_tilt_deg(session: Session) -> float | None:
     return _stated_in_range(session, "axis_tilt_deg", -MAX_AXIS_TILT_DEG, MAX_AXIS_TILT_DEG)
 
 
-def _stated_in_range(session: Session, key: str, low: float, high: float) -> float | None:
+def _stated_in_range(session: Session, metadata_key: str, low: float, high: float) -> float | None:
     """Return the number of a metadata key, or None if not stated; raise if not in a range."""
-    if key not in session.metadata:
+    if metadata_key not in session.metadata:
         return None
-    stated_number = session.number(key)
+    stated_number = session.number(metadata_key)
     if not low <= stated_number <= high:
         raise _invalid_value_error(
-            session, key, stated_number, f"must lie between {low:g} and {high:g}"
+            session, metadata_key, stated_number, f"must lie between {low:g} and {high:g}"
         )
     return stated_number
 
 
-def stated_delay_s(session: Session, key: str) -> float:
+def stated_delay_s(session: Session, metadata_key: str) -> float:
     """Return the age of a channel's values at their time stamps in seconds, 0 if not stated.
 
     Parameters
     ----------
     session : Session
         Session as read.
-    key : str
+    metadata_key : str
         Key of the delay in the metadata.
 
     Raises
@@ -206,9 +209,11 @@ def stated_delay_s(session: Session, key: str) -> float:
     RecordError
         The delay is longer than that of any device.
     """
-    delay_s = session.number(key, 0.0)
+    delay_s = session.number(metadata_key, 0.0)
     if abs(delay_s) > _MAX_DELAY_S:
-        raise _invalid_value_error(session, key, delay_s, f"must lie within ±{_MAX_DELAY_S:g}")
+        raise _invalid_value_error(
+            session, metadata_key, delay_s, f"must lie within ±{_MAX_DELAY_S:g}"
+        )
     return delay_s
 
 
@@ -283,11 +288,12 @@ def stated_uniformity(session: Session) -> float:
 
 
 def _invalid_value_error(
-    session: Session, key: str, stated_value: float, violated_rule: str
+    session: Session, metadata_key: str, stated_value: float, violated_rule: str
 ) -> RecordError:
     """Return the error for an invalid number of the session's metadata, with the violated rule."""
     return RecordError(
-        f"{session.path}: {key} is {f'{stated_value:g} {unit_of(key)}'.rstrip()}, but "
+        f"{session.path}: {metadata_key} is "
+        f"{f'{stated_value:g} {unit_of(metadata_key)}'.rstrip()}, but "
         f"{violated_rule}; correct the file's metadata."
     )
 
@@ -311,7 +317,7 @@ MAX_TICKS = MAX_SAMPLES
 MAX_ABSOLUTE_VALUE = 1e9
 """Largest angle in rad or torque in N·m; the squares of much larger values would overflow."""
 
-MAX_CLOCK_ERROR = 1e-3
+MAX_RELATIVE_CLOCK_ERROR = 1e-3
 """Largest relative difference between the stated rate and the rate of the time stamps."""
 
 
@@ -368,20 +374,22 @@ def check_clock(
     if len(ticks) < 2:
         return
     # The values are compared, because a difference of values from a file may overflow.
-    bad_indices = np.flatnonzero(t_ns[1:] <= t_ns[:-1])
-    if bad_indices.size:
-        first_bad_index = int(bad_indices[0])
+    not_increasing_indices = np.flatnonzero(t_ns[1:] <= t_ns[:-1])
+    if not_increasing_indices.size:
+        first_not_increasing_index = int(not_increasing_indices[0])
         raise RecordError(
-            f"{path}: the time stamp t_ns goes from {t_ns[first_bad_index]} ns at tick "
-            f"{ticks[first_bad_index]} to "
-            f"{t_ns[first_bad_index + 1]} ns at tick {ticks[first_bad_index + 1]}, but time must "
+            f"{path}: the time stamp t_ns goes from {t_ns[first_not_increasing_index]} ns at tick "
+            f"{ticks[first_not_increasing_index]} to "
+            f"{t_ns[first_not_increasing_index + 1]} ns at tick "
+            f"{ticks[first_not_increasing_index + 1]}, but time must "
             "go forward; it does "
-            f"not at {bad_indices.size} of {len(ticks)} samples. Correct the program that wrote "
+            f"not at {not_increasing_indices.size} of {len(ticks)} samples. Correct the program "
+            "that wrote "
             "the file."
         )
     elapsed_ns = max(int(t_ns[-1]) - int(t_ns[0]), 1)
     rate_of_stamps_hz = 1e9 * int(ticks[-1] - ticks[0]) / elapsed_ns
-    if abs(rate_of_stamps_hz / rate_hz - 1.0) > MAX_CLOCK_ERROR:
+    if abs(rate_of_stamps_hz / rate_hz - 1.0) > MAX_RELATIVE_CLOCK_ERROR:
         raise RecordError(
             f"{path}: rate_hz is {rate_hz:g} Hz, but the time stamps t_ns advance at "
             f"{rate_of_stamps_hz:g} ticks per second; correct whichever is wrong."
@@ -389,7 +397,7 @@ def check_clock(
 
 
 def check_finite(
-    path: Path, field: str, values: NDArray[np.float64], ticks: NDArray[np.int64]
+    path: Path, field_name: str, field_values: NDArray[np.float64], ticks: NDArray[np.int64]
 ) -> None:
     """Raise if values of a channel are not finite, or implausible for any rig.
 
@@ -397,9 +405,9 @@ def check_finite(
     ----------
     path : Path
         File that messages name.
-    field : str
+    field_name : str
         Name of the channel.
-    values : ndarray, shape (n,)
+    field_values : ndarray, shape (n,)
         Values in rad or N·m.
     ticks : ndarray of int, shape (n,)
         Numbers of the recorded ticks.
@@ -409,19 +417,21 @@ def check_finite(
     RecordError
         Some values are not finite or implausible.
     """
-    too_large_indices = np.flatnonzero(np.abs(values) > MAX_ABSOLUTE_VALUE)
-    not_finite_indices = np.flatnonzero(~np.isfinite(values))
+    too_large_indices = np.flatnonzero(np.abs(field_values) > MAX_ABSOLUTE_VALUE)
+    not_finite_indices = np.flatnonzero(~np.isfinite(field_values))
     if not_finite_indices.size:
         raise RecordError(
-            f"{path}: {field} is {values[not_finite_indices[0]]} at tick "
+            f"{path}: {field_name} is {field_values[not_finite_indices[0]]} at tick "
             f"{ticks[not_finite_indices[0]]} and not finite in "
-            f"{not_finite_indices.size} of {len(values)} samples; such a record cannot be analysed."
+            f"{not_finite_indices.size} of {len(field_values)} samples; such a record cannot be "
+            "analysed."
         )
     if too_large_indices.size:
         raise RecordError(
-            f"{path}: {field} is {values[too_large_indices[0]]:g} at tick "
+            f"{path}: {field_name} is {field_values[too_large_indices[0]]:g} at tick "
             f"{ticks[too_large_indices[0]]} and beyond "
-            f"±{MAX_ABSOLUTE_VALUE:g} in {too_large_indices.size} of {len(values)} samples; no rig "
+            f"±{MAX_ABSOLUTE_VALUE:g} in {too_large_indices.size} of {len(field_values)} samples; "
+            "no rig "
             "has such values; correct the program that wrote the file."
         )
 
@@ -449,7 +459,7 @@ def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
 
 
 def check_fillable(
-    path: Path, channel: str, is_unknown: NDArray[np.bool_], first_tick: int, rate_hz: float
+    path: Path, channel_name: str, is_unknown: NDArray[np.bool_], first_tick: int, rate_hz: float
 ) -> None:
     """Raise if too many samples of a channel in the sweep would have to be interpolated.
 
@@ -459,7 +469,7 @@ def check_fillable(
     ----------
     path : Path
         File that messages name.
-    channel : str
+    channel_name : str
         Name of the channel in messages.
     is_unknown : ndarray of bool, shape (n,)
         Whether each sample of the sweep has no new value.
@@ -469,14 +479,15 @@ def check_fillable(
         Sampling rate.
     """
     fraction_message = unknown_fraction_message(
-        f"the {channel} in the sweep", int(is_unknown.sum()), len(is_unknown)
+        f"the {channel_name} in the sweep", int(is_unknown.sum()), len(is_unknown)
     )
     if fraction_message:
         raise RecordError(f"{path}: {fraction_message}")
     gap_ticks, gap_start = longest_run(is_unknown)
     if gap_ticks > MAX_GAP_S * rate_hz:
         raise RecordError(
-            f"{path}: {gap_ticks} ticks of the {channel} in a row are missing or stale from tick "
+            f"{path}: {gap_ticks} ticks of the {channel_name} in a row are missing or stale from "
+            "tick "
             f"{first_tick + gap_start} on ({1e3 * gap_ticks / rate_hz:.0f} ms), longer than the "
             f"{1e3 * MAX_GAP_S:g} ms that are interpolated; record the session again."
         )
@@ -520,5 +531,7 @@ def longest_run(run_mask: NDArray[np.bool_]) -> tuple[int, int]:
     run_starts, run_ends = runs_of_true(run_mask)
     if run_starts.size == 0:
         return 0, 0
-    longest_index = int(np.argmax(run_ends - run_starts))
-    return int(run_ends[longest_index] - run_starts[longest_index]), int(run_starts[longest_index])
+    longest_run_index = int(np.argmax(run_ends - run_starts))
+    return int(run_ends[longest_run_index] - run_starts[longest_run_index]), int(
+        run_starts[longest_run_index]
+    )

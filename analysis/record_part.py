@@ -27,7 +27,7 @@ _TICK_TOLERANCE: Final = 1e-3
 
 
 def part_of_session(
-    session: Session, requested_s: PartOption, rate_hz: float
+    session: Session, requested_part_s: PartOption, rate_hz: float
 ) -> tuple[Session, tuple[float, float]]:
     """Return the part of a session between two times, and these times.
 
@@ -37,7 +37,7 @@ def part_of_session(
     ----------
     session : Session
         Session with at least one sample.
-    requested_s : tuple of float or None
+    requested_part_s : tuple of float or None
         Beginning and end of the part in seconds since the session's start; None for the beginning
         or end of the session.
     rate_hz : float
@@ -59,7 +59,7 @@ def part_of_session(
     first_s, end_s = int(ticks[0]) / rate_hz, (int(ticks[-1]) + 1) / rate_hz
     from_s, to_s = (
         limit_s if requested is None else requested
-        for requested, limit_s in zip(requested_s, (first_s, end_s), strict=True)
+        for requested, limit_s in zip(requested_part_s, (first_s, end_s), strict=True)
     )
     tolerance_s = _TICK_TOLERANCE / rate_hz
     if not (first_s - tolerance_s <= from_s < end_s and to_s <= end_s + tolerance_s):
@@ -81,10 +81,10 @@ def part_of_session(
         if max(segment_first, first_tick) < min(segment_end, end_tick)
     }
     if "sweep" in session.segments and "sweep" not in part_segments:
-        sweep_s = [tick / rate_hz for tick in session.segments["sweep"]]
+        sweep_limits_s = [tick / rate_hz for tick in session.segments["sweep"]]
         raise RecordError(
             f"{path}: the part from {from_s:g} to {to_s:g} s contains nothing of the sweep, which "
-            f"lasts from {sweep_s[0]:g} to {sweep_s[1]:g} s; choose a part that does."
+            f"lasts from {sweep_limits_s[0]:g} to {sweep_limits_s[1]:g} s; choose a part that does."
         )
     part_samples = session.samples[slice(*np.searchsorted(ticks, (first_tick, end_tick)))]
     if len(part_samples) == 0:
@@ -111,11 +111,12 @@ def check_part_length(path: object, part_s: tuple[float, float], beam: Beam) -> 
     RecordError
         The part has fewer than ten periods of the beam's first mode.
     """
-    least_s = _MIN_PART_PERIODS / first_mode_hz(beam)
-    if part_s[1] - part_s[0] < least_s:
+    min_part_s = _MIN_PART_PERIODS / first_mode_hz(beam)
+    if part_s[1] - part_s[0] < min_part_s:
         raise RecordError(
             f"{path}: the part from {part_s[0]:g} to {part_s[1]:g} s is too short for an estimate, "
-            f"which needs {_MIN_PART_PERIODS:g} periods of the first mode, {least_s:.3g} s; choose "
+            f"which needs {_MIN_PART_PERIODS:g} periods of the first mode, {min_part_s:.3g} s; "
+            "choose "
             "a longer part."
         )
 
@@ -135,13 +136,14 @@ def swept_frequencies_hz(
         First tick inside one direction of the sweep, and the tick after the last.
     """
     try:
-        ends_hz = float(session.metadata["start_hz"]), float(session.metadata["stop_hz"])
+        sweep_ends_hz = float(session.metadata["start_hz"]), float(session.metadata["stop_hz"])
     except (KeyError, ValueError):
         return None
     if "sweep" not in session.segments:
         return None
     swept_hz = [
-        sweep_frequency_hz(session.segments, ends_hz, tick) for tick in (first_tick, end_tick - 1)
+        sweep_frequency_hz(session.segments, sweep_ends_hz, tick)
+        for tick in (first_tick, end_tick - 1)
     ]
     known_hz = [frequency_hz for frequency_hz in swept_hz if frequency_hz is not None]
     return (min(known_hz), max(known_hz)) if len(known_hz) == len(swept_hz) else None

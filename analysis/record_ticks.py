@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rigd.session import Session
 
 SIGNAL_FIELDS = ("angle_reference_rad", "angle_rad", "coupling_torque_nm")
-"""Fields of a sample that are filtered, in the order of the rows of `RecordSignals.values`."""
+"""Fields of a sample that are filtered, in the order of the rows of a record's signal values."""
 
 _REPORTED_FLAGS = (
     (Status.TORQUE_SATURATED, "torque command saturated"),
@@ -90,11 +90,11 @@ class TickGrid:
         Ticks per second.
     first_tick : int
         Number of the first tick.
-    count : int
+    tick_count : int
         Number of ticks.
-    status_bits : ndarray of uint16, shape (count,)
+    status_bits : ndarray of uint16, shape (tick_count,)
         Bits of `Status`; 0 where a tick is missing.
-    is_missing : ndarray of bool, shape (count,)
+    is_missing : ndarray of bool, shape (tick_count,)
         Whether a tick has no sample.
     sweep : slice
         Ticks of the segment ``sweep``, relative to the first tick; all ticks without this segment.
@@ -105,14 +105,14 @@ class TickGrid:
     session: Session
     rate_hz: float
     first_tick: int
-    count: int
+    tick_count: int
     status_bits: NDArray[np.uint16]
     is_missing: NDArray[np.bool_]
     sweep: slice
     unrecorded_ticks: int
 
     @classmethod
-    def of(cls, session: Session, rate_hz: float) -> TickGrid:
+    def from_session(cls, session: Session, rate_hz: float) -> TickGrid:
         """Return the grid of a session, after checks of its ticks, times and gaps.
 
         Parameters
@@ -153,26 +153,26 @@ class TickGrid:
 
     @property
     def is_angle_unknown(self) -> NDArray[np.bool_]:
-        """Whether the angle of each tick is missing or stale, shape (count,)."""
-        return self.is_missing | self._has(Status.ANGLE_STALE)
+        """Whether the angle of each tick is missing or stale, shape (tick_count,)."""
+        return self.is_missing | self._has_flag(Status.ANGLE_STALE)
 
     @property
     def is_torque_unknown(self) -> NDArray[np.bool_]:
-        """Whether the torque of each tick is missing or stale, shape (count,)."""
-        return self.is_missing | self._has(Status.WRENCH_STALE)
+        """Whether the torque of each tick is missing or stale, shape (tick_count,)."""
+        return self.is_missing | self._has_flag(Status.WRENCH_STALE)
 
     @property
     def is_torque_measured(self) -> NDArray[np.bool_]:
-        """Whether the torque was measured at its tick and within the range, shape (count,)."""
-        return ~(self.is_torque_unknown | self._has(Status.WRENCH_SATURATED))
+        """Whether the torque was measured at its tick and within the range, shape (tick_count,)."""
+        return ~(self.is_torque_unknown | self._has_flag(Status.WRENCH_SATURATED))
 
-    def _has(self, flag: Status) -> NDArray[np.bool_]:
-        """Return whether each tick has a flag, shape (count,)."""
-        has_flag: NDArray[np.bool_] = (self.status_bits & flag) != 0
-        return has_flag
+    def _has_flag(self, flag: Status) -> NDArray[np.bool_]:
+        """Return whether each tick has a flag, shape (tick_count,)."""
+        is_flagged: NDArray[np.bool_] = (self.status_bits & flag) != 0
+        return is_flagged
 
     @property
-    def there(self) -> slice | None:
+    def outward_sweep(self) -> slice | None:
         """Ticks of the first of two sweeps; None if there is only one sweep."""
         segment_first_tick, segment_end_tick = self.session.segments.get("there", (0, 0))
         first_index, end_index = (
@@ -187,17 +187,21 @@ class TickGrid:
             missing_ticks=int(self.is_missing.sum()),
             longest_gap_ticks=longest_run(self.is_missing)[0],
             sweep_missing_ticks=int(self.is_missing[self.sweep].sum()),
-            sweep_stale_angles=int(self._has(Status.ANGLE_STALE)[self.sweep].sum()),
-            sweep_stale_torques=int(self._has(Status.WRENCH_STALE)[self.sweep].sum()),
+            sweep_stale_angles=int(self._has_flag(Status.ANGLE_STALE)[self.sweep].sum()),
+            sweep_stale_torques=int(self._has_flag(Status.WRENCH_STALE)[self.sweep].sum()),
         )
 
     def flag_counts(self) -> dict[str, int]:
         """Return the number of samples of the sweep with each flag that occurs there."""
-        counts = {
+        sample_count_by_meaning = {
             meaning: int(np.count_nonzero(self.status_bits[self.sweep] & status_flag))
             for status_flag, meaning in _REPORTED_FLAGS
         }
-        return {meaning: sample_count for meaning, sample_count in counts.items() if sample_count}
+        return {
+            meaning: sample_count
+            for meaning, sample_count in sample_count_by_meaning.items()
+            if sample_count
+        }
 
     def fault_sentences(self, outcome: Mapping[str, str]) -> tuple[str, ...]:
         """Return sentences on an incomplete session, missing samples and flags.
@@ -296,15 +300,15 @@ class TorqueExtreme:
     ----------
     limit_nm : float
         Torque.
-    values : int
+    sample_count : int
         Number of samples with exactly this torque.
-    repeated : int
+    repeated_count : int
         Number of these samples whose neighbour also has this torque.
     """
 
     limit_nm: float
-    values: int
-    repeated: int
+    sample_count: int
+    repeated_count: int
 
 
 class ExtremeCount:
@@ -314,41 +318,43 @@ class ExtremeCount:
 
     Parameters
     ----------
-    sign : int
+    sign_of_extreme : int
         1 for the largest value, -1 for the smallest.
     """
 
-    def __init__(self, sign: int) -> None:
-        self._sign = sign
+    def __init__(self, sign_of_extreme: int) -> None:
+        self._sign = sign_of_extreme
         self._limit_nm = -np.inf
         self._values = self._repeated = 0
         self._last_nm = np.full(2, np.nan)
 
     def add(self, torque_nm: NDArray[np.float64]) -> None:
         """Include the next values."""
-        signed_nm = np.concatenate([self._last_nm, self._sign * torque_nm])
-        largest_nm = float(np.max(signed_nm[2:], initial=-np.inf, where=~np.isnan(signed_nm[2:])))
-        if largest_nm > self._limit_nm:
-            self._limit_nm, self._values, self._repeated = largest_nm, 0, 0
-        is_at_limit = signed_nm == self._limit_nm
-        follows_another = is_at_limit[2:] & is_at_limit[1:-1]
+        signed_torque_nm = np.concatenate([self._last_nm, self._sign * torque_nm])
+        largest_torque_nm = float(
+            np.max(signed_torque_nm[2:], initial=-np.inf, where=~np.isnan(signed_torque_nm[2:]))
+        )
+        if largest_torque_nm > self._limit_nm:
+            self._limit_nm, self._values, self._repeated = largest_torque_nm, 0, 0
+        is_at_limit = signed_torque_nm == self._limit_nm
+        follows_limit_sample = is_at_limit[2:] & is_at_limit[1:-1]
         self._values += int(np.count_nonzero(is_at_limit[2:]))
         # The first of a run of such values counts when the second arrives.
-        self._repeated += int(np.count_nonzero(follows_another))
-        self._repeated += int(np.count_nonzero(follows_another & ~is_at_limit[:-2]))
-        self._last_nm = signed_nm[-2:]
+        self._repeated += int(np.count_nonzero(follows_limit_sample))
+        self._repeated += int(np.count_nonzero(follows_limit_sample & ~is_at_limit[:-2]))
+        self._last_nm = signed_torque_nm[-2:]
 
-    def result(self) -> TorqueExtreme:
+    def torque_extreme(self) -> TorqueExtreme:
         """Return the extreme of all values."""
         return TorqueExtreme(self._sign * self._limit_nm, self._values, self._repeated)
 
 
 def torque_extremes(torque_nm: NDArray[np.float64]) -> tuple[TorqueExtreme, ...]:
     """Return the largest and the smallest value of a torque in N·m; NaN is unknown."""
-    counts = (ExtremeCount(1), ExtremeCount(-1))
-    for count in counts:
-        count.add(torque_nm)
-    return tuple(count.result() for count in counts)
+    extreme_counts = (ExtremeCount(1), ExtremeCount(-1))
+    for extreme_count in extreme_counts:
+        extreme_count.add(torque_nm)
+    return tuple(extreme_count.torque_extreme() for extreme_count in extreme_counts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,24 +363,24 @@ class RecordSignals:
 
     Attributes
     ----------
-    values : ndarray, shape (3, n)
+    signal_values : ndarray, shape (3, n)
         Reference and measured angle in rad, and coupling torque in N·m.
     angle_known, torque_known : ndarray of bool, shape (n,)
         Whether angle and torque were measured at all ticks on which a sample depends.
     first_tick : int
         Tick of the first sample, relative to the first tick of the record.
-    factor : int
+    ticks_per_sample : int
         Number of ticks from one sample to the next.
     torque_extremes : tuple of TorqueExtreme
         Largest and smallest measured torque before the signals were decimated; empty if they were
         not.
     """
 
-    values: NDArray[np.float64]
+    signal_values: NDArray[np.float64]
     angle_known: NDArray[np.bool_]
     torque_known: NDArray[np.bool_]
     first_tick: int = 0
-    factor: int = 1
+    ticks_per_sample: int = 1
     torque_extremes: tuple[TorqueExtreme, ...] = ()
 
     def samples_in(self, ticks: slice) -> slice:
@@ -386,7 +392,10 @@ class RecordSignals:
             First tick, and the tick after the last, relative to the first tick of the record.
         """
         start, stop = (
-            min(max(-((self.first_tick - tick) // self.factor), 0), self.values.shape[1])
+            min(
+                max(-((self.first_tick - tick) // self.ticks_per_sample), 0),
+                self.signal_values.shape[1],
+            )
             for tick in (ticks.start, ticks.stop)
         )
         return slice(start, stop)
@@ -403,7 +412,7 @@ class FullRateSignals:
 
     def __init__(self, grid: TickGrid) -> None:
         self.grid = grid
-        self._values = np.zeros((len(SIGNAL_FIELDS), grid.count))
+        self._values = np.zeros((len(SIGNAL_FIELDS), grid.tick_count))
 
     def add(self, samples: NDArray[np.void]) -> None:
         """Include samples of the record, as for `SignalDecimation`."""
@@ -445,5 +454,5 @@ def samples_on_grid(
         Samples in the order of their ticks.
     """
     ticks = samples["tick"].astype(np.int64) - grid.first_tick
-    is_inside = (ticks >= 0) & (ticks < grid.count)
+    is_inside = (ticks >= 0) & (ticks < grid.tick_count)
     return (samples, ticks) if is_inside.all() else (samples[is_inside], ticks[is_inside])

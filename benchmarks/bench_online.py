@@ -74,14 +74,14 @@ def beam_of(generator: np.random.Generator, name: str, off: float) -> Truth:
     alpha = structure.fixed.get("alpha", generator.uniform(0.6, 1.3)) or 1.0
     lambda_ = structure.fixed.get("lambda", generator.uniform(0.4, 1.4)) or 1.0
     inner, outer = np.exp(generator.uniform(*np.log([0.001, 0.03]), size=2))
-    if structure.internal and structure.external:
+    if structure.has_internal_damping and structure.has_external_damping:
         inner, outer = inner / 2, outer / 2
     zeta = 2 * inner / (second**alpha * math.sin(math.pi / 2 * alpha))
     gamma = 2 * outer * ratio * first ** (2 - lambda_) / math.sin(math.pi / 2 * lambda_)
     return Truth(
-        zeta=zeta if structure.internal else 0.0,
+        zeta=zeta if structure.has_internal_damping else 0.0,
         alpha=alpha,
-        gamma=gamma if structure.external else 0.0,
+        gamma=gamma if structure.has_external_damping else 0.0,
         lambda_=lambda_,
         density_over_stiffness=ratio,
         bending_stiffness_n_m2=stiffness,

@@ -204,7 +204,7 @@ def _status_and_reason(
         structure, max(usual_mode_count, 2) if most_show_several_modes else 1
     ):
         return "not identifiable", few_modes_reason
-    if not structure.has(order):
+    if not structure.has_damping_of(order):
         return "absent", "no such damping is visible"
     parameter = freest_fit.parameters_by_name.get(order)
     if (

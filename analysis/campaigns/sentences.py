@@ -566,8 +566,8 @@ def _describe_damping(structure: str) -> str:
     damping_texts = [
         f"{damping_name} damping ({order} {'free' if order in damping_structure.free else '= 1'})"
         for damping_name, order, is_present in (
-            ("internal", "alpha", damping_structure.internal),
-            ("external", "lambda", damping_structure.external),
+            ("internal", "alpha", damping_structure.has_internal_damping),
+            ("external", "lambda", damping_structure.has_external_damping),
         )
         if is_present
     ]

@@ -32,13 +32,13 @@ from rigd.runtime.background import SINGLE_THREADED, use_one_thread
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-Result = TypeVar("Result")
+TaskResult = TypeVar("TaskResult")
 """Type of a task's result."""
 
 _PRESENCE_CHECK_INTERVAL_S: Final = 2.0
 """Interval in seconds at which the presence of worker processes is checked."""
 
-_MIN_LOST_TASKS: Final = 2
+_MIN_FAILED_TASKS: Final = 2
 """Number of lost tasks at which, if none has finished, the workers and not the tasks are at fault.
 """
 
@@ -64,7 +64,7 @@ def available_cores() -> int:
         return os.cpu_count() or 1
 
 
-def _ignore_progress(_number: int) -> None:
+def _ignore_progress(_task_index: int) -> None:
     """Ignore the number of a finished task."""
 
 
@@ -96,17 +96,17 @@ class Workers:
 
     def run(
         self,
-        function: Callable[..., Result],
-        arguments: Sequence[tuple[Any, ...]],
+        function: Callable[..., TaskResult],
+        argument_tuples: Sequence[tuple[Any, ...]],
         on_done: Callable[[int], None] = _ignore_progress,
-    ) -> list[Result | FailedTask]:
+    ) -> list[TaskResult | FailedTask]:
         """Call a function with every tuple of arguments, in parallel.
 
         Parameters
         ----------
         function : callable
             Function that worker processes can import; arguments and result must be picklable.
-        arguments : sequence of tuple
+        argument_tuples : sequence of tuple
             Arguments of each call.
         on_done : callable, optional
             Called with the index of each finished task, in order of completion.
@@ -121,93 +121,97 @@ class Workers:
         CampaignError
             All workers are lost.
         """
-        task_results: dict[int, Result | FailedTask] = {}
+        task_results: dict[int, TaskResult | FailedTask] = {}
 
-        def submit(task_index: int) -> Future[Result]:
+        def submit_task(task_index: int) -> Future[TaskResult]:
             """Start a task by its index."""
-            return self._executor.submit(function, *arguments[task_index])
+            return self._executor.submit(function, *argument_tuples[task_index])
 
-        def store_result(task_index: int, task_result: Result | FailedTask) -> None:
+        def store_result(task_index: int, task_result: TaskResult | FailedTask) -> None:
             """Store the result of a task and report its completion."""
             task_results[task_index] = task_result
             on_done(task_index)
 
-        task_queue = deque(range(len(arguments)))
+        task_queue = deque(range(len(argument_tuples)))
         while task_queue:
-            with self._convert_errors():
-                interrupted_tasks = self._run_until_process_ends(task_queue, submit, store_result)
+            with self._convert_executor_errors():
+                interrupted_tasks = self._run_until_process_ends(
+                    task_queue, submit_task, store_result
+                )
                 for task_index in interrupted_tasks:
-                    self._replace_executor(alone=True)
-                    if self._run_until_process_ends(deque([task_index]), submit, store_result):
+                    self._replace_executor(is_single_process=True)
+                    if self._run_until_process_ends(deque([task_index]), submit_task, store_result):
                         store_result(task_index, FailedTask(self._failed_task_reason))
             if interrupted_tasks:
-                any_finished = any(
+                is_any_task_finished = any(
                     not isinstance(task_result, FailedTask) for task_result in task_results.values()
                 )
                 if (
                     self._no_workers_message
-                    and not any_finished
-                    and (len(task_results) >= _MIN_LOST_TASKS or not task_queue)
+                    and not is_any_task_finished
+                    and (len(task_results) >= _MIN_FAILED_TASKS or not task_queue)
                 ):
                     raise CampaignError(self._no_workers_message)
                 self._replace_executor()
-        return [task_results[task_index] for task_index in range(len(arguments))]
+        return [task_results[task_index] for task_index in range(len(argument_tuples))]
 
     def _run_until_process_ends(
         self,
         task_queue: deque[int],
-        submit_task: Callable[[int], Future[Result]],
-        store_result: Callable[[int, Result], None],
+        submit_task: Callable[[int], Future[TaskResult]],
+        store_result: Callable[[int, TaskResult], None],
     ) -> list[int]:
         """Run queued tasks until a worker process ends.
 
         Return the indices of the tasks that the end of the process interrupted; the list is empty
         if all tasks finished.
         """
-        in_progress: dict[Future[Result], int] = {}
+        task_index_by_future: dict[Future[TaskResult], int] = {}
         interrupted_tasks: list[int] = []
-        last_seen_s = time.monotonic()
-        while in_progress or (task_queue and not interrupted_tasks):
+        workers_last_seen_s = time.monotonic()
+        while task_index_by_future or (task_queue and not interrupted_tasks):
             while (
                 task_queue
                 and not interrupted_tasks
-                and len(in_progress) != self._max_tasks_in_progress
+                and len(task_index_by_future) != self._max_tasks_in_progress
             ):
                 try:
-                    in_progress[submit_task(task_queue[0])] = task_queue[0]
+                    task_index_by_future[submit_task(task_queue[0])] = task_queue[0]
                 except BrokenExecutor:
-                    if not in_progress:  # an idle process has ended
+                    if not task_index_by_future:  # an idle process has ended
                         self._replace_executor()
                     break
                 task_queue.popleft()
-            for future in wait(in_progress, _PRESENCE_CHECK_INTERVAL_S, FIRST_COMPLETED).done:
-                task_index = in_progress.pop(future)
+            for future in wait(
+                task_index_by_future, _PRESENCE_CHECK_INTERVAL_S, FIRST_COMPLETED
+            ).done:
+                task_index = task_index_by_future.pop(future)
                 try:
                     task_result = future.result()
                 except self._process_end_error:
                     interrupted_tasks.append(task_index)
                 else:
                     store_result(task_index, task_result)
-            last_seen_s = self._check_presence(last_seen_s)
+            workers_last_seen_s = self._check_presence(workers_last_seen_s)
         return interrupted_tasks
 
-    def _replace_executor(self, *, alone: bool = False) -> None:
+    def _replace_executor(self, *, is_single_process: bool = False) -> None:
         """Replace the executor after a worker process ended.
 
-        `alone` states that the new executor shall have a single process.
+        `is_single_process` states that the new executor shall have a single process.
         """
 
-    def _convert_errors(self) -> AbstractContextManager[None]:
+    def _convert_executor_errors(self) -> AbstractContextManager[None]:
         """Convert an executor's own errors on the loss of all workers to `CampaignError`."""
         return nullcontext()
 
-    def _check_presence(self, last_seen_s: float) -> float:
+    def _check_presence(self, workers_last_seen_s: float) -> float:
         """Return the time in s at which workers were last present.
 
         The time is that of `time.monotonic`. Raise `CampaignError` if there have been no workers
         for too long.
         """
-        return last_seen_s
+        return workers_last_seen_s
 
 
 @contextmanager
@@ -253,10 +257,10 @@ class _LocalWorkers(Workers):
         super().__init__(_spawn_pool(jobs))
         self._max_tasks_in_progress = jobs
 
-    def _replace_executor(self, *, alone: bool = False) -> None:
-        """Start a new pool after a worker process ended, with a single process if `alone`."""
+    def _replace_executor(self, *, is_single_process: bool = False) -> None:
+        """Start a new pool after a worker process ended, of one process if `is_single_process`."""
         self.close()
-        self._executor = _spawn_pool(1 if alone else self._max_tasks_in_progress)
+        self._executor = _spawn_pool(1 if is_single_process else self._max_tasks_in_progress)
 
     def close(self, *, wait: bool = True) -> None:
         """Start no more tasks, and end the processes after their present tasks."""
@@ -294,14 +298,14 @@ seconds."""
 
 
 @contextmanager
-def dask_cluster(address: str) -> Iterator[Workers]:
+def dask_cluster(scheduler_address: str) -> Iterator[Workers]:
     """Provide the workers of a Dask cluster.
 
     The workers need the same version of this package, and the session files under the same paths.
 
     Parameters
     ----------
-    address : str
+    scheduler_address : str
         Address of its scheduler, such as ``tcp://10.0.0.5:8786``.
 
     Raises
@@ -318,19 +322,20 @@ def dask_cluster(address: str) -> Iterator[Workers]:
         ) from error
     with _suppress_dask_messages():
         try:
-            _check_scheduler(address)
+            _check_scheduler(scheduler_address)
             dask_client = distributed.Client(
-                address, timeout=_CONNECTION_TIMEOUT_S, set_as_default=False
+                scheduler_address, timeout=_CONNECTION_TIMEOUT_S, set_as_default=False
             )
         except (OSError, ValueError) as error:
             raise CampaignError(
-                f"No Dask scheduler answers at {address} within {_CONNECTION_TIMEOUT_S:g} s; start "
+                f"No Dask scheduler answers at {scheduler_address} within "
+                f"{_CONNECTION_TIMEOUT_S:g} s; start "
                 "one with "
                 "'dask scheduler' and its workers with 'dask worker ADDRESS', or leave --dask out."
             ) from error
         try:
-            _check_workers(dask_client, address)
-            yield _DaskWorkers(dask_client, address)
+            _check_workers(dask_client, scheduler_address)
+            yield _DaskWorkers(dask_client, scheduler_address)
         finally:
             dask_client.close()
 
@@ -338,24 +343,24 @@ def dask_cluster(address: str) -> Iterator[Workers]:
 @contextmanager
 def _suppress_dask_messages() -> Iterator[None]:
     """Suppress Dask's messages on failures and different versions, as this module reports them."""
-    log = logging.getLogger("distributed.client")
-    log_level = log.level
-    log.setLevel(logging.CRITICAL)
+    dask_logger = logging.getLogger("distributed.client")
+    log_level = dask_logger.level
+    dask_logger.setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="(?s).*Mismatched versions")
             yield
     finally:
-        log.setLevel(log_level)
+        dask_logger.setLevel(log_level)
 
 
-def _check_scheduler(address: str) -> None:
+def _check_scheduler(scheduler_address: str) -> None:
     """Raise an OSError if no scheduler listens at an address.
 
     Dask's client would keep trying to connect even after it has reported its failure.
     """
-    host_and_port = address.rsplit("://", maxsplit=1)[-1]
-    if "://" in address and not address.startswith(("tcp://", "tls://")):
+    host_and_port = scheduler_address.rsplit("://", maxsplit=1)[-1]
+    if "://" in scheduler_address and not scheduler_address.startswith(("tcp://", "tls://")):
         return
     host, _, port = host_and_port.rpartition(":")
     if not (host and port.isdecimal()):
@@ -375,14 +380,14 @@ class _DaskWorkers(Workers):
         "workers' logs"
     )
 
-    def __init__(self, client: Any, address: str) -> None:  # noqa: ANN401 - Dask has no types
+    def __init__(self, client: Any, scheduler_address: str) -> None:  # noqa: ANN401 - Dask has no types
         # With pure=False, Dask also repeats a call with the same arguments.
         super().__init__(client.get_executor(pure=False))
-        self._client, self._address = client, address
+        self._client, self._address = client, scheduler_address
         self._process_end_error = _import_distributed().KilledWorker
 
     @contextmanager
-    def _convert_errors(self) -> Iterator[None]:
+    def _convert_executor_errors(self) -> Iterator[None]:
         """Convert errors that mean the loss of the scheduler to `CampaignError`."""
         try:
             yield
@@ -396,27 +401,28 @@ class _DaskWorkers(Workers):
                 raise
             raise CampaignError(self._cluster_lost_message("went away")) from error
 
-    def _check_presence(self, last_seen_s: float) -> float:
+    def _check_presence(self, workers_last_seen_s: float) -> float:
         """Return the time in s (`time.monotonic`) at which workers were last present.
 
         Raise `CampaignError` if the scheduler is lost, or if there have been no workers for too
         long.
         """
-        now = time.monotonic()
+        now_s = time.monotonic()
         if self._client.status != "running":
             raise CampaignError(self._cluster_lost_message("went away"))
         if self._client.scheduler_info(n_workers=-1)["workers"]:
-            return now
-        if now - last_seen_s > _NO_WORKERS_TIMEOUT_S:
+            return now_s
+        if now_s - workers_last_seen_s > _NO_WORKERS_TIMEOUT_S:
             raise CampaignError(
                 self._cluster_lost_message(f"has had no workers for {_NO_WORKERS_TIMEOUT_S:g} s")
             )
-        return last_seen_s
+        return workers_last_seen_s
 
-    def _cluster_lost_message(self, event: str) -> str:
+    def _cluster_lost_message(self, loss_phrase: str) -> str:
         """Return the message of an error that concerns the whole cluster."""
         return (
-            f"The Dask scheduler at {self._address} {event}; check its log and the workers', and "
+            f"The Dask scheduler at {self._address} {loss_phrase}; check its log and the workers', "
+            "and "
             "start the campaign again, or leave --dask out."
         )
 
@@ -426,7 +432,7 @@ def _import_distributed() -> Any:  # noqa: ANN401 - Dask has no types
     return import_module("distributed")
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Return the versions of the packages that must agree between this process and the workers."""
     import numpy as np
 
@@ -439,19 +445,19 @@ def versions() -> dict[str, str]:
     }  # fmt: skip
 
 
-def _check_workers(client: Any, address: str) -> None:  # noqa: ANN401 - Dask has no types
+def _check_workers(client: Any, scheduler_address: str) -> None:  # noqa: ANN401 - Dask has no types
     """Raise if a cluster has no workers, or a worker lacks the versions installed here."""
     try:
         client.wait_for_workers(1, timeout=_FIRST_WORKER_TIMEOUT_S)
     except TimeoutError as error:
         raise CampaignError(
-            f"The Dask scheduler at {address} has no workers; start some with "
-            f"'dask worker {address} --nthreads 1'."
+            f"The Dask scheduler at {scheduler_address} has no workers; start some with "
+            f"'dask worker {scheduler_address} --nthreads 1'."
         ) from error
     versions_by_worker: Mapping[str, dict[str, str] | Exception] = client.run(
-        versions, on_error="return"
+        package_versions, on_error="return"
     )
-    own_versions = versions()
+    own_versions = package_versions()
     for worker, worker_versions in versions_by_worker.items():
         if isinstance(worker_versions, ModuleNotFoundError):
             raise CampaignError(
@@ -460,12 +466,13 @@ def _check_workers(client: Any, address: str) -> None:  # noqa: ANN401 - Dask ha
             )
         if isinstance(worker_versions, Exception):
             raise CampaignError(f"The Dask worker at {worker} cannot be used: {worker_versions}.")
-        differences = [f"{name} {worker_versions[name]} and not {own_versions[name]}"
+        version_differences = [f"{name} {worker_versions[name]} and not {own_versions[name]}"
                        for name in own_versions
                        if worker_versions[name] != own_versions[name]]  # fmt: skip
-        if differences:
+        if version_differences:
             raise CampaignError(
-                f"The Dask worker at {worker} has {', '.join(differences)}: install the versions "
+                f"The Dask worker at {worker} has {', '.join(version_differences)}: install the "
+                "versions "
                 "of this "
                 "machine there, and start it again."
             )

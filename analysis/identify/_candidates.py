@@ -384,7 +384,9 @@ class CandidateSet:
         The candidate is unchanged if the plant has a damping that its structure lacks.
         """
         structure, damping = candidate.structure, plant.damping
-        if (damping.zeta and not structure.internal) or (damping.gamma and not structure.external):
+        if (damping.zeta and not structure.has_internal_damping) or (
+            damping.gamma and not structure.has_external_damping
+        ):
             return candidate
         start_refit = self.descend_from_plant(plant, structure, 1)
         cost_to_beat = candidate.fit.cost * (1 - MISSED_COST_FRACTION)
@@ -435,7 +437,7 @@ class CandidateSet:
         absent_dampings = [
             (order, coefficient)
             for order, coefficient in COEFFICIENT_OF.items()
-            if not structure.has(coefficient) or order in own_fit.at_bounds
+            if not structure.has_damping_of(coefficient) or order in own_fit.at_bounds
         ]
         if len(absent_dampings) != 1:
             return own_fit, False
@@ -443,7 +445,7 @@ class CandidateSet:
         fixed_values = {
             parameter_name: fixed_value
             for parameter_name, fixed_value in structure.fixed.items()
-            if structure.has(parameter_name)
+            if structure.has_damping_of(parameter_name)
         }
         fixed_values[order] = 1.0
         both_dampings = replace(structure, fixed=fixed_values)

@@ -46,12 +46,12 @@ def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
     clipped = [
         extreme
         for extreme in measurement.torque_extremes or torque_extremes(known_nm)
-        if extreme.limit_nm != 0 and extreme.repeated >= _MIN_CLIPPED_VALUES
+        if extreme.limit_nm != 0 and extreme.repeated_count >= _MIN_CLIPPED_VALUES
     ]
     if not clipped:
         return
     limits_text = " and ".join(f"{extreme.limit_nm:+.3g} N·m" for extreme in clipped)
-    clipped_tick_count = sum(extreme.values for extreme in clipped)
+    clipped_tick_count = sum(extreme.sample_count for extreme in clipped)
     yield Finding(
         kind="clipping",
         sentence=(

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.decimation import Decimation, fast_length_below
+from analysis.decimation import Decimation, fast_fft_length_below
 from analysis.identify._data import MeasurementError
 from analysis.identify._drag_expansion import DragExpansion
 from analysis.identify._instrument import reference_coherent_part
 from analysis.identify._predictor import TorquePredictor
 from analysis.identify.drag_torque import DragResponse
 from analysis.identify.free_decay import DecaySpectra, LaterDecaySpectra, count_decay_spectra
-from analysis.models import LARGEST_FRACTION_OF_RATE
+from analysis.models import MAX_FREQUENCY_TO_RATE_RATIO
 from analysis.optimizer import RecentValues
 from rigd.beam import undamped_frequencies_rad_s
 
@@ -144,11 +144,12 @@ class Comparison:
             The record cannot be used, or is too short for the band.
         """
         lowest_hz, highest_hz = band_hz
-        limit_hz = LARGEST_FRACTION_OF_RATE * measurement.rate_hz
+        limit_hz = MAX_FREQUENCY_TO_RATE_RATIO * measurement.rate_hz
         if not 0 <= lowest_hz < highest_hz <= limit_hz:
             raise MeasurementError(
                 f"{measurement.name}: the band {lowest_hz:g}-{highest_hz:g} Hz is empty, negative "
-                f"or beyond {LARGEST_FRACTION_OF_RATE:g} of the sampling rate ({limit_hz:g} Hz); "
+                f"or beyond {MAX_FREQUENCY_TO_RATE_RATIO:g} of the sampling rate ({limit_hz:g} "
+                "Hz); "
                 "choose another --band."
             )
         measurement.check(highest_hz)
@@ -157,7 +158,7 @@ class Comparison:
         usable_samples = decimation.samples_inside_record(measurement.angle_rad.size)
         samples = usable_samples.stop - usable_samples.start
         if samples > 0:
-            samples = fast_length_below(samples)
+            samples = fast_fft_length_below(samples)
         all_hz = np.arange(samples // 2 + 1) * (decimation.rate_hz / max(samples, 1))
         first_bin = max(int(np.searchsorted(all_hz, lowest_hz)), 1)
         bins = slice(first_bin, int(np.searchsorted(all_hz, highest_hz, side="right")))
@@ -217,7 +218,7 @@ class Comparison:
         rate_hz, impacts = self.decimation.rate_hz, self.measurement.impacts
         sample_times_s = self.times_s()
         unknown_indices = self._decimated_indices(~self.measurement.torque_known)
-        reach_s = self.decimation.reach / rate_hz
+        reach_s = self.decimation.half_length_samples / rate_hz
         unknown_times_s = unknown_indices / self.measurement.rate_hz - reach_s
         impact_nm, impact_at_unknown_nm = (
             np.sum([impact.torque(time_s, sample_times_s, rate_hz) for impact in impacts], axis=0)
@@ -254,7 +255,10 @@ class Comparison:
     @property
     def first_sample_s(self) -> float:
         """Return the time in seconds from the record's first tick to the first compared sample."""
-        return float(self.retained.start - self.decimation.reach) / self.decimation.rate_hz
+        return (
+            float(self.retained.start - self.decimation.half_length_samples)
+            / self.decimation.rate_hz
+        )
 
     @property
     def is_long(self) -> bool:
@@ -406,7 +410,9 @@ class Comparison:
         incoherent_prediction = self.prediction.with_angle(self.incoherent_rad)
         incoherent_nm = incoherent_prediction.torque(plant)[0]
         unknown_tick_nm = incoherent_prediction.torque_at_fine_samples(
-            plant, self.decimation.factor, self._decimated_indices(~self.measurement.torque_known)
+            plant,
+            self.decimation.downsampling_factor,
+            self._decimated_indices(~self.measurement.torque_known),
         )[0]
         updated_comparison = replace(
             self, incoherent_nm=incoherent_nm, incoherent_in_gaps_nm=unknown_tick_nm
@@ -512,8 +518,8 @@ class Comparison:
 
         unknown_indices = self._decimated_indices(~self.measurement.torque_known)
         full_rate_nm = np.fft.irfft(
-            self.decimation.factor * np.fft.rfft(drag_torque.torque_nm),
-            self.decimation.factor * drag_torque.torque_nm.size,
+            self.decimation.downsampling_factor * np.fft.rfft(drag_torque.torque_nm),
+            self.decimation.downsampling_factor * drag_torque.torque_nm.size,
         )
         return replace(
             self,
@@ -608,7 +614,7 @@ class Comparison:
         filled_nm[~known_mask] = (
             self.removed_in_gaps_nm
             + self.prediction.torque_at_fine_samples(
-                plant, self.decimation.factor, self._decimated_indices(~known_mask)
+                plant, self.decimation.downsampling_factor, self._decimated_indices(~known_mask)
             )[0]
         )
         decimated_nm = self.decimation.apply(filled_nm)
@@ -633,7 +639,7 @@ class Comparison:
         unknown_gradient = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
         if is_unknown.any():
             _, gradient = self.prediction.torque_at_fine_samples(
-                plant, self.decimation.factor, self._decimated_indices(is_unknown), wrt
+                plant, self.decimation.downsampling_factor, self._decimated_indices(is_unknown), wrt
             )
             for spectrum_row, derivative_nm in zip(unknown_gradient, gradient, strict=True):
                 unknown_nm = np.zeros(is_unknown.size)
@@ -646,7 +652,10 @@ class Comparison:
 
         `is_marked` is a mask over the ticks of the record.
         """
-        return np.flatnonzero(is_marked) + self.decimation.reach * self.decimation.factor
+        return (
+            np.flatnonzero(is_marked)
+            + self.decimation.half_length_samples * self.decimation.downsampling_factor
+        )
 
 
 @lru_cache(maxsize=2)

@@ -224,7 +224,7 @@ class Measurement:
             tip_mass_kg=record.tip_mass_kg,
             axis_tilt_deg=record.axis_tilt_deg,
             is_single_sweep=record.metadata.get("excitation", "chirp") == "chirp"
-            and record.there is None,
+            and record.outward_sweep is None,
             torque_extremes=record.torque_extremes,
         )
 

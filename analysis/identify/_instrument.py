@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.decimation import fast_length
+from analysis.decimation import fast_fft_length
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,7 +65,7 @@ def reference_coherent_part(
     return_to_zero = 0.5 * (
         1 + np.cos(np.linspace(0, np.pi, round(_RETURN_TO_ZERO_S * rate_hz) + 1)[1:])
     )
-    padded_length = fast_length(2 * (angle_rad.size + return_to_zero.size))
+    padded_length = fast_fft_length(2 * (angle_rad.size + return_to_zero.size))
 
     def spectrum_of(values: NDArray[np.float64]) -> NDArray[np.complex128]:
         return np.fft.rfft(np.concatenate([values, values[-1] * return_to_zero]), padded_length)

@@ -564,7 +564,7 @@ class _DerivativeSpan:
         if self._rows is not None:
             return self._rows
         search = self._search
-        rows: NDArray[np.float64] = search.comparison.shared_values.at(
+        rows: NDArray[np.float64] = search.comparison.shared_values.value_at(
             search.x, lambda _x: search.span(), self
         )
         return rows

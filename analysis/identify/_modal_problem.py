@@ -216,7 +216,7 @@ class ModalProblem:
 
         The solutions at the last points are cached.
         """
-        return self._recent.at(x, self._solve_at, self if self._comparison.is_long else None)
+        return self._recent.value_at(x, self._solve_at, self if self._comparison.is_long else None)
 
     def _solve_at(self, x: NDArray[np.float64]) -> _LinearSolution:
         """Return the best linear parameters at a point `x`, computed without the cache."""

@@ -120,7 +120,7 @@ class Objective:
         The results at the last points are cached.
         """
         owner = self if self.comparison.is_long else None
-        return self._recent.at(x, self._linearise, owner)
+        return self._recent.value_at(x, self._linearise, owner)
 
     def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
         """Return torque residual and derivatives for the unknowns `x`, without the cache."""
@@ -246,7 +246,7 @@ class Objective:
                 region,
                 relative_tolerance=relative_tolerance,
                 max_evaluations=max_evaluations,
-                hopeless=hopeless,
+                early_stop_limits=hopeless,
             )
             has_converged = objective is self or np.abs(minimum.x - x).max() < _UNKNOWNS_TOLERANCE
             x = minimum.x

@@ -84,8 +84,8 @@ class Refit:
 
         `torque_spectra`, shape (c, K), are torque spectra of unknown size that are projected out in
         addition to the free decay. `held_unknowns` names unknowns that keep their start values.
-        `relative_tolerance` and `hopeless` are those of `analysis.optimizer.descend`. With
-        `max_evaluations` of 1 the start is only evaluated.
+        `relative_tolerance` is that of `analysis.optimizer.descend`, and `hopeless` its
+        `early_stop_limits`. With `max_evaluations` of 1 the start is only evaluated.
         """
         descent_steps = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
         x = np.clip(start, descent_steps.lower, descent_steps.upper)
@@ -142,7 +142,7 @@ class Refit:
     def predicted_step(self) -> NDArray[np.float64]:
         """Return the Gauss-Newton step of the unknowns to the predicted minimum, shape (k,)."""
         normal_equations = self.equations
-        is_at_bound = normal_equations.held(self.x, *self.objective.unknowns.bounds)
+        is_at_bound = normal_equations.is_held_at_bound(self.x, *self.objective.unknowns.bounds)
         is_free = ~is_at_bound & (np.diag(normal_equations.hessian) > 0)
         scaled_hessian, hessian_scale = normal_equations.scaled_hessian()
         scaled_gradient = normal_equations.gradient[is_free] / hessian_scale[is_free]

@@ -390,7 +390,7 @@ def headline_of_fit(
                 order_intervals.get(each),
             )
             for each in fit.parameters
-            if fit.structure.has(each)
+            if fit.structure.has_damping_of(each)
         },
         sizes=tuple(
             # A loss factor is valid without its order. A coefficient is valid with its order only.
@@ -502,7 +502,7 @@ def _conditional_estimate(
         parameters={
             parameter_name: _reported_parameter(simplest_candidate.fit, parameter_name, None, None)
             for parameter_name in simplest_candidate.fit.parameters
-            if simplest_candidate.structure.has(parameter_name)
+            if simplest_candidate.structure.has_damping_of(parameter_name)
             and parameter_name not in fixed_orders
         },
     )

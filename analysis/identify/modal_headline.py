@@ -321,7 +321,7 @@ def _structure_status(
             return exact_status
         structure = STRUCTURES[structure_name.partition(",")[0]]
         for order_name, coefficient_name in COEFFICIENT_OF.items():
-            if not structure.has(coefficient_name):
+            if not structure.has_damping_of(coefficient_name):
                 deviance_rise = estimate.deviance_without_damping[coefficient_name]
             elif structure.fixed.get(order_name) == 1.0:
                 deviance_rise = estimate.deviance_of_order_one[order_name]

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._settings import SETTINGS
-from analysis.models import ORDER_RANGE, SIZE_RANGE
+from analysis.models import ORDER_RANGE, RELATIVE_DAMPING_RANGE
 from rigd.beam import DAMPING_PARAMETERS, Plant, gradient_name, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class Unknowns:
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lower and the upper bounds of the unknowns, each of shape (k,)."""
-        ln_size_range = (math.log(SIZE_RANGE[0]), math.log(SIZE_RANGE[1]))
+        ln_size_range = (math.log(RELATIVE_DAMPING_RANGE[0]), math.log(RELATIVE_DAMPING_RANGE[1]))
         largest_scaled_delay = _DELAY_RANGE_S / _DELAY_UNIT_S
         unknown_ranges = {
             "zeta": ln_size_range,
@@ -306,7 +306,7 @@ class Unknowns:
         first_omega_rad_s, second_omega_rad_s = self.omega_rad_s
         # ln of the factor by which damping changes stiffness and inertia, with its derivatives.
         stiffness_change, inertia_change = np.zeros((2, x.size + 1))
-        if self.structure.internal:
+        if self.structure.has_internal_damping:
             parameter_values["alpha"] = damping_order = unknown_values.get(
                 "alpha", parameter_values["alpha"]
             )
@@ -319,7 +319,7 @@ class Unknowns:
                 parameter_slopes[unknown_indices["zeta"], unknown_indices["alpha"]] = (
                     ln_size_slope - math.log(second_omega_rad_s)
                 )
-        if self.structure.external:
+        if self.structure.has_external_damping:
             parameter_values["lambda"] = damping_order = unknown_values.get(
                 "lambda", parameter_values["lambda"]
             )
@@ -343,7 +343,7 @@ class Unknowns:
                     unknown_values[parameter_name] + ln_factor[-1]
                 )
                 parameter_slopes[unknown_indices[parameter_name]] += ln_factor[:-1]
-        if self.structure.external:
+        if self.structure.has_external_damping:
             density_over_stiffness = parameter_values["density_over_stiffness"]
             parameter_values["gamma"] = density_over_stiffness * math.exp(
                 ln_g + (2 - parameter_values["lambda"]) * math.log(first_omega_rad_s)
@@ -461,7 +461,9 @@ class StepRule:
         )
         return cls(*unknowns.bounds, damping_indices, loss_indices, linear_loss_limit)
 
-    def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def step_limits(
+        self, x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the smallest and largest admissible step of each unknown, each of shape (k,).
 
         An order approaches 0 and 2 by a fraction of its distance at a time: the effect of damping
@@ -480,7 +482,9 @@ class StepRule:
             )
         return smallest_steps, largest_steps
 
-    def end(self, x: NDArray[np.float64], unknown_step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def end_point(
+        self, x: NDArray[np.float64], unknown_step: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Return the unknowns after a step along the curve, within the bounds, shape (k,).
 
         Parameters
@@ -488,7 +492,7 @@ class StepRule:
         x : ndarray, shape (k,)
             Unknowns before the step.
         unknown_step : ndarray, shape (k,)
-            Step within the `limits`, tangent to the curve at `x`.
+            Step within the `step_limits`, tangent to the curve at `x`.
         """
         end = np.clip(x + unknown_step, self.lower, self.upper)
         for i in self.loss_indices:

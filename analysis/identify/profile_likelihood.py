@@ -243,7 +243,7 @@ def profile_both_orders(
                 candidate_set, freest_candidate, order, search_other_minima=order not in determined
             )
             for order in _BOTH_ORDERS
-            if compute and freest_candidate.structure.has(order)
+            if compute and freest_candidate.structure.has_damping_of(order)
         }
         costs_before = [candidate.fit.cost for candidate in candidate_set.candidates]
         if round_index == _MAX_ROUNDS:
@@ -397,7 +397,7 @@ class OrderProfiler:
         """
         damping_coefficient, free_parameters = COEFFICIENT_OF[self.order], set(self.structure.free)
         for candidate in self._candidate_set.candidates:
-            is_special_case = candidate.structure.has(
+            is_special_case = candidate.structure.has_damping_of(
                 damping_coefficient
             ) and free_parameters > set(candidate.structure.free)
             if not is_special_case:

@@ -412,7 +412,7 @@ class UniformBeamProblem:
             Minimum of chi-square.
         """
         chi_square_curvature = np.diag(minimum.equations.hessian)
-        is_at_bound = minimum.equations.held(minimum.x, self.lower, self.upper)
+        is_at_bound = minimum.equations.is_held_at_bound(minimum.x, self.lower, self.upper)
         return int(np.count_nonzero(is_at_bound | (chi_square_curvature < _IDLE_CURVATURE)))
 
 

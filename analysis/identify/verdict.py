@@ -143,7 +143,10 @@ def too_few_modes(structure: Structure, mode_count: int) -> str | None:
     # that the beam is exactly uniform.
     if mode_count < _MIN_MODES_FOR_AN_ORDER:
         return "a single mode determines the amount of damping, not its order"
-    if structure.internal != structure.external and mode_count < _MIN_MODES_FOR_A_SINGLE_DAMPING:
+    if (
+        structure.has_internal_damping != structure.has_external_damping
+        and mode_count < _MIN_MODES_FOR_A_SINGLE_DAMPING
+    ):
         return SECOND_DAMPING_REASON
     return None
 
@@ -173,7 +176,7 @@ def _order_status(
     reason_against = not_reported_reason(candidate_set, visible_numbers)
     if reason_against is not None:
         return "not identifiable", reason_against
-    if not freest_candidate.structure.has(order_name):
+    if not freest_candidate.structure.has_damping_of(order_name):
         return "absent", "no such damping is visible"
     if not order_profile.identifiable:
         return "not identifiable", ORDER_NOT_DETERMINED_REASON

@@ -251,7 +251,7 @@ class _FrfProblem:
 
     def deviation_and_jacobian(self, x: NDArray[np.float64]) -> _Linearization:
         """Return model minus measurement, (n,), and its derivatives with respect to x, (k, n)."""
-        return self._recent_linearizations.at(x, self._linearize)
+        return self._recent_linearizations.value_at(x, self._linearize)
 
     def _linearize(self, x: NDArray[np.float64]) -> _Linearization:
         """Compute model minus measurement and its derivatives with respect to x."""

@@ -117,7 +117,7 @@ def _damping_term(
 
 def _elastic_factor(structure: Structure) -> Formula | None:
     """Return the formula ``1 + zeta s^alpha``, or None for a structure without internal damping."""
-    if not structure.internal:
+    if not structure.has_internal_damping:
         return None
     return _join(
         _NUMBER_ONE,
@@ -134,7 +134,7 @@ def _inertial_terms(structure: Structure) -> Formula:
     inertia = Formula(ratio_mathml, density_ratio.tex.replace("frac", "dfrac")) + _power(
         _S_SYMBOL, _NUMBER_TWO
     )
-    if not structure.external:
+    if not structure.has_external_damping:
         return inertia
     return _join(
         inertia,
@@ -302,8 +302,8 @@ def types_table(whole_record: WholeRecord) -> Table:
         for structure in STRUCTURES.values():
             term_descriptions, damping_terms = [], []
             for is_present, damping_name, coefficient_name, order_name, order_symbol in (
-                (structure.internal, "internal", "ζ", "alpha", "α"),
-                (structure.external, "external", "γ", "lambda", "λ"),
+                (structure.has_internal_damping, "internal", "ζ", "alpha", "α"),
+                (structure.has_external_damping, "external", "γ", "lambda", "λ"),
             ):
                 is_first_order = order_name not in structure.free
                 damping_terms.append(

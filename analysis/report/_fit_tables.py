@@ -190,7 +190,7 @@ def _damping_cells(
     not_reported = unreported_parameters(structure, unsupported_orders)
     parameter_cells: list[Cell] = []
     for parameter_name in DAMPING_PARAMETERS:
-        if not structure.has(parameter_name):
+        if not structure.has_damping_of(parameter_name):
             parameter_cells += [number_cell(None), number_cell(None)]
             continue
         parameter_std = (

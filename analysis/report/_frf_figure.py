@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.models import ESTIMATOR_NAMES, estimate_text
+from analysis.models import ESTIMATOR_NAMES, estimator_text
 from analysis.report import _style as style
 from rigd.spectral import magnitude_db, phase_deg
 
@@ -97,7 +97,7 @@ def _estimate_text(analysis: WelchAnalysis) -> str:
     band_text = (
         f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz, {len(response.response)} bins"
     )
-    method_text = estimate_text(settings.estimator, analysis.segmentation, response.segments)
+    method_text = estimator_text(settings.estimator, analysis.segmentation, response.segments)
     return f"{method_text}  ·  {band_text}"
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from analysis.campaigns import best_models
 from analysis.campaigns.specimen_sentences import pooled_title
-from analysis.models import STRUCTURES, estimate_text
+from analysis.models import STRUCTURES, estimator_text
 from analysis.report.table import (
     NOT_REPORTED_MARK,
     TEXT_FORMAT,
@@ -67,7 +67,7 @@ def welch_method_text(campaign: CampaignResult) -> str:
         f"{min_segments}" if min_segments == max_segments else f"{min_segments} to {max_segments}"
     )
     # The settings state all lengths, so that the rate has no effect.
-    return estimate_text(settings.estimator, settings.segmentation(PAPER_RATE_HZ), segments_text)
+    return estimator_text(settings.estimator, settings.segmentation(PAPER_RATE_HZ), segments_text)
 
 
 _STATISTICS: Final = ("mean", "median", "std", "min", "max")

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from analysis.decimation import fast_length
+from analysis.decimation import fast_fft_length
 from analysis.report import _style as style
 from analysis.report._shown_model import ShownModel
 from analysis.report._style import Illustration
@@ -636,7 +636,7 @@ def measured_response(whole_record: WholeRecord) -> FrequencyResponse:
     """
     record = whole_record.record
     angle = record.angle_rad - (record.rest_angle_rad or 0.0)
-    response = fft_response(angle, record.torque_nm, record.rate_hz, fast_length(len(angle)))
+    response = fft_response(angle, record.torque_nm, record.rate_hz, fast_fft_length(len(angle)))
     first_mode_hz = float(undamped_frequencies_rad_s(whole_record.fit.plant.beam, 1)[0]) / (
         2 * np.pi
     )

@@ -397,7 +397,7 @@ def loss_factors(fit: FittedPlant, frequency_hz: RealArray) -> LossFactors:
     total_value = np.zeros(omega_rad_s.size)
     total_slopes = np.zeros((len(fit.determined), omega_rad_s.size))
     internal_loss = external_loss = None
-    if fit.structure.internal:
+    if fit.structure.has_internal_damping:
         loss_value, slope_pair = _loss_with_slopes(
             omega_rad_s, parameter_values["zeta"], parameter_values["alpha"], 1.0
         )
@@ -411,7 +411,7 @@ def loss_factors(fit: FittedPlant, frequency_hz: RealArray) -> LossFactors:
             total_value + loss_value,
             total_slopes + loss_value * log_loss_gradient,
         )
-    if fit.structure.external:
+    if fit.structure.has_external_damping:
         inertia_term = parameter_values["density_over_stiffness"] * omega_rad_s**2
         loss_value, slope_pair = _loss_with_slopes(
             omega_rad_s, parameter_values["gamma"] / inertia_term, parameter_values["lambda"], -1.0

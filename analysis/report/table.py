@@ -455,7 +455,7 @@ def unreported_parameters(
         parameter_name
         for order_name in unsupported_orders
         for parameter_name in (order_name, COEFFICIENT_OF[order_name])
-        if structure.has(parameter_name)
+        if structure.has_damping_of(parameter_name)
     )
 
 

@@ -25,7 +25,7 @@ def decimated(paper_file):
 def test_result_does_not_depend_on_blocks(paper_file, decimated):
     whole = load_record(paper_file)
     decimation = Decimation.to_band(1000.0, 50.0, 2.5)
-    assert (decimation.factor, decimation.reach) == (FACTOR, REACH)
+    assert (decimation.downsampling_factor, decimation.half_length_samples) == (FACTOR, REACH)
     inside = decimation.samples_inside_record(whole.time_s.size)
     for name in ("reference_rad", "angle_rad", "torque_nm"):
         expected = decimation.apply(getattr(whole, name))[inside]
@@ -109,11 +109,11 @@ def test_clipping_is_found_in_all_samples(
     at_limit = torque_nm == -most_nm
     path = write_session(tmp_path / "clipped.mcap", replace(paper_signals, torque_nm=torque_nm))
     largest, smallest = load_record(path, longest_samples=LONGEST).torque_extremes
-    assert (smallest.limit_nm, smallest.values) == (-most_nm, np.count_nonzero(at_limit))
+    assert (smallest.limit_nm, smallest.sample_count) == (-most_nm, np.count_nonzero(at_limit))
     neighbours = np.roll(at_limit, 1) | np.roll(at_limit, -1)
-    assert smallest.repeated == np.count_nonzero(at_limit & neighbours) >= 4
-    assert (largest.limit_nm, largest.values) == (torque_nm.max(), 1)
-    assert decimated.torque_extremes[1].values == 1
+    assert smallest.repeated_count == np.count_nonzero(at_limit & neighbours) >= 4
+    assert (largest.limit_nm, largest.sample_count) == (torque_nm.max(), 1)
+    assert decimated.torque_extremes[1].sample_count == 1
     assert load_record(paper_file).torque_extremes == ()
     measurement = Measurement.from_record(load_record(path, longest_samples=LONGEST))
     assert measurement.torque_extremes == (largest, smallest)

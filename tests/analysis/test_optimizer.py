@@ -231,12 +231,20 @@ def test_only_hopeless_descents_are_stopped_early():
     assert whole.evaluations > 4
     above, below = whole.cost * 0.99, whole.cost * 1.01
     given_up = descend(
-        Counted(decays, slopes), start, free(3), relative_tolerance=tight, hopeless=(4, above)
+        Counted(decays, slopes),
+        start,
+        free(3),
+        relative_tolerance=tight,
+        early_stop_limits=(4, above),
     )
     assert given_up.evaluations == 4
     assert given_up.cost > whole.cost
     followed = descend(
-        Counted(decays, slopes), start, free(3), relative_tolerance=tight, hopeless=(40, below)
+        Counted(decays, slopes),
+        start,
+        free(3),
+        relative_tolerance=tight,
+        early_stop_limits=(40, below),
     )
     assert followed.evaluations == whole.evaluations
     assert followed.x == pytest.approx(whole.x, abs=1e-12)

@@ -26,8 +26,8 @@ def test_fixed_and_free(name):
     assert structure.name == name
     assert dict(structure.fixed) == TABLE_2[name]
     assert structure.free == tuple(p for p in DAMPING_PARAMETERS if p not in TABLE_2[name])
-    assert structure.internal == (name not in ("II", "V"))
-    assert structure.external == (name not in ("I", "IV"))
+    assert structure.has_internal_damping == (name not in ("II", "V"))
+    assert structure.has_external_damping == (name not in ("I", "IV"))
 
 
 def test_damping_ignores_values_of_fixed_parameters():

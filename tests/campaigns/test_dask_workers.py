@@ -10,7 +10,7 @@ import pytest
 
 from analysis.campaigns import CampaignError, campaign
 from analysis.campaigns import workers as dask_workers
-from analysis.campaigns.workers import FailedTask, dask_cluster, versions
+from analysis.campaigns.workers import FailedTask, dask_cluster, package_versions
 
 ONE_DEATH_IS_ENOUGH = {"distributed.scheduler.allowed-failures": 0}
 
@@ -71,7 +71,10 @@ class Elsewhere:
 @pytest.mark.parametrize(
     ("reported", "words"),
     [
-        (versions() | {"rigd": "9.9"}, f"7:1 has rigd 9.9 and not {versions()['rigd']}: install"),
+        (
+            package_versions() | {"rigd": "9.9"},
+            f"7:1 has rigd 9.9 and not {package_versions()['rigd']}: install",
+        ),
         (ModuleNotFoundError("no", name="analysis"), "7:1 has no module analysis: install rigd"),
         (OSError("no"), "7:1 cannot be used: no"),
     ],
@@ -79,7 +82,7 @@ class Elsewhere:
 def test_worker_of_other_versions_is_reported(reported, words):
     with pytest.raises(CampaignError, match=re.escape(words)):
         dask_workers._check_workers(Elsewhere(reported), "tcp://10.0.0.5:8786")
-    dask_workers._check_workers(Elsewhere(versions()), "tcp://10.0.0.5:8786")
+    dask_workers._check_workers(Elsewhere(package_versions()), "tcp://10.0.0.5:8786")
 
 
 @pytest.mark.process

@@ -83,7 +83,9 @@ def test_spectra_of_decays_that_begin_within_a_filtered_record(decimation):
     samples = inside.stop - inside.start
     hz = np.fft.rfftfreq(samples, 1 / decimation.rate_hz)
     bins = slice(1, int(np.searchsorted(hz, 50.0)))
-    first_s = (begin - (inside.start - decimation.reach) * decimation.factor) / rate_hz
+    first_s = (
+        begin - (inside.start - decimation.half_length_samples) * decimation.downsampling_factor
+    ) / rate_hz
     spectra = LaterDecaySpectra(
         samples, decimation.rate_hz, 2 * np.pi * hz[bins], first_s, 1 / rate_hz
     )

@@ -39,7 +39,7 @@ def test_short_step_is_straight(zeta, alpha, gamma, lambda_, direction):
     sizes = [math.exp(x[i]) / math.sin(math.pi / 2 * x[j]) for i, j in ((0, 1), (2, 3))]
     step = 1e-7 * np.array(direction) * np.array([1, 0.01, 1, 0.01, 1, 1, 1, 1e-3])
     if min(away) > 1e-3 and max(sizes) < 1e3:
-        assert STEPS.end(x, step) == pytest.approx(x + step, abs=1e-9)
+        assert STEPS.end_point(x, step) == pytest.approx(x + step, abs=1e-9)
 
 
 @given(
@@ -51,10 +51,10 @@ def test_short_step_is_straight(zeta, alpha, gamma, lambda_, direction):
 )
 def test_no_step_leaves_the_bounds(zeta, alpha, gamma, lambda_, step):
     x = np.array([zeta, alpha, gamma, lambda_, *REST])
-    least, most = STEPS.limits(x)
+    least, most = STEPS.step_limits(x)
     assert (least <= 0).all()
     assert (most >= 0).all()
-    end = STEPS.end(x, np.clip(step, least, most))
+    end = STEPS.end_point(x, np.clip(step, least, most))
     assert ((STEPS.lower <= end) & (end <= STEPS.upper)).all()
 
 
@@ -68,7 +68,7 @@ def test_large_order_step_preserves_the_phase(i, j, before, after):
     # ln tan(theta/2) stays where the loss changes by size / sin(turn) times the turn's change.
     turned = math.pi / 2 * (after - before) * (1 if i == 0 else -1)
     step[i] = -size / math.sin(math.pi / 2 * before) * turned
-    end = STEPS.end(x, step)
+    end = STEPS.end_point(x, step)
     assert end[j] == pytest.approx(after)
     assert phases(end) == pytest.approx(phases(x), rel=1e-9)
     assert abs(end[i] - x[i]) > 0.5
@@ -80,7 +80,7 @@ def test_order_is_limited_by_the_largest_loss():
     step = np.zeros(8)
     step[2] = 3.0
     step[3] = 0.03
-    end = STEPS.end(x, step)
+    end = STEPS.end_point(x, step)
     assert end[2] == STEPS.upper[2]
     assert STEPS.lower[3] < end[3] < x[3] + step[3]
     most = math.pi / 2 * (2 - (x[3] + step[3]))
@@ -91,14 +91,14 @@ def test_almost_absent_damping_may_vanish_at_constant_order():
     x = np.array([-12.0, 0.5, -4.0, 1.0, *REST])
     step = np.zeros(8)
     step[0] = -1.5
-    end = STEPS.end(x, step)
+    end = STEPS.end_point(x, step)
     assert end[0] == STEPS.lower[0]
-    least, most = STEPS.limits(end)
+    least, most = STEPS.step_limits(end)
     assert least[1] == most[1] == 0
     assert least[3] < 0 < most[3]
     large = x.copy()
     large[0] = -5.0
-    assert STEPS.end(large, step)[0] == pytest.approx(-6.5, abs=0.01)
+    assert STEPS.end_point(large, step)[0] == pytest.approx(-6.5, abs=0.01)
 
 
 def test_steps_without_a_free_order_are_straight():
@@ -106,7 +106,7 @@ def test_steps_without_a_free_order_are_straight():
     x, step = np.array([1.0, 1.0, *REST]), np.array([2.0, -3.0, 0.1, 0.1, 0.1, 0.1])
     assert steps.damping_indices == ()
     assert steps.loss_indices == (0, 1)
-    assert steps.end(x, step) == pytest.approx(x + step)
+    assert steps.end_point(x, step) == pytest.approx(x + step)
 
 
 @pytest.mark.parametrize("structure", ["VI", "III"])
@@ -117,9 +117,9 @@ def test_tiny_loss_grows_by_the_requested_step(structure):
     x, step = unknowns.vector(NOMINAL), np.zeros(len(unknowns.names))
     # A loss of 1e-8 is to become 1e-5: a step of its logarithm by 999 would end at the upper bound.
     x[index], step[index] = math.log(1e-8), 999.0
-    assert math.exp(steps.end(x, step)[index]) == pytest.approx(1e-5, rel=1e-3)
-    assert StepRule.for_unknowns(unknowns).end(x, step)[index] == steps.upper[index]
+    assert math.exp(steps.end_point(x, step)[index]) == pytest.approx(1e-5, rel=1e-3)
+    assert StepRule.for_unknowns(unknowns).end_point(x, step)[index] == steps.upper[index]
     x[index], step[index] = math.log(1e-2), 0.5
-    assert steps.end(x, step) == pytest.approx(
-        StepRule.for_unknowns(unknowns).end(x, step), abs=1e-12
+    assert steps.end_point(x, step) == pytest.approx(
+        StepRule.for_unknowns(unknowns).end_point(x, step), abs=1e-12
     )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.decimation import Decimation, fast_length, fast_length_below, interpolate_gaps
+from analysis.decimation import Decimation, fast_fft_length, fast_fft_length_below, interpolate_gaps
 from analysis.identify.noise import (
     estimate_noise,
     noise_power_with_peaks,
@@ -37,13 +37,13 @@ def test_signal_without_gaps_is_unchanged():
 )
 def test_decimation_passes_only_the_band(rate_hz, highest_hz, factor):
     decimation = Decimation.to_band(rate_hz, highest_hz)
-    assert decimation.factor == factor
+    assert decimation.downsampling_factor == factor
     n = 20_000
     t = np.arange(n) / rate_hz
     for hz in (0.0, 0.3 * highest_hz, highest_hz):
         decimated = decimation.apply(np.cos(2 * np.pi * hz * t + 0.4))
         inside = decimation.samples_inside_record(n)
-        at = (np.arange(decimated.size) - decimation.reach) / decimation.rate_hz
+        at = (np.arange(decimated.size) - decimation.half_length_samples) / decimation.rate_hz
         expected = np.cos(2 * np.pi * hz * at + 0.4)
         assert np.abs(decimated - expected)[inside].max() < 2e-5
     beyond_hz = 1.01 * decimation.rate_hz / 2
@@ -63,7 +63,7 @@ def test_inside_excludes_edge_effects():
 
 
 def test_fast_lengths():
-    assert (fast_length(13), fast_length_below(13), fast_length(1024)) == (14, 12, 1024)
+    assert (fast_fft_length(13), fast_fft_length_below(13), fast_fft_length(1024)) == (14, 12, 1024)
 
 
 def noise(shape, seed):

@@ -10,7 +10,7 @@ from rerun_files import batches
 from typer.testing import CliRunner
 
 from analysis.cli.app import app
-from analysis.decimation import fast_length
+from analysis.decimation import fast_fft_length
 from analysis.models import WelchSettings
 from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
@@ -195,7 +195,7 @@ def test_model_of_the_whole_record_lies_over_the_response(record_result, from_re
     chunks, _ = from_record
     whole = record_result.whole
     angle = whole.record.angle_rad - (whole.record.rest_angle_rad or 0.0)
-    size = fast_length(len(angle))
+    size = fast_fft_length(len(angle))
     found = fft_response(angle, whole.record.torque_nm, whole.record.rate_hz, size)
     found = found.band(0.1, whole.band_hz[1])
     grid_hz, delay_s = found.frequency_hz, whole.fit.parameters["delay_s"]
