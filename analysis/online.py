@@ -149,7 +149,7 @@ class OnlineEstimate:
     def as_json(self) -> dict[str, Any]:
         """Return the estimate as a JSON document (docs/online_fit.md)."""
         from analysis.identify import headline_json
-        from analysis.results import finite
+        from analysis.results import finite_json
 
         json_content: dict[str, Any] = {
             "tick": self.tick,
@@ -173,7 +173,7 @@ class OnlineEstimate:
                 "noise": _noise_spectrum(self.analysis),
             }
             del json_content["file"]
-        return dict(finite(json_content))
+        return dict(finite_json(json_content))
 
 
 def _noise_spectrum(analysis: RecordAnalysis) -> dict[str, Any]:

@@ -85,7 +85,7 @@ def make_quick_look(path: Path, last_session_path: Path | None = None) -> dict[s
         `last_session_path`.
     """
     from analysis.record import RecordError, load_record
-    from analysis.results import finite
+    from analysis.results import finite_json
 
     started_s = time.monotonic()
     modes: list[ReportedMode] = []
@@ -136,7 +136,7 @@ def make_quick_look(path: Path, last_session_path: Path | None = None) -> dict[s
         "model": model_document,
     }
     quick_look_document["text"] = list(_text_lines(quick_look_document))
-    return dict(finite(quick_look_document))
+    return dict(finite_json(quick_look_document))
 
 
 def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:

@@ -50,7 +50,7 @@ class AnalysisOptions:
     ----------
     settings : WelchSettings
         Settings of the Welch fits.
-    paper, whole_record : bool
+    with_welch_fits, whole_record : bool
         Whether the Welch fits of the paper, and the fits to the whole record, are run.
     fixed : tuple of str
         Parameters of rig and specimen that stay at the file's values.
@@ -68,7 +68,7 @@ class AnalysisOptions:
     """
 
     settings: WelchSettings
-    paper: bool
+    with_welch_fits: bool
     whole_record: bool
     fixed: tuple[Setting, ...]
     band_hz: tuple[float, float] | None = None
@@ -374,7 +374,7 @@ def record_result(
     record = with_uniformity(record, options.uniformity)
     record = _add_warnings(record, remarks(record, options.band_hz))
     on_step("read")
-    if not options.paper:
+    if not options.with_welch_fits:
         check_record_band(record, options.band_hz)
         on_step("whole record")
         return RecordResult(record, _fit_whole_record(record, options, warn))
@@ -385,14 +385,14 @@ def record_result(
         on_step("Welch fits")
         return RecordResult(record, None, fit_welch()[0])
     on_step("Welch fits and whole record")
-    computation: AbstractContextManager[Callable[[], tuple[WelchAnalysis | None, str | None]]]
+    welch_computation: AbstractContextManager[Callable[[], tuple[WelchAnalysis | None, str | None]]]
     if options.settings.are_from_paper:
-        computation = computed_in_parallel(fit_welch)
+        welch_computation = computed_in_parallel(fit_welch)
     else:  # chosen settings may not suit the record, which is reported before the other fits
-        welch_of_settings = fit_welch()
-        computation = nullcontext(lambda: welch_of_settings)
+        welch_outcome = fit_welch()
+        welch_computation = nullcontext(lambda: welch_outcome)
     whole_fits, measurement_error = None, None
-    with computation as welch_fits:
+    with welch_computation as welch_fits:
         try:
             whole_fits = _fit_whole_record(record, options, warn)
         except MeasurementError as error:
@@ -417,10 +417,10 @@ def _fit_whole_record(
 ) -> WholeRecord:
     """Fit all structures to a whole record, including the selected ones of installed packages."""
     whole_fits = whole_record(record, options.fixed, options.band_hz)
-    return _with_structures(whole_fits, options.structures, warn)
+    return _add_structure_fits(whole_fits, options.structures, warn)
 
 
-def _with_structures(
+def _add_structure_fits(
     whole_fits: WholeRecord,
     structures: tuple[AddedStructure, ...],
     warn: Callable[[str], None],
@@ -431,7 +431,7 @@ def _with_structures(
     from analysis.identify import fit_structure
     from rigd.plugins import PluginError
 
-    fits = []
+    structure_fits = []
     for added in structures:
         try:
             structure_fit = fit_structure(added, whole_fits.selection, whole_fits.fixed)
@@ -444,8 +444,8 @@ def _with_structures(
                 f"beam, with which the structure {added.structure.name} is not fitted."
             )
         else:
-            fits.append(structure_fit)
-    return replace(whole_fits, added=tuple(fits))
+            structure_fits.append(structure_fit)
+    return replace(whole_fits, added=tuple(structure_fits))
 
 
 def with_uniformity(record: Record, uniformity: float | None) -> Record:
@@ -466,7 +466,7 @@ def _add_warnings(record: Record, warnings: tuple[str, ...]) -> Record:
     return replace(record, warnings=(*record.warnings, *warnings)) if warnings else record
 
 
-def finite(json_value: Any) -> Any:  # noqa: ANN401 - any JSON value
+def finite_json(json_value: Any) -> Any:  # noqa: ANN401 - any JSON value
     """Return a copy of a JSON value with null for non-finite numbers, and without NumPy types.
 
     A trailing underscore, which distinguishes an attribute from a Python keyword (``lambda_``), is

@@ -24,18 +24,18 @@ Statistical Association 90 (1995) 773-795)."""
 BIC_TIE: Final = 6.0
 """Difference of BIC below which the data do not distinguish two structures."""
 
-_SMALLEST_TAIL: Final = 1e-290
+_SMALLEST_TAIL_PROBABILITY: Final = 1e-290
 """Tail probability below which its logarithm is computed from an asymptotic expansion."""
 
 
-def chi_square_p_value(value: ArrayLike, degrees_of_freedom: float) -> NDArray[np.float64]:
-    """Return the probability that a chi-square variable is at least `value`.
+def chi_square_p_value(chi_square: ArrayLike, degrees_of_freedom: float) -> NDArray[np.float64]:
+    """Return the probability that a chi-square variable is at least `chi_square`.
 
-    The result has the shape of `value`.
+    The result has the shape of `chi_square`.
 
     Parameters
     ----------
-    value : array_like
+    chi_square : array_like
         Value of the chi-square variable, not negative.
     degrees_of_freedom : float
         Degrees of freedom, above 0.
@@ -48,18 +48,18 @@ def chi_square_p_value(value: ArrayLike, degrees_of_freedom: float) -> NDArray[n
     """
     from scipy.special import chdtrc
 
-    p_value: NDArray[np.float64] = chdtrc(degrees_of_freedom, value)
+    p_value: NDArray[np.float64] = chdtrc(degrees_of_freedom, chi_square)
     return p_value
 
 
-def chi_square_deviate(value: float, degrees_of_freedom: float) -> float:
+def chi_square_deviate(chi_square: float, degrees_of_freedom: float) -> float:
     """Return the standard normal deviate with the upper tail probability of a chi-square value.
 
-    The deviate is finite for any `value`, even if the probability underflows.
+    The deviate is finite for any `chi_square`, even if the probability underflows.
 
     Parameters
     ----------
-    value : float
+    chi_square : float
         Value of the chi-square variable, not negative.
     degrees_of_freedom : float
         Degrees of freedom, above 0.
@@ -72,19 +72,19 @@ def chi_square_deviate(value: float, degrees_of_freedom: float) -> float:
     """
     from scipy.special import chdtr, chdtrc, gammaln, ndtri_exp
 
-    a, x = degrees_of_freedom / 2, max(value / 2, np.finfo(float).tiny)
-    in_upper_tail = x > a
-    tail_probability = float((chdtrc if in_upper_tail else chdtr)(2 * a, 2 * x))
-    if tail_probability > _SMALLEST_TAIL:
-        log_tail = np.log(tail_probability)
-    elif in_upper_tail:
+    a, x = degrees_of_freedom / 2, max(chi_square / 2, np.finfo(float).tiny)
+    is_in_upper_tail = x > a
+    tail_probability = float((chdtrc if is_in_upper_tail else chdtr)(2 * a, 2 * x))
+    if tail_probability > _SMALLEST_TAIL_PROBABILITY:
+        log_tail_probability = np.log(tail_probability)
+    elif is_in_upper_tail:
         # Leading terms of the incomplete gamma functions far from their middle, summed as geometric
         # series (NIST DLMF 8.11.2 and 8.11.4): the deviate is off by less than 1e-4 there.
-        log_tail = (a - 1) * np.log(x) - x - np.log1p(-(a - 1) / x) - gammaln(a)
+        log_tail_probability = (a - 1) * np.log(x) - x - np.log1p(-(a - 1) / x) - gammaln(a)
     else:
-        log_tail = a * np.log(x) - x - np.log1p(-x / (a + 1)) - gammaln(a + 1)
-    deviate = float(ndtri_exp(log_tail))
-    return -deviate if in_upper_tail else deviate
+        log_tail_probability = a * np.log(x) - x - np.log1p(-x / (a + 1)) - gammaln(a + 1)
+    deviate = float(ndtri_exp(log_tail_probability))
+    return -deviate if is_in_upper_tail else deviate
 
 
 def kolmogorov_p_value(statistic: float) -> float:
@@ -101,12 +101,12 @@ def kolmogorov_p_value(statistic: float) -> float:
     return float(kolmogorov(statistic))
 
 
-def student_t_quantile(level: float, degrees_of_freedom: float) -> float:
-    """Return the half width of the central interval of Student's t with probability `level`.
+def student_t_quantile(confidence_level: float, degrees_of_freedom: float) -> float:
+    """Return the half width of the central interval of Student's t at a confidence level.
 
     Parameters
     ----------
-    level : float
+    confidence_level : float
         Probability of the interval, 0 to 1.
     degrees_of_freedom : float
         Degrees of freedom, above 0.
@@ -119,7 +119,7 @@ def student_t_quantile(level: float, degrees_of_freedom: float) -> float:
     """
     from scipy.special import stdtrit
 
-    return float(stdtrit(degrees_of_freedom, (1 + level) / 2))
+    return float(stdtrit(degrees_of_freedom, (1 + confidence_level) / 2))
 
 
 def nrmse_percent(residual: NDArray[Any], measured: NDArray[Any]) -> float:

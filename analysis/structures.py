@@ -21,11 +21,11 @@ from rigd.plugins import Plugin, Registry, load_declaration, plugin_errors
 from rigd.printable import listed, printable
 from rigd.units import unit_of
 
-_MAX_STARTS: Final = 64
+_MAX_START_POINTS: Final = 64
 """Largest number of combinations of start values; each costs an evaluation of the whole record."""
 _CHECKED_OMEGA_RAD_S: Final = np.geomspace(0.1, 1e4, 60)
 """Angular frequencies at which the damping of a package's structure is checked."""
-_LOSS_TOLERANCE: Final = 1e-9
+_NEGATIVE_LOSS_TOLERANCE: Final = 1e-9
 """Largest negative imaginary part of a factor, relative to it, that rounding errors can cause."""
 
 
@@ -44,42 +44,45 @@ def check_structure(structure: Structure) -> None:
         raise ValueError("its description is not one line of text.")
     if not structure.free:
         raise ValueError("it has no free parameter.")
-    names = [parameter.name for parameter in structure.parameters]
+    parameter_names = [parameter.name for parameter in structure.parameters]
     for parameter in structure.parameters:
-        if names.count(parameter.name) > 1 or parameter.name in PARAMETERS:
+        if parameter_names.count(parameter.name) > 1 or parameter.name in PARAMETERS:
             raise ValueError(
                 f"the name of its parameter {parameter.name} is taken; choose another one."
             )
         _check_parameter(parameter)
-    unknown_names = sorted(set(structure.fixed) - set(names))
+    unknown_names = sorted(set(structure.fixed) - set(parameter_names))
     if unknown_names:
         raise ValueError(f"it fixes {listed(unknown_names)}, which it does not have.")
-    starts = structure.start_values()
-    if len(starts) > _MAX_STARTS:
+    start_points = structure.start_values()
+    if len(start_points) > _MAX_START_POINTS:
         raise ValueError(
-            f"it has {len(starts)} combinations of start values; state at most {_MAX_STARTS}."
+            f"it has {len(start_points)} combinations of start values; state at most "
+            f"{_MAX_START_POINTS}."
         )
-    for values in starts:
+    for values in start_points:
         _check_damping(structure, values)
 
 
-def _check_damping(structure: Structure, values: Mapping[str, float]) -> None:
+def _check_damping(structure: Structure, parameter_values: Mapping[str, float]) -> None:
     """Raise ValueError unless the damping at given parameters is valid (`check_structure`)."""
     s = (1j * _CHECKED_OMEGA_RAD_S).astype(np.complex128)
-    factors = structure.finite_factors(s, values)
-    structure.finite_factors(1.0 + s, values)  # causal responses are computed there
+    factors = structure.finite_factors(s, parameter_values)
+    structure.finite_factors(1.0 + s, parameter_values)  # causal responses are computed there
     for factor, name in zip(factors, ("stiffness", "external damping"), strict=True):
-        gains = np.flatnonzero(factor.imag < -_LOSS_TOLERANCE * np.abs(factor))
-        if gains.size:
+        gain_indices = np.flatnonzero(factor.imag < -_NEGATIVE_LOSS_TOLERANCE * np.abs(factor))
+        if gain_indices.size:
             raise ValueError(
-                f"its {name} gains energy at {_CHECKED_OMEGA_RAD_S[gains[0]]:.3g} rad/s with "
-                f"{parameters_text(values)}: the imaginary part is negative."
+                f"its {name} gains energy at {_CHECKED_OMEGA_RAD_S[gain_indices[0]]:.3g} rad/s "
+                "with "
+                f"{parameters_text(parameter_values)}: the imaginary part is negative."
             )
-    conjugate_factors = structure.finite_factors(s.conj(), values)
+    conjugate_factors = structure.finite_factors(s.conj(), parameter_values)
     for factor, at_conjugate in zip(factors, conjugate_factors, strict=True):
         if not np.allclose(at_conjugate, factor.conj(), rtol=1e-9, atol=0.0):
             raise ValueError(
-                f"its damping is not a real function of time with {parameters_text(values)}: at "
+                "its damping is not a real function of time with "
+                f"{parameters_text(parameter_values)}: at "
                 "the conjugate of s it must have the conjugate value."
             )
 
@@ -139,12 +142,12 @@ _REGISTRY: Final = Registry("analysis.structures", STRUCTURES, _load_structure, 
 """Damping structures, by name."""
 
 
-def added_structures(names: Sequence[str]) -> tuple[AddedStructure, ...]:
+def added_structures(structure_names: Sequence[str]) -> tuple[AddedStructure, ...]:
     """Return the structures of given names that installed packages add.
 
     Parameters
     ----------
-    names : sequence of str
+    structure_names : sequence of str
         Names of structures.
 
     Raises
@@ -155,7 +158,7 @@ def added_structures(names: Sequence[str]) -> tuple[AddedStructure, ...]:
         If a package cannot be used.
     """
     structures = []
-    for name in names:
+    for name in structure_names:
         plugin = _REGISTRY.owner(name)
         if plugin is None:
             available_names = [

@@ -62,15 +62,15 @@ if TYPE_CHECKING:
 
     RealArray = NDArray[np.float64]
 
-_MIN_BEFORE_S: Final = 0.3
+_MIN_RECORD_BEFORE_TOUCH_S: Final = 0.3
 """Least duration that must be recorded before a detection for an estimate of the touch."""
-_MIN_AFTER_S: Final = 0.02
+_MIN_RECORD_AFTER_TOUCH_S: Final = 0.02
 """Least duration that must be recorded after a detection for an estimate of the touch."""
-_MIN_REST_S: Final = 0.5
+_MIN_REST_DURATION_S: Final = 0.5
 """Least duration of rest at the start of a record, from which the noise is estimated."""
-_MIN_PAUSE_S: Final = 0.5
+_MIN_PAUSE_BETWEEN_TOUCHES_S: Final = 0.5
 """Pause between two detections from which they count as different touches: the beam may bounce."""
-_LONGEST_FILTER_TICKS: Final = 0.99
+_MAX_SENSOR_FILTER_TICKS: Final = 0.99
 """Longest span in ticks of the filter that averages sensor records: that of 100 in a tick."""
 _MAX_TOUCHES: Final = 20
 """Largest number of touches found in a record; with more, the model does not fit the record."""
@@ -96,7 +96,7 @@ class Touch:
         Number of the touch, from 1, in the order of time.
     tick
         Tick of the detection.
-    noticed_s
+    detection_time_s
         Time of the detection after the start of the record used for the estimate.
     angle_rad
         Motor angle at the touch.
@@ -105,10 +105,10 @@ class Touch:
     estimate
         Estimate of the touch. It is None, like the following attributes, if the record around the
         touch is too short.
-    antenna_m
+    antenna_points_m
         Points of the bent antenna at the touch, seen from above with the motor's axis at (0, 0),
         shape (points, 2).
-    point_m
+    contact_point_m
         Point of contact in this plane, shape (2,); None if it is not known.
     interval_ends_m
         Ends of the 95 % interval of the point of contact, shape (2, 2); None if it is not known.
@@ -116,18 +116,18 @@ class Touch:
 
     number: int
     tick: int
-    noticed_s: float
+    detection_time_s: float
     angle_rad: float
     start_s: float
     estimate: TouchEstimate | None = None
-    antenna_m: RealArray | None = None
-    point_m: RealArray | None = None
+    antenna_points_m: RealArray | None = None
+    contact_point_m: RealArray | None = None
     interval_ends_m: RealArray | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the touch and its estimate as a JSON document."""
         estimate = self.estimate
-        contact_point = None if self.point_m is None else self.point_m.tolist()
+        contact_point = None if self.contact_point_m is None else self.contact_point_m.tolist()
         return {
             "number": self.number,
             "tick": self.tick,
@@ -182,11 +182,11 @@ class TouchAnalysis:
         of the profile attached to each file is used.
     """
 
-    def __init__(self, model: Path | None = None) -> None:
-        self._model = model
+    def __init__(self, model_path: Path | None = None) -> None:
+        self._model = model_path
         self._prepared: dict[tuple[object, ...], _PreparedModel] = {}
 
-    def session(
+    def analyse_session(
         self, path: Path, on_step: Callable[[str], None] = lambda _: None
     ) -> SessionTouches:
         """Return the touches of a session.
@@ -219,11 +219,17 @@ class TouchAnalysis:
                 "The file states no shear_projection: the touches are estimated from the torque "
                 "alone, which determines instant and point poorly."
             )
-        marked_ticks = samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist()
+        flagged_ticks = samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist()
         contact_ticks = round(CONTACT_S * rate_hz)
-        free_ticks = [0, *(detection_tick + contact_ticks for detection_tick in marked_ticks)]
-        detection_source, detected_ticks = "loop", list(zip(marked_ticks, free_ticks, strict=False))
-        if not marked_ticks:
+        first_free_ticks = [
+            0,
+            *(detection_tick + contact_ticks for detection_tick in flagged_ticks),
+        ]
+        detection_source, detected_ticks = (
+            "loop",
+            list(zip(flagged_ticks, first_free_ticks, strict=False)),
+        )
+        if not flagged_ticks:
             on_step("searching for touches")
             detection_source, detected_ticks = (
                 "record",
@@ -236,9 +242,9 @@ class TouchAnalysis:
                 )
                 detected_ticks = detected_ticks[:_MAX_TOUCHES]
         touches = []
-        for touch_number, (detection_tick, free_ticks) in enumerate(detected_ticks, start=1):
+        for touch_number, (detection_tick, free_tick) in enumerate(detected_ticks, start=1):
             on_step(f"touch {touch_number} of {len(detected_ticks)}")
-            touch_samples = around_touch(samples, detection_tick, rate_hz, free_ticks)
+            touch_samples = around_touch(samples, detection_tick, rate_hz, free_tick)
             touches.append(
                 self._estimate_touch(
                     touch_samples,
@@ -270,25 +276,29 @@ class TouchAnalysis:
     ) -> Touch:
         """Return a touch with its estimate from the samples around its detection."""
         start_s = int(touch_samples["tick"][0]) / rate_hz
-        samples_record = touch_record(touch_samples, detection_tick, rate_hz, shear_coefficients)
-        time_s = samples_record.detected / rate_hz
-        after_s = (samples_record.angle_rad.size - 1 - samples_record.detected) / rate_hz
-        angles_rad = samples_record.angle_rad
-        if time_s < _MIN_BEFORE_S or after_s < _MIN_AFTER_S:
+        record_around_touch = touch_record(
+            touch_samples, detection_tick, rate_hz, shear_coefficients
+        )
+        time_s = record_around_touch.detected / rate_hz
+        recorded_after_s = (
+            record_around_touch.angle_rad.size - 1 - record_around_touch.detected
+        ) / rate_hz
+        angles_rad = record_around_touch.angle_rad
+        if time_s < _MIN_RECORD_BEFORE_TOUCH_S or recorded_after_s < _MIN_RECORD_AFTER_TOUCH_S:
             return Touch(
                 touch_number,
                 detection_tick,
                 time_s,
-                float(angles_rad[samples_record.detected]),
+                float(angles_rad[record_around_touch.detected]),
                 start_s,
             )
         prepared_model = self._prepare_model(touch_model, rate_hz)
-        touch_estimate = prepared_model.estimator.estimate(samples_record)
+        touch_estimate = prepared_model.estimator.estimate(record_around_touch)
         if touch_estimate.time_s is not None:
             time_s = touch_estimate.time_s.value
         angle_rad = float(np.interp(time_s, np.arange(angles_rad.size) / rate_hz, angles_rad))
         x_m = prepared_model.free_beam.x_m
-        deflection_m = _free_deflection_m(prepared_model.free_beam, samples_record, time_s)
+        deflection_m = _free_deflection_m(prepared_model.free_beam, record_around_touch, time_s)
         contact_point_m = interval_ends_m = None
         if touch_estimate.x_m is not None:
             positions_m = np.array([touch_estimate.x_m.value, *touch_estimate.x_m.interval_95])
@@ -299,7 +309,7 @@ class TouchAnalysis:
         return Touch(
             touch_number,
             detection_tick,
-            samples_record.detected / rate_hz,
+            record_around_touch.detected / rate_hz,
             angle_rad,
             start_s,
             touch_estimate,
@@ -310,15 +320,20 @@ class TouchAnalysis:
 
     def _prepare_model(self, touch_model: TouchModel, rate_hz: float) -> _PreparedModel:
         """Return touch estimator and freely moving beam of a model, made at the first use."""
-        key = (touch_model.plant, touch_model.angle_delay_s, touch_model.sensor_filter, rate_hz)
-        if key not in self._prepared:
+        cache_key = (
+            touch_model.plant,
+            touch_model.angle_delay_s,
+            touch_model.sensor_filter,
+            rate_hz,
+        )
+        if cache_key not in self._prepared:
             x_m = np.linspace(0.0, touch_model.plant.beam.length_m, _ANTENNA_POINTS)
             sample_count = round((HISTORY_S + FINAL_S) * rate_hz) + 1
-            self._prepared[key] = _PreparedModel(
+            self._prepared[cache_key] = _PreparedModel(
                 TouchEstimator(touch_model, rate_hz),
                 FreeBeam(touch_model, x_m, rate_hz, sample_count),
             )
-        return self._prepared[key]
+        return self._prepared[cache_key]
 
 
 @dataclass(frozen=True, slots=True)
@@ -400,15 +415,17 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
     delay_s = session.number("sensor_filter_delay_s", 0.0)
     # A mean of n records per tick has a delay of (n - 1) / 2n ticks, a triangle twice as much.
     delay_fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(filter_kind, inf)
-    if not 0.0 <= delay_fraction < _LONGEST_FILTER_TICKS:
+    if not 0.0 <= delay_fraction < _MAX_SENSOR_FILTER_TICKS:
         raise RecordError(
             f"{session.path}: sensor_filter is {filter_kind[:100]!r} with sensor_filter_delay_s = "
             f"{delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} s) "
             f"or a triangle (shorter than a period); correct the file's metadata."
         )
-    record_count = round(1 / (1 - delay_fraction))
-    spacing_s = delay_fraction / rate_hz / max(record_count - 1, 1)
-    return SensorFilter.for_records(corner_hz, filter_order, filter_kind, record_count, spacing_s)
+    averaged_record_count = round(1 / (1 - delay_fraction))
+    record_spacing_s = delay_fraction / rate_hz / max(averaged_record_count - 1, 1)
+    return SensorFilter.for_records(
+        corner_hz, filter_order, filter_kind, averaged_record_count, record_spacing_s
+    )
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:
@@ -455,19 +472,19 @@ def _detect_touches(
         else base_shear_n(samples, shear_coefficients)
     )
     rest_end_tick = session.segments.get("rest", (0, 0))[1]
-    noise_end_tick = max(rest_end_tick, int(ticks[0]) + round(_MIN_REST_S * rate_hz))
+    noise_end_tick = max(rest_end_tick, int(ticks[0]) + round(_MIN_REST_DURATION_S * rate_hz))
     is_at_rest = ticks < noise_end_tick
     channel_noise = ChannelNoise(
         _white_noise_std(torque_nm[is_at_rest]),
         None if shear_coefficients is None else _white_noise_std(shear_n[is_at_rest]),
         _angle_noise_std(samples["angle_rad"], is_at_rest),
     )
-    beam_watch = detector_model(touch_model, rate_hz, channel_noise)
-    detector = TouchDetector(beam_watch, rate_hz, DetectorSettings())
+    beam_detector_model = detector_model(touch_model, rate_hz, channel_noise)
+    detector = TouchDetector(beam_detector_model, rate_hz, DetectorSettings())
     is_armed = False
     detections: list[tuple[int, int]] = []
-    pause_ticks = round(_MIN_PAUSE_S * rate_hz)
-    last_detection = int(ticks[0]) - pause_ticks - 1
+    pause_ticks = round(_MIN_PAUSE_BETWEEN_TOUCHES_S * rate_hz)
+    last_detection_tick = int(ticks[0]) - pause_ticks - 1
     previous_tick = int(ticks[0]) - 1
     sample_columns = (
         ticks, samples["angle_rad"], torque_nm, shear_n,
@@ -485,9 +502,9 @@ def _detect_touches(
             missed=tick - previous_tick - 1,
             angle_stale=is_angle_stale, wrench_stale=is_wrench_stale,
         ):  # fmt: skip
-            if tick - last_detection > pause_ticks:
-                detections.append((tick, last_detection + 1))
-            last_detection = tick
+            if tick - last_detection_tick > pause_ticks:
+                detections.append((tick, last_detection_tick + 1))
+            last_detection_tick = tick
         previous_tick = tick
     return detections
 
@@ -513,20 +530,21 @@ def _angle_noise_std(angle_rad: RealArray, is_at_rest: NDArray[np.bool_]) -> flo
 def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
     """Return sentences on touches that are not estimated or not explained by the model."""
     sentences = []
-    without_estimate = [touch.number for touch in touches if touch.estimate is None]
-    if without_estimate:
+    touches_without_estimate = [touch.number for touch in touches if touch.estimate is None]
+    if touches_without_estimate:
         sentences.append(
-            f"Touch {_number_list(without_estimate)}: not estimated, because that requires "
-            f"{_MIN_BEFORE_S:g} s of record before a touch and {1e3 * _MIN_AFTER_S:g} ms after it."
+            f"Touch {_number_list(touches_without_estimate)}: not estimated, because that requires "
+            f"{_MIN_RECORD_BEFORE_TOUCH_S:g} s of record before a touch and "
+            f"{1e3 * _MIN_RECORD_AFTER_TOUCH_S:g} ms after it."
         )
-    not_explained = [
+    unexplained_touches = [
         touch.number
         for touch in touches
         if touch.estimate is not None and touch.estimate.chi2_per_degree > _LARGEST_CHI2_PER_DEGREE
     ]
-    if not_explained:
+    if unexplained_touches:
         sentences.append(
-            f"Touch {_number_list(not_explained)}: the record is not explained by the model "
+            f"Touch {_number_list(unexplained_touches)}: the record is not explained by the model "
             f"(residuals more than {sqrt(_LARGEST_CHI2_PER_DEGREE):.1f} times the noise). Use an "
             "identified model (--model); if there was no contact, such a touch is an error of the "
             "model."
@@ -548,8 +566,8 @@ def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, time_s: float) 
     `free_beam` computes the motion at points along the beam, the first at the motor's axis. Its
     vibration is fitted to the samples of `record` before `time_s` (since the record's start).
     """
-    fit_samples = min(max(int(time_s * record.rate_hz) - 1, _MIN_FIT_SAMPLES), record.detected)
-    free_motion = free_beam.motion(record, fit_samples, fit_samples - 4)
+    fit_sample_count = min(max(int(time_s * record.rate_hz) - 1, _MIN_FIT_SAMPLES), record.detected)
+    free_motion = free_beam.motion(record, fit_sample_count, fit_sample_count - 4)
     step_index = round((time_s - free_motion.first_s) / free_motion.step_s)
     displacement_m: RealArray = free_motion.displacement_m[
         :, min(max(step_index, 0), free_motion.displacement_m.shape[1] - 1)

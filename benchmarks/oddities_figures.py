@@ -58,7 +58,7 @@ def weights(folder: Path, found: Parameters, made: Session) -> None:
             for row, (text, colour) in enumerate(texts):
                 panel.text(0.04, 0.93 - 0.075 * row, text, color=colour, transform=panel.transAxes)
             panel.set_title(f"Type {name}")
-            style.frequency_axis(panel, (0.6, 50.0))
+            style.set_frequency_axis(panel, (0.6, 50.0))
             panel.set_ylim(-45, 48)
             panel.set_xlabel("Frequency (Hz)")
         axes[0].set_ylabel("Magnitude (dB re 1 N·m/rad)")
@@ -176,7 +176,7 @@ def order(
         for mode, mark in enumerate(np.array([16.045, 100.55, 281.55]) / (2 * np.pi), start=1):
             right.axvline(mark, color=style.LIGHT_GREY, linewidth=0.8, zorder=0)
             right.text(mark, 6.6, f"mode {mode}", ha="center", fontsize=7.5, color=style.GREY)
-        style.frequency_axis(right, (1.0, 50.0))
+        style.set_frequency_axis(right, (1.0, 50.0))
         right.set_ylim(0, 7)
         right.set_xlabel("Frequency (Hz)")
         right.set_ylabel("Loss factor (%)")
@@ -257,5 +257,5 @@ def _legend(figure: Figure, axes: Axes) -> None:
 
 def _save(figure: Figure, path: Path) -> None:
     path.unlink(missing_ok=True)
-    style.save(figure, path)
+    style.save_figure(figure, path)
     print(f"wrote {path}")

@@ -390,7 +390,7 @@ def analyze(
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
     options = AnalysisOptions(
         settings,
-        paper=method != "record",
+        with_welch_fits=method != "record",
         whole_record=method != "welch",
         fixed=_fixed_parameters(fix),
         band_hz=band_hz(band),

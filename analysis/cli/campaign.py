@@ -98,14 +98,16 @@ def campaign_command(
     text_lines = [f"Report of the campaign: {report_folder / 'report.html'}"]
     if outputs.json is not None and not outputs.json_to_stdout:
         # The file is written before any output, because the streams may be closed.
-        json_text = document_text(campaign_document(campaign_result, with_paper=with_paper))
+        json_text = document_text(campaign_document(campaign_result, with_paper_values=with_paper))
         write_new(outputs.json, json_text, overwrite=outputs.overwrite)
         text_lines.insert(0, f"All results as JSON: {outputs.json}")
     console = outputs.console()
-    console.print(campaign_tables(campaign_result, with_paper=with_paper, verbose=outputs.verbose))
+    console.print(
+        campaign_tables(campaign_result, with_paper_values=with_paper, verbose=outputs.verbose)
+    )
     console.print("\n".join(text_lines), markup=False, soft_wrap=True)
     if outputs.json_to_stdout:
-        json_content = campaign_document(campaign_result, with_paper=with_paper)
+        json_content = campaign_document(campaign_result, with_paper_values=with_paper)
         print(document_text(json_content, ascii_only=True), end="")  # noqa: T201 - the requested output
     return 1 if campaign_result.failures or campaign_result.failed_predictions else 0
 
@@ -138,7 +140,7 @@ def _analyse_and_write(
             if len(campaign_result.sessions) == 1:
                 raise SingleSessionError(campaign_result.sessions[0].path, campaign_result.failures)
             write_campaign(
-                campaign_result, partial_folder, with_paper=with_paper, formats=formats,
+                campaign_result, partial_folder, with_paper_values=with_paper, formats=formats,
                 on_step=lambda done_steps: progress.update(bar, advance=1, description=done_steps),
             )  # fmt: skip
     report_error = partial(print_readable, progress.console)

@@ -320,7 +320,7 @@ def _count_steps(options: AnalysisOptions, rerun_file: Path | None) -> int:
     from analysis.report.record_report import welch_figure_names
 
     figure_names = welch_figure_names(
-        with_paper_figures=options.paper, has_whole_record=options.whole_record
+        with_paper_figures=options.with_welch_fits, has_whole_record=options.whole_record
     )
     figure_count = (
         len(figure_names) + options.whole_record * len(RECORD_FIGURES) + (rerun_file is not None)

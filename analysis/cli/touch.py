@@ -134,7 +134,7 @@ def _analyse_sessions(
                 file_progress.update(progress_task, description=f"{name}: {step}")
 
             try:
-                session_touches.append(touch_analysis.session(session_file, on_step))
+                session_touches.append(touch_analysis.analyse_session(session_file, on_step))
             except (SessionError, RecordError, MemoryError) as error:
                 error_text = (
                     str(error) or f"{session_file}: not enough memory; close other programs."

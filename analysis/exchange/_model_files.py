@@ -17,9 +17,9 @@ def write_json(variables: Variables, stream: BinaryIO) -> None:
 
     Complex numbers are pairs of real and imaginary part; unknown values are null.
     """
-    from analysis.results import finite
+    from analysis.results import finite_json
 
-    json_content = finite(
+    json_content = finite_json(
         {variable_name: _json_value(json_value) for variable_name, json_value in variables.items()}
     )
     json_lines = (

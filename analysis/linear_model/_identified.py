@@ -381,11 +381,11 @@ def identify_session(path: Path) -> IdentifiedModel:
         If the record cannot be used.
     """
     from analysis.record import load_record
-    from analysis.results import finite, whole_record
+    from analysis.results import finite_json, whole_record
 
     record = load_record(path)
     record_analysis = whole_record(record)
-    headline_json = finite(record_analysis.headline_json())
+    headline_json = finite_json(record_analysis.headline_json())
     return IdentifiedModel(
         path.name,
         str(path),

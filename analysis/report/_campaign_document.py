@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.campaigns import headlines
 from analysis.report._campaign_tables import all_tables
-from analysis.report._document import versions
+from analysis.report._document import program_versions
 from analysis.report.table import json_rows
-from analysis.results import finite
+from analysis.results import finite_json
 
 if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult, RecordEstimate, SessionAnalysis
@@ -18,14 +18,16 @@ if TYPE_CHECKING:
     from analysis.paper.welch_analysis import FitIndices, FittedModel
 
 
-def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Any]:
+def campaign_document(
+    campaign: CampaignResult, *, with_paper_values: bool = False
+) -> dict[str, Any]:
     """Return the results of a campaign as one JSON document.
 
     Parameters
     ----------
     campaign : Campaign
         Results of all sessions.
-    with_paper : bool
+    with_paper_values : bool
         Whether the tables include the numbers that the reference paper publishes.
 
     Returns
@@ -40,9 +42,9 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
         of their CSV files. All numbers are finite.
     """
     leading_quantity = campaign.homogeneity.leading_scatter
-    document_content: dict[str, Any] = finite(
+    document_content: dict[str, Any] = finite_json(
         {
-            "versions": versions(),
+            "versions": program_versions(),
             "headlines": headlines(campaign),
             "validity": campaign.validity.as_json(),
             "verdict": None if campaign.verdict is None else asdict(campaign.verdict),
@@ -97,14 +99,18 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
             ],
             **{
                 table_name: json_rows(report_table)
-                for table_name, report_table in all_tables(campaign, with_paper=with_paper).items()
+                for table_name, report_table in all_tables(
+                    campaign, with_paper_values=with_paper_values
+                ).items()
             },
         }
     )
     return document_content
 
 
-def _fit_identity(session: SessionAnalysis, estimator: str, structure_name: str) -> dict[str, Any]:
+def _fit_identity_json(
+    session: SessionAnalysis, estimator: str, structure_name: str
+) -> dict[str, Any]:
     """Return the entries that identify a session's fit: file, estimator, type and weighting."""
     return {
         "file": str(session.path), "estimator": estimator, "type": structure_name,
@@ -116,22 +122,22 @@ def _welch_fit_json(session: SessionAnalysis, model: FittedModel) -> dict[str, A
     """Return the JSON object of a model that is fitted to a session's Welch response."""
     fit = model.fit
     return {
-        **_fit_identity(session, "welch", fit.structure.name),
+        **_fit_identity_json(session, "welch", fit.structure.name),
         "weighting": fit.weighting,
-        **_fit_values(fit, model.indices),
+        **_fit_values_json(fit, model.indices),
     }
 
 
 def _record_fit_json(session: SessionAnalysis, estimate: RecordEstimate) -> dict[str, Any]:
     """Return the JSON object of the model that is fitted to a session's whole record."""
     return {
-        **_fit_identity(session, "record", estimate.name),
+        **_fit_identity_json(session, "record", estimate.name),
         "candidate": estimate.name,
-        **_fit_values(estimate.fit, estimate.indices),
+        **_fit_values_json(estimate.fit, estimate.indices),
     }
 
 
-def _fit_values(fit: FrfFit | RecordFit, indices: FitIndices) -> dict[str, Any]:
+def _fit_values_json(fit: FrfFit | RecordFit, indices: FitIndices) -> dict[str, Any]:
     """Return the entries of a fit's JSON object with parameters, accuracy and indices."""
     return {
         "parameters": fit.parameters,
@@ -147,7 +153,7 @@ def _mode_json(
 ) -> dict[str, Any]:
     """Return the JSON object of a mode of a session's whole-record fit."""
     mode_values = asdict(mode)
-    return _fit_identity(session, "record", estimate.name) | {
+    return _fit_identity_json(session, "record", estimate.name) | {
         "mode": mode_values.pop("number"),
         **mode_values,
     }

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult, NominalModel, SessionAnalysis
     from analysis.campaigns.pooling import PooledParameter
 
-_INDEX_PANELS: Final = (
+_FIT_INDEX_PANELS: Final = (
     ("mse", "(a) Mean square error", "MSE ((N·m/rad)²)"),
     ("wmse", "(b) Mean square error, weighted with 1/ω", "WMSE ((N·m/rad)²)"),
     ("md", "(c) Maximum deviation", "MD (N·m/rad)"),
@@ -39,7 +39,7 @@ _MARKER_SIZE_PT: Final = 3.0
 """Size of the markers for means and outliers, in points."""
 
 
-def index_figure(campaign: CampaignResult) -> Figure:
+def fit_index_figure(campaign: CampaignResult) -> Figure:
     """Draw how far each session is from each nominal model: MSE, WMSE and MD (Eqs. 28-30)."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -61,7 +61,7 @@ def index_figure(campaign: CampaignResult) -> Figure:
         1, 3, left=0.055, right=0.99, top=1 - 1.2 / height_in, bottom=0.45 / height_in, wspace=0.2
     )
     box_width = 0.72 / len(weightings)
-    for panel_number, (index_name, panel_title, axis_label) in enumerate(_INDEX_PANELS):
+    for panel_number, (index_name, panel_title, axis_label) in enumerate(_FIT_INDEX_PANELS):
         axes = figure.add_subplot(grid[panel_number])
         for model in campaign.nominal:
             box_offset = weightings.index(model.weighting) - (len(weightings) - 1) / 2
@@ -92,16 +92,16 @@ def index_figure(campaign: CampaignResult) -> Figure:
         axes.grid(visible=False, axis="x")
         axes.set_title(panel_title)
         axes.set_ylabel(axis_label)
-    weighting_entries = [
+    weighting_handles = [
         Patch(facecolor="white", edgecolor=color_by_weighting[w], label=f"weights {w}")
         for w in weightings
     ]
-    mark_entries = [
+    mark_handles = [
         Line2D([], [], color="#C00000", label="median"),
         Line2D([], [], color=style.GREEN, marker="o", linestyle="", markersize=4, label="mean"),
     ]
-    style.legend(
-        figure, [*weighting_entries, *mark_entries], column_count=len(weighting_entries) + 2
+    style.add_legend(
+        figure, [*weighting_handles, *mark_handles], column_count=len(weighting_handles) + 2
     )
     return figure
 
@@ -112,7 +112,7 @@ INTERVAL_COLOR: Final = "#C3DCED"
 """Colour of a pooled value's interval: opaque light blue, like the line of the value."""
 
 
-def pooled_figure(campaign: CampaignResult) -> Figure:
+def pooled_parameters_figure(campaign: CampaignResult) -> Figure:
     """Draw the sessions' estimates of each parameter, with the pooled value in the background.
 
     All have 95 % intervals. The parameters are those of the reported pooled estimate.
@@ -120,53 +120,60 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    estimate = campaign.headline
-    assert estimate is not None
+    headline_estimate = campaign.headline
+    assert headline_estimate is not None
     unsupported_orders = campaign.verdict.withheld_orders if campaign.verdict else ()
-    not_reported = unreported_parameters(STRUCTURES[estimate.structure], unsupported_orders)
-    subtitle_note = (
-        f"  ·  {NOT_REPORTED_MARK} not reported: not supported by the data" if not_reported else ""
+    unreported_names = unreported_parameters(
+        STRUCTURES[headline_estimate.structure], unsupported_orders
     )
-    if any(campaign.homogeneity.is_mixed(parameter.name) for parameter in estimate.parameters):
+    subtitle_note = (
+        f"  ·  {NOT_REPORTED_MARK} not reported: not supported by the data"
+        if unreported_names
+        else ""
+    )
+    if any(
+        campaign.homogeneity.is_mixed(parameter.name) for parameter in headline_estimate.parameters
+    ):
         subtitle_note += f"  ·  {MIXTURE_MARK} mean of a mixture"
-    row_count = -(-len(estimate.parameters) // _PANELS_PER_ROW)
+    row_count = -(-len(headline_estimate.parameters) // _PANELS_PER_ROW)
     width_in, height_in = 13.0, 2.6 * row_count + 1.35
     figure = style.new_figure(
         width_in, height_in,
         pooled_title(
-            f"{session_count_text(estimate, campaign)} — pooled whole-record estimate, type "
-            f"{estimate.name}",
+            f"{session_count_text(headline_estimate, campaign)} — pooled whole-record estimate, "
+            "type "
+            f"{headline_estimate.name}",
             campaign.homogeneity,
         ),
         f"freest type that the sessions support{exact_condition_text(campaign)}  ·  "
-        f"residual {estimate.misfit:.3g} times the noise  ·  p: p-value of Cochran's Q"
+        f"residual {headline_estimate.misfit:.3g} times the noise  ·  p: p-value of Cochran's Q"
         f"{subtitle_note}",
     )  # fmt: skip
     grid = figure.add_gridspec(
         row_count, _PANELS_PER_ROW, left=0.06, right=0.99, top=1 - 1.2 / height_in,
         bottom=0.5 / height_in, wspace=0.42, hspace=0.4,
     )  # fmt: skip
-    for panel_number, parameter in enumerate(estimate.parameters):
+    for panel_number, parameter in enumerate(headline_estimate.parameters):
         panel_axes = figure.add_subplot(
             grid[panel_number // _PANELS_PER_ROW, panel_number % _PANELS_PER_ROW]
         )
         _draw_parameter_panel(
             campaign,
-            estimate.name,
+            headline_estimate.name,
             parameter,
             panel_axes,
-            is_reported=parameter.name not in not_reported,
+            is_reported=parameter.name not in unreported_names,
         )
-        if panel_number + _PANELS_PER_ROW >= len(estimate.parameters):
+        if panel_number + _PANELS_PER_ROW >= len(headline_estimate.parameters):
             panel_axes.set_xlabel("Session", labelpad=1)
-    legend_entries = [
+    legend_handles = [
         Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
                label="session, ± 1.96 of its standard deviation"),
         Line2D([], [], color=style.BLUE, label="pooled"),
         Patch(facecolor=INTERVAL_COLOR, label="its 95 % interval"),
         Patch(facecolor=style.SHADE_COLOR, label="95 % prediction interval"),
     ]  # fmt: skip
-    style.legend(figure, legend_entries, column_count=4)
+    style.add_legend(figure, legend_handles, column_count=4)
     return figure
 
 
@@ -225,9 +232,9 @@ def _draw_parameter_panel(
     panel_axes.ticklabel_format(axis="y", useOffset=False)
 
 
-_PANEL_COLUMNS: Final = 500
+_PANEL_DECIMATION_COLUMNS: Final = 500
 """Number of columns into which a response is decimated in a small panel."""
-_WIDE_COLUMNS: Final = 1500
+_WIDE_DECIMATION_COLUMNS: Final = 1500
 """Number of columns into which a response is decimated in a wide panel."""
 _MAX_DRAWN_SESSIONS: Final = 40
 """Largest number of sessions whose responses are drawn: more would not be distinguishable."""
@@ -240,7 +247,7 @@ _BEST_MODEL_STYLES: Final[tuple[dict[str, Any], ...]] = (
 """Line styles of the two best models."""
 
 
-def nominal_figure(campaign: CampaignResult) -> Figure:
+def nominal_models_figure(campaign: CampaignResult) -> Figure:
     """Draw the nominal models of each type on top of all measured responses (as in Figure 6)."""
     type_names = list(dict.fromkeys(model.structure for model in campaign.nominal))
     panel_columns = min(len(type_names), 4 if len(type_names) > 6 else 3)
@@ -256,7 +263,11 @@ def nominal_figure(campaign: CampaignResult) -> Figure:
     style_by_weighting = line_styles(campaign.settings.weightings)
     line_by_label: dict[str, Line2D] = {}
     panel_axes = style.type_panels(
-        figure, grid, type_names, campaign.settings.band_hz, _db_limits(campaign, campaign.nominal)
+        figure,
+        grid,
+        type_names,
+        campaign.settings.band_hz,
+        _magnitude_limits_db(campaign, campaign.nominal),
     )
     for type_name, magnitude_axes, phase_axes in panel_axes:
         type_models = [model for model in campaign.nominal if model.structure == type_name]
@@ -265,7 +276,12 @@ def nominal_figure(campaign: CampaignResult) -> Figure:
             for m in type_models
         ]
         line_by_label |= _draw_responses(
-            campaign, magnitude_axes, phase_axes, type_models, model_styles, _PANEL_COLUMNS
+            campaign,
+            magnitude_axes,
+            phase_axes,
+            type_models,
+            model_styles,
+            _PANEL_DECIMATION_COLUMNS,
         )
     for phase_axes in figure.axes[1::2][-panel_columns:]:
         phase_axes.set_xlabel("Frequency (Hz)", labelpad=1)
@@ -273,7 +289,7 @@ def nominal_figure(campaign: CampaignResult) -> Figure:
     return figure
 
 
-def best_figure(campaign: CampaignResult) -> Figure:
+def best_models_figure(campaign: CampaignResult) -> Figure:
     """Draw the two best nominal models on top of all measured responses (as in Figure 8)."""
     drawn_models = best_models(campaign.nominal)
     width_in, height_in = 10.0, 6.6
@@ -289,12 +305,12 @@ def best_figure(campaign: CampaignResult) -> Figure:
         for m, line_style in zip(drawn_models, _BEST_MODEL_STYLES, strict=False)
     ]
     line_by_label = _draw_responses(
-        campaign, magnitude_axes, phase_axes, drawn_models, model_styles, _WIDE_COLUMNS
+        campaign, magnitude_axes, phase_axes, drawn_models, model_styles, _WIDE_DECIMATION_COLUMNS
     )
-    magnitude_axes.set_ylim(_db_limits(campaign, drawn_models))
-    style.response_axes(magnitude_axes, phase_axes)
-    style.frequency_axis(magnitude_axes, campaign.settings.band_hz, with_labels=False)
-    style.frequency_axis(phase_axes, campaign.settings.band_hz)
+    magnitude_axes.set_ylim(_magnitude_limits_db(campaign, drawn_models))
+    style.set_response_axes(magnitude_axes, phase_axes)
+    style.set_frequency_axis(magnitude_axes, campaign.settings.band_hz, with_labels=False)
+    style.set_frequency_axis(phase_axes, campaign.settings.band_hz)
     phase_axes.set_xlabel("Frequency (Hz)", labelpad=1)
     _add_legend(figure, line_by_label)
     return figure
@@ -390,16 +406,20 @@ def _decimated_line(
 
 def _add_legend(figure: Figure, line_by_label: dict[str, Line2D]) -> None:
     """Add a legend to a figure and thicken the line of the measured responses in it."""
-    figure_legend = style.legend(
+    figure_legend = style.add_legend(
         figure, list(line_by_label.values()), list(line_by_label), column_count=len(line_by_label)
     )
     figure_legend.get_lines()[0].set_linewidth(1.5)
 
 
-def _db_limits(campaign: CampaignResult, models: Sequence[NominalModel]) -> tuple[float, float]:
+def _magnitude_limits_db(
+    campaign: CampaignResult, models: Sequence[NominalModel]
+) -> tuple[float, float]:
     """Return axis limits in dB that contain all sessions' responses and the models' peaks."""
-    measured_frf = [session.response for session in campaign.sessions]
-    return style.db_limits(measured_frf, [model.response for model in models], headroom_db=3.0)
+    measured_responses = [session.response for session in campaign.sessions]
+    return style.db_limits(
+        measured_responses, [model.response for model in models], headroom_db=3.0
+    )
 
 
 _ROW_HEIGHT_IN: Final = 0.27
@@ -439,14 +459,14 @@ def validation_figure(campaign: CampaignResult) -> Figure:
             markersize=2.6,
             alpha=0.6,
         )  # fmt: skip
-        expected_errors = [
+        own_errors = [
             session_error.own_error
             for session_error in model_errors
             if session_error.own_error is not None
         ]
-        if expected_errors:
+        if own_errors:
             axes.plot(
-                [100 * float(np.mean(expected_errors))], [row], "|", color=style.INK, markersize=11
+                [100 * float(np.mean(own_errors))], [row], "|", color=style.INK, markersize=11
             )
     axes.set_yticks(
         range(len(ranked_models)), [_model_label(*model[:3]) for model in ranked_models]
@@ -470,7 +490,7 @@ def validation_figure(campaign: CampaignResult) -> Figure:
         *(Line2D([], [], color=color_by_weighting[w], marker="o", linestyle="", markersize=3.5,
                  label=f"nominal model, weights {w}") for w in weightings),
     ]  # fmt: skip
-    style.legend(figure, legend_handles, column_count=2)
+    style.add_legend(figure, legend_handles, column_count=2)
     return figure
 
 

@@ -13,7 +13,7 @@ from analysis.campaigns.sentences import describe_failed_predictions
 from analysis.report._paper_tables import FIT_NAME_COLUMNS, paper_tables
 from analysis.report._pooled_tables import (
     homogeneity_table,
-    likely_estimates,
+    leading_estimates,
     modes_table,
     pooled_table,
     specimens_table,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     """Return the tables of the whole-record fits for terminal and page, in their order there."""
     homogeneity = campaign.homogeneity
-    estimates = likely_estimates(campaign)
+    estimates = leading_estimates(campaign)
     scatter_tables = [homogeneity_table(campaign)] if homogeneity.quantities else []
     return (
         session_list_table(campaign),
@@ -54,18 +54,18 @@ def main_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     """Return the main tables: pooled modes, parameters with a tolerance, and the pooled fit."""
-    candidate_tables = (
+    possible_tables = (
         modes_table(campaign),
         tolerance_table(campaign),
-        *(pooled_table(campaign, estimate) for estimate in likely_estimates(campaign)[:1]),
+        *(pooled_table(campaign, estimate) for estimate in leading_estimates(campaign)[:1]),
     )
-    return tuple(report_table for report_table in candidate_tables if report_table.rows)
+    return tuple(report_table for report_table in possible_tables if report_table.rows)
 
 
-def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Table]:
+def all_tables(campaign: CampaignResult, *, with_paper_values: bool = False) -> dict[str, Table]:
     """Return the tables that are written to files, except empty ones, by table name."""
-    candidate_tables = (
-        *paper_tables(campaign, with_paper=with_paper),
+    possible_tables = (
+        *paper_tables(campaign, with_paper_values=with_paper_values),
         session_list_table(campaign),
         sessions_welch_table(campaign),
         sessions_record_table(campaign),
@@ -79,15 +79,15 @@ def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[st
         validation_table(campaign),
     )
     return {
-        report_table.name: report_table for report_table in candidate_tables if report_table.rows
+        report_table.name: report_table for report_table in possible_tables if report_table.rows
     }
 
 
 def session_list_table(campaign: CampaignResult) -> Table:
     """Return the table of all files with the metadata that each states, excluded files last."""
 
-    def text_cell(text: str) -> Cell:
-        return Cell(text, text or ABSENT_TEXT)
+    def text_cell(cell_text: str) -> Cell:
+        return Cell(cell_text, cell_text or ABSENT_TEXT)
 
     column_headings = ("file", "recorded (UTC)", "specimen", "operator", "note")
     column_keys = ("file", "start_utc", "specimen", "operator", "note")
@@ -109,7 +109,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
                 Column(column_heading, key, TEXT_FORMAT)
                 for column_heading, key in zip(column_headings, column_keys, strict=True)
             ),
-            *map(_added_column, metadata_names),
+            *map(_added_metadata_column, metadata_names),
             Column("used", "used", TEXT_FORMAT),
         ),
         (
@@ -120,7 +120,9 @@ def session_list_table(campaign: CampaignResult) -> Table:
                 text_cell(experiment.operator if experiment else ""),
                 text_cell(experiment.note if experiment else ""),
                 *(
-                    _added_cell(experiment.added.get(metadata_name) if experiment else None)
+                    _added_metadata_cell(
+                        experiment.added.get(metadata_name) if experiment else None
+                    )
                     for metadata_name in metadata_names
                 ),
                 is_used,
@@ -132,7 +134,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
     )
 
 
-def _added_column(metadata_name: str) -> Column:
+def _added_metadata_column(metadata_name: str) -> Column:
     """Return the table column of a metadata key that users added, with the unit in its name."""
     unit_symbol = unit_of(metadata_name)
     column_heading = metadata_name.removesuffix(suffix_of(metadata_name)).replace("_", " ")
@@ -143,7 +145,7 @@ def _added_column(metadata_name: str) -> Column:
     )
 
 
-def _added_cell(metadata_value: float | str | None) -> Cell:
+def _added_metadata_cell(metadata_value: float | str | None) -> Cell:
     """Return the table cell of a metadata value that users added; a dash if there is none."""
     if metadata_value is None:
         return Cell(None, ABSENT_TEXT)
@@ -237,7 +239,7 @@ def validation_summary(campaign: CampaignResult) -> Table:
         campaign.validation
     ):
         session_errors = [session_error.error for session_error in model_errors]
-        expected_errors = [
+        own_errors = [
             session_error.own_error
             for session_error in model_errors
             if session_error.own_error is not None
@@ -248,10 +250,8 @@ def validation_summary(campaign: CampaignResult) -> Table:
                 "type": type_name,
                 "weighting": weighting or "",
                 "sessions": f"{len(session_errors)} of {campaign.trials}",
-                "nrmse_percent": 100 * (1 - float(np.mean(expected_errors)))
-                if expected_errors
-                else None,
-                "own_error": float(np.mean(expected_errors)) if expected_errors else None,
+                "nrmse_percent": 100 * (1 - float(np.mean(own_errors))) if own_errors else None,
+                "own_error": float(np.mean(own_errors)) if own_errors else None,
                 "error": float(np.mean(session_errors)),
                 "worst": max(session_errors),
             }
@@ -292,7 +292,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         if (prediction.method, prediction.name) == ("record", structure_name)
     }
 
-    def row(session: SessionAnalysis) -> tuple[Entry, ...]:
+    def session_row(session: SessionAnalysis) -> tuple[Entry, ...]:
         verdict, trial = session.verdict, trials_by_path.get(session.path)
         own_error = trial.own_error if trial else None
         finding_kinds = [finding.kind for finding in verdict.findings] if verdict else []
@@ -322,7 +322,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         ),
         (
             (*row_cells, group_by_file.get(str(row_cells[0]), ABSENT_TEXT))
-            for row_cells in (*map(row, campaign.sessions), *excluded_rows)
+            for row_cells in (*map(session_row, campaign.sessions), *excluded_rows)
         ),
         (
             *((f"Fit and error: of type {structure_name}.",) if trials_by_path else ()),

@@ -21,7 +21,7 @@ from analysis.paper.welch_analysis import fit_indices
 from analysis.report._shown_model import ShownModel
 from analysis.report.bands import loss_estimate, loss_factors, supported_band_hz
 from analysis.report.table import unreported_parameters
-from analysis.results import finite
+from analysis.results import finite_json
 from analysis.statistics import nrmse_percent
 from rigd.beam import Plant, ResponseGrid
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     # Values of the paper's indices by name: mse, wmse, md.
     IndexValues = dict[str, float | None]
 
-NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
+NO_INDEX_VALUES: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
 """Indices MSE, WMSE and MD of a fit if there is no measured response to compare it with."""
 
 
@@ -83,7 +83,7 @@ def _fit_indices(
     """Return the errors MSE, WMSE and MD of a model's response against a measured response."""
     is_finite = np.isfinite(measured_frf.response)
     if not is_finite.any():
-        return NOT_COMPARED
+        return NO_INDEX_VALUES
     omega_rad_s = 2 * np.pi * measured_frf.frequency_hz[is_finite]
     return asdict(
         fit_indices(omega_rad_s, measured_frf.response[is_finite], model_response[is_finite])
@@ -113,14 +113,14 @@ def record_entries(
     ``headline``: reported estimates with flags. ``fits`` and ``modes``: lists of objects like those
     of the Welch fits, with ``estimator`` "record". ``records``: one object with verdict, noise,
     hum, and response and loss factors with their 95 % bands. Numbers may have NumPy's types or be
-    infinite or NaN (see `finite`).
+    infinite or NaN (see `finite_json`).
 
     Values that are not reported are flagged instead of omitted: ``withheld`` of a fit names the
     parameters that the data do not support, ``visible`` of a mode states whether the record shows
     it. ``indices`` are distances from Welch's response, as for the paper's fits, and
     ``indices_whole_record`` are distances from the ratio of the whole record's transforms.
     """
-    fit_keys = [
+    fits_with_keys = [
         (
             {
                 "file": str(whole_record.record.path),
@@ -134,11 +134,11 @@ def record_entries(
         )
         for fit_name, fit in whole_record.fits.items()
     ]
-    indices = [
-        (NOT_COMPARED, NOT_COMPARED)
+    index_values = [
+        (NO_INDEX_VALUES, NO_INDEX_VALUES)
         if welch_analysis is None
         else indices_of_record_fit(fit, welch_analysis)
-        for _, fit in fit_keys
+        for _, fit in fits_with_keys
     ]
     return {
         "headline": whole_record.headline_json(),
@@ -168,7 +168,7 @@ def record_entries(
                 "indices_whole_record": record_indices,
             }
             for (fit_key, fit), (welch_indices, record_indices) in zip(
-                fit_keys, indices, strict=True
+                fits_with_keys, index_values, strict=True
             )
         ],
         "modes": [
@@ -183,7 +183,7 @@ def record_entries(
                 "damping_ratio_std": mode.damping_ratio.std,
             }
             # The reported modes come first, because narrow sweeps are planned from them.
-            for fit_key, _ in fit_keys
+            for fit_key, _ in fits_with_keys
             if fit_key["selected"]
             for mode in whole_record.headline.modes
         ],
@@ -255,8 +255,10 @@ def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
     )
     model_band = model.band(frequency_hz)
     lower_magnitude, upper_magnitude = model_band.magnitude_limits()
-    factors_over_frequency = None if loss_model is None else loss_factors(loss_model, frequency_hz)
-    supported_hz = supported_band_hz(whole_record)
+    loss_factors_over_frequency = (
+        None if loss_model is None else loss_factors(loss_model, frequency_hz)
+    )
+    supported_limits_hz = supported_band_hz(whole_record)
     return {
         "model": "beam" if model.modal is None else "modal",
         "frequency_hz": frequency_hz.tolist(),
@@ -265,16 +267,18 @@ def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
         "magnitude_high_nm_per_rad": upper_magnitude.tolist(),
         "phase_rad": np.angle(model_band.response).tolist(),
         "phase_std_rad": model_band.phase_std_rad.tolist(),
-        "loss_factor_supported_hz": None if supported_hz is None else list(supported_hz),
+        "loss_factor_supported_hz": None
+        if supported_limits_hz is None
+        else list(supported_limits_hz),
         "loss_factor": None
-        if factors_over_frequency is None
-        else _loss_factor_json(factors_over_frequency.total),
+        if loss_factors_over_frequency is None
+        else _loss_factor_json(loss_factors_over_frequency.total),
         "internal_loss_factor": None
-        if factors_over_frequency is None
-        else _loss_factor_json(factors_over_frequency.internal),
+        if loss_factors_over_frequency is None
+        else _loss_factor_json(loss_factors_over_frequency.internal),
         "external_loss_factor": None
-        if factors_over_frequency is None
-        else _loss_factor_json(factors_over_frequency.external),
+        if loss_factors_over_frequency is None
+        else _loss_factor_json(loss_factors_over_frequency.external),
     }
 
 
@@ -317,9 +321,9 @@ def document(
     welch_analyses = [
         (result.welch, result.unsupported_orders) for result in record_results if result.welch
     ]
-    document_content: dict[str, Any] = finite(
+    document_content: dict[str, Any] = finite_json(
         {
-            "versions": versions(),
+            "versions": program_versions(),
             "files": [
                 {**file_facts, "validity": result.validity.as_json()}
                 for result, file_facts in (
@@ -329,7 +333,7 @@ def document(
                         if result.welch
                     ),
                     *(
-                        (result, _record_facts(result.record, result.warnings))
+                        (result, _record_json(result.record, result.warnings))
                         for result in record_results
                         if result.welch is None
                     ),
@@ -398,7 +402,7 @@ def _welch_file_json(analysis: WelchAnalysis) -> dict[str, Any]:
     """Return the JSON object of a file with a Welch analysis, including the settings."""
     settings, response = analysis.settings, analysis.response
     return {
-        **_record_facts(analysis.record, analysis.warnings),
+        **_record_json(analysis.record, analysis.warnings),
         "settings": {
             **asdict(settings),
             **asdict(analysis.segmentation),
@@ -411,7 +415,7 @@ def _welch_file_json(analysis: WelchAnalysis) -> dict[str, Any]:
     }
 
 
-def _record_facts(record: Record, warnings: Sequence[str]) -> dict[str, Any]:
+def _record_json(record: Record, warnings: Sequence[str]) -> dict[str, Any]:
     """Return the JSON object of a record: rate, samples, beam, delays, gaps and warnings."""
     return {
         "file": str(record.path),
@@ -454,7 +458,7 @@ def _welch_fit_json(
     """Return the JSON object of one model that is fitted to a record's Welch response."""
     fit = model.fit
     return {
-        **_fit_identity(analysis, model),
+        **_fit_identity_json(analysis, model),
         "frf": analysis.settings.estimator,
         "free": list(fit.structure.free),
         "parameters": dict(fit.parameters),
@@ -480,7 +484,7 @@ def _welch_modes_json(analysis: WelchAnalysis, model: FittedModel) -> list[dict[
         mode = model.modes[mode_number - 1] if model.modes else None
         mode_objects.append(
             {
-                **_fit_identity(analysis, model),
+                **_fit_identity_json(analysis, model),
                 "mode": mode_number,
                 "frequency_hz": None if mode is None else mode.frequency_hz,
                 "natural_frequency_rad_s": None if mode is None else mode.natural_frequency_rad_s,
@@ -498,7 +502,7 @@ def _welch_modes_json(analysis: WelchAnalysis, model: FittedModel) -> list[dict[
     return mode_objects
 
 
-def _fit_identity(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
+def _fit_identity_json(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
     """Return the entries that identify a Welch fit: file, estimator, type and weighting."""
     return {
         "file": str(analysis.record.path),
@@ -508,7 +512,7 @@ def _fit_identity(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]
     }
 
 
-def versions() -> dict[str, str]:
+def program_versions() -> dict[str, str]:
     """Return the versions of rigd, Python and NumPy that computed the results."""
     return {
         "rigd": rigd.__version__,

@@ -30,7 +30,7 @@ class Formula(NamedTuple):
         return Formula(self.mathml + next_formula.mathml, f"{self.tex} {next_formula.tex}")
 
     @property
-    def row(self) -> Formula:
+    def grouped_formula(self) -> Formula:
         """Formula grouped so that it can be one argument of another formula."""
         return Formula(f"<mrow>{self.mathml}</mrow>", f"{{{self.tex}}}")
 
@@ -52,35 +52,35 @@ def _number_formula(number_text: str) -> Formula:
 
 def _power(base_formula: Formula, exponent_formula: Formula) -> Formula:
     """Return a formula raised to the power of another formula."""
-    exponent_group = exponent_formula.row
+    exponent_group = exponent_formula.grouped_formula
     return Formula(
-        f"<msup>{base_formula.row.mathml}{exponent_group.mathml}</msup>",
+        f"<msup>{base_formula.grouped_formula.mathml}{exponent_group.mathml}</msup>",
         f"{base_formula.tex}^{exponent_group.tex}",
     )
 
 
 def _subscript(base_formula: Formula, subscript_formula: Formula) -> Formula:
     """Return a formula with another formula as its subscript."""
-    index_group = subscript_formula.row
+    index_group = subscript_formula.grouped_formula
     return Formula(
-        f"<msub>{base_formula.row.mathml}{index_group.mathml}</msub>",
+        f"<msub>{base_formula.grouped_formula.mathml}{index_group.mathml}</msub>",
         f"{base_formula.tex}_{index_group.tex}",
     )
 
 
 def _fraction(numerator: Formula, denominator: Formula) -> Formula:
     """Return the fraction of two formulas."""
-    a, b = numerator.row, denominator.row
+    a, b = numerator.grouped_formula, denominator.grouped_formula
     return Formula(f"<mfrac>{a.mathml}{b.mathml}</mfrac>", rf"\frac{a.tex}{b.tex}")
 
 
-def _function_of(function_word: str, argument_formula: Formula) -> Formula:
+def _function_formula(function_word: str, argument_formula: Formula) -> Formula:
     """Return a function with several letters, such as sin, of an argument in brackets."""
     function_name = Formula(f"<mi>{function_word}</mi><mo>&#x2061;</mo>", rf"\{function_word}")
-    return _join(function_name, _OPENING_BRACKET, argument_formula, _CLOSING_BRACKET)
+    return _join_formulas(function_name, _OPENING_BRACKET, argument_formula, _CLOSING_BRACKET)
 
 
-def _join(*joined_formulas: Formula) -> Formula:
+def _join_formulas(*joined_formulas: Formula) -> Formula:
     """Return a formula that consists of several formulas, one after the other."""
     return reduce(Formula.__add__, joined_formulas)
 
@@ -119,7 +119,7 @@ def _elastic_factor(structure: Structure) -> Formula | None:
     """Return the formula ``1 + zeta s^alpha``, or None for a structure without internal damping."""
     if not structure.has_internal_damping:
         return None
-    return _join(
+    return _join_formulas(
         _NUMBER_ONE,
         _PLUS_SIGN,
         _damping_term(_ZETA_SYMBOL, _ALPHA_SYMBOL, is_first_order="alpha" not in structure.free),
@@ -136,7 +136,7 @@ def _inertial_terms(structure: Structure) -> Formula:
     )
     if not structure.has_external_damping:
         return inertia
-    return _join(
+    return _join_formulas(
         inertia,
         _PLUS_SIGN,
         _damping_term(_GAMMA_SYMBOL, _LAMBDA_SYMBOL, is_first_order="lambda" not in structure.free),
@@ -150,16 +150,16 @@ def _beam_equations(structure: Structure) -> tuple[Formula, Formula]:
     """
     elastic_factor, z = _elastic_factor(structure), _BETA_SYMBOL + _L_SYMBOL
     sin, cos, sinh, cosh = (
-        _function_of(function_word, z) for function_word in ("sin", "cos", "sinh", "cosh")
+        _function_formula(function_word, z) for function_word in ("sin", "cos", "sinh", "cosh")
     )
     stiffness_factor = (
         _EI_SYMBOLS
         if elastic_factor is None
-        else _join(_EI_SYMBOLS, _OPENING_BRACKET, elastic_factor, _CLOSING_BRACKET)
+        else _join_formulas(_EI_SYMBOLS, _OPENING_BRACKET, elastic_factor, _CLOSING_BRACKET)
     )
-    numerator = _join(sin, cosh, _MINUS_SIGN, cos, sinh)
-    denominator = _join(_NUMBER_ONE, _PLUS_SIGN, cos, cosh)
-    response_equation = _join(
+    numerator = _join_formulas(sin, cosh, _MINUS_SIGN, cos, sinh)
+    denominator = _join_formulas(_NUMBER_ONE, _PLUS_SIGN, cos, cosh)
+    response_equation = _join_formulas(
         _G_SYMBOL,
         _ARGUMENT_S,
         _EQUALS_SIGN,
@@ -174,7 +174,7 @@ def _beam_equations(structure: Structure) -> tuple[Formula, Formula]:
         if elastic_factor is None
         else _fraction(inertial_terms, elastic_factor)
     )
-    return response_equation, _join(
+    return response_equation, _join_formulas(
         _power(_BETA_SYMBOL, _number_formula("4")), _EQUALS_SIGN, _MINUS_SIGN, minus_beta_to_4
     )
 
@@ -183,33 +183,41 @@ def _measured_equation(fit: RecordFit) -> Formula:
     """Return the equation of measured torque divided by angle: beam, tool inertia and channels."""
     beam_response = _G_SYMBOL + _ARGUMENT_S
     parameter_names = fit.parameters
-    beam_and_tool = _join(beam_response, _PLUS_SIGN, _variable("J"), _power(_S_SYMBOL, _NUMBER_TWO))
-    delay_factor = _power(_variable("e"), _join(_MINUS_SIGN, _variable("τ", r"\tau"), _S_SYMBOL))
-    measured_formula = _join(
+    beam_and_tool = _join_formulas(
+        beam_response, _PLUS_SIGN, _variable("J"), _power(_S_SYMBOL, _NUMBER_TWO)
+    )
+    delay_factor = _power(
+        _variable("e"), _join_formulas(_MINUS_SIGN, _variable("τ", r"\tau"), _S_SYMBOL)
+    )
+    measured_formula = _join_formulas(
         _operator("[", r"\left["), beam_and_tool, _operator("]", r"\right]"), delay_factor
     )
-    filter_time = _variable("T") + _S_SYMBOL
+    filter_term = _variable("T") + _S_SYMBOL
     if "filter_time_constant_s" in parameter_names:
-        measured_formula += _fraction(_NUMBER_ONE, _join(_NUMBER_ONE, _PLUS_SIGN, filter_time))
+        measured_formula += _fraction(
+            _NUMBER_ONE, _join_formulas(_NUMBER_ONE, _PLUS_SIGN, filter_term)
+        )
     if "second_order_filter_time_constant_s" in parameter_names:
         root_two = Formula(f"<msqrt>{_NUMBER_TWO.mathml}</msqrt>", r"\sqrt{2}")
         square_sum = _power(_variable("T"), _NUMBER_TWO) + _power(_S_SYMBOL, _NUMBER_TWO)
         measured_formula += _fraction(
             _NUMBER_ONE,
-            _join(_NUMBER_ONE, _PLUS_SIGN, root_two, filter_time, _PLUS_SIGN, square_sum),
+            _join_formulas(_NUMBER_ONE, _PLUS_SIGN, root_two, filter_term, _PLUS_SIGN, square_sum),
         )
-    return _join(_TORQUE_OVER_ANGLE, _EQUALS_SIGN, measured_formula)
+    return _join_formulas(_TORQUE_OVER_ANGLE, _EQUALS_SIGN, measured_formula)
 
 
 def _modal_equation() -> Formula:
     """Return the equation of the modal model: poles and residues, and background terms."""
     k, n, highest_exponent = _variable("k"), _variable("n"), BACKGROUND_COEFFICIENTS - 1
-    sum_over_modes = Formula(f"<munder><mo>∑</mo>{k.row.mathml}</munder>", rf"\sum_{k.row.tex}")
+    sum_over_modes = Formula(
+        f"<munder><mo>∑</mo>{k.grouped_formula.mathml}</munder>", rf"\sum_{k.grouped_formula.tex}"
+    )
     upper_sum_limit = _number_formula(str(highest_exponent))
-    lower_sum_limit = _join(n, _EQUALS_SIGN, _number_formula("0"))
+    lower_sum_limit = _join_formulas(n, _EQUALS_SIGN, _number_formula("0"))
     sum_over_powers = Formula(
-        f"<munderover><mo>∑</mo>{lower_sum_limit.row.mathml}{upper_sum_limit.row.mathml}</munderover>",
-        rf"\sum_{lower_sum_limit.row.tex}^{upper_sum_limit.row.tex}",
+        f"<munderover><mo>∑</mo>{lower_sum_limit.grouped_formula.mathml}{upper_sum_limit.grouped_formula.mathml}</munderover>",
+        rf"\sum_{lower_sum_limit.grouped_formula.tex}^{upper_sum_limit.grouped_formula.tex}",
     )
     modal_terms = []
     for residue_symbol, pole_symbol in (
@@ -219,11 +227,11 @@ def _modal_equation() -> Formula:
         modal_terms.append(
             _fraction(
                 _subscript(residue_symbol, k),
-                _join(_S_SYMBOL, _MINUS_SIGN, _subscript(pole_symbol, k)),
+                _join_formulas(_S_SYMBOL, _MINUS_SIGN, _subscript(pole_symbol, k)),
             )
         )
     first_term, second_term = modal_terms
-    return _join(
+    return _join_formulas(
         _TORQUE_OVER_ANGLE, _EQUALS_SIGN, sum_over_modes, _OPENING_BRACKET, first_term, _PLUS_SIGN,
         second_term,
         _CLOSING_BRACKET, _PLUS_SIGN,
@@ -298,7 +306,7 @@ def types_table(whole_record: WholeRecord) -> Table:
     """Return the table of damping types I to VII with their internal and external terms."""
     order_adjectives = {False: "fractional", True: "integer"}
 
-    def rows() -> Iterator[tuple[str, str, str, str]]:
+    def structure_rows() -> Iterator[tuple[str, str, str, str]]:
         for structure in STRUCTURES.values():
             term_descriptions, damping_terms = [], []
             for is_present, damping_name, coefficient_name, order_name, order_symbol in (
@@ -326,7 +334,7 @@ def types_table(whole_record: WholeRecord) -> Table:
             Column("External", "external", TEXT_FORMAT),
             Column("Damping", "damping", TEXT_FORMAT),
         ),
-        rows(),
+        structure_rows(),
         (
             "Internal damping multiplies EI by 1 + the term, external damping adds the term to "
             'ρ/EI s². I to VI as in the paper, VII as its conclusions propose. "Modes free": each '

@@ -94,7 +94,8 @@ def structures_table(whole_record: WholeRecord) -> Table:
             "the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power over "
             "that of the noise, 1 if nothing but noise is left. Free: number of free parameters, "
             "including those of rig and beam. * at the limit of the search range. The marked row "
-            f"is {_marked_row(whole_record)}. The numbers of excluded structures are in the CSV "
+            f"is {_highlighted_row_text(whole_record)}. The numbers of excluded structures are in "
+            "the CSV "
             "file only, with the sums of squares.",
         ),
         selected=list(whole_record.fits).index(whole_record.headline.name),
@@ -105,7 +106,7 @@ def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
     """Return the table of the fits of structures from installed packages; empty without any."""
     if not whole_record.added:
         return ()
-    rows: list[tuple[Entry, ...]] = [
+    table_rows: list[tuple[Entry, ...]] = [
         (
             fit.structure.name,
             parameter.symbol,
@@ -138,7 +139,7 @@ def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
             Column("", "package", TEXT_FORMAT),
             Column("", "compared_with", TEXT_FORMAT),
         ),
-        rows,
+        table_rows,
         (
             "ΔBIC: Bayesian information criterion above the lowest of types I to VII. These "
             "structures are compared with the types, but are not candidates of the verdict. * at "
@@ -149,7 +150,7 @@ def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
     return (table,)
 
 
-def _marked_row(whole_record: WholeRecord) -> str:
+def _highlighted_row_text(whole_record: WholeRecord) -> str:
     """Return the part of a note that states which fit the highlighted row of the table shows."""
     return (
         "the one reported"
@@ -187,7 +188,7 @@ def _damping_cells(
 
     Fixed values have no standard deviation. Parameters that the structure lacks are dashes.
     """
-    not_reported = unreported_parameters(structure, unsupported_orders)
+    unreported_names = unreported_parameters(structure, unsupported_orders)
     parameter_cells: list[Cell] = []
     for parameter_name in DAMPING_PARAMETERS:
         if not structure.has_damping_of(parameter_name):
@@ -205,7 +206,7 @@ def _damping_cells(
             value_cell = replace(value_cell, text=f"{value_cell.text}*")
         parameter_cells += (
             [mark_cell(value_cell), grey_cell(std_cell)]
-            if parameter_name in not_reported
+            if parameter_name in unreported_names
             else [value_cell, std_cell]
         )
     return parameter_cells
@@ -216,10 +217,10 @@ def _parameter_heading(parameter_name: str) -> str:
 
     The units are omitted, because they depend on the orders and would be too long.
     """
-    definition = PARAMETERS[parameter_name]
-    if definition.display_factor == 1.0:
-        return definition.symbol
-    return f"{definition.symbol} ({definition.display_unit.split()[0]})"
+    parameter_definition = PARAMETERS[parameter_name]
+    if parameter_definition.display_factor == 1.0:
+        return parameter_definition.symbol
+    return f"{parameter_definition.symbol} ({parameter_definition.display_unit.split()[0]})"
 
 
 _NAME_COLUMNS: Final = (
@@ -227,9 +228,9 @@ _NAME_COLUMNS: Final = (
     Column("Weights", "weighting", TEXT_FORMAT),
 )
 """Columns that identify a Welch fit: type and weighting."""
-_INDEX_NAMES: Final = ("mse", "wmse", "md")
+_FIT_INDEX_NAMES: Final = ("mse", "wmse", "md")
 """Names of the paper's indices."""
-_INDEX_UNITS: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
+_FIT_INDEX_UNITS_NOTE: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
 """Note on the units of the indices."""
 
 
@@ -246,7 +247,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
             *_NAME_COLUMNS,
             *_damping_columns(),
             Column("Fit (%)", "nrmse_percent", ".2f"),
-            *(Column(index_name.upper(), index_name) for index_name in _INDEX_NAMES),
+            *(Column(index_name.upper(), index_name) for index_name in _FIT_INDEX_NAMES),
             Column("", "not_reported", TEXT_FORMAT),
         ),
         (
@@ -257,14 +258,15 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
                     at_bounds=fit.at_bounds,
                 ),
                 response_fit_percent(analysis, model),
-                *(getattr(model.indices, index_name) for index_name in _INDEX_NAMES),
+                *(getattr(model.indices, index_name) for index_name in _FIT_INDEX_NAMES),
                 " ".join(sorted(unreported_parameters(fit.structure, unsupported_orders))),
             )
             for fit, model in zip(fits, analysis.models, strict=True)
         ),
         (
             *footnotes(unsupported_orders),
-            f"Fit: NRMSE of the complex response in the band. {_INDEX_UNITS} std (±): one standard "
+            f"Fit: NRMSE of the complex response in the band. {_FIT_INDEX_UNITS_NOTE} std (±): one "
+            "standard "
             "deviation, from the scatter of the response about the model. The bias of Welch's "
             "estimate on a chirp, which the window smears at the resonances, is not included and "
             "is often larger; whole-record fits do not have it.",
@@ -283,7 +285,7 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
             {key: [file_values[key] for file_values in results_of_files] for key in fit_keys}
             for fit_keys, results_of_files in (
                 (DAMPING_PARAMETERS, [fit.parameters for fit in model_fits]),
-                (_INDEX_NAMES, [asdict(model.indices) for model in same_models]),
+                (_FIT_INDEX_NAMES, [asdict(model.indices) for model in same_models]),
             )
         )
         table_rows.append(
@@ -317,7 +319,7 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
             *_damping_columns(),
             *(
                 table_column
-                for value_name in _INDEX_NAMES
+                for value_name in _FIT_INDEX_NAMES
                 for table_column in (
                     Column(value_name.upper(), value_name),
                     Column("std", f"{value_name}_std", std_of_previous=True),
@@ -325,7 +327,7 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
             ),
         ),
         table_rows,
-        (_INDEX_UNITS,),
+        (_FIT_INDEX_UNITS_NOTE,),
         grouped=True,
     )  # fmt: skip
 
@@ -386,7 +388,7 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     if not max_modes:
         return None
 
-    def cells(
+    def mode_value_cells(
         fitted_model: FittedModel, value_name: str, number_format: str, display_factor: float = 1.0
     ) -> list[Cell]:
         mode_cells = []
@@ -401,14 +403,14 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
             mode_cells.append(cell)
         return mode_cells or [number_cell(None)] * max_modes
 
-    mode_pairs = [
-        mode_pair
+    modes_with_flags = [
+        mode_with_flag
         for fitted_model in fitted_models
-        for mode_pair in zip(fitted_model.modes, fitted_model.followed, strict=True)
+        for mode_with_flag in zip(fitted_model.modes, fitted_model.followed, strict=True)
     ]
-    is_underdamped = [mode.damping_ratio < 1 for mode, _ in mode_pairs]
+    is_underdamped = [mode.damping_ratio < 1 for mode, _ in modes_with_flags]
     table_notes = ["From the poles of the fitted model; ξ is the damping ratio."]
-    if any(not is_followed and mode.damping_ratio < 1 for mode, is_followed in mode_pairs):
+    if any(not is_followed and mode.damping_ratio < 1 for mode, is_followed in modes_with_flags):
         table_notes.append(
             f"{_FAR_MODE_MARK} more than {100 * LARGEST_FREQUENCY_SHIFT:g} % off the undamped "
             "beam's: the fit does not follow this resonance. The number only describes the fitted "
@@ -427,8 +429,8 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
         (
             (
                 *_type_and_weighting(fitted_model),
-                *cells(fitted_model, "frequency_hz", ".4f"),
-                *cells(fitted_model, "damping_ratio", ".4g", 100.0),
+                *mode_value_cells(fitted_model, "frequency_hz", ".4f"),
+                *mode_value_cells(fitted_model, "damping_ratio", ".4g", 100.0),
             )
             for fitted_model in fitted_models
         ),

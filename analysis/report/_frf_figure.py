@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 
     from analysis.paper.welch_analysis import FittedModel, WelchAnalysis
 
-_CURVE_COLUMNS: Final = 500
+_CURVE_DECIMATION_COLUMNS: Final = 500
 """Number of columns into which the curves of a panel are decimated."""
 _LEGEND_COLUMNS: Final = 4
 """Number of columns of the legend."""
-_LINES_BY_WEIGHTING: Final[dict[str, dict[str, Any]]] = {
+_LINE_STYLE_BY_WEIGHTING: Final[dict[str, dict[str, Any]]] = {
     "const": {"color": style.BLUE, "linestyle": "-"},
     "omega": {"color": style.VERMILION, "linestyle": (0, (4, 2))},
 }
 """Colour and dash of the models with the paper's two weightings, as in the paper."""
-_FURTHER_LINES: Final[tuple[dict[str, Any], ...]] = (
+_FURTHER_LINE_STYLES: Final[tuple[dict[str, Any], ...]] = (
     {"color": style.GREEN, "linestyle": (0, (1, 1.2))},
     {"color": style.PURPLE, "linestyle": (0, (5, 1.5, 1, 1.5))},
     {"color": style.ORANGE, "linestyle": "-"},
@@ -48,7 +48,7 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
     height_in = 2.9 * panel_rows + 1.0 + header_height_in
     figure = style.new_figure(
         width_in, height_in, "Frequency response by Welch's method",
-        f"coupling torque over motor angle  ·  {_estimate_text(analysis)}  ·  "
+        f"coupling torque over motor angle  ·  {_response_estimate_text(analysis)}  ·  "
         "MSE, WMSE in (N·m/rad)²",
     )  # fmt: skip
     grid = figure.add_gridspec(
@@ -69,11 +69,11 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
         line_by_label |= _draw_type_panel(
             analysis, type_models, magnitude_axes, phase_axes, style_by_weighting
         )
-        _write_scores(magnitude_axes, type_models, style_by_weighting)
+        _write_fit_errors(magnitude_axes, type_models, style_by_weighting)
     coherence_axes = figure.add_subplot(grid[panel_rows, :])
     _draw_coherence(coherence_axes, analysis)
     panel_columns = min(len(line_by_label), _LEGEND_COLUMNS)
-    style.legend(
+    style.add_legend(
         figure, list(line_by_label.values()), list(line_by_label), column_count=panel_columns
     )
     return figure
@@ -84,14 +84,14 @@ def line_styles(weightings: tuple[str, ...]) -> dict[str, dict[str, Any]]:
 
     The paper's two weightings have the styles of the paper.
     """
-    further_lines = cycle(_FURTHER_LINES)
+    further_line_styles = cycle(_FURTHER_LINE_STYLES)
     return {
-        weighting_name: _LINES_BY_WEIGHTING.get(weighting_name) or next(further_lines)
+        weighting_name: _LINE_STYLE_BY_WEIGHTING.get(weighting_name) or next(further_line_styles)
         for weighting_name in weightings
     }
 
 
-def _estimate_text(analysis: WelchAnalysis) -> str:
+def _response_estimate_text(analysis: WelchAnalysis) -> str:
     """Return a description of the response estimate: method, segments, band and bins."""
     settings, response = analysis.settings, analysis.response
     band_text = (
@@ -138,14 +138,14 @@ def _draw_type_panel(
         line_hz, plotted_values = frequency_hz[is_drawable], response[is_drawable]
         (line_by_label[curve_label],) = magnitude_axes.plot(
             *style.envelope(
-                line_hz, magnitude_db(plotted_values), _CURVE_COLUMNS, logarithmic=True
+                line_hz, magnitude_db(plotted_values), _CURVE_DECIMATION_COLUMNS, logarithmic=True
             ),
             **line_style,
         )
         if curve_label.startswith("measured"):
             # Dots, because a line would jump wherever noise wraps the phase.
-            point_indices = style.log_spaced_indices(line_hz, _CURVE_COLUMNS)
-            style.dots(
+            point_indices = style.log_spaced_indices(line_hz, _CURVE_DECIMATION_COLUMNS)
+            style.draw_dots(
                 phase_axes,
                 line_hz[point_indices],
                 phase_deg(plotted_values[point_indices]),
@@ -155,7 +155,7 @@ def _draw_type_panel(
         else:
             phase_axes.plot(
                 *style.envelope(
-                    line_hz, phase_deg(plotted_values), _CURVE_COLUMNS, logarithmic=True
+                    line_hz, phase_deg(plotted_values), _CURVE_DECIMATION_COLUMNS, logarithmic=True
                 ),
                 **line_style,
             )
@@ -168,7 +168,7 @@ def _draw_type_panel(
     return line_by_label
 
 
-def _write_scores(
+def _write_fit_errors(
     panel_axes: Axes, models: list[FittedModel], style_by_weighting: dict[str, dict[str, Any]]
 ) -> None:
     """Write each model's errors (MSE, WMSE) into the panel, in the colour of the model's line."""
@@ -186,7 +186,7 @@ def _draw_coherence(axes: Axes, analysis: WelchAnalysis) -> None:
     """Draw the coherence of the measured response, or a note that there is none."""
     response = analysis.response
     axes.set_title("Coherence")
-    style.frequency_axis(axes, analysis.settings.band_hz)
+    style.set_frequency_axis(axes, analysis.settings.band_hz)
     axes.set_ylim(0.0, 1.05)
     axes.set_yticks((0.0, 0.5, 1.0))
     axes.set_xlabel("Frequency (Hz)", labelpad=1)

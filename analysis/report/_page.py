@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import jinja2
 import matplotlib as mpl
 
-from analysis.report._document import versions as computed_by
+from analysis.report._document import program_versions
 
 if TYPE_CHECKING:
     from datetime import datetime
 
-Facts = tuple[str, list[tuple[str, str]]]
+FactGroup = tuple[str, list[tuple[str, str]]]
 """Title of a group of facts, and the name and value of each fact."""
 
 
@@ -38,13 +38,13 @@ def _environment() -> jinja2.Environment:
     )
 
 
-def versions(made_at: datetime) -> Facts:
+def version_facts(made_at: datetime) -> FactGroup:
     """Return the date of the report and the versions of the programs, as a group of facts."""
     return (
         "Versions",
         [
             ("report made", made_at.isoformat(timespec="seconds")),
-            *computed_by().items(),
+            *program_versions().items(),
             ("matplotlib", mpl.__version__),
         ],
     )

@@ -43,17 +43,20 @@ FIT_NAME_COLUMNS: Final = (
 """Columns that identify a Welch fit: type and weighting."""
 
 
-def paper_tables(campaign: CampaignResult, *, with_paper: bool = False) -> tuple[Table, ...]:
+def paper_tables(campaign: CampaignResult, *, with_paper_values: bool = False) -> tuple[Table, ...]:
     """Return the reference paper's tables with the numbers of the campaign's Welch fits.
 
-    The tuple is empty if the campaign has no Welch fits. With `with_paper` the tables also contain
-    the numbers that the paper publishes, in parentheses.
+    The tuple is empty if the campaign has no Welch fits. With `with_paper_values` the tables also
+    contain the numbers that the paper publishes, in parentheses.
     """
     if not campaign.nominal:
         return ()
     return (
-        *(make_table(campaign, with_paper=with_paper) for make_table in (table3, table4, table5)),
-        indices_table(campaign),
+        *(
+            make_table(campaign, with_paper_values=with_paper_values)
+            for make_table in (table3, table4, table5)
+        ),
+        fit_indices_table(campaign),
         *([bias_table(campaign)] if campaign.welch_biases else []),
     )
 
@@ -70,7 +73,7 @@ def welch_method_text(campaign: CampaignResult) -> str:
     return estimator_text(settings.estimator, settings.segmentation(PAPER_RATE_HZ), segments_text)
 
 
-_STATISTICS: Final = ("mean", "median", "std", "min", "max")
+_STATISTIC_NAMES: Final = ("mean", "median", "std", "min", "max")
 """Statistics of a parameter over the sessions, as in Table 3."""
 _TABLE_3_HEADINGS: Final = {"zeta": ("ζ (10⁻⁴ s^α)", 1e4), "alpha": ("α", 1.0),
                    "gamma": ("γ (10⁻¹ s^λ/m⁴)", 10.0), "lambda": ("λ", 1.0)}  # fmt: skip
@@ -81,24 +84,26 @@ _PARENTHESES_NOTE: Final = "In parentheses: the values of the paper."
 """Note on the numbers in parentheses."""
 
 
-def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
+def table3(campaign: CampaignResult, *, with_paper_values: bool = False) -> Table:
     """Return the table of each parameter's statistics over the sessions (Table 3)."""
     table_rows: list[Row] = []
     for statistics in campaign.statistics:
         parameter_symbol, display_factor = _TABLE_3_HEADINGS[statistics.parameter]
         paper_values: dict[str, float | None] = {}
-        if with_paper:
+        if with_paper_values:
             paper_row = published_table3().get(
                 (statistics.structure, statistics.weighting, statistics.parameter)
             )
             paper_values = {
                 statistic_name: getattr(paper_row, statistic_name, None)
-                for statistic_name in _STATISTICS
+                for statistic_name in _STATISTIC_NAMES
             }
-        statistic_values = [getattr(statistics, statistic_name) for statistic_name in _STATISTICS]
+        statistic_values = [
+            getattr(statistics, statistic_name) for statistic_name in _STATISTIC_NAMES
+        ]
         statistic_cells = dict(
             zip(
-                _STATISTICS,
+                _STATISTIC_NAMES,
                 estimate_cells(statistic_values, statistics.std, display_factor),
                 strict=True,
             )
@@ -128,7 +133,7 @@ def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
         (
             *FIT_NAME_COLUMNS,
             Column("parameter", "parameter", TEXT_FORMAT),
-            *(Column(statistic_name, statistic_name) for statistic_name in _STATISTICS),
+            *(Column(statistic_name, statistic_name) for statistic_name in _STATISTIC_NAMES),
         ),
         tuple(table_rows),
         (
@@ -139,7 +144,7 @@ def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
                 if any(statistics.at_bounds for statistics in campaign.statistics)
                 else []
             ),
-            *([_PARENTHESES_NOTE] if with_paper else []),
+            *([_PARENTHESES_NOTE] if with_paper_values else []),
         ),
         grouped=True,
     )
@@ -149,14 +154,14 @@ _PEAK_HEADINGS: Final = {"frequency_rad_s": "ω{} (rad/s)", "magnitude_db": "M{}
 """Headings of a resonance peak's deviations, with a placeholder for the mode's number."""
 
 
-def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
+def table4(campaign: CampaignResult, *, with_paper_values: bool = False) -> Table:
     """Return the table of mean deviations of the models' resonance peaks from the measured ones.
 
     It corresponds to the paper's Table 4.
     """
     type_names = list(dict.fromkeys(nominal_model.structure for nominal_model in campaign.nominal))
     weightings = list(dict.fromkeys(nominal_model.weighting for nominal_model in campaign.nominal))
-    deviations = {
+    deviation_by_key = {
         (peak_quantity, deviation.mode, nominal_model.weighting, nominal_model.structure): getattr(
             deviation, peak_quantity
         )
@@ -166,18 +171,18 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
     }
     table_rows: list[Row] = []
     for peak_quantity, mode_number, weighting in sorted(
-        {key[:3] for key in deviations}, key=lambda key: (*key[:2], weightings.index(key[2]))
+        {key[:3] for key in deviation_by_key}, key=lambda key: (*key[:2], weightings.index(key[2]))
     ):
         row_key = (peak_quantity, mode_number, weighting)
         deviation_cells = {
-            type_name: number_cell(deviations[*row_key, type_name], ".3g")
+            type_name: number_cell(deviation_by_key[*row_key, type_name], ".3g")
             for type_name in type_names
-            if (*row_key, type_name) in deviations
+            if (*row_key, type_name) in deviation_by_key
         }
         paper_values = {
             other_type: published_table4().get((other_type, weighting, peak_quantity, mode_number))
             for other_type in deviation_cells
-            if with_paper
+            if with_paper_values
         }
         table_rows.append(
             {
@@ -203,26 +208,26 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
         tuple(table_rows),
         (
             "A nominal model has the mean of the sessions' parameters.",
-            *([_PARENTHESES_NOTE] if with_paper else []),
+            *([_PARENTHESES_NOTE] if with_paper_values else []),
         ),
         grouped=True,
     )
 
 
-_TABLE_5_FACTORS: Final = {"alpha": 1.0, "zeta": 1e5, "lambda": 1.0, "gamma": 1e2}
+_TABLE_5_DISPLAY_FACTORS: Final = {"alpha": 1.0, "zeta": 1e5, "lambda": 1.0, "gamma": 1e2}
 """Display factor of each parameter in Table 5: a power of ten, as in the paper."""
 
 
-def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
+def table5(campaign: CampaignResult, *, with_paper_values: bool = False) -> Table:
     """Return the table of the two best nominal models' parameters and WMSE (Table 5)."""
     table_rows: list[Row] = []
-    std = {
+    std_by_parameter = {
         (statistics.structure, statistics.weighting, statistics.parameter): statistics.std
         for statistics in campaign.statistics
     }
     for model in best_models(campaign.nominal):
         paper_wmse = published_wmse().get((model.structure, model.weighting))
-        paper_values = {"wmse": paper_wmse} if with_paper else {}
+        paper_values = {"wmse": paper_wmse} if with_paper_values else {}
         table_rows.append(
             {
                 "type": model.structure,
@@ -230,8 +235,8 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
                 **{
                     value_name: estimate_cells(
                         [model_value],
-                        std.get((model.structure, model.weighting, value_name)),
-                        _TABLE_5_FACTORS[value_name],
+                        std_by_parameter.get((model.structure, model.weighting, value_name)),
+                        _TABLE_5_DISPLAY_FACTORS[value_name],
                     )[0]
                     for value_name, model_value in model.parameters.items()
                 },
@@ -262,22 +267,22 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
             Column("WMSE ((N·m/rad)²)", "wmse"),
         ),
         tuple(table_rows),
-        (_PARENTHESES_NOTE,) if with_paper else (),
+        (_PARENTHESES_NOTE,) if with_paper_values else (),
     )  # fmt: skip
 
 
-_INDEX_HEADINGS: Final = {
+_FIT_INDEX_HEADINGS: Final = {
     "mse": "MSE ((N·m/rad)²)", "wmse": "WMSE ((N·m/rad)²)", "md": "MD (N·m/rad)",
 }  # fmt: skip
 """Headings of the paper's indices."""
 
 
-def indices_table(campaign: CampaignResult) -> Table:
+def fit_indices_table(campaign: CampaignResult) -> Table:
     """Return the table of the distances between nominal models and sessions, as in Figure 7."""
     table_rows: list[Row] = []
     for model in campaign.nominal:
         row: dict[str, Entry] = {"type": model.structure, "weighting": model.weighting}
-        for index_name in _INDEX_HEADINGS:
+        for index_name in _FIT_INDEX_HEADINGS:
             index_values = np.array(
                 [getattr(session_indices, index_name) for session_indices in model.indices]
             )
@@ -294,7 +299,7 @@ def indices_table(campaign: CampaignResult) -> Table:
             *FIT_NAME_COLUMNS,
             *(
                 value_column
-                for index_name, index_heading in _INDEX_HEADINGS.items()
+                for index_name, index_heading in _FIT_INDEX_HEADINGS.items()
                 for value_column in (
                     Column(index_heading, index_name),
                     Column("std", f"{index_name}_std", std_of_previous=True)
@@ -312,7 +317,7 @@ def bias_table(campaign: CampaignResult) -> Table:
     unsupported_orders = campaign.verdict.withheld_orders if campaign.verdict else frozenset[str]()
     table_rows: list[Row] = []
     for fit_bias in campaign.welch_biases:
-        not_reported = unreported_parameters(STRUCTURES[fit_bias.structure], unsupported_orders)
+        unreported_names = unreported_parameters(STRUCTURES[fit_bias.structure], unsupported_orders)
         for parameter in fit_bias.parameters:
             parameter_symbol, display_factor = _TABLE_3_HEADINGS[parameter.parameter]
             welch_cell = estimate_cells(
@@ -335,7 +340,7 @@ def bias_table(campaign: CampaignResult) -> Table:
                     "parameter": Cell(
                         parameter.parameter,
                         parameter_symbol
-                        + NOT_REPORTED_MARK * (parameter.parameter in not_reported),
+                        + NOT_REPORTED_MARK * (parameter.parameter in unreported_names),
                     ),
                     **bias_cells,
                     "bias": estimate_cells((parameter.bias,), parameter.bias_std, display_factor)[
@@ -343,7 +348,7 @@ def bias_table(campaign: CampaignResult) -> Table:
                     ],
                     "bias_std": parameter.bias_std,
                     "significant": parameter.significant,
-                    "reported": parameter.parameter not in not_reported,
+                    "reported": parameter.parameter not in unreported_names,
                     "wmse": fit_bias.wmse,
                     "record_wmse": fit_bias.record_wmse,
                     "mixture": campaign.homogeneity.is_mixture,

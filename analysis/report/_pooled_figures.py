@@ -39,7 +39,7 @@ _FREEST_TYPE: Final = "VI"
 
 _LOSS_FACTOR_POINTS: Final = 400
 """Number of frequencies at which the pooled loss factor is drawn."""
-_RESPONSE_COLUMNS: Final = 1500
+_RESPONSE_DECIMATION_COLUMNS: Final = 1500
 """Number of columns into which the sessions' responses are decimated."""
 _AXIS_END_RATIO: Final = 1.6
 """Ratio by which the frequency axis extends beyond the first and the last mode."""
@@ -136,7 +136,7 @@ def damping_figure(campaign: CampaignResult) -> Figure:
             figure.add_subplot(grid[1, panel_number]), pooled_mode, session_modes, session_count
         )
     figure.axes[1].set_ylabel("Damping ratio (%)")
-    style.frequency_axis(
+    style.set_frequency_axis(
         upper_axes,
         (
             pooled_modes[0].frequency_hz / _AXIS_END_RATIO,
@@ -147,13 +147,13 @@ def damping_figure(campaign: CampaignResult) -> Figure:
     upper_axes.margins(y=0.1)
     upper_axes.set_ylabel("Damping ratio (%)")
     upper_axes.set_xlabel("Frequency (Hz)", labelpad=1)
-    legend_entries = [
+    legend_handles = [
         Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
                label="session, ± 1.96 of its standard deviation"),
         Line2D([], [], color=style.BLUE, marker="D", markersize=4, label="pooled"),
         Patch(facecolor=INTERVAL_COLOR, label="its 95 % interval"),
     ]  # fmt: skip
-    style.legend(figure, legend_entries, column_count=3)
+    style.add_legend(figure, legend_handles, column_count=3)
     return figure
 
 
@@ -268,7 +268,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
     assert pooled_estimate is not None
     peaks_hz = [pooled_mode.frequency_hz for pooled_mode in campaign.modes]
     first_hz, last_hz = _response_band_hz(campaign, peaks_hz)
-    pooled_band = response_band(
+    pooled_response_band = response_band(
         _PooledFit.from_estimate(pooled_estimate), dense_grid(first_hz, last_hz, peaks_hz)
     )
     is_measured = bool(campaign.sessions[0].frequency_hz.size)
@@ -294,39 +294,45 @@ def response_figure(campaign: CampaignResult) -> Figure:
     )  # fmt: skip
     magnitude_axes, phase_axes, width_axes = (figure.add_subplot(grid[row]) for row in range(3))
     lowest_db = _draw_sessions(
-        campaign, pooled_estimate, magnitude_axes, phase_axes, pooled_band.frequency_hz
+        campaign, pooled_estimate, magnitude_axes, phase_axes, pooled_response_band.frequency_hz
     )
     lower_db, upper_db = (
         magnitude_db(magnitude_limit.astype(complex))
-        for magnitude_limit in pooled_band.magnitude_limits()
+        for magnitude_limit in pooled_response_band.magnitude_limits()
     )
-    modelled_db = magnitude_db(pooled_band.response)
+    modelled_db = magnitude_db(pooled_response_band.response)
     magnitude_axes.fill_between(
-        pooled_band.frequency_hz, lower_db, upper_db, color=INTERVAL_COLOR, linewidth=0
+        pooled_response_band.frequency_hz, lower_db, upper_db, color=INTERVAL_COLOR, linewidth=0
     )
-    magnitude_axes.plot(pooled_band.frequency_hz, modelled_db, color=style.BLUE)
+    magnitude_axes.plot(pooled_response_band.frequency_hz, modelled_db, color=style.BLUE)
     magnitude_axes.set_ylim(min(lowest_db, float(np.quantile(modelled_db, 0.02))) - 5,
                        float(modelled_db.max()) + 5)  # fmt: skip
-    phase_axes.plot(pooled_band.frequency_hz, phase_deg(pooled_band.response), color=style.BLUE)
-    style.response_axes(magnitude_axes, phase_axes)
+    phase_axes.plot(
+        pooled_response_band.frequency_hz,
+        phase_deg(pooled_response_band.response),
+        color=style.BLUE,
+    )
+    style.set_response_axes(magnitude_axes, phase_axes)
     width_axes.plot(
-        pooled_band.frequency_hz, 100 * NORMAL_95 * pooled_band.log_magnitude_std, color=style.BLUE
+        pooled_response_band.frequency_hz,
+        100 * NORMAL_95 * pooled_response_band.log_magnitude_std,
+        color=style.BLUE,
     )
     width_axes.set_ylim(bottom=0.0)
     width_axes.set_ylabel("Band (± %)")
     width_axes.set_xlabel("Frequency (Hz)", labelpad=1)
     for response_panel in (magnitude_axes, phase_axes, width_axes):
-        style.frequency_axis(
+        style.set_frequency_axis(
             response_panel, (first_hz, last_hz), with_labels=response_panel is width_axes
         )
     figure.align_ylabels()
-    legend_entries = [
+    legend_handles = [
         Line2D([], [], color=SESSION_COLOR, linewidth=1.5,
                label=f"sessions, {'measured' if is_measured else 'each by its own fit'}"),
         Line2D([], [], color=style.BLUE, label="pooled"),
         Patch(facecolor=INTERVAL_COLOR, label="its 95 % band"),
     ]  # fmt: skip
-    style.legend(figure, legend_entries, column_count=3)
+    style.add_legend(figure, legend_handles, column_count=3)
     return figure
 
 
@@ -367,6 +373,11 @@ def _draw_sessions(
             )[0]
         lowest_db = min(lowest_db, float(np.quantile(magnitude_db(response), 0.005)))
         draw_session(
-            magnitude_axes, phase_axes, frequency_hz, response, _RESPONSE_COLUMNS, _RESPONSE_COLUMNS
+            magnitude_axes,
+            phase_axes,
+            frequency_hz,
+            response,
+            _RESPONSE_DECIMATION_COLUMNS,
+            _RESPONSE_DECIMATION_COLUMNS,
         )
     return lowest_db

@@ -58,17 +58,19 @@ def structures_table(campaign: CampaignResult) -> Table:
     Structures that are not pooled follow the pooled ones.
     """
 
-    def row(ranked_structure: RankedStructure) -> Row:
-        as_grey: Callable[[Cell], Cell] = (
+    def structure_row(ranked_structure: RankedStructure) -> Row:
+        grey_if_not_pooled: Callable[[Cell], Cell] = (
             (lambda cell: cell) if ranked_structure.is_pooled else grey_cell
         )
         return {
             "type": Cell(ranked_structure.structure, ranked_structure.name),
-            "fitted": as_grey(count_cell(ranked_structure.fitted_sessions)),
-            "sessions": as_grey(count_cell(ranked_structure.determining_sessions)),
-            "bic_above_lowest": as_grey(number_cell(ranked_structure.bic_above_lowest, ".1f")),
-            "misfit": as_grey(number_cell(ranked_structure.misfit)),
-            "selected_alone": as_grey(count_cell(ranked_structure.selecting_sessions)),
+            "fitted": grey_if_not_pooled(count_cell(ranked_structure.fitted_sessions)),
+            "sessions": grey_if_not_pooled(count_cell(ranked_structure.determining_sessions)),
+            "bic_above_lowest": grey_if_not_pooled(
+                number_cell(ranked_structure.bic_above_lowest, ".1f")
+            ),
+            "misfit": grey_if_not_pooled(number_cell(ranked_structure.misfit)),
+            "selected_alone": grey_if_not_pooled(count_cell(ranked_structure.selecting_sessions)),
             "pooled": ranked_structure.is_pooled,
         }
 
@@ -83,7 +85,7 @@ def structures_table(campaign: CampaignResult) -> Table:
             Column("ΔBIC", "bic_above_lowest"),
             Column("residual (noise = 1)", "misfit"),
         ),
-        tuple(map(row, campaign.structures)),
+        tuple(map(structure_row, campaign.structures)),
         (
             "Each damping parameter has one value for all sessions, with a between-session "
             "variance where they differ, or one per session if some session does not determine "
@@ -98,7 +100,7 @@ def structures_table(campaign: CampaignResult) -> Table:
     )
 
 
-def likely_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
+def leading_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
     """Return the reported pooled estimate, then the one of the structure with the lowest BIC.
 
     The list has one element if both are the same, and none without a pooled estimate.
@@ -148,7 +150,9 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
         Column("p", "p_value"),
     )  # fmt: skip
     if only_estimate is None:
-        ordered_estimates = sorted(campaign.pooled, key=lambda item: item is not headline)
+        ordered_estimates = sorted(
+            campaign.pooled, key=lambda pooled_estimate: pooled_estimate is not headline
+        )
         table_rows = [
             table_row
             for estimate in ordered_estimates
@@ -185,10 +189,10 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
     )
     if unreported_names:
         table_notes += footnotes(unsupported_orders)
-    flags = pooled_flags(campaign, only_estimate)
+    flag_by_parameter = pooled_flags(campaign, only_estimate)
     table_notes += flag_notes(
         flag
-        for parameter_name, flag in flags.items()
+        for parameter_name, flag in flag_by_parameter.items()
         if parameter_name in only_estimate.parameters_by_name
         and parameter_name not in unreported_names
         and not homogeneity.is_mixed(parameter_name)
@@ -203,7 +207,7 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
             homogeneity,
         ),
         table_columns,
-        tuple(_pooled_rows(only_estimate, campaign, unsupported_orders, flags)),
+        tuple(_pooled_rows(only_estimate, campaign, unsupported_orders, flag_by_parameter)),
         tuple(table_notes),
     )
 
@@ -212,12 +216,16 @@ def _pooled_rows(
     pooled_estimate: PooledEstimate,
     campaign: CampaignResult,
     unsupported_orders: Collection[str],
-    flags: Mapping[str, str],
+    flag_by_parameter: Mapping[str, str],
 ) -> Iterator[Row]:
     """Yield the rows of an estimate's parameters in the table of pooled estimates."""
     for parameter in pooled_estimate.parameters:
         yield _pooled_row(
-            pooled_estimate, parameter, campaign, unsupported_orders, flags.get(parameter.name)
+            pooled_estimate,
+            parameter,
+            campaign,
+            unsupported_orders,
+            flag_by_parameter.get(parameter.name),
         )
 
 
@@ -304,10 +312,12 @@ def tolerance_table(campaign: CampaignResult) -> Table:
             reported_value.std or None,
             display_factor,
         )
-        exact_value = exact_parameters.get(parameter_name)
+        exact_estimate = exact_parameters.get(parameter_name)
         exact_cells = (
-            estimate_cells((exact_value.value, exact_value.std), exact_value.std, display_factor)
-            if exact_value
+            estimate_cells(
+                (exact_estimate.value, exact_estimate.std), exact_estimate.std, display_factor
+            )
+            if exact_estimate
             else (number_cell(None), number_cell(None))
         )
         table_rows.append(
@@ -325,14 +335,14 @@ def tolerance_table(campaign: CampaignResult) -> Table:
                 **dict(
                     zip(
                         ("exact", "exact_std"),
-                        flagged_cells(exact_cells, exact_value.flag if exact_value else None),
+                        flagged_cells(exact_cells, exact_estimate.flag if exact_estimate else None),
                         strict=True,
                     )
                 ),
                 "uniformity_percent": 100 * tolerant_estimate.uniformity,
                 "basis": tolerant_estimate.basis,
                 "flag": reported_value.flag,
-                "exact_flag": exact_value.flag if exact_value else None,
+                "exact_flag": exact_estimate.flag if exact_estimate else None,
             }
         )
     return Table(
@@ -493,7 +503,7 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
     """Return the table of the scatter between sessions of modal quantities and parameters."""
     homogeneity = campaign.homogeneity
 
-    def row(scatter: Heterogeneity) -> Row:
+    def scatter_row(scatter: Heterogeneity) -> Row:
         _, display_factor, _ = label_and_unit(scatter.quantity)
         return {
             "quantity": Cell(
@@ -525,7 +535,7 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
             Column("Cochran's Q", "cochran_q", ".3g"),
             Column("I²", "i_squared"), Column("p", "p_value"),
         ),
-        tuple(map(row, homogeneity.quantities)),
+        tuple(map(scatter_row, homogeneity.quantities)),
         (
             "Between sessions: standard deviation beyond the sessions' own uncertainties (τ). τ/s: "
             "the same over a typical session's own. I²: its share of the variance. p: p-value of "

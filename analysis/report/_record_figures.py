@@ -49,7 +49,7 @@ _MIN_LABELS_PER_DECADE: Final = 1 / math.log10(2.0)
 """Number of labels that must fit into a decade of an axis so that 1, 2 and 5 are labelled."""
 
 
-def plain_logarithmic(axes: Axes, lower_limit: float, upper_limit: float) -> None:
+def set_plain_logarithmic_axis(axes: Axes, lower_limit: float, upper_limit: float) -> None:
     """Make the vertical axis logarithmic within the limits, with as many labels as fit."""
     axes.set_yscale("log")
     axes.set_ylim(lower_limit, upper_limit)
@@ -79,7 +79,7 @@ _DETAIL_POINTS: Final = 161
 _DETAIL_HALF_WIDTHS: Final = 6.0
 """Frequency range on either side of a mode in its enlarged panel, in half-widths of the peak."""
 
-_MIN_RELATIVE_DETAIL: Final = 0.006
+_MIN_RELATIVE_DETAIL_WIDTH: Final = 0.006
 """Least frequency range on either side of a mode in its enlarged panel, relative to the mode."""
 
 
@@ -130,7 +130,7 @@ def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
     )
     magnitude_axes.set_ylim(lowest_db - 5, float(modelled_db.max()) + 5)
     point_indices = style.log_spaced_indices(measured_frf.frequency_hz, _RESPONSE_POINTS)
-    style.dots(
+    style.draw_dots(
         phase_axes,
         measured_frf.frequency_hz[point_indices],
         phase_deg(measured_without_delay[point_indices]),
@@ -138,14 +138,16 @@ def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
         color=style.GREY,
     )
     phase_axes.plot(model_band.frequency_hz, phase_deg(model_band.response), color=style.BLUE)
-    style.response_axes(magnitude_axes, phase_axes)
+    style.set_response_axes(magnitude_axes, phase_axes)
     half_width_percent = 100 * NORMAL_95 * model_band.log_magnitude_std
     width_axes.plot(model_band.frequency_hz, half_width_percent, color=style.BLUE, linewidth=1.0)
-    plain_logarithmic(width_axes, 0.8 * half_width_percent.min(), 1.4 * half_width_percent.max())
+    set_plain_logarithmic_axis(
+        width_axes, 0.8 * half_width_percent.min(), 1.4 * half_width_percent.max()
+    )
     width_axes.set_ylabel("Band (± %)")
     width_axes.set_xlabel("Frequency (Hz)", labelpad=1)
     for response_panel in (magnitude_axes, phase_axes, width_axes):
-        style.frequency_axis(
+        style.set_frequency_axis(
             response_panel, (first_hz, last_hz), with_labels=response_panel is width_axes
         )
     for panel_number, visible_mode in enumerate(visible_modes):
@@ -164,7 +166,7 @@ def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
         )
         detail_axes.set_xlim(detail_limits_hz)
         detail_axes.set_ylim(
-            style.limits(
+            style.axis_limits(
                 magnitude_db(measured_without_delay[is_in_detail]),
                 magnitude_db(detail_band.response),
             )
@@ -213,13 +215,13 @@ def _draw_magnitude(
 def _detail_range_hz(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
     """Return the frequency range of a mode's enlarged panel, with at least one bin."""
     bin_spacing_hz = float(np.diff(frequency_hz).max())
-    relative_width = max(_DETAIL_HALF_WIDTHS * mode.damping_ratio, _MIN_RELATIVE_DETAIL)
+    relative_width = max(_DETAIL_HALF_WIDTHS * mode.damping_ratio, _MIN_RELATIVE_DETAIL_WIDTH)
     half_width_hz = max(relative_width * mode.frequency_hz, bin_spacing_hz)
     lowest_hz = float(frequency_hz[0]) / 2
     return max(mode.frequency_hz - half_width_hz, lowest_hz), mode.frequency_hz + half_width_hz
 
 
-_LOSS_POINTS: Final = 400
+_LOSS_FACTOR_POINTS: Final = 400
 """Number of frequencies at which the loss factors are drawn."""
 _CURVE_STYLES: Final = {
     "internal (material and clamp)": (style.VERMILION, (0, (4, 2))),
@@ -252,7 +254,9 @@ def loss_figure(
     """
     figure = style.new_figure(9.0, 3.6)
     axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))
-    drawn_values = _draw_loss_factors(axes, loss_model, axis_hz, supported_hz, unsupported_orders)
+    drawn_loss_factors = _draw_loss_factors(
+        axes, loss_model, axis_hz, supported_hz, unsupported_orders
+    )
     for legend_label, is_filled in (("modes", True), ("modes, doubtful", False)):
         drawn_modes = [
             mode_estimate
@@ -273,21 +277,24 @@ def loss_figure(
     )
     for band_edge_hz, band_end_hz in grey_bands_hz:
         axes.axvspan(band_edge_hz, band_end_hz, color="#F4F4F4", linewidth=0, zorder=0)
-    style.frequency_axis(axes, axis_hz)
+    style.set_frequency_axis(axes, axis_hz)
     mode_loss_factors = [2 * mode_estimate.damping_ratio for mode_estimate in mode_estimates]
     # A quantile of each curve, because a total may rise without bound towards an end.
     highest_loss = max(
         [
             *mode_loss_factors,
-            *(float(np.nanquantile(loss_values, 0.98)) for loss_values in drawn_values),
+            *(float(np.nanquantile(loss_values, 0.98)) for loss_values in drawn_loss_factors),
         ],
         default=1.0,
     )
     lowest_loss = min(
-        [*mode_loss_factors, *(float(np.nanmin(loss_values)) for loss_values in drawn_values)],
+        [
+            *mode_loss_factors,
+            *(float(np.nanmin(loss_values)) for loss_values in drawn_loss_factors),
+        ],
         default=highest_loss,
     )
-    plain_logarithmic(
+    set_plain_logarithmic_axis(
         axes, max(lowest_loss / 2, 3 * highest_loss / _MAX_LOSS_AXIS_RATIO), 3 * highest_loss
     )
     axes.set_ylabel("Loss factor (1)")
@@ -318,7 +325,7 @@ def _draw_loss_factors(
     if first_hz >= last_hz:
         return []
     loss_factors_over_frequency = loss_factors(
-        loss_model, np.geomspace(first_hz, last_hz, _LOSS_POINTS)
+        loss_model, np.geomspace(first_hz, last_hz, _LOSS_FACTOR_POINTS)
     )
     loss_curves = dict(
         zip(
@@ -332,7 +339,7 @@ def _draw_loss_factors(
         )
     )
     has_both_parts = None not in loss_curves.values()
-    drawn_values = []
+    drawn_loss_factors = []
     for (curve_label, loss_factor), draw_order in zip(
         loss_curves.items(), ("alpha", "lambda", None), strict=True
     ):
@@ -356,8 +363,8 @@ def _draw_loss_factors(
             linestyle=line_dash,
             label=curve_label,
         )
-        drawn_values.append(loss_factor.value)
-    return drawn_values
+        drawn_loss_factors.append(loss_factor.value)
+    return drawn_loss_factors
 
 
 def _unsupported_ranges_hz(
@@ -378,7 +385,7 @@ _BINS_PER_POINT: Final = 24
 """Number of frequency bins that are averaged to one point of the residual's spectrum."""
 _NOISE_MODEL_POINTS: Final = 600
 """Number of points of the noise model's curve."""
-_MAX_INTERVALS: Final = 120
+_MAX_TIME_INTERVALS: Final = 120
 """Largest number of intervals in which the residual's power over time is shown.
 
 A short record has fewer independent values."""
@@ -425,7 +432,7 @@ def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> N
             ha="center", fontsize=7.5, color=style.PURPLE,
         )  # fmt: skip
         axes.axvline(hum_line.frequency_hz, color=style.PURPLE, linewidth=1.0, linestyle=":")
-    plain_logarithmic(axes, min(rms_mnm_values) / 1.6, max(rms_mnm_values) * 1.6)
+    set_plain_logarithmic_axis(axes, min(rms_mnm_values) / 1.6, max(rms_mnm_values) * 1.6)
     axes.set_xlim(0.0, frequency_hz[-1])
     axes.set_title("Spectrum (grey: modes)")
     axes.set_ylabel("Torque (mN·m/√Hz)")
@@ -495,7 +502,7 @@ def residual_power(
     bin_count = residual.size
     envelope_power = np.abs(np.fft.ifft(residual)) ** 2 * bin_count / 2
     envelope_power *= bin_count / np.count_nonzero(analysis.compared)
-    interval_count = min(_MAX_INTERVALS, bin_count)
+    interval_count = min(_MAX_TIME_INTERVALS, bin_count)
     interval_power: NDArray[np.float64] = np.array(
         [
             interval_envelope.mean()
@@ -635,8 +642,13 @@ def measured_response(whole_record: WholeRecord) -> FrequencyResponse:
     The delay between the channels is not removed from it.
     """
     record = whole_record.record
-    angle = record.angle_rad - (record.rest_angle_rad or 0.0)
-    response = fft_response(angle, record.torque_nm, record.rate_hz, fast_fft_length(len(angle)))
+    angle_from_rest_rad = record.angle_rad - (record.rest_angle_rad or 0.0)
+    response = fft_response(
+        angle_from_rest_rad,
+        record.torque_nm,
+        record.rate_hz,
+        fast_fft_length(len(angle_from_rest_rad)),
+    )
     first_mode_hz = float(undamped_frequencies_rad_s(whole_record.fit.plant.beam, 1)[0]) / (
         2 * np.pi
     )

@@ -56,7 +56,7 @@ def modes_table(whole_record: WholeRecord) -> Table:
     has_inertias = any(mode.participation is not None for mode in headline.modes)
     return Table.from_rows(
         "modes",
-        f"Modes with locked hub (clamped–free): {_modes_source(headline)}",
+        f"Modes with locked hub (clamped–free): {_source_of_modes(headline)}",
         (
             *_MODE_COLUMNS,
             Column("Inertia (kg·mm²)" if has_inertias else "", "participation_kg_m2"),
@@ -118,18 +118,18 @@ def _mode_row(mode: ReportedMode) -> tuple[Entry, ...]:
     """Return the row of a mode in the table of modes, with marks at doubtful numbers."""
     frequency_flag, damping_flag = mode.frequency_hz.flag, mode.damping_ratio.flag
     mode_cells, inertia_cells = _mode_cells(mode), _inertia_cells(mode.participation)
-    last_entries = mode.source, mode_flag(mode) or ""
+    source_and_flag = mode.source, mode_flag(mode) or ""
     if damping_flag is not None and frequency_flag is not None:
         marked_cells = flagged_cells(
             (count_cell(mode.number), *mode_cells, *inertia_cells), damping_flag
         )
-        return *marked_cells, *last_entries
+        return *marked_cells, *source_and_flag
     return (
         mode.number,
         *flagged_cells(mode_cells[:2], frequency_flag),
         *flagged_cells(mode_cells[2:], damping_flag),
         *flagged_cells(inertia_cells, mode.participation.flag if mode.participation else None),
-        *last_entries,
+        *source_and_flag,
     )
 
 
@@ -142,7 +142,7 @@ _SQUARE_MM_PER_SQUARE_M: Final = 1e6
 """Number of square millimetres in a square metre."""
 
 
-def _modes_source(headline: Headline) -> str:
+def _source_of_modes(headline: Headline) -> str:
     """Return the name of the model from which the reported modes are computed."""
     return (
         "modal model"
@@ -299,7 +299,8 @@ def _scale_notes(whole_record: WholeRecord) -> Iterator[str]:
             f": the uncertainty of {' and '.join(unknown_scales)}, which the file does not state."
         )
     yield (
-        f"A wrong scale shows as {_scale_dependence(whole_record)}; no other parameter depends on "
+        f"A wrong scale shows as {_scale_dependence_note(whole_record)}; no other parameter "
+        "depends on "
         "these, and none on the stated density."
     )
     density_result = density_check(
@@ -326,7 +327,7 @@ def _scale_notes(whole_record: WholeRecord) -> Iterator[str]:
     )
 
 
-def _scale_dependence(whole_record: WholeRecord) -> str:
+def _scale_dependence_note(whole_record: WholeRecord) -> str:
     """Return a text that states each parameter's dependence on the scales as powers of scales."""
     return ", ".join(
         f"{parameter_named(name).symbol} ∝ {_product_text(SCALE_EXPONENTS[name])}"
@@ -376,9 +377,15 @@ def exact_geometry_table(whole_record: WholeRecord) -> Table | None:
     )
 
 
-def _is_fixed(headline: Headline, parameter_name: str, *, exact: bool = False) -> bool:
+def _is_fixed(
+    headline: Headline, parameter_name: str, *, with_exact_geometry: bool = False
+) -> bool:
     """Return whether a parameter was held at a fixed value in its fit."""
-    if headline.tolerant is not None and not exact and parameter_name in headline.tolerant.values:
+    if (
+        headline.tolerant is not None
+        and not with_exact_geometry
+        and parameter_name in headline.tolerant.values
+    ):
         return False
     return parameter_name not in headline.fit.interval and parameter_name != "drag"
 
@@ -428,13 +435,13 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
     )
     table_rows: list[tuple[Entry, ...]] = []
     for parameter_name, simpler_value in simpler_estimates.parameters.items():
-        definition = parameter_named(parameter_name)
-        display_factor = definition.display_factor
-        free_value = headline.parameters.get(parameter_name)
+        parameter_definition = parameter_named(parameter_name)
+        display_factor = parameter_definition.display_factor
+        free_estimate = headline.parameters.get(parameter_name)
         table_rows.append(
             (
-                Cell(parameter_name, definition.symbol),
-                _unit_cell(definition.display_unit),
+                Cell(parameter_name, parameter_definition.symbol),
+                _unit_cell(parameter_definition.display_unit),
                 *estimate_cells(
                     (simpler_value.value, *_interval_ends(simpler_value)),
                     simpler_value.std,
@@ -442,17 +449,17 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
                 ),
                 *(
                     [number_cell(None)] * 3
-                    if free_value is None
+                    if free_estimate is None
                     else flagged_cells(
                         estimate_cells(
-                            (free_value.value, *_interval_ends(free_value)),
-                            free_value.std,
+                            (free_estimate.value, *_interval_ends(free_estimate)),
+                            free_estimate.std,
                             display_factor,
                         ),
-                        free_value.flag,
+                        free_estimate.flag,
                     )
                 ),
-                (free_value.flag or "") if free_value is not None else "",
+                (free_estimate.flag or "") if free_estimate is not None else "",
             )
         )
     return Table.from_rows(
@@ -531,10 +538,10 @@ def _parameter_row(
     )
     if parameters_with_scales:
         # A parameter that depends on no scale has the same interval with scales.
-        with_scale_uncertainty = parameters_with_scales.get(parameter_name, parameter)
+        estimate_with_scales = parameters_with_scales.get(parameter_name, parameter)
         value_cells += estimate_cells(
-            (with_scale_uncertainty.std or None, *_interval_ends(with_scale_uncertainty)),
-            with_scale_uncertainty.std,
+            (estimate_with_scales.std or None, *_interval_ends(estimate_with_scales)),
+            estimate_with_scales.std,
             display_factor,
         )
     return (
@@ -574,10 +581,10 @@ def _loss_factor_row(loss_factor: ReportedLossFactor, flag_text: str | None) -> 
     if loss_factor.omega_rad_s is None:
         loss_symbol = loss_symbol[0]
     value_cell, std_cell, low_cell, high_cell = _quantity_cells(loss_size)
-    relative_std = number_cell(
+    relative_std_cell = number_cell(
         None if loss_size.std is None else loss_size.std / loss_size.value, "#.2g", 100.0
     )
-    value_cells = (value_cell, std_cell, relative_std, low_cell, high_cell)
+    value_cells = (value_cell, std_cell, relative_std_cell, low_cell, high_cell)
     return (
         loss_factor.damping,
         loss_symbol,

@@ -82,14 +82,14 @@ _WIDE_CHART_SIZE: Final = (1280.0, 350.0)
 _NARROW_CHART_SIZE: Final = (640.0, 262.0)
 """Width and height of a page's narrow charts, in points, for a window of 1280 × 800."""
 
-_LINES_BY_WEIGHTING: Final[dict[str, tuple[Color, float]]] = {
+_LINE_STYLE_BY_WEIGHTING: Final[dict[str, tuple[Color, float]]] = {
     "const": (ORANGE, 3.0),
     "omega": (VERMILION, 1.5),
 }
 """Colour and width of a model's line by its weighting.
 
 The narrower line lies over the wider one, because the two models are often alike."""
-_FURTHER_LINES: Final = ((PURPLE, 1.5), (GREEN, 1.5), (ORANGE, 1.5))
+_FURTHER_LINE_STYLES: Final = ((PURPLE, 1.5), (GREEN, 1.5), (ORANGE, 1.5))
 """Colours and widths of the lines for further weightings."""
 _MAX_MODELS_WITH_LONG_LABEL: Final = 2
 """Largest number of models for which the legend of a narrow chart contains the word "weights"."""
@@ -119,7 +119,7 @@ class ChartCurve:
     """
 
     name: str
-    key: LegendEntry
+    legend_entry: LegendEntry
     values: RealArray
     dotted: bool = False
 
@@ -160,12 +160,12 @@ class ChartPage:
 
 def welch_pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
     """Return the charts of the Welch fits: a page for the measured response, and one per type."""
-    level_axis = _magnitude_axis(analysis)
+    magnitude_axis = _magnitude_axis(analysis)
     entry_by_weighting = model_legend_entries(analysis.settings.weightings)
     return (
-        _measured_page(analysis, level_axis),
+        _measured_page(analysis, magnitude_axis),
         *(
-            _type_page(analysis, type_name, level_axis, entry_by_weighting)
+            _type_page(analysis, type_name, magnitude_axis, entry_by_weighting)
             for type_name in analysis.settings.types
         ),
     )
@@ -173,14 +173,14 @@ def welch_pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
 
 def model_legend_entries(weightings: tuple[str, ...]) -> dict[str, LegendEntry]:
     """Return the legend entry (label and line style) of fitted models, by their weighting."""
-    further_lines = cycle(_FURTHER_LINES)
-    entry_by_weighting = {
-        weighting_name: _LINES_BY_WEIGHTING.get(weighting_name) or next(further_lines)
+    further_line_styles = cycle(_FURTHER_LINE_STYLES)
+    line_style_by_weighting = {
+        weighting_name: _LINE_STYLE_BY_WEIGHTING.get(weighting_name) or next(further_line_styles)
         for weighting_name in weightings
     }
     return {
         weighting_name: LegendEntry(f"model, weights {weighting_name}", line_color, line_width)
-        for weighting_name, (line_color, line_width) in entry_by_weighting.items()
+        for weighting_name, (line_color, line_width) in line_style_by_weighting.items()
     }
 
 
@@ -215,7 +215,7 @@ def _draw_page(fit_page: ChartPage, stream: RecordingStream) -> None:
                 stream,
                 curve.name,
                 curve_strips,
-                curve.key,
+                curve.legend_entry,
                 static=True,
                 dotted=curve.dotted,
                 curve_order=curve_order,
@@ -233,14 +233,14 @@ def _draw_text(entity_path: str, markdown_text: str, stream: RecordingStream) ->
 def _page_view(fit_page: ChartPage) -> rrb.Container:
     """Return the tab with the three charts of `fit_page`: a wide one above two narrow ones."""
 
-    def view(graph: Graph) -> rrb.Spatial2DView:
+    def graph_view(graph: Graph) -> rrb.Spatial2DView:
         graph_chart = graph.chart
         return chart_view(graph.title, graph_chart.entity, (graph_chart.width, graph_chart.height))
 
-    return chart_page(*map(view, fit_page.graphs), tab_title=fit_page.title)
+    return chart_page(*map(graph_view, fit_page.graphs), tab_title=fit_page.title)
 
 
-def _measured_page(analysis: WelchAnalysis, level_axis: Axis) -> ChartPage:
+def _measured_page(analysis: WelchAnalysis, magnitude_axis: Axis) -> ChartPage:
     """Return the charts of the measured response for one tab: magnitude, phase and coherence."""
     response, band_hz = analysis.response, analysis.settings.band_hz
     coherence = response.coherence
@@ -256,7 +256,7 @@ def _measured_page(analysis: WelchAnalysis, level_axis: Axis) -> ChartPage:
                     f"{page_entity}/magnitude",
                     _WIDE_CHART_SIZE,
                     band_hz,
-                    level_axis,
+                    magnitude_axis,
                     MEASURED_ENTRY,
                 ),
                 (ChartCurve("measured", MEASURED_ENTRY, magnitude_db(response.response)),),
@@ -292,7 +292,7 @@ def _measured_page(analysis: WelchAnalysis, level_axis: Axis) -> ChartPage:
 def _type_page(
     analysis: WelchAnalysis,
     type_name: str,
-    level_axis: Axis,
+    magnitude_axis: Axis,
     entry_by_weighting: dict[str, LegendEntry],
 ) -> ChartPage:
     """Return the charts of one damping type for one tab: magnitude, phase and residuals."""
@@ -300,7 +300,7 @@ def _type_page(
     legend_entries = [entry_by_weighting[model.fit.weighting] for model in models]
     # Short labels on the narrow charts, because long ones would overlap the axis title.
     label_format = "weights {}" if len(models) <= _MAX_MODELS_WITH_LONG_LABEL else "{}"
-    short_entries = [
+    short_legend_entries = [
         replace(key, label=label_format.format(model.fit.weighting))
         for key, model in zip(legend_entries, models, strict=True)
     ]
@@ -309,11 +309,11 @@ def _type_page(
 
     def model_curves(values_of_model: Callable[[FittedModel], RealArray]) -> list[ChartCurve]:
         return [
-            ChartCurve(_entity_name(model.fit.weighting), key, values_of_model(model))
-            for key, model in zip(legend_entries, models, strict=True)
+            ChartCurve(_entity_name(model.fit.weighting), legend_entry, values_of_model(model))
+            for legend_entry, model in zip(legend_entries, models, strict=True)
         ]
 
-    score_text = "; ".join(
+    fit_error_text = "; ".join(
         f"{model.fit.weighting}: MSE {model.indices.mse:.3g}, WMSE {model.indices.wmse:.3g}"
         for model in models
     )
@@ -321,12 +321,12 @@ def _type_page(
         f"Type {type_name}",
         (
             Graph(
-                f"Magnitude, type {type_name} ({score_text})",
+                f"Magnitude, type {type_name} ({fit_error_text})",
                 response_chart(
                     f"{page_entity}/magnitude",
                     _WIDE_CHART_SIZE,
                     band_hz,
-                    level_axis,
+                    magnitude_axis,
                     MEASURED_ENTRY,
                     *legend_entries,
                 ),
@@ -343,7 +343,7 @@ def _type_page(
                     band_hz,
                     PHASE_AXIS,
                     MEASURED_ENTRY,
-                    *short_entries,
+                    *short_legend_entries,
                 ),
                 (
                     ChartCurve("measured", MEASURED_ENTRY, phase_deg(measured_frf), dotted=True),
@@ -356,9 +356,9 @@ def _type_page(
                     f"{page_entity}/residual",
                     _NARROW_CHART_SIZE,
                     band_hz,
-                    level_axis,
+                    magnitude_axis,
                     _MEASURED_MAGNITUDE_ENTRY,
-                    *short_entries,
+                    *short_legend_entries,
                 ),
                 (
                     ChartCurve("measured", _MEASURED_MAGNITUDE_ENTRY, magnitude_db(measured_frf)),
@@ -437,7 +437,7 @@ _PLOTS_OVER_TIME: Final = (
         ("measured (N·m)", "model (N·m)"),
         (SKY_BLUE, ORANGE),
         (2.5, 1.0),
-        lambda torque: np.column_stack((torque.measured, torque.modelled)),
+        lambda torque: np.column_stack((torque.measured_nm, torque.modelled_nm)),
     ),
     PlotOverTime(
         f"{RECORD_ENTITY}/residual",
@@ -445,7 +445,7 @@ _PLOTS_OVER_TIME: Final = (
         ("residual (mN·m)",),
         (VERMILION,),
         (1.0,),
-        lambda torque: 1e3 * torque.residual[:, None],
+        lambda torque: 1e3 * torque.residual_nm[:, None],
     ),
 )
 """Plots over time: torque, measured and modelled, and residual."""
@@ -469,9 +469,12 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
         shown_model.band(grid_hz).response,
     )
     band_hz = float(grid_hz[0]), float(grid_hz[-1])
-    level_axis = _axis_of_responses(measured_frf, [model_response])
-    key, curve_name = LegendEntry(shown_model.name.removeprefix("the "), ORANGE, 2.0), "model"
-    short_entry = replace(key, label="model")
+    magnitude_axis = _axis_of_responses(measured_frf, [model_response])
+    legend_entry, curve_name = (
+        LegendEntry(shown_model.name.removeprefix("the "), ORANGE, 2.0),
+        "model",
+    )
+    short_legend_entry = replace(legend_entry, label="model")
     page_entity = f"{RECORD_ENTITY}/response"
     return ChartPage(
         "Response",
@@ -483,13 +486,13 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
                     f"{page_entity}/magnitude",
                     _WIDE_CHART_SIZE,
                     band_hz,
-                    level_axis,
+                    magnitude_axis,
                     MEASURED_ENTRY,
-                    key,
+                    legend_entry,
                 ),
                 (
                     ChartCurve("measured", MEASURED_ENTRY, magnitude_db(measured_frf)),
-                    ChartCurve(curve_name, key, magnitude_db(model_response)),
+                    ChartCurve(curve_name, legend_entry, magnitude_db(model_response)),
                 ),
             ),
             Graph(
@@ -500,11 +503,11 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
                     band_hz,
                     PHASE_AXIS,
                     MEASURED_ENTRY,
-                    short_entry,
+                    short_legend_entry,
                 ),
                 (
                     ChartCurve("measured", MEASURED_ENTRY, phase_deg(measured_frf), dotted=True),
-                    ChartCurve(curve_name, key, phase_deg(model_response)),
+                    ChartCurve(curve_name, legend_entry, phase_deg(model_response)),
                 ),
             ),
             Graph(
@@ -513,13 +516,15 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
                     f"{page_entity}/residual",
                     _NARROW_CHART_SIZE,
                     band_hz,
-                    level_axis,
+                    magnitude_axis,
                     _MEASURED_MAGNITUDE_ENTRY,
-                    short_entry,
+                    short_legend_entry,
                 ),
                 (
                     ChartCurve("measured", _MEASURED_MAGNITUDE_ENTRY, magnitude_db(measured_frf)),
-                    ChartCurve(curve_name, key, magnitude_db(measured_frf - model_response)),
+                    ChartCurve(
+                        curve_name, legend_entry, magnitude_db(measured_frf - model_response)
+                    ),
                 ),
             ),
         ),
@@ -555,14 +560,14 @@ def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container
     """Return the tab of the whole record, which contains tabs for verdict, response and torque."""
     import rerun.blueprint as rrb
 
-    end_s = float(whole_record.record.time_s[-1])
+    session_end_s = float(whole_record.record.time_s[-1])
     return rrb.Tabs(
         rrb.TextDocumentView(name=VERDICT_TITLE, origin=VERDICT_ENTITY),
         _page_view(record_page(whole_record)),
         rrb.Vertical(
             *(
                 _time_plot_view(
-                    time_plot, end_s, float(np.abs(time_plot.compute_values(torque)).max())
+                    time_plot, session_end_s, float(np.abs(time_plot.compute_values(torque)).max())
                 )
                 for time_plot in _PLOTS_OVER_TIME
             ),
@@ -573,14 +578,14 @@ def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container
 
 
 def _time_plot_view(
-    time_plot: PlotOverTime, end_s: float, largest_value: float
+    time_plot: PlotOverTime, session_end_s: float, largest_value: float
 ) -> rrb.TimeSeriesView:
     """Return the view of a plot that always shows the whole session, at any current time."""
     import rerun as rr
     import rerun.blueprint as rrb
 
     start_boundary = rrb.TimeRangeBoundary.absolute(seconds=0.0)
-    end_boundary = rrb.TimeRangeBoundary.absolute(seconds=end_s)
+    end_boundary = rrb.TimeRangeBoundary.absolute(seconds=session_end_s)
     series_style = rr.SeriesLines(
         names=time_plot.names,
         colors=time_plot.colors,
@@ -649,7 +654,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
 
         torque = torque_in_band(
             whole_record.record,
-            ShownModel.from_headline(whole_record.headline, whole_record.record).transfer,
+            ShownModel.from_headline(whole_record.headline, whole_record.record).transfer_function,
             whole_record.band_hz[1],
         )
         result_tabs.append(record_tab(whole_record, torque))

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-_MOST_NAMES: Final = 3
+_MAX_NAMED_FILES: Final = 3
 """Number of files that a shared warning names."""
 
 
@@ -45,14 +45,14 @@ def shared_warnings(files: Sequence[FileWarnings]) -> list[str]:
         warning and a few of their names.
     """
     names_by_text: dict[str, dict[int, str]] = {}
-    for index, file in enumerate(files):
+    for file_index, file in enumerate(files):
         for sentence in file.warnings:
             # What differs by the path of the file alone is the same warning.
-            text = sentence.replace(f"{file.path}: ", "")
-            names_by_text.setdefault(text, {})[index] = file.name
+            warning_text = sentence.replace(f"{file.path}: ", "")
+            names_by_text.setdefault(warning_text, {})[file_index] = file.name
     return [
-        f"{_files_text(list(names.values()), len(files))}: {text}"
-        for text, names in names_by_text.items()
+        f"{_files_text(list(names.values()), len(files))}: {warning_text}"
+        for warning_text, names in names_by_text.items()
     ]
 
 
@@ -62,8 +62,8 @@ def _files_text(names: Sequence[str], file_count: int) -> str:
         return names[0]
     if len(names) == file_count:
         return f"all {file_count} files"
-    named_files = ", ".join(names[:_MOST_NAMES])
-    unnamed_count = len(names) - _MOST_NAMES
+    named_files = ", ".join(names[:_MAX_NAMED_FILES])
+    unnamed_count = len(names) - _MAX_NAMED_FILES
     return (
         f"{len(names)} of {file_count} files ({named_files}"
         f"{f' and {unnamed_count} more' if unnamed_count > 0 else ''})"

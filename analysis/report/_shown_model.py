@@ -32,7 +32,7 @@ class ShownModel:
         Name of the model in captions.
     modal : ModalFit or None
         Modal model; None if no mode is visible.
-    beam : RecordFit
+    beam_fit : RecordFit
         Fit of the beam, which is shown if there is no modal model.
     modes : tuple of ModeEstimate
         Modes that are visible in the record.
@@ -42,7 +42,7 @@ class ShownModel:
 
     name: str
     modal: ModalFit | None
-    beam: RecordFit
+    beam_fit: RecordFit
     modes: tuple[ModeEstimate, ...]
     stated_delay_s: float
 
@@ -62,20 +62,20 @@ class ShownModel:
             if headline.modal is None
             else "the modal model",
             modal=headline.modal,
-            beam=headline.fit,
+            beam_fit=headline.fit,
             modes=shown_modes(headline),
             stated_delay_s=record.torque_delay_s - record.angle_delay_s,
         )
 
     @property
-    def transfer(self) -> Plant | ModalModel:
+    def transfer_function(self) -> Plant | ModalModel:
         """Transfer function from angle to torque: the modal model, or the beam's plant."""
-        return self.beam.plant if self.modal is None else self.modal.model
+        return self.beam_fit.plant if self.modal is None else self.modal.model
 
     @property
     def residual(self) -> NDArray[np.complex128]:
         """Whitened residual of the displayed model, shape (K,)."""
-        return self.beam.residual if self.modal is None else self.modal.residual
+        return self.beam_fit.residual if self.modal is None else self.modal.residual
 
     @property
     def delay_s(self) -> float:
@@ -83,7 +83,7 @@ class ShownModel:
 
         For a beam model it was fitted, for a modal model it is the one that the file states.
         """
-        return self.beam.parameters["delay_s"] if self.modal is None else self.stated_delay_s
+        return self.beam_fit.parameters["delay_s"] if self.modal is None else self.stated_delay_s
 
     def band(self, frequency_hz: RealArray) -> ResponseBand:
         """Return the model's response without the delay, with its 95 % band.
@@ -94,7 +94,7 @@ class ShownModel:
             Frequencies, positive.
         """
         if self.modal is None:
-            return response_band(self.beam, frequency_hz)
+            return response_band(self.beam_fit, frequency_hz)
         return modal_response_band(self.modal, frequency_hz, self.delay_s)
 
     def analysis_of_residual(self, analysis: RecordAnalysis) -> RecordAnalysis:
@@ -117,7 +117,7 @@ class ShownModel:
         analysis : RecordAnalysis
             Analysis of the record.
         """
-        fit = self.beam if self.modal is None else self.modal
+        fit = self.beam_fit if self.modal is None else self.modal
         return self.analysis_of_residual(analysis).fit_percent(fit)
 
 

@@ -102,7 +102,7 @@ def shade_intervals(axes: Axes, intervals: tuple[RecordInterval, ...]) -> None:
         )  # fmt: skip
 
 
-def set_up_detail(axes: Axes, interval_number: int, interval: RecordInterval) -> None:
+def set_up_detail_axes(axes: Axes, interval_number: int, interval: RecordInterval) -> None:
     """Set the title (with the interval's number) and the time axis of an enlarged panel."""
     axes.set_title(f"{interval_number}  {interval.name}", fontsize=8.5, fontweight="normal")
     axes.set_xlim(interval.first_s, interval.last_s)
@@ -113,13 +113,13 @@ def set_up_detail(axes: Axes, interval_number: int, interval: RecordInterval) ->
 class TorqueInBand:
     """Measured and modelled coupling torque in the band of a fit, in N·m, shape (n,) each."""
 
-    measured: NDArray[np.float64]
-    modelled: NDArray[np.float64]
+    measured_nm: NDArray[np.float64]
+    modelled_nm: NDArray[np.float64]
 
     @property
-    def residual(self) -> NDArray[np.float64]:
+    def residual_nm(self) -> NDArray[np.float64]:
         """Measured minus modelled torque in N·m, shape (n,)."""
-        return self.measured - self.modelled
+        return self.measured_nm - self.modelled_nm
 
 
 def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float) -> TorqueInBand:
@@ -128,18 +128,20 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
     The modelled torque is computed from the measured angle. At higher frequencies the measured
     torque is noise, and the modelled torque is due to the encoder's quantisation.
     """
-    angle = Measurement.from_record(record).angle_from_rest(highest_hz)
+    angle_rad = Measurement.from_record(record).angle_from_rest(highest_hz)
     band_hz = (0.0, highest_hz)
     # Followed by its mirror image, the angle has no step at its end, to which the model would
     # respond before it in so narrow a band.
-    mirrored_angle = np.concatenate([angle, angle[::-1]])
+    mirrored_angle_rad = np.concatenate([angle_rad, angle_rad[::-1]])
     modelled_nm, _ = TorquePredictor(
-        band_limited(mirrored_angle, record.rate_hz, band_hz), record.rate_hz, slice(0, angle.size)
+        band_limited(mirrored_angle_rad, record.rate_hz, band_hz),
+        record.rate_hz,
+        slice(0, angle_rad.size),
     ).torque(plant)
     offset_nm = float(np.mean(record.torque_nm - modelled_nm))
     return TorqueInBand(
-        measured=band_limited(record.torque_nm - offset_nm, record.rate_hz, band_hz),
-        modelled=modelled_nm,
+        measured_nm=band_limited(record.torque_nm - offset_nm, record.rate_hz, band_hz),
+        modelled_nm=modelled_nm,
     )
 
 
@@ -149,8 +151,8 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
     Panels below enlarge the torques and their difference at each mode of the model. `highest_hz` is
     the highest frequency of the fit's band.
     """
-    shown_torque = torque_in_band(record, model.transfer, highest_hz)
-    record_of_fitted_beam = replace(record, beam=model.beam.plant.beam)
+    shown_torque = torque_in_band(record, model.transfer_function, highest_hz)
+    record_of_fitted_beam = replace(record, beam=model.beam_fit.plant.beam)
     mode_by_number = {mode.number: mode for mode in model.modes}
     intervals = tuple(
         replace(
@@ -175,15 +177,15 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
         (1e3 * record.angle_rad, _ANGLE_LINE | {"color": style.PURPLE, "label": "measured angle"}),
     )
     torque_lines = (
-        (shown_torque.measured, _MEASURED_LINE | {"label": "measured torque"}),
-        (shown_torque.modelled, _MODELLED_LINE | {"label": "modelled torque"}),
+        (shown_torque.measured_nm, _MEASURED_LINE | {"label": "measured torque"}),
+        (shown_torque.modelled_nm, _MODELLED_LINE | {"label": "modelled torque"}),
     )
     _draw_whole_record(angle_axes, record, angle_lines, "Motor angle", _ANGLE_LABEL, title_pad=14)
     _draw_whole_record(torque_axes, record, torque_lines, "Coupling torque", _TORQUE_LABEL)
     _draw_whole_record(
         residual_axes,
         record,
-        ((shown_torque.residual, _RESIDUAL_LINE),),
+        ((shown_torque.residual_nm, _RESIDUAL_LINE),),
         _RESIDUAL_TITLE,
         _TORQUE_LABEL,
     )
@@ -191,7 +193,7 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
     for axes in (angle_axes, torque_axes, residual_axes):
         axes.tick_params(labelbottom=axes is residual_axes)
     shade_intervals(angle_axes, intervals)
-    detail_signals = (shown_torque.measured, shown_torque.modelled, shown_torque.residual)
+    detail_signals = (shown_torque.measured_nm, shown_torque.modelled_nm, shown_torque.residual_nm)
     for panel_number, interval in enumerate(intervals):
         axes = figure.add_subplot(grid[1, panel_number])
         axes.xaxis.set_major_locator(MaxNLocator(4))
@@ -253,7 +255,7 @@ def _draw_whole_record(
         axes.plot(*style.envelope(record.time_s, signal_values), **line_style)
     axes.set_title(panel_title, pad=title_pad)
     axes.set_ylabel(axis_label)
-    axes.set_ylim(style.limits(*(signal_values for signal_values, _ in signal_list)))
+    axes.set_ylim(style.axis_limits(*(signal_values for signal_values, _ in signal_list)))
     axes.set_xlim(record.time_s[0], record.time_s[-1])
 
 
@@ -268,7 +270,7 @@ def _draw_detail(
     """Draw signals in the enlarged panel of one interval. The first panel of a row has a legend."""
     for signal_values, line_style in styled_signals:
         axes.plot(record.time_s[interval.samples], signal_values[interval.samples], **line_style)
-    set_up_detail(axes, panel_number + 1, interval)
+    set_up_detail_axes(axes, panel_number + 1, interval)
     if panel_number == 0:
         axes.set_ylabel(axis_label)
 
@@ -302,8 +304,8 @@ def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
         angle_axes, record, angle_lines, "(a) Motor angle", _ANGLE_LABEL, title_pad=14
     )
     angle_axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.07), ncols=2, borderaxespad=0.0)
-    green_line = {"color": style.GREEN}
-    torque_lines = ((record.torque_nm, _ANGLE_LINE | green_line),)
+    green_line_style = {"color": style.GREEN}
+    torque_lines = ((record.torque_nm, _ANGLE_LINE | green_line_style),)
     _draw_whole_record(
         torque_axes, record, torque_lines, "(b) Coupling torque", _TORQUE_LABEL, title_pad=14
     )
@@ -320,7 +322,7 @@ def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
             angle_detail_axes, record, detail_angle_lines, panel_number, interval, _ANGLE_LABEL
         )
         torque_detail_axes = figure.add_subplot(grid[3, panel_number])
-        line_style = green_line | {"linewidth": 0.9}
+        line_style = green_line_style | {"linewidth": 0.9}
         _draw_detail(
             torque_detail_axes,
             record,

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from analysis.results import FigureFormat
 
     # Image files of a figure by their formats.
-    Images = dict[FigureFormat, bytes]
+    ImageByFormat = dict[FigureFormat, bytes]
 
 # This hides messages about the font cache, which is slow to build or is being built by another
 # process. They affect no figure and mean nothing to the reader of a log.
@@ -200,7 +200,7 @@ def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
     return image_buffer.getvalue()
 
 
-def save(figure: Figure, path: Path) -> bytes:
+def save_figure(figure: Figure, path: Path) -> bytes:
     """Write a figure in the format of the file's suffix; call it within `figure_style`.
 
     Return the content of the file. Raise `OutputError` if the file exists or cannot be written.
@@ -293,20 +293,20 @@ def _draw_in_two_processes(
     illustrations: Sequence[Illustration],
     formats: Collection[FigureFormat],
     on_step: Callable[[str], None],
-) -> dict[str, Images]:
+) -> dict[str, ImageByFormat]:
     """Return the image files of each figure by its name; a copy of the process draws half."""
     own_illustrations, copied_illustrations = illustrations[::2], illustrations[1::2]
-    images: dict[str, Images] = {}
-    computation = (
+    images: dict[str, ImageByFormat] = {}
+    background_drawing = (
         computed_in_parallel(
-            lambda: {each.name: _images(each, formats) for each in copied_illustrations}
+            lambda: {each.name: _draw_images(each, formats) for each in copied_illustrations}
         )
         if copied_illustrations
         else nullcontext(dict)
     )
-    with computation as other_images:
+    with background_drawing as other_images:
         for illustration in own_illustrations:
-            images[illustration.name] = _images(illustration, formats)
+            images[illustration.name] = _draw_images(illustration, formats)
             on_step(f"figure {illustration.name}")
         images |= other_images()
     for illustration in copied_illustrations:
@@ -314,11 +314,11 @@ def _draw_in_two_processes(
     return images
 
 
-def _images(illustration: Illustration, formats: Collection[FigureFormat]) -> Images:
+def _draw_images(illustration: Illustration, formats: Collection[FigureFormat]) -> ImageByFormat:
     """Return a figure's images by file format: the requested ones, and one for the page."""
     with figure_style():
         figure = illustration.draw()
-        rendered_images: Images = {
+        rendered_images: ImageByFormat = {
             file_format: render_figure(figure, file_format) for file_format in formats
         }
         if not {"svg", "png"} & rendered_images.keys():
@@ -365,7 +365,7 @@ def log_spaced_indices(x: NDArray[np.float64], max_indices: int) -> NDArray[np.i
     return np.unique(np.clip(np.searchsorted(x, spaced_values), 0, len(x) - 1))
 
 
-def dots(
+def draw_dots(
     axes: Axes,
     x: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -388,7 +388,9 @@ def dots(
     )
 
 
-def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, with_labels: bool = True) -> None:
+def set_frequency_axis(
+    axes: Axes, band_hz: tuple[float, float], *, with_labels: bool = True
+) -> None:
     """Make the horizontal axis a logarithmic frequency axis, with labels at 1, 2 and 5."""
     axes.set_xscale("log")
     axes.set_xlim(band_hz)
@@ -402,7 +404,7 @@ def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, with_labels: boo
     axes.tick_params(axis="x", which="both", labelbottom=with_labels)
 
 
-def response_axes(magnitude_axes: Axes, phase_axes: Axes, *, with_labels: bool = True) -> None:
+def set_response_axes(magnitude_axes: Axes, phase_axes: Axes, *, with_labels: bool = True) -> None:
     """Label the axes of a frequency response, and set the range of the phase axis.
 
     The phase of the response from angle to torque is from 0 to 180°, well inside this range.
@@ -433,9 +435,9 @@ def type_panels(
         )
         magnitude_axes.set_title(f"({ascii_lowercase[panel_number]}) Type {type_name}   {symbols}")
         magnitude_axes.set_ylim(db_limits)
-        response_axes(magnitude_axes, phase_axes, with_labels=panel_column == 0)
-        frequency_axis(magnitude_axes, band_hz, with_labels=False)
-        frequency_axis(
+        set_response_axes(magnitude_axes, phase_axes, with_labels=panel_column == 0)
+        set_frequency_axis(magnitude_axes, band_hz, with_labels=False)
+        set_frequency_axis(
             phase_axes, band_hz, with_labels=panel_number >= len(type_names) - grid_cells.ncols
         )
         for axes in (magnitude_axes, phase_axes):
@@ -459,7 +461,7 @@ def db_limits(
     return low_db, min(max(top_db, peaks_db), top_db + 15.0) + headroom_db
 
 
-def legend(
+def add_legend(
     figure: Figure,
     legend_handles: Sequence[Artist],
     legend_labels: Sequence[str] | None = None,
@@ -475,7 +477,7 @@ def legend(
     )  # fmt: skip
 
 
-def limits(*signal_arrays: NDArray[np.float64]) -> tuple[float, float]:
+def axis_limits(*signal_arrays: NDArray[np.float64]) -> tuple[float, float]:
     """Return axis limits with a margin around the values of all signals.
 
     The limits differ even if all values are equal.

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from analysis.results import RecordResult, WholeRecord
     from rigd.estimates import Estimate, ReportedMode
 
-_WIDTH_CHARACTERS: Final = 120
+_TERMINAL_WIDTH_CHARACTERS: Final = 120
 """Width of plain text in characters."""
 
 
 def as_text(renderable: RenderableType) -> str:
     """Return one of Rich's renderables as plain text."""
-    console = Console(width=_WIDTH_CHARACTERS, color_system=None, force_terminal=False)
+    console = Console(width=_TERMINAL_WIDTH_CHARACTERS, color_system=None, force_terminal=False)
     with console.capture() as console_capture:
         console.print(renderable)
     return console_capture.get()

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from analysis.touch import SessionTouches, Touch
     from rigd.touch import TouchEstimate
 
-_SHOWN_BEFORE_MS: Final = 25.0
+_SHOWN_BEFORE_TOUCH_MS: Final = 25.0
 """Time that is shown before a touch, in milliseconds."""
-_SHOWN_AFTER_MS: Final = 100.0
+_SHOWN_AFTER_TOUCH_MS: Final = 100.0
 """Time that is shown after a touch, in milliseconds."""
 _MIN_LOG_LIKELIHOOD_RANGE: Final = 40.0
 """Least range of the log-likelihood's axis."""
@@ -36,10 +36,10 @@ _SESSION_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE
 
 def touch_illustrations(sessions: Sequence[SessionTouches]) -> Iterator[Illustration]:
     """Yield a map of all contacts and a figure of each touch."""
-    if any(touch.point_m is not None for session in sessions for touch in session.touches):
+    if any(touch.contact_point_m is not None for session in sessions for touch in session.touches):
         yield Illustration(
             "map",
-            partial(map_figure, sessions),
+            partial(contact_map_figure, sessions),
             "Points of contact as seen from above, with their 95 % intervals (hollow: kind of "
             "contact not identifiable); the antenna (grey) as it was bent at each touch, from the "
             "motor's axis (black). The angle is zero along x.",
@@ -68,7 +68,7 @@ def touch_figure(touch: Touch, estimate: TouchEstimate) -> Figure:
     left_grid = grid[0].subgridspec(2, 1, hspace=0.42)
     right_grid = grid[1].subgridspec(channel_count, 1, hspace=0.28)
     _draw_likelihood(figure.add_subplot(left_grid[0]), estimate)
-    touch_time_s = touch.noticed_s if estimate.time_s is None else estimate.time_s.value
+    touch_time_s = touch.detection_time_s if estimate.time_s is None else estimate.time_s.value
     _draw_force(figure.add_subplot(left_grid[1]), estimate, touch_time_s)
     for row, channel_name in zip(range(channel_count), ("Torque", "Base shear"), strict=False):
         panel_axes = figure.add_subplot(right_grid[row])
@@ -101,7 +101,7 @@ def _draw_force(axes: Axes, estimate: TouchEstimate, touch_time_s: float) -> Non
     axes.plot(times_ms, estimate.force_history_n, color=style.VERMILION)
     if not estimate.force_history_n.size:
         axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", color=style.GREY)
-    axes.set_xlim(-_SHOWN_BEFORE_MS, _SHOWN_AFTER_MS)
+    axes.set_xlim(-_SHOWN_BEFORE_TOUCH_MS, _SHOWN_AFTER_TOUCH_MS)
     axes.set_ylim(bottom=0.0)
     axes.set_title("Contact force")
     axes.set_ylabel("Magnitude (N)")
@@ -129,7 +129,7 @@ def _draw_innovations(
     )
     axes.set_ylim(-axis_limit, axis_limit)
     axes.yaxis.set_major_formatter(lambda value, _position: f"{value:g}".replace("-", "−"))
-    axes.set_xlim(-_SHOWN_BEFORE_MS, _SHOWN_AFTER_MS)
+    axes.set_xlim(-_SHOWN_BEFORE_TOUCH_MS, _SHOWN_AFTER_TOUCH_MS)
     axes.set_title(f"{channel_name}: innovations")
     axes.set_ylabel("Standard deviations")
 
@@ -137,29 +137,34 @@ def _draw_innovations(
 # Map
 
 
-def map_figure(session_touches: Sequence[SessionTouches]) -> Figure:
+def contact_map_figure(session_touches: Sequence[SessionTouches]) -> Figure:
     """Draw the points of contact of all sessions as seen from above.
 
     Each session has at least one contact point.
     """
     contact_points_m = np.array(
-        [t.point_m for session in session_touches for t in session.touches if t.point_m is not None]
+        [
+            t.contact_point_m
+            for session in session_touches
+            for t in session.touches
+            if t.contact_point_m is not None
+        ]
     )
     length_m = max(session.model.plant.beam.length_m for session in session_touches)
-    spread_m = float(np.ptp(contact_points_m, axis=0).max())
-    has_detail = spread_m < _MAX_DETAIL_FRACTION * length_m
+    contact_spread_m = float(np.ptp(contact_points_m, axis=0).max())
+    has_detail = contact_spread_m < _MAX_DETAIL_FRACTION * length_m
     figure = style.new_figure(9.0, 4.6)
     grid = figure.add_gridspec(
         1, 1 + has_detail, left=0.075, right=0.97, top=0.93, bottom=0.1, wspace=0.22
     )
     overview_axes = figure.add_subplot(grid[0])
-    _draw_map(overview_axes, session_touches, with_numbers=not has_detail)
+    _draw_contact_map(overview_axes, session_touches, with_numbers=not has_detail)
     overview_axes.plot(0.0, 0.0, "o", color=style.INK, markersize=7)
     overview_axes.set_aspect("equal", adjustable="datalim")
     overview_axes.set_title("Seen from above")
     if has_detail:
         detail_axes = figure.add_subplot(grid[1])
-        _draw_map(detail_axes, session_touches, with_numbers=True)
+        _draw_contact_map(detail_axes, session_touches, with_numbers=True)
         interval_ends_m = np.concatenate(
             [
                 t.interval_ends_m
@@ -183,28 +188,32 @@ def map_figure(session_touches: Sequence[SessionTouches]) -> Figure:
     return figure
 
 
-def _draw_map(axes: Axes, sessions: Sequence[SessionTouches], *, with_numbers: bool) -> None:
+def _draw_contact_map(
+    axes: Axes, sessions: Sequence[SessionTouches], *, with_numbers: bool
+) -> None:
     """Draw the contact points of sessions with their intervals, and the bent antenna."""
     for session_number, session in enumerate(sessions):
         session_color = _SESSION_COLORS[session_number % len(_SESSION_COLORS)]
         session_label: str | None = session.path.stem
         for touch in session.touches:
-            if touch.antenna_m is not None:
-                axes.plot(*touch.antenna_m.T, color=style.LIGHT_GREY, linewidth=1.0, zorder=1)
-            if touch.point_m is None or touch.interval_ends_m is None:
+            if touch.antenna_points_m is not None:
+                axes.plot(
+                    *touch.antenna_points_m.T, color=style.LIGHT_GREY, linewidth=1.0, zorder=1
+                )
+            if touch.contact_point_m is None or touch.interval_ends_m is None:
                 continue
             axes.plot(
                 *touch.interval_ends_m.T, color=session_color, linewidth=2.4, alpha=0.5, zorder=2
             )
             kind_is_known = touch.estimate is not None and touch.estimate.kind != "unknown"
             axes.plot(
-                *touch.point_m, "o", color=session_color, markersize=4, zorder=3,
+                *touch.contact_point_m, "o", color=session_color, markersize=4, zorder=3,
                 label=session_label,
                 markerfacecolor=session_color if kind_is_known else "white",
             )  # fmt: skip
             session_label = None
             if with_numbers:
                 axes.annotate(
-                    str(touch.number), tuple(touch.point_m), xytext=(5, 4),
+                    str(touch.number), tuple(touch.contact_point_m), xytext=(5, 4),
                     textcoords="offset points", fontsize=7.5, color=session_color, clip_on=True,
                 )  # fmt: skip

@@ -37,7 +37,7 @@ _PERCENT: Final = 100.0
 """Factor from fractions to percent."""
 
 
-def _deviations(uniformity_test: UniformBeamTest) -> NDArray[np.float64]:
+def _modal_constant_deviations(uniformity_test: UniformBeamTest) -> NDArray[np.float64]:
     """Return measured minus predicted constants, (modes, 4), phases between -pi and pi."""
     deviations = (uniformity_test.measured - uniformity_test.predicted).reshape(
         -1, len(MODE_CONSTANT_NAMES)
@@ -53,7 +53,7 @@ def uniformity_figure(uniformity_test: UniformBeamTest) -> Figure:
     The test has at least one degree of freedom.
     """
     constant_deviations, std = (
-        _deviations(uniformity_test),
+        _modal_constant_deviations(uniformity_test),
         uniformity_test.std.reshape(-1, len(MODE_CONSTANT_NAMES)),
     )
     figure = style.new_figure(9.0, 4.0)
@@ -136,7 +136,7 @@ def uniformity_description(uniformity_test: UniformBeamTest) -> str:
 def uniformity_table(uniformity_test: UniformBeamTest) -> Table:
     """Return the table of measured and predicted modal constants with their deviations."""
     table_rows: list[tuple[Entry, ...]] = []
-    constant_deviations = _deviations(uniformity_test).ravel()
+    constant_deviations = _modal_constant_deviations(uniformity_test).ravel()
     for constant_index, (measured_value, std, predicted_value, deviation) in enumerate(
         zip(
             uniformity_test.measured.tolist(), uniformity_test.std.tolist(),

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _BLOCK_BINS: Final = 24
 """Number of frequency bins in a block, whose mean power decides whether the block was excited."""
-_EXCITED_TO_NOISE_POWER: Final = 4.0
+_MIN_POWER_TO_NOISE_RATIO: Final = 4.0
 """Ratio of a block's mean power to the noise's power, above which the block counts as excited.
 
 By chance the ratio exceeds 2 in one of 10 000 blocks."""
@@ -92,7 +92,7 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
     bins_in_full_blocks = power_over_noise.size - power_over_noise.size % _BLOCK_BINS
     excited_blocks = np.flatnonzero(
         power_over_noise[:bins_in_full_blocks].reshape(-1, _BLOCK_BINS).mean(axis=1)
-        > _EXCITED_TO_NOISE_POWER
+        > _MIN_POWER_TO_NOISE_RATIO
     )
     if excited_blocks.size == 0:
         return None
@@ -264,13 +264,13 @@ def response_band(fit: FittedPlant, frequency_hz: RealArray) -> ResponseBand:
     for gradient_row, parameter_name, response_derivative in zip(
         log_response_gradient, parameter_names, derivatives, strict=True
     ):
-        scale_by_value = (
+        is_scaled_by_value = (
             parameter_name in LOGARITHMIC_PARAMETERS
             and gradient_name(parameter_name) == parameter_name
         )
         gradient_row[:] = (
             response_derivative
-            * (fit.parameters[parameter_name] if scale_by_value else 1.0)
+            * (fit.parameters[parameter_name] if is_scaled_by_value else 1.0)
             / response
         )
     covariance = fit.covariance[np.ix_(parameter_indices, parameter_indices)]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from analysis.campaigns import CampaignResult
-    from analysis.report._page import Facts
+    from analysis.report._page import FactGroup
     from analysis.report._style import Illustration, Picture
     from analysis.results import FigureFormat
 
@@ -66,7 +66,7 @@ def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
 
 
 def campaign_tables(
-    campaign: CampaignResult, *, with_paper: bool = False, verbose: bool = True
+    campaign: CampaignResult, *, with_paper_values: bool = False, verbose: bool = True
 ) -> RenderableType:
     """Return a campaign's verdict, its tables and its warnings, for the terminal.
 
@@ -74,11 +74,11 @@ def campaign_tables(
     ----------
     campaign : CampaignResult
         Results of all sessions.
-    with_paper : bool
+    with_paper_values : bool
         Whether the paper's own numbers are included.
     verbose : bool
         Whether all tables are included. Otherwise only the verdict, the pooled modes and
-        parameters, and with `with_paper` the tables of the paper.
+        parameters, and with `with_paper_values` the tables of the paper.
     """
     text_parts: list[RenderableType] = []
     all_sentences = campaign_sentences(campaign)
@@ -90,8 +90,8 @@ def campaign_tables(
             text_parts += [Text(f"  {advice_text}") for advice_text in campaign.verdict.experiments]
         text_parts.append("")
     text_parts += with_empty_lines(shown_tables(campaign) if verbose else main_tables(campaign))
-    if verbose or with_paper or campaign.headline is None:
-        text_parts += with_empty_lines(paper_tables(campaign, with_paper=with_paper))
+    if verbose or with_paper_values or campaign.headline is None:
+        text_parts += with_empty_lines(paper_tables(campaign, with_paper_values=with_paper_values))
     text_parts += warning_lines(_session_warnings(campaign))
     return Group(*text_parts)
 
@@ -106,18 +106,20 @@ def _session_warnings(campaign: CampaignResult) -> list[str]:
     )
 
 
-def campaign_text(campaign: CampaignResult, *, with_paper: bool = False) -> str:
+def campaign_text(campaign: CampaignResult, *, with_paper_values: bool = False) -> str:
     """Return a campaign's tables as plain text, with a list of the files that were excluded.
 
     Parameters
     ----------
     campaign : CampaignResult
         Results of all sessions.
-    with_paper : bool
+    with_paper_values : bool
         Whether the paper's own numbers are included.
     """
-    left_out = (Text(f"Left out: {failure.message}") for failure in campaign.failures)
-    return as_text(Group(campaign_tables(campaign, with_paper=with_paper), *left_out))
+    left_out_lines = (Text(f"Left out: {failure.message}") for failure in campaign.failures)
+    return as_text(
+        Group(campaign_tables(campaign, with_paper_values=with_paper_values), *left_out_lines)
+    )
 
 
 # Page
@@ -128,7 +130,11 @@ correspond to the reference paper's."""
 
 
 def campaign_page(
-    campaign: CampaignResult, pictures: Sequence[Picture], made_at: datetime, *, with_paper: bool
+    campaign: CampaignResult,
+    pictures: Sequence[Picture],
+    made_at: datetime,
+    *,
+    with_paper_values: bool,
 ) -> str:
     """Return the HTML page with the results of a campaign.
 
@@ -140,7 +146,7 @@ def campaign_page(
         Figures of the campaign.
     made_at : datetime
         Date and time of the report, with a time zone.
-    with_paper : bool
+    with_paper_values : bool
         Whether the paper's own numbers are included.
 
     Returns
@@ -148,7 +154,7 @@ def campaign_page(
     str
         HTML document that refers to no other files.
     """
-    from analysis.report._page import page, versions
+    from analysis.report._page import page, version_facts
 
     session_paths = [session.path for session in campaign.sessions]
     all_sentences = campaign_sentences(campaign)
@@ -166,8 +172,8 @@ def campaign_page(
         paper_pictures=[
             picture for picture in pictures if picture.name not in _WHOLE_RECORD_FIGURES
         ],
-        paper_tables=paper_tables(campaign, with_paper=with_paper),
-        how=[*_collect_facts(campaign), versions(made_at)],
+        paper_tables=paper_tables(campaign, with_paper_values=with_paper_values),
+        how=[*_collect_facts(campaign), version_facts(made_at)],
     )
 
 
@@ -183,7 +189,7 @@ def _warning_texts(campaign: CampaignResult) -> list[str]:
     ]
 
 
-def _collect_facts(campaign: CampaignResult) -> list[Facts]:
+def _collect_facts(campaign: CampaignResult) -> list[FactGroup]:
     """Return groups of facts on specimen and estimators, for the HTML page."""
     settings, (first_hz, last_hz) = campaign.settings, campaign.record_band_hz
     stated_beam = campaign.sessions[0].beam
@@ -256,7 +262,7 @@ def write_campaign(
     campaign: CampaignResult,
     folder: Path,
     *,
-    with_paper: bool = False,
+    with_paper_values: bool = False,
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
     on_step: Callable[[str], None] = lambda _done: None,
 ) -> None:
@@ -271,7 +277,7 @@ def write_campaign(
         Results of all sessions.
     folder : Path
         Existing folder that contains none of these files.
-    with_paper : bool
+    with_paper_values : bool
         Whether the paper's own numbers are included.
     formats : sequence of str
         Formats of the figures.
@@ -287,23 +293,25 @@ def write_campaign(
 
     illustrations = list(_illustrations(campaign))
     pictures = save_pictures(illustrations, folder / "figures", formats, on_step)
-    for table_name, report_table in all_tables(campaign, with_paper=with_paper).items():
+    for table_name, report_table in all_tables(
+        campaign, with_paper_values=with_paper_values
+    ).items():
         write_new(folder / "tables" / f"{table_name}.csv", csv_text(report_table))
-    document_json = document_text(campaign_document(campaign, with_paper=with_paper))
+    document_json = document_text(campaign_document(campaign, with_paper_values=with_paper_values))
     write_new(folder / "campaign.json", document_json)
-    write_new(folder / "tables.txt", campaign_text(campaign, with_paper=with_paper))
+    write_new(folder / "tables.txt", campaign_text(campaign, with_paper_values=with_paper_values))
     made_at = datetime.now().astimezone()
-    page_html = campaign_page(campaign, pictures, made_at, with_paper=with_paper)
+    page_html = campaign_page(campaign, pictures, made_at, with_paper_values=with_paper_values)
     write_new(folder / "report.html", page_html)
 
 
 def _illustrations(campaign: CampaignResult) -> Iterator[Illustration]:
     """Yield the figures of a campaign's report, except those for which there are no data."""
     from analysis.report._campaign_figures import (
-        best_figure,
-        index_figure,
-        nominal_figure,
-        pooled_figure,
+        best_models_figure,
+        fit_index_figure,
+        nominal_models_figure,
+        pooled_parameters_figure,
         validation_figure,
     )
     from analysis.report._pooled_figures import damping_figure, response_figure
@@ -325,7 +333,7 @@ def _illustrations(campaign: CampaignResult) -> Iterator[Illustration]:
         )
         yield Illustration(
             "pooled",
-            partial(pooled_figure, campaign),
+            partial(pooled_parameters_figure, campaign),
             "Whole-record estimate of each session with its 95 % interval, and the pooled one.",
         )
     if campaign.validation:
@@ -343,18 +351,18 @@ def _illustrations(campaign: CampaignResult) -> Iterator[Illustration]:
     )
     yield Illustration(
         "figure6_nominal",
-        partial(nominal_figure, campaign),
+        partial(nominal_models_figure, campaign),
         "Measured responses of all sessions, and the nominal models of each type (Figure 6).",
     )
     yield Illustration(
         "figure7_indices",
-        partial(index_figure, campaign),
+        partial(fit_index_figure, campaign),
         "Mean square error, its weighted kind and maximum deviation of each nominal model "
         "over the sessions (Figure 7).",
     )
     yield Illustration(
         "figure8_best",
-        partial(best_figure, campaign),
+        partial(best_models_figure, campaign),
         "Measured responses of all sessions, and the two best nominal models (Figure 8).",
     )
 

@@ -19,7 +19,7 @@ from rigd.documents import DocumentError, read_json, read_text
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-_LARGEST_LIST_BYTES: Final = 10_000_000
+_MAX_CHECKSUM_LIST_BYTES: Final = 10_000_000
 """Largest size of a list of files that is read, in bytes: a hundred thousand files."""
 CHECKSUM_LIST_NAME: Final = "SHA256SUMS"
 """Name of the file that lists a report's files with their checksums."""
@@ -65,7 +65,7 @@ def report_folders(
         requested_folders = [
             session_file.parent / f"{session_file.stem}.report" for session_file in session_files
         ]
-    elif overwrite or _is_free(report_path):
+    elif overwrite or _is_missing_or_empty(report_path):
         requested_folders = (
             [report_path]
             if len(session_files) == 1
@@ -121,7 +121,7 @@ def check_new_file(path: Path, message_subject: str, *, overwrite: bool = False)
         )
 
 
-def _is_free(folder: Path) -> bool:
+def _is_missing_or_empty(folder: Path) -> bool:
     """Return whether a report can be written to a path: it does not exist or is an empty folder."""
     return not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir()))
 
@@ -188,10 +188,12 @@ def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
             for path in sorted(temporary_folder.rglob("*"))
             if path.is_file()
         }
-        if overwrite and not _is_free(folder):
+        if overwrite and not _is_missing_or_empty(folder):
             _replace_report(folder, temporary_folder, checksums)
             return
-        (temporary_folder / CHECKSUM_LIST_NAME).write_text(_list_text(checksums), encoding="utf-8")
+        (temporary_folder / CHECKSUM_LIST_NAME).write_text(
+            _checksum_list_text(checksums), encoding="utf-8"
+        )
         with suppress(OSError):
             folder.rmdir()  # Windows does not replace a folder, not even an empty one
         try:
@@ -252,7 +254,9 @@ def _replace_file(path: Path, file_bytes: bytes) -> None:
 
 def _require_free_or_report(folder: Path) -> None:
     """Raise OutputExistsError unless a folder is absent, empty or contains an earlier report."""
-    if not _is_free(folder) and not (folder.is_dir() and (folder / CHECKSUM_LIST_NAME).is_file()):
+    if not _is_missing_or_empty(folder) and not (
+        folder.is_dir() and (folder / CHECKSUM_LIST_NAME).is_file()
+    ):
         raise OutputExistsError(
             f"--overwrite replaces reports of an analysis, and {folder} is not one: it has no list "
             f"of its files ({CHECKSUM_LIST_NAME}). Choose another folder with --report, or move "
@@ -264,7 +268,7 @@ def _replace_report(
     folder: Path, temporary_folder: Path, checksums: Mapping[str, set[str]]
 ) -> None:
     """Move a new report's files into an earlier report's folder, and remove the earlier files."""
-    earlier_checksums = _read_list(folder)
+    earlier_checksums = _read_checksum_list(folder)
     for file_name in checksums:
         if os.path.lexists(folder / file_name) and not _is_unchanged_report_file(
             folder, file_name, earlier_checksums
@@ -281,7 +285,7 @@ def _replace_report(
             file_name: earlier_checksums.get(file_name, set()) | checksums.get(file_name, set())
             for file_name in {*earlier_checksums, *checksums}
         }
-        _replace_file(folder / CHECKSUM_LIST_NAME, _list_text(all_checksums).encode())
+        _replace_file(folder / CHECKSUM_LIST_NAME, _checksum_list_text(all_checksums).encode())
         for file_name in checksums:
             (folder / file_name).parent.mkdir(parents=True, exist_ok=True)
             (temporary_folder / file_name).replace(folder / file_name)
@@ -290,7 +294,7 @@ def _replace_report(
                 (folder / file_name).unlink()
                 with suppress(OSError):  # folders that are not empty stay
                     (folder / file_name).parent.rmdir()
-        _replace_file(folder / CHECKSUM_LIST_NAME, _list_text(checksums).encode())
+        _replace_file(folder / CHECKSUM_LIST_NAME, _checksum_list_text(checksums).encode())
     except OSError as error:
         raise OutputError(
             f"The report {folder} cannot be replaced: {error.strerror or error}."
@@ -310,14 +314,16 @@ def _is_unchanged_report_file(
     )
 
 
-def _read_list(folder: Path) -> dict[str, set[str]]:
+def _read_checksum_list(folder: Path) -> dict[str, set[str]]:
     """Return the SHA-256 checksums in the list of a report's folder, by file name.
 
     A file has two checksums if the analysis was interrupted while it replaced the file.
     """
     checksums: dict[str, set[str]] = {}
     try:
-        for list_line in read_text(folder / CHECKSUM_LIST_NAME, _LARGEST_LIST_BYTES).splitlines():
+        for list_line in read_text(
+            folder / CHECKSUM_LIST_NAME, _MAX_CHECKSUM_LIST_BYTES
+        ).splitlines():
             checksum, _, file_name = list_line.partition("  ")
             checksums.setdefault(file_name, set()).add(checksum)
     except DocumentError as error:
@@ -325,7 +331,7 @@ def _read_list(folder: Path) -> dict[str, set[str]]:
     return checksums
 
 
-def _list_text(checksums: Mapping[str, set[str]]) -> str:
+def _checksum_list_text(checksums: Mapping[str, set[str]]) -> str:
     """Return the text of a report's list of files and checksums."""
     return "".join(
         f"{checksum}  {file_name}\n"

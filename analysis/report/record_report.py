@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from analysis.paper.welch_analysis import WelchAnalysis
     from analysis.record import Record
-    from analysis.report._page import Facts
+    from analysis.report._page import FactGroup
     from analysis.report._style import Illustration, Picture
     from analysis.results import FigureFormat, RecordResult, WholeRecord
 
@@ -65,7 +65,7 @@ def record_page(
     str
         HTML document that refers to no other files.
     """
-    from analysis.report._page import page, versions
+    from analysis.report._page import page, version_facts
 
     whole_record = result.whole
     assert whole_record is not None
@@ -95,7 +95,7 @@ def record_page(
         tables=record_tables,
         paper_pictures=paper_pictures,
         paper_tables=paper_tables,
-        how=[*_collect_facts(result, whole_record), versions(made_at)],
+        how=[*_collect_facts(result, whole_record), version_facts(made_at)],
     )
 
 
@@ -132,7 +132,7 @@ _METADATA_SHOWN_ELSEWHERE = frozenset(
 """Keys of metadata that the page shows in another section."""
 
 
-def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[Facts]:
+def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[FactGroup]:
     """Return groups of facts on file, record, session and settings, for the HTML page."""
     record, welch_analysis = result.record, result.welch
     return [
@@ -378,8 +378,14 @@ def write_report(
     pictures = save_pictures(illustrations, folder / "figures", formats, on_step)
     write_new(folder / "tables.txt", tables_text(result))
     if whole_record is not None:
-        paper_count = len(paper_illustrations)
-        _write_page(result, whole_record, folder, pictures[paper_count:], pictures[:paper_count])
+        paper_figure_count = len(paper_illustrations)
+        _write_page(
+            result,
+            whole_record,
+            folder,
+            pictures[paper_figure_count:],
+            pictures[:paper_figure_count],
+        )
     write_new(folder / "analysis.json", document_text(document([result])))
 
 

@@ -30,7 +30,7 @@ ABSENT_TEXT: Final = "–"
 TEXT_FORMAT: Final = ""
 """Number format of a column that contains texts instead of numbers."""
 
-Value = str | float | bool | None
+CellValue = str | float | bool | None
 """Value of a cell in CSV and JSON files: in SI units, without formatting."""
 
 
@@ -50,7 +50,7 @@ class Cell:
         Whether the value is shown in grey, because the data do not support it as a result.
     """
 
-    value: Value
+    value: CellValue
     text: str
     strong: bool = False
     doubtful: bool = False
@@ -61,7 +61,7 @@ class Cell:
         return isinstance(self.value, int | float) and not isinstance(self.value, bool)
 
 
-Entry = Cell | Value
+Entry = Cell | CellValue
 """Cell of a table, or a value that is shown in its column's standard format."""
 Row = Mapping[str, Entry]
 """Entries of a table's row by the keys of their columns."""
@@ -79,7 +79,7 @@ class Column:
         Name for programs, with the SI unit: header in CSV, key in JSON.
     number_format : str
         Format of the column's numbers; `TEXT_FORMAT` if the column contains texts.
-    factor : float
+    display_factor : float
         Factor from SI units to the displayed unit.
     std_of_previous : bool
         Whether the column contains the standard deviations of the column before it. The terminal,
@@ -89,7 +89,7 @@ class Column:
     heading: str
     key: str
     number_format: str = ".4g"
-    factor: float = 1.0
+    display_factor: float = 1.0
     std_of_previous: bool = False
 
     @property
@@ -108,7 +108,7 @@ class Column:
         return (
             count_cell(entry)
             if isinstance(entry, int)
-            else number_cell(entry, self.number_format, self.factor)
+            else number_cell(entry, self.number_format, self.display_factor)
         )
 
 
@@ -238,12 +238,12 @@ def csv_text(table: Table) -> str:
     return text_buffer.getvalue()
 
 
-def json_rows(table: Table) -> list[dict[str, Value]]:
+def json_rows(table: Table) -> list[dict[str, CellValue]]:
     """Return a table's rows as dicts of JSON values; None for a value unknown or not finite."""
-    return [{key: _program_value(entry) for key, entry in row.items()} for row in table.rows]
+    return [{key: _file_value(entry) for key, entry in row.items()} for row in table.rows]
 
 
-def _program_value(entry: Entry) -> Value:
+def _file_value(entry: Entry) -> CellValue:
     """Return an entry's value for CSV and JSON; None if it is a number that is not finite."""
     entry_value = entry.value if isinstance(entry, Cell) else entry
     return (

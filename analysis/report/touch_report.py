@@ -5,17 +5,17 @@ from __future__ import annotations
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-from analysis.report._document import document_text, versions
+from analysis.report._document import document_text, program_versions
 from analysis.report.folder import write_new
 from analysis.report.table import TEXT_FORMAT, Cell, Column, Entry, Table, csv_text, number_cell
-from analysis.results import finite
+from analysis.results import finite_json
 from rigd.units import decimals, with_half_width
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from analysis.report._page import Facts
+    from analysis.report._page import FactGroup
     from analysis.touch import SessionTouches, Touch
     from rigd.touch import TouchQuantity
 
@@ -23,7 +23,7 @@ _MAX_INTERVAL_ASYMMETRY = 0.25
 """Asymmetry of an interval above which its ends are shown instead of value and half-width.
 
 The asymmetry is the distance of the value from the interval's middle, relative to its length."""
-_KIND_DESCRIPTIONS = {
+_DESCRIPTION_BY_KIND = {
     "rigid": "obstacle at rest",
     "yielding": "obstacle that gives way",
     "moving": "moving obstacle",
@@ -76,18 +76,18 @@ def _touch_row(session: SessionTouches, touch: Touch) -> dict[str, Entry]:
         "angle_rad": touch.angle_rad,
         "kind": "not estimated"
         if estimate is None
-        else _KIND_DESCRIPTIONS.get(estimate.kind, estimate.kind),
+        else _DESCRIPTION_BY_KIND.get(estimate.kind, estimate.kind),
     }
-    estimate_offsets: dict[str, tuple[TouchQuantity | None, float]] = {}
+    quantities_with_offsets: dict[str, tuple[TouchQuantity | None, float]] = {}
     if estimate is not None:
-        estimate_offsets = {
+        quantities_with_offsets = {
             "time_s": (estimate.time_s, touch.start_s),
             "x_m": (estimate.x_m, 0.0),
             "force_n": (estimate.force_n, 0.0),
             "stiffness_n_per_m": (estimate.stiffness_n_per_m, 0.0),
         }
     for key in ("time_s", "x_m", "force_n", "stiffness_n_per_m"):
-        estimated_quantity, display_offset = estimate_offsets.get(key, (None, 0.0))
+        estimated_quantity, display_offset = quantities_with_offsets.get(key, (None, 0.0))
         row[key] = _estimate_cell(estimated_quantity, display_offset)
         row[f"{key}_std"] = None if estimated_quantity is None else estimated_quantity.std
     return row
@@ -139,12 +139,12 @@ def session_lines(session: SessionTouches) -> list[str]:
     validity_text = f" {session.validity.sentence}" if touch_count else ""
     return [
         f"{session.path.name}: {touch_count_text}{detection_text}. "
-        f"Model: {model_words(session)}.{validity_text}",
+        f"Model: {describe_model(session)}.{validity_text}",
         *(f"Warning: {sentence}" for sentence in session.warnings),
     ]
 
 
-def model_words(session: SessionTouches) -> str:
+def describe_model(session: SessionTouches) -> str:
     """Return a text that states the source of the parameters of a session's beam model."""
     model_source = session.model.source
     return "the nominal beam of the attached profile" if model_source == "profile" else model_source
@@ -167,9 +167,9 @@ def touches_document(
     dict
         ``versions``, ``touches`` and ``errors``: lists of objects that name their file.
     """
-    document_content: dict[str, Any] = finite(
+    document_content: dict[str, Any] = finite_json(
         {
-            "versions": versions(),
+            "versions": program_versions(),
             "touches": [
                 {
                     "file": str(session.path),
@@ -246,12 +246,12 @@ def write_touch_report(
         tables=(touch_table,) if touch_table.rows else (),
         paper_pictures=(),
         paper_tables=(),
-        how=[*_collect_facts(session_touches), pages.versions(datetime.now().astimezone())],
+        how=[*_collect_facts(session_touches), pages.version_facts(datetime.now().astimezone())],
     )
     write_new(folder / "report.html", page_html)
 
 
-def _collect_facts(session_touches: Sequence[SessionTouches]) -> list[Facts]:
+def _collect_facts(session_touches: Sequence[SessionTouches]) -> list[FactGroup]:
     """Return groups of facts on sessions, model and estimator, for the HTML page."""
     return [
         (
@@ -267,7 +267,7 @@ def _collect_facts(session_touches: Sequence[SessionTouches]) -> list[Facts]:
         ),
         (
             "Model",
-            sorted({(model_words(session), _beam_text(session)) for session in session_touches}),
+            sorted({(describe_model(session), _beam_text(session)) for session in session_touches}),
         ),
         (
             "Estimate",

@@ -121,7 +121,7 @@ FIGURES = (
 @pytest.mark.further  # as figures of a report
 def test_every_figure_is_filled(done, tmp_path):
     found, _ = done
-    write_campaign(found, tmp_path, with_paper=True, formats=("png",))
+    write_campaign(found, tmp_path, with_paper_values=True, formats=("png",))
     for figure in FIGURES:
         image = Image.open(tmp_path / "figures" / f"{figure}.png")
         assert np.asarray(image.convert("L")).std() > 5
@@ -131,7 +131,9 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path, without_drawing
     found, _ = done
     steps = []
     with without_drawing():
-        write_campaign(found, tmp_path, with_paper=True, on_step=steps.append, formats=("png",))
+        write_campaign(
+            found, tmp_path, with_paper_values=True, on_step=steps.append, formats=("png",)
+        )
     figures, tables = tmp_path / "figures", tmp_path / "tables"
     for figure in FIGURES:
         assert (figures / f"{figure}.png").exists()
@@ -406,7 +408,7 @@ def test_numbers_of_the_paper_are_shown_on_request_only(done):
     found, _ = done
     assert campaign_tables(found)
     assert "the paper's" not in campaign_text(found)
-    assert "(1.33)" in campaign_text(found, with_paper=True)
+    assert "(1.33)" in campaign_text(found, with_paper_values=True)
 
 
 def test_error_without_any_usable_session(tmp_path, settings, in_this_process):

@@ -203,7 +203,7 @@ def test_agreeing_quantities_are_not_marked_as_a_mixture(mixture, tmp_path):
     assert "ρ/EI (10⁻³ s²/m⁴) ‡" in text
     assert "ζ (10⁻⁵ s^α) ‡" not in text
     assert "(Table 3), of a mixture" in text
-    write_campaign(mixture, tmp_path / "report", with_paper=False)
+    write_campaign(mixture, tmp_path / "report", with_paper_values=False)
     texts = ET.parse(tmp_path / "report" / "figures" / "pooled.svg").iter(
         "{http://www.w3.org/2000/svg}text"
     )
@@ -218,7 +218,7 @@ def test_page_and_json_report_the_mixture(mixture):
     assert content["groups"]["files"] == [["0.mcap", "1.mcap"], ["stiff20.mcap", "stiff21.mcap"]]
     assert [row["files"] for row in content["specimens"]] == [4, 1]
     assert {row["mixture"] for row in content["table3"]} == {True}
-    page = campaign_page(mixture, (), datetime.now(UTC), with_paper=False)
+    page = campaign_page(mixture, (), datetime.now(UTC), with_paper_values=False)
     assert page.index("The files state") < page.index("type VI: internal damping")
     for name in ("specimens", "homogeneity"):
         assert f'id="{name}"' in page

@@ -86,7 +86,7 @@ def test_terminal_page_and_files_report_the_lost_trial(shaken):
     lines = campaign_text(shaken).splitlines()
     (row,) = (line for line in lines if line.startswith("record   III "))
     assert "3 of 4" in row
-    page = campaign_page(shaken, (), datetime.now(UTC), with_paper=False)
+    page = campaign_page(shaken, (), datetime.now(UTC), with_paper_values=False)
     assert "3 of 4" in page
     assert f"Not predicted from the others: {shaken.failed_predictions[0].path}: its worker" in page
     content = campaign_document(shaken)
@@ -100,7 +100,7 @@ def test_terminal_page_and_files_report_the_lost_trial(shaken):
 @pytest.mark.process
 @pytest.mark.further  # as terminal and page
 def test_figure_reports_the_lost_trial(shaken, tmp_path):
-    write_campaign(shaken, tmp_path / "report", with_paper=False)
+    write_campaign(shaken, tmp_path / "report", with_paper_values=False)
     texts = ET.parse(tmp_path / "report" / "figures" / "validation.svg").iter(
         "{http://www.w3.org/2000/svg}text"
     )

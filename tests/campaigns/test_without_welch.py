@@ -59,7 +59,7 @@ def test_common_warning_is_reported_once(found):
     text = " ".join(campaign_text(found).split())
     assert text.count("Welch fits left out") == 1
     assert "Warning: all 2 files: Welch fits left out: a multisine" in text
-    page = campaign_page(found, (), datetime(2026, 1, 1, tzinfo=UTC), with_paper=False)
+    page = campaign_page(found, (), datetime(2026, 1, 1, tzinfo=UTC), with_paper_values=False)
     assert page.count("Welch fits left out") == 1
 
 
@@ -67,7 +67,7 @@ def test_sessions_are_listed_with_their_metadata(found):
     line = next(each for each in campaign_text(found).splitlines() if each.startswith("0.mcap "))
     for value in ("A", "Eve", "[clamp] <b>new</b>", "yes"):
         assert value in line
-    page = campaign_page(found, (), datetime(2026, 1, 1, tzinfo=UTC), with_paper=False)
+    page = campaign_page(found, (), datetime(2026, 1, 1, tzinfo=UTC), with_paper_values=False)
     assert "[clamp] &lt;b&gt;new&lt;/b&gt;" in page
     assert "<b>" not in page
 

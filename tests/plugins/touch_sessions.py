@@ -110,4 +110,4 @@ def touch_analysis():
 @pytest.fixture(scope="session")
 def touched(touch_file, touch_analysis):
     """Return the analysis of the file."""
-    return touch_analysis.session(touch_file.path)
+    return touch_analysis.analyse_session(touch_file.path)

@@ -16,7 +16,7 @@ from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from analysis.report import _style as style
 from analysis.report import frf_figure, illustrations
-from analysis.report._record_figures import plain_logarithmic
+from analysis.report._record_figures import set_plain_logarithmic_axis
 from analysis.report._signal_figures import (
     best_model,
     paper_signals_figure,
@@ -28,7 +28,7 @@ from analysis.report.folder import OutputExistsError
 
 
 def pixels(figure, path):
-    style.save(figure, path)
+    style.save_figure(figure, path)
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 
@@ -146,7 +146,7 @@ def test_a_figure_is_the_same_each_time_in_every_format(tmp_path, kind, start):
         with style.figure_style():
             figure = style.new_figure(4.0, 3.0, "Title µ ζ", "and more")
             figure.add_subplot().plot([1.0, 2.0])
-            return style.save(figure, tmp_path / f"{name}.{kind}")
+            return style.save_figure(figure, tmp_path / f"{name}.{kind}")
 
     content = drawn("a")
     assert content.startswith(start)
@@ -245,7 +245,7 @@ def test_failed_drawing_leaves_no_copy(monkeypatch, tmp_path):
 
 def test_title_with_invalid_text_is_drawn(tmp_path):
     with style.figure_style():
-        style.save(style.new_figure(6.0, 4.0, "caf\udce9.mcap", "—"), tmp_path / "a.png")
+        style.save_figure(style.new_figure(6.0, 4.0, "caf\udce9.mcap", "—"), tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -277,7 +277,7 @@ def test_a_picture_is_never_overwritten(paper_analysis, tmp_path):
     target = tmp_path / "a.png"
     target.write_bytes(b"mine")
     with style.figure_style(), pytest.raises(OutputExistsError):
-        style.save(style.new_figure(4, 3, "a", "b"), target)
+        style.save_figure(style.new_figure(4, 3, "a", "b"), target)
     assert target.read_bytes() == b"mine"
 
 
@@ -288,7 +288,7 @@ def test_labels_of_a_logarithmic_axis_do_not_overlap(span, height_in):
     with style.figure_style():
         figure = style.new_figure(8.0, 4.0)
         axes = figure.add_axes((0.1, 0.1, 0.8, height_in / 4.0))
-        plain_logarithmic(axes, 0.3, 0.3 * span)
+        set_plain_logarithmic_axis(axes, 0.3, 0.3 * span)
         figure.canvas.draw()
         low, high = axes.get_ylim()
         boxes = sorted(
@@ -350,8 +350,8 @@ def test_the_fit_in_per_cent_is_that_of_the_torque_in_time(record_result):
     """The same number from signals: measured against predicted torque, without their means."""
     whole = record_result.whole
     torque = torque_in_band(whole.record, whole.fit.plant, whole.band_hz[1])
-    measured = torque.measured - torque.measured.mean()
-    expected = 100 * (1 - np.linalg.norm(torque.residual) / np.linalg.norm(measured))
+    measured = torque.measured_nm - torque.measured_nm.mean()
+    expected = 100 * (1 - np.linalg.norm(torque.residual_nm) / np.linalg.norm(measured))
     found = whole.analysis.fit_percent(whole.fit)
     assert found == pytest.approx(expected, abs=0.3)
     assert 50 < found < 100
@@ -366,7 +366,7 @@ def test_model_torque_is_continuous_at_a_nonzero_end(record_result):
     held_off_zero = replace(record, angle_rad=record.angle_rad - 0.008 * way**2 * (3 - 2 * way))
     torque = torque_in_band(held_off_zero, whole.fit.plant, whole.band_hz[1])
     last = slice(-round(0.5 * record.rate_hz), None)
-    assert np.abs(torque.modelled[last]).max() < 0.1 * np.abs(torque.measured).max()
+    assert np.abs(torque.modelled_nm[last]).max() < 0.1 * np.abs(torque.measured_nm).max()
 
 
 @pytest.mark.fit

@@ -20,10 +20,10 @@ def analyze(monkeypatch, touch_analysis, touch_file, touched):
     """Run the command; the file is analysed once for all tests."""
 
     class Analysed:
-        def session(self, path, *options):
+        def analyse_session(self, path, *options):
             if path == touch_file.path:
                 return touched
-            return touch_analysis.session(path, *options)
+            return touch_analysis.analyse_session(path, *options)
 
     monkeypatch.setattr(
         "analysis.touch.TouchAnalysis", lambda model: Analysed() if model is None else None

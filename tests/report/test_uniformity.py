@@ -72,7 +72,7 @@ def test_band_of_the_modal_model_matches_scatter_of_draws(modal_result):
 def test_modal_model_is_shown_first(modal_result):
     whole = modal_result.whole
     model = ShownModel.from_headline(whole.headline, whole.record)
-    assert model.transfer is whole.headline.modal.model
+    assert model.transfer_function is whole.headline.modal.model
     assert model.fit_percent(whole.analysis) == pytest.approx(
         whole.analysis.fit_percent(whole.fit), abs=0.2
     )
