@@ -365,7 +365,7 @@ def exact_geometry_table(whole_record: WholeRecord) -> Table | None:
                 parameter_name,
                 parameter,
                 {},
-                is_fixed=_is_fixed(whole_record.headline, parameter_name, exact=True),
+                is_fixed=_is_fixed(whole_record.headline, parameter_name, with_exact_geometry=True),
             )
             for parameter_name, parameter in exact_estimates.parameters.items()
         ),
